@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 
 from plow_twin.errors import InputError, Problem
 
-#: Where the token stands, where it is in no file.
+#: Name of the environment variable of the token, used without a file.
 TOKEN_VARIABLE: Final = "PLOW_TWIN_DASHBOARD_TOKEN"
 DEFAULT: Final = "127.0.0.1:8070"
 #: Fewest characters of a token.

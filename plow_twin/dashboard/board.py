@@ -1,4 +1,4 @@
-"""What the server of the screen knows: the newest of everything, the hour, and what each page lacks."""
+"""State of the screen's server: the newest values, the last hour, and the updates that each page lacks."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Board:
         news.set()
 
     def since(self, version: int) -> dict[str, Any]:
-        """Return what a page lacks that has had the update of that number; 0: it has had none."""
+        """Return the updates after the given number, the last that a page has received; 0: all."""
         found: dict[str, Any] = {
             "version": self.version,
             "age": round(time.monotonic() - self._updated_s, 2),

@@ -12,7 +12,7 @@ from plow_twin.record.alarms import alarms_of
 
 
 def facts_of(scene: Scene, parameters: Mapping[str, Any], source: str) -> dict[str, Any]:
-    """Return the facts; `parameters` are those of the twin, `source` says where its samples come from."""
+    """Return the facts from the twin's `parameters`; `source` names the origin of its samples."""
     letters = {corner: letter for letter, corner in scene.frame.labels.items()}
     places = zip(PAIR_NAMES, CORNER_X, CORNER_Y, NORMAL_X, NORMAL_Y, strict=True)
     return {

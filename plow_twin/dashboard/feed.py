@@ -1,4 +1,4 @@
-"""The feed of a process beside a twin: what has happened is summed up at a rate, and handed over where there is room.
+"""The feed of a process beside a twin: it sums up publications and hands the sums over at a rate, where there is room.
 
 An update that is not taken is not queued: its peaks, and the newest of everything else, stay for the next one.
 """
@@ -39,7 +39,7 @@ class Motion:
     """The newest motion, and the extremes since they were last cleared."""
 
     def __init__(self) -> None:
-        #: stamp reached [ns]; 0: nothing has come
+        #: stamp reached [ns]; 0: no publication yet
         self.stamp_ns = 0
         self.pose = np.full(3, np.nan)
         self.penetration = np.full(PAIR_COUNT, np.nan)
@@ -53,7 +53,7 @@ class Motion:
         self.clear()
 
     def clear(self) -> None:
-        """Let the extremes begin anew."""
+        """Reset the extremes."""
         self.peak = np.zeros(PAIR_COUNT)
         #: 5 % and 95 % points of the peaks, shape (2, 8), where they are known
         self.points: Array | None = None
@@ -96,9 +96,9 @@ class Motion:
         self.clearance, self.estimate = values, {}
 
     def _clearances(self, values: Array) -> dict[str, float | None]:
-        """Return clearances by name: those published, or those of an estimate that came after them.
+        """Return the newest clearances by name: published ones, or those of a later estimate.
 
-        Nothing may be published any more after an estimate: a file has ended, or the machine stands.
+        An estimate may be the last message: a file has ended, or the machine stands.
         """
         found = {name: number(value) for name, value in zip(CLEARANCE_NAMES, values.tolist(), strict=True)}
         for axis in [axis for axis in ("horizontal", "vertical") if self.status.get(axis) in _KNOWN_STATES]:
@@ -129,7 +129,7 @@ class Motion:
 
 
 class Feed:
-    """What a twin, or a reader beside it, tells the screen or a receiver of telemetry.
+    """Updates from a twin, or from a reader beside it, to the screen or a receiver of telemetry.
 
     Parameters
     ----------
@@ -138,14 +138,14 @@ class Feed:
     facts
         What is known of the machine (`facts.facts_of`).
     answer
-        Does what an operator asks for, `acknowledge` or `mark` with a text; returns whether it was done, and a text.
+        Carries out an operator's request, `acknowledge` or `mark` with a text; returns success and a text.
         None: nothing can be asked for.
     load
         Returns the newest load Fx, Fy [N], M [N m] that is known with a publication, shape (3,).
     on_error
-        Receives the reason why nothing goes out any more.
+        Receives the reason when the feed has ended.
     process, consequence
-        Name of the process, and what its end means.
+        Name of the process, and the consequence of its end.
     """
 
     def __init__(
@@ -169,7 +169,7 @@ class Feed:
         self._waiting: list[Published] = []
         self._loads: list[Array] = []
         self.motion = Motion()
-        #: second of stamps that the newest update has told of
+        #: second of stamps of the newest update
         self._second = 0
         #: updates that the server took, and those that it had no room for
         self.taken = self.not_taken = 0
@@ -202,7 +202,7 @@ class Feed:
         del self._events[:-_EVENTS]
 
     def turn(self) -> None:
-        """Do what operators ask for, and send an update: called at the rate of the updates."""
+        """Carry out operators' requests, and send an update: called at the rate of the updates."""
         self.hear()
         self.send()
         if self._link.broken and not self._ended:
@@ -210,7 +210,7 @@ class Feed:
             self._on_error(self._end)
 
     def hear(self) -> None:
-        """Do what operators ask for, and take in reports of the process."""
+        """Carry out operators' requests, and read reports of the process."""
         for _ in range(_MOST_ASKED):
             asked = self._link.receive()
             if asked is None:

@@ -16,7 +16,7 @@ class History:
 
     Where intervals are known, the 5 % and 95 % points of the eight peaks follow.
 
-    Each has the number of the update that changed it last, so that a page gets what it lacks.
+    Each has the number of the update that changed it last, so that a page gets only newer values.
     """
 
     def __init__(self) -> None:
@@ -24,7 +24,7 @@ class History:
         self._versions: deque[int] = deque()
 
     def add(self, motion: dict[str, Any], version: int) -> bool:
-        """Take in the motion of an update; True where the stamps have stepped back and the hour begins anew."""
+        """Take in the motion of an update; True where the stamps have stepped back and the hour is cleared."""
         second = int(motion["t"])
         stepped_back = bool(self._seconds) and second < self._seconds[-1][0]
         if stepped_back:

@@ -1,4 +1,4 @@
-"""The way between a twin and the screen's server: whole messages both ways, bounded, and nobody waits."""
+"""The link between a twin and the screen's server: whole messages both ways, bounded, without waiting."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ class Link:
         self.broken = False
 
     def fileno(self) -> int:
-        """Return the descriptor, for whoever waits for messages."""
+        """Return the descriptor, for `select`."""
         return self._end.fileno()
 
     def send(self, message: dict[str, Any]) -> bool:
-        """Send a message; False where it is not taken: there is no room, it is too long, or nobody is there."""
+        """Send a message; False where it is not taken: no room, too long, or no receiver."""
         data = json.dumps(message, separators=(",", ":")).encode()
         if self.broken or len(data) > LONGEST:
             return False
@@ -47,7 +47,7 @@ class Link:
             return False
 
     def receive(self) -> dict[str, Any] | None:
-        """Return the next message; None where none has come."""
+        """Return the next message, or None."""
         if self.broken:
             return None
         try:

@@ -89,7 +89,7 @@ class NodeWatch:
             waited += 0.1
 
     def spin(self) -> None:
-        """Take what has come, waiting a little."""
+        """Process messages that have arrived, waiting a little."""
         self._executor.spin_once(timeout_sec=0.1)
 
     def parameters(self) -> dict[str, Any]:
@@ -101,7 +101,7 @@ class NodeWatch:
         return {name: value for name, value in zip(_SHOWN, values, strict=False) if value is not None}
 
     def listen(self, feed: Feed, source: str) -> None:
-        """Hand over to a feed what comes from now on."""
+        """Hand messages from now on over to a feed."""
         self.feed = feed
         best_effort = partial(QoSProfile, reliability=ReliabilityPolicy.BEST_EFFORT)
         self._subscribe(JointState, "contact_forces", best_effort(depth=_NEWEST), self._forces)

@@ -28,7 +28,7 @@ from plow_twin.stream.topics import Cadence, names_of
 
 #: The topics whose messages are decoded one by one.
 _SLOW: Final = names_of(Cadence.ESTIMATE, Cadence.CHANGE)
-#: How long the feed waits for room [s]: nothing is live here that it could hold up.
+#: How long the feed waits for room [s]: a file is no live run that it could hold up.
 _WAIT_S: Final = 2e-3
 
 
@@ -77,7 +77,7 @@ class RunFeed:
             self._feed.motion.was_held |= self._feed.motion.held
             while not (self._feed.send() or self._stopped()):
                 time.sleep(_WAIT_S)
-        self._say(batch)  # an estimate stands for the clearances before it
+        self._say(batch)  # an estimate replaces the clearances before it
 
     def _second(self, rows: dict[str, Rows], loads: Rows) -> None:
         motion = self._feed.motion
@@ -118,7 +118,7 @@ def pose_of(numbers: Array) -> Array:
 
 
 def show_run(path: Path, access: PageAccess, stopped: Callable[[], bool], on_open: Callable[[Screen], object]) -> None:
-    """Show a recording until `stopped`: as it is written, or at once what is there.
+    """Show a recording until `stopped`: while it is written, or at once.
 
     Parameters
     ----------

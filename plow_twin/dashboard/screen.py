@@ -1,4 +1,4 @@
-"""The screen beside a twin: its server as a process, and the feed that it is told by."""
+"""The screen beside a twin: its server as a process, and the feed to it."""
 
 from __future__ import annotations
 
@@ -51,5 +51,5 @@ class Screen(Beside):
 
     @property
     def has_ended(self) -> bool:
-        """Whether the server has gone: nothing is shown any more."""
+        """Whether the server has ended."""
         return self.link.broken

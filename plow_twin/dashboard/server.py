@@ -1,7 +1,7 @@
 """The server of the screen, a process of its own: `python -m plow_twin.dashboard.server LINK SOCKET`.
 
-Each page is sent what it lacks once it has taken what was sent before: a slow page gets fewer updates, a frozen one
-none, and nobody else waits for either.
+Each page gets the newer values once it has taken the update before: a slow page gets fewer updates, a frozen one
+no update, and no other page waits for either.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ _HEADERS: Final = {
 
 
 class Guard:
-    """Refuses requests under names that are not the screen's own, and those of pages of others."""
+    """Refuses requests under foreign host names, and requests from pages of other sites."""
 
     def __init__(self, app: ASGIApp, access: PageAccess) -> None:
         self._app, self._access = app, access
@@ -109,7 +109,7 @@ class Pages:
                 return
             await self._serve(socket)
         except (WebSocketDisconnect, TimeoutError, RuntimeError):
-            return  # it has gone, or takes nothing any more
+            return  # it has gone, or does not read
         finally:
             self._board.pages -= 1
 
@@ -133,7 +133,7 @@ class Pages:
             await asyncio.gather(*tasks, return_exceptions=True)
 
     async def _tell(self, socket: WebSocket) -> None:
-        """Send what the page lacks, again and again; what it was too slow for is counted."""
+        """Send newer values to the page in a loop; count updates that it was too slow for."""
         board, version, skipped = self._board, 0, 0
         while not self._link.broken:
             news = board.news
@@ -147,7 +147,7 @@ class Pages:
         await socket.close(ENDED, "the twin has ended")
 
     async def _listen(self, socket: WebSocket) -> None:
-        """Pass on what the page wishes."""
+        """Pass on the page's requests."""
         while True:
             wish = await _wish(socket)
             if wish.get("do") in ("acknowledge", "mark"):
@@ -156,7 +156,7 @@ class Pages:
 
 
 async def _wish(socket: WebSocket) -> dict[str, Any]:
-    """Return the next wish of a page; one that cannot be read is none."""
+    """Return the next request of a page; None where it cannot be read."""
     try:
         found = json.loads(await socket.receive_text())
     except (ValueError, KeyError):

@@ -1,4 +1,4 @@
-"""The forces of the demo's synthetic machine beside those that the twin published and those of its nominal scene."""
+"""The forces of the demo's synthetic machine, beside the twin's published forces and those of the nominal scene."""
 
 from __future__ import annotations
 
@@ -46,14 +46,14 @@ class Comparison:
 
 
 def compare_forces(run: Path, wider_m: float) -> Comparison | None:
-    """Return the forces of a run beside those of a machine whose clearances are larger; None without forces.
+    """Return the forces of a run beside the forces of a machine with larger clearances; None without forces.
 
     Parameters
     ----------
     run : Path
         The recording.
     wider_m : float
-        By which the machine's clearances exceed those of the scene in m.
+        Excess of the machine's clearances over the scene's in m.
     """
     reader = RunReader(run)
     stamps, wrench, told, estimates = _read(reader)

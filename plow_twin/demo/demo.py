@@ -340,7 +340,7 @@ def _print(console: Console, watch: Watch, summary: RunSummary, sent: int, lost:
 
 
 def _print_clearances(console: Console, summary: RunSummary) -> None:
-    """Print the clearances estimated from the synthetic sensor, else those of the model with its prior."""
+    """Print the clearances estimated from the synthetic sensor, or the model's with its prior."""
     for name, (value, low, high) in summary.clearance.items():
         found = None if summary.estimate is None else summary.estimate[name]
         if found is None:
@@ -356,7 +356,7 @@ def _print_clearances(console: Console, summary: RunSummary) -> None:
 
 
 def _print_comparison(console: Console, beside: Comparison) -> None:
-    """Print the forces of the synthetic machine beside the published ones and those of the nominal scene."""
+    """Print the forces of the synthetic machine, the published forces and the forces of the nominal scene."""
     table = Table(title=f"Largest forces of the last {COMPARED_S:g} s in kN")
     table.add_column("pair", no_wrap=True)
     names = ("nominal", "followed", "true")

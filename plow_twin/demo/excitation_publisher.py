@@ -195,7 +195,7 @@ def plan(
 ) -> Plan:
     """Sample the loads of a scene, gravity not included, with a cutting load on top.
 
-    With `sensor_mm` the plan has the noisy pose of a head whose clearances exceed those of the scene by that.
+    With `sensor_mm` the plan has the noisy pose of a head whose clearances exceed the scene's by as much.
 
     Raises
     ------

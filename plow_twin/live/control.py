@@ -1,4 +1,4 @@
-"""A local socket through which a running twin without ROS can be asked for what the node's services do.
+"""A local socket that offers the node's services on a running twin without ROS.
 
 A request and its answer are one datagram each, so that no client can hold up the twin.
 """
@@ -28,7 +28,7 @@ TURN_S: Final = 0.1
 
 
 class ControlError(PlowTwinError):
-    """The socket cannot be opened, or nobody answers on it."""
+    """The socket cannot be opened, or does not answer."""
 
 
 class Control:
@@ -87,7 +87,7 @@ class Control:
             try:
                 self._socket.sendto(json.dumps({"success": done, "message": message}).encode(), client or b"")
             except OSError:
-                continue  # it has gone, or takes nothing
+                continue  # it has gone, or does not read
 
     def _answer(self, data: bytes) -> tuple[bool, str]:
         try:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 OK, WARN, ERROR = 0, 1, 2
 
-#: Parts of /diagnostics with their keys and what each means.
+#: Parts of /diagnostics with their keys and their meanings.
 KEYS: Final[dict[str, dict[str, str]]] = {
     "state": {
         "lifecycle": "unconfigured, inactive, active or finalized",
@@ -124,7 +124,7 @@ KEYS: Final[dict[str, dict[str, str]]] = {
     },
 }
 
-#: Keys of `status` and what each means.
+#: Keys of `status` and their meanings.
 STATUS_KEYS: Final[dict[str, str]] = {
     "lifecycle": "unconfigured, inactive, active or finalized",
     "stream": "waiting, running, stale, ended or failed",
@@ -231,7 +231,7 @@ def failures(runtime: Runtime) -> list[str]:
 
 
 class Health:
-    """The parts of `/diagnostics`; remembers counters to tell what has happened since the last report."""
+    """The parts of `/diagnostics`; remembers counters, for differences since the last report."""
 
     def __init__(self) -> None:
         self._before: dict[str, int] = {}
@@ -277,7 +277,7 @@ class Health:
         return level, message, values
 
     def input(self, runtime: Runtime) -> Part:
-        """Return what arrived and what became of it."""
+        """Return the part `input`: samples arrived, used and dropped."""
         counted = counters(runtime.driver)
         inputs, residual, age_s = runtime.inputs, runtime.residual(), runtime.newest_sample_age_s()
         peak, wait_s = inputs.take_queue_peak()
@@ -340,7 +340,7 @@ class Health:
         return (WARN if missed else OK), missed or "publishing", values
 
     def _note_periods(self, runtime: Runtime, values: dict[str, str]) -> str:
-        """Add what is known of the loop's periods to `values`; return what is wrong with them, if anything."""
+        """Add the statistics of the loop's periods to `values`; return the faults found."""
         keys = ("periods_missed", "period_mean_ms", "period_deviation_ms", "period_max_ms")
         values |= dict.fromkeys(keys, "")
         if runtime.periods is None:

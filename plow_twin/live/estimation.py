@@ -64,12 +64,12 @@ class Estimation:
         #: the newest forecast, or the reason why there is no forecast
         self.forecast: dict[str, Any] | None = None
         self.forecast_error = "nothing has been estimated yet"
-        #: the newest one, for a journal that is begun anew
+        #: the newest one, for a new journal
         self.entry: Estimated | None = None
 
     @property
     def error(self) -> str:
-        """Why nothing more is estimated; empty: it is."""
+        """Reason why the estimation has ended; empty: it continues."""
         return self._worker.error
 
     def finish(self) -> None:
@@ -78,12 +78,12 @@ class Estimation:
 
     @property
     def done(self) -> bool:
-        """Whether nothing is estimated any more: the last window has been, or the process has failed."""
+        """Whether the estimation is over: the last window is done, or the process has failed."""
         return self._worker.ended is not None or bool(self.error)
 
     @property
     def shortage(self) -> str:
-        """Why nothing was estimated at all; empty: something was, or the source has not ended."""
+        """Why no estimate was made; empty: one was, or the source has not ended."""
         return "" if self.count else self._worker.ended or ""
 
     @property
@@ -111,7 +111,7 @@ class Estimation:
                 self.trust, self.reasons = dict.fromkeys(self.trust, ""), ()
                 self.forecast, self.forecast_error = None, "nothing has been estimated since the pads were set"
             case SetModel():
-                # the clearances are those of the other numbers now, and no estimate of those before is taken over
+                # the clearances now are those of other numbers, so an older estimate no longer applies
                 self._worker.restart()
                 self._forget()
             case Reset():
@@ -152,7 +152,7 @@ class Estimation:
         return messages
 
     def _forget(self) -> None:
-        """Let the clearances be those of the model again."""
+        """Return to the model's clearances."""
         self.entry = None
         self.states = dict.fromkeys(self.states, State.PRIOR)
 

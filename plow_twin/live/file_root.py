@@ -1,4 +1,4 @@
-"""Which files the parameters of a twin may name: whoever reaches the ROS graph may set parameters."""
+"""Bounds of the files that parameters may name: anybody on the ROS graph may set parameters."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Named(Protocol):
 
     @property
     def file_root(self) -> str:
-        """Folder that the files must stay within; empty: none."""
+        """Folder that the files must stay within; empty: no such folder."""
 
     @property
     def scene(self) -> str:
@@ -33,7 +33,7 @@ class Named(Protocol):
 
 
 def outside(settings: Named) -> list[Problem]:
-    """Return a problem for each parameter that names a file outside of `file_root`, links followed; none without it."""
+    """Return a problem for each parameter that names a file outside of `file_root`, links followed."""
     if not settings.file_root:
         return []
     root = Path(settings.file_root).resolve()

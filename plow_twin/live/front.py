@@ -1,4 +1,4 @@
-"""The live twin without ROS: a bridge feeds it, and what it has to say goes to one function."""
+"""The live twin without ROS: a bridge feeds it, and its reports go to one function."""
 
 from __future__ import annotations
 
@@ -43,13 +43,13 @@ Say = Callable[[str, Part], None]
 
 
 class Watcher(Protocol):
-    """Gets what is said and each publication."""
+    """Receives each report and each publication."""
 
     def publication(self, published: Published) -> None:
         """Take in a publication of at least one row."""
 
     def part(self, name: str, part: Part) -> None:
-        """Take in what is said."""
+        """Receive a part of the diagnostics."""
 
 
 class BridgeFront:
@@ -60,7 +60,7 @@ class BridgeFront:
     bridge
         Where samples come from.
     mapping
-        YAML file of the mapping, or None: by what is there.
+        YAML file of the mapping, or None: recognise columns by name.
     settings, prepared
         As of `Runtime`.
     say
@@ -68,7 +68,7 @@ class BridgeFront:
     on_error
         Receives errors in words; may be called from another thread.
     units
-        Units by name (fx, ..., t) that are not those of the mapping.
+        Units by name (fx, ..., t) in place of the mapping's.
 
     Raises
     ------
@@ -107,7 +107,7 @@ class BridgeFront:
         self.runtime = Runtime(self, settings, prepared)
         self._feeder = Feeder(self.roles, self.runtime, self.send, model if "drive" in self.roles else None)
         self._health = diagnostics.Health()
-        #: what has its turn while the source is read
+        #: work that gets its turn while the source is read
         self.timers: list[Timer] = []
         self._watchers: list[Watcher] = []
         #: further parts of the diagnostics, by name
@@ -123,12 +123,12 @@ class BridgeFront:
             watcher.publication(published)
 
     def now_ns(self) -> int:
-        """Return the system's time, or that of the samples where they bring their own [ns]."""
+        """Return the system's time, or the samples' own time [ns]."""
         # 0 would say that there is no time yet
         return (self._feeder.newest_ns or 1) if self.follows_samples else time.time_ns()
 
     def send(self, topic: str, message: memoryview | Message) -> None:
-        """Say an alarm, an estimate or what follows from it (of forces their peaks); the recording holds the motion."""
+        """Report an alarm, an estimate, or its forecast and peak forces; the recording holds the motion."""
         if isinstance(message, DiagnosticStatus):
             self._tell(topic, (message.level, message.message, dict(message.values)))
         elif isinstance(message, JointState):
@@ -152,7 +152,7 @@ class BridgeFront:
         """Do nothing: `say` gets the alarms."""
 
     def time_text(self, stamp_ns: int) -> str:
-        """Return a stamp in words, as it stands in the input."""
+        """Return a stamp in words, as in the input."""
         return time_text(stamp_ns, own_start=True)
 
     def changed(self) -> None:
@@ -166,7 +166,7 @@ class BridgeFront:
         self.runtime.record_status(DiagnosticStatus(level, self.name, message, head, tuple(values.items())))
 
     def run(self, stop_asked: Callable[[], bool], seconds: float = float("inf")) -> list[str]:
-        """Feed the twin until the source ends, a stop is asked for, or time is up; return what was lost, in words."""
+        """Feed the twin until the source ends, a stop is requested, or time is up; return the losses in words."""
         runtime, bridge = self.runtime, self._bridge
         lost: list[str] = []
         try:
@@ -196,7 +196,7 @@ class BridgeFront:
         return []
 
     def causes(self) -> list[str]:
-        """Return, in words, likely causes of samples that were not used or began the motion anew."""
+        """Return, in words, likely causes of samples that were not used or reset the motion."""
         counts, found = self.runtime.driver.intake.counts, []
         many = _MANY * max(1, sum(counts.values()))
         if self._feeder.unfit:
@@ -298,7 +298,7 @@ def _roles(
     if ("drive" in roles) != modelled or {"drive", "excitation"} <= roles.keys():
         raise BridgeError("mapping: expected drive and load_model together, and no excitation beside them")
     if source == "excitation" and not {"drive", "excitation"} & roles.keys():
-        # whatever stands there: it may be no text at all
+        # the content may be no text at all
         there = "; ".join(f"{topic} ({str(kind)[:120]})" for topic, kind in (topics or {}).items())
         single = any(isinstance(kind, Columns) and len(kind.names) == 1 for kind in (topics or {}).values())
         between = " with commas, semicolons or tabs between them" if single else ""

@@ -1,4 +1,4 @@
-"""What arrives on the inputs, whoever brings it: senders followed, messages counted, optional inputs checked."""
+"""The inputs, from any transport: senders followed, messages counted, optional inputs checked."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class Inputs:
         #: senders of the optional inputs
         self.optional = {topic: OneSender() for topic in OPTIONAL}
         self._queue_peak = (0, 0.0)
-        #: longest wait of a sample in the queue [s]; whoever looks at it sets it back
+        #: longest wait of a sample in the queue [s]; a report resets it
         self.wait_s = 0.0
         self._heard_ns: dict[str, int] = {}
         self._other_heard_ns: dict[str, int] = {}

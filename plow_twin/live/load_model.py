@@ -43,7 +43,7 @@ class LoadModel:
     efficiency : tuple of float, optional
         Power at the chain over motor power.
     idle_force_n : tuple of float
-        Pull of the chain when nothing is cut [N].
+        Pull of the chain without cutting [N].
     specific_force_n_m : tuple of float, optional
         Cutting force per metre of depth [N/m].
     resistance : tuple of tuples, optional

@@ -58,7 +58,7 @@ class Metrics:
         self._thread.join()
 
     def take(self, name: str, part: Part) -> None:
-        """Take in a part of the diagnostics; cheap, for nothing is computed until the page is read."""
+        """Keep a part of the diagnostics; cheap, because the page is computed when it is read."""
         self._parts = {**self._parts, name: part}
 
     def collect(self) -> Iterator[Metric]:

@@ -1,4 +1,4 @@
-"""What one part of `/diagnostics` says."""
+"""One part of `/diagnostics`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From what is published to messages: what is sent, what is recorded, which alarms follow, and what is counted."""
+"""From publications to messages: sending, recording, alarms and counters."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Front(Protocol):
     topics : mapping
         Resolved names of the outputs by their base names.
     follows_samples : bool
-        Whether time is that of the samples alone (`/clock`, a file): nothing is held for want of them.
+        Whether the samples alone move the time (`/clock`, a file): silence is not bridged.
     sends_motion : bool
         Whether messages of the motion are sent; else they are at most recorded.
     """
@@ -133,7 +133,7 @@ class Publishing:
         return {} if self._messages is None else self._messages.memory
 
     def messages(self, published: Published) -> Iterator[Outgoing]:
-        """Yield the messages of a publication of at most one row, forces first; nothing when a number is not finite.
+        """Yield the messages of a publication of at most one row, forces first; no message when a number is not finite.
 
         Between them latency and age are counted, alarms are looked at, and the recording gets its share.
         """

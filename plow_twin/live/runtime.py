@@ -59,7 +59,7 @@ class Runtime:
     settings
         The parameters.
     prepared
-        Scene and twin, the solver compiled; nobody else may use the twin.
+        Scene and twin, the solver compiled; the twin belongs to this runtime alone.
     kept_wear
         Wear of earlier runtimes of this process, by the scene's identity.
 
@@ -85,7 +85,7 @@ class Runtime:
         self.compile_s = prepared.compile_s
         #: turns of the loop that publishes at a fixed rate, or else follows the clock; None: samples set the pace
         self.periods = _periods(settings)
-        #: why time stands still, where it does: `waiting` for the first `/clock`, or `paused`
+        #: why time stands still: `waiting` for the first `/clock`, or `paused`; empty: it runs
         self.clock = "running"
         #: whether somebody else publishes under the names of this twin's outputs
         self.others_publish = False
@@ -142,7 +142,7 @@ class Runtime:
         self._set_limits(settings)
 
     def start(self) -> None:
-        """Open the journal; nothing of the front can fail any more. Without a clock the first sample opens it."""
+        """Open the journal, once the front can no longer fail. Without a clock the first sample opens it."""
         self._start_due = self.without_clock
         self.inputs.started = not self._start_due
         self.clock = "waiting" if self._start_due else "running"
@@ -170,7 +170,7 @@ class Runtime:
 
     @property
     def waits_for_clock(self) -> bool:
-        """Whether the journal is not open yet for want of a clock: nothing can be asked of the twin."""
+        """Whether the journal still waits for a clock: services are refused."""
         return self._start_due
 
     @property
@@ -283,7 +283,7 @@ class Runtime:
         self._journal_unused()
 
     def close(self) -> list[str]:
-        """Save the wear, end journal and recording; return what was lost, in words."""
+        """Save the wear, end journal and recording; return the losses in words."""
         self.deactivate()
         lost = []
         if self.estimation:
@@ -334,7 +334,7 @@ class Runtime:
         for intake in (self.driver.intake, self.driver.clock):
             intake.jump_back_s, intake.jump_forward_s = settings.jump_back, settings.jump_forward
         if self._start_due:
-            return  # nothing is journaled yet
+            return  # the journal is empty yet
         if name in MODEL:
             self.driver.set_model(self.stamp_ns, model_changes(settings))
             self._front.changed()
@@ -443,7 +443,7 @@ class Runtime:
         return Estimation(self.settings, self.scene)
 
     def _journal(self) -> Callable[[Entry], object]:
-        """Return the receiver of each entry: the recording, the estimate, both or nobody."""
+        """Return the receiver of each entry: the recording, the estimate, both or neither."""
         recording, estimation = self.recording, self.estimation
         if estimation is None:
             return recording.journal if recording else _ignore
@@ -522,7 +522,7 @@ class Runtime:
         if self.recording and self.recording.wants_snapshot:
             self._renew_recording()
         if self._front.follows_samples:
-            # nothing is late: a pause, bounded by the number of samples, lets recorder and estimate catch up
+            # without a deadline: a pause, bounded by the number of samples, lets recorder and estimate catch up
             while count and self._behind:
                 time.sleep(_CATCH_UP_S)
                 count -= 1
@@ -563,4 +563,4 @@ def limits(settings: Settings, scene: Scene) -> Limits:
 
 
 def _ignore(entry: Entry) -> None:
-    """Drop an entry: nothing is recorded."""
+    """Drop an entry: there is no recording."""

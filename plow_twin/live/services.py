@@ -28,7 +28,7 @@ class Services:
         self._kept: Snapshot | None = None
 
     def call(self, name: str, text: str = "") -> tuple[bool, str]:
-        """Do what the service `name` does, unless the parameter `services_off` names it; `text` is that of a mark."""
+        """Carry out the service `name`, unless the parameter `services_off` names it; `text` belongs to a mark."""
         if name in services_off(self._runtime.settings):
             return False, f"{name}: switched off by the parameter services_off"
         if name == "mark":
@@ -37,7 +37,7 @@ class Services:
         return done
 
     def mark(self, text: str = "") -> tuple[bool, str]:
-        """Put a text, or else that of the parameter `mark`, into the journal and have the ring written, if any."""
+        """Put a text, by default the parameter `mark`, into the journal, and write the ring if there is one."""
         return self._runtime.mark(text or self._runtime.settings.mark or "service")
 
     def reset(self) -> tuple[bool, str]:

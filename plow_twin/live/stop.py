@@ -20,7 +20,7 @@ def stop_signals() -> list[signal.Signals]:
 class StopSignals:
     """SIGINT, SIGTERM and SIGHUP as a flag; while `interrupt` is set (a long start), as `StopRequested`.
 
-    A context: when it is left, the signals do what they did before.
+    A context that restores the signals' handlers when it is left.
     """
 
     def __init__(self) -> None:
@@ -38,7 +38,7 @@ class StopSignals:
             signal.signal(number, handler)
 
     def ignore(self) -> None:
-        """Let the signals do nothing more, at the end of a program.
+        """Ignore the signals, at the end of a program.
 
         The interpreter gives them their default back while it ends: one more, as of a terminal and a launch at once,
         would be the end of a process that has done all it was to do.

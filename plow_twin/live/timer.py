@@ -9,7 +9,7 @@ from collections.abc import Callable
 class Timer:
     """Call `do` each `period_s`; missed calls are left out, and the phase is kept.
 
-    `do` may return for how long there is nothing to do [s]: it is not called before.
+    `do` may return the time [s] before which it need not be called.
     """
 
     def __init__(self, period_s: float, do: Callable[[], float | None]) -> None:
@@ -17,7 +17,7 @@ class Timer:
         self.restart()
 
     def restart(self) -> None:
-        """Begin anew: it is due in a period."""
+        """Start again: it is due in a period."""
         self.due = time.monotonic() + self._period_s
 
     def look(self) -> None:

@@ -44,7 +44,7 @@ class WearKeeper:
     """The wear of one head in one scene, in a folder.
 
     Only a file that this keeper has read or written is replaced: another one, of a volume that was mounted meanwhile
-    or of somebody who put it there, is wear that nobody has used yet.
+    or put there by hand, is wear that no twin has used yet.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ class WearKeeper:
         self.release()
 
     def release(self) -> None:
-        """Leave the folder to others; nothing is saved."""
+        """Release the folder without saving."""
         claim, self._claim = self._claim, None
         if claim is not None:
             os.close(claim)

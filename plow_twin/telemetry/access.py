@@ -116,7 +116,7 @@ class Credentials:
         return str(path)
 
     def secret(self, section: str, key: str, variable: str) -> str:
-        """Return the first line of a file, or what stands in the environment."""
+        """Return the first line of a file, or a variable of the environment."""
         path = self.file(section, key)
         if path is None:
             return os.environ.get(f"PLOW_TWIN_{variable}", "")

@@ -36,7 +36,7 @@ class Influx:
     org, bucket, token
         Where the points go, and the right to write there.
     ca
-        Authority that its certificate is checked against; None: those of the system.
+        Authority that its certificate is checked against; None: the system's.
     """
 
     def __init__(self, url: str, org: str, bucket: str, token: str, ca: str | None) -> None:
@@ -60,7 +60,7 @@ class Influx:
             self.state.lost += 1
 
     async def turn(self) -> None:
-        """Write what waits, unless the database has failed just now."""
+        """Write waiting lines, unless the database has failed just now."""
         while self._waiting and time.monotonic() >= self._again_s:
             lines = [self._waiting[index] for index in range(min(len(self._waiting), _AT_ONCE))]
             try:
@@ -73,14 +73,14 @@ class Influx:
             self.state.connected, self.state.trouble, self._wait_s = True, "", 0.0
 
     async def close(self, patience_s: float) -> None:
-        """Write what waits once more; the rest is lost."""
+        """Write waiting lines once more; the rest is lost."""
         if self.state.connected and patience_s:
             await self.turn()
         self.state.lost += len(self._waiting)
         self._client.close()
 
     def _fail(self, error: Any, count: int) -> None:
-        """Keep the lines for another attempt, unless the database has refused them for what they are."""
+        """Keep the lines for another attempt, unless the database has refused their content."""
         self.state.connected = False
         status = getattr(error, "status", None)
         reason = f"{status} {error.reason}" if status else str(error)
@@ -97,7 +97,7 @@ class Influx:
 
 
 def line_of(name: str, group: Group, head: str) -> str:
-    """Return a group as a line of InfluxDB's protocol; empty: nothing of it is known."""
+    """Return a group as a line of InfluxDB's protocol; empty: no value is known."""
     point = Point(f"plow_twin_{name}")
     if head:
         point = point.tag("head", head)

@@ -25,7 +25,7 @@ _KEEPALIVE_S: Final = 10
 
 
 class Message(NamedTuple):
-    """A message; a retained one is what a late subscriber gets."""
+    """A message; a late subscriber gets the retained one."""
 
     topic: str
     payload: bytes
@@ -43,13 +43,13 @@ class Broker:
     tls
         Files `ca`, `certificate` and `key`, or None: not encrypted.
     will
-        Returns what the broker sends when the next connection breaks.
+        Returns the broker's message for a break of the next connection.
     on_connected
-        Returns what is sent before all that waits, once the broker has accepted.
+        Returns the messages that go before all waiting ones, once the broker has accepted.
     waiting
         Most messages that wait while the broker does not answer; the oldest are dropped and counted.
     keeps
-        Whether what waits is sent after a break; else it is dropped and counted.
+        Whether waiting messages are sent after a break; else they are dropped and counted.
 
     Raises
     ------
@@ -103,7 +103,7 @@ class Broker:
             self._drop(len(self._waiting) - (self._most if self._keeps or self.state.connected else 0))
 
     async def close(self, last: Message, patience_s: float) -> None:
-        """Send what waits, then the last message, and disconnect."""
+        """Send waiting messages, then the last message, and disconnect."""
         self.send(last)
         give_up = time.monotonic() + patience_s
         while self.state.connected and (self._waiting or self._unacknowledged) and time.monotonic() < give_up:
@@ -189,7 +189,7 @@ class MqttOut:
         """Do nothing: the connection has a thread."""
 
     async def close(self, patience_s: float) -> None:
-        """Send what waits, then that the twin has gone."""
+        """Send waiting messages, then that the twin has gone."""
         await self._broker.close(self._gone, patience_s)
 
 

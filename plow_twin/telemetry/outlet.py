@@ -1,4 +1,4 @@
-"""A way out beside a twin: its process, the feed that it is told by, and its part of the diagnostics."""
+"""A way out beside a twin: its process, the feed to it, and its part of the diagnostics."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from plow_twin.live.part import Part
 from plow_twin.telemetry.access import WayOut
 from plow_twin.telemetry.way import TelemetryError
 
-#: How long a process may take to open its way [s]: it imports its library, and compiles nothing.
+#: How long a process may take to open its way [s]: it only imports its library.
 _START_S: Final = 60.0
 
 
@@ -63,7 +63,7 @@ class Outlet(Beside):
             raise TelemetryError(failed)
 
     def turn(self) -> None:
-        """Send an update, and say what has changed at the receiver."""
+        """Send an update, and report changes at the receiver."""
         self.feed.turn()
         self._say()
 
@@ -84,7 +84,7 @@ class Outlet(Beside):
         return int(bool(said)), said, values
 
     def close(self) -> None:
-        """Send the newest, let the receiver have what waits, and end the process."""
+        """Send the newest values, wait for the receiver, and end the process."""
         self.feed.send()
         give_up = time.monotonic() + END_S
         asked = False

@@ -1,4 +1,4 @@
-"""The process of one way out: `python -m plow_twin.telemetry.process LINK`; the first message says which and where.
+"""The process of one way out: `python -m plow_twin.telemetry.process LINK`; the first message names the way.
 
 It takes the updates of a feed one by one. While the receiver does not answer, the way out keeps as many as its own
 bound allows and counts the others; the twin does not wait for any of it.
@@ -33,7 +33,7 @@ WAYS: Final = {
 _NICE: Final = 5
 #: Longest time between two reports [s].
 _REPORT_S: Final = 0.5
-#: How long the receiver has for what waits at the end [s].
+#: How long the receiver has for waiting messages at the end [s].
 _END_S: Final = 2.0
 
 

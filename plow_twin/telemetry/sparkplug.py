@@ -86,7 +86,7 @@ class Sparkplug:
         self._newest = Newest()
         #: newest value of each metric that was sent
         self._sent: dict[tuple[str, str], Value] = {}
-        # what a break has swallowed is not sent: the birth after it has the newest of everything
+        # messages of a break are not sent: the birth after it has all newest values
         self._broker = Broker(will=self._next_death, on_connected=self._born, keeps=False, **options)
         self._broker.client.on_message = self._asked
         self.state = self._broker.state
@@ -111,7 +111,7 @@ class Sparkplug:
         return group._replace(values=values)
 
     async def turn(self) -> None:
-        """Begin anew where that was asked for."""
+        """Send the birth again where a rebirth was requested."""
         if self._rebirth:
             self._rebirth = False
             with self._broker.lock:

@@ -30,7 +30,7 @@ class Group(NamedTuple):
     Attributes
     ----------
     time_s : float
-        Stamp that the model had reached, in seconds since 1970; 0: none yet.
+        Stamp that the model had reached, in seconds since 1970; 0: no stamp yet.
     values : mapping
         Values by name; numbers in SI.
     held : bool

@@ -11,7 +11,7 @@ from plow_twin.telemetry.values import Group, Newest
 
 
 class TelemetryError(PlowTwinError):
-    """A way out cannot be opened; the message names it, and what was expected."""
+    """A way out cannot be opened; the message names it with the expectation."""
 
 
 @dataclass
@@ -46,7 +46,7 @@ class Way(Protocol):
         """Send the groups that have changed."""
 
     async def turn(self) -> None:
-        """Do what waits; called twice a second at least."""
+        """Do pending work; called twice a second at least."""
 
     async def close(self, patience_s: float) -> None:
-        """Send what waits within `patience_s` [s], and close."""
+        """Send waiting messages within `patience_s` [s], and close."""

@@ -63,7 +63,7 @@ class Feeder:
         #: time of a source with its own time [ns]: the newest stamp, unless it lies alone far ahead
         self.newest_ns = 0
         self._far_ahead_ns: int | None = None
-        #: why the first load that could not be read was none; empty: there was no such
+        #: why the first unreadable load was refused; empty: all were read
         self.unfit = ""
         self._number = 0
         #: number of the newest message, where it does not continue those before
@@ -121,7 +121,7 @@ class Feeder:
             self._send(topic, message)
 
     def _feed_table(self, table: Table) -> bool:
-        """Process lines whose load can be read at once; False, and nothing is done, where it cannot."""
+        """Process lines as a table; False, without effect, where the load cannot be read so."""
         roles, inputs = self._by_topic.get(table.topic, []), self._runtime.inputs
         role = next((role for name, role in roles if name == "excitation"), None)
         if role is None or role.sequence or not (self._at_once and inputs.active):
@@ -203,7 +203,7 @@ class Feeder:
         return [(stamp_ns, wrench)]
 
     def _numbered(self, role: Role, arrived: Arrived) -> tuple[bytes, int, bool]:
-        """Return the sender, the number of the message (counted here if it has none), and whether it came before."""
+        """Return sender, message number (counted here where the message has no number), and whether it came before."""
         number = role.number(arrived) if role.sequence else None
         if number is None:
             # unreadable or not numbered: the next number

@@ -42,7 +42,7 @@ class _Tail:
     lines: Lines = field(default_factory=Lines)
     rows: Rows = field(default_factory=Rows)
     _file: Any = None
-    #: the newest bytes read, which differ in a file that was written anew
+    #: the newest bytes read, which differ in a rewritten file
     _newest: bytes = b""
     #: lines whose end never came: the file was cut or replaced
     left: int = 0
@@ -100,7 +100,7 @@ class _Tail:
         return os.pread(self._file.fileno(), len(self._newest), begin) != self._newest
 
     def _is_another(self) -> bool:
-        """Return whether the file was written anew, or another file is at its path."""
+        """Return whether the file was rewritten, or another file is at its path."""
         try:
             found = self.path.stat()
         except FileNotFoundError:
@@ -189,7 +189,7 @@ def messages(topic: str, lines: list[bytes | None], rows: Rows) -> list[Arrived]
 
 
 class Files:
-    """Files, each a topic under its name without ending; those of a pattern (`load_*.csv`) are one topic.
+    """Files, each a topic under its name without ending; files of a pattern (`load_*.csv`) are one topic.
 
     Parameters
     ----------
@@ -301,7 +301,7 @@ class Files:
 
 
 def is_pattern(path: Path) -> bool:
-    """Return whether a path stands for all files with such a name."""
+    """Return whether a path is a pattern of names."""
     return any(sign in path.name for sign in "*?[") and not path.exists()
 
 

@@ -59,7 +59,7 @@ def subscription_refusal(reason: Any) -> str:
 
 
 def end_of(*facts: Any) -> str:
-    """Return in words why a connection has ended, from what `on_disconnect` gets behind client and data."""
+    """Return in words why a connection has ended, from the further arguments of `on_disconnect`."""
     if len(facts) == 1:
         from paho.mqtt.client import error_string
 

@@ -23,7 +23,7 @@ _LIMIT: Final = {"warn": "High", "error": "HighHigh"}
 
 @dataclass
 class Condition:
-    """One alarm: its events, and what its newest one said."""
+    """One alarm: its events, and the state of the newest one."""
 
     events: Any
     node_id: ua.NodeId
@@ -50,7 +50,7 @@ class Conditions:
 
     def __init__(self, server: Server, model: Model) -> None:
         self._server, self._model = server, model
-        #: has the twin acknowledge its alarms, and returns whether it was asked; None: nobody may
+        #: has the twin acknowledge its alarms, and returns whether the request was passed on; None: not allowed
         self.acknowledge: Callable[[], bool] | None = None
         self._conditions: dict[str, Condition] = {}
         self._values: Mapping[str, Value] = {}
@@ -91,7 +91,7 @@ class Conditions:
             before = condition.level, condition.acknowledged
             condition.level = str(values[f"{name}_level"] or "none")
             raised = values[f"{name}_time"]
-            if raised != condition.raised:  # None: nothing is latched any more
+            if raised != condition.raised:  # None: no alarm is latched
                 condition.raised, condition.acknowledged = raised, raised is None
             if (condition.level, condition.acknowledged) != before:
                 await self._send(name, condition)

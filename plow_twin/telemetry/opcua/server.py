@@ -1,4 +1,4 @@
-"""The OPC UA server: what the twin knows as variables with stamp and status, read by clients and written by none."""
+"""The OPC UA server: the twin's results as variables with stamp and status, which clients can read but not write."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class OpcUaServer:
     trusted
         Folder of the certificates of clients, or of their authorities, that are admitted; None: all.
     user, password
-        The only user; empty: nobody is asked for a name.
+        The only user; empty: clients need no name.
     acknowledges
         Whether alarms may be acknowledged.
     """

@@ -27,14 +27,14 @@ from plow_twin.record.mapping import Role
 from plow_twin.record.merging import StampOf
 from plow_twin.record.sources import Arrived, TopicType
 
-#: Most samples that wait to be read; further ones are counted as lost, those of the history wait.
+#: Most samples that wait to be read; further ones are counted as lost, except samples of the history.
 _QUEUE: Final = 100_000
 _PORTS: Final = {"opc.tcp": 4840}
 #: Values with one stamp come in one message or in two that follow each other; the rest is for a busy machine [s].
 _WAIT_S: Final = 5e-3 * PUBLISHING_MS
 #: The history is read in pieces of this length [ns].
 _PIECE_NS: Final = 10_000_000_000
-#: Values of one node may have been on their way when those of another had arrived [ns].
+#: Longest delay of one node's values after the values of another [ns].
 _OVERLAP_NS: Final = 1_000_000_000
 #: What a server has sent may reach its history so much later [s].
 _HISTORY_LAG_S: Final = 5.0
@@ -172,7 +172,7 @@ class OpcUa:
             wait_s = min(2.0 * wait_s, _LONGEST_WAIT_S)
 
     async def _follow(self, link: Link) -> None:
-        """Take what comes over one connection until it breaks or a stop is asked for."""
+        """Read one connection until it breaks or a stop is requested."""
         again = self._answer.is_set()
         self._held_back, self._no_history, self._link = [], "", link
         self._revised = await link.open()
@@ -247,7 +247,7 @@ class OpcUa:
                     samples.begin(node, *found)
 
     async def _fill(self, up_to: list[tuple[int, Any]]) -> bool:
-        """Take from the history what is between the newest values and these; return whether nothing is missing."""
+        """Fill the gap between the newest values and these from the history; return whether it is complete."""
         ends_ns: dict[int, int] = {}
         for number, value in up_to:
             found = reading(value, self._by_server(number), Counts())

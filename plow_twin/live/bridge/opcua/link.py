@@ -1,4 +1,4 @@
-"""A connection to an OPC UA server: one subscription, and the history of what it has missed."""
+"""A connection to an OPC UA server: one subscription, and the history for its breaks."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from plow_twin.live.bridge.source import BridgeError
 PUBLISHING_MS: Final = 10.0
 #: Values of a node that the server is asked to keep between two messages: 1 s at 10 kHz.
 _QUEUE: Final = 10_000
-#: A server that has nothing to send says so at this interval [s]; three times that long it is believed to be there.
+#: Interval [s] at which a server without news reports; after three of them in silence it counts as gone.
 _KEEPALIVE_S: Final = 2.0
 #: The server keeps a subscription for so long without its client [s].
 _LIFETIME_S: Final = 60.0
@@ -49,7 +49,7 @@ class Revised:
     queue: int
 
     def complaint(self, sampling_ms: float) -> str:
-        """Return in words what falls short of what was asked for; empty: nothing."""
+        """Return in words which requests the server does not meet; empty: it meets all."""
         slow = self.sampling_ms > max(1.01 * sampling_ms, self.publishing_ms if sampling_ms == 0.0 else 0.0)
         found = [f"samples every {self.sampling_ms:g} ms, asked every {sampling_ms:g} ms"] * slow
         needed = self.publishing_ms / sampling_ms if sampling_ms else 1.0
@@ -115,7 +115,7 @@ class Link:
 
     @property
     def trouble(self) -> str:
-        """Why nothing can come any more; empty: the server answers."""
+        """Why no value can arrive; empty: the server answers."""
         if self._ended:
             return self._ended
         if not self._client.uaclient.has_transport:

@@ -45,7 +45,7 @@ class Samples:
         """Take in a value; the same stamp of a node again is ignored."""
         if stamp_ns == self.newest_ns[node]:
             return
-        # the clock of a first value, perhaps the server's at its start, says nothing of those after it
+        # the first value's clock, perhaps the server's at its start, does not bind later values
         self.newest_ns[node] = stamp_ns if node in self._begun else max(stamp_ns, self.newest_ns[node])
         self._begun.discard(node)
         if stamp_ns not in self._waiting:
@@ -54,7 +54,7 @@ class Samples:
         self._waiting[stamp_ns][1].setdefault(node, value)
 
     def begin(self, node: str, stamp_ns: int, value: Value) -> None:
-        """Take in the value that a node had before the first sample: it completes that sample, and is none itself."""
+        """Take the value that a node had before the first sample: it completes that sample, and is no sample itself."""
         self.newest_ns[node] = stamp_ns
         self._begun.add(node)
         self._held[node] = value

@@ -31,7 +31,7 @@ async def secure(client: Client, access: Access, host: str) -> None:
     Raises
     ------
     BridgeError
-        The server offers none, its certificate is not trusted, or a file cannot be read.
+        The server offers no secure channel, its certificate is not trusted, or a file cannot be read.
     """
     assert access.certificate and access.key and access.ca, "checked with the address"
     endpoints = await client.connect_and_get_server_endpoints()
