@@ -187,7 +187,7 @@ def _watch(task: Any, every: float, as_json: bool, quiet: bool) -> dict[str, Any
 
 
 def _show_contacts(console: Console, results: Sequence[dict[str, Any]]) -> None:
-    """Print what the model computed of each run, runs side by side."""
+    """Print the contacts that the model computed, runs side by side."""
     shown = table("Contacts computed", "run", "time [s]", "impacts [1/min]", "largest force [kN]", "at")
     # a long name takes two lines
     shown.columns[0].no_wrap, shown.columns[0].overflow = False, "fold"

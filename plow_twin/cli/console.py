@@ -66,13 +66,13 @@ POSITIVE: Final = PositiveNumber()
 
 
 class PlainConsole(Console):
-    """A console on which texts from files do nothing: no markup, no emoji codes, no control characters."""
+    """A console that shows texts of files literally: no markup, no emoji codes, no control characters."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(markup=False, emoji=False, **options)
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
-        """Yield the parts of what is shown; control codes of the console itself are marked as such."""
+        """Yield the parts to show; control codes of the console itself are marked as such."""
         for part in super().render(renderable, options):
             yield part if part.control else Segment(printable(part.text), part.style)
 
@@ -164,7 +164,7 @@ def table(title: str, *columns: str) -> Table:
 
 
 def show_facts(console: Console, facts: Mapping[Any, Any], indent: int = 0) -> None:
-    """Print a fact on each line, those of a mapping indented below its name; long texts are not wrapped."""
+    """Print a fact on each line, the facts of a mapping indented below its name; long texts are not wrapped."""
     for key, value in facts.items():
         name = " " * indent + str(key)
         if isinstance(value, Mapping) and value:

@@ -56,7 +56,7 @@ def say_where(screen: Screen, access: PageAccess) -> None:
 
 
 def stay(screen: Screen, stopped: Callable[[], bool]) -> None:
-    """Keep the page until a stop is asked for or its server has gone."""
+    """Keep the page until a stop is requested or its server has ended."""
     say_error("the input has ended; the page stays until Ctrl-C")
     while not (stopped() or screen.has_ended):
         screen.feed.turn()

@@ -224,7 +224,7 @@ def _given(source: Path, scene: Path | None, mapping: Path | None, folder: bool)
 
 
 def _followed(given: _Given, members: int, dt: float | None) -> tuple[list[str], Any]:
-    """Return names and rows of what was known at each time."""
+    """Return names and rows of forces and clearances, with intervals, at each time."""
     from plow_twin.estimate import followed as offline
 
     stretch = offline.follow(given.measured.scene, given.load, given.poses, members, dt, gaps=given.gaps)

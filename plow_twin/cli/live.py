@@ -169,7 +169,7 @@ def _say_what_differs(front: BridgeFront, settings: Settings) -> None:
 
 
 def _also_metrics(say: Say, port: int | None, opened: ExitStack) -> Say:
-    """Return what a twin says to: `say`, and the page of metrics where there is one."""
+    """Return the receivers of a twin's reports: `say`, and the page of metrics where there is one."""
     if port is None:
         return say
     from plow_twin.live.metrics import Metrics
@@ -219,7 +219,7 @@ def _show_progress(front: BridgeFront, bridge: Bridge, update: OnProgress) -> No
 
 
 def _control(path: Path | None) -> AbstractContextManager[Control | None]:
-    """Return the socket that is asked for, which is removed at the end."""
+    """Return the requested socket, which is removed at the end."""
     if path is None:
         return nullcontext()
     from plow_twin.live.control import Control

@@ -1,4 +1,4 @@
-"""What `plow-twin live` says on its way: lines for a person, or JSON lines for a program."""
+"""Reports of `plow-twin live`: lines for a person, or JSON lines for a program."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ Part = tuple[int, str, dict[str, str]]
 class Report:
     """Says status and alarms when they change, and with `lines` all parts as JSON lines.
 
-    An alarm is said when it is raised and when it is acknowledged, not each time that its quantity passes a threshold.
+    An alarm is reported when it is raised and when it is acknowledged, not each time its quantity passes a threshold.
 
     Parameters
     ----------
     lines, quiet : bool
-        JSON lines on standard output; nothing for a person.
+        JSON lines on standard output; no text for a person.
     stamp_ns
         Returns the stamp that the twin has reached [ns].
     """

@@ -28,7 +28,7 @@ def study() -> None:
 def paper_command() -> click.Command:
     """Return the verb `paper` of the package `plow_twin_paper`: installed, or beside this package in a clone.
 
-    Where neither is there, its place is taken by a verb that says how to get it.
+    Where neither is installed, a verb in its place says how to get it.
     """
     if CLONE.is_dir() and str(CLONE) not in sys.path:
         sys.path.append(str(CLONE))

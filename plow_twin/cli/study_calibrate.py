@@ -98,7 +98,7 @@ def calibrate(
 
 
 def _merged(proposed: Sequence[str], given: Sequence[str]) -> tuple[str, ...]:
-    """Return the unknowns of the target file and those given, which replace those of the same parameter.
+    """Return the unknowns of the target file; given ones replace those of the same parameter.
 
     `contact.damping` and `contact.restitution` exclude each other, and so does a range that is `PATH=fixed`.
     """

@@ -141,7 +141,7 @@ def view(
 
 
 def _check_still(option: str, *, moving: bool, exaggerate: float | None, others: tuple[str, ...]) -> None:
-    """Refuse what a picture of a whole run does not have."""
+    """Refuse options that a picture of a whole run does not have."""
     if moving:
         raise click.UsageError(
             f"{option} cannot be combined with --out, --web or --follow: it is a picture of a whole run"

@@ -21,7 +21,7 @@ from plow_twin.stream.outputs import Published
 
 #: Base name of their topic.
 ALARMS: Final = "alarms"
-#: Name under which an acknowledgement stands in the journal as a parameter.
+#: Parameter name of an acknowledgement in the journal.
 ACKNOWLEDGED: Final = "alarms_acknowledged"
 #: Factor and unit of each quantity in words.
 _UNITS: Final = {
@@ -47,7 +47,7 @@ def alarms_of(parameters: Mapping[str, Any]) -> Alarms:
 
 
 def alarms_message(alarms: Alarms, node: str, hardware_id: str) -> DiagnosticStatus:
-    """Return the message with the level of each alarm, and how the latched ones were raised."""
+    """Return the message with the level of each alarm, and the origin of the latched ones."""
     values: dict[str, str] = {}
     for name, alarm in alarms.alarms.items():
         raised = alarm.raised

@@ -115,7 +115,7 @@ def beside_folders(run: Path) -> Sequence[Path]:
 
 
 def readable_beside(run: Path, lost: Counter[str]) -> list[Path]:
-    """Return those of `beside_folders` that can be read, and the losses.
+    """Return the readable folders of `beside_folders`, and the losses.
 
     Losses are the files of the other folders, and by topic the messages that their recorders lost.
     """

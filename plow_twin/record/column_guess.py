@@ -50,8 +50,8 @@ class Guess:
     """What a file holds.
 
     `columns` by role and number; `units` of those that are not SI, by number; `time` is the column of the time and
-    `time_unit` its unit, empty for dates in words. `because` says how each was found. `open` are those that cannot be
-    told: number or `t`, and the columns or units to choose from.
+    `time_unit` its unit, empty for dates in words. `because` says how each was found. `open` are the undecided
+    ones: number or `t`, and the columns or units to choose from.
     """
 
     path: Path
@@ -91,7 +91,7 @@ class Guess:
 
 
 def guess_columns(path: Path, scene: Scene, columns: Mapping[str, str], units: Mapping[str, str]) -> Guess:
-    """Guess what the columns of a CSV file are, from its first 20,000 rows, or two million cells.
+    """Guess the meanings of a CSV file's columns, from its first 20,000 rows, or two million cells.
 
     Parameters
     ----------
@@ -159,7 +159,7 @@ def _read(path: Path) -> tuple[Guess, list[list[str]]]:
 def _find_time(
     guess: Guess, rows: Sequence[Sequence[str]], numbers: Mapping[str, Array], given: str, unit: str
 ) -> None:
-    """Find the column of the time: by its name, or the one that rises; and its unit, where the numbers tell it."""
+    """Find the column of the time, by its name or because it alone rises; and its unit, where the numbers show it."""
     alike = [name for name in guess.names if re.fullmatch(_TIME, _plain(name))]
     rising = [name for name, found in numbers.items() if len(found) > 2 and (np.diff(found) > 0.0).all()]
     choices = [given] if given else alike or rising
@@ -187,7 +187,7 @@ def _find_time(
 
 
 def _find_units(guess: Guess, numbers: Mapping[str, Array], scene: Scene, given: Mapping[str, str]) -> None:
-    """Find the units: those stated, those in the names, those that the magnitudes tell."""
+    """Find the units: stated, in the names, or by the magnitudes."""
     for key, column in guess.columns.items():
         unit = given.get(key[1]) or _unit_of(column)
         known = UNITS[QUANTITIES[key]]

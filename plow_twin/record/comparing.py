@@ -61,7 +61,7 @@ class Sent:
         )  # fmt: skip
 
     def differing(self, messages: Messages, chosen: slice) -> list[int]:
-        """Return which of some of the messages, `chosen` among all, are not those of their publication."""
+        """Return which messages, `chosen` among all, differ from those of their publication."""
         wrong = np.empty(len(messages), bool)
         places = messages.start, messages.length
         count = compare(messages.buffer, *places, self.kind[chosen], self.after[chosen], *self._expected, wrong)
@@ -86,7 +86,7 @@ def _with_whole_rows(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _pieces(numbers: list[list[NDArray[np.float64]]], templates: Templates) -> tuple[Indexes, Indexes]:
-    """Return where numbers stand side by side both in messages and in rows, and where those of each kind end.
+    """Return the runs of numbers that are contiguous both in messages and in rows, and the end of each kind.
 
     A piece is its place in the message [B], how many they are, their address in the first row, and from row to row [B].
     """

@@ -1,4 +1,4 @@
-"""Which publications a recording keeps: all, none, or some with the impulses and peaks of those left out."""
+"""Selection of recorded publications: all, none, or some with the impulses and peaks of those left out."""
 
 from __future__ import annotations
 

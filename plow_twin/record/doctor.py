@@ -248,7 +248,7 @@ def repair(path: Path) -> list[Path]:
     Returns
     -------
     list of Path
-        The files that were rewritten or put aside, those of other topics beside the run included. A cut, damaged or
+        The files that were rewritten or put aside, also files of other topics beside the run. A cut, damaged or
         empty part stays as `<name>.damaged` (`<name>.damaged_2`, ...), a part that repeats another one as
         `<name>.repeated`, a part of another run as `<name>.foreign`.
 
@@ -330,7 +330,7 @@ def _rewrite(part: Path, *, last: bool) -> None:
     def on_metadata(name: str, record: dict[str, str]) -> None:
         if name == LOSS_RECORD:
             loss.update(record)
-        elif name != DAMAGE_RECORD:  # noted anew below
+        elif name != DAMAGE_RECORD:  # noted again below
             file.metadata(name, record)
 
     reader = ChunkReader(part, on_metadata)

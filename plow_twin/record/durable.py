@@ -11,7 +11,7 @@ from typing import BinaryIO
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Add the name of the file or folder to errors of writes to it, such as that of a full disk."""
+    """Add the name of the file or folder to errors of writes to it, such as the error of a full disk."""
     try:
         yield
     except OSError as error:

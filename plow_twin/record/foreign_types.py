@@ -1,4 +1,4 @@
-"""Message types whose text stands in a recording: parsed within bounds, for decoders are generated from them."""
+"""Message types with their text in a recording: parsed within bounds, because decoders are generated from them."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ def parsed_types(text: str, message_type: str) -> dict[str, Any]:
     ------
     RecordingError
         The text is too long, or the type holds itself or too many parts. Parser and type store raise other errors for
-        what is no such text.
+        for other texts.
     """
     from rosbags.typesys import get_types_from_msg
 
-    # the parser's time grows with the square of the lines in a row that hold nothing
+    # the parser's time grows with the square of the number of empty lines in a row
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     if sum(map(len, lines)) > _LONGEST:
         raise RecordingError(f"{message_type}: got a longer text, expected at most {_LONGEST} characters")
@@ -39,7 +39,7 @@ def _count(name: str, types: dict[str, Any], counts: dict[str, int]) -> int:
     if name not in types:
         return 1
     if name not in counts:
-        counts[name] = _MOST_PARTS + 1  # what holds itself has no end
+        counts[name] = _MOST_PARTS + 1  # a type that holds itself has no end
         counts[name] = max(1, sum(_parts(field, types, counts) for _, field in types[name][1]))
     if counts[name] > _MOST_PARTS:
         raise RecordingError(f"{name}: got more parts, expected at most {_MOST_PARTS}")

@@ -29,7 +29,7 @@ class Feed:
     roles: dict[str, Role]
     measured: Callable[[str, int, dict[str, float]], object]
     intake: Intake = field(default_factory=Intake)
-    #: messages that were not used, by reason; the intake counts those of the load too
+    #: messages that were not used, by reason; the intake counts the load's too
     unfit: Counter[str] = field(default_factory=Counter)
     _stamps: list[int] = field(default_factory=list)
     _wrench: list[tuple[float, float, float]] = field(default_factory=list)

@@ -24,7 +24,7 @@ ROLES: Final[dict[str, tuple[str, ...]]] = {
 }
 #: Type of a topic whose fields are nodes of an OPC UA server.
 OPCUA: Final = "opcua"
-#: Which stamp of a node's values is that of the sample: the sensor's, or the server's.
+#: Stamp of a node's values that counts for the sample: the sensor's, or the server's.
 SOURCE_STAMP: Final = "source"
 SERVER_STAMP: Final = "server"
 #: Keys that a node may have, beside its identifier.
@@ -131,7 +131,7 @@ def _nodes_as_fields(role: Any, entry: Any) -> Any:
         if own:
             given = rest.get(key)
             rest[key] = {**(given if isinstance(given, dict) else {}), **own}
-        elif isinstance(rest.get(key), dict):  # one for all names: those without a node have none
+        elif isinstance(rest.get(key), dict):  # one entry for all names: a name without a node has no entry
             rest[key] = {name: value for name, value in rest[key].items() if name in fields or name not in ROLES[role]}
     return {"stamp": SOURCE_STAMP, "stamp_unit": "ns", **rest, "topic": role, "type": OPCUA, "fields": fields}
 

@@ -112,7 +112,7 @@ class Role:
         return None if stamp_ns is None else stamp_ns + self.clock_offset_ns
 
     def why_unfit(self, arrived: Arrived, *, with_value: bool = False) -> str:
-        """Return why a message does not fit: the topic, and the field or stamp that is no number, with what it is."""
+        """Return why a message does not fit: the topic, and the field or stamp that is no number, with its value."""
         content = arrived.content
         if with_value and content is None:
             count = len(self.message_type.names) if isinstance(self.message_type, Columns) else 0
@@ -170,7 +170,7 @@ class Role:
             if self.stamp == "header":
                 name = next((name for name in TIMES if name in content), None)
                 return received_ns if name is None else time_ns(content[name], self.stamp_unit)
-            # a missing time is not replaced by that of receipt
+            # a missing time is not replaced by the time of receipt
             return time_ns(_at(content, self.stamp), self.stamp_unit)
         stamp = getattr(getattr(content, "header", None), "stamp", None)
         # types without a header have only their receive time
@@ -369,7 +369,7 @@ def with_units(roles: Mapping[str, Role], units: Mapping[str, str]) -> dict[str,
 
 
 def _limits(path: Path, key: str, given: float | list[float]) -> tuple[float, float]:
-    """Return smallest and largest; one number stands for both signs."""
+    """Return smallest and largest; a single number bounds both signs."""
     low, high = given if isinstance(given, list) else (-given, given)
     if not low < high:
         raise map_error(path, key, given, "the smallest number, then the largest")

@@ -97,7 +97,7 @@ class ChunkBuilder:
         self._offsets.append(offset)
 
     def pop(self) -> tuple[Bytes, dict[int, Any]]:
-        """Return the records and, by channel, times and offsets in order of time, and begin anew."""
+        """Return the records and, by channel, times and offsets in order of time; then start empty."""
         channels, times, offsets = map(np.concatenate, (self._channels, self._times, self._offsets))
         index = {}
         for channel in np.unique(channels).tolist():

@@ -47,9 +47,9 @@ class Measured:
     """Measurements of one run.
 
     load : (n, 4) t [s], Fx, Fy [N], M [N m] believed; poses : (k, 4) t [s], x, y [m], theta [rad], NaN where a cell is
-    empty; unreadable : rows that are not numbers, and whatever else `lost` says, which could not be read or used of a
+    empty; unreadable : rows that are not numbers, and the other losses of `lost`, which could not be read or used of a
     recording; pose_deviation, load_deviation, gaps_deviation : stated standard
-    deviations, 0 where none is; gaps : (m, 9) t [s] and the gaps of the eight pairs [m], NaN where there is no sensor;
+    deviations, 0 where not stated; gaps : (m, 9) t [s] and the gaps of the eight pairs [m], NaN without a sensor;
     forces : (m, 9) the same of contact forces [N].
     """
 
@@ -146,10 +146,10 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
 
 
 def _journal(reader: RunReader) -> tuple[Array, list[int], Array, Array, Array, Array]:
-    """Return samples, the rows of them before which some are missing, poses and gaps, and what is said of deviations.
+    """Return samples, the rows of them before which some are missing, poses, gaps, and stated deviations.
 
     Stamps in ns are in front. The deviations are the largest of the load, (3,), and those that came with each pose,
-    (n, 3), NaN where none did. What was before new pads, or a step of the clock, is of another machine or time: the
+    (n, 3), NaN where not stated. Data before new pads, or a step of the clock, belong to another machine or time: the
     last stretch counts.
     """
     nothing = [np.zeros((0, 4))]
@@ -207,7 +207,7 @@ def _collect(
 ) -> tuple[dict[str, Array], list[int], Counter[str], str]:
     """Return the rows of each wanted role, stamps in ns, the rows after gaps, the losses and a reason.
 
-    The rows after gaps are those of the load; the reason says why no message fits.
+    The rows after gaps belong to the load; the reason says why no message fits.
     """
     rows: dict[str, list[list[float]]] = {name: [] for name in wanted}
     lost, begins = Counter[str](), list[int]()

@@ -9,7 +9,7 @@ from typing import Final, TypeAlias, TypeVar
 
 T = TypeVar("T")
 
-#: Returns the stamp of a message [ns], None: it has none.
+#: Returns the stamp of a message [ns], or None.
 StampOf: TypeAlias = Callable[[T], int | None]
 
 #: A stamp older than the newest one by more than this [ns] is a step of the clock; less is a late row.

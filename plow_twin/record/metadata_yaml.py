@@ -172,7 +172,7 @@ def missing_files(folder: Path, without: Collection[str] = ()) -> list[str]:
         listed = listed_parts(folder)
     except RecordingError:
         return []
-    # old versions of rosbag2 write the name of the folder before that of the file
+    # old versions of rosbag2 write the folder's name before the file's
     return [
         name
         for name in listed

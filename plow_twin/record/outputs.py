@@ -23,7 +23,7 @@ FOLLOWED_TOPICS: Final = names_of(Cadence.FOLLOWED)
 
 
 def publication_messages(published: Published, frame_id: str, child_frame_id: str) -> dict[str, Message]:
-    """Return the messages of one publication by the base name of their topic; the slow ones only when it has them."""
+    """Return the messages of a publication by the base name of their topic; slow ones only when it has them."""
     return _messages(REPLAYED, published, frame_id, child_frame_id)
 
 

@@ -121,7 +121,7 @@ class RunReader:
                 self.repeated[file] = read[self._headers[file].part]
 
     def _of_other_runs(self) -> dict[Path, tuple[str, ...]]:
-        """Return the files whose headers differ from those of most, with the keys that differ."""
+        """Return the files whose headers differ from the majority, with the keys that differ."""
         records = {file: header.to_record() for file, header in self._headers.items()}
         for record in records.values():
             del record["part"]

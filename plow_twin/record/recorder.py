@@ -51,7 +51,7 @@ class RecorderCounters:
     """State of a recorder. `lost` counts by topic the messages that did not reach the file, journal entries as
     `journal`.
 
-    `error` says why recording has stopped (None once it goes on), or why the last ring was not written. `marks` counts
+    `error` is why recording has stopped (None once it continues), or why the last ring was not written. `marks` counts
     the rings that were written, `marks_lost` those that failed.
     """
 
@@ -74,7 +74,7 @@ class LossReport:
 
     @property
     def complete(self) -> bool:
-        """Whether nothing was lost and the file has its index."""
+        """Whether the file is without loss and has its index."""
         return self.closed and not self.lost and self.error is None
 
 
@@ -98,7 +98,7 @@ class Recorder:
     part_bytes, part_s
         Size [B] and time [s] at which the recording goes on in a new part; 0: never.
     keep_bytes
-        The oldest parts are removed while all ended ones are larger together [B]; 0: all are kept.
+        The oldest parts are removed while the sum of ended parts is larger [B]; 0: all are kept.
     ring_s
         Time kept in memory, which is written at each `mark` [s]; 0: everything is written.
     sync
@@ -203,7 +203,7 @@ class Recorder:
     def mark(self) -> Path | None:
         """Write the ring, once the next `Snapshot` is journalled or the recorder is closed.
 
-        Returns its folder, or None for a recorder without a ring. Further calls before it is written change nothing.
+        Returns its folder, or None for a recorder without a ring. Further calls before it is written have no effect.
         """
         from plow_twin.record.writer import free_folder
 
@@ -231,7 +231,7 @@ class Recorder:
                 if self._journal_gap:
                     self._push_entry(now, Loss(self._journal_gap))
                     self._journal_gap = 0
-                if snapshot:  # the loss stands before it: all that follows can be compared
+                if snapshot:  # the loss is noted before it: all later messages can be compared
                     self._push_notes(now)
                 self._push_entry(now, entry)
                 self._snapshot_due = self._snapshot_due and not snapshot
@@ -326,7 +326,7 @@ class Recorder:
         return len(self._queue) + self._more
 
     def _push_many(self, item: _SeriesItem | _PublicationsItem, count: int) -> None:
-        """Queue an item that stands for some."""
+        """Queue an item that counts for several."""
         self._more += count - 1
         self._queue.append(item)
 
@@ -432,7 +432,7 @@ class Recorder:
             else:
                 publications = self._write_publications(publications)
                 item.write(self._writer)
-        # samples first: their chunk must come before that of the messages sent after them
+        # samples first: their chunk must precede the chunk of the messages sent after them
         self._write_samples(samples)
         self._write_publications(publications)
 
@@ -518,7 +518,7 @@ class Recorder:
             self._on_error(error)
 
     def _give_up(self, reason: str, unsafe: Mapping[str, int] = MappingProxyType({})) -> None:
-        """Refuse items from now on, count the queued and the `unsafe` ones as lost, and report the reason once."""
+        """Refuse items from now on, count queued and `unsafe` items as lost, and report the reason once."""
         first = self._error is None
         with self._lock:
             self._accepting, self._paused = False, None
@@ -625,14 +625,14 @@ _Item: TypeAlias = _EntryItem | _OutputItem | _PublicationItem | _SeriesItem | _
 
 
 def _count(item: _Item) -> int:
-    """Return how many entries or publications an item stands for."""
+    """Return how many entries or publications an item counts for."""
     if isinstance(item, _SeriesItem):
         return item.keys[JOURNAL]
     return len(item.sequence) if isinstance(item, _PublicationsItem) else 1
 
 
 def _add_keys(counts: Counter[str], items: Iterable[_Item]) -> None:
-    """Count what is lost with some items."""
+    """Count the entries and messages that are lost with some items."""
     several = [item for item in items if isinstance(item, _SeriesItem | _PublicationsItem)]
     if not several:
         counts.update(chain.from_iterable(item.keys for item in items))

@@ -49,7 +49,7 @@ COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
 
 
 def read_recording(run: str | Path) -> Recording:
-    """Return a recording of plow_twin; only its header is read until a table is asked for.
+    """Return a recording of plow_twin; only its header is read before the first table.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ class Recording:
         return dict(self._losses)
 
     def _read(self, *, outputs: bool) -> Iterator[Batch]:
-        """Yield the batches of the recording, and keep at the end what it lacks."""
+        """Yield the batches of the recording, and keep its losses at the end."""
         reader = RunReader(self.path)
         yield from reader.batches(outputs=outputs)
         whole = reader.status is FileStatus.COMPLETE

@@ -230,12 +230,12 @@ class _Replay:
             self._note(Divergence(*difference))
 
     def _messages(self, sent: SentMessages, begin: int, end: int) -> None:
-        chosen = (sent.kind[begin:end] >= 0) == (self.sink is None)  # messages to be written are formed anew
+        chosen = (sent.kind[begin:end] >= 0) == (self.sink is None)  # messages to be written are formed again
         for index in (begin + np.flatnonzero(chosen)).tolist():
             self.output(sent.record(index))
 
     def _run(self, entries: Entries, sent: SentMessages, begin: int, end: int) -> bool:
-        """Apply a run of samples and digests at once and compare the messages sent; False: nothing was done."""
+        """Apply a run of samples and digests at once and compare the messages sent; False: without effect."""
         done: Indexes = np.cumsum(entries.sample, dtype=np.int64)
         digests = entries.digest_at
         stamps, wrench = entries.samples()
@@ -326,7 +326,7 @@ class _Replay:
         done: Indexes,
         first_step: int,
     ) -> list[tuple[int, int, str, str, str, str]]:
-        """Compare the messages that were sent with those of the publications; return the differences."""
+        """Compare the messages sent with those of the publications; return the differences."""
         poses = [
             (int(entries.sequence[index]) & _SEQUENCE_MASK, first_step + int(done[index]) - 1, entry)
             for index, entry in sorted(entries.rest.items())
@@ -350,7 +350,7 @@ class _Replay:
         return differences
 
     def _difference(self, record: OutputRecord, published: Published) -> tuple[str, str, str] | None:
-        """Return the difference between a recorded message and that of a publication, computed as the node does."""
+        """Return the difference between a recorded message and the publication's, computed as in the node."""
         name = self.topics[record.topic]
         computed = publication_messages(published, self.header.frame_id, self.header.child_frame_id).get(name)
         if computed is None:
@@ -363,7 +363,7 @@ class _Replay:
             self.next_sequence = record.sequence  # the parts before it are not here
             self.alarms.give_up()
         missing = (record.sequence - self.next_sequence) & _SEQUENCE_MASK
-        if 0 < (-missing & _SEQUENCE_MASK) <= self.in_a_row:  # it stands there once more
+        if 0 < (-missing & _SEQUENCE_MASK) <= self.in_a_row:  # the entry is repeated
             self.report.repeated += 1
             return
         self.inputs.add_entry(record.entry)
@@ -418,7 +418,7 @@ class _Replay:
     def _snapshot(self, snapshot: Snapshot) -> None:
         if self.synced and self.outputs_synced:
             self.report.snapshots_compared += 1
-            # what was before it is forgotten, as the live session did when it journalled it
+            # the time before it is forgotten, as in the live session when it was journalled
             computed = self.session.renew().data
             self._compare("snapshot", snapshot.stamp_ns, "state", _hash(snapshot.data), _hash(computed))
             return
@@ -430,11 +430,11 @@ class _Replay:
         if before is not None:  # only messages were lost: the motion must be the same
             self._compare("snapshot", snapshot.stamp_ns, "state", self.session.twin.digest(), before)
         self.synced = self.resumed = True
-        # without messages nobody takes the outputs' windows
+        # without messages the outputs' windows are not taken
         self.outputs_synced = self.all_outputs and self.outputs_whole
 
     def output(self, record: OutputRecord) -> None:
-        """Compare one recorded message with the one that the model gives at that place."""
+        """Compare a recorded message with the model's at that place."""
         if self.sink is not None:  # another topic goes over as it is
             place = (record.topic, record.sequence, record.log_time_ns, record.publish_time_ns)
             self.sink.write_output(*place, record.message())
@@ -496,7 +496,7 @@ class _Replay:
 
 
 def _warm_up(scene: Scene, tol: float, templates: Templates, *, rows: bool) -> None:
-    """Compile what a replay needs, so that its time is that of the work."""
+    """Compile the kernels of a replay, so that its time is the time of the work."""
     session = Session(Twin(scene, tol=tol, excitation="sampled"))
     stamps = np.arange(1, 3, dtype=np.int64) * 1000
     memory = np.zeros(2, ROW) if rows else None

@@ -66,12 +66,12 @@ class ReplayReport:
 
     @property
     def loss(self) -> bool:
-        """Whether a part of the run is missing in the file, or nothing in it could be compared."""
+        """Whether a part of the run is missing in the file, or no message in it could be compared."""
         return bool(self.lost) or self.status is not FileStatus.COMPLETE or self.nothing
 
     @property
     def nothing(self) -> bool:
-        """Whether nothing in the file could be compared."""
+        """Whether no message in the file could be compared."""
         return self.messages_compared + self.digests_compared == 0
 
     @property

@@ -51,7 +51,7 @@ def rows_by_topic(
     topics
         Base names by topic.
     templates
-        By base name. A message with other texts than its template (an older name, say) is decoded alone; one that does
+        By base name. A message with other texts than its template (an older name) is decoded alone; a message that does
         not have as many numbers is left out.
     """
     found: dict[str, list[Rows]] = {}

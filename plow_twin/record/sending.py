@@ -1,4 +1,4 @@
-"""The messages of a publication as the bytes that are sent: one compiled call for those of one record."""
+"""The messages of a publication as bytes to send: one compiled call for all messages of a record."""
 
 from __future__ import annotations
 

@@ -150,7 +150,7 @@ def _decompressed(data: bytes) -> bytes:
 
 
 class Decoder:
-    """Decoder of CDR: the types of ROS 2 Jazzy, and those whose schema stands in the recording."""
+    """Decoder of CDR: the types of ROS 2 Jazzy, and types with a schema in the recording."""
 
     def __init__(self, losses: Losses) -> None:
         from rosbags.typesys import Stores, get_typestore
@@ -257,7 +257,7 @@ class McapSource:
 
 
 class SqliteSource:
-    """Files of rosbag2's sqlite3 storage, of a recording without the files `missing`; damaged ones are left out."""
+    """Files of rosbag2's sqlite3 storage, of a recording without the files `missing`; damaged files are left out."""
 
     def __init__(self, parts: list[Path], missing: Sequence[Path] = ()) -> None:
         self.parts = sorted(parts, key=part_number)
@@ -305,7 +305,7 @@ class SqliteSource:
 
     @contextmanager
     def _reading(self, part: Path) -> Iterator[tuple[sqlite3.Connection | None, list[tuple[int, str, str]]]]:
-        """Open a file for a while and read its topics: number, name and type; None and nothing where it is damaged."""
+        """Open a file and read its topics: number, name and type; None and no topics where it is damaged."""
         topics: list[tuple[int, str, str]] = []
         with ExitStack() as opened:
             try:
@@ -369,7 +369,7 @@ class CsvSource:
         Raises
         ------
         RecordingError
-            A file has no header, or a column's name stands twice.
+            A file has no header, or two columns of one name.
         """
         found: dict[str, TopicType] = {}
         for part in self.parts:
@@ -407,7 +407,7 @@ def read_table(path: Path) -> tuple[Columns, list[list[str]]]:
     Raises
     ------
     RecordingError
-        The file cannot be read, or a column's name stands twice.
+        The file cannot be read, or has two columns of one name.
     """
     try:
         with open_csv(path) as stream:

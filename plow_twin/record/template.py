@@ -31,7 +31,7 @@ _SECOND_NS: Final = 1_000_000_000
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function that works on bytes."""
     dispatcher: Callable[..., Any] = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
-    if hasattr(dispatcher, "_cache"):  # else numba is told not to compile
+    if hasattr(dispatcher, "_cache"):  # else numba's compiler is switched off
         save_or_warn(dispatcher)
     return dispatcher
 

@@ -18,7 +18,7 @@ STAMP_UNITS: Final = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 NO_TIME: Final = -1
 NUMBER: Final = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|inf|nan)", re.IGNORECASE)
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
-#: Times below this [s] count from some start and are moved away from 0, which stands for a missing stamp.
+#: Times below this [s] count from some start and are moved away from 0, which means a missing stamp.
 EPOCH_S: Final = 1e9
 #: A time of 0 is at this stamp [ns].
 START_NS: Final = 1_000_000_000
@@ -29,7 +29,7 @@ _FARTHEST_NS: Final = 4_000_000_000_000_000_000
 
 
 def time_ns(value: Any, unit: str = "s") -> int | None:
-    """Return the stamp [ns] of a number or of a text in ISO 8601 (UTC unless it says otherwise).
+    """Return the stamp [ns] of a number or of a text in ISO 8601 (UTC unless stated).
 
     None for any other value.
     """
@@ -51,7 +51,7 @@ def time_ns(value: Any, unit: str = "s") -> int | None:
 
 
 def times_ns(texts: Sequence[bytes], unit: str) -> NDArray[np.int64] | None:
-    """Return the stamps [ns] of texts, shape (n,), each as of `time_ns`; None where one has none."""
+    """Return the stamps [ns] of texts, shape (n,), each as of `time_ns`; None where one is no time."""
     try:
         numbers = np.array(list(map(float, texts))) * STAMP_UNITS[unit]
     except ValueError:

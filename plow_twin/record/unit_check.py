@@ -1,4 +1,4 @@
-"""Wrong units in measured data: magnitude and rate tell them, where a mapping states no unit."""
+"""Wrong units in measured data: found by magnitude and rate, where a mapping states no unit."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _START_S: Final = START_NS * 1e-9
 #: Messages that are looked at: 20 s at 1 kHz hold several periods of a load.
 CHECKED: Final = 20_000
 #: A machine that idles draws more than the hundredth part of the scene's largest force; the thousandth is the same in
-#: kN; what is below the ten-thousandth is neither.
+#: kN; below the ten-thousandth the unit is unknown.
 _IDLE_SHARE: Final = 1e-2
 _BROKEN_SHARE: Final = 1e-4
 #: An angle beyond this [rad] leaves the model, which ends at 45 degrees.
@@ -35,11 +35,11 @@ _SLOW_S: Final = 0.5
 _SMOOTH: Final = 0.05
 #: Ploughs travel at 3.6 m/s at most (Caterpillar's GH1600); beyond this [m/s] a speed is in another unit.
 _FASTEST_M_S: Final = 5.0
-#: Stamps of which so many fall are no times; where nearly all do, the newest row stands first.
+#: Stamps of which so many fall are no times; where nearly all fall, the newest row is first.
 _FALLING, _REVERSED = 0.2, 0.9
 #: Spreadsheets count days since 1900: dates of this century lie between these numbers.
 _SHEET_DAYS: Final = (36_525.0, 73_050.0)
-#: Fewer samples tell nothing of their spacing.
+#: Least number of samples for a judgement of their spacing.
 _FEW: Final = 20
 _SORT: Final = "sort the rows by time"
 _NAME_TIME: Final = "name the column of the time in a mapping (stamp: NAME)"
@@ -55,7 +55,7 @@ class UnitDoubt:
     """Numbers of a role that look as if they were in another unit; the stamps of the load are `t`.
 
     `found` and `expected` say why, `likely` is the unit that they look like. `is_impossible`: no head can move so.
-    `advice` says what to do where no unit helps.
+    `advice` is a remedy where no unit helps.
     """
 
     role: str
@@ -83,7 +83,7 @@ def unit_doubts(
     Parameters
     ----------
     values
-        Measured numbers by role and name, as ("excitation", "fx") or ("head_pose", "theta"); NaN where none came.
+        Measured numbers by role and name, as ("excitation", "fx") or ("head_pose", "theta"); NaN where missing.
     load_stamps_s
         Stamps of the load [s].
     scene
@@ -139,7 +139,7 @@ def _stated(doubt: UnitDoubt, roles: Mapping[str, Role]) -> bool:
 
 
 def _usual_magnitude(values: Array, percent: float = 99.0) -> float:
-    """Return the magnitude that one value in a hundred exceeds: an outlier tells nothing of the unit."""
+    """Return the magnitude that one value in a hundred exceeds: an outlier is no evidence of the unit."""
     known = np.abs(values)[np.isfinite(values)]
     return float(np.percentile(known, percent)) if known.size else 0.0
 
@@ -170,7 +170,7 @@ def _pose(magnitudes: Mapping[tuple[str, str], float], scene: Scene) -> list[Uni
 
 
 def _travel(values: Mapping[tuple[str, str], Sequence[float] | Array]) -> list[UnitDoubt]:
-    """Doubt speeds along the face that no plough reaches, where they are more than single wrong ones."""
+    """Doubt speeds along the face that no plough reaches, where they are more than single outliers."""
     speed = _usual_magnitude(np.asarray(values.get(("travel", "speed"), ()), float), 90.0)
     if speed <= _FASTEST_M_S:
         return []

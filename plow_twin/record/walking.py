@@ -1,6 +1,6 @@
 """Many samples at a time through a session: from the journal of a run, or from the load of any recording.
 
-Time is that of the stamps, and the load is linear from one sample to the next: no load is held.
+Time follows the stamps, and the load is linear from sample to sample: no load is held.
 """
 
 from __future__ import annotations

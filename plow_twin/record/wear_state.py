@@ -149,7 +149,7 @@ def save_wear(folder: Path, content: bytes) -> None:
     Raises
     ------
     OSError
-        The disk refuses it; the file is the old one, or the new one that the disk does not confirm.
+        The disk refuses it; the file is the old version, or the new version, unconfirmed by the disk.
     """
     folder.mkdir(parents=True, exist_ok=True)
     write_whole(folder / FILE_NAME, content, sync=True)

@@ -57,7 +57,7 @@ class _Part:
 class RunWriter:
     """Writes entries and outputs in the order of the calls.
 
-    Journal and outputs have chunks of their own; the chunk of entries comes before that of the outputs sent after them.
+    Journal and outputs have chunks of their own; the chunk of entries precedes that of the outputs sent after them.
     Every method may raise `OSError` (disk full). After a failed `flush` or write the file is whole up to the flush
     before and can be written on; after any other failed method only `abandon` may be called.
 

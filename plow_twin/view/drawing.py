@@ -294,7 +294,7 @@ class Drawing:
                 self._pads(stamps, steps, numbers)
 
     def _poses(self, measured: Sequence[tuple[int, Pose]], steps: Indexes, head: Rows, at: Indexes) -> None:
-        """Draw measured poses beside those of the model, where there are any."""
+        """Draw measured poses, if any, beside the model's."""
         if not (measured or self.measured.rows):
             return
         theta = 2.0 * np.arctan2(head.numbers[:, 2], head.numbers[:, 3])
@@ -307,7 +307,7 @@ class Drawing:
     def _growth_m(self, numbers: Array) -> Array:
         """Return the growth of the clearances by wear alone [m] with its interval, in the order of `layout.GROWTH`.
 
-        It is that of the pads: an estimate or a changed parameter is no wear.
+        It is the wear of the pads: an estimate or a changed parameter is no wear.
         """
         new = clearances(self._scene, np.zeros(PAIR_COUNT))[:2]
         best, low, high = (clearances(self._scene, numbers[:, pads])[:, :2] - new for pads in _PAD_POINTS)

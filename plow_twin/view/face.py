@@ -1,4 +1,4 @@
-"""Chart of the largest contact force over the place along the face, pass by pass, drawn anew during the run."""
+"""Chart of the largest contact force over the place along the face, pass by pass, redrawn during the run."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ def signed(value: float, form: str) -> str:
 
 
 def date_text(stamp_ns: int | None) -> str:
-    """Return the date of a stamp for a title; empty for one that counts from a start of its own."""
+    """Return the date of a stamp for a title; empty for a stamp that counts from its own start."""
     if stamp_ns is None or stamp_ns < EPOCH_S * 1e9:
         return ""
     return datetime.fromtimestamp(stamp_ns // 10**9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")

@@ -23,7 +23,7 @@ _SCALE: Final = 1e3
 _COMPONENTS: Final = (("x", "mm"), ("y", "mm"), ("θ", "mrad"))
 #: Characters in a line of the title.
 _LINE: Final = 150
-#: Time between two rows, in that of most, from which on it is a gap.
+#: Time between two rows, over the usual time, from which on it is a gap.
 _GAP: Final = 10.0
 #: Largest distance from the prior's middle that is drawn, in half widths of the prior; values beyond it lie there.
 _FARTHEST: Final = 2.0
@@ -31,10 +31,10 @@ _FARTHEST: Final = 2.0
 
 @dataclass(frozen=True)
 class FittedValue:
-    """A value with its interval, and what was known before, each as middle, low, high in the unit of the label.
+    """A value with its interval, and its prior, each as middle, low, high in the unit of the label.
 
-    `prior` is None where there is nothing to hold it against; `note` is its state, or another short word; `is_log` says
-    whether its place in the prior is that of its logarithm.
+    `prior` is None where there is no prior; `note` is its state, or another short word; `is_log` says
+    whether its place in the prior is measured in the logarithm.
     """
 
     label: str
@@ -53,7 +53,7 @@ class FittedValue:
 
     @property
     def prior_text(self) -> str:
-        """The prior's interval, or nothing."""
+        """The prior's interval, or an empty text."""
         if self.prior is None:
             return ""
         return " to ".join(signed(number, self.digits) for number in self.prior[1:])

@@ -33,12 +33,12 @@ INTERVAL: Final = ("quality/sample_interval_ms",)
 TOTAL: Final = tuple(f"clearance/{name}" for name in CLEARANCE_NAMES if not name.startswith("pad_"))
 GROWTH: Final = tuple(f"growth/{name}" for name in CLEARANCE_NAMES if not name.startswith("pad_"))
 #: Areas between the bounds of a clearance: each is a curve that alternates between them. Their names sort before
-#: those of the clearances, which are therefore drawn above.
+#: the clearances' bands, which are therefore drawn above.
 BAND: Final = tuple(f"{group}/band/{way}" for group in ("clearance", "growth") for way in ("horizontal", "vertical"))
 RESIDUAL: Final = ("residual/x", "residual/y", "residual/theta")
 WEAR: Final = tuple(f"wear/{name}" for name in CLEARANCE_NAMES if name.startswith("pad_"))
 
-#: Views hide bounds at first: bands show those of the clearances, and a legend of more than eight names is cut.
+#: Views hide bounds at first: bands show the clearances' bounds, and a legend of more than eight names is cut.
 _WITHOUT_BOUNDS: Final = (
     "$origin/**",
     *(f"- $origin/{name}" for name in CLEARANCE_NAMES if name.endswith(("/p05", "/p95"))),

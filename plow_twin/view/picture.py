@@ -87,7 +87,7 @@ def run_figure(reader: RunReader, curves: RunCurves) -> Figure:
 
 
 def _meanings(curves: RunCurves) -> list[str]:
-    """Return what shades and bands mean, where there are any."""
+    """Return the meanings of shades and bands, where there are any."""
     span = max(curves.force.bin_s, curves.load.bin_s)
     return [
         *(["grey: without samples"] if curves.held_s else []),

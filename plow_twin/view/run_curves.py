@@ -44,7 +44,7 @@ class RunCurves:
     """Largest forces [kN], load [kN, kN m] and clearances [mm] over time, and the instant of the largest force.
 
     Times count from `first_ns`, the first stamp of a sample or message [s]. `held_s` are the stretches computed without
-    samples, `failed_s` those of `failed` advances, which have no forces; `changes` are the instants at which the
+    samples, `failed_s` the times of `failed` advances, which have no forces; `changes` are the instants at which the
     clearance changed by something else than wear, with the reason.
     """
 

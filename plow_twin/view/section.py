@@ -45,14 +45,14 @@ _OUTWARDS: Final[Array] = np.stack((NORMAL_X, NORMAL_Y), axis=1)
 class Section:
     """Sizes [mm] that are constant in a run.
 
-    A head that carries walls is drawn as the cavity that moves about the frame, one that carries corners as the block
+    A head that carries walls is drawn as the moving cavity about the frame, a head that carries corners as the block
     that moves in the cavity.
     """
 
     frame: Array
     cavity: Array
     labels: tuple[str, ...]
-    #: name of the body that stands; with a support the section is drawn in its axes
+    #: name of the fixed body; with a support the section is drawn in its axes
     frame_name: str = "frame (fixed)"
     is_block: bool = False
 
@@ -118,7 +118,7 @@ class Section:
         along = _SIGNS - _OUTWARDS
         depth = np.minimum(PAD_MM_PER_MM * wear_depth_mm, 0.25 * self.frame.min())[:, None]
         middles = (corners - 0.5 * depth * _OUTWARDS - (0.5 * _PAD_MM + 12.0) * along) * _FLIP
-        # inside the frame, away from the walls: two rows at a corner, that of its vertical wall nearer the centre
+        # inside the frame, away from the walls: two rows at a corner, the vertical wall's nearer the centre
         inwards = np.stack((np.full(PAIR_COUNT, 0.5), np.where(np.abs(_OUTWARDS[:, 0]) > 0.5, 0.26, 0.64)), axis=1)
         labels = corners * inwards * _FLIP - [0.0, LABEL_MM]
         return middles, 0.5 * (depth * np.abs(_OUTWARDS) + _PAD_MM * np.abs(along)), labels

@@ -1,4 +1,4 @@
-"""Largest contact forces of other scenes under the load of a run, beside those of the run."""
+"""Largest contact forces of other scenes under the load of a run, beside the run's."""
 
 from __future__ import annotations
 
