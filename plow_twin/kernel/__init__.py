@@ -1,1 +1,1 @@
-"""The compiler, SIMD lanes and polynomials that every compiled function uses. Knows nothing of the machine."""
+"""The compiler, SIMD lanes and polynomials that every compiled function uses; independent of the machine."""

@@ -255,7 +255,7 @@ class Subscriptions:
             self._runtime.take_pose(stamp, (pose.position.x, pose.position.y, theta), deviation)
 
     def _messages(self, topic: str, kind: type, intake: Intake, batch: list[Taken]) -> Iterator[Any]:
-        """Yield the messages of an input other than the load; unreadable ones are counted."""
+        """Yield the messages of an input other than the load; count unreadable ones."""
         for taken in batch:
             self._inputs.arriving = (topic, taken.sender)
             message = _message(taken.data, kind)

@@ -115,7 +115,7 @@ class TwinBatch:
         return tuple(part is not None for part in (*parts.terms, parts.implicit))
 
     def set_wrench(self, wrench: ArrayLike) -> None:
-        """Let the load begin at other samples: it goes from there to the next ones on straight lines.
+        """Set the samples at which the load begins; it runs from there to the next samples on straight lines.
 
         Parameters
         ----------
@@ -216,7 +216,7 @@ class TwinBatch:
         Raises
         ------
         ArgumentError
-            When the data has not the size of a snapshot; nothing has changed then.
+            When the data has not the size of a snapshot; the twin is unchanged.
         """
         here, sample, speed = read_snapshot(snapshot, self._states.dtype)
         away = np.broadcast_to(np.asarray(moved, dtype=np.float64), (len(self), 6))
@@ -261,7 +261,7 @@ class TwinBatch:
         Raises
         ------
         ArgumentError
-            As `Twin.set_travel_speed`; nothing has changed then.
+            As `Twin.set_travel_speed`; the batch is unchanged.
         """
         speeds = np.broadcast_to(np.abs(np.asarray(speed_m_s, dtype=np.float64)), len(self))
         for scene, speed in zip(self.scenes, speeds.tolist(), strict=True):

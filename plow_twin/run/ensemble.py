@@ -119,7 +119,7 @@ def simulate_many(
     first, others = run.tasks(threads)
     with ThreadPoolExecutor(threads) as pool:
         try:
-            # alone: it compiles what all need
+            # alone: it compiles the kernels of all
             for task in first:
                 task()
             for done in [pool.submit(task) for task in others]:
@@ -134,7 +134,7 @@ def simulate_many(
     return ensemble
 
 
-#: Members in lanes that a thread takes at a time, at least: lanes stand empty while the last ones end.
+#: Least members in lanes that a thread takes at a time: lanes are empty while the last members end.
 _LEAST_SHARE = 64
 #: Shares a thread, so that all threads end at about the same time.
 _SHARES = 4
@@ -159,7 +159,7 @@ class _Run:
         self.stopped, self.done = threading.Event(), 0
 
     def tasks(self, threads: int) -> tuple[list[Callable[[], None]], list[Callable[[], None]]]:
-        """Return what is done first, alone, and what threads then share."""
+        """Return the tasks to do first, alone, and the tasks that threads then share."""
         groups: dict[object, list[int]] = {}
         alone: list[Callable[[], None]] = []
         for index, one in enumerate(self._compiled):
@@ -216,7 +216,7 @@ class _Run:
         self._tell(1)
 
     def _take(self, index: int, totals: Totals, state: np.record | np.void, status: int) -> None:
-        """Take over what is told of a member that is done."""
+        """Take over the results of a finished member."""
         ensemble = self._ensemble
         ensemble.peak[index], ensemble.impulse[index] = totals["peak"], totals["impulse"]
         ensemble.time_in_contact[index], ensemble.makes[index] = totals["time_in_contact"], totals["makes"]

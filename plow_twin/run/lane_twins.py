@@ -54,7 +54,7 @@ class LaneTwins:
         self.clear()
 
     def clear(self) -> None:
-        """Leave nothing in the lanes of a call that has been stopped."""
+        """Empty the lanes of a call that has been stopped."""
         self._lanes, self._totals = new_lanes(), np.zeros(WIDTH, TOTALS)
 
     def advance(

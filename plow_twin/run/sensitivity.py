@@ -59,9 +59,9 @@ class Sensitivity:
     exponent : float
         Largest Lyapunov exponent in 1/s, of the second half of the motion: above 0 errors grow for ever.
     tol : float
-        Tolerance that the motion was asked for.
+        Tolerance of the motion.
     by_parameter : mapping of str to ndarray, shape (n, k)
-        Derivatives of the state at `t` by the parameters asked for, in their units.
+        Derivatives of the state at `t` by the chosen parameters, in their units.
     """
 
     t: Array
@@ -223,7 +223,7 @@ def sensitivity_of(scene: Scene, t_end: float, tol: float, parameters: Sequence[
     t_end : float
         End in s, above 0.
     tol : float
-        Tolerance that the motion itself is asked for.
+        Tolerance of the motion itself.
     parameters : sequence of str
         Paths of `sensitivity_parameters` by which derivatives are wanted.
 

@@ -300,7 +300,7 @@ class Twin:
         Raises
         ------
         ArgumentError
-            For a time, depth or pose out of range; nothing has changed then.
+            For a time, depth or pose out of range; the twin is unchanged.
         """
         if not np.isfinite(t):
             raise ArgumentError(f"t: got {t!r}, expected a finite time in s")

@@ -24,7 +24,7 @@ except ImportError:
     from yaml import SafeDumper as _Dumper  # type: ignore[assignment]
     from yaml import SafeLoader as _Loader  # type: ignore[assignment]
 
-#: Largest file [B] and most values in it: a table of 200,000 rows, which takes ten seconds; longer ones stand in CSV.
+#: Largest file [B] and most values in it: a table of 200,000 rows, read in ten seconds; longer tables belong in CSV.
 LARGEST_FILE: Final = 64 * 2**20
 MOST_VALUES: Final = 1_000_000
 #: Deepest nesting of collections; a scene has six levels.
@@ -67,7 +67,7 @@ SceneDumper.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+.01
 
 
 def read_yaml(path: Path, name: str, sections: str) -> tuple[Any, list[Problem]]:
-    """Return what a YAML file holds and its problems, as `load_yaml`, within `LARGEST_FILE` and `MOST_VALUES`."""
+    """Return content and problems of a YAML file, as `load_yaml`, within `LARGEST_FILE` and `MOST_VALUES`."""
     try:
         with path.open("rb") as stream:
             data = stream.read(LARGEST_FILE + 1)
@@ -106,7 +106,7 @@ def load_yaml(text: str, name: str, sections: str, *, most_values: float = math.
 
 @dataclass
 class _Size:
-    """Size of a node with all below it, each alias counted as the node that it stands for."""
+    """Size of a node with all below it, each alias counted as its node."""
 
     values: int = 1
     keys: int = 0

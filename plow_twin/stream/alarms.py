@@ -115,7 +115,7 @@ class Alarm:
 
 
 class _Model:
-    """The latest poses of the model, and measured ones that wait for it."""
+    """The latest poses of the model, and measured poses that wait for it."""
 
     def __init__(self) -> None:
         self._stamps_ns: list[int] = []
@@ -224,7 +224,7 @@ class Alarms:
         return self._model is not None
 
     def _feed_quiet(self, published: Published) -> bool:
-        """Judge many rows at once and return True; False, and nothing is judged, where a row may change a level."""
+        """Judge many rows at once and return True; False, without effect, where a row may change a level."""
         rows, slow = published
         growth = self.alarms.get("clearance_rate")
         if self._model is not None or rows["held"].any() or (growth is not None and growth.lowest < math.inf):

@@ -181,12 +181,12 @@ class Driver:
             yield from self._use(run, now_ns)
 
     def _may_go_on(self, stamp_ns: int, wrench: tuple[float, float, float]) -> bool:
-        """Return whether nothing speaks against a sample."""
+        """Return whether a sample can be accepted."""
         reached_ns = self.session.stamp_ns
         return not (reached_ns is None or self._steps.waits) and self.intake.goes_on(stamp_ns, wrench, reached_ns)
 
     def _goes_on(self, stamp_ns: int, wrench: tuple[float, float, float]) -> bool:
-        """Accept a sample against which nothing speaks; False: it has to be judged."""
+        """Accept a sample that is plausible at once; False: it has to be judged."""
         found = self._may_go_on(stamp_ns, wrench)
         if found:
             self.intake.accept(stamp_ns, wrench)
@@ -246,7 +246,7 @@ class Driver:
         return self._advance(Hold(stamp_ns), now_ns, StreamState.STALE)
 
     def quiet_ns(self, now_ns: int) -> int:
-        """Return for how long `silence` has nothing to do, whatever comes [ns]."""
+        """Return the time for which `silence` need not be called, whatever arrives [ns]."""
         timeout_ns = round(self.policy.excitation_timeout_s * NS_PER_S)
         left_ns = timeout_ns if self._newest_ns is None else self._received_ns + timeout_ns - now_ns
         return max(0, min(left_ns, _LONGEST_QUIET_NS))
@@ -324,7 +324,7 @@ class Driver:
         Raises
         ------
         ArgumentError
-            They cannot be taken while the twin runs; nothing has changed then.
+            The change is impossible while the twin runs; the twin is unchanged.
         """
         self.session.check_model(changes)
         if dict(changes) != self.session.changes:
@@ -336,7 +336,7 @@ class Driver:
         Raises
         ------
         ValueError
-            Not 8 finite depths of at least 0; nothing has changed then.
+            Not 8 finite depths of at least 0; the twin is unchanged.
         """
         depth = tuple(float(value) for value in depth_m)
         if len(depth) != PAIR_COUNT or not all(0.0 <= value < math.inf for value in depth):
@@ -364,7 +364,7 @@ class Driver:
         self._resumed = True
 
     def pause(self) -> None:
-        """No sample comes for now: one that waits for the next is counted."""
+        """No sample comes for now: count a sample that waits for the next."""
         self._steps.end()
 
     def close(self) -> None:

@@ -34,7 +34,7 @@ class History:
         self._snapshots: list[tuple[int, bytes]] = []
         #: stamps of the first sample in each span: calls of single samples have a snapshot at each
         self._kept_ns: list[int] = []
-        #: largest stamp of these so far: running again up to there forgets nothing
+        #: largest stamp of these so far: running again up to it discards no state
         self._newest_kept_ns: int | None = None
         self._samples: list[Sample] = []
         self._stamps_ns: list[int] = []
@@ -179,7 +179,7 @@ class RecentStamps:
 
     @property
     def oldest_ns(self) -> int | None:
-        """Stamp before which nothing can be used any more [ns]; None before the first."""
+        """Stamp before which no sample can be used [ns]; None before the first."""
         return self._stamps_ns[-1] - self._span_ns if self._stamps_ns else None
 
     def __contains__(self, stamp_ns: int) -> bool:

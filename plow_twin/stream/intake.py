@@ -1,6 +1,6 @@
 """Whether an arriving sample is used, and the count of each reason why one was not.
 
-The clock is passed in: nothing here reads one.
+The clock is passed in; the driver reads no clock.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class KnownStamps(Protocol):
 
     @property
     def oldest_ns(self) -> int | None:
-        """Stamp behind which all can be worked in [ns], None: nothing can."""
+        """Stamp after which late samples can be worked in [ns]; None: no late sample can."""
 
     def __contains__(self, stamp_ns: int) -> bool:
         """Return whether there is a sample of that stamp."""
@@ -159,7 +159,7 @@ class Intake:
             The past, for late samples.
         may_reset
             Whether a step of the sender's clock may reset the model now; to where the stamps were before the last one
-            it always may, or a single wrong stamp could keep all right ones out.
+            it always may, or a single wrong stamp could exclude all right ones.
         """
         verdict = self._judge(stamp_ns, values, reached_ns, history)
         self.returned = verdict.resets and self._goes_on_from_before(stamp_ns)

@@ -151,7 +151,7 @@ class Gaps:
 
 @dataclass(frozen=True)
 class Unused:
-    """`count` messages of `sender` came on the input `topic` and were not used; kept for a dispute, moves nothing.
+    """`count` messages of `sender` came on the input `topic` and were not used; kept as evidence, moves nothing.
 
     `reason` is that of the counters `dropped_<reason>`, or `not_followed`, or `lost`: sent and never arrived (a `count`
     below 0: that many arrived after all). `stamps_ns` and `values` have an item for each message in order of
@@ -171,9 +171,9 @@ class Unused:
 class Estimated:
     """An estimate of the window from `start_ns` to before `end_ns` has come.
 
-    The window had so many `samples` of the load and `poses`; the fit began at `guess`, or was searched from nothing
+    The window had so many `samples` of the load and `poses`; the fit began at `guess`, or with a search
     where that is empty. `shift` is added to the horizontal clearance that the model's wear makes, to its 5 % and its
-    95 % point, then to those of the vertical one (6 numbers [m]) from here on. `result` is all of the estimate, JSON.
+    95 % point, then to the vertical one's (6 numbers [m]) from here on. `result` is the whole estimate, JSON.
     """
 
     start_ns: int

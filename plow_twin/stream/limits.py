@@ -33,7 +33,7 @@ class Limits:
         return any(map(gt, map(abs, values), self.largest))
 
     def keep(self, before: Sequence[float], values: Sequence[float], duration_s: float) -> bool:
-        """Return whether values are finite and nothing is exceeded, neither by them nor by their change."""
+        """Return whether values are finite and within the limits, also in their rates of change."""
         for old, value, largest, fastest in zip(before, values, self.largest, self.fastest, strict=True):
             if not (abs(value) <= largest and abs(value - old) <= fastest * duration_s):
                 return False

@@ -225,7 +225,7 @@ class Outputs:
         return Published(chosen, self._slow(chosen))
 
     def pop(self) -> Published:
-        """Publish all advances since the publication before; nothing without an advance."""
+        """Publish all advances since the publication before, if there are any."""
         if not self._waits:
             return NOTHING
         rows, self._waits = self._stock.new(1), 0
@@ -264,7 +264,7 @@ class Outputs:
 
     @property
     def is_clear(self) -> bool:
-        """Whether the next publication tells of the advances to come alone, and bears no mark."""
+        """Whether the next publication covers later advances only, without a mark."""
         window = self._window
         return not (self._waits or window["corrected"][0] or window["marked"][0])
 
@@ -336,7 +336,7 @@ class Outputs:
         return found
 
     def modelled(self, wear_depth: Array) -> Array:
-        """Return the horizontal clearance of the model and its two points, then the vertical ones, shape (6,) [m]."""
+        """Return the model's horizontal clearance and its two points, then the vertical ones, shape (6,) [m]."""
         middle = clearances(self._scene, wear_depth)
         low, high = (clearances(self._scene, points) for points in prior_points(self._scene, wear_depth))
         return np.stack((middle, low, high), axis=1)[:2].ravel()
@@ -353,7 +353,7 @@ class Outputs:
         self._clear()
         self._window["makes"] = parts[0].view(np.int64)
         self._window["impulse"], self._window["peak"] = parts[1:3]
-        self._window["measured_peak"] = parts[2]  # nothing is known of a part without samples
+        self._window["measured_peak"] = parts[2]  # a part without samples is unknown
         self._slow_wear_depth = parts[3].copy()
         slow_ns = int(np.frombuffer(data, np.int64, 1, offset=8 * _STATE_SIZE)[0])
         self._slow_ns = None if slow_ns < 0 else slow_ns

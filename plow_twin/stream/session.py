@@ -79,7 +79,7 @@ class _Measured(NamedTuple):
 class Applied(NamedTuple):
     """Result of applying samples.
 
-    A row of each, the publications, the digests asked for, and the numbers of failed advances and late samples.
+    A row of each, the publications, the requested digests, and the numbers of failed advances and late samples.
     """
 
     rows: Rows
@@ -92,8 +92,8 @@ class Applied(NamedTuple):
 class Series(NamedTuple):
     """Samples that have been applied at once, and are not in the journal yet.
 
-    Stamps [ns], shape (n,), and wrenches (n, 3); what is published, a row after each sample or nothing; the digests,
-    and after how many samples each stands, shape (m,).
+    Stamps [ns], shape (n,), and wrenches (n, 3); the publications, a row after each sample, or None; the digests,
+    and the number of samples before each, shape (m,).
     """
 
     stamps: NDArray[np.int64]
@@ -103,7 +103,7 @@ class Series(NamedTuple):
     digest_after: NDArray[np.int64]
 
     def part(self, begin: int, end: int) -> Series:
-        """Return some of the samples, with what follows each."""
+        """Return some of the samples, with their publications and digests."""
         marked = (self.digest_after > begin) & (self.digest_after <= end)
         published = self.published
         if len(published.rows):
@@ -126,7 +126,7 @@ class Series(NamedTuple):
 
 
 class _UndoneError(Exception):
-    """An advance failed, and the twin stands where it was before the samples."""
+    """An advance failed, and the twin is in its state before the samples."""
 
 
 class Session:
@@ -330,7 +330,7 @@ class Session:
         return applied
 
     def apply_series(self, stamps: NDArray[np.int64], wrench: NDArray[np.float64], *, each: bool) -> Series | None:
-        """Apply samples at once, the first not late; nothing is emitted: the caller journals the series.
+        """Apply samples at once, the first not late, without entries: the caller journals the series.
 
         Parameters
         ----------
@@ -388,7 +388,7 @@ class Session:
         wrench : ndarray, shape (n, 3)
             Fx, Fy [N] and M [N m] at each.
         rows : ndarray of `ROW`, shape (n,), or None
-            Receives the rows; None: nothing is read out, and `outputs` gets nothing.
+            Receives the rows; None: no row is read out, and `outputs` gets none.
         taken : ndarray of int64
             As of `Outputs.add`.
         marks : ndarray of int64, shape (m,)
@@ -448,7 +448,7 @@ class Session:
         return Applied(parts[-1].rows if rows is None else rows, published, digests, sum(part.failed for part in parts))
 
     def emit(self, entry: Entry) -> None:
-        """Emit an entry that describes the present state and changes nothing."""
+        """Emit an entry that only describes the present state."""
         self._on_entry(entry)
 
     def check_model(self, changes: Mapping[str, float]) -> None:
@@ -505,7 +505,7 @@ class Session:
         resumed: bool = False,
         undo: bytes | None = None,
     ) -> Applied:
-        """Advance to samples between which nothing else happens; `resumed`: the first since a time without samples.
+        """Advance to samples without other entries between them; `resumed`: the first since a time without samples.
 
         Where an advance fails the twin goes back to the snapshot `undo`, if there is one, with an `_UndoneError`.
         """
@@ -532,7 +532,7 @@ class Session:
         return Applied(rows, self.outputs.add(rows, stamps, taken), digests, failed)
 
     def _follow(self, stamp_ns: int, entry: Pose | PartOfPose | Estimated, known: float = -math.inf) -> None:
-        """Give a measurement to a following twin; before the first sample nothing moves."""
+        """Give a measurement to a following twin; before the first sample it has no effect."""
         if self.following is None or self.origin_ns is None:
             return
         time = (stamp_ns - self.origin_ns) * 1e-9
@@ -603,7 +603,7 @@ class Session:
                     self._follow(one.stamp_ns, one.entry, one.known)
                 else:
                     self._measured.append(one)
-        # one that was to come at the snapshot may have been applied, or be to come still
+        # a change due at the snapshot may be applied already, or still to come
         known = {travel.stamp_ns: travel for travel in (*self._travels, *travels, *pending, *more)}
         self._travels = sorted(known.values(), key=lambda travel: travel.stamp_ns)
         return samples

@@ -42,7 +42,7 @@ class Steps:
         """Add a sample; return those that can be judged now, in order of arrival."""
         jumped, jumps = self._jumped, self._intake.jumps(stamp_ns, reached_ns)
         arrival = stamp_ns, wrench, now_ns
-        if jumped is None or stamp_ns <= 0:  # an unstamped sample decides nothing
+        if jumped is None or stamp_ns <= 0:  # an unstamped sample is no evidence
             if not jumps:
                 return (arrival,)
             self._jumped = arrival
@@ -61,7 +61,7 @@ class Steps:
         return ()
 
     def unopposed(self, now_ns: int, silence_ns: int) -> Timed | None:
-        """Return the sample that waits, once nothing that speaks against it has come for so long."""
+        """Return the waiting sample, once no contradiction has come for so long."""
         jumped = self._jumped
         if jumped is None or now_ns - jumped[2] <= silence_ns:
             return None

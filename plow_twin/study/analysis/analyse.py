@@ -48,7 +48,7 @@ _COLUMNS: Final = (
 _TOLERANCE: Final = 1e-9
 #: A measured stamp older than the newest one by more than this [ns] is a step of its clock.
 _STEP_NS: Final = 1_000_000_000
-#: Largest measured value, in any unit; the squares of larger ones leave the numbers there are.
+#: Largest measured value, in any unit; squares of larger values overflow.
 _LARGEST: Final = 1e15
 #: Name of the scene in the header of a run.
 _OF_THE_RUN: Final = "of the run"
@@ -155,7 +155,7 @@ class Measured:
         """Add the numbers of one message of that stretch; a number that is not finite was not measured."""
         before, newest = self._latest.get(role, (0, stamp_ns))
         back = newest - stamp_ns > _STEP_NS
-        # its clock has stepped before that of the load
+        # its clock has stepped before the load's
         stretch = max(stretch, before + back)
         self._latest[role] = stretch, stamp_ns if back else max(newest, stamp_ns)
         prefix = {"forces": "force_", "gaps": "gap_"}.get(role, "")
@@ -288,17 +288,17 @@ def analyse(
     path
         A run of ours, another recording (MCAP, rosbag2's sqlite3, CSV), or a folder of its parts.
     scene
-        Scene file or preset; needed for other recordings (or `scene.yaml` beside them), else that of the run.
+        Scene file or preset; needed for other recordings (or `scene.yaml` beside them), else the run's.
     mapping
         YAML that maps topics to roles.
     units
-        Units by name (fx, x, ..., t) that are not those of the mapping; for another recording only.
+        Units by name (fx, x, ..., t) in place of the mapping's; for another recording only.
     others
         Further scenes to predict with.
     out
         Folder in which another recording becomes a run like any other (`run`).
     tail, on_caught_up
-        With a `Tail` a run of ours is followed while it is written; the second receives the analysis of what there is,
+        With a `Tail` a run of ours is followed while it is written; the second receives the analysis so far,
         each time that all has been read.
 
     Raises
@@ -474,7 +474,7 @@ def _holds_recording(folder: Path) -> bool:
 
 
 def left_out(path: Path) -> list[Path]:
-    """Return the folders in a folder that `expand` leaves out: empty ones, runs beside or inside others."""
+    """Return the folders in a folder that `expand` leaves out: empty folders, runs beside or inside others."""
     if not path.is_dir():
         return []
     folders = [item for item in sorted(path.iterdir()) if item.is_dir()]
@@ -485,7 +485,7 @@ def left_out(path: Path) -> list[Path]:
 
 
 def expand(paths: Sequence[Path]) -> list[Path]:
-    """Return the recordings in some places: a folder that is not a recording stands for those in it.
+    """Return the recordings in some places: a folder that is no recording is replaced by the recordings in it.
 
     Raises
     ------

@@ -53,7 +53,7 @@ class Series:
         self.low, self.high, self.last = math.inf, -math.inf, math.nan
 
     def __iter__(self) -> Iterator[float]:
-        """Yield the numbers; nothing may be added meanwhile."""
+        """Yield the numbers; none may be added meanwhile."""
         self._file.seek(0)
         while block := self._file.read(_IN_MEMORY):
             yield from np.frombuffer(block).tolist()
@@ -141,7 +141,7 @@ class LoadTotals:
         """Return the kinetic energy of the head, its potential one in gravity and the elastic one of contacts [J]."""
         head, gravity = self.scene.head, self.scene.gravity
         theta, omega = q[:, 2], v[:, 2]
-        # from the cavity's centre to that of mass, in world axes
+        # from the cavity's centre to the centre of mass, in world axes
         along = np.cos(theta) * head.com_offset_m[0] - np.sin(theta) * head.com_offset_m[1]
         up = np.sin(theta) * head.com_offset_m[0] + np.cos(theta) * head.com_offset_m[1]
         speed_2 = (v[:, 0] - omega * up) ** 2 + (v[:, 1] + omega * along) ** 2
@@ -176,7 +176,7 @@ class LoadTotals:
         self._worn = walked.rows.wear_depth[-1].copy()
 
     def _wear(self, depth: Array, speed: float, pieces: NDArray[np.int64]) -> None:
-        """Book the wear by direction: the pads', and that of the places of the slide that they pass.
+        """Add the wear by direction: of the pads, and of the places of the slide that they pass.
 
         A pad is engaged all the way, a place of the slide only while the pad passes it: for its length.
         """
@@ -194,7 +194,7 @@ class LoadTotals:
             self.slide_wear[key] = self.slide_wear.get(key, 0.0) + share * gained[pieces == piece].sum(axis=0)
 
     def wear_facts(self) -> dict[str, Any] | None:
-        """Return the wear for JSON, depths in m; None where nothing wears."""
+        """Return the wear for JSON, depths in m; None without wear."""
         if not self.pad_wear.any():
             return None
         pads = {

@@ -1,4 +1,4 @@
-"""Many recordings: on all cores of this machine, or on a Dask cluster; a worker that dies loses nothing."""
+"""Many recordings: on all cores of this machine, or on a Dask cluster; the death of a worker costs no result."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def _round(tasks: Sequence[RunTask], waiting: list[int], workers: int, done: _On
                 done(futures[future], future.result())
             except BrokenProcessPool:
                 left.append(futures[future])
-    except BaseException:  # an interrupt: the next call makes unfinished analyses anew
+    except BaseException:  # an interrupt: the next call repeats unfinished analyses
         for worker in set(active_children()).difference(others):
             worker.kill()
         raise

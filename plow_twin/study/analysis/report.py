@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from plow_twin.study.analysis.analyse import Analysis, Prediction
 
 _MOST_POINTS: Final = 4000
-#: What stands in the place of results for a folder without a recording.
+#: Placeholder of the results of a folder without a recording.
 LEFT_OUT: Final = "left out: no recording"
 
 _PAGE: Final = """<!doctype html>

@@ -71,7 +71,7 @@ class Task:
     out: Path | None
     #: other contents of the recording's folder, named in the results
     left_out: tuple[Path, ...] = ()
-    #: units of measured numbers by name, beside those of the mapping
+    #: units of measured numbers by name, beside the mapping's
     units: Mapping[str, str] = field(default_factory=dict)
 
     def stored(self) -> dict[str, Any] | None:
@@ -178,7 +178,7 @@ def _is_ours(file: Path) -> bool:
     try:
         header = read_header(file)
         if header is None and next(iter(ChunkReader(file)), None) is None:
-            return True  # killed before its header: there is nothing in it
+            return True  # killed before its header: it is empty
     except RecordingError:
         return False
     return header is not None and MAPPED_LOAD in header.parameters

@@ -88,7 +88,7 @@ def calibrate(
     search : Search, optional
         Effort of each start.
     first : ndarray, shape (n,), optional
-        A point that joins the first population of the first start: the scene as it stands.
+        A point that joins the first population of the first start: the given scene.
     on_progress : callable, optional
         Called after every generation.
     """

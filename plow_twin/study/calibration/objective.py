@@ -83,7 +83,7 @@ class TargetObjective:
                 try:
                     scenes.append(with_parameters(self.scene, {**self.targets.settings[column], **candidates[row]}))
                 except SceneError:
-                    continue  # a candidate that no scene can have: its residuals are those of a failure
+                    continue  # an impossible candidate gets the residuals of a failure
                 places.append((row, column))
         if not scenes:
             return

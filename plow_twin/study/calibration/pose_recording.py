@@ -39,7 +39,7 @@ class PoseRecording:
 
     @property
     def output_dt(self) -> float:
-        """Distance of the simulated rows in s: that of the recorded ones, not below t_end / 20000."""
+        """Distance of the simulated rows in s: the recorded one, not below t_end / 20000."""
         end = float(self.t[-1])
         step = float(np.median(np.diff(self.t))) if len(self.t) > 1 else end
         return max(min(step, 0.01), end / _MOST_ROWS)

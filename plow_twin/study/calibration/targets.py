@@ -126,7 +126,7 @@ class TargetSet:
         Raises
         ------
         StudyError
-            When a pattern matches nothing, or no target is left.
+            When a pattern matches no target, or no target is left.
         """
         names = [target.name for target in self.targets]
         for pattern in patterns:

@@ -12,9 +12,9 @@ Array = NDArray[np.float64]
 
 #: Draws of the bootstrap: the 2.5 % point of an interval is then known to 0.5 % of probability.
 _DRAWS: Final = 1000
-#: Fewer windows do not tell chance from change.
+#: Least number of windows that can separate chance from change.
 FEWEST: Final = 8
-#: Of the load's variation within groups so much at least, relative to its mean, tells how a quantity follows it.
+#: Least variation of the load within groups, over its mean, that shows how a quantity follows it.
 _LEAST_VARIATION: Final = 0.01
 #: Loads of two groups that differ by less than this share count as equal.
 _EQUAL_LOAD: Final = 0.01
@@ -29,7 +29,7 @@ class Change:
     share, low, high : float
         The change and its 95 % interval.
     machine, machine_low, machine_high : float or None
-        The same at equal load; None where the load does not tell how the quantity follows it.
+        The same at equal load; None where the load varies too little to show how the quantity follows it.
     """
 
     share: float
@@ -58,7 +58,7 @@ def points(values: Array) -> dict[str, float]:
 def change(
     before: tuple[Array, Array], after: tuple[Array, Array], random: np.random.Generator, draws: int = _DRAWS
 ) -> Change | None:
-    """Return the change between two groups of windows, None where it cannot be told.
+    """Return the change between two groups of windows, None where there are too few.
 
     Means are compared by a bootstrap over windows. At equal load: less the part that follows the load, by the slope
     over the load's variation within the groups (analysis of covariance).

@@ -18,7 +18,7 @@ from plow_twin.study.comparison.windows import QUANTITIES, Windows, windows_of
 
 #: Stamps before this [ns] are no dates: 1e18 ns is in the year 2001.
 _DATES_NS: Final = 10**18
-#: Begins of the shifts where none are given.
+#: Default begins of the shifts.
 SHIFTS: Final = (time(6), time(14), time(22))
 
 #: Returns the label of the group that a window belongs to, by the run's name and the window's stamp.
@@ -36,7 +36,7 @@ class Comparison:
     runs : dict of str to list of str
         Runs that have windows in a group.
     changes : dict
-        By group but the first, pair and quantity: `Change`, or None where it cannot be told.
+        By group (but the first), pair and quantity: `Change`, or None where there are too few windows.
     """
 
     groups: dict[str, Windows]
@@ -182,7 +182,7 @@ class WindowsTask:
         return None
 
     def run(self) -> dict[str, Any]:
-        """Return the windows under the key `windows`, and what the run lacks under `lost`.
+        """Return the windows under the key `windows`, and the run's losses under `lost`.
 
         Raises
         ------

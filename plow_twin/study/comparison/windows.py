@@ -159,7 +159,7 @@ def windows_of(recording: Recording, window_s: float | None = None) -> Windows:
 
 
 def _risen(part: Batched, window: Indexes) -> tuple[Batched, Indexes]:
-    """Return rows in order of their stamps: late samples and steps of the clock bring older ones."""
+    """Return rows in order of their stamps: late samples and steps of the clock bring older stamps."""
     order = np.argsort(part.stamp_ns, kind="stable")
     return Batched(part.stamp_ns[order], part.values[order]), window[order]
 

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 _HALF: Final = 0.03
 #: An impact: how far the acceleration of z [m/s^2] and of theta [rad/s^2] leaves that of a flight, below which gap [m].
 _FALL, _JERK, _TWIST, _NEAR = 9.0, 9.0, 300.0, 0.03
-#: Rise in m between two bounces that are told apart.
+#: Least rise in m between two separate bounces.
 _RISE: Final = 0.003
 
 

@@ -19,7 +19,7 @@ SEMI_AXES: Final = (0.035, 0.025)
 GYRATION: Final = 0.0192
 #: Stiffness per mass in 1/s^2: place and arms stay during an impact, so it sets the time only.
 _STIFFNESS: Final = 1e9
-#: Speed in m/s of approach at which restitutions are given: the middle of the measured ones.
+#: Speed in m/s of approach at which restitutions are given: the middle of the measured speeds.
 USUAL_SPEED: Final = 2.5
 _LEAST, _LARGEST = 0.05, 0.98
 
@@ -128,7 +128,7 @@ def impact(before: ArrayLike, contact: EllipseContact = ELLIPSE) -> Array:
 
 
 def _numbers(contact: EllipseContact, speed: Array, along: Array, normal_arm: Array) -> tuple[Array, NDArray[np.void]]:
-    """Return lambda of each impact in s/m, and what all have in common."""
+    """Return lambda of each impact in s/m, and the numbers that all share."""
     law, wanted = LAWS[contact.law], contact.restitution
     e = np.clip(wanted * (speed / USUAL_SPEED) ** -contact.fall - contact.fall_along * np.abs(along), _LEAST, _LARGEST)
     viscous, damping = 0.0, np.zeros_like(speed)

@@ -1,4 +1,4 @@
-"""Drops of a square block: its first flight fitted, and bands of what follows from a batch of blocks."""
+"""Drops of a square block: its first flight fitted, and bands of the later motion from a batch of blocks."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ _DT: Final = 1.0 / RATE_HZ
 _NUMBERS: Final = 1000
 #: Touches of a motion that have a scatter of their own.
 _TOUCHES: Final = 64
-#: Turn in rad beside that of the flight within a row which only an impact makes.
+#: Turn in rad beside the flight's within a row, which only an impact makes.
 _TURN_IN_A_ROW: Final = 0.1
-#: Rows of a first flight: fewer do not tell its speeds.
+#: Least rows of a first flight, for its speeds.
 LEAST_ROWS: Final = 4
 
 #: Fitted to drops with odd numbers.
@@ -35,7 +35,7 @@ SQUARE: Final = np.array(
 
 @dataclass(frozen=True)
 class Marker:
-    """The tracked frame on the block: what the sensor measures is its pose.
+    """The tracked frame on the block, whose pose the sensor measures.
 
     At rest the block lies flat and its tracked angle is 33 mrad less, in 242 of 250 drops; heights at rest differ with
     the side that it lies on.
@@ -318,7 +318,7 @@ def bands(first_flight: ArrayLike, n_rows: int) -> Array:
     Raises
     ------
     ArgumentError
-        For fewer than four rows of flight, numbers that are not finite, or no row asked for.
+        For fewer than four rows of flight, numbers that are not finite, or no requested row.
     """
     if n_rows < 1:
         raise ArgumentError(f"n_rows: got {n_rows!r}, expected at least 1")

@@ -18,7 +18,7 @@ from plow_twin.run.simulate import Result, simulate
 from plow_twin_paper import sets as paper_sets
 from plow_twin_paper.values import CORNERS, SENSE_NAMES
 
-#: Poses are said to have parted at that distance [m].
+#: Distance [m] at which poses count as parted.
 PARTED_M = 1e-3
 
 

@@ -35,7 +35,7 @@ class Row:
     group, source : str
         Heading of the row and place of the statement in the paper.
     what, published, computed : str
-        The statement, what the paper says, what this run gives, for people.
+        The statement, the paper's value and this run's value, for people.
     verdict, criterion
         Whether it agrees, and the rule that decides it.
     inputs : str

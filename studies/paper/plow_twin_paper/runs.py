@@ -203,7 +203,7 @@ def face_of_pair() -> list[str]:
 
 
 def face_forces(force: Array) -> Array:
-    """Return the force on each inner face [N], shape (n, 4) as `FACES`, from that of the pairs, shape (n, 8)."""
+    """Return the force on each inner face [N], shape (n, 4) as `FACES`, from the pairs' forces, shape (n, 8)."""
     faces = face_of_pair()
     columns: Sequence[Array] = [
         force[:, [pair for pair, name in enumerate(faces) if name == face]].sum(axis=1) for face in FACES

@@ -56,7 +56,7 @@ class PaperStudy:
 
     @property
     def recording_error_m(self) -> float | None:
-        """Largest distance in m of the recorded head from that of the report's run; None without a recording."""
+        """Largest distance in m of the recorded head from the head of the report's run; None without a recording."""
         if self.recording is None:
             return None
         apart = self.recording.q[:, :2] - self.runs.case.q[:, :2]
@@ -141,7 +141,7 @@ def _changes(runs: PaperRuns) -> list[Change]:
 
 
 def row_as_plain(row: Row) -> dict[str, Any]:
-    """Return a row as it stands in JSON and CSV; the difference is a share, published values are `given`."""
+    """Return a row as in JSON and CSV; the difference is a share, published values are `given`."""
     return asdict(row) | {
         "difference": row.difference,
         "verdict": row.verdict.value,

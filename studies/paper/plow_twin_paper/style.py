@@ -1,4 +1,4 @@
-"""How the figures of the report look: colours that colour-blind readers tell apart (Okabe and Ito), one type size."""
+"""Style of the report's figures: colours that colour-blind readers can distinguish (Okabe and Ito), one type size."""
 
 from __future__ import annotations
 
