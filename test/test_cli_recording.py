@@ -52,7 +52,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return record_run(tmp_path_factory.mktemp("recording") / "run", map(paper_sample, range(SAMPLES)))
 
 
-def test_an_analysis_of_runs_without_measurements_shows_what_the_model_computed_and_no_empty_table(
+def test_an_analysis_of_runs_without_measurements_shows_the_model_and_no_empty_table(
     run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     other = shutil.copytree(run.folder, tmp_path / "other")
@@ -135,7 +135,7 @@ def test_a_recording_with_counted_loss_ends_with_3_in_every_verb(tmp_path: Path)
         assert "lost" in done.stdout + done.stderr
 
 
-def test_info_counts_what_a_recording_holds(run: Run) -> None:
+def test_info_counts_the_content_of_a_recording(run: Run) -> None:
     done = plow_twin_here("info", run.file, "--json")
     assert done.returncode == 0, done.stderr
     facts = json.loads(done.stdout)
@@ -145,7 +145,7 @@ def test_info_counts_what_a_recording_holds(run: Run) -> None:
     assert facts["messages"]["/contact_forces"] == SAMPLES
 
 
-def test_view_writes_where_it_is_told(run: Run, tmp_path: Path) -> None:
+def test_view_writes_to_the_given_file(run: Run, tmp_path: Path) -> None:
     done = plow_twin_here("view", run.folder, "--out", tmp_path / "picture.rrd")
     assert done.returncode == 0, done.stderr
     assert f"{SAMPLES} force rows" in done.stdout
@@ -162,7 +162,7 @@ def answers(port: int) -> bool:
         return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
-def test_view_refuses_what_cannot_be_drawn(run: Run, tmp_path: Path) -> None:
+def test_view_refuses_recordings_that_cannot_be_drawn(run: Run, tmp_path: Path) -> None:
     refused = plow_twin_here("view", run.folder, "--out", tmp_path / "x.rrd", "--exaggerate", "1e+308")
     assert refused.returncode == 2 and "1e+308" in refused.stderr and "Traceback" not in refused.stderr
     # a run under its scene's own loads has none in its journal

@@ -69,13 +69,13 @@ def test_a_file_is_the_one_before_or_whole_when_the_disk_is_full(suffix: str, tm
     assert out.read_bytes() == before and [*tmp_path.iterdir()] == [out]
 
 
-def test_what_a_library_says_of_a_file_is_kept(tmp_path: Path) -> None:
+def test_messages_of_a_library_about_a_file_are_kept(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="no such codec"), whole_file(tmp_path / "table"):
         raise OSError("no such codec")
     assert not [*tmp_path.iterdir()]
 
 
-def test_what_is_no_file_is_written_to_as_it_is(tmp_path: Path) -> None:
+def test_a_device_is_written_to_in_place(tmp_path: Path) -> None:
     pipe, other = tmp_path / "pipe.csv", tmp_path / "other.csv"
     os.mkfifo(pipe)
     (tmp_path / "link.csv").symlink_to(other)
@@ -169,7 +169,7 @@ def test_a_closed_standard_output_is_no_traceback() -> None:
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_what_cannot_be_done_exits_with_1(tmp_path: Path) -> None:
+def test_failures_exit_with_1(tmp_path: Path) -> None:
     (tmp_path / "no.mcap").write_bytes(b"not a recording")
     (tmp_path / "full.csv").symlink_to("/dev/full")
     for arguments, said in (
@@ -259,7 +259,7 @@ def test_the_energy_balance_closes() -> None:
     assert "balance of energy" in shown and "largest imbalance" in shown
 
 
-def test_words_of_the_paper_scene_say_in_a_comment_what_they_rest_on() -> None:
+def test_words_of_the_paper_scene_name_their_evidence_in_a_comment() -> None:
     text = scene_path("paper").read_text(encoding="utf-8")
     words = re.findall(r"^ *(rotation|labels|law|locked|pairs|wear): (?:[^#\n]*)(.*)$", text, re.MULTILINE)
     assert {key for key, _ in words} == {"rotation", "labels", "law", "locked", "pairs", "wear"}

@@ -50,7 +50,7 @@ def _published(second: float, peak: float, load: float = 0.0) -> Published:
     return Published(rows, NOTHING.slow)
 
 
-def test_a_feed_that_nobody_reads_waits_for_nothing_and_keeps_the_peaks() -> None:
+def test_a_feed_without_a_reader_does_not_wait_and_keeps_the_peaks() -> None:
     link, theirs = pair()
     feed = Feed(link, FACTS)
     for index in range(2000):
@@ -73,7 +73,7 @@ def test_a_feed_that_nobody_reads_waits_for_nothing_and_keeps_the_peaks() -> Non
     link.close()
 
 
-def test_the_hour_is_bounded_has_each_second_once_and_begins_anew_where_stamps_step_back() -> None:
+def test_the_hour_is_bounded_has_each_second_once_and_is_cleared_where_stamps_step_back() -> None:
     history = History()
     motion = {"load_low": [0, -1, None], "load_high": [0, 1, None], "was_held": False}
     for version in range(1, 2 * SPAN_S + 1):
@@ -208,7 +208,7 @@ def _memory_kb(pid: int) -> int:
     return int(next(line for line in text.splitlines() if line.startswith("VmRSS")).split()[1])
 
 
-def test_a_frozen_page_costs_no_memory_keeps_nobody_waiting_and_gets_the_newest_when_it_reads_again() -> None:
+def test_a_frozen_page_costs_no_memory_delays_no_page_and_gets_the_newest_when_it_reads_again() -> None:
     with (
         Screen(PageAccess("127.0.0.1", 0), FACTS) as screen,
         socket.create_connection(("127.0.0.1", int(screen.url.rstrip("/").rpartition(":")[2]))) as raw,
@@ -345,7 +345,7 @@ def test_an_operator_acknowledges_and_marks_and_the_journal_has_both(tmp_path: P
     assert replay(tmp_path / "run").exit_code == 0
 
 
-def test_a_killed_server_is_said_once_and_the_twin_goes_on(tmp_path: Path) -> None:
+def test_a_killed_server_is_reported_once_and_the_twin_continues(tmp_path: Path) -> None:
     with _twin() as (process, _):
         _feed(process, 0, 600)
         server = int(next(Path(f"/proc/{process.pid}/task").glob("*/children")).read_text().split()[0])

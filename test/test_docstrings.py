@@ -83,7 +83,7 @@ def test_every_field_is_described(package: griffe.Module) -> None:
     assert lacking == []
 
 
-def test_what_a_function_raises_by_name_is_said(package: griffe.Module) -> None:
+def test_errors_that_a_function_raises_are_documented(package: griffe.Module) -> None:
     lacking = []
     for name, function in public(package):
         if function.is_function:

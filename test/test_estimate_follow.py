@@ -110,7 +110,7 @@ def test_intervals_hold_from_the_first_row_on_and_narrow(truth: Truth, followed:
         assert high[-1] - low[-1] < 1e-3
 
 
-def test_a_row_knows_only_what_was_measured_up_to_it(truth: Truth, followed: Stretch) -> None:
+def test_a_row_uses_measurements_up_to_its_time_only(truth: Truth, followed: Stretch) -> None:
     end = 4.0
     cut = follow(truth.nominal, *_until(truth, end), MEMBERS)
     count = len(cut.rows.t)
@@ -188,7 +188,7 @@ def test_another_machine_is_followed_from_its_own_prior(truth: Truth) -> None:
     assert (low < [0.010, 0.012]).all() and (high > [0.010, 0.012]).all() and (value < 0.02).all()
 
 
-def test_late_poses_correct_too_and_later_ones_tell_nothing(truth: Truth, forces: Array) -> None:
+def test_late_poses_correct_too_and_later_poses_have_no_effect(truth: Truth, forces: Array) -> None:
     def error(late: float) -> float:
         follower = Follower(truth.nominal, MEMBERS)
         _take(follower, replace(_known(truth), gain_m=Interval.normal(truth.gain[2] + 0.05, 0.05)))

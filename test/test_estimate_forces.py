@@ -115,7 +115,7 @@ def test_the_law_s_forces_are_those_of_the_solver() -> None:
     np.testing.assert_allclose(small * units.force, force, rtol=1e-9)
 
 
-def test_a_folder_without_forces_runs_none_of_their_code(
+def test_a_folder_without_forces_runs_no_code_of_forces(
     truth: Truth, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     short = replace(truth, load=truth.load.between(0.0, 4.0), poses=truth.poses.between(0.0, 4.0), forces=None)

@@ -183,7 +183,7 @@ def test_a_scene_without_wear_or_period_is_refused() -> None:
         mean_forces(replace(scene, loads=()), np.zeros(8))
 
 
-def test_a_history_of_clearances_tells_the_coefficient(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_history_of_clearances_determines_the_coefficient(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The truth is a direct run, which shares no jump with the estimate; its coefficient is not the prior's middle."""
     true_k = 1.8e-9
     scene = replace(preset("paper"), wear=replace(FAST, coefficient_m2_n=1e-9, prior_m2_n=(2.5e-10, 4e-9)))
@@ -257,7 +257,7 @@ def test_a_path_that_does_not_come_to_its_end_is_no_limit_never_reached() -> Non
         mean_forces(scene, np.full(8, 0.5))
 
 
-def test_a_clearance_hardly_known_is_none_below_zero() -> None:
+def test_a_clearance_hardly_known_is_not_below_zero() -> None:
     """Drawn from its prior it was -70 mm: the path to the limit from there left the model's range."""
     scene = replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0, prior_m2_n=(5e-15, 2e-14)))
     found = forecast(scene, Plan(0.026, 0.031, 1e3, draws=50), (0.03, 0.03))
@@ -292,7 +292,7 @@ def test_a_history_that_shrinks_is_refused() -> None:
     assert coefficient(scene, History(travel, shrunk, np.full((2, 2), 1e-3))).interval().mean < 1e-13
 
 
-def test_what_a_forecast_cannot_use_is_refused_and_not_left_out(
+def test_unusable_input_of_a_forecast_is_refused_and_not_left_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A stop beyond the horizon, an estimate of nothing, a contact of none: all gave some forecast."""

@@ -82,7 +82,7 @@ def test_windows_do_not_depend_on_the_order_of_arrival() -> None:
             assert np.array_equal(first, second)
 
 
-def test_what_comes_without_a_load_does_not_pile_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_measurements_without_a_load_do_not_pile_up(monkeypatch: pytest.MonkeyPatch) -> None:
     """A load that has stopped, or poses of a clock that is ahead by hours."""
     monkeypatch.setattr("plow_twin.estimate.window.MOST_KEPT", 100)
     windows = Windows(4.0, 1.0, 0.5)
@@ -210,7 +210,7 @@ def _found(horizontal: State, vertical: State) -> Found:
     return Found(START_NS, START_NS + 1, 2, 3, (), result, 0.1, 0, 0)
 
 
-def test_what_is_estimated_stays_until_it_is_withdrawn_or_the_pads_are_changed() -> None:
+def test_an_estimate_stays_until_it_is_withdrawn_or_the_pads_are_changed() -> None:
     wear = Wear(1e-13, 0.015, 2.0, prior_m2_n=(5e-14, 2e-13))
     scene = replace(preset("paper"), wear=wear)
     session = Session(Twin(scene, excitation="sampled"), rollback_span_s=2.0)
@@ -257,7 +257,7 @@ class _Finished:
         self.found.clear()
 
 
-def test_other_pads_and_other_numbers_of_the_model_forget_what_was_told_of_those_before(
+def test_other_pads_and_other_model_numbers_discard_earlier_estimates(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("plow_twin.live.estimation.Worker", _Finished)
@@ -292,7 +292,7 @@ def test_other_pads_and_other_numbers_of_the_model_forget_what_was_told_of_those
     assert estimation.poll(session) == {}
 
 
-def test_a_worker_that_reads_nothing_is_told_and_nothing_more_is_kept_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_frozen_worker_is_reported_and_costs_no_further_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("plow_twin.estimate.worker._MOST_WAITING", 20_000)
     worker = Worker(preset("paper"), Windows(10.0, 4.0, 1.0))
     os.kill(worker._process.pid, signal.SIGSTOP)
@@ -310,7 +310,7 @@ def test_a_worker_that_reads_nothing_is_told_and_nothing_more_is_kept_for_it(mon
     assert not worker._thread.is_alive()
 
 
-def test_a_worker_that_died_is_told_and_stops_nothing() -> None:
+def test_the_death_of_a_worker_is_reported_and_stops_nothing() -> None:
     worker = Worker(preset("paper"), Windows(10.0, 4.0, 1.0))
     os.kill(worker._process.pid, signal.SIGSTOP)
     worker._connection.close()
@@ -325,7 +325,7 @@ def test_a_worker_that_died_is_told_and_stops_nothing() -> None:
     worker.close()
 
 
-def test_without_an_estimate_none_of_its_code_is_loaded(tmp_path: Path) -> None:
+def test_without_an_estimate_its_code_is_not_loaded(tmp_path: Path) -> None:
     program = """
 import sys
 import ros_processes

@@ -58,7 +58,7 @@ def test_data_that_contradict_themselves_are_withdrawn(name: str) -> None:
         *(pytest.param(name, marks=pytest.mark.stress) for name in ("kelvin_voigt", "exponent", "shape", "scale")),
     ],
 )
-def test_what_is_outside_the_model_is_flagged_and_rough_at_best(name: str) -> None:
+def test_effects_outside_the_model_are_flagged_and_rough_at_best(name: str) -> None:
     truth = draw(replace(GROUPS[name], periods=6.0), 1)
     result = estimate(truth.nominal, truth.load, truth.poses)
     assert (result.model, result.sensor) == (truth.group.model, truth.group.sensor), result.reasons
@@ -89,7 +89,7 @@ def test_a_lever_arm_of_the_sensor_is_found_and_the_interval_holds() -> None:
     assert np.hypot(*(share * by for share, by, _ in found)) == pytest.approx(5e-3, rel=0.2)
 
 
-def test_of_a_head_that_never_moves_sideways_the_vertical_clearance_is_told() -> None:
+def test_the_vertical_clearance_of_a_head_that_never_moves_sideways_is_estimated() -> None:
     truth = mismatched(replace(KINDS["vertical"], periods=6.0), 80_000)
     result = estimate(truth.nominal, truth.load, truth.poses)
     assert result.horizontal_state is State.NOT_OBSERVABLE and result.vertical_state.known, result.reasons

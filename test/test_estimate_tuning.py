@@ -54,7 +54,7 @@ def test_a_new_number_without_an_origin_is_found() -> None:
     assert unexplained("#: Bound: rounds.\n_ROUNDS = 7\n_MORE = 8\n\n_LATER = 9\n") == ["_LATER = 9"]
 
 
-def test_every_chosen_number_is_used_and_says_what_it_was_set_on() -> None:
+def test_every_chosen_number_is_used_and_states_its_data() -> None:
     entries = tuning.entries()
     used = " ".join(path.read_text(encoding="utf-8") for path in (ROOT / "plow_twin").rglob("*.py"))
     assert [entry.name for entry in entries if f"tuning.{entry.name}" not in used] == []

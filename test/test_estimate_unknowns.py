@@ -15,7 +15,7 @@ from plow_twin.estimate.unknowns import Unknowns
 from plow_twin.model.loads import compile_loads
 
 
-def test_the_prior_is_what_the_scene_states_or_the_mark_says() -> None:
+def test_the_prior_is_the_scene_s_or_that_of_the_mark() -> None:
     scene = preset("paper")
     t = np.arange(0.0, 10.0, 0.1)
     load, poses = Load(t, compile_loads(scene.loads).at(t)), Poses(t, np.zeros((len(t), 3)))

@@ -125,14 +125,14 @@ for name in {list(FILES)!r}:
     ],
     ids=["nesting", "aliases", "merge keys", "keys", "values"],
 )
-def test_what_exceeds_a_bound_is_named_with_its_place(text: str, got: str, bound: int) -> None:
+def test_an_exceeded_bound_is_named_with_its_place(text: str, got: str, bound: int) -> None:
     found, problems = load_yaml(text, "scene", "sections", most_values=MOST_VALUES)
     assert found is None and len(problems) == 1
     assert problems[0].key.startswith("line ")
     assert got in str(problems[0].got) and f"at most {bound} " in problems[0].expected
 
 
-def test_what_stays_within_the_bounds_is_read() -> None:
+def test_content_within_the_bounds_is_read() -> None:
     deep = "[" * DEEPEST + "]" * DEEPEST
     assert load_yaml(deep, "scene", "sections")[1] == []
     shared = "head: &one {mass: 1}\nframe: {<<: *one, width: 2}\nloads: [*one, *one]"
@@ -206,7 +206,7 @@ for name, words in json.load(sys.stdin):
 
 
 @pytest.mark.parametrize("kind", COMMANDS)
-def test_recordings_that_nobody_writes_by_accident_end_in_a_line(kind: str, tmp_path: Path) -> None:
+def test_absurd_recordings_end_with_one_line(kind: str, tmp_path: Path) -> None:
     """No signal, no traceback, one line at most for an error, and bounded processor time and memory."""
     asked = []
     for file, make in MADE.items():

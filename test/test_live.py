@@ -143,7 +143,7 @@ def test_a_time_that_stands_alone_is_no_clock_and_no_end(tmp_path: Path, capsys:
 
 
 @pytest.mark.parametrize(("column", "bad"), [("x", "999"), ("speed", "fast")])
-def test_whatever_is_dropped_of_any_input_is_told_by_the_exit_code(column: str, bad: str, tmp_path: Path) -> None:
+def test_dropped_messages_of_any_input_change_the_exit_code(column: str, bad: str, tmp_path: Path) -> None:
     path = tmp_path / "all.csv"
     rows = "".join(f"{index * 0.01},1,2,3,{bad if index % 2 else 0}\n" for index in range(20))
     path.write_text(f"t,fx,fy,m,{column}\n{rows}")
@@ -186,7 +186,7 @@ def test_measured_poses_and_gaps_are_journaled_as_they_come(tmp_path: Path) -> N
     assert (report.samples, report.exit_code) == (100, 0)
 
 
-def test_bounded_work_is_said_with_its_error_and_given_again_by_the_journal(tmp_path: Path) -> None:
+def test_bounded_work_is_reported_with_its_error_and_repeated_by_the_journal(tmp_path: Path) -> None:
     given = {"scene": "bench_kv", "max_evaluations": 16, "record_path": str(tmp_path / "run")}
     reports: list[Part] = []
     parts = _run(_csv(tmp_path / "load.csv", 1500), reports=reports, **given)
@@ -257,7 +257,7 @@ def test_the_alarms_of_a_run_are_computed_again_and_compared(tmp_path: Path) -> 
     assert (report.exit_code, report.compared["alarms"]) == (0, 0) and report.not_compared["alarms"] > 0
 
 
-def test_what_is_not_used_of_any_input_is_a_warning(tmp_path: Path) -> None:
+def test_an_unused_message_of_any_input_is_a_warning(tmp_path: Path) -> None:
     rows = [",".join(map(repr, (*_row(index), 50.0 if index == 7 else 1.0))) for index in range(20)]
     path = tmp_path / "load.csv"
     path.write_text("t,fx,fy,m,speed\n" + "\n".join(rows) + "\n")
@@ -265,7 +265,7 @@ def test_what_is_not_used_of_any_input_is_a_warning(tmp_path: Path) -> None:
     assert (level, message, values["travel_used"], values["travel_dropped"]) == (1, "travel_dropped", "19", "1")
 
 
-def test_the_senders_own_numbers_tell_loss_repetition_and_a_new_start(tmp_path: Path) -> None:
+def test_the_senders_own_numbers_show_loss_repetition_and_a_new_start(tmp_path: Path) -> None:
     numbers = [*range(7, 100), 99, *range(110, 200), *range(1, 50), *range(52, 60)]
     lines = [
         json.dumps({"time": 1000 + index, "load": {"f": [index, 2, 3]}, "n": n}) for index, n in enumerate(numbers)
@@ -303,7 +303,7 @@ def test_a_single_stray_number_moves_nothing(tmp_path: Path, numbers: list[str],
     assert (values["samples_lost"], values["samples_used"]) == (str(lost), str(len(numbers)))
 
 
-def test_a_mapping_takes_units_offsets_clocks_and_names_what_is_wrong(tmp_path: Path) -> None:
+def test_a_mapping_takes_units_offsets_clocks_and_names_its_faults(tmp_path: Path) -> None:
     path = tmp_path / "map.yaml"
 
     def read(text: str, **content: Any) -> tuple[int, dict[str, float]] | None:
@@ -458,7 +458,7 @@ def test_a_file_is_followed_while_it_grows_and_when_it_is_replaced(tmp_path: Pat
     assert (report.samples, report.exit_code) == (300, 0)
 
 
-def test_an_alarm_is_said_once_with_value_pad_threshold_and_time_and_acknowledged_without_ros(
+def test_an_alarm_is_reported_once_with_value_pad_threshold_and_time_and_acknowledged_without_ros(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     # the address of a socket is short, unlike a folder of tests
@@ -728,9 +728,7 @@ excitation: {topic: plough/load, fields: {fx: force.x, fy: force.y, m: moment}, 
 """
 
 
-def test_a_broker_keeps_what_comes_while_the_twin_is_away_and_garbage_is_counted(
-    broker: Access, tmp_path: Path
-) -> None:
+def test_a_broker_keeps_messages_for_an_absent_twin_and_garbage_is_counted(broker: Access, tmp_path: Path) -> None:
     (tmp_path / "map.yaml").write_text(MAP)
     (tmp_path / "password").write_text(broker.password + "\n")
     arguments = (
@@ -775,7 +773,7 @@ def test_a_wrong_password_a_strange_certificate_and_a_broker_without_tls_are_ref
             Mqtt(replace(broker, client_id="other"), connect_s=5.0).start(["plough/load", topic])
 
 
-def test_what_the_system_refuses_is_a_warning_and_the_rest_is_done() -> None:
+def test_a_refusal_by_the_system_is_a_warning_and_the_rest_is_done() -> None:
     code = """
 import os, resource
 from dataclasses import replace
@@ -820,7 +818,7 @@ def test_another_machine_without_tls_and_passwords_in_the_address_are_refused(ur
         (["mqtt://localhost:1"], 1, "expected one that names the topics"),
     ],
 )
-def test_a_wrong_call_says_what_was_expected(
+def test_a_wrong_call_names_the_expectation(
     arguments: list[str],
     code: int,
     said: str,

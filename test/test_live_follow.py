@@ -213,7 +213,7 @@ def test_without_an_estimate_poses_leave_the_median_twin_alone(truth: Truth, bef
     assert before != "nothing" or _error(followed, run.force[: len(followed)]) < 0.08
 
 
-def test_wear_goes_on_from_where_it_is_and_widens_what_was_estimated(truth: Truth) -> None:
+def test_wear_continues_from_its_depth_and_widens_the_estimate(truth: Truth) -> None:
     wear = Wear(2e-11, 0.015, 2.0, initial_depth_m=(1e-3,) * 8)
     live = Live(replace(truth.nominal, wear=wear))
     live.take(_in_turn(truth, 0.0, 2.0))
@@ -297,7 +297,7 @@ def test_late_samples_and_poses_end_in_the_bits_of_those_in_order_and_replay_giv
     assert force == pytest.approx(expected, rel=0.02, abs=2e3)
 
 
-def test_what_is_published_does_not_change_the_motion_where_poses_samples_and_a_hold_are_late(truth: Truth) -> None:
+def test_publications_do_not_change_the_motion_where_poses_samples_and_a_hold_are_late(truth: Truth) -> None:
     """What has been published decides how far a late sample goes back."""
     live, part = Live(truth.nominal), _in_turn(truth, 0.5, 1.5)
     live.take([*_in_turn(truth, 0.0, 0.5), _known(truth), *part[30:60], *part[:30], *part[90:120], *part[60:90]])
@@ -357,7 +357,7 @@ def test_each_mark_has_a_digest_as_of_a_twin_that_does_not_follow(truth: Truth) 
         assert digests[0] == digests[1] and len(digests) == 3 and digests[2] == twin.digest()
 
 
-def test_a_locked_degree_of_freedom_stays_whatever_is_taken_in(truth: Truth) -> None:
+def test_a_locked_degree_of_freedom_is_not_moved_by_measurements(truth: Truth) -> None:
     locked = replace(truth.nominal, locked=("theta", "x"), initial=Initial(q=(0.004, 0.0, 0.01)))
     live = Live(locked)
     change = SetModel(_stamp(0.7), json.dumps({"clearance.horizontal_m": 0.020}))
@@ -408,7 +408,7 @@ def test_twins_that_leave_the_range_of_the_model_come_back_with_the_next_pose(tr
     assert max(lost) > 0 and lost[-1] == 0
 
 
-def test_what_waits_is_bounded_and_dropped_poses_are_counted_and_no_estimate_is_dropped(truth: Truth) -> None:
+def test_waiting_poses_are_bounded_dropped_ones_counted_and_no_estimate_is_dropped(truth: Truth) -> None:
     live = Live(truth.nominal)
     live.take(_in_turn(truth, 0.0, 0.5))
     live.take([Pose(_stamp(t), (0.0, 0.0, 0.0)) for t in (3601.0, 7200.0)])
@@ -423,7 +423,7 @@ def test_what_waits_is_bounded_and_dropped_poses_are_counted_and_no_estimate_is_
     assert live.twin.estimate is not None
 
 
-def test_without_measurements_the_median_twin_is_the_nominal_one_and_none_is_moved(
+def test_without_measurements_the_median_twin_is_the_nominal_one_and_no_twin_is_moved(
     truth: Truth, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(TwinBatch, "move", lambda *_: pytest.fail("a member was moved"))
@@ -533,7 +533,7 @@ class Front:
 
 
 @pytest.mark.parametrize("mode", ["on_sample", "fixed_rate"])
-def test_a_runtime_says_what_follows_and_goes_on_by_the_parameters_where_samples_wait(
+def test_a_runtime_reports_its_followers_and_falls_back_to_the_parameters_where_samples_wait(
     truth: Truth, tmp_path: Path, mode: str
 ) -> None:
     scene = tmp_path / "believed.yaml"

@@ -64,7 +64,7 @@ def test_absurd_telemetry_goes_through_to_where_it_is_counted_and_is_no_certaint
     assert max(max(entry.deviation) for entry in entries if isinstance(entry, Spread)) < 1e6
 
 
-def test_the_interval_holds_what_coefficients_drawn_by_chance_give() -> None:
+def test_the_interval_covers_randomly_drawn_coefficients() -> None:
     drive = {"power": 200e3, "speed": 2.0}
     found = MODEL.wrench(drive)
     assert found is not None

@@ -152,7 +152,7 @@ def _stamps(found: list[Arrived]) -> list[int]:
     return [arrived.content["source"] for arrived in found]
 
 
-def test_values_of_a_stamp_are_a_sample_and_what_has_not_changed_stays() -> None:
+def test_values_of_a_stamp_are_a_sample_and_unchanged_fields_stay() -> None:
     samples = Samples(["a", "b"], wait_s=1.0)
     samples.add("a", 10, 1.0, 0.0)
     samples.add("b", 10, 2.0, 0.1)
@@ -225,7 +225,7 @@ def test_a_lost_message_is_seen_by_its_number_and_filled_from_the_history(server
         assert _stamps(found) == [start_ns + 6 * MS, start_ns + 7 * MS]
 
 
-def test_what_the_server_grants_is_compared_with_what_was_asked() -> None:
+def test_the_server_s_grants_are_compared_with_the_requests() -> None:
     assert Revised(10.0, 1.0, 100).complaint(1.0) == ""
     assert Revised(10.0, 10.0, 100).complaint(0.0) == ""
     assert "samples every 100 ms, asked every 1 ms" in Revised(100.0, 100.0, 1000).complaint(1.0)
@@ -342,7 +342,7 @@ def test_an_encrypted_session_of_a_user_leaves_no_secret_in_the_recording(
     assert access.password.encode() not in shown + recorded and key not in recorded
 
 
-def test_what_is_not_trusted_or_not_encrypted_is_refused(
+def test_untrusted_and_unencrypted_connections_are_refused(
     secured: tuple[Plant, Access], certificates: Path, roles: Any, server: Plant
 ) -> None:
     _, access = secured

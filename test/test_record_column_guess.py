@@ -83,7 +83,7 @@ def test_units_are_those_of_the_names_or_of_the_sizes(
     assert guess.stamps_s[-1] == pytest.approx(0.599)
 
 
-def test_what_cannot_be_told_is_asked_for_by_the_option_that_states_it(
+def test_undecided_columns_end_with_the_option_that_states_them(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = _file(tmp_path / "own.csv", "t;a;b;c;d", step=1e-3, size=1.0)
@@ -122,7 +122,7 @@ def _in_terminal(folder: Path, *said: bytes) -> tuple[int, str]:
     return process.wait(60.0), screen.decode()
 
 
-def test_prompts_in_a_terminal_take_corrections_and_write_what_was_chosen(tmp_path: Path) -> None:
+def test_prompts_in_a_terminal_take_corrections_and_write_the_choice(tmp_path: Path) -> None:
     _file(tmp_path / "own.csv", "t;a;b;c;d", step=1e-3, size=1.0)
     code, screen = _in_terminal(tmp_path, b"z\n", b"a\n", b"\n", b"b\n", b"c\n")
     assert code == 0, screen

@@ -44,7 +44,7 @@ def test_tables_hold_the_numbers_of_the_messages(run: Run) -> None:
         recording["forces"]
 
 
-def test_what_a_recording_lacks_is_known_after_its_tables_have_been_read_once(run: Run, tmp_path: Path) -> None:
+def test_losses_of_a_recording_are_known_after_one_reading_of_its_tables(run: Run, tmp_path: Path) -> None:
     cut = tmp_path / "cut.mcap"
     whole = next(run.folder.glob("*.mcap")).read_bytes()
     cut.write_bytes(whole[: len(whole) * 3 // 4])

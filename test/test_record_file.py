@@ -168,7 +168,7 @@ def test_rerun_checks_the_file(run: Run) -> None:
     assert result.returncode == 0, result.stdout + result.stderr
 
 
-def test_a_file_cut_anywhere_gives_what_lies_before_the_cut(run: Run, tmp_path: Path) -> None:
+def test_a_file_cut_anywhere_gives_its_content_before_the_cut(run: Run, tmp_path: Path) -> None:
     data = run.file.read_bytes()
     whole = list(RunReader(run.file))
     rng = random.Random(1)
@@ -262,7 +262,7 @@ def test_ten_gigabytes_take_the_memory_of_some_chunks(run: Run, tmp_path: Path) 
     assert large - small < 5 * 80_000_000
 
 
-def test_a_file_that_another_program_wrote_anew_is_a_run(run: Run, tmp_path: Path) -> None:
+def test_a_file_that_another_program_rewrote_is_a_run(run: Run, tmp_path: Path) -> None:
     """Its header stands behind the chunks; without an index at the end it is found all the same."""
     file = rewrite(run.file, tmp_path / "anew.mcap", metadata_last=True)
     report = replay(file)
@@ -285,7 +285,7 @@ def test_a_file_that_another_program_wrote_anew_is_a_run(run: Run, tmp_path: Pat
         (None, "no such recording"),
     ],
 )
-def test_what_is_no_recording_is_named(content: bytes | None, expected: str, tmp_path: Path) -> None:
+def test_a_file_that_is_no_recording_is_named(content: bytes | None, expected: str, tmp_path: Path) -> None:
     file = tmp_path / "notes.mcap"
     if content is not None:
         file.write_bytes(content)

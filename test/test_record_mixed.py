@@ -169,9 +169,7 @@ def test_after_a_hold_and_a_reset_samples_are_not_taken_for_held(tmp_path: Path)
 
 
 @pytest.mark.parametrize("hold", ["hold", "zero"])
-def test_a_blow_before_a_hold_in_the_same_publication_is_an_alarm_and_one_in_the_hold_is_none(
-    hold: str, tmp_path: Path
-) -> None:
+def test_a_blow_before_a_hold_raises_an_alarm_and_a_blow_in_the_hold_does_not(hold: str, tmp_path: Path) -> None:
     live = Mixed(tmp_path, publish_mode="fixed_rate", alarm_force=[6e4, 1e9], excitation_timeout=0.05, hold_policy=hold)
     # a short push, on which the head goes on without a sample until it meets the frame
     live.send(*(_at(index, (0.0, 40e3, 0.0)) for index in range(20)))

@@ -129,7 +129,7 @@ def test_a_damaged_chunk_is_left_out_by_a_repair_and_the_gap_is_named(tmp_path: 
         assert after.messages_compared == before.messages_compared
 
 
-def test_what_other_programs_would_stumble_over_is_named_and_repaired(tmp_path: Path) -> None:
+def test_faults_that_stop_other_programs_are_named_and_repaired(tmp_path: Path) -> None:
     run = record_run(tmp_path / "run", map(paper_sample, range(100)))
     listing = run.folder / "metadata.yaml"
     good = listing.read_text()
@@ -164,7 +164,7 @@ def test_a_repair_keeps_every_old_file_and_lists_every_part(tmp_path: Path) -> N
     assert [file.read_bytes() for file in kept] == old[:2]
 
 
-def test_what_was_recorded_beside_a_run_is_examined_and_repaired(tmp_path: Path) -> None:
+def test_topics_recorded_beside_a_run_are_examined_and_repaired(tmp_path: Path) -> None:
     run = record_run(tmp_path / "run", map(paper_sample, range(100)))
     writer = BagWriter(run.folder / "beside")
     number = writer.topic(Topic("/level", "own/msg/Level", "float64 value", "RIHS01_" + 64 * "0", "[]"))
@@ -363,9 +363,7 @@ def test_parts_that_are_removed_while_others_are_read_are_passed_over(
     assert reader.parts == [parts[1], *parts[3:]]
 
 
-def test_estimate_and_forecast_tell_of_parts_that_are_not_there(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_estimate_and_forecast_report_missing_parts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     poses = (Pose(paper_sample(index).stamp_ns, (0.0, 0.0, 0.0)) for index in range(COUNT))
     entries = (entry for pair in zip(map(paper_sample, range(COUNT)), poses, strict=True) for entry in pair)
     run = record_run(tmp_path / "run", entries, frame_every=10**9, wear=Wear(1e-14, 0.015, 2.0), **SMALL)

@@ -305,7 +305,7 @@ def test_a_recording_goes_on_when_the_disk_has_room_again(
     assert report.lost[JOURNAL] == loss.lost[JOURNAL] and report.compared["contact_peaks"] > 500
 
 
-def test_half_a_ring_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_incomplete_ring_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def half(folder: Path, *arguments: object, **options: object) -> None:
         (folder / "metadata.yaml.partial").touch()
         raise OSError(28, "No space left on device")
@@ -368,7 +368,7 @@ def test_a_ring_keeps_the_last_seconds_and_writes_them_at_a_mark(
     assert stamps[0].isdisjoint(stamps[1])
 
 
-def test_what_callers_lose_while_the_file_is_closed_does_not_disturb_it(
+def test_losses_of_callers_do_not_disturb_the_closing_of_the_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     close = RunWriter.close
@@ -400,7 +400,7 @@ def test_a_removed_file_is_noticed(whole: bool, tmp_path: Path) -> None:
     assert len(errors) == 1 and "removed or replaced" in errors[0]
 
 
-def test_a_recorder_that_nobody_closes_is_closed_at_exit(tmp_path: Path) -> None:
+def test_an_open_recorder_is_closed_at_exit(tmp_path: Path) -> None:
     process = start_writer(tmp_path / "run", count=200)
     process.communicate(timeout=60)
     assert process.returncode == 0
@@ -465,7 +465,7 @@ SYNCS = """
 """
 
 
-def test_with_sync_what_was_flushed_survives_a_loss_of_power(tmp_path: Path) -> None:
+def test_with_sync_flushed_data_survive_a_loss_of_power(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     command = writer_command(folder, begin=SYNCS, sync=True, flush_period_s=0.2)
     file = folder / "run_0.mcap"
@@ -505,7 +505,7 @@ def test_without_sync_the_disk_is_not_waited_for_and_with_it_a_closed_run_is_who
     assert {str(folder / "metadata.yaml.partial"), str(folder)} <= set(waited[1])
 
 
-def test_a_full_disk_beside_a_run_is_said_at_once_and_when_there_is_room_again(
+def test_a_full_disk_beside_a_run_is_reported_at_once_and_when_there_is_room_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     said: list[str] = []

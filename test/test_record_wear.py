@@ -48,7 +48,7 @@ def _saved(keeper: WearKeeper, depth: np.ndarray) -> str:
     return keeper.error
 
 
-def test_what_was_saved_is_loaded_to_the_bit_and_nothing_else_stays_behind(tmp_path: Path) -> None:
+def test_saved_wear_is_loaded_to_the_bit_and_no_other_file_stays_behind(tmp_path: Path) -> None:
     folder = tmp_path / "new" / "folder"
     assert _loaded(folder, "head 7", SCENE) is None
     _save(folder)
@@ -133,7 +133,7 @@ def test_a_file_that_came_while_the_twin_ran_is_left_as_it_is(tmp_path: Path) ->
     assert _loaded(path.parent, "head 7", SCENE) == DEPTH
 
 
-def test_a_folder_that_is_made_anew_is_claimed_anew(tmp_path: Path) -> None:
+def test_a_folder_that_is_recreated_is_claimed_again(tmp_path: Path) -> None:
     folder = tmp_path / "wear"
     first = WearKeeper(folder, "head 7", SCENE)
     assert _saved(first, NEW) == ""

@@ -108,7 +108,7 @@ def test_a_publisher_that_is_killed_is_followed_by_the_next_one(tmp_path: Path) 
         second.stop()
 
 
-def test_a_node_that_is_stopped_counts_what_overran_its_queue_and_goes_on(tmp_path: Path) -> None:
+def test_a_paused_node_counts_the_overrun_of_its_queue_and_continues(tmp_path: Path) -> None:
     with bench(tmp_path, input_depth=200, jump_forward=60.0) as running:
         publisher = running.publisher("--rate", "1000", "--seconds", "8")
         running.probe.until(lambda: int(running.probe.figures("input")["samples_used"]) > 500, "samples")
@@ -306,9 +306,7 @@ def test_the_scene_s_loads_follow_a_clock_that_is_paused_looped_and_fast(tmp_pat
 
 
 @pytest.mark.parametrize("source", ["scene", "excitation"])
-def test_whatever_comes_on_clock_the_twin_lives_counts_all_and_the_journal_repeats_it(
-    source: str, tmp_path: Path
-) -> None:
+def test_any_sequence_on_clock_is_survived_counted_and_repeated_by_the_journal(source: str, tmp_path: Path) -> None:
     rng = random.Random(f"clock {source}")
     with bench(
         tmp_path, use_sim_time="true", excitation_source=source, record_path=tmp_path / "run", **RELIABLE_INPUT
@@ -411,7 +409,7 @@ def test_steps_of_the_node_s_own_clock_stop_reset_and_lose_nothing(
     assert (report.exit_code, report.samples) == (0, sent)
 
 
-def test_the_scene_s_loads_begin_anew_where_the_node_s_own_clock_steps(
+def test_the_scene_s_loads_start_again_where_the_node_s_own_clock_steps(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stepped_clock: Callable[[float], None]
 ) -> None:
     with bench(tmp_path, excitation_source="scene", record_path=tmp_path / "run") as running:

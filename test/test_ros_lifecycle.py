@@ -122,7 +122,7 @@ def test_an_active_node_refuses_to_be_configured_and_another_scene(managed: Benc
     assert _state(managed) == "active"
 
 
-def test_a_node_configured_anew_has_another_scene_and_records_beside_the_first(managed: Bench, tmp_path: Path) -> None:
+def test_a_node_configured_again_has_another_scene_and_records_beside_the_first(managed: Bench, tmp_path: Path) -> None:
     for scene in ("paper", "bench_kv"):
         assert _set(managed, "scene", scene).successful
         assert _set(managed, "record_path", str(tmp_path / "run")).successful
@@ -194,7 +194,7 @@ def test_all_bad_parameters_are_named_at_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("program", ["ros.main", "demo.excitation_publisher"])
-def test_arguments_that_ros_cannot_read_are_said_without_a_traceback(tmp_path: Path, program: str) -> None:
+def test_arguments_that_ros_cannot_read_are_reported_without_a_traceback(tmp_path: Path, program: str) -> None:
     path = tmp_path / "missing.yaml"
     process = Process(f"plow_twin.{program}", ["--ros-args", "--params-file", str(path)], tmp_path / "log")
     assert process.wait() == 2

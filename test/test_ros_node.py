@@ -169,7 +169,7 @@ def test_every_sample_sent_is_used_dropped_or_counted_as_lost(tmp_path: Path, mo
 
 
 @pytest.mark.stress
-def test_a_queue_that_overruns_is_loss_and_said(tmp_path: Path) -> None:
+def test_an_overrun_of_the_queue_is_counted_as_loss_and_reported(tmp_path: Path) -> None:
     with bench(tmp_path, input_depth=200, excitation_timeout=60.0, publish_mode="fixed_rate") as running:
         probe = running.probe
         send = probe.excitation()
@@ -197,7 +197,7 @@ def test_a_queue_that_overruns_is_loss_and_said(tmp_path: Path) -> None:
     assert any("samples_lost" in message for message in said)
 
 
-def test_one_publisher_is_followed_and_a_second_said_until_a_switch_is_asked_for(tmp_path: Path) -> None:
+def test_one_publisher_is_followed_and_a_second_reported_until_a_switch(tmp_path: Path) -> None:
     with bench(tmp_path, excitation_timeout=60.0, record_path=tmp_path / "run") as running:
         probe = running.probe
         forces = probe.listen(JointState, "contact_forces")
@@ -263,7 +263,7 @@ def test_of_several_publishers_of_an_optional_input_one_is_followed(tmp_path: Pa
     assert {(found["reason"], *found["values"][:1]) for found in unused} == {("not_followed", 0.002)}
 
 
-def test_an_alarm_stays_until_it_is_acknowledged_and_writes_what_was_before_it(tmp_path: Path) -> None:
+def test_an_alarm_stays_until_it_is_acknowledged_and_writes_the_time_before_it(tmp_path: Path) -> None:
     ring = {"record_path": tmp_path / "run", "record_ring": 60.0}
     with bench(tmp_path, excitation_timeout=60.0, alarm_force="[1.0, 1e9]", **ring, **RELIABLE_INPUT) as running:
         probe = running.probe
@@ -595,7 +595,7 @@ def test_best_effort_and_reliable_publishers_connect(tmp_path: Path, reliability
         assert running.probe.figures("input")["refused_publishers"] == "0"
 
 
-def test_silence_is_held_and_said(tmp_path: Path) -> None:
+def test_silence_is_held_and_reported(tmp_path: Path) -> None:
     started_ns = time.time_ns()
     with bench(tmp_path, excitation_timeout=0.2) as running:
         probe = running.probe

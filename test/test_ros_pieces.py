@@ -37,7 +37,7 @@ def _rights(enclave: str, kind: str, right: str, namespace: str) -> set[str]:
     return {name if name in apart else f"{namespace}/{name.removeprefix('/')}" for name in names}
 
 
-def test_the_policy_allows_what_the_node_has_and_nothing_more(tmp_path: Path) -> None:
+def test_the_policy_allows_exactly_the_names_of_the_node(tmp_path: Path) -> None:
     with bench(tmp_path, lifecycle="active") as running:
         name, node, ns = ("plow_twin", running.namespace), running.probe.node, running.namespace
         optional = {f"{ns}/{topic}" for topic in (*OUTPUTS, "markers")} | {"/tf"}

@@ -81,7 +81,7 @@ def test_other_topics_come_into_the_run_s_folder_with_their_types(tmp_path: Path
     assert found.comparisons(found.predictions[0])["x"].n == COUNT
 
 
-def test_a_topic_that_was_named_and_never_had_a_publisher_is_said_and_is_no_success(tmp_path: Path) -> None:
+def test_a_named_topic_without_a_publisher_is_reported_and_no_success(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "plow_twin", "record", str(tmp_path / "run"), "never", "--wait", "0"]
     with started(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as recorder:
         assert recorder.stderr is not None

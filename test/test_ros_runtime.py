@@ -284,7 +284,7 @@ def test_loads_without_a_direction_may_be_named_and_count_nothing() -> None:
     assert tools.wrench(every, [1.0]) is None
 
 
-def test_under_a_flood_of_samples_what_is_due_is_done_and_others_have_their_turn() -> None:
+def test_under_a_flood_of_samples_due_work_is_done_and_others_have_their_turn() -> None:
     flood, turns, errors = _Flood(), Turns(), list[Exception]()
     done, at = threading.Semaphore(0), list[int]()
     loop = InputLoop(turns, errors.append)
@@ -339,7 +339,7 @@ def test_a_queue_that_fills_while_it_is_emptied_is_emptied_to_its_end() -> None:
     assert heard == list(range(1, 54))
 
 
-def test_another_node_under_the_same_name_is_said() -> None:
+def test_another_node_under_the_same_name_is_reported() -> None:
     with _node() as node:
         assert node.start()
         node._publish_diagnostics()
@@ -360,7 +360,7 @@ def test_loss_is_counted_by_the_publishers_numbers() -> None:
         assert node.runtime.inputs.lost == 1
 
 
-def test_what_was_sent_before_the_subscription_is_no_loss_whenever_its_publisher_is_discovered() -> None:
+def test_messages_from_before_the_subscription_are_no_loss_whenever_their_publisher_is_discovered() -> None:
     period_ns = 5_000_000
 
     def hear(node: TwinNode, sender: bytes, after_s: float, *numbers: int) -> int:
@@ -396,7 +396,7 @@ def test_the_middleware_is_asked_for_no_events() -> None:
         assert [topic.topic_name for topic in topics if topic.event_handlers] == []
 
 
-def test_an_error_in_the_thread_of_the_inputs_ends_the_program_and_is_said() -> None:
+def test_an_error_in_the_thread_of_the_inputs_ends_the_program_with_a_message() -> None:
     with _node() as node:
         assert node.start()
         assert node.runtime is not None and node._front is not None

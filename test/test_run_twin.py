@@ -169,7 +169,7 @@ def test_a_pose_out_of_range_is_never_handed_out_as_good() -> None:
         simulate(analytic.scene, 0.0465)
 
 
-def test_a_scene_compiles_only_what_it_needs() -> None:
+def test_a_scene_compiles_only_its_own_terms() -> None:
     """Parts that a scene lacks are None in the compiled signature of the step."""
     twin = Twin(wall_and_point(preset("bench_kv").contact, speed=1.0))
     twin.advance(0.01)

@@ -177,7 +177,7 @@ gravty: 3
         "version: 1" + "0" * 5000,
     ],
 )
-def test_what_is_no_scene_is_a_scene_error(text: str) -> None:
+def test_a_text_that_is_no_scene_is_a_scene_error(text: str) -> None:
     with pytest.raises(SceneError):
         loads_scene(text)
 

@@ -192,7 +192,7 @@ def test_senses_of_corners_are_those_of_the_block() -> None:
         (lambda: block(head=Head(1.0, 1.0, carries="edges")), "walls, corners"),
     ],
 )
-def test_what_corners_cannot_have_is_named(make: Callable[[], Scene], expected: str) -> None:
+def test_features_that_corners_cannot_have_are_named(make: Callable[[], Scene], expected: str) -> None:
     with pytest.raises(SceneError, match=expected):
         make()
 

@@ -168,7 +168,7 @@ def test_rest_and_flight_are_left_to_their_methods(build: Callable[[], Scene]) -
     assert pose_error(scene, many.q[1], alone.q) < 1e-8 and many.events[1] == len(alone.events)
 
 
-def test_what_the_lanes_do_not_cover_keeps_its_way() -> None:
+def test_scenes_that_lanes_do_not_cover_run_one_by_one() -> None:
     scene = preset("bench_kv")
     others = [
         preset("bench_hc"),

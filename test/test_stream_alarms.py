@@ -96,7 +96,7 @@ def test_the_growth_of_the_clearance_is_that_of_ten_seconds() -> None:
 
 
 @pytest.mark.parametrize("names", [("force",), ("wear_rate",), ("clearance", "clearance_rate"), ()])
-def test_many_publications_at_once_raise_what_they_raise_one_by_one(names: tuple[str, ...]) -> None:
+def test_many_publications_at_once_raise_the_alarms_of_one_by_one(names: tuple[str, ...]) -> None:
     rng = np.random.default_rng(len(names))
     run = []
     for index in range(4000):

@@ -93,7 +93,7 @@ def test_time_spent_inactive_is_not_caught_up() -> None:
 
 
 @pytest.mark.parametrize(("jump_ns", "key"), [(-5 * NS_PER_S, "jumps_back"), (60 * NS_PER_S, "jumps_forward")])
-def test_a_jump_of_the_stamps_starts_the_model_anew(jump_ns: int, key: str) -> None:
+def test_a_jump_of_the_stamps_resets_the_model(jump_ns: int, key: str) -> None:
     bench = Bench()
     for index in range(300):
         bench.sample(T0 + index * MS, LOAD, now_ns=index * MS)
@@ -259,7 +259,7 @@ def test_wrong_stamps_one_after_another_reset_no_more_than_five_times_and_keep_n
     assert counted["samples_used"] + counted["dropped_unsteady"] + counted["dropped_stray"] == 2000
 
 
-def test_a_sample_that_jumps_is_used_when_none_follows_and_counted_when_the_twin_is_paused() -> None:
+def test_a_sample_that_jumps_is_used_without_a_successor_and_counted_when_the_twin_is_paused() -> None:
     bench = Bench(Policy(excitation_timeout_s=0.1))
     bench.sample(T0, LOAD, now_ns=0)
     assert bench.sample(T0 + 60 * NS_PER_S, LOAD, now_ns=MS) is None
@@ -327,7 +327,7 @@ def _troubled(seed: int, count: int) -> list[tuple[str, list[tuple[int, tuple[fl
 
 
 @pytest.mark.parametrize("max_steps", [DEFAULT_BUDGET, 3])
-def test_whatever_comes_single_calls_of_the_session_give_the_bits_of_the_driver_s(max_steps: int) -> None:
+def test_single_calls_of_the_session_give_the_driver_s_bits_for_any_input(max_steps: int) -> None:
     """Messages, journal and all that a later sample depends on; with 3 steps an advance fails now and then."""
 
     def new_session(journal: list[Entry]) -> Session:

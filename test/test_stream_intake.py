@@ -52,7 +52,7 @@ _ARRIVALS = st.lists(
 
 
 @given(_ARRIVALS)
-def test_used_samples_rise_strictly_and_none_goes_uncounted(arrivals: list[tuple[int, float]]) -> None:
+def test_used_samples_rise_strictly_and_every_sample_is_counted(arrivals: list[tuple[int, float]]) -> None:
     intake = Intake(jump_back_s=0.5, jump_forward_s=1.0)
     reached_ns = None
     for number, (offset_ms, value) in enumerate(arrivals, 1):

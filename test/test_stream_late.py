@@ -142,7 +142,7 @@ def test_a_lasting_rise_of_the_delay_does_not_stop_the_twin() -> None:
     assert _marks(third) == (False, False, False)
 
 
-def test_what_is_older_than_the_memory_is_counted() -> None:
+def test_samples_older_than_the_memory_are_counted() -> None:
     live = Live()
     live.driver.intake.jump_back_s = 60.0
     live.send(*(_arrival(index) for index in range(0, 5000, 2)))
@@ -255,7 +255,7 @@ def test_a_change_faster_than_possible_is_refused() -> None:
 
 
 @pytest.mark.parametrize("seed", range(1, 7))
-def test_whatever_comes_the_journal_repeats_it_at_every_entry(seed: int) -> None:
+def test_the_journal_repeats_any_input_at_every_entry(seed: int) -> None:
     random = Random(seed)
     hold = random.choice(["hold", "zero"])
     live = Live(every_sample=bool(seed % 2), policy=Policy(excitation_timeout_s=0.05, hold=hold, hold_limit_s=0.3))

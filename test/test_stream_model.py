@@ -64,7 +64,7 @@ def _again(scene: Scene, entries: list[Entry]) -> list[Entry]:
     return emitted
 
 
-def test_a_restored_motion_goes_on_as_it_did_after_its_snapshot_whatever_the_stamps() -> None:
+def test_a_restored_motion_continues_as_after_its_snapshot_for_any_stamps() -> None:
     bench = Bench(PAPER)
     bench.send(0, 700)
     kept = bench.driver.snapshot()
@@ -146,7 +146,7 @@ def test_the_same_model_again_is_no_change() -> None:
         ({"head.mass_kg": 1.0}, "expected one of"),
     ],
 )
-def test_what_cannot_change_while_the_twin_runs_is_refused_and_changes_nothing(
+def test_an_impossible_change_while_the_twin_runs_is_refused_without_effect(
     changes: dict[str, float], said: str
 ) -> None:
     bench = Bench(PAPER)

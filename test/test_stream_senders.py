@@ -11,21 +11,21 @@ ONE, OTHER = b"one", b"other"
 
 
 @given(st.sets(st.integers(1, 300), min_size=1))
-def test_used_plus_lost_is_what_was_sent_whatever_was_taken_out(heard: set[int]) -> None:
+def test_used_plus_lost_equals_sent_for_any_removed_messages(heard: set[int]) -> None:
     senders = Senders()
     assert all(senders.hear(ONE, number) for number in sorted(heard))
     assert len(heard) + senders.lost == max(heard)
 
 
 @given(st.permutations(range(1, 12)))
-def test_what_comes_after_all_is_no_loss(order: list[int]) -> None:
+def test_a_message_that_arrives_late_is_no_loss(order: list[int]) -> None:
     senders = Senders()
     for number in order:
         senders.hear(ONE, number)
     assert senders.lost == 0
 
 
-def test_what_was_sent_before_the_subscription_is_no_loss() -> None:
+def test_messages_from_before_the_subscription_are_no_loss() -> None:
     senders = Senders()
     senders.start([ONE])
     for number in (5000, 5001, 5004):

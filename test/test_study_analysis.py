@@ -496,7 +496,7 @@ def test_mutated_files_many_times(tmp_path: Path) -> None:
     mutate_many(tmp_path, range(1000, 11_000))
 
 
-def test_rows_beyond_what_fits_are_kept_evenly(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_beyond_the_limit_are_thinned_evenly(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(thinned, "MOST_ROWS", 100)
     rows, signal = thinned.Thinned(1), thinned.ThinnedSignal()
     for begin, end in pairwise((0, 1, 70, 71, 350, 900, 901)):
@@ -510,7 +510,7 @@ def test_rows_beyond_what_fits_are_kept_evenly(monkeypatch: pytest.MonkeyPatch) 
         np.testing.assert_array_equal(values.ravel(), 2.0 * stamps)
 
 
-def test_cycles_are_those_of_the_whole_series_whatever_its_length(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cycles_are_those_of_the_whole_series_for_any_length(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(loads, "_IN_MEMORY", 4096)  # of 40 000 bytes
     forces, series = np.abs(np.random.default_rng(1).normal(size=5000)), loads.Series()
     for part in np.array_split(forces, 7):

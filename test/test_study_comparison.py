@@ -75,7 +75,9 @@ def test_chance_is_taken_for_change_once_in_twenty() -> None:
 
 
 @pytest.mark.parametrize(("factor", "load_factor", "verdict"), [(1.15, 1.0, "machine"), (1.0, 1.15, "load")])
-def test_a_change_of_the_machine_is_told_from_one_of_the_load(factor: float, load_factor: float, verdict: str) -> None:
+def test_a_change_of_the_machine_is_distinguished_from_a_change_of_the_load(
+    factor: float, load_factor: float, verdict: str
+) -> None:
     random = np.random.default_rng(2)
     load = [random.normal(mean, 0.08, 300) for mean in (1.0, load_factor)]
     force = [

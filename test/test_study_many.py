@@ -221,7 +221,7 @@ def test_no_recording_of_a_folder_is_left_out_unsaid(tmp_path: Path, capsys: pyt
     assert str(tmp_path / "good") in (out / "report.html").read_text()
 
 
-def test_a_run_that_was_killed_before_its_header_is_made_anew(runs: Path, tmp_path: Path) -> None:
+def test_a_run_that_was_killed_before_its_header_is_repeated(runs: Path, tmp_path: Path) -> None:
     task = Task(runs / "r0", PAPER, None, (), tmp_path)
     task.run()
     part = tmp_path / "run" / "run_0.mcap"

@@ -96,7 +96,7 @@ def test_tossed_block_moves_as_the_solver_s_block_that_carries_corners() -> None
     np.testing.assert_allclose(found[:, 2], solved.q[:, 2], atol=0.05)
 
 
-def test_flight_is_fitted_to_what_was_measured_in_it(drops) -> None:
+def test_flight_is_fitted_to_its_measured_rows(drops) -> None:
     for pose, given in list(zip(drops.pose, drops.flight_rows, strict=True))[:40]:
         if given < 8:
             continue
@@ -125,12 +125,12 @@ def test_bands_are_ordered_start_narrow_and_repeat(drops) -> None:
 
 
 @pytest.mark.parametrize("wrong", [np.zeros((3, 3)), np.zeros((8, 2)), np.full((8, 3), np.nan)])
-def test_what_is_no_flight_is_named(wrong: np.ndarray) -> None:
+def test_bad_rows_of_a_flight_are_named(wrong: np.ndarray) -> None:
     with pytest.raises(ArgumentError, match="first_flight"):
         bands(wrong, 10)
 
 
-def test_what_is_no_impact_is_named() -> None:
+def test_bad_numbers_of_an_impact_are_named() -> None:
     with pytest.raises(ArgumentError, match=r"before.*\(n, 6\)"):
         impact(np.zeros((2, 5)))
     with pytest.raises(ArgumentError, match="n_rows"):

@@ -121,7 +121,7 @@ def test_a_broker_gets_all_groups_with_tls_and_says_when_the_twin_has_died(broke
         subscriber.close()
 
 
-def test_a_broker_that_is_not_there_costs_the_twin_nothing_and_is_said(tmp_path: Path) -> None:
+def test_a_missing_broker_is_reported_and_costs_the_twin_nothing(tmp_path: Path) -> None:
     path, runs = _csv(tmp_path / "load.csv", 2000), [tmp_path / "alone", tmp_path / "with"]
     url = f"mqtt://127.0.0.1:{_free_port()}/plough"
     done = [
@@ -140,7 +140,7 @@ def _entries(run: Path) -> list[object]:
     return [record.entry for record in RunReader(run) if isinstance(record, EntryRecord)]
 
 
-def test_what_waits_for_a_broker_is_bounded_counted_and_comes_in_order(tmp_path: Path) -> None:
+def test_messages_that_wait_for_a_broker_are_bounded_counted_and_come_in_order(tmp_path: Path) -> None:
     port = _free_port()
     there = Message("online", b"true", True)
     way = Broker(
@@ -172,7 +172,7 @@ def test_what_waits_for_a_broker_is_bounded_counted_and_comes_in_order(tmp_path:
         ("mqtt://localhost/a/+/b", "the prefix without + and #"),
     ],
 )
-def test_an_address_that_cannot_be_used_says_what_was_expected(url: str, said: str, tmp_path: Path) -> None:
+def test_a_bad_address_is_refused_with_the_expectation(url: str, said: str, tmp_path: Path) -> None:
     done = plow_twin_here("live", _csv(tmp_path / "load.csv", 3), "--mqtt-out", url, "--quiet")
     assert done.returncode == 2 and said in " ".join(done.stderr.split()) and "secret" not in done.stderr
 
@@ -398,7 +398,7 @@ class Database(BaseHTTPRequestHandler):
         """Say nothing."""
 
 
-def test_influxdb_gets_lines_and_what_waited_while_it_was_down(tmp_path: Path) -> None:
+def test_influxdb_gets_lines_also_from_the_time_while_it_was_down(tmp_path: Path) -> None:
     path = _csv(tmp_path / "load.csv", 500)
     (tmp_path / "token").write_text("a-token\n")
     (tmp_path / "out.yaml").write_text("influx: {token_file: token}\n")

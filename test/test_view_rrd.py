@@ -162,7 +162,7 @@ def test_the_cross_section_moves_with_the_head(run: Run, view: tuple[ViewSummary
 
 
 @pytest.mark.parametrize("follow", [(), ("--follow", "--wait", "0")])
-def test_what_does_not_fit_on_the_disk_is_said_and_no_half_of_it_stays(
+def test_a_file_without_room_on_the_disk_is_reported_and_no_half_of_it_stays(
     run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str], follow: tuple[str, ...]
 ) -> None:
     out, before = tmp_path / "run.rrd", resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -178,7 +178,7 @@ def test_what_does_not_fit_on_the_disk_is_said_and_no_half_of_it_stays(
         assert capsys.readouterr().err == f"plow-twin: {out}: cannot be written: File too large\n"
 
 
-def test_what_lies_along_the_face_what_was_measured_and_what_if(tmp_path: Path) -> None:
+def test_forces_along_the_face_measured_poses_and_other_scenes_are_drawn(tmp_path: Path) -> None:
     entries: list[Entry] = []
     scene = load_scene(scene_path("paper"))
     twin, offset = Twin(scene, excitation="sampled"), np.array([1e-3, -5e-4, 2e-3])
@@ -257,7 +257,7 @@ def test_a_touch_that_is_over_is_not_drawn_on_in_a_thinned_run(tmp_path: Path) -
     assert list(zip(times, states, strict=True)) == [(0, "free"), (50, "ccw a"), (80, "free"), (1000, "ccw a")]
 
 
-def test_what_is_over_is_not_drawn_on(tmp_path: Path) -> None:
+def test_finished_pieces_are_not_redrawn(tmp_path: Path) -> None:
     """A load that has fallen to zero, one that is held, and the wear of pads that have been replaced."""
     wear = Wear(1e-14, pad_area_m2=0.015, travel_speed_m_s=2.0)
     end = BASE_NS + 1000 * STEP_NS
@@ -302,7 +302,7 @@ def test_a_block_moves_in_its_guide_and_a_wall_pushes_its_corner_inwards() -> No
     np.testing.assert_allclose(vectors, [[0.0, -ARROW_MM_PER_N * 1e5]], atol=1e-9)  # up, which is -y on the screen
 
 
-def test_events_tell_touches_and_how_the_file_ended(
+def test_events_show_touches_and_the_end_of_the_file(
     run: Run, view: tuple[ViewSummary, dict[str, pa.Table]], tmp_path: Path
 ) -> None:
     summary, tables = view
@@ -360,7 +360,7 @@ def test_gaps_are_drawn_as_wide_as_asked_with_their_wear() -> None:
     assert touching.tolist() == [False, False, False, True]
 
 
-def test_what_pads_have_lost_is_written_inside_the_frame_in_rows_apart() -> None:
+def test_wear_depths_are_written_inside_the_frame_in_rows_apart() -> None:
     section = Section.of(load_scene(scene_path("paper")))
     places = section.pads(np.full(8, 1e-3))[2]
     assert (np.abs(places) < [0.3 * section.frame[0], 0.4 * section.frame[1]]).all()
@@ -379,7 +379,7 @@ def test_a_picture_needs_no_viewer(run: Run, tmp_path: Path) -> None:
     assert (tmp_path / "run.png").read_bytes()[:4] == b"\x89PNG" and (tmp_path / "run.png").stat().st_size > 50_000
 
 
-def test_what_is_not_in_a_recording_is_not_in_its_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_picture_shows_only_contents_of_the_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     figures = kept_figures(monkeypatch)
     journal = [Parameter("hold", "hold"), *map(paper_sample, range(100))]
     run = record_run(tmp_path / "run", journal, frame_every=10**9)
