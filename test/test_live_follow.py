@@ -116,10 +116,11 @@ OTHER = SetModel(T0, json.dumps({"clearance.horizontal_m": 0.024}))
 class Live:
     """A session of a twin that follows, its journal and what it publishes."""
 
-    def __init__(self, scene: Scene, how: str = "full") -> None:
+    def __init__(self, scene: Scene, how: str = "full", *, defers: bool = False) -> None:
         self.journal: list[Entry] = []
         self.published: list[Published] = []
         twin = follower(scene, how, MEMBERS, 1e-9)
+        twin.defers = defers
         self.session = Session(twin, on_entry=self.journal.append, rollback_span_s=SPAN_S)
 
     @property
@@ -131,6 +132,8 @@ class Live:
         for entry in entries:
             if isinstance(entry, Sample):
                 self.published.append(self.session.apply_samples([entry], each=True).published)
+                if len(self.published) % 3:
+                    self.session.catch_up()
             else:
                 self.session.apply(entry)
 
@@ -348,6 +351,50 @@ def test_live_and_offline_give_the_same_rows(truth: Truth) -> None:
     assert np.array_equal(live.column("force"), rows.force)
     assert np.array_equal(live.column("force_low"), rows.low) and np.array_equal(live.column("force_high"), rows.high)
     assert np.array_equal(live.column("known_clearance").reshape(-1, 2, 3), rows.clearance)
+
+
+def test_twins_that_catch_up_later_give_the_same_bits(truth: Truth) -> None:
+    """Whatever comes between forces and the other twins: poses, late samples, an estimate, a hold, other numbers."""
+    entries = [
+        *_in_turn(truth, 0.0, 0.6), *_poses(truth, 0.3, 0.35), _known(truth), *_in_turn(truth, 0.6, 0.81),
+        *_late(truth, 0.7), *_in_turn(truth, 0.81, 0.9), PartOfPose(_stamp(0.7), (0, 2), (0.001, 0.0)),
+        *_in_turn(truth, 0.9, 1.0), Hold(_stamp(1.05)), *_samples(truth, 1.1, 1.2), OTHER, *_in_turn(truth, 1.2, 1.4),
+        *_late(truth, 1.25), *_in_turn(truth, 1.4, 1.5),
+    ]  # fmt: skip
+    later, at_once = Live(truth.nominal, defers=True), Live(truth.nominal)
+    for one in (later, at_once):
+        one.take(entries)
+        one.session.catch_up()
+    assert later.twin.digest() == at_once.twin.digest()
+    for name in ROW.names or ():
+        assert np.array_equal(later.column(name), at_once.column(name)), name
+    assert [entry for entry in later.journal if isinstance(entry, Digest)] == [
+        entry for entry in at_once.journal if isinstance(entry, Digest)
+    ]
+    assert _again(later.journal, truth.nominal).twin.digest() == later.twin.digest()
+
+
+def _late(truth: Truth, t: float) -> list[Sample]:
+    """A sample between two of the load."""
+    first, second = _samples(truth, t - 1e-6, t + 0.0101)[:2]
+    return [replace(first, stamp_ns=(first.stamp_ns + second.stamp_ns) // 2)]
+
+
+def test_the_guard_of_a_steered_twin_knows_its_penetrations_with_an_offset_centre_of_mass(truth: Truth) -> None:
+    head = replace(truth.nominal.head, rotation="consistent", com_offset_m=(0.03, -0.02))
+    gravity = replace(truth.nominal.gravity, arm_m=0.0)
+    one = Follower(replace(truth.nominal, head=head, gravity=gravity), MEMBERS)
+    rows = one.held(0.0)
+    ensemble = one._ensemble
+    assert rows["penetration"][0] == pytest.approx(ensemble._penetration(ensemble.pose)[0], abs=1e-12)
+
+
+def test_counts_of_poses_go_on_with_other_numbers_of_the_model(truth: Truth) -> None:
+    live = Live(truth.nominal)
+    live.take(_in_turn(truth, 0.0, 0.5))
+    used = live.twin.poses_used
+    live.take([OTHER])
+    assert live.twin.poses_used == used > 0
 
 
 def test_each_mark_has_a_digest_as_of_a_twin_that_does_not_follow(truth: Truth) -> None:
@@ -590,6 +637,30 @@ def test_a_runtime_reports_its_followers_and_falls_back_to_the_parameters_where_
     drawn = to_rrd(tmp_path / "run", tmp_path / "run.rrd")
     entities = {chunk.entity_path for chunk in RrdReader(str(drawn.path)).stream() if not chunk.is_static}
     assert {f"/{name}" for name in (*layout.FORCE_BOUNDS, *layout.POSE, *layout.MEASURED)} <= entities
+
+
+def test_forces_go_out_before_the_other_twins_are_advanced(
+    truth: Truth, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = tmp_path / "believed.yaml"
+    scene.write_text(dump_scene(truth.nominal), encoding="utf-8")
+    given = parameters.settings({"scene": str(scene), "estimate": True, "follow_members": MEMBERS})
+    runtime = Runtime(Front(), given, Preparation(given).result(lambda: False))
+    advance, done = TwinBatch.advance_samples, list[float]()
+
+    def counted(twins: TwinBatch, t: Array, wrench: Array) -> Any:
+        done.extend(t)
+        return advance(twins, t, wrench)
+
+    runtime.start()
+    runtime.activate()
+    monkeypatch.setattr(TwinBatch, "advance_samples", counted)
+    order = list[tuple[str, int]]()
+    for sample in _samples(truth, 0.0, 0.5):
+        order += [(topic, len(done)) for topic, _ in runtime.step([(sample.stamp_ns, sample.wrench)])]
+    assert runtime.close() == []
+    for topic, before in (("contact_forces", 0), ("contact_peaks", 0), ("head_state", 0), ("force_intervals", 1)):
+        assert [count for name, count in order if name == topic] == list(range(before, 50 + before)), topic
 
 
 def test_nothing_follows_in_bounded_time(truth: Truth) -> None:

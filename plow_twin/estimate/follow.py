@@ -21,9 +21,9 @@ import struct
 import time as _time
 from bisect import bisect_left, insort
 from collections import Counter, deque
-from collections.abc import Container
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -36,13 +36,13 @@ from plow_twin.estimate.result import Estimate, Interval, State
 from plow_twin.estimate.similar import Units
 from plow_twin.estimate.start import noise_level
 from plow_twin.estimate.unknowns import DAMPING, GAIN, Unknowns
-from plow_twin.model.geometry import penetration_rows
+from plow_twin.model.geometry import penetration_rows, states_of
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import DOF_NAMES, Clearance, Gravity, Scene, fastest_travel
 from plow_twin.run.advance import Advance
 from plow_twin.run.batch import TwinBatch
-from plow_twin.run.twin import Advanced
-from plow_twin.solve.state import FOLLOWED, ROW, WITH_INTERVALS, Status
+from plow_twin.run.twin import Advanced, Twin
+from plow_twin.solve.state import FOLLOWED, ROW, WITH_INTERVALS
 from plow_twin.stream.driven import MOST_MEASURED
 from plow_twin.stream.outputs import clearances
 
@@ -75,6 +75,10 @@ _KNOWN_HZ: Final = 10.0
 #: Poses that wait for the model to reach their stamps at most: as many as a session keeps to use again.
 _MOST_DUE: Final = MOST_MEASURED
 _THETA: Final = DOF_NAMES.index("theta")
+#: Derived: places of c, s, X, Y in the solver's state.
+_PLACES: Final = (5, 6, 0, 1)
+_YES: Final = np.ones(1, bool)
+_NO: Final = np.zeros(1, bool)
 _NO_MARKS: Final = np.zeros(0, np.int64)
 _UNMOVED: Final = np.zeros(6)
 #: Nothing is stated of either.
@@ -99,6 +103,20 @@ class Span:
     end: float
     peak: Array
     impulse: Array
+
+
+class _Behind(NamedTuple):
+    """Samples that only the first member has been through: times, loads, its rows.
+
+    Which rows are to have intervals, and end a span of peaks and impulses; whether one begins with the first.
+    """
+
+    t: Array
+    wrench: Array
+    rows: Rows
+    wanted: NDArray[np.bool_]
+    ends: NDArray[np.bool_]
+    begins: bool
 
 
 class Follower:
@@ -143,7 +161,10 @@ class Follower:
         self.taken = 0
         #: whether the intervals of the forces are wanted at each row, beside those published
         self.every_row = False
-        self._ends = _NO_MARKS
+        #: whether a row that is published by itself does not wait for the other members, which `catch_up` advances
+        self.defers = False
+        self._behind: _Behind | None = None
+        self._ends, self._begins = _NO_MARKS, False
         self._span_start = start
         self._wrench = np.zeros(3)
         #: poses that have moved the members, poses that are outliers, and poses that were dropped because too many wait
@@ -181,12 +202,13 @@ class Follower:
     @property
     def signature(self) -> tuple[bool, ...]:
         """Which terms the equations have, as of `Twin`."""
-        return self._ensemble.twins.signature
+        others = self._ensemble.others
+        return self._ensemble.first.signature + (() if others is None else others.signature)
 
     @property
     def time(self) -> float:
         """Model time in s."""
-        return self._ensemble.twins.time
+        return self._ensemble.first.time
 
     @property
     def wrench(self) -> Array:
@@ -196,9 +218,7 @@ class Follower:
     @property
     def wear_depth(self) -> Array:
         """Wear depth of each pad of the median twin [m], shape (8,)."""
-        self._ensemble.settle()
-        worn: Array = self._ensemble.worn[0].copy()
-        return worn
+        return self._ensemble.first.wear_depth
 
     @property
     def steered(self) -> bool:
@@ -213,20 +233,26 @@ class Follower:
     @property
     def lost(self) -> int:
         """Members that have left the model's range."""
+        self.catch_up()
         return int((~self._ensemble.good).sum())
 
     def poses_of_all(self) -> Array:
         """Return the present pose of each member, x, y [m] and theta [rad], shape (m, 3)."""
+        self.catch_up()
         found: Array = self._ensemble.pose.copy()
         return found
 
     def failure(self, status: int) -> str:
         """Say why the newest advance that failed did so."""
-        return Status(status).text
+        return self._ensemble.first.failure(status)
 
     def like(self, scene: Scene) -> Follower:
-        """Return a follower of another machine."""
-        return Follower(scene, self._members, tol=self.tol, seed=self._seed)
+        """Return a follower of another machine, which counts on."""
+        found = Follower(scene, self._members, tol=self.tol, seed=self._seed)
+        found.every_row, found.defers = self.every_row, self.defers
+        found.poses_used, found.poses_outlying = self.poses_used, self.poses_outlying
+        found.poses_dropped = self.poses_dropped
+        return found
 
     def warm_up(self) -> float:
         """Compile what is needed, or load it from the cache on disk; return the seconds it took."""
@@ -253,16 +279,24 @@ class Follower:
         begins : bool
             Whether a span begins with the first row.
         """
-        self._ends = ends
-        if begins:
-            self._ensemble.begin_span()
+        self.catch_up()
+        self._ends, self._begins = ends, begins
 
     def advance_rows(
         self, t: Array, wrench: Array, rows: Rows | None, marks: NDArray[np.int64] = _NO_MARKS
     ) -> Advanced:
-        """Advance to some times, as `Twin.advance_rows`; a row knows what was measured before it."""
+        """Advance to some times, as `Twin.advance_rows`; a row knows what was measured before it.
+
+        With `defers`, the other members are left to `catch_up` after a row that is published by itself.
+        """
+        self.catch_up()
         if wrench.shape != (len(t), 3) or not np.isfinite(wrench).all():
             raise ArgumentError(f"wrench: got {wrench!r}, expected finite numbers of shape ({len(t)}, 3)")
+        if self.defers and self._begins and len(t) == len(self._ends) == 1 and not len(marks) and rows is not None:
+            failed = self._advance_first(t, wrench, rows, _YES if self.steered else _NO, _YES)
+            if failed:
+                self.catch_up()
+            return Advanced(failed, [])
         ends = np.zeros(len(t), bool)
         ends[self._ends] = True
         self._ends = _NO_MARKS
@@ -276,17 +310,38 @@ class Follower:
             end = self._stop(t, begin, stops)
             here = slice(begin, end)
             told = rows[here] if rows is not None else np.zeros(end - begin, ROW)
-            self._ensemble.advance(t[here], wrench[here], told, wanted[here], ends[here])
-            failed += int((told["status"] != 0).sum())
-            self._say_clearance(told, float(t[end - 1]))
-            self._wrench = wrench[end - 1].copy()
-            while self._due and self._due[0][0] <= t[end - 1]:
-                when, _, what = self._due.pop(0)
-                self._take_in(when, what)
+            failed += self._advance_first(t[here], wrench[here], told, wanted[here], ends[here])
+            self.catch_up()
             if end in stops:
                 digests += [self.digest()] * stops[end]
             begin = end
         return Advanced(failed, digests)
+
+    def _advance_first(
+        self, t: Array, wrench: Array, rows: Rows, wanted: NDArray[np.bool_], ends: NDArray[np.bool_]
+    ) -> int:
+        """Advance the median twin, and leave the others to `catch_up`; return how many advances failed."""
+        failed = self._ensemble.advance_first(t, wrench, rows)
+        known = self._clearance.ravel()
+        rows["known_clearance"] = known if self.scene.wear is None else known + self._moved(rows["wear_depth"])
+        self._wrench = wrench[-1].copy()
+        self._behind = _Behind(t, wrench, rows, wanted, ends, self._begins)
+        self._begins = False
+        return failed
+
+    def catch_up(self) -> None:
+        """Bring all members to where the first is: its rows get their intervals, and what was measured acts."""
+        behind, self._behind = self._behind, None
+        if behind is None:
+            return
+        if behind.begins:
+            self._ensemble.begin_span()
+        self._ensemble.advance_others(*behind[:-1])
+        if math.floor(self.time * _KNOWN_HZ) != self._cell:
+            self._tell_clearance()
+        while self._due and self._due[0][0] <= self.time:
+            when, _, what = self._due.pop(0)
+            self._take_in(when, what)
 
     def _stop(self, t: Array, begin: int, marks: Container[int]) -> int:
         """Return up to where to go at once: nothing happens on the way."""
@@ -296,13 +351,6 @@ class Follower:
             if place + 1 in marks or t[place] >= due or math.floor(t[place] * _KNOWN_HZ) != self._cell:
                 return place + 1
         return end
-
-    def _say_clearance(self, rows: Rows, now: float) -> None:
-        """Write what is known of the clearances, with the wear of the median twin."""
-        rows["known_clearance"] = self._clearance.ravel() + self._moved(rows["wear_depth"])
-        if math.floor(now * _KNOWN_HZ) != self._cell:
-            self._tell_clearance()
-            rows["known_clearance"][-1] = self._clearance.ravel() + self._moved(rows["wear_depth"][-1])
 
     def _moved(self, worn: Array) -> Array:
         """Return by how much pads that are worn by `worn` (..., 8) widen the clearances and their points, (..., 6)."""
@@ -329,6 +377,7 @@ class Follower:
         pose: tuple[ArrayLike, ArrayLike] | None = None,
     ) -> None:
         """Begin anew at model time `t`, as `Twin.reset`: what was measured of the motion before holds no longer."""
+        self.catch_up()
         self.drawn += 1
         worn = self._unworn() if wear_depth is None else np.array(wear_depth, dtype=np.float64)
         self._draw("", t, worn)
@@ -341,16 +390,19 @@ class Follower:
 
     def set_travel_speed(self, speed_m_s: float) -> None:
         """Set the speed along the face from here on, as `Twin.set_travel_speed`."""
+        self.catch_up()
         self._speed = abs(float(speed_m_s))
         self._ensemble.set_travel_speed(self._speed)
 
     def digest(self) -> str:
         """Return 16 hexadecimal digits that stand for the exact state."""
-        state = self._ensemble.twins.snapshot() + self._wrench.tobytes() + self._ensemble.square.tobytes()
-        return hashlib.blake2b(state, digest_size=8).hexdigest()
+        self.catch_up()
+        state = [*self._ensemble.twins(), self._wrench.tobytes(), self._ensemble.square.tobytes()]
+        return hashlib.blake2b(b"".join(state), digest_size=8).hexdigest()
 
     def snapshot(self) -> bytes:
         """Return the exact state as bytes, to be restored by a follower of the same scene, members and seed."""
+        self.catch_up()
         blobs, random = self._ensemble.state()
         noise = np.array(self._noise_rows).reshape(-1, 3)
         blobs += [noise.tobytes(), self._clearance.tobytes(), self._wrench.tobytes()]
@@ -370,6 +422,7 @@ class Follower:
 
     def restore(self, data: bytes) -> None:
         """Take over a state saved by `snapshot`."""
+        self._behind = None
         facts, begin = _facts(data)
         blobs = []
         for size in facts["sizes"]:
@@ -408,6 +461,7 @@ class Follower:
     def _take(self, t: float, what: list[float] | str) -> None:
         self.taken += 1
         if t <= self.time:
+            self.catch_up()
             self._take_in(t, what)
         elif isinstance(what, str) or len(self._due) < _MOST_DUE:
             insort(self._due, (t, self.taken, what), key=lambda due: due[:2])
@@ -435,6 +489,7 @@ class Follower:
 
     def follow_parameters(self) -> None:
         """Go on with one twin that no pose moves, from where the median twin stands."""
+        self.catch_up()
         self._members = 1
         self._begin_anew(self._text)
 
@@ -475,12 +530,14 @@ class Follower:
 
     def clearance(self) -> Array:
         """Return horizontal and vertical clearance, each with its 5 % and 95 % points, shape (2, 3), in m."""
+        self.catch_up()
         self._tell_clearance()
         found: Array = self._clearance + self._moved(self.wear_depth).reshape(2, 3)
         return found
 
     def span(self) -> Span:
         """Return peaks and impulses since the call before, where no publication has ended a span."""
+        self.catch_up()
         start, self._span_start = self._span_start, self.time
         found = Span(start, self.time, *self._ensemble.span())
         self._ensemble.begin_span()
@@ -488,6 +545,7 @@ class Follower:
 
     def held(self, t: float) -> Rows:
         """Return the row, shape (1,), of a time after the newest sample, which is held; nothing changes."""
+        self.catch_up()
         rows = np.zeros(1, ROW)
         self._ensemble.held(t, rows)
         rows["known_clearance"] = self._clearance.ravel() + self._moved(rows["wear_depth"])
@@ -542,8 +600,10 @@ class Ensemble:
             states = (known.horizontal_state, known.vertical_state)
             self.moved_before = np.where([[state.known] for state in states], _moved(scene, worn)[:, None], 0.0)
             scenes = [_worn(one, scene, worn, self.moved_before[:, 0]) for one in scenes]
-        self.twins = TwinBatch(scenes, tol=tol, start=start)
-        self._gain, self._rng = gain, rng
+        #: the first member, by itself: its forces need not wait for the others
+        self.first = Twin(scenes[0], tol=tol, excitation="sampled", start=start)
+        self.others = TwinBatch(scenes[1:], tol=tol, start=start) if members > 1 else None
+        self._scene, self._gain, self._rng = scene, gain, rng
         self._walls = np.stack([penetration_rows(one) for one in scenes])
         self._clearance = np.array([[one.clearance.horizontal_m, one.clearance.vertical_m] for one in scenes])
         self._fastest = np.array([fastest_travel(one.wear, one.contact) for one in scenes])
@@ -577,31 +637,42 @@ class Ensemble:
 
     def set_travel_speed(self, speed_m_s: float) -> None:
         """Set the speed along the face, of each member as far as its damping allows."""
-        self.twins.set_travel_speed(np.minimum(speed_m_s, self._fastest))
+        speeds = np.minimum(speed_m_s, self._fastest)
+        self.first.set_travel_speed(float(speeds[0]))
+        if self.others is not None:
+            self.others.set_travel_speed(speeds[1:])
 
-    def advance(self, t: Array, wrench: Array, rows: Rows, wanted: NDArray[np.bool_], ends: NDArray[np.bool_]) -> None:
-        """Advance all members; write the rows of the first, shape (n,).
-
-        Intervals stand in those `wanted`; a span of peaks and impulses ends with each of `ends`.
-        """
-        batch = self.twins.advance_samples(t, wrench * self._gain[:, None, :])
-        rows[:] = batch.rows[0]
+    def advance_first(self, t: Array, wrench: Array, rows: Rows) -> int:
+        """Advance the first member and write its rows, shape (n,); return how many advances failed."""
+        failed, _ = self.first.advance_rows(t, wrench * self._gain[0], rows)
         rows["followed"] = FOLLOWED
-        failed = batch.status.any()
+        return failed
+
+    def advance_others(
+        self, t: Array, wrench: Array, rows: Rows, wanted: NDArray[np.bool_], ends: NDArray[np.bool_]
+    ) -> None:
+        """Advance the other members to where the first is, whose rows are given; write intervals into those `wanted`.
+
+        A span of peaks and impulses ends with each of `ends`.
+        """
+        parts = [_bytes(rows[None])]
+        if self.others is not None:
+            parts.append(_bytes(self.others.advance_samples(t, wrench * self._gain[1:, None, :]).rows))
+        whole = np.concatenate(parts).view(ROW)
+        good = whole["status"] == 0
         if len(self.good) == 1:
             self.good[:] = True
         for place, (now, is_wanted, is_end) in enumerate(zip(t.tolist(), wanted.tolist(), ends.tolist(), strict=True)):
-            if failed:
-                self.good &= batch.status[:, place] == 0
-            np.maximum(self._peak, batch.peak[:, place], out=self._peak)
-            self._impulse += batch.impulse[:, place]
+            self.good &= good[:, place]
+            np.maximum(self._peak, whole["peak"][:, place], out=self._peak)
+            self._impulse += whole["impulse"][:, place]
             if is_wanted:
-                self._told[:, 0] = batch.force[:, place]
+                self._told[:, 0] = whole["force"][:, place]
                 self._tell(rows[place : place + 1])
             if is_end:
                 self.begin_span()
-            self._remember(now, batch.q[:, place].copy())
-        self._newest = batch.rows[:, -1]
+            self._remember(now, whole["q"][:, place].copy())
+        self._newest = whole[:, -1]
 
     def settle(self) -> None:
         """Take rates, wear and penetration out of the newest rows: few samples are asked for them."""
@@ -622,15 +693,17 @@ class Ensemble:
         _, low, high = self._points(self._told)
         for index, name in enumerate(("force", "peak", "impulse")):
             row[f"{name}_low"], row[f"{name}_high"] = low[index], high[index]
-        row["followed"] = WITH_INTERVALS
+        if np.isfinite(low.sum() + high.sum()):
+            row["followed"] = WITH_INTERVALS
 
     def held(self, t: float, row: Rows) -> None:
         """Write the row of a later time with the newest sample held; nothing changes."""
-        before = self.twins.snapshot()
-        batch = self.twins.advance(t)
-        self.twins.restore(before)
-        row[:] = batch.rows[0]
-        self._told[:, 0] = batch.force[:, 0]
+        before = self.twins()
+        row[:] = self.first.advance(t).rows
+        self._told[0, 0] = row["force"][0]
+        if self.others is not None:
+            self._told[1:, 0] = self.others.advance(t).force[:, 0]
+        self.set_twins(before)
         self._tell(row)
 
     def begin_span(self) -> None:
@@ -685,7 +758,9 @@ class Ensemble:
         if before._steers_first and not self._steers_first and before.good[0]:
             from_[1:2] = 0
         share = self._shares(before._room()[from_])
-        self.twins.set_wrench(wrench * self._gain)
+        self.first.advance(self.first.time, wrench * self._gain[0])
+        if self.others is not None:
+            self.others.set_wrench(wrench * self._gain[1:])
         self._path = deque((t, q[from_] * share) for t, q in before._path)
         self._told[1:], self._told[0] = before._told[from_[1:]], before._told[0]
         self._stand(self._path[-1][1], before._v[from_], before._force(before._depth)[from_])
@@ -789,35 +864,54 @@ class Ensemble:
         return np.asarray((self._force(self._penetration(q)) < force + self._pressed).all(axis=1))
 
     def _put(self, which: NDArray[np.int64], q: Array, v: Array) -> None:
-        self.twins.move(which, q, v)
+        for place in np.flatnonzero(which == 0):
+            self.first.move(q[place], v[place])
+        rest = which > 0
+        if self.others is not None and rest.any():
+            self.others.move(which[rest] - 1, q[rest], v[rest])
         self._path[-1][1][which], self._v[which] = q, v
         self._depth = self._penetration(self._path[-1][1])
 
     def _penetration(self, q: Array) -> Array:
         """Return the penetration of each pair in m, (m, 8), with each member's clearances at poses of shape (m, 3)."""
-        x, y, theta = q.T
-        c, s = np.cos(theta), np.sin(theta)
-        body = np.stack([c, s, c * x + s * y, -s * x + c * y, np.ones(len(q))], axis=1)
+        state = states_of(self._scene, np.concatenate([q, np.zeros_like(q)], axis=1))
+        body = np.concatenate([state[:, _PLACES], np.ones((len(q), 1))], axis=1)
         found: Array = np.einsum("mi,mij->mj", body, self._walls) - self.worn
         return found
+
+    def twins(self) -> list[bytes]:
+        """Return the exact states of the twins: of the first, and of the others."""
+        return [self.first.snapshot(), b"" if self.others is None else self.others.snapshot()]
+
+    def set_twins(self, states: Sequence[bytes]) -> None:
+        """Go on from what `twins` returned."""
+        self.first.restore(states[0])
+        if self.others is not None:
+            self.others.restore(states[1])
 
     def state(self) -> tuple[list[bytes], Any]:
         """Return all that changes, as bytes and as JSON."""
         self.settle()
         times, path = np.array([time for time, _ in self._path]), np.stack([q for _, q in self._path])
         arrays = (self.good, self.square, self._peak, self._impulse, self._v, self.worn, self._depth, times, path)
-        return [self.twins.snapshot(), *(one.tobytes() for one in arrays)], self._rng.bit_generator.state
+        return [*self.twins(), *(one.tobytes() for one in arrays)], self._rng.bit_generator.state
 
     def set_state(self, blobs: list[bytes], random: Any) -> None:
         """Go on from what `state` returned."""
-        self.twins.restore(blobs[0])
-        self.good = np.frombuffer(blobs[1], np.bool_).copy()
+        self.set_twins(blobs[:2])
+        self.good = np.frombuffer(blobs[2], np.bool_).copy()
         count = len(self.good)
-        self.square, *wide, times, path = (np.frombuffer(blob).copy() for blob in blobs[2:])
+        self.square, *wide, times, path = (np.frombuffer(blob).copy() for blob in blobs[3:])
         self._peak[:], self._impulse[:], self._v, self.worn, self._depth = (one.reshape(count, -1) for one in wide)
         self._newest = None
         self._path = deque(zip(times.tolist(), path.reshape(-1, count, 3), strict=True))
         self._rng.bit_generator.state = random
+
+
+def _bytes(rows: Rows) -> NDArray[np.uint8]:
+    """Return rows (m, n) as bytes: numpy copies a record field by field."""
+    found: NDArray[np.uint8] = np.ascontiguousarray(rows).view(np.uint8)
+    return found
 
 
 def _off(q: Array, then: Array, there: NDArray[np.int64]) -> Array:

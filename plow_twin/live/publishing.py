@@ -114,6 +114,8 @@ class Publishing:
         #: stamp of the sample of a series whose alarms are being said [ns]
         self.series_ns: int | None = None
         self._newest: Rows | None = None
+        #: brings a publication's intervals once its forces have gone out, where they come later
+        self.catch_up: Callable[[], object] | None = None
         #: takes each publication beside the front, where somebody watches
         self.watch: Callable[[Published], object] | None = None
 
@@ -135,6 +137,8 @@ class Publishing:
     def messages(self, published: Published) -> Iterator[Outgoing]:
         """Yield the messages of a publication of at most one row, forces first; no message when a number is not finite.
 
+        The intervals come last: they are of many twins, which `catch_up` advances meanwhile.
+
         Between them latency and age are counted, alarms are looked at, and the recording gets its share.
         """
         rows, _ = published
@@ -149,6 +153,11 @@ class Publishing:
         if self.received_ns:
             self.latency.add((time.monotonic_ns() - self.received_ns) * 1e-9)
         yield from sent[1:]
+        if self.catch_up is not None and self._messages is not None:
+            self.catch_up()
+            intervals = self._messages.intervals(published)
+            yield from intervals
+            sent += intervals
         self._newest, (stamp_ns, marked, held, *_) = rows, summary(rows, 0)
         self.published += 1
         if marked:

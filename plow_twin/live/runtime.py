@@ -138,6 +138,9 @@ class Runtime:
             limits=limits(settings, self.scene),
         )
         every_sample = settings.publish_mode == "on_sample"
+        if session.following is not None:
+            session.following.defers = front.sends_motion
+            self.publishing.catch_up = session.catch_up
         self.driver = Driver(session, self.inputs.intake, policy(settings), every_sample=every_sample)
         self._set_limits(settings)
 

@@ -41,22 +41,24 @@ class Messages:
     def write(self, published: Published) -> tuple[tuple[str, memoryview], ...]:
         """Return topic and bytes of the messages of a publication of one row, in the order in which they are sent.
 
-        The bytes stay until the next call. Without a message where a number is not finite.
+        Those with intervals are no part of it: `intervals`. The bytes stay until the next call. Without a message where
+        a number is not finite.
         """
         rows, slow = published
         if not self._each.fill(rows) or (len(slow) and not self._slow.fill(slow)):
             return ()
         found = self._each.parts
-        if self._followed is not None and published.with_intervals:
-            if not self._followed.fill(rows):
-                return ()
-            found += self._followed.parts
         if len(slow):
             found += self._slow.parts
         if rows["marked"][0]:
             self._marked.fill(rows)
             found += self._marked.parts
         return found
+
+    def intervals(self, published: Published) -> tuple[tuple[str, memoryview], ...]:
+        """Return topic and bytes of the messages with intervals, if it has some, as `write`."""
+        wanted = self._followed is not None and published.with_intervals and self._followed.fill(published.rows)
+        return self._followed.parts if self._followed is not None and wanted else ()
 
 
 class _Group(NamedTuple):

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from plow_twin.errors import ArgumentError, LimitError, RunInterrupted
 from plow_twin.kernel.compiler import for_arguments
+from plow_twin.model import geometry
 from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
 from plow_twin.model.scene import Initial, Scene, check_travel_speed
 from plow_twin.run.advance import Advance, AdvanceSeries, check_times
@@ -22,7 +23,7 @@ from plow_twin.solve import loop
 from plow_twin.solve.compiled_scene import CompiledScene, compile_scene, inertias, wear_rate
 from plow_twin.solve.method.rest import AT_REST
 from plow_twin.solve.method.step_size import PARTING_ORDER
-from plow_twin.solve.modes import LARGEST_ANGLE
+from plow_twin.solve.modes import LARGEST_ANGLE, settle_moved
 from plow_twin.solve.samples import lay_out
 from plow_twin.solve.state import (
     BOUND,
@@ -47,6 +48,7 @@ DEFAULT_BUDGET = 50_000_000
 #: The compiled kernels, by a key that determines the types of their arguments; numba's dispatch takes milliseconds.
 _entries: dict[tuple[Any, ...], Callable[..., bool]] = {}
 _NO_MARKS = np.zeros(0, np.int64)
+_THE_ONE = np.zeros(1, np.int64)
 #: Fewest evaluations that an advance can be bounded to: four Runge-Kutta steps.
 LEAST_EVALUATIONS = 16
 
@@ -316,6 +318,17 @@ class Twin:
             begin = replace(begin, scene=replace(self.scene, initial=initial))
         self._states[0] = begin.initial_state(t, depth)
         self._wrench = np.zeros(3)
+
+    def move(self, q: ArrayLike, v: ArrayLike) -> None:
+        """Put a head under sampled loads elsewhere at the present time; its wear and counts stay.
+
+        Parameters
+        ----------
+        q, v : array_like, shape (3,)
+            Pose x, y [m], theta [rad] and its rates. A lasting contact keeps the damping of its touch.
+        """
+        place = geometry.states_of(self.scene, np.concatenate([q, v])[None])
+        settle_moved(self._params, self._states, _THE_ONE, place, self.time, self._parts.terms.stick)
 
     def set_travel_speed(self, speed_m_s: float) -> None:
         """Set the speed along the face from here on; only wear depends on it.

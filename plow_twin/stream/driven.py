@@ -57,6 +57,11 @@ class Following(Driven, Protocol):
 
     #: poses and estimates that it has taken in
     taken: int
+    #: whether a row that is published by itself gets its intervals, and what was measured acts, with `catch_up` only
+    defers: bool
+
+    def catch_up(self) -> None:
+        """Do what the newest row left over, if it is not done; every other call does it first."""
 
     def take_pose(self, t: float, q: ArrayLike, known: float = ...) -> None:
         """Add a pose measured at model time `t` in s, shape (3,), NaN where not measured; it acts from `known` on."""

@@ -206,6 +206,13 @@ class Session:
         #: the twin, where it follows measurements
         self.following = twin if isinstance(twin, Following) else None
 
+    def catch_up(self) -> None:
+        """Let a following twin do what its newest row left over, and keep the state that a late sample may need."""
+        if self.following is not None:
+            self.following.catch_up()
+            if self.history.is_due and self.stamp_ns is not None and not self.held:
+                self._remember(kept=False)
+
     def start(self) -> None:
         """Emit the snapshot that opens a journal."""
         self._on_entry(self.snapshot())
