@@ -945,7 +945,7 @@ def _mistaken(name: str) -> str:
         ("days", 2, "they look like days of a spreadsheet: write seconds, or dates"),
         ("km/h", 2, "speed: got 7.2, expected at most 5 m/s, as ploughs reach; they look like km/h"),
         ("bars", 1, "expected the columns fx, fy, m with commas, semicolons or tabs between them"),
-        ("summer time", 0, "the stamps jumped back (1), and the motion began anew: is it local time"),
+        ("summer time", 0, "the stamps jumped back (1), and the motion was reset: is it local time"),
     ],
 )
 def test_a_natural_mistake_in_a_file_is_named(

@@ -516,7 +516,7 @@ def test_a_full_disk_beside_a_run_is_reported_at_once_and_when_there_is_room_aga
         writer.add(number, index, index, index, bytes(12))
         writer.flush()
     assert [text.removeprefix(f"{writer.path}: ") for text in said] == [
-        "full: what comes is lost until there is room",
+        "full: messages are lost until there is room",
         "goes on, 2 messages are lost",
     ]
     writer.close()

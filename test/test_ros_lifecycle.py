@@ -290,7 +290,7 @@ def test_the_model_changes_a_motion_comes_back_and_the_journal_gives_it_all_agai
         # the first sample is that of the snapshot's time
         assert feed(101)[1:] == first
         answer = _set(running, "damping", 0.0)
-        assert not answer.successful and "configure anew" in answer.reason
+        assert not answer.successful and "configure the node again" in answer.reason
         assert not _set(running, "wear_coefficient", 1e-14).successful
         assert _set(running, "clearance_horizontal", 0.04).successful
         assert _set(running, "mark", "wider").successful and ask("mark").success

@@ -138,7 +138,7 @@ def test_the_same_model_again_is_no_change() -> None:
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"contact.damping": 0.0}, "configure anew"),
+        ({"contact.damping": 0.0}, "configure the node again"),
         ({"contact.restitution": 0.4}, "the scene has no restitution"),
         ({"wear.coefficient_m2_n": 1e-14}, "the scene has no wear"),
         ({"contact.stiffness": 0.0}, "expected a finite number"),

@@ -29,7 +29,7 @@ from plow_twin.cli.console import (
 
 
 @click.command(
-    short_help="Compare recordings with what the model predicts.",
+    short_help="Compare recordings with the model's predictions.",
     epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 done with counted loss.",
 )
 @click.argument("recordings", metavar="RUN...", type=click.Path(path_type=Path), nargs=-1, required=True)
@@ -229,7 +229,7 @@ def _show(results: list[dict[str, Any]], many: bool, as_json: bool, quiet: bool,
     for facts in good:
         if not facts["signals"]:
             console.print(
-                f"{facts['run']}: nothing measured that the model could be held against",
+                f"{facts['run']}: no measured values to compare with the model",
                 highlight=False,
                 soft_wrap=True,
             )

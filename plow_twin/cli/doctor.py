@@ -12,8 +12,8 @@ from plow_twin.cli.console import DONE, DONE_WITH_LOSS, json_option, output_cons
 
 
 @click.command(
-    short_help="Say what a recording holds and lacks; repair it.",
-    epilog="Exit codes: 0 nothing is missing, 1 failed or no recording, 2 wrong usage, 3 something is missing.",
+    short_help="Report content and losses of a recording; repair it.",
+    epilog="Exit codes: 0 complete, 1 failed or no recording, 2 wrong usage, 3 incomplete.",
 )
 @click.argument("recording", type=click.Path(path_type=Path, exists=True))
 @click.option("--repair", is_flag=True, help="Rewrite parts that were cut off or damaged; the old ones are kept.")

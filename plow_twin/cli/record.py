@@ -27,7 +27,7 @@ from plow_twin.cli.console import (
 )
 @click.argument("run", type=click.Path(path_type=Path, file_okay=False))
 @click.argument("topics", metavar="[TOPIC]...", nargs=-1)
-@click.option("--all", "every", is_flag=True, help="All topics but hidden ones and those that the run holds itself.")
+@click.option("--all", "every", is_flag=True, help="All topics except hidden ones and the run's own.")
 @click.option("--exclude", metavar="REGEX", help="With --all: leave these out.")
 @click.option(
     "--wait", type=click.FloatRange(0.0), default=10.0, show_default=True, help="How long to look for a run [s]."

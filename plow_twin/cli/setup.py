@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @click.command(
     short_help="Guess the columns of a CSV file; write a mapping and a stub of a scene.",
-    epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, or a column that cannot be told.",
+    epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, or a column that cannot be assigned.",
 )
 @click.argument("file", type=click.Path(path_type=Path, exists=True, dir_okay=False))
 @click.option("--scene", help="Scene file or preset of the machine; without it a stub is written.")

@@ -46,7 +46,9 @@ MOST_ROWS: Final = 10_000_000
     help="Balance energy and momentum; takes some four times as long.",
 )
 @click.option(
-    "--trust", is_flag=True, help="Say how errors grow and what the tolerance is worth; takes some ten times as long."
+    "--trust",
+    is_flag=True,
+    help="Report the growth of errors and the worth of the tolerance; takes some ten times as long.",
 )
 @click.option("--max-steps", type=click.IntRange(min=1), default=10**8, show_default=True, help="Steps at most.")
 @click.option(

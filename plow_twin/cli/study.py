@@ -18,7 +18,7 @@ CLONE: Final = Path(__file__).resolve().parents[2] / "studies" / "paper"
 
 
 @click.group(
-    short_help="Sweeps, calibration and the paper: what takes many runs.",
+    short_help="Studies of many runs: sweeps, calibration, the paper.",
     epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 done with counted loss.",
 )
 def study() -> None:

@@ -45,7 +45,9 @@ _COLUMN, _FIRST_COLUMN = 12, 8
 @click.option("--workers", type=click.IntRange(1), help="Threads; all cores by default.")
 @click.option("--dask", metavar="ADDRESS", help="Scheduler of a Dask cluster to run on, e.g. tcp://host:8786.")
 @click.option("--chunk", type=click.IntRange(1), help="Members stored together; 16, or two for each core if more.")
-@click.option("--resume/--fresh", default=True, show_default=True, help="Keep what the folder holds, or discard it.")
+@click.option(
+    "--resume/--fresh", default=True, show_default=True, help="Keep the results in the folder, or discard them."
+)
 @quiet_option
 def sweep(
     scene: str,

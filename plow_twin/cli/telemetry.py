@@ -20,7 +20,7 @@ def telemetry_options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option(
             "--out-access",
             type=click.Path(path_type=Path, exists=True, dir_okay=False),
-            help="YAML file with users, certificates and files of secrets for what is sent out.",
+            help="YAML file with users, certificates and files of secrets of the outputs.",
         ),
         click.option(
             "--out-rate",

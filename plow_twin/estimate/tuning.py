@@ -88,7 +88,7 @@ OUTLYING: Annotated[
     float,
     Tuned(
         "deviations",
-        "what noise does not reach: kinks of a flight, impacts away from a wall, gaps, poses, steps to "
+        "limit that noise does not reach: kinks of a flight, impacts away from a wall, gaps, poses, steps to "
         "another law; its square for chi^2 of the turns of walls and for the gain left to a fit",
         "one in 1.7 million normal values; chi^2 of the turns was 9 at most for right models (seeds 42000 to 42004)",
     ),
@@ -125,7 +125,7 @@ LAW_DAMPING: Annotated[
         "damping of the other law: in a fit; of drawn hard contacts, median and deviation of the logarithm",
     ),
 ] = (0.05, 0.2, 0.6)
-MOST_DISTANCE: Annotated[float, Tuned("1", "distance of a hard motion from the drawn ones, in theirs")] = 4.0
+MOST_DISTANCE: Annotated[float, Tuned("1", "distance of a hard motion from the drawn ones, over theirs")] = 4.0
 MOST_PATH: Annotated[float, Tuned("deviations", "distance of its path over the load's period")] = 4.5
 MOST_ODDS: Annotated[
     tuple[float, ...],
@@ -199,7 +199,7 @@ CERTAINLY_HARD: Annotated[
         "m", "penetration below which a fit also starts from the range of motion, and a comparison has the last word"
     ),
 ] = 3e-4
-RESOLVED: Annotated[float, Tuned("m", "penetration that a pose cannot tell from zero")] = 1e-4
+RESOLVED: Annotated[float, Tuned("m", "penetration that a pose cannot distinguish from zero")] = 1e-4
 SLOWEST_IMPACT: Annotated[
     float,
     Tuned(
@@ -241,7 +241,7 @@ KNOTS: Annotated[
 LEFT_OPEN: Annotated[
     float,
     Tuned(
-        "1", "weight of what a broad-band load does between its samples: contacts turn it from pose to rate and back"
+        "1", "weight of a broad-band load's effect between its samples, which contacts turn from pose to rate and back"
     ),
 ] = 4.0
 

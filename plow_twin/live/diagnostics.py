@@ -19,7 +19,7 @@ OK, WARN, ERROR = 0, 1, 2
 KEYS: Final[dict[str, dict[str, str]]] = {
     "state": {
         "lifecycle": "unconfigured, inactive, active or finalized",
-        "stream": "what the stream is doing",
+        "stream": "state of the stream",
         "reason": "reason of a failed configure or of the last failed advance; empty: no failure",
         "scene": "scene in use",
         "compile_s": "time that compiling or loading the solver took [s]",
@@ -110,7 +110,7 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "poses_used": "measured poses that have moved the twins",
         "poses_outlying": "measured poses left out because they lie too far from their predictions",
         "poses_dropped": "measured poses dropped because they are more than an hour ahead of the load or too many wait",
-        "taken_over": "times that the twins were drawn anew: by an estimate, its withdrawal or a change of the machine",
+        "taken_over": "times that the twins were redrawn: by an estimate, its withdrawal or a change of the machine",
         "reduced": "1 where the parameters alone follow because all twins did not keep up",
     },
     "recorder": {

@@ -213,7 +213,7 @@ class BridgeFront:
         jumps = counts[Verdict.JUMP_BACK]
         if jumps and self._bridge.ends:
             found.append(
-                f"the stamps jumped back ({jumps}), and the motion began anew: is it local time, where summer time "
+                f"the stamps jumped back ({jumps}), and the motion was reset: is it local time, where summer time "
                 "ends? Expected UTC, or stamps with their offset"
             )
         return found

@@ -265,7 +265,7 @@ class Runtime:
         if folder is None:
             return True, "noted in the recording"
         self._renew_recording()
-        return True, f"what is kept in memory goes to {folder}"
+        return True, f"the ring in memory goes to {folder}"
 
     def record_status(self, status: DiagnosticStatus) -> None:
         """Put a published status into the recording."""

@@ -44,7 +44,7 @@ class Services:
         """Put the motion back to its initial state; return whether that was done, and a text for who asked."""
         self._runtime.driver.reset(self._runtime.stamp_ns, "service")
         self._changed()
-        return True, "initial motion restored, the wear stays; the next sample starts model time anew"
+        return True, "initial motion restored, the wear stays; the next sample is model time 0"
 
     def snapshot(self) -> tuple[bool, str]:
         """Journal the exact state and keep it for `restore`."""

@@ -67,7 +67,7 @@ class Preparation:
         """
         while not wait((self._future,), _LOOK_S).done:
             if stop_asked():
-                raise StartAbandoned("a stop was asked for while the solver was compiled")
+                raise StartAbandoned("a stop was requested while the solver was compiled")
         return self._future.result()
 
 

@@ -82,7 +82,7 @@ class BagWriter:
             self.lost.update(waiting)
             self.error = f"{self.path}: {error.strerror or error}"
             if not self._in_trouble:
-                self._on_trouble(f"{self.error}: what comes is lost until there is room")
+                self._on_trouble(f"{self.error}: messages are lost until there is room")
             self._in_trouble = True
         else:
             if waiting and self._in_trouble:

@@ -202,7 +202,7 @@ def _name_problems(report: RunReport, reader: RunReader) -> None:
     if unnamed > 0:
         report.problems.append(f"{unnamed} part(s) are missing by their numbers")
     if report.repeated:
-        report.problems.append(f"{report.repeated} journal entries stand there more than once: the first ones are used")
+        report.problems.append(f"{report.repeated} journal entries occur more than once: the first are used")
     if report.gaps:
         report.problems.append(f"{report.gaps} journal entries are missing")
     for topic, count in report.lost.items():

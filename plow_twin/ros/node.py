@@ -253,7 +253,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
         runtime = self.runtime
         if runtime is not None and runtime.without_clock and self._reports % _SAY_AGAIN == 0:
             self.get_logger().warning(
-                "use_sim_time is set and nothing has come on /clock: waiting, nothing is recorded"
+                "use_sim_time is set and no message has come on /clock: waiting, without recording"
             )
         self._reports += 1
         with self._turn():

@@ -59,7 +59,7 @@ def changed_twin(twin: Driven, scene: Scene, changes: Mapping[str, float]) -> Dr
     if found.signature != twin.signature:
         raise ArgumentError(
             f"{', '.join(changes)}: got {', '.join(map(repr, changes.values()))}, which adds a term to the equations "
-            "or takes one away, expected a change of numbers: configure anew"
+            "or takes one away, expected a change of numbers: configure the node again"
         )
     return found
 
