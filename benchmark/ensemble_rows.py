@@ -21,7 +21,7 @@ SECTION = "ensemble"
 BATCH = f"{HEYOKA}, batch"
 COLUMNS, ROWS = 40, 25
 PAIRS = f"kv, {COLUMNS * ROWS} clearance pairs"
-#: From loose to tight; the first at which every pair is within `LISTED` is the one that is timed with care.
+#: From loose to tight; the first at which every pair is within `LISTED` is timed with care.
 TOLERANCES = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5, 3e-6, 1e-6)
 _BATCH_TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
 EXACT = 1e-12
@@ -42,7 +42,7 @@ def clearance_pairs(columns: int, rows: int) -> list[Scene]:
 
 
 def ensemble_rows(columns: int, rows: int, lean_steps: Sequence[float], repeats: int, notify: Notify) -> Iterator[Row]:
-    """Yield one run at each tolerance down to the one that all pairs need, that one timed, peers, and a list.
+    """Yield one run at each tolerance down to the one that all pairs need, which is timed, peers, and a list.
 
     Peers with `lean_steps` only.
     """

@@ -116,7 +116,7 @@ GROUPS = {
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What is true, and what the estimate gets; `clearance` is that at the end of the window, shape (2,), in m."""
+    """The truth and the estimate's inputs; `clearance` is the one at the end of the window, shape (2,), in m."""
 
     group: Group
     scene: Scene

@@ -3,8 +3,8 @@
     python benchmark/follow.py --group soft --group hard --truths 12 --seed 72000
     python benchmark/follow.py --table                       # of what the file holds
 
-All is causal: what is told at a time comes from what was measured up to it. Everything was set on seeds below 72000.
-Each truth is written as soon as it is done; what the file holds already is not run again.
+All is causal: the result at a time uses measurements up to it. Everything was set on seeds below 72000.
+Each truth is written as soon as it is done; truths in the file are not run again.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ GROUPS = {
 }
 #: Forces count from the beginning of the fifth load period on; pairs with a hundredth of the largest impulse.
 FIRST_PERIOD, LEAST_SHARE = 4, 0.01
-#: Distance of rows in s from which peaks and impulses of the truth are told: the hardest contact lasts five of them.
+#: Distance in s of the rows that give the truth's peaks and impulses: the hardest contact lasts five of them.
 _FINE = 1e-4
 
 

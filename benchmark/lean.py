@@ -1,4 +1,4 @@
-"""The plain way: equations of motion in world axes and classical RK4, jitted, with nothing counted or located."""
+"""The plain way: equations of motion in world axes and classical RK4, jitted, without counts or events."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, Final
 from cases import Array
 from numba import njit
 
-#: Numba's own types of its decorator do not let what it compiles be called.
+#: Numba's types of its decorator do not declare compiled functions callable.
 compiled: Final[Callable[[Any], Any]] = njit
 fast: Final[Callable[[Any], Any]] = njit(fastmath=True)
 inlined: Final[Callable[[Any], Any]] = njit(inline="always", fastmath=True)

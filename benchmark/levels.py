@@ -1,4 +1,4 @@
-"""Time at equal error: what each solver needs to stay below an error, from its ladder of settings."""
+"""Time at equal error: the time that each solver needs to stay below an error, from its ladder of settings."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ LEVELS = (1e-2, 1e-3, 1e-6, 1e-9)
 OUTPUTS = (0.1, 1e-3)
 Member = Callable[[str], bool]
 
-#: Groups of peers that are compared as one: the fastest member at a level stands for the group.
+#: Groups of peers compared as one: at each level the fastest member counts.
 PEERS: dict[str, Member] = {
     "CVODE from C": lambda solver: solver.startswith("CVODE") and solver.endswith("(C)"),
     "CVODE from C, rootfinding": lambda solver: "rootfinding" in solver,

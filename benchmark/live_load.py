@@ -50,7 +50,7 @@ CASES = (ECHO, RAW_ECHO, ON_SAMPLE, RECORDED, FIXED, FIXED_RECORDED, Case("fixed
 
 
 def echo(raw: bool = False, namespace: str = "live_load") -> None:
-    """Answer each sample with three messages of the sizes that the node sends, and nothing else.
+    """Answer each sample with three messages of the sizes that the node sends, and no others.
 
     `raw`: with bytes that were serialised before, but for the stamp, that of the sample: the least that
     any node in rclpy does.
@@ -176,7 +176,7 @@ def source(rate_hz: float, seconds: float) -> subprocess.Popen[bytes]:
 
 
 def measure(answerer: list[str], rate_hz: float, seconds: float) -> dict[str, float]:
-    """Run one answerer under one rate; return what was sent, used and lost, its CPU, and the age at a subscriber."""
+    """Run an answerer at a rate; return samples sent, used and lost, its CPU, and the age at a subscriber."""
     with running(answerer) as (probe, process_id):
         sender, ages, figures = source(rate_hz, seconds), probe.ages, probe.figures
         try:
@@ -187,7 +187,7 @@ def measure(answerer: list[str], rate_hz: float, seconds: float) -> dict[str, fl
             probe.spin(lambda: sender.poll() is not None, seconds + 30.0)
             share = (_cpu_s(process_id) - busy) / (time.monotonic() - begin)
         finally:
-            sender.kill()  # one that has found nobody to send to would send to the next
+            sender.kill()  # a publisher without a subscriber would send to the next one
             sender.wait()
         figures.pop("samples_used", None)
         if "published" in figures:
@@ -282,7 +282,7 @@ def compare(seconds: float, repeats: int) -> None:
                 command = answerer if case in (ECHO, RAW_ECHO) else _twin(case.mode, path)
                 found = measure(command, case.rate_hz, seconds)
                 print(json.dumps(case._asdict() | found), flush=True)
-                if found["messages"]:  # one without an answer has no age, but is told
+                if found["messages"]:  # a case without an answer has no age, but is reported
                     runs[case].append(found)
     if not all(runs.values()):
         sys.exit("a case was never answered: no medians")
@@ -295,7 +295,7 @@ def compare(seconds: float, repeats: int) -> None:
 
 
 def _targets(rows: dict[Case, dict[str, float]]) -> Iterator[tuple[str, float, float]]:
-    """Yield the targets in words, what was reached, and the most that is allowed."""
+    """Yield the targets in words, the result, and the limit."""
     bare = rows[ECHO]
     for case, how in ((ON_SAMPLE, ""), (RECORDED, ", recording")):
         row = rows[case]
@@ -381,7 +381,7 @@ def soak(minutes: float, rate_hz: float) -> bool:
                 "threads": _status(process_id, "Threads"),
                 "files": len(os.listdir(f"/proc/{process_id}/fd")),
                 "core": round((_cpu_s(process_id) - busy) / PERIOD_S, 3),
-                "age_p50_ms": round(ages[len(ages) // 2], 3) if ages else None,  # None: it stands still
+                "age_p50_ms": round(ages[len(ages) // 2], 3) if ages else None,  # None: no clock
                 "age_p99_ms": round(ages[len(ages) * 99 // 100], 3) if ages else None,
                 "queued": int(figures.get("queued") or 0),
                 **_account(figures),
@@ -405,9 +405,9 @@ def soak(minutes: float, rate_hz: float) -> bool:
 
 
 def _growth(minutes: list[float], sizes: list[float]) -> tuple[float, float]:
-    """Return slope and half-width of its 95 % interval of what came after the first quarter, an hour.
+    """Return slope per hour, after the first quarter, and half-width of its 95 % interval.
 
-    From the means of six blocks: memory grows in steps, and samples beside each other are no independent ones.
+    From the means of six blocks: memory grows in steps, and neighbouring samples are not independent.
     """
     import numpy as np
 

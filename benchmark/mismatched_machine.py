@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 #: Steps in the shortest period of a contact's oscillation, and the longest step in s.
 _STEPS_A_PERIOD, _LONGEST_STEP = 60.0, 1e-4
-#: Mass in kg of a frame that stands on a spring, and its share of the critical damping.
+#: Mass in kg of a frame on a spring, and its share of the critical damping.
 _FRAME_MASS, _FRAME_DAMPING = 500.0, 0.1
 #: Speed in m/s below which friction is viscous.
 _CREEP = 0.005
@@ -39,7 +39,7 @@ class Machine:
     friction : float
         Coefficient of friction.
     spring : float
-        Stiffness in N/m of the spring that the frame stands on, along x and along y; 0: the frame is fixed.
+        Stiffness in N/m of the spring under the frame, along x and along y; 0: the frame is fixed.
     """
 
     stiffness_share: Array

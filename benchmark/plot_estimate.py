@@ -18,7 +18,7 @@ from lives import SHARES
 
 from plow_twin.estimate.result import NORMAL_P95, State
 
-#: Groups that are drawn, with their colours, in the order of the legend; first seed that nothing was set on.
+#: Groups that are drawn, with their colours, in the order of the legend; first held-out seed.
 STYLES = {
     "plain": "#1f4e9c", "sensor": "#5aae61", "stochastic": "#dfa526", "middle": "#8c510a", "firm": "#35978f",
     "hard": "#d62728", "hard_sensor": "#9970ab",
@@ -46,7 +46,7 @@ def draw(rows: Sequence[dict[str, Any]], lives: Sequence[dict[str, Any]], path: 
 
 
 def fresh(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the newest row of each truth that nothing was set on."""
+    """Return the newest row of each held-out truth."""
     newest = {(row["group"], row["seed"]): row for row in rows if row["seed"] >= _FRESH and "not_drawn" not in row}
     return list(newest.values())
 
@@ -58,7 +58,7 @@ def _draw_errors(panel: Any, rows: Sequence[dict[str, Any]], axis: str, color: s
     bars = np.array([1e3 * NORMAL_P95 * row[f"{axis}_sd_m"] for row in known])
     panel.errorbar(stiffness, errors, bars, fmt=".", color=color, label=title, linewidth=0.8, markersize=4)
     unknown = [row["stiffness"] for row in rows if row[f"{axis}_state"] != State.ESTIMATED.value]
-    # none told: a tick at the lower edge
+    # no estimate: a tick at the lower edge
     panel.plot(unknown, [-0.98 * _MOST_MM] * len(unknown), "|", color=color, markersize=9)
 
 

@@ -34,7 +34,7 @@ _KINDS = {"kelvin_voigt": 0, "hunt_crossley": 1, "exact_restitution": 2}
 
 @dataclass(frozen=True)
 class ReferenceRun:
-    """A reference trajectory: `q` (rows, 3), whether it was finished, and what it cost."""
+    """A reference trajectory: `q` (rows, 3), whether it was finished, and its cost."""
 
     q: NDArray[np.float64]
     finished: bool

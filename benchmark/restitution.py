@@ -23,14 +23,14 @@ PICTURE = ROOT / "docs" / "images" / "restitution.png"
 PAGE = ROOT / "benchmark" / "results" / "restitution.md"
 BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
 
-#: Restitutions asked for: every hundredth in the CSV, these in the page.
+#: Nominal restitutions: every hundredth in the CSV, these in the page.
 ASKED = tuple(round(0.01 * k, 2) for k in range(101))
 SHOWN = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0)
 #: Damping ratios C / (2 sqrt(K m)) of the Kelvin-Voigt table.
 RATIOS = (0.0, 0.01, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 2.0)
 #: Ramp lengths of the ramped law, over the depth v sqrt(m/K) of the undamped impact.
 RAMPS = (0.001, 0.01, 0.1, 0.3, 1.0, 3.0, 10.0)
-#: A law is called valid where it delivers the restitution asked for within this share.
+#: A law is called valid where it delivers the nominal restitution within this share.
 VALID = 0.05
 
 MASS_KG, SPEED_M_S, STIFFNESS, EXPONENT = 2.0, 1.0, 1e9, 1.5
@@ -94,7 +94,7 @@ def measure(law: str, asked: Iterable[float], ramp: float = 0.0) -> list[Row]:
 
 
 def restitution_laws() -> list[str]:
-    """Return the laws that can be asked for a restitution, in the order of their definition."""
+    """Return the laws that take a restitution, in the order of their definition."""
     return [name for name, law in LAWS.items() if law.takes_restitution]
 
 

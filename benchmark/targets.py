@@ -60,7 +60,7 @@ RATIOS = (
 )
 ENSEMBLE_S, WITHIN, REAL_TIME, CORE_SHARE = 0.5, 10.0, 1000.0, 0.25
 BATCH_TIMES = 5.0
-#: Definition of "near nothing": this share of an hour of the driven scene.
+#: Definition of "next to no work": this share of an hour of the driven scene.
 IDLE_SHARE = 0.01
 
 

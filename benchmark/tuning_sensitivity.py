@@ -82,7 +82,7 @@ def known(row: dict[str, Any], axis: str) -> bool:
 
 
 def verdict(row: dict[str, Any]) -> list[Any]:
-    """Return what is said of a truth beside the numbers."""
+    """Return the verdict on a truth, beside its numbers."""
     return [row.get("failed"), row.get("model"), row.get("sensor"), *(row[axis][3] for axis in "hv" if axis in row)]
 
 
@@ -118,7 +118,7 @@ def summary(name: str, factor: float, rows: list[dict[str, Any]]) -> str:
 
 
 def table() -> str:
-    """Return all chosen numbers with what they mean, what they were set on, and their sensitivity."""
+    """Return all chosen numbers with their meaning, the data that they were set on, and their sensitivity."""
     rows = load_rows(FILE)
     count = {group: sum(row["group"] == group and row["name"] != "" for row in rows) for group in CASES}
     varied_in = ", ".join(f"`{group}` {number}" for group, number in count.items() if number)

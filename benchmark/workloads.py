@@ -69,7 +69,7 @@ def swaying_scene() -> Scene:
 
 
 def horizon_cases(longest: float) -> Iterator[Case]:
-    """Yield the KV scene over growing machine time, and an hour in which next to nothing happens."""
+    """Yield the KV scene over growing machine time, and an hour with next to no events."""
     scenes = [(bench_scene("kv"), "kv", t_end) for t_end in (1.0, 10.0, 60.0, 600.0, HOUR_S)]
     scenes += [
         (still_scene(), "at rest after the fall", HOUR_S),

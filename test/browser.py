@@ -26,7 +26,7 @@ _OPTIONS = (
 
 
 class Page:
-    """An open page; `requests` are the addresses that it has asked for, `errors` what it has complained of."""
+    """An open page; `requests` are the requested addresses, `errors` its messages of errors."""
 
     def __init__(self, socket: ClientConnection) -> None:
         self._socket = socket
@@ -64,7 +64,7 @@ class Page:
             self.errors.append(str(message["params"]["exceptionDetails"]))
         elif message.get("method") == "Log.entryAdded":
             entry = message["params"]["entry"]
-            if entry["level"] == "error" and entry["source"] != "network":  # `requests` has those of the network
+            if entry["level"] == "error" and entry["source"] != "network":  # in `requests`
                 self.errors.append(str(entry))
 
     def evaluate(self, expression: str) -> Any:

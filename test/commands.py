@@ -31,7 +31,7 @@ def started(command: Sequence[str], **options: Any) -> Iterator[subprocess.Popen
 
 
 def plow_twin_here(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    """Run a command in this process: what it says and its exit code are the same, a start costs a second."""
+    """Run a command in this process, with the same output and exit code: a start costs a second."""
     given, out, err = [*map(str, arguments)], StringIO(), StringIO()
     with chdir(cwd or Path.cwd()), redirect_stdout(out), redirect_stderr(err):
         code = run(given)

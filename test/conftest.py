@@ -79,6 +79,6 @@ def _skipped(reporter: pytest.TerminalReporter) -> list[tuple[str, str]]:
 
 
 def _listed(file: Path) -> list[str]:
-    """What stands before the first bar of each line, without comments."""
+    """Text before the first bar of each line, without comments."""
     lines = (line.partition("#")[0].strip() for line in file.read_text(encoding="utf-8").splitlines())
     return [line.partition("|")[0].strip() for line in lines if line]

@@ -1,4 +1,4 @@
-"""Motions whose bits are pinned, hashed by what they tell and not by how the solver keeps its state.
+"""Motions whose bits are pinned, hashed by their results and not by the solver's state.
 
     python test/golden.py
 
@@ -33,7 +33,7 @@ _DAMPING = {"kelvin_voigt": 6e4, "ramped_damping": 6e4}
 
 
 def build_name() -> str:
-    """Return the name of what decides bits beside the sources: processor, compiler and mathematical library."""
+    """Return a name of processor, compiler and mathematical library, which decide bits beside the sources."""
     libc = "".join(platform.libc_ver())
     return f"{llvmlite.binding.get_host_cpu_name()}-numba{version('numba')}-numpy{version('numpy')}-{libc}"
 

@@ -1,4 +1,4 @@
-"""Makers of recordings that nobody writes by accident."""
+"""Makers of absurd recordings."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ SOURCES = (
 
 
 def copy_sources(target: Path) -> Path:
-    """Copy what a build reads, without anything that an earlier build or run left behind."""
+    """Copy the inputs of a build, without leftovers of an earlier build or run."""
     target.mkdir(parents=True)
     for name in SOURCES:
         if (ROOT / name).is_dir():

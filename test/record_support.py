@@ -28,7 +28,7 @@ from plow_twin.stream.session import Session
 
 BASE_NS = 1_800_000_000_000_000_000
 STEP_NS = 1_000_000
-#: what the paper's loads are worth together: N, N, N m
+#: largest loads of the paper together: N, N, N m
 PAPER_AMPLITUDE = (32_000.0, -11_000.0, -45_495.0)
 
 
@@ -138,7 +138,7 @@ def rewrite(
 
 
 def chunk_spans(file: Path, *, journal: bool | None = None) -> list[tuple[int, int]]:
-    """Offset and length of the data of each chunk of a file; of those of the journal only, or of all others."""
+    """Offset and length of the data of each chunk of a file: of the journal's chunks only, or of all others."""
     spans, topics = [], {}
     with file.open("rb") as stream:
         for record in StreamReader(stream, emit_chunks=True).records:

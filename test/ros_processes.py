@@ -34,7 +34,7 @@ ROOT = Path(__file__).resolve().parent.parent
 START_S = 100.0
 #: Long enough for discovery on a machine that does other work [s].
 WAIT_S = 60.0
-#: Twice what a stop may take: three processes share two cores [s].
+#: Twice the longest time of a stop: three processes share two cores [s].
 STOP_S = 10.0
 _numbers = itertools.count()
 
@@ -106,7 +106,7 @@ class Probe:
         self._clients: dict[str, Any] = {}
         self.status: list[DiagnosticStatus] = []
         self.reports: list[dict[str, DiagnosticStatus]] = []
-        # deeper than the twin's own: what changes quickly is still seen
+        # deeper than the twin's own, so that no quick change is missed
         latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.node.create_subscription(DiagnosticStatus, "status", self.status.append, latched)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._report, 100)
@@ -176,7 +176,7 @@ class Probe:
         return send
 
     def pace(self, index: int) -> None:
-        """Rest after each 50 samples: best-effort readers drop what comes faster than they look."""
+        """Rest after each 50 samples: best-effort readers drop messages that come faster than they read."""
         if index % 50 == 49:
             self.pause(0.04)
 
@@ -187,7 +187,7 @@ class Probe:
             self._executor.spin_once(timeout_sec=0.02)
 
     def call(self, kind: type, service: str, request: Any) -> Any:
-        # one client for all calls: an answer to one that the server has not discovered yet is lost
+        # one client for all calls: the answer to a client that the server has not discovered yet is lost
         if service not in self._clients:
             self._clients[service] = self.node.create_client(kind, service)
         client = self._clients[service]
@@ -206,7 +206,7 @@ class Bench:
 
     def __init__(self, folder: Path, parameters: dict[str, Any], arguments: Sequence[str] = ()) -> None:
         self.namespace = f"/t{os.getpid()}_{next(_numbers)}"
-        # {ns} in a name of a parameter stands for the namespace
+        # {ns} in a name of a parameter is replaced by the namespace
         named = {name.replace("{ns}", self.namespace): given for name, given in parameters.items()}
         self.folder = folder
         self._publishers: list[Process] = []
@@ -222,7 +222,7 @@ class Bench:
         return self._publishers[-1]
 
     def close(self) -> None:
-        """End what still runs."""
+        """End the processes that still run."""
         self.probe.close()
         for process in (self.twin, *self._publishers):
             process.close()

@@ -1,4 +1,4 @@
-"""The benchmark runs, names what it cannot run, and its errors are within what was asked; no time is judged."""
+"""The benchmark runs, names peers that it cannot run, and its errors are within the tolerances; no time is judged."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`replay`, `view` and `info` on recordings: what they say and how they end."""
+"""`replay`, `view` and `info` on recordings: their output and exit codes."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ def answers(port: int) -> bool:
 def test_view_refuses_recordings_that_cannot_be_drawn(run: Run, tmp_path: Path) -> None:
     refused = plow_twin_here("view", run.folder, "--out", tmp_path / "x.rrd", "--exaggerate", "1e+308")
     assert refused.returncode == 2 and "1e+308" in refused.stderr and "Traceback" not in refused.stderr
-    # a run under its scene's own loads has none in its journal
+    # a run under its scene's own loads has no samples in its journal
     own = rewrite(run.file, tmp_path / "own.mcap", metadata=lambda record: {**record, "excitation_source": "scene"})
     refused = plow_twin_here("view", own, "--out", tmp_path / "x.rrd", "--with", "paper")
     assert refused.returncode == 1 and "excitation_source" in refused.stderr

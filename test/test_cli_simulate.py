@@ -36,7 +36,7 @@ def test_csv_and_json_keep_the_contract(tmp_path: Path) -> None:
         header, *rows = csv.reader(file)
     assert header == ["t", "x", "y", "theta", "vx", "vy", "omega", *(f"force_{name}" for name in PAIR_NAMES)]
     expected = np.column_stack([result.t, result.q, result.v, result.force])
-    np.testing.assert_array_equal(np.array(rows, dtype=float), expected)  # 17 digits lose nothing
+    np.testing.assert_array_equal(np.array(rows, dtype=float), expected)  # 17 digits are exact
 
     answer = json.loads(done.stdout)
     assert answer.keys() == {"scene", "t_end", "pairs", "contact_sets", "solver", "wall_s", "compile_s"}

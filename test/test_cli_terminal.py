@@ -75,7 +75,7 @@ def test_a_recording_and_its_replay_are_shown_as_words(printed: Callable[..., li
     for line in ("messages", "build", "messages_compared", "  contact_forces         50", "lost                     -"):
         assert line in lines
     long = [line for line in lines if len(line) > WIDTH]
-    assert all(str(tmp_path) in line for line in long)  # what is copied stays in one piece
+    assert all(str(tmp_path) in line for line in long)  # a value to copy stays in one piece
 
 
 def test_numbers_that_are_estimated_or_compared_have_their_units_and_are_whole(

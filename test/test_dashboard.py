@@ -1,4 +1,4 @@
-"""The operator's screen: what it shows is the twin's, and whatever its readers do, the twin does not notice."""
+"""The operator's screen: it shows the twin's numbers, and its readers do not affect the twin."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_a_feed_without_a_reader_does_not_wait_and_keeps_the_peaks() -> None:
             updates.append(update)
         feed.turn()
         updates.append(far.receive() or {})
-        # the first has the facts; what was not taken, and its largest force, is in the first one after there is room
+        # the first has the facts; the first one after there is room has the refused updates' largest force
         assert updates[0]["facts"]["can_ask"] is False and len(updates) == feed.taken
         assert max(update["motion"]["peak"][0] for update in updates) == 7e5
         assert updates[-1]["not_taken"] == feed.not_taken and updates[-1]["motion"]["t"] == pytest.approx(2.999)
@@ -121,7 +121,7 @@ def test_the_clearances_of_an_estimate_after_the_last_publication_are_shown_with
             clearance = (far.receive() or {})["motion"]["clearance"]
             return clearance["horizontal/p05"], clearance["vertical/p05"]
 
-        publish(1.0, 0.0057)  # summed up with what follows: it came before the estimate
+        publish(1.0, 0.0057)  # summed up with later publications: it came before the estimate
         feed.part("estimate", (0, "", numbers))
         feed.part("status", (0, "", {"horizontal": "estimated", "vertical": "not_observable"}))
         feed.part("estimate", (0, "estimating", {"estimates": "1"}))
@@ -275,7 +275,7 @@ def _feed(process: subprocess.Popen[str], begin: int = 0, end: int = COUNT) -> N
 
 
 def _stopped(process: subprocess.Popen[str]) -> dict[str, Any]:
-    """End the input and the twin; return its diagnostics, and what it said meanwhile."""
+    """End the input and the twin; return its diagnostics and its output meanwhile."""
     assert process.stdin is not None
     process.stdin.close()
     process.stdin = None
@@ -355,7 +355,7 @@ def test_a_killed_server_is_reported_once_and_the_twin_continues(tmp_path: Path)
         assert process.stdin is not None
         process.stdin.close()
         process.stdin = None
-        out, err = process.communicate(timeout=60)  # nothing is left to stay for
+        out, err = process.communicate(timeout=60)  # no page is left to wait for
     assert process.returncode == 0 and json.loads(out)["input"]["samples_used"] == str(COUNT)
     assert "server of the screen" not in err
 
@@ -397,7 +397,7 @@ _SEEN = """JSON.stringify({pads: document.querySelectorAll('#pads tbody tr').len
     seconds: screenState.seconds.length, fooled: Boolean(window.fooled)})"""
 
 
-#: The smallest contrast of a text with what lies behind it, as WCAG 2 defines it, disabled controls apart.
+#: The smallest contrast of a text with its background, as WCAG 2 defines it, disabled controls apart.
 _CONTRAST = """(() => {
     const parts = (color) => color.match(/[\\d.]+/g).map(Number);
     const light = (color) => parts(color).slice(0, 3).map((part) => part / 255)

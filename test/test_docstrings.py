@@ -33,7 +33,7 @@ def public(package: griffe.Module) -> Iterator[tuple[str, Any]]:
 
 
 def described(item: Any) -> dict[str, str]:
-    """Return what a docstring says of each parameter and attribute: its type with shape, and its text."""
+    """Return a docstring's type, shape and text of each parameter and attribute."""
     said = {}
     for section in item.docstring.parsed:
         if section.kind.value in ("parameters", "attributes"):

@@ -41,9 +41,9 @@ def test_a_hard_contact_is_estimated_by_its_bounces() -> None:
 
 
 def test_the_deviate_of_a_path_is_normal_for_a_right_model_and_large_for_a_wrong_one() -> None:
-    """Paths scatter together, far along a few directions: there a right one is as far off as any of the drawn ones.
+    """Paths scatter together, far along a few directions: there a right path is as far off as any drawn path.
 
-    A wrong one that is off across these is found, though it is nearer by the mean square over the phases.
+    A wrong path that is off across these is found, though it is nearer by the mean square over the phases.
     """
     rng = np.random.default_rng(5)
     modes, slopes = rng.standard_normal((3, 60)), rng.standard_normal((14, 60))
@@ -91,7 +91,7 @@ def test_the_bias_of_a_sensor_behind_a_hard_contact_is_found(turn: float) -> Non
 
 
 def test_a_bias_changes_the_other_features_of_a_hard_motion_hardly_at_all() -> None:
-    """What was left of a turn, 3e-4 rad on the whole, moved the measured motion among drawn ones, which had none."""
+    """A remaining turn of 3e-4 rad on the whole moved the measured motion among drawn ones, which had no turn."""
     truth = draw(replace(GROUPS["hard"], periods=4.0), 3)
     eye = MotionFeatures(Unknowns(truth.nominal), truth.poses, truth.load.period())
     bias = np.array([1e-4, -1e-4, 6e-4])
@@ -116,7 +116,7 @@ def test_the_delay_is_the_lag_at_which_the_measured_path_is_nearest_to_drawn_pat
 
 
 def test_a_classifier_of_drawn_motions_finds_another_law() -> None:
-    """The classes differ along one direction of little scatter, where no single feature tells them apart."""
+    """The classes differ along one direction of little scatter, where no single feature separates them."""
     rng = np.random.default_rng(5)
     across = np.array([1.0, -1.0, 0.0, 0.0, 0.0, 0.0]) / np.sqrt(2.0)
 
@@ -135,7 +135,7 @@ def test_a_classifier_of_drawn_motions_finds_another_law() -> None:
 
 
 def test_log_odds_find_another_law_among_motions_whose_drawn_numbers_matter_more() -> None:
-    """What is drawn moves the motions along a curve, by some ten times what the law and the noise do."""
+    """The drawn numbers move the motions along a curve, by some ten times the effect of law and noise."""
     rng = np.random.default_rng(5)
     slope, curve, apart = rng.standard_normal((3, 40))
 
@@ -186,7 +186,7 @@ def test_a_motion_like_those_of_another_law_is_suspect_unless_that_law_is_unlike
 
 
 def test_the_likeliest_clearances_are_found_from_paths_with_more_parts_than_drawn_motions() -> None:
-    """Each drawn motion is told as one that was not drawn is, whatever it was drawn with and however late it is."""
+    """The clearances of each drawn motion are found as for a new motion, for any drawn numbers and any delay."""
     rng = np.random.default_rng(5)
     slopes, curve, common, late = (rng.standard_normal((rows, 150)) for rows in (7, 1, 3, 1))
     scale, middle = np.array([3e-4, 3e-4, 0.3, 0.3, 0.06, 0.06, 0.06]), np.array([0.02, 0.03, -7.0, 0.0, 1.0, 1.0, 1.0])
@@ -215,6 +215,6 @@ def test_the_regression_gives_the_value_at_the_measured_features() -> None:
     found = regress_near(features, targets, np.array([0.5, 0.2, 0.0]))
     assert found.value[0] == pytest.approx(2.3, abs=0.1)
     assert 0.05 < found.deviation[0] < 0.2
-    # what is not linear is in the deviation
+    # the deviation includes the nonlinear part
     assert found.deviation[1] > 0.2
     assert found.distance < 1.5 < regress_near(features, targets, np.full(3, 6.0)).distance

@@ -1,4 +1,4 @@
-"""The twin that follows its machine: forces and clearances as known at each time, from what was measured up to it."""
+"""The twin that follows its machine: forces and clearances at each time, from measurements up to it."""
 
 from __future__ import annotations
 
@@ -213,7 +213,7 @@ def test_a_machine_without_gravity_is_steered_too(truth: Truth, monkeypatch: pyt
     monkeypatch.setattr(TwinBatch, "move", counted)
     nominal = replace(truth.nominal, gravity=replace(truth.nominal.gravity, acceleration_m_s2=0.0))
     _run(Follower(nominal, MEMBERS), truth, 1.0)
-    assert np.mean(moved) > MEMBERS / 3  # with a limit of zero: none
+    assert np.mean(moved) > MEMBERS / 3  # with a limit of zero: no pose
 
 
 def test_a_member_is_never_pushed_into_a_hard_wall() -> None:

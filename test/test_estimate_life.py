@@ -1,4 +1,4 @@
-"""Wear over a life: known answers, the direct run, and a forecast whose quantiles are what they say."""
+"""Wear over a life: known answers, the direct run, and a forecast with honest quantiles."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def test_scenarios_are_forecasts_of_their_own_from_the_same_draws() -> None:
     alone = forecast(scene, replace(plan, scenarios=()))
     assert np.array_equal(found.hours, alone.hours)
     assert found.scenarios["dry"].hours == pytest.approx(2.0 * found.hours, rel=1e-2)
-    # the force grows with the load, by what share the contact decides
+    # the force grows with the load, by a share that the contact decides
     middle, sooner = found.quantile(0.5), found.scenarios["heavy"].quantile(0.5)
     assert middle is not None and sooner is not None and 0.6 * middle < sooner < 0.95 * middle
     for text in ("no numbers:load", "a:speed=2", "b:load=0", ":load=2", "c:load=nan"):
@@ -164,7 +164,7 @@ def test_of_a_run_the_pads_as_it_left_them_count_and_no_estimate_of_others(tmp_p
     scene, newest = left_by(RunReader(tmp_path / "set"))
     assert newest is None and scene.clearance.vertical_m == 0.031
     assert scene.wear is not None and scene.wear.initial_depth_m == pytest.approx(depth, abs=1e-12)
-    # the wear that a run began with, from the folder that keeps it, stands in its first snapshot
+    # the first snapshot of a run holds its initial wear, from the folder that keeps it
     session = Session(Twin(scene, excitation="sampled"), wear_depth=depth)
     record_run(tmp_path / "kept", [session.snapshot(), paper_sample(0), of_old_pads], wear=Wear(1e-14, 0.015, 2.0))
     scene, newest = left_by(RunReader(tmp_path / "kept"))
@@ -198,7 +198,7 @@ def test_a_history_of_clearances_determines_the_coefficient(tmp_path: Path, caps
     known = coefficient(scene, history)
     found = known.interval()
     assert found.p05 < true_k < found.p95 and found.p95 / found.p05 < 1.3**2
-    # clearances without noise would not make the path certain that tells it
+    # clearances without noise would not make their path certain
     sure = replace(known, weight=np.eye(len(known.value))[len(known.value) // 2]).interval()
     assert sure.p95 / sure.p05 > math.exp(3.2 * tuning.PATH_DEVIATION)
     assert np.abs(known.clearance - [0.025, 0.030] - grown[-1]).max() < 4.0 * noise
@@ -210,7 +210,7 @@ def test_a_history_of_clearances_determines_the_coefficient(tmp_path: Path, caps
         [known.depth @ np.abs(NORMAL_X), known.depth @ np.abs(NORMAL_Y)]
     )
     assert total == pytest.approx(known.clearance)
-    # what is known narrows the forecast
+    # knowledge narrows the forecast
     plan = Plan(0.030, 0.035, 1.0, load_deviation=0.0)
     prior, posterior = (forecast(scene, plan, known=knowledge) for knowledge in (None, known))
     ratios = [life.quantile(0.9) / life.quantile(0.1) for life in (prior, posterior)]  # type: ignore[operator]
@@ -247,7 +247,7 @@ def test_a_forecast_wears_the_pads_by_the_contact_that_was_estimated() -> None:
 
 
 def test_a_path_that_does_not_come_to_its_end_is_no_limit_never_reached() -> None:
-    """From a clearance of a micrometre 400 steps went nowhere, which was told as `not reached`."""
+    """From a clearance of a micrometre 400 steps made no progress, which was reported as `not reached`."""
     scene = replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0, prior_m2_n=(5e-15, 2e-14)))
     tight = replace(scene, clearance=Clearance(1e-6, 0.030))
     found = forecast(tight, Plan(0.002, 0.034, 1e3, draws=50))
@@ -273,7 +273,7 @@ def test_a_clearance_hardly_known_is_not_below_zero() -> None:
 
 
 def test_a_history_that_the_prior_does_not_allow_is_refused() -> None:
-    """All of the posterior lay at the end of the grid: an interval of no width, and none of the truth."""
+    """All of the posterior lay at the end of the grid: an interval of no width, without the truth."""
     scene = replace(preset("paper"), wear=replace(FAST, coefficient_m2_n=1e-9, prior_m2_n=(2.5e-10, 4e-9)))
     travel = np.arange(5) * 10.0
     still = np.tile([0.025, 0.030], (5, 1))
@@ -284,7 +284,7 @@ def test_a_history_that_the_prior_does_not_allow_is_refused() -> None:
 
 
 def test_a_history_that_shrinks_is_refused() -> None:
-    """By 20 of its deviations: a coefficient of nearly none was told, with a narrow interval."""
+    """By 20 of its deviations: the result was a coefficient of nearly 0 with a narrow interval."""
     scene = replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0))
     travel, shrunk = np.array([0.0, 1e4]), np.array([[0.025, 0.030], [0.0245, 0.0295]])
     with pytest.raises(LifeError, match=r"no wear of this scene explains.*row 2 is -0\.2\d+ mm off"):
@@ -295,7 +295,7 @@ def test_a_history_that_shrinks_is_refused() -> None:
 def test_unusable_input_of_a_forecast_is_refused_and_not_left_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A stop beyond the horizon, an estimate of nothing, a contact of none: all gave some forecast."""
+    """A stop beyond the horizon, an empty estimate, a missing contact: all gave some forecast."""
     scene = replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0, prior_m2_n=(5e-15, 2e-14)))
     file, found, history = (tmp_path / name for name in ("scene.yaml", "estimate.json", "history.csv"))
     file.write_text(dump_scene(scene))

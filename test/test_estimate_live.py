@@ -65,7 +65,7 @@ def test_windows_do_not_depend_on_the_order_of_arrival() -> None:
     stamps = START_NS + np.arange(0, 800) * 10_000_000
     loads = [(int(stamp), tuple(rng.standard_normal(3).tolist())) for stamp in stamps]
     poses = [(int(stamp) + 3, tuple(rng.standard_normal(3).tolist())) for stamp in stamps]
-    # each is late by up to 0.4 s, less than what is waited for
+    # each is late by up to 0.4 s, less than the wait
     late = [sorted(rows, key=lambda row: row[0] + int(rng.integers(0, 400_000_000))) for rows in (loads, poses)]
     ordered, mixed = _windows(loads, poses), _windows(*late)
     assert [window.end_ns for window in ordered] == [window.end_ns for window in mixed]
@@ -165,7 +165,7 @@ def test_the_live_estimate_is_published_and_given_again_by_the_journal(tmp_path:
         probe.until_figure("estimate", "estimates", *map(str, range(1, 9)))
         probe.until(lambda: value(probe.status[-1], "horizontal") == "estimated", "the flag")
         found = dict(zip(heard[-1].name, heard[-1].position, strict=True))
-        # what the next slow publication says: the hold policy goes on meanwhile
+        # the next slow publication: the hold policy continues meanwhile
         probe.until(lambda: abs(clearances[-1].position[0] - found["horizontal"]) < 1e-9, "the clearance")
         last = dict(zip(clearances[-1].name, clearances[-1].position, strict=True))
         status: DiagnosticStatus = probe.status[-1]
@@ -186,10 +186,10 @@ def test_the_live_estimate_is_published_and_given_again_by_the_journal(tmp_path:
     facts = json.loads(done.stdout)
     assert facts["live"]["repeated"] is True and facts["live"]["estimates"] >= 1
     assert facts["horizontal"]["mean_m"] == found["horizontal"]
-    # gaps were measured too: they tell the groups of pads
+    # gaps were measured too: they give the groups of pads
     group = facts["groups"]["horizontal_top"]
     assert group["mean_m"] == pytest.approx(truth.clearance[0], abs=3e-4) and group["p95_m"] - group["p05_m"] > 4e-4
-    # what follows from the estimate is the same too
+    # the results that follow from the estimate are the same too
     assert facts["forecast"] == json.loads(answer.message)
     told = dict(zip(forecasts[-1].name, forecasts[-1].position, strict=True))
     assert told["seconds/p50"] == pytest.approx(3600.0 * facts["forecast"]["p50"]["hours"])
@@ -242,7 +242,7 @@ def test_an_estimate_stays_until_it_is_withdrawn_or_the_pads_are_changed() -> No
 
 
 class _Finished:
-    """Stands in for the process: what it has found is given by hand."""
+    """Replaces the process: its results are given by hand."""
 
     def __init__(self, *_: Any) -> None:
         self.found: list[Found] = []
@@ -284,7 +284,7 @@ def test_other_pads_and_other_model_numbers_discard_earlier_estimates(
     session.apply(SetWear(START_NS + 1, (0.0,) * 8, "new pads"))
     assert (estimation.forecast, estimation.reasons, estimation.end_ns) == (None, (), None)
     assert estimation.forecast_error and set(estimation.trust.values()) == {""}
-    # and takes back what is latched
+    # and releases latched alarms
     messages = estimation.poll(session)
     assert {topic: (message.stamp_ns, message.name) for topic, message in messages.items()} == dict.fromkeys(
         ("estimate", "forecast"), (START_NS + 1, ())

@@ -1,4 +1,4 @@
-"""The estimate from measured motion: intervals that hold on synthetic truths, and a stated reason where it has none."""
+"""The estimate from measured motion: intervals that hold on synthetic truths, or a stated reason."""
 
 from __future__ import annotations
 
@@ -157,7 +157,7 @@ def test_a_motion_that_can_hardly_be_predicted_is_no_evidence_of_a_clearance(mon
 
 @pytest.mark.stress
 def test_a_clearance_without_evidence_is_not_estimated() -> None:
-    """With theta locked the head stays at the top walls: 6.8 mm were told instead of 27.1, with a deviation of 0.4."""
+    """With theta locked the head stays at the top walls: the result was 6.8 mm, not 27.1, with a deviation of 0.4."""
     nominal = replace(preset("paper"), locked=("theta",))
     rng = np.random.default_rng([77, 2])
     fine = np.arange(0.0, 10.0 * np.pi + 1e-3, 1e-3)
@@ -202,7 +202,7 @@ def test_without_measurements_the_prior_is_returned() -> None:
 
 
 def test_poses_too_sparse_for_a_fit_are_refused() -> None:
-    """At 5 Hz, or 200 Hz of which 1.5 % arrive, a swing's start cannot be told: the fit was wrong, and sure of it."""
+    """At 5 Hz, or 200 Hz of which 1.5 % arrive, a swing's start is undetermined: the fit was wrong and narrow."""
     nominal = preset("paper")
     load, _ = Load.of([0.0, 20.0], np.ones((2, 3)))
     rng = np.random.default_rng(1)
@@ -273,11 +273,11 @@ def test_a_machine_at_rest_does_not_make_the_model_suspect() -> None:
         result = estimate(truth.nominal, Load.of(t, load)[0], Poses.of(t, rests)[0])
         assert result.horizontal_state is result.vertical_state is State.NOT_OBSERVABLE
         assert (result.model, result.sensor) == ("ok", "ok") and "the head rests" in result.reasons[0]
-    # one that has just come to rest shows the noise of a hard wall, and nothing else of it
+    # a head that has just come to rest shows the noise of a hard wall, and no other sign of it
     rests[:200] += np.linspace(1e-2, 0.0, 200)[:, None]
     result = estimate(truth.nominal, Load.of(t, idle)[0], Poses.of(t, rests)[0])
     assert (result.horizontal_state, result.model) == (State.NOT_OBSERVABLE, "ok")
-    # one that is pushed and does not move is stuck, or its sensor is
+    # a head that is pushed and does not move is stuck, or its sensor is
     pushed = Load.of(t, idle + np.outer(np.sin(2.0 * t), [3e4, 1e4, 4e4]))[0]
     result = estimate(truth.nominal, pushed, Poses.of(t, rests)[0])
     assert result.horizontal_state is State.WITHDRAWN
@@ -308,7 +308,7 @@ def test_a_rough_load_costs_little_accuracy() -> None:
     found = estimate(truth.nominal, truth.load, truth.poses)
     assert (found.model, found.sensor) == ("ok", "ok")
     for value, true in zip((found.horizontal, found.vertical), truth.clearance, strict=True):
-        # swings that know nothing of each other leave an interval twice as wide, and were 0.2 mm off
+        # unlinked swings leave an interval twice as wide, and were 0.2 mm off
         assert value.p95 - value.p05 < 2.5e-4 and abs(value.mean - true) < 1.5e-4
 
 

@@ -46,14 +46,14 @@ def worn_askew(depth: np.ndarray, seed: int) -> tuple[Estimate, dict[str, float]
 
 
 def test_walls_worn_askew_are_estimated_and_the_model_is_not_suspect() -> None:
-    """Pads as uneven as they are towards the end of a life: a fit of even ones does not hold."""
+    """Pads as uneven as towards the end of a life: a fit of even pads does not hold."""
     result, true = worn_askew(UNEVEN, 1)
     assert (result.model, result.horizontal_state) == ("ok", State.ESTIMATED), result.reasons
     assert result.horizontal.mean == pytest.approx(0.5 * (true["horizontal_top"] + true["horizontal_bottom"]), abs=3e-4)
     assert result.vertical.mean == pytest.approx(0.5 * (true["vertical_left"] + true["vertical_right"]), abs=3e-4)
     for name, (value, state) in result.groups.items():
         assert state is State.ESTIMATED and abs(value.mean - true[name]) < 1.5 * (value.p95 - value.p05)
-    # told apart: the walls are askew by 2 mm
+    # distinguished: the walls are askew by 2 mm
     assert result.groups["horizontal_top"][0].p05 > result.groups["horizontal_bottom"][0].p95
 
 
@@ -65,7 +65,7 @@ def test_walls_worn_less_askew_do_not_make_the_clearance_too_small() -> None:
 
 
 def test_pads_that_are_not_touched_leave_a_clearance_between_askew_walls_open() -> None:
-    """The lower left pad is never reached: how far apart the lower pads are no motion tells, nor the mean of all."""
+    """The lower left pad is never reached: neither the distance of the lower pads nor the mean of all is determined."""
     truth, _ = known()[0]
     depth = tuple(1e-3 * value for value in (3.0, 0.0, 0.0, 2.0, 0.0, 4.0, 1.0, 0.0))
     scene = replace(

@@ -1,4 +1,4 @@
-"""Every example runs as its README says, in bounded time, and says what it promises."""
+"""Every example runs as its README says, in bounded time, with the promised output."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ pytestmark = pytest.mark.timeout(600)
 
 @pytest.fixture(scope="module")
 def found() -> dict[str, Any]:
-    """Compute the figures; a process that compiles its kernels and one that finds them compiled must agree."""
+    """Compute the figures; processes that compile the kernels and that load them must agree."""
     runs: list[dict[str, Any]] = []
     for _ in range(2):
         done = subprocess.run([sys.executable, PROGRAM], capture_output=True, text=True, check=False)
@@ -38,7 +38,7 @@ def found() -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def pinned() -> dict[str, Any]:
-    """Return the figures of this build, else those of another one without their digests."""
+    """Return the figures of this build, else another build's without their digests."""
     own = FOLDER / f"{build_name()}.json"
     path = own if own.exists() else sorted(FOLDER.glob("*.json"))[0]
     figures: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))

@@ -70,7 +70,7 @@ FILES: dict[str, Callable[[], str]] = {
     "an alias to itself": lambda: "a: &a {b: *a}",
     "a scalar of 20 MB": lambda: "a: " + "x" * 20_000_000,
 }
-#: Files that are read, and hold nothing that a reader expects.
+#: Readable files without the expected content.
 WITHIN = {"unknown keys", "a scalar of 20 MB"}
 #: Each reader of YAML that a user names: arguments of `plow-twin`.
 READERS = {

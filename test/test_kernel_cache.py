@@ -20,7 +20,7 @@ LINKED = (
     "compiled_scene.compile_scene(load_scene('paper'), 1e-6).initial_state(); "
     "(overload,) = modes.mode_inside.overloads.values(); print(len(list(overload.library.get_defined_functions())))"
 )
-#: How a kernel that Python calls holds the kernels that it calls: none of them is one that other code can be given.
+#: A kernel that Python calls holds its own copies of the kernels that it calls.
 ENTRY = (
     "from plow_twin import load_scene; from plow_twin.solve import compiled_scene, modes; "
     "compiled_scene.compile_scene(load_scene('paper'), 1e-6).initial_state(); "

@@ -1,4 +1,4 @@
-"""OPC UA in: a real server in a process of its own, its losses, breaks and history, and what is not trusted."""
+"""OPC UA in: a real server in a process of its own, its losses, breaks and history, and trust."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class Plant:
         threading.Thread(target=self._let_in, args=(self._door,), daemon=True).start()
 
     def cut(self) -> None:
-        """Break all connections; nobody can connect any more."""
+        """Break all connections and refuse new ones."""
         for found in (self._door, *self._sockets):
             with suppress(OSError):
                 found.shutdown(socket.SHUT_RDWR)

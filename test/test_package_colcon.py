@@ -40,12 +40,12 @@ def test_colcon_build_gives_the_layout_of_ros2_run(options: list[str], tmp_path:
         assert installed == {path.name for path in (ROOT / folder).glob(pattern)}
         assert installed
 
-    if not options:  # nothing of an installation by copy may reach back to the sources
+    if not options:  # an installation by copy may not refer to the sources
         shutil.rmtree(source)
         shutil.rmtree(tmp_path / "build")
 
     def start(program: str, code: int = 0) -> str:
-        """Do what `. install/setup.bash && ros2 run plow_twin <program>` comes to."""
+        """Do the same as `. install/setup.bash && ros2 run plow_twin <program>`."""
         line = f". {tmp_path}/install/setup.bash && exec {programs}/{program}"
         return run("bash", "-c", line, cwd=tmp_path, env=environment, code=code)
 

@@ -1,4 +1,4 @@
-"""What wheel and sdist contain: all that the package needs, and nothing of the tests."""
+"""Contents of wheel and sdist: all that the package needs, without the tests."""
 
 from __future__ import annotations
 

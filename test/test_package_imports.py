@@ -93,7 +93,7 @@ LIBRARIES = {
 }
 
 
-#: The study of the paper stands on the library; nothing of the library but the verb's place knows of it.
+#: The study of the paper imports the library; of the library only the verb's placeholder refers to it.
 PAPER_STUDY = PACKAGE.parent / "studies" / "paper" / "plow_twin_paper"
 PAPER_MAY_IMPORT = CORE | {"build", "scene_file", "stream", "record", "view", "study", "cli"}
 
@@ -103,7 +103,7 @@ def _modules() -> list[Path]:
 
 
 def _imports(path: Path) -> Iterator[str]:
-    """Yield the full name of every import, the lazy ones included."""
+    """Yield the full name of every import, lazy imports included."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -168,7 +168,7 @@ def test_the_cache_stamp_and_the_build_fingerprint_cover_every_kernel() -> None:
     subpackages = {path.relative_to(PACKAGE).parts[0] for path in compiled}
     assert subpackages <= {*KERNEL_FOLDERS} and {*KERNEL_FOLDERS} <= {*NUMERIC_SUBPACKAGES}
     assert all((PACKAGE / subpackage).is_dir() for subpackage in (*KERNEL_FOLDERS, *NUMERIC_SUBPACKAGES))
-    # numba's own decorator stands in one file only, whose change numba sees: it calls no kernel of another
+    # one file only uses numba's own decorator: it calls no kernel of another, so numba sees its changes
     direct = {path.relative_to(PACKAGE).as_posix() for path in _modules() if "numba" in {*_imports(path)}}
     assert {name for name in direct if not name.startswith("kernel/")} == {"build.py", "record/template.py"}
     modules = {_module_name(path) for path in compiled}

@@ -1,4 +1,4 @@
-"""Own files: separator, time, columns and units are guessed, or asked for by the option that states them."""
+"""Own files: separator, time, columns and units are guessed, or the option that states them is named."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_a_spreadsheet_s_file_becomes_a_mapping_with_which_the_twin_runs(
     assert cli(run) == 0
     facts = json.loads(capsys.readouterr().out)
     assert (facts["input"]["samples_used"], facts["state"]["model_time_s"]) == ("600", "0.599")
-    # nothing that is there already is written over
+    # no existing file is overwritten
     assert cli(["setup", str(file), "--out", str(out)]) == 2 and "is there already" in capsys.readouterr().err
 
 
@@ -130,7 +130,7 @@ def test_prompts_in_a_terminal_take_corrections_and_write_the_choice(tmp_path: P
     written = (tmp_path / "out" / "map.yaml").read_text()
     assert all(f"{name}: {column}" in written for name, column in (("fx", "a"), ("fy", "b"), ("m", "c")))
     assert "next: plow-twin live own.csv --map out/map.yaml --scene out/scene.yaml" in screen
-    # what is there already is not written over
+    # existing files are not overwritten
     code, screen = _in_terminal(tmp_path, b"a\n", b"b\n", b"c\n")
     assert code == 2 and "is there already" in screen and (tmp_path / "out" / "map.yaml").read_text() == written
 

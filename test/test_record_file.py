@@ -86,7 +86,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
 def test_every_entry_comes_back_exactly(entry: Entry | Dropped) -> None:
     message = to_message(entry, "slide_frame")
     again = from_message(decode(encode(message), message.TYPE))
-    # repr tells -0.0 from 0.0 and 1 from 1.0 and True, which == does not
+    # repr distinguishes -0.0 from 0.0 and 1 from 1.0 and True, which == does not
     assert repr(again) == repr(entry)
 
 
@@ -203,7 +203,7 @@ def test_a_damaged_byte_costs_one_chunk_and_is_reported(run: Run, tmp_path: Path
         assert (reader.damaged_chunks, reader.status) == (1, FileStatus.DAMAGED)
         rest = iter(whole)
         assert 0 < len(records) < len(whole)
-        assert all(record in rest for record in records)  # in order, none invented
+        assert all(record in rest for record in records)  # in order, without invented entries
 
 
 def write_large(source: Path, target: Path, images: int, image_size: int, attachments: int) -> None:
@@ -214,7 +214,7 @@ def write_large(source: Path, target: Path, images: int, image_size: int, attach
 
     data = source.read_bytes()
     head = 8
-    for _ in range(2):  # the file's header, and that of the run
+    for _ in range(2):  # the header of the file, and the header of the run
         head += 9 + struct.unpack_from("<Q", data, head + 1)[0]
     schema = struct.pack("<H", 60_000) + text("sensor_msgs/msg/Image") + text("ros2msg") + text("uint8[] data")
     channel = struct.pack("<HH", 60_000, 60_000) + text("/camera") + text("cdr") + struct.pack("<I", 0)
@@ -263,7 +263,7 @@ def test_ten_gigabytes_take_the_memory_of_some_chunks(run: Run, tmp_path: Path) 
 
 
 def test_a_file_that_another_program_rewrote_is_a_run(run: Run, tmp_path: Path) -> None:
-    """Its header stands behind the chunks; without an index at the end it is found all the same."""
+    """Its header is behind the chunks; without an index at the end it is found all the same."""
     file = rewrite(run.file, tmp_path / "anew.mcap", metadata_last=True)
     report = replay(file)
     assert (report.exit_code, report.messages_compared) == (0, replay(run.file).messages_compared)

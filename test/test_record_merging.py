@@ -28,7 +28,7 @@ def order(*streams: Iterator[Arrived]) -> list[tuple[str, float | None]]:
     ("one", "other", "expected"),
     [
         ((1, 3, 5), (2, 4), "ababa"),
-        ((1, None, 5), (2, 4), "aabba"),  # without a stamp: where it stands
+        ((1, None, 5), (2, 4), "aabba"),  # without a stamp: in its place
         ((1, 3, 2.9, 5), (2, 4), "abaaba"),  # late
         ((10, 12, 1, 13, 15), (11, 14), "abaaaba"),  # one wrong stamp back
         ((10, 12, 99, 13, 15), (11, 14), "abaaaba"),  # and forward

@@ -219,7 +219,7 @@ def test_late_samples_at_the_edge_of_the_memory_give_the_same_however_they_came(
 
 
 def test_a_late_speed_at_the_edge_of_the_memory_acts_where_it_did(tmp_path: Path) -> None:
-    """A replay keeps no states between: what is too old must not follow from those that it has."""
+    """A replay keeps no states between, so the verdict "too old" may not depend on the states that it has."""
     live = Mixed(tmp_path, rollback_span=0.1)
     live.send(*map(_swinging, range(300)))
     for ms in (50, 190, 198, 199, 201):
@@ -267,7 +267,7 @@ def _drive(live: Mixed, random: Random, calls: int) -> None:
                 skipped += range(index, index + gap)
                 index += gap
             case "late" if skipped:
-                near = [ms for ms in skipped if abs(index - ms - span_ms) < 20]  # at the edge of what is remembered
+                near = [ms for ms in skipped if abs(index - ms - span_ms) < 20]  # at the edge of the memory
                 chosen = near or random.sample(skipped, min(len(skipped), random.choice([1, 1, 4])))
                 skipped = [ms for ms in skipped if ms not in chosen]
                 load = ABSURD if fails and random.random() < 0.2 else None

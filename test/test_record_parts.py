@@ -96,7 +96,7 @@ def test_a_recording_that_was_cut_off_is_repaired(share: float, tmp_path: Path) 
     assert repair(run.folder) == [run.file]
     after = examine(run.folder)
     assert after.problems == [] and after.status == FileStatus.COMPLETE.value
-    # all that could be read before; order among equal places is that of the journal
+    # all that could be read before; entries at equal places are in the journal's order
     assert {repr(record) for record in RunReader(run.folder)} == {repr(record) for record in found}
     assert replay(run.folder).exit_code == 0
     with AnyReader([run.folder]) as reader:
@@ -262,7 +262,7 @@ def test_a_full_disk_is_named_and_a_repair_leaves_nothing_half_done(tmp_path: Pa
 def test_a_full_disk_ends_the_writing_of_a_replay_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = record_run(tmp_path / "run", map(paper_sample, range(COUNT)), frame_every=10**9, pause_every=0)
     before, full = run.file.read_bytes(), tmp_path / "full"
-    assert cli(["replay", str(run.folder), "--write", str(tmp_path / "whole"), "-q"]) == 0  # what it compiles is cached
+    assert cli(["replay", str(run.folder), "--write", str(tmp_path / "whole"), "-q"]) == 0  # its kernels are cached
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, limits[1]))
     try:
@@ -271,7 +271,7 @@ def test_a_full_disk_ends_the_writing_of_a_replay_by_name(tmp_path: Path, capsys
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     said = capsys.readouterr().err
     assert str(full / "full_0.mcap") in said and "too large" in said and "Traceback" not in said
-    # what there was room for is a recording that was cut off, and what was read is as it was
+    # the written part is a recording that was cut off, and the source is unchanged
     assert run.file.read_bytes() == before and (full / "full_0.mcap").stat().st_size <= 200_000
     report = replay(full)
     assert (report.exit_code, report.status, report.divergences) == (3, FileStatus.TRUNCATED, 0)
@@ -328,7 +328,7 @@ def test_a_part_that_is_not_there_is_counted_and_no_load_drawn_over_its_hole(whi
     whole = analyse(run.folder)
     assert not whole.lossy and not read_recording(run.folder)[1]
     RunReader(run.folder).parts[which].unlink()
-    for listing in (True, False):  # the numbers of the parts tell of one in the middle
+    for listing in (True, False):  # the numbers of the parts show a missing one in the middle
         report, found, (facts, lossy) = replay(run.folder), analyse(run.folder), read_recording(run.folder)
         problems = examine(run.folder).problems
         if listing or which == 1:
@@ -346,7 +346,7 @@ def test_parts_that_are_removed_while_others_are_read_are_passed_over(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where the oldest parts go (`record_keep_mb`), a reader may be slower than the recorder."""
-    monkeypatch.setattr("plow_twin.record.reader._LEAST", 1)  # no part is read before what stands in the one before
+    monkeypatch.setattr("plow_twin.record.reader._LEAST", 1)  # the parts are read in their order
     run = record_run(tmp_path / "run", map(paper_sample, range(COUNT)), **SMALL)
     (run.folder / "metadata.yaml").unlink()  # it is not there before the end
     parts = RunReader(run.folder).parts
@@ -379,7 +379,7 @@ def test_estimate_and_forecast_report_missing_parts(tmp_path: Path, capsys: pyte
 
 
 def test_an_estimate_draws_no_load_over_a_damaged_chunk(tmp_path: Path) -> None:
-    """A silence is one from half a second on only; what is known to be missing is short."""
+    """A silence is half a second or longer; the known gap is shorter."""
     poses = [Pose(paper_sample(index).stamp_ns, (0.0, 0.0, 0.0)) for index in range(0, COUNT, 10)]
     entries = [entry for index in range(COUNT) for entry in (paper_sample(index), *poses[index : index + 1])]
     run = record_run(tmp_path / "run", entries, frame_every=10**9, flush_period_s=0.01)

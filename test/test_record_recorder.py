@@ -1,4 +1,4 @@
-"""The recorder under stress: killed, overrun, out of disk, forgotten; what is lost is counted."""
+"""The recorder under stress: killed, overrun, out of disk, forgotten; losses are counted."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ FORKS = """
 
 
 def kill_writers(folders: Iterable[Path], rng: random.Random, flush_s: float, longest_s: float) -> None:
-    """Kill writers at random moments: nothing is lost but what came in since the last flush."""
+    """Kill writers at random moments: only items since the last flush are lost."""
     command = [sys.executable, "-c", textwrap.dedent(FORKS) + textwrap.dedent(WRITER)]
     with started(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         assert process.stdin is not None and process.stdout is not None
@@ -195,12 +195,12 @@ def test_a_full_queue_is_counted_and_noted_in_the_file(tmp_path: Path) -> None:
     assert [r.publish_time_ns for r in records if isinstance(r, OutputRecord)] == kept_messages
     assert sum(entry.count for entry in entries if isinstance(entry, Loss)) == loss.lost[JOURNAL]
     assert sum(entry.count for entry in entries if isinstance(entry, Dropped)) == loss.lost[TOPIC]
-    # lost messages may be noted in between: what was lost is told before the snapshot
+    # lost messages may be noted in between: a loss is noted before the snapshot
     told = [entry for entry in entries if not isinstance(entry, Dropped)]
     for entry, following in itertools.pairwise(told):
         assert not isinstance(entry, Loss) or isinstance(following, Snapshot)
     assert reader.lost == dict(loss.lost)
-    # of one that was killed the notes are left
+    # the notes of a killed process remain
     data = reader.path.read_bytes()
     (tmp_path / "cut.mcap").write_bytes(data[: data.index(LOSS_RECORD.encode())])
     cut = RunReader(tmp_path / "cut.mcap")
@@ -226,7 +226,7 @@ def test_a_full_disk_stops_the_recording_and_nothing_else(tmp_path: Path) -> Non
     reader = RunReader(tmp_path / "run")
     entries = [record for record in reader if isinstance(record, EntryRecord)]
     assert reader.status is FileStatus.TRUNCATED and len(entries) > 100
-    # nothing vanishes without being counted; what was on its way when the disk filled up may be counted and there
+    # every item is there or counted; an item on its way when the disk filled up may be both
     assert len(entries) + report["lost"][JOURNAL] >= 3000
 
 
@@ -360,7 +360,7 @@ def test_a_ring_keeps_the_last_seconds_and_writes_them_at_a_mark(
         report = replay(path)
         assert (report.exit_code, report.divergences) == (0, 0) and report.messages_compared
         assert 0.02 < report.span_s < 0.7 * index * 1e-3  # a busy machine gives few samples in the 0.4 s
-    # what lies between the two is in neither, or in one
+    # items between the two are in one of them or in neither
     stamps = [
         {int(stamp) for batch in RunReader(path).batches() for stamp in batch.entries.stamp_ns[batch.entries.sample]}
         for path in written
@@ -452,7 +452,7 @@ def test_a_message_of_another_type_stops_the_recording_with_its_topic(tmp_path: 
     assert loss.error is not None and TOPIC in loss.error and not loss.closed
 
 
-#: Says what the disk has been waited for: path and size.
+#: Logs the waits for the disk: path and size.
 SYNCS = """
     import os, time
     def note(wait):

@@ -195,7 +195,7 @@ def test_a_cut_file_is_replayed_as_far_as_it_goes(run: Run, tmp_path: Path) -> N
 def test_after_a_damaged_chunk_nothing_is_claimed(run: Run, tmp_path: Path) -> None:
     spans = chunk_spans(run.file)
     lost_entries = lost_messages = False
-    for start, length in spans:  # of the journal, and of what was sent
+    for start, length in spans:  # of the journal, and of the sent messages
         data = bytearray(run.file.read_bytes())
         middle = start + length // 2
         # one bit alone may stand in a reference to other bytes that are the same
@@ -272,7 +272,7 @@ def test_a_journal_alone_gives_the_full_recording_again(tmp_path: Path) -> None:
 def test_digests_alone_are_compared_without_opening_the_outputs(run: Run, tmp_path: Path) -> None:
     data = bytearray(run.file.read_bytes())
     for start, length in chunk_spans(run.file, journal=False):
-        data[start + length // 2] ^= 0xFF  # the chunks of outputs: nobody looks
+        data[start + length // 2] ^= 0xFF  # the chunks of outputs, which are not read
     file = tmp_path / "damaged.mcap"
     file.write_bytes(data)
     report = replay(file, digests_only=True)

@@ -88,7 +88,7 @@ def test_two_twins_do_not_keep_their_wear_in_one_folder(tmp_path: Path) -> None:
     first.close(np.array(DEPTH))
     second = WearKeeper(tmp_path / "wear", "head 7", SCENE)
     assert second.load() == DEPTH
-    second.release()  # what could not be configured leaves the folder too
+    second.release()  # a failed configure releases the folder too
     WearKeeper(tmp_path / "wear", "head 7", SCENE).release()
     assert os.listdir(tmp_path / "wear") == [FILE_NAME]
 

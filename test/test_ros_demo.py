@@ -62,7 +62,7 @@ def test_the_demo_runs_to_its_end_without_loss(tmp_path: Path, speed: str) -> No
     ):
         assert line in done.stdout, done.stdout
     if speed == "fast":
-        # what is printed can be run from here, with nothing of the environment on PATH
+        # the printed command runs from here, without the environment on PATH
         (again,) = (line.partition(":  ")[2] for line in done.stdout.splitlines() if "again, bit for bit" in line)
         bare = dict(os.environ) | {"PATH": "/usr/bin:/bin"}
         assert subprocess.run(again, shell=True, cwd=ROOT, env=bare, capture_output=True, timeout=100).returncode == 0
@@ -98,7 +98,7 @@ def test_forces_are_compared_with_the_machine_s_and_the_time_of_each_estimate_is
     beside = compare_forces(record_run(tmp_path / "run", entries).folder, 1.5e-3)
     assert beside is not None
     assert beside.estimates_s == pytest.approx([1.499])
-    # nothing follows in this run: it is the nominal one
+    # this run does not follow: its forces are nominal
     assert beside.error["followed"] == pytest.approx(beside.error["nominal"], rel=1e-3)
     assert beside.error["nominal"] > 0.02
 

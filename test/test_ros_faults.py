@@ -63,7 +63,7 @@ def _accounted(figures: dict[str, str]) -> int:
 
 
 def _until_accounted(running: Bench, sent: int) -> dict[str, str]:
-    """Wait until all that was sent is accounted for; what is lost at the very end shows with a sample after it."""
+    """Wait until all samples sent are accounted for; a loss at the very end shows with a sample after it."""
     figures: dict[str, str] = {}
 
     def reached() -> bool:
@@ -121,7 +121,7 @@ def test_a_paused_node_counts_the_overrun_of_its_queue_and_continues(tmp_path: P
 
 
 def test_outputs_come_in_time_while_samples_come_ten_times_as_fast(tmp_path: Path) -> None:
-    # reliable: what a best-effort reader loses at the very end would never be known
+    # reliable: a best-effort reader's loss at the very end would never show
     settings = {"publish_mode": "fixed_rate", "publish_rate": 100.0, "input_depth": 20000}
     with bench(tmp_path, **settings, **RELIABLE_INPUT) as running:
         publisher = running.publisher("--rate", "10000", "--seconds", "5")
@@ -161,7 +161,7 @@ def test_a_disk_that_takes_no_more_stops_the_recording_and_not_the_twin(tmp_path
         # as good as a full disk: a write beyond that size fails
         resource.prlimit(running.twin._process.pid, resource.RLIMIT_FSIZE, (200_000, 200_000))
         publisher = running.publisher("--rate", "1000", "--seconds", "120")
-        # what a machine that does other work loses is trouble too, and may be said before
+        # losses of a busy machine are trouble too, and may be reported before
         running.probe.until(lambda: running.probe.figures("recorder")["error"], "the full disk")
         running.probe.until(lambda: value(running.probe.status[-1], "recorder") == "trouble", "the full disk in status")
         assert running.probe.status[-1].level == b"\x02"
@@ -230,7 +230,7 @@ def test_damaged_bytes_on_every_input_are_counted_to_the_last_one(tmp_path: Path
         assert running.twin.stop() == 0
     report = replay(tmp_path / "run")
     assert report.exit_code == 0 and report.samples > 2900
-    # the file tells the same to the message
+    # the file agrees to the message
     assert sum(report.inputs["tool_forces"].values()) == 3000
 
 
@@ -293,7 +293,7 @@ def test_the_scene_s_loads_follow_a_clock_that_is_paused_looped_and_fast(tmp_pat
         reach(T0)
         reach(T0 + 20 * MS)
         count = len(forces)
-        for _ in range(3):  # paused: three reports, and nothing moves
+        for _ in range(3):  # paused: three reports without motion
             probe.figures("output")
         assert len(forces) == count and probe.figures("state")["resets"] == "0"
         for second in range(1, 8):  # as fast as the answers come, seven seconds of the head in as many messages
@@ -362,7 +362,7 @@ def test_any_sequence_on_clock_is_survived_counted_and_repeated_by_the_journal(s
 
 @pytest.fixture
 def stepped_clock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
-    """Give the processes started from now on a clock of their own, and return what puts it off by so many seconds.
+    """Give processes started from now on a clock of their own; return a function that shifts it by seconds.
 
     The system's clock only: the steady one goes on as it is, as with a step of NTP.
     """
@@ -399,7 +399,7 @@ def test_steps_of_the_node_s_own_clock_stop_reset_and_lose_nothing(
                 probe.pace(sent)
             figures = _until_accounted(running, sent)
             age_s = float(figures["newest_sample_age_s"]) - (time.time_ns() - T0 - sent * MS) * 1e-9
-            # the report tells the node's own time, so the step has come there; a busy machine may read it late
+            # the report has the node's own time, which shows the step there; a busy machine may read it late
             assert abs(age_s - off_s) < 5.0
             assert (figures["samples_used"], figures["holds"]) == (str(sent), "0")
         found = probe.figures("state")

@@ -86,7 +86,7 @@ def test_a_recording_that_cannot_be_made_refuses_configuration_and_leaves_nothin
 
 
 def test_a_folder_that_takes_no_wear_refuses_configuration_and_is_named(managed: Bench) -> None:
-    # /proc takes no files, whoever asks
+    # /proc takes no files from any user
     assert _set(managed, "wear_state_path", "/proc/self/wear").successful
     assert not _change(managed, Transition.TRANSITION_CONFIGURE)
     expected = "wear_state_path: got '/proc/self/wear', expected a folder that can be written to: "
@@ -154,7 +154,7 @@ def test_a_request_beside_a_cleanup_is_answered_and_the_node_lives(tmp_path: Pat
         running.probe.pause(0.5)
 
         def beside(transition: int) -> None:
-            """Send requests before and after that of a transition, faster than they are answered."""
+            """Send requests before and after a transition's, faster than they are answered."""
             request = ChangeState.Request(transition=Transition(id=transition))
             before = [one.call_async(Trigger.Request()) for one in asked]
             changed = change.call_async(request)
@@ -214,7 +214,7 @@ def test_a_parameter_file_with_integers_for_doubles_and_a_typing_error(tmp_path:
         found = running.probe.call(GetParameters, service, request).values
         assert [item.type for item in found] == [ParameterType.PARAMETER_DOUBLE] * 2
         assert [item.double_value for item in found] == [2.0, 1e-8]
-        # all that it holds, given back to it while active, changes nothing and is taken
+        # all its parameters, given back to it while active, are accepted without a change
         assert _set(running, "tolerance", 1e-8).successful and _set(running, "scene", "paper").successful
         assert not _set(running, "tolerance", 1e-7).successful
         assert "unknown parameter hold_polcy: 'zero' is not used; did you mean hold_policy?" in running.twin.output()
@@ -287,7 +287,7 @@ def test_the_model_changes_a_motion_comes_back_and_the_journal_gives_it_all_agai
         assert ask("snapshot").success
         first = feed(100)
         assert ask("restore").success
-        # the first sample is that of the snapshot's time
+        # the first sample takes the snapshot's time
         assert feed(101)[1:] == first
         answer = _set(running, "damping", 0.0)
         assert not answer.successful and "configure the node again" in answer.reason

@@ -92,7 +92,7 @@ def test_outputs_equal_an_offline_twin_on_the_same_samples_bit_for_bit(tmp_path:
 
     stamps = [stamp_ns(message.header) for message in forces]
     assert (np.diff(stamps) == MS).all()
-    # what the publisher samples: the scene's loads on the grid
+    # the publisher's samples: the scene's loads on the grid
     wrench = compile_loads(scene.loads).at(np.arange(2000) * 1e-3)
     series = _offline(scene, stamps, wrench)
     assert tuple(forces[0].name) == PAIR_NAMES == tuple(peaks[0].name)
@@ -150,7 +150,7 @@ def test_at_a_fixed_rate_the_latency_includes_the_wait_for_the_publication(tmp_p
     ("mode", "rate"), [pytest.param("on_sample", 3000, marks=pytest.mark.stress), ("fixed_rate", 10000)]
 )
 def test_every_sample_sent_is_used_dropped_or_counted_as_lost(tmp_path: Path, mode: str, rate: int) -> None:
-    # the publisher overruns any queue: what is read is between all and a part
+    # the publisher overruns any queue: some or all samples are read
     with bench(tmp_path, publish_mode=mode, input_depth=200, excitation_timeout=60.0) as running:
         probe = running.probe
         publisher = running.publisher("--rate", str(rate), "--seconds", "2")
@@ -163,7 +163,7 @@ def test_every_sample_sent_is_used_dropped_or_counted_as_lost(tmp_path: Path, mo
             if counted == sent:
                 break
     assert sent == 2 * rate
-    # what is lost at the very end shows with the next sample only
+    # a loss at the very end shows with the next sample only
     assert 0 <= sent - counted <= 0.01 * sent
     assert int(figures["samples_missing"]) == 0  # off: no rate is asked for
 
@@ -183,7 +183,7 @@ def test_an_overrun_of_the_queue_is_counted_as_loss_and_reported(tmp_path: Path)
         sent, figures = 1000, probe.figures("input")
 
         def accounted() -> bool:
-            """Send one more, which tells that those before it are missing; a busy middleware may have kept none."""
+            """Send one more, which reveals the missing ones before it; a busy middleware may have kept none."""
             nonlocal sent
             send(T0 + sent * MS, (1.0, 2.0, 3.0))
             sent += 1
@@ -216,7 +216,7 @@ def test_one_publisher_is_followed_and_a_second_reported_until_a_switch(tmp_path
         probe.until(lambda: len(forces) == 41, "an answer to the second")
         assert stamp_ns(forces[-1].header) == T0 + 41 * MS
         running.twin.stop()
-    # who sent what is in the file, to the message
+    # the file has the sender of each message
     unused = list(unused_messages(tmp_path / "run"))
     assert {found["reason"] for found in unused} == {"not_followed"} and len(unused) == 41
     told = [(found["stamp_ns"], found["values"][0]) for found in unused]
@@ -320,16 +320,16 @@ def test_an_alarm_stays_until_it_is_acknowledged_and_writes_the_time_before_it(t
         found["topic_metadata"]["name"].rpartition("/")[2]: found["topic_metadata"]["offered_qos_profiles"][0]
         for found in stated["topics_with_message_count"]
     }
-    # what the recording states is what the graph shows
+    # the recording states what the graph shows
     recorded = {name: profiles[name]["durability"] for name in profiles.keys() & offered.keys()}
     assert recorded == {name: offered[name] for name in recorded}
     assert {*recorded.values()} == {"volatile", "transient_local"}
     assert (profiles["alarms"]["depth"], profiles["contact_forces"]["depth"]) == (1, 1000)
     before, after = replay(tmp_path / "run"), replay(tmp_path / "run_2")
     assert (before.exit_code, after.exit_code) == (0, 0)
-    # at the alarm and not at the end; what follows it lies in the second one
+    # at the alarm and not at the end; the time after it is in the second one
     assert 0 < before.samples < 600 and before.samples + after.samples == 601
-    # the first one, which holds the beginning, tells the alarm again; what led to the second one's is not in it
+    # the first one, with the beginning, raises the alarm again; the cause of the second one's is not in it
     assert (before.compared["alarms"], after.compared["alarms"]) == (1, 0) and after.not_compared["alarms"] > 0
     kinds = [type(record.entry).__name__ for record in RunReader(tmp_path / "run_2") if hasattr(record, "entry")]
     # the acknowledgement, the text of the mark, and the mark
@@ -369,7 +369,7 @@ def test_a_delay_that_rises_for_good_is_worked_in_marked_and_replayed_exactly(tm
         figures = probe.figures("input")
         running.twin.stop()
     assert figures["samples_used"] == "600"
-    assert 1 <= int(figures["rolled_back"]) < 300  # the first batch; what follows is on time again
+    assert 1 <= int(figures["rolled_back"]) < 300  # the first batch; later ones are on time again
     marks = [tuple(message.position) for message in quality]
     turns = [mark for mark, _ in itertools.groupby(marks)]
     # a busy machine may be silent once more on the way
@@ -381,7 +381,7 @@ def test_a_delay_that_rises_for_good_is_worked_in_marked_and_replayed_exactly(tm
     report = replay(record)
     assert (report.exit_code, report.divergences) == (0, 0), report
     assert report.compared["contact_peaks"] >= len(forces) and not report.not_compared
-    # what a subscriber received is what the file holds
+    # a subscriber received the messages of the file
     topic = f"{running.namespace}/contact_forces"
     recorded = [item.message() for item in RunReader(record) if getattr(item, "topic", "") == topic]
     assert len(recorded) >= len(forces)
@@ -631,7 +631,7 @@ def test_under_sim_time_silence_moves_nothing(tmp_path: Path) -> None:
         probe = running.probe
         forces = probe.listen(JointState, "contact_forces")
         send = probe.excitation()
-        # without /clock it waits and says so; what is more than the queue holds is counted
+        # without /clock it waits and says so; samples beyond the queue are counted
         for index in range(210):
             send(T0 + index * MS, (30e3, 0.0, 0.0))
             probe.pace(index)
@@ -641,7 +641,7 @@ def test_under_sim_time_silence_moves_nothing(tmp_path: Path) -> None:
         assert (len(forces), probe.figures("recorder")["written"]) == (0, "0")
         clock = probe.node.create_publisher(Clock, "/clock", 10)
         message = Clock()
-        # a time before 0 is none
+        # a time before 0 is not valid
         message.clock.sec = -5
         probe.until(lambda: clock.publish(message) or "/clock: got -5 s" in running.twin.output(), "a wrong time said")
         assert value(probe.status[-1], "clock") == "waiting" and not forces

@@ -68,7 +68,7 @@ def test_other_topics_come_into_the_run_s_folder_with_their_types(tmp_path: Path
     gauge = f"{namespace}/gauge"
     assert facts["messages"][gauge] + facts["lost"].pop(gauge, 0) == 2 * COUNT  # best effort
     assert facts["lost"] == {} == facts["skipped_topics"] and facts["without_publisher"] == []
-    # what the run holds itself is left out
+    # topics of the run itself are left out
     assert not facts["messages"].keys() & {*RunReader(run).header.topics.values()}
     with Reader(run / "beside") as reader:
         store = get_typestore(Stores.EMPTY)

@@ -255,7 +255,7 @@ def test_the_covariance_of_each_pose_goes_into_the_journal_and_the_estimate(tmp_
             taken = [Taken(b"", number, 0, serialize_message(message))]
             front.subscriptions._measured_poses(taken)
         assert front.runtime.inputs.head_pose.counts[Verdict.NON_FINITE] == 2
-        # a quaternion that nobody has filled in is no angle of 0
+        # an empty quaternion is no angle of 0
         message.pose.pose.orientation.w = 0.0
         front.subscriptions._measured_poses([Taken(b"", 6, 0, serialize_message(message))])
         assert front.runtime.inputs.head_pose.counts[Verdict.MALFORMED] == 1
@@ -319,7 +319,7 @@ def test_a_queue_that_fills_while_it_is_emptied_is_emptied_to_its_end() -> None:
         def send(count: int) -> None:
             for _ in range(count):
                 publisher.publish(TwistStamped())
-            # has the middleware told of all of them, every turn takes what it is asked for
+            # once the middleware has announced all of them, every turn takes the requested number
             time.sleep(0.2)
 
         while publisher.get_subscription_count() == 0 and time.monotonic() < give_up:

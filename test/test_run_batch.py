@@ -1,4 +1,4 @@
-"""Many twins in one call: each is its single run, in numbers, in saving and in what it says."""
+"""Many twins in one call: each equals its single run, in numbers, snapshots and errors."""
 
 from __future__ import annotations
 

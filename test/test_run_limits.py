@@ -1,4 +1,4 @@
-"""Bounded work: limits of a run, Ctrl-C and progress, each with what has been computed."""
+"""Bounded work: limits of a run, Ctrl-C and progress, each with the results so far."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_a_run_stops_at_its_limits_and_says_where_it_stood() -> None:
     part = stop.value.result
     assert part.solver["steps"] == 100 and 0 < len(part.t) < len(whole.t)
     assert stop.value.time_s == pytest.approx(part.t[-1], abs=0.01)
-    # what has been computed is what it would have been
+    # the results so far equal those of a whole run
     for name in ("t", "q", "v", "force"):
         assert np.array_equal(getattr(part, name), getattr(whole, name)[: len(part.t)]), name
     with pytest.raises(LimitError, match=r"max_wall_s = 1e-09 reached at t = "):
@@ -126,7 +126,7 @@ def test_a_twin_stops_at_its_limits_where_its_last_advance_ended() -> None:
         if name == "scene":
             assert late.time == len(part) == 0 and late.digest() == Twin(BENCH).digest()
             continue
-        # it goes on as if no more had been asked for
+        # it continues as if no more had been requested
         assert 0 < len(part) < len(times) and late.time == times[len(part) - 1] == stop.value.time_s
         assert np.array_equal(part.q, whole.q[: len(part)])
         late._pace.max_wall_s = np.inf

@@ -126,7 +126,7 @@ def test_a_live_twin_has_the_derivatives_too() -> None:
 
 @pytest.mark.parametrize("e", [1.0, 0.7])
 def test_a_live_twin_has_the_derivative_by_restitution_also_where_nothing_damps(e: float) -> None:
-    """At e = 1 the scene beside it is damped, and a contact under way keeps what it has read at its touch."""
+    """At e = 1 the scene beside it is damped, and a contact under way keeps the damping of its touch."""
     scene = replace(preset("paper"), initial=Initial((0.001, 0.002, 0.003), (0.4, 0.1, 0.8)))
     scene = replace(scene, contact=Contact("exact_restitution", scene.contact.stiffness, restitution=e))
     twin = Twin(scene, excitation="sampled")

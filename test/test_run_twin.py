@@ -1,4 +1,4 @@
-"""The twin: same bits however it is asked, saved and restored; bad input changes nothing."""
+"""The twin: same bits however it is advanced, saved and restored; bad input changes nothing."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def test_a_failed_advance_keeps_the_last_good_state_and_the_next_one_goes_on(wre
 
 @pytest.mark.parametrize("depth", [0.2, 1.3])
 def test_a_failed_advance_leaves_no_trace_in_later_ones(depth: float) -> None:
-    """It has crossed the end of the ramp; the impact goes on as if there had been none."""
+    """It has crossed the end of the ramp; the impact continues as if the advance had not been tried."""
     ramp, idle = 1e-3, (0.0, 0.0, 0.0)
     contact = Contact("ramped_damping", 1e6, exponent=1.5, damping=2e3, ramp_m=ramp)
     twins = [Twin(wall_and_point(contact, speed=1.0), excitation="sampled") for _ in range(2)]
@@ -155,7 +155,7 @@ def test_a_failed_advance_leaves_no_trace_in_later_ones(depth: float) -> None:
 
 
 def test_a_pose_out_of_range_is_never_handed_out_as_good() -> None:
-    """A step that ends at the time asked for is checked too."""
+    """A step that ends at the requested time is checked too."""
     for dt in (1e-3, 7e-4):
         twin = Twin(preset("paper"), excitation="sampled")
         rows = [twin.advance(k * dt, (0.0, 0.0, 1e6)) for k in range(1, 100)]

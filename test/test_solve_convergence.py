@@ -76,7 +76,7 @@ def test_event_location_keeps_the_order_of_the_series(
 ) -> None:
     """Error against number of steps over 4 s of impacts, the order of the series held at 6 and 8.
 
-    Six decades of the tolerance, above what rounding leaves (1e-13 of the clearance).
+    Six decades of the tolerance, above rounding (1e-13 of the clearance).
     """
     scene, exact = preset(name), reference(REFERENCES[name])["q"][:401]
     monkeypatch.setattr(compiled_scene, "order_for", lambda tol: order)
@@ -87,7 +87,7 @@ def test_event_location_keeps_the_order_of_the_series(
 
 @pytest.mark.parametrize("name", REFERENCES)
 def test_the_error_falls_with_the_tolerance(name: str) -> None:
-    """From 1e-3 to 1e-8, above what rounding leaves: error = constant times tol^s with s near 1."""
+    """From 1e-3 to 1e-8, above rounding: error = constant times tol^s with s near 1."""
     scene, exact = preset(name), reference(REFERENCES[name])["q"][:501]
     exponents = np.arange(3, 9)
     errors = [run(scene, 10.0**-k, exact)[1] for k in exponents.tolist()]

@@ -118,7 +118,7 @@ def test_corners_fly_and_turn_without_end(spin: float) -> None:
 
 
 def mirrored(scene: Scene) -> Scene:
-    """Return the head with walls whose motion is minus that of the block, while it does not turn."""
+    """Return the head with walls whose motion is the block's with the sign turned, while it does not turn."""
     q, v = scene.initial.q, scene.initial.v
     turned = tuple(replace(load, force_n=(-load.force_n[0], -load.force_n[1])) for load in scene.loads)
     return replace(
@@ -160,7 +160,7 @@ def test_corners_that_turn_little_are_nearly_a_mirrored_head_with_walls() -> Non
         ends = [simulate(one, t_end=0.03, output_dt=1e-3, tol=1e-10).q for one in (scene, mirrored(scene))]
         return float(np.abs(ends[0] + ends[1]).max())
 
-    # what the arms differ by is the clearance over the size, and a turn as large
+    # the arms differ by the clearance over the size, and a turn as large
     assert difference(1e-3) < 0.1 * 0.03
 
 

@@ -1,4 +1,4 @@
-"""Tangential friction: closed forms of a sliding block, both solvers, and no code where there is none."""
+"""Tangential friction: closed forms of a sliding block, both solvers, and no code without friction."""
 
 from __future__ import annotations
 

@@ -101,7 +101,7 @@ def assert_within_the_gate(scene: Scene, tolerances: tuple[float, ...]) -> None:
     for tol in tolerances:
         result = simulate(scene, 2.0, output_dt=0.01, tol=tol)
         assert result.solver["steps"] <= (15_000 if tol >= 1e-8 else 30_000), tol
-        # where a displacement grows the tolerance means nothing
+        # where a displacement grows the tolerance has no meaning
         if growth < 1e3:
             assert pose_error(shown, result.q, exact.q) <= 10.0 * tol, (tol, growth)
 
@@ -116,7 +116,7 @@ def test_the_tolerance_holds_however_loose_it_is(damping: float) -> None:
 
 
 def test_growth_while_dampers_hold_the_head_is_reported() -> None:
-    """A rest on two corners 1e-8 m deep amplifies what rounding leaves, for less time than the rest lasts."""
+    """A rest on two corners 1e-8 m deep amplifies rounding errors, for less time than the rest lasts."""
     scene = replace(BENCH, contact=overdamped("kelvin_voigt", 1e11), friction=Friction(0.2, 0.02))
     with pytest.warns(ToleranceWarning, match=r"an error grows \S+ times"):
         found = simulate(scene, 1.77, output_dt=0.01, sensitivity=True)

@@ -123,7 +123,7 @@ def _check_beside_the_loop(seed: int, count: int) -> None:
         alone = simulate(scene, 0.7, 0.02, tol=1e-12)
         error = pose_error(scene, many.q[index], alone.q)
         if error > 1e-9:
-            # the scene amplifies what rounding leaves, in two single runs as well
+            # the scene amplifies rounding errors, in two single runs as well
             assert error < 300.0 * pose_error(scene, simulate(scene, 0.7, 0.02, tol=1e-11).q, alone.q), index
             continue
         close += 1

@@ -21,7 +21,7 @@ from plow_twin.solve.modes import weigh_pairs
 from plow_twin.solve.state import new_work
 from plow_twin.solve.step import METHODS
 
-#: Fields of the state that every method may write, and those of one method alone.
+#: Fields of the state that every method may write, and fields of one method alone.
 OUTPUT = {"alpha", "beta", "sigma_end", "order", "ends_at_stop", "evaluations"}
 DECAY = {"implicit_size", "decay_times", "refused"}
 OWN = {

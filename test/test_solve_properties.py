@@ -23,7 +23,7 @@ from plow_twin.model.loads import compile_loads
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.run.advance import Advance
 
-#: Steps that one request may take; what needs more says so.
+#: Steps that a request may take; a longer one ends with its status.
 BUDGET = 20_000
 #: Steps after which a run is long enough.
 ENOUGH = 100_000
@@ -250,7 +250,7 @@ def search(structure: str, examples: int) -> None:
     assert ended[Status.NON_FINITE] == 0, ended
 
 
-# each structure compiles all kernels anew: the others are left to the full count
+# each structure compiles all kernels: the others are left to the full count
 @pytest.mark.parametrize("structure", ["viscous, harmonic", "factor, n = 1.5, harmonic", "factor, sampled"])
 def test_random_scenes_keep_the_energy_balance(structure: str) -> None:
     search(structure, 12)

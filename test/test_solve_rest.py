@@ -157,7 +157,7 @@ def test_a_harmonic_that_cannot_be_seen_lets_the_head_rest(
 
 
 def test_loose_tolerances_find_the_same_rest() -> None:
-    """Steps near the bound of stability leave some ringing of the stiffest pairs: it moves the head next to nothing."""
+    """Steps near the bound of stability leave some ringing of the stiffest pairs, which hardly moves the head."""
     steps = [simulate(fallen(), t_end, tol=1e-3).solver["steps"] for t_end in (100.0, 1000.0)]
     assert steps[1] == steps[0] + 9
 

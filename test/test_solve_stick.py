@@ -81,7 +81,7 @@ class Slider:
         return motion
 
     def left(self, motion: Callable[[float], np.ndarray], slip: int, anchor: float, t: float) -> float:
-        """Return what is left until the block lets go or holds again."""
+        """Return the distance to the block's next slip or stick."""
         x, v = motion(t)
         return slip * v if slip else self.static - abs(self.grip * (x - anchor))
 
@@ -152,7 +152,7 @@ def test_a_block_on_a_moving_belt_sticks_and_slips_for_ever() -> None:
 
 
 def test_a_load_below_the_limit_is_held_without_creep() -> None:
-    """Pressed by up to 0.9 mu N back and forth: the way is the spring's, F / k, and 20 periods leave nothing behind."""
+    """Pressed by up to 0.9 mu N back and forth: the way is the spring's, F / k, and 20 periods leave no creep."""
     amplitude, omega = 0.9 * MU * MASS * G, 2.0 * math.pi
     load = Harmonic("pull", (amplitude, 0.0), omega_rad_s=omega)
     scene = replace(block(0.0, 0.0), friction=HELD, loads=(load,))
@@ -337,7 +337,7 @@ def test_a_force_too_small_to_move_the_head_still_decides_whether_its_corner_hol
 
 @pytest.mark.parametrize("seed", [6, 17])
 def test_a_soft_grip_at_a_tight_tolerance_stays_finite(seed: int) -> None:
-    """The release penetration is one that the corner does not cross in less time than the series can tell."""
+    """The corner does not cross the release penetration in less time than the series can resolve."""
     scene = held_scene("hertz", seed)
     assert scene.friction is not None
     scene = replace(scene, friction=replace(scene.friction, stick_stiffness_n_m=1e8, stick_damping_n_s_m=None))

@@ -155,7 +155,7 @@ def test_a_restored_twin_and_a_batch_go_on_alike() -> None:
     assert twin.frame is not None and np.abs(twin.frame[:3]).max() > 1e-4
     assert np.array_equal(twin.frame, other.frame)
     assert not np.array_equal(members.q[0], members.q[1])
-    # what fails leaves both bodies where they were
+    # a failure leaves both bodies in place
     held = Twin(scene, excitation="sampled", max_steps=1)
     held.restore(twin.snapshot())
     assert held.advance(0.9, [9e4, 0.0, 0.0]).status.name == "BUDGET" and np.array_equal(held.frame, twin.frame)

@@ -1,4 +1,4 @@
-"""Archard wear: both closed forms, and that nothing of it runs when it is off."""
+"""Archard wear: both closed forms, and no code of it when it is off."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_depth_is_the_wear_law_of_the_impulse_and_widens_the_clearance() -> None
     assert worn.q == pytest.approx(same.q, abs=1e-9)
 
 
-#: Both of what may wear a pad beside its force and the travel: one kernel for the tests of either.
+#: Both further effects on wear, sliding and running-in: one kernel for the tests of either.
 RUBBED = Wear(1e-11, 0.015, 2.0, sliding="total", running_in_ratio=4.0, running_in_depth_m=2e-5)
 
 
@@ -122,7 +122,7 @@ def test_a_twin_goes_on_wearing_from_a_snapshot_and_stands_still_without_wear() 
     other = Twin(scene)
     other.restore(parts.snapshot())
     assert np.array_equal(other.advance(2.0).wear_depth, expected)
-    # worn pads have run in: they do not begin as new ones do, at the same motion
+    # worn pads have run in: at the same motion they wear slower than new ones
     other.reset(0.0, wear_depth=np.full(8, 1e-3))
     assert (other.advance(2.0).wear_depth - 1e-3).max() < 0.4 * expected.max()
     other.set_travel_speed(0.0)

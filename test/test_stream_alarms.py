@@ -45,7 +45,7 @@ def test_an_alarm_comes_after_its_duration_goes_below_its_hysteresis_and_stays_l
     assert _levels(alarms) == (Level.WARN, Level.WARN)
     _changes(alarms, _publication(5, 94.0))
     assert _levels(alarms) == (Level.NONE, Level.WARN)
-    # one that does not last is none, and one without samples says nothing
+    # a short level raises no alarm, and a level without samples is no evidence
     _changes(alarms, _publication(6, 300.0))
     _changes(alarms, _publication(7, 0.0))
     for stamp in range(8, 20):

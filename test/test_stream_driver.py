@@ -1,4 +1,4 @@
-"""Silence, jumps, failures and the scene's own loads: what becomes of them in the journal and in the motion."""
+"""Silence, jumps, failures and the scene's own loads: their effect on journal and motion."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LOAD = (32e3, 0.0, -45e3)
 
 
 def _some(published: Published) -> Published | None:
-    """Return what is published, None where it is nothing."""
+    """Return the publication, or None."""
     return published if len(published.rows) else None
 
 
@@ -41,7 +41,7 @@ class Bench:
         self.driver = Driver(session, Intake(), policy or Policy(), every_sample=every_sample)
 
     def sample(self, stamp_ns: int, wrench: tuple[float, float, float], now_ns: int) -> Published | None:
-        """Return what is published for one sample."""
+        """Return the publication of one sample."""
         return _some(Published.joined(list(self.driver.samples([(stamp_ns, wrench)], now_ns))))
 
     def silence(self, now_ns: int) -> Published | None:
@@ -69,7 +69,7 @@ def test_silence_is_bridged_that_far_behind_the_clock(hold: str) -> None:
     assert held == [first, Hold(T0 + 31 * MS)]
     assert driver.state is StreamState.STALE
 
-    # what the model has passed is late, the next one is used at once
+    # a sample that the model has passed is late, the next one is used at once
     assert bench.sample(T0 + 31 * MS, LOAD, now_ns=132 * MS) is None
     assert bench.sample(T0 + 32 * MS, LOAD, now_ns=132 * MS) is not None
     assert driver.state is StreamState.RUNNING
@@ -119,7 +119,7 @@ def test_a_late_burst_after_a_long_silence_is_dropped_and_the_model_goes_on() ->
     assert "Reset" not in bench.kinds()
     assert driver.session.twin.digest() == digest
     assert bench.sample(T0 + 3000 * MS, LOAD, now_ns=3000 * MS) is not None
-    # one that jumps is no step of the clock because it came twice, and a duplicate just after one is not late
+    # a jump that came twice is no step of the clock, and a duplicate just after a jump is not late
     assert bench.sample(T0 - 60 * NS_PER_S, LOAD, now_ns=3001 * MS) is None
     assert bench.sample(T0 - 60 * NS_PER_S, LOAD, now_ns=3001 * MS) is None
     assert bench.sample(T0 - 60 * NS_PER_S + MS, LOAD, now_ns=3001 * MS) is not None

@@ -1,4 +1,4 @@
-"""Which samples are used, and that each one that is not is counted under its own reason."""
+"""Which samples are used; each unused sample is counted under its reason."""
 
 from __future__ import annotations
 

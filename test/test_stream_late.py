@@ -126,7 +126,7 @@ def test_a_lasting_rise_of_the_delay_does_not_stop_the_twin() -> None:
     ordered.send(*(_arrival(index) for index in range(1500)))
     for index in range(500):
         live.send(_arrival(index), now_ns=index * MS)
-    for now in range(500, 1300, 10):  # nothing arrives for 0.8 s
+    for now in range(500, 1300, 10):  # no sample for 0.8 s
         live.silence(now * MS)
     assert _newest(live.frames[-1], "held") and _newest(live.frames[-1], "stamp_ns") > T0 + 1100 * MS
     held = len(live.frames)

@@ -52,7 +52,7 @@ def _same(first: list[Published], second: list[Published]) -> bool:
 
 
 def _again(scene: Scene, entries: list[Entry]) -> list[Entry]:
-    """Run a journal again, as it comes back from a file, and return what is emitted."""
+    """Run a journal again, as read back from a file, and return the emitted entries."""
     emitted: list[Entry] = []
     session = Session(Twin(scene, excitation="sampled"), on_entry=emitted.append, rollback_span_s=0.5)
     for entry in entries:

@@ -1,4 +1,4 @@
-"""The machine that live node and replay drive: same entries, same bits; nothing lost between two publications."""
+"""The machine that live node and replay drive: same entries, same bits; no loss between two publications."""
 
 from __future__ import annotations
 
@@ -233,12 +233,12 @@ def test_running_in_and_sliding_in_the_plane_wear_live_as_offline_and_go_on_afte
         return simulate(worn, 2e-3 * (STEPS - 1), 0.1, tol=Twin(scene).tol).wear_depth
 
     new = lived(WearKeeper(tmp_path, "head 7", scene))
-    # within what the solver's tolerance leaves of the motion
+    # within the solver's tolerance of the motion
     assert new == pytest.approx(offline(np.zeros(8)), rel=1e-3, abs=1e-12)
     assert new.max() > 1.5 * wear.running_in_depth_m
     worn = lived(WearKeeper(tmp_path, "head 7", scene))
     assert worn == pytest.approx(offline(new), rel=1e-3, abs=1e-12)
-    # pads that have run in wear as many times slower as they are told to
+    # pads that have run in wear slower by the given ratio
     assert (worn - new).max() < 0.6 * new.max()
 
 

@@ -1,4 +1,4 @@
-"""Other people's recordings through the twin: what a sensor's bias and delay look like, files of every kind, damage."""
+"""Other people's recordings through the twin: a sensor's bias and delay, files of every kind, damage."""
 
 from __future__ import annotations
 
@@ -269,7 +269,7 @@ def test_travel_makes_passes_of_the_face(tmp_path: Path) -> None:
     assert again.pad_wear == pytest.approx(loads.pad_wear, rel=1e-12)
     facts = loads.wear_facts()
     assert facts is not None and loads.pad_wear[0].max() > 0.0 < loads.pad_wear[1].max()
-    # what the pads have gained in both directions is what the model has worn away
+    # the pads' wear in both directions adds up to the model's
     assert loads.pad_wear.sum(axis=0) == pytest.approx(prediction.clearance.series()[1][-1][2:10], rel=0.03)
     # the slide as a whole wears as pad length to the way gone, and each place by what passed it
     whole = np.array(list(facts["slide_mean_m"].values())) * facts["slide_pieces"]
@@ -331,7 +331,7 @@ def test_duty_is_a_share_of_time_however_coarsely_the_load_is_sampled(tmp_path: 
 
 @pytest.mark.parametrize("clock_s", [2.0, 3600.0])
 def test_measured_values_are_compared_with_the_stretch_they_belong_to(clock_s: float, tmp_path: Path) -> None:
-    """The clock steps back into what was, or an hour ahead: either stretch is predicted as it was measured."""
+    """The clock steps back into the past, or an hour ahead: either stretch is predicted as it was measured."""
     times, wrench, q = motion()
     short = 3000
     weak = 0.3 * wrench[:short]
@@ -350,7 +350,7 @@ def test_measured_values_are_compared_with_the_stretch_they_belong_to(clock_s: f
 
 @pytest.mark.parametrize("rotation", ["paper", "consistent"])
 def test_contacts_under_gravity_alone_take_the_energy_of_the_height_lost(rotation: str, tmp_path: Path) -> None:
-    """In flight that is nothing; of a head that lies still m g times the drop of its centre less what is stored."""
+    """In flight that is 0; for a head at rest m g times the drop of its centre, less the stored energy."""
     scene = load_scene(PAPER)
     arm, height = scene.gravity.arm_m, 0.1
     assert arm > 0.1
@@ -377,7 +377,7 @@ def test_contacts_under_gravity_alone_take_the_energy_of_the_height_lost(rotatio
 
 
 def test_energy_stored_where_a_recording_begins_is_no_gain_of_the_contacts(tmp_path: Path) -> None:
-    """Contacts almost without damping take nothing, whatever they hold where it begins, 66 J, and where it ends."""
+    """Contacts almost without damping take no energy, for any stored energy at the begin, 66 J, and at the end."""
     scene = load_scene(PAPER)
     scene = replace(scene, initial=Initial(q=(0.0151, 0.0, 0.0)), contact=replace(scene.contact, damping=1e-9))
     (tmp_path / "scene.yaml").write_text(dump_scene(scene))

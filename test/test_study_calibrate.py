@@ -105,7 +105,7 @@ def test_an_unseen_parameter_is_reported_as_such() -> None:
 
 
 def figures(seconds: float) -> TargetSet:
-    """Return what a paper might publish of the true motion: forces, means, shares, impulses."""
+    """Return figures of the true motion as a paper might publish them: forces, means, shares, impulses."""
     true = with_parameters(preset("paper"), TRUTH)
     members = run_members([true], seconds)
     paths = [

@@ -1,4 +1,4 @@
-"""Runs compared: windows hold the recorded numbers; chance, load and machine are told apart."""
+"""Runs compared: windows hold the recorded numbers; chance, load and machine are distinguished."""
 
 from __future__ import annotations
 

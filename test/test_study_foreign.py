@@ -32,7 +32,7 @@ TYPE = "geometry_msgs/msg/WrenchStamped"
 
 
 def sqlite_bag(folder: Path) -> Path:
-    """A bag with the load, of which the last third stands in the log that a killed recorder leaves behind."""
+    """A bag with the load, whose last third is in the log that a killed recorder leaves behind."""
     with BagWriter(folder, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
         connection = writer.add_connection("/load", TYPE, typestore=STORE)
         for index in range(2 * COUNT // 3):
@@ -47,7 +47,7 @@ def sqlite_bag(folder: Path) -> Path:
         live.execute("INSERT INTO messages (topic_id, timestamp, data) VALUES (1, ?, ?)", (time_ns, data))
     live.commit()
     killed.mkdir()
-    for item in folder.glob("*.db3*"):  # as it stands on the disk, without a clean end
+    for item in folder.glob("*.db3*"):  # as it is on the disk, without a clean end
         if not item.name.endswith("-shm"):
             shutil.copy(item, killed)
     live.close()

@@ -1,4 +1,4 @@
-"""Many recordings at once, with workers that die; one that is analysed while it is recorded."""
+"""Many recordings at once, with workers that die; a recording that is analysed while it is written."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_a_killed_worker_loses_nothing_and_a_second_call_uses_finished_chunks(ru
     assert process.returncode == 0
     assert [facts["input"]["samples_used"] for facts in report["runs"]] == [2000 + n for n in range(RUNS)]
     assert len(list(out.glob("*/analysis.json"))) == RUNS
-    # a second call takes what is whole, and makes anew what was cut off in the middle
+    # a second call keeps complete results and repeats interrupted ones
     (out / "r2" / "asked.json").unlink()
     stored = [task.stored() for task in tasks(runs, out)]
     assert [facts is None for facts in stored] == [False, False, True, False]
@@ -264,7 +264,7 @@ def test_no_input_is_removed_and_results_of_two_recordings_never_stand_side_by_s
     narrow.write_text(dump_scene(replace(scene, clearance=replace(scene.clearance, horizontal_m=0.02))))
     Task(runs / "r0", PAPER, None, (narrow,), out).run()
     assert (out / "predicted_1.parquet").exists()
-    for path in (out / "run", out / "run" / "run_0.mcap"):  # its own input, and that of another task
+    for path in (out / "run", out / "run" / "run_0.mcap"):  # its own input, and another task's
         with pytest.raises(RecordingError, match="would replace it"):
             Task(path, None, None, (), out).run()
         with pytest.raises(RecordingError, match="would replace it"):
@@ -275,7 +275,7 @@ def test_no_input_is_removed_and_results_of_two_recordings_never_stand_side_by_s
     with pytest.raises(RecordingError):
         Task(broken, PAPER, None, (), out).run()
     assert not [path.name for path in out.iterdir() if path.is_file()]
-    # a scene beside it is another question than a scene to predict with, and so is one that says something else
+    # another role of a scene, or another scene, is another task
     Task(runs / "r0", PAPER, None, (narrow,), out).run()
     assert Task(runs / "r0", PAPER, None, (narrow,), out).stored() is not None
     assert Task(runs / "r0", PAPER, narrow, (), out).stored() is None

@@ -32,7 +32,7 @@ def drops() -> Drops:
 
 
 def misses(found: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Return the norm of what the velocities miss in m/s."""
+    """Return the norm of the velocities' errors in m/s."""
     return np.linalg.norm((found - after)[:, 3:] * [1.0, 1.0, GYRATION], axis=1)
 
 
@@ -45,7 +45,7 @@ def test_measured_impacts_are_met_better_than_by_a_rigid_impact(impacts) -> None
     missed = misses(impact(before), after)
     assert np.sqrt((missed**2).mean()) < 0.245
     assert np.median(missed) < 0.15
-    # without what falls and without the spring's damper it is no better than the rigid one
+    # without the fall of restitution and without the spring's damper it is no better than the rigid one
     plain = replace(ELLIPSE, fall=0.0, fall_along=0.0, restitution=0.54, tilt=0.0, stick_damping=0.0)
     assert np.sqrt((misses(impact(before, plain), after) ** 2).mean()) > 0.27
 
@@ -67,7 +67,7 @@ def test_central_impact_of_the_ellipse_returns_its_restitution() -> None:
     before = np.array([[0.0, SEMI_AXES[1], 0.0, 0.0, -2.5, 0.0], [0.0, SEMI_AXES[1], 0.0, 0.0, 1.0, 0.0]])
     after = impact(before, replace(ELLIPSE, tilt=0.0))
     assert after[0, 4] == pytest.approx(2.5 * ELLIPSE.restitution, rel=3e-3)
-    # one that moves away touches nothing
+    # a body that moves away has no impact
     assert (after[1] == before[1]).all()
 
 
@@ -149,7 +149,7 @@ def test_marker_is_turned_as_the_angles_at_rest_show(drops) -> None:
 def test_marker_s_state_is_the_block_s_and_back() -> None:
     state = np.random.default_rng(0).standard_normal((20, 6))
     np.testing.assert_allclose(MARKER.state_of_block(MARKER.measured(state)), state, atol=1e-12)
-    # its velocity is that of a point of the block
+    # it moves with a point of the block
     h = 1e-6
     moved = state.copy()
     moved[:, :3] += h * state[:, 3:]

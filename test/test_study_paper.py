@@ -1,4 +1,4 @@
-"""The study of the paper: what it leaves on disk, that its numbers are the run's, that it says where they disagree."""
+"""The study of the paper: its files, its numbers equal to the run's, and its list of disagreements."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_the_command_leaves_a_report_its_table_and_the_run(tmp_path: Path, capsy
     images = re.findall(r'src="data:image/png;base64,([^"]+)"', html)
     files = [(out / "figures" / f"{name}.png").read_bytes() for name in FIGURES]
     assert [base64.b64decode(image) for image in images] == files
-    assert not re.search(r'(src|href)="(?!data:)', html)  # nothing outside of the file
+    assert not re.search(r'(src|href)="(?!data:)', html)  # no resource outside of the file
 
     document = json.loads((out / "table.json").read_text())
     with (out / "table.csv").open() as file:
@@ -87,7 +87,7 @@ def test_the_command_leaves_a_report_its_table_and_the_run(tmp_path: Path, capsy
     assert document["recording_error_m"] < 1e-6
     assert replay(out / "run").divergences == 0
 
-    assert run(["study", "paper", "--out", str(out)]) == 2  # nothing is overwritten
+    assert run(["study", "paper", "--out", str(out)]) == 2  # no file is overwritten
     assert "expected a new folder" in " ".join(capsys.readouterr().err.split())
 
 
@@ -175,7 +175,7 @@ def test_sets_from_the_events_are_the_solver_s_own(study: PaperStudy) -> None:
         assert all(first.end_s == second.start_s for first, second in itertools.pairwise(timeline))
         shares = {name: figures.share for name, figures in paper_sets.figures(timeline).items()}
         assert shares == pytest.approx(dict(study.runs.case.contact_sets[sense]), abs=1e-9)
-    forces = study.runs.case.force  # what the events say is what the rows say
+    forces = study.runs.case.force  # events and rows agree
     letters, chosen = paper_sets.letters_of_pairs(study.runs.scene), paper_sets.of_sense("cw")
     for index in range(0, len(forces), 997):
         seen = {letters[pair] for pair in range(8) if chosen[pair] and forces[index, pair] > 0.0}

@@ -1,4 +1,4 @@
-"""What goes out to a plant: real brokers, servers and clients in other processes get what the recording holds."""
+"""Outputs to a plant: real brokers, servers and clients in other processes get the numbers of the recording."""
 
 from __future__ import annotations
 
@@ -265,7 +265,7 @@ def test_opcua_clients_read_a_typed_model_and_acknowledge_alarms_where_that_is_a
 
 
 def _meanwhile(live: Live, work: Coroutine[Any, Any, Any]) -> Any:
-    """Do something while what the twin says is read: it waits for its readers."""
+    """Do something while the twin's output is read: the twin waits for its readers."""
     with ThreadPoolExecutor(1) as pool:
         done = pool.submit(asyncio.run, work)
         live.until(lambda _: done.done(), "done")

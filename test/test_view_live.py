@@ -60,7 +60,7 @@ def test_a_stopped_viewer_does_not_disturb_the_node_and_catches_up_later(tmp_pat
             node.probe.until(lambda: len(forces) >= 4000, "every publication")
             recorder, output = node.probe.figures("recorder"), node.probe.figures("output")
             assert recorder["lost"] in ("", "0", "{}") and recorder["error"] == "" and output["withheld"] == "0"
-            os.kill(shown.pid, signal.SIGCONT)  # it goes on alone: what it sends is not taken
+            os.kill(shown.pid, signal.SIGCONT)  # it continues alone: its messages are not taken
             assert node.twin.stop() == 0
         assert written.wait(WAIT_S) == 0
         reader = RunReader(run)

@@ -60,7 +60,7 @@ def read(path: Path) -> dict[str, pa.Table]:
 
 
 def curve_names(path: Path) -> dict[str, str]:
-    """Return what the legend calls each curve of a .rrd."""
+    """Return the legend's name of each curve of a .rrd."""
     names: dict[str, str] = {}
     for chunk in RrdReader(str(path)).stream():
         batch = chunk.to_record_batch()
@@ -138,7 +138,7 @@ def test_the_growth_of_the_clearance_is_drawn_in_micrometres(tmp_path: Path) -> 
         index = sent[0].name.index(name)
         np.testing.assert_allclose(best, [1e6 * (m.position[index] - new_m) for m in sent], rtol=0, atol=1e-9)
         assert 0.0 < low[-1] < 0.2 * best[-1] < best[-1] < 0.2 * high[-1]
-        # the legend shows the colour of the first stroke: that of a band is not faint
+        # the legend shows the colour of the first stroke, which is not faint for a band
         colors = tables[f"/growth/band/{name} colors"]["SeriesLines:colors"].to_pylist()
         assert [color[0] & 0xFF for color in colors] == [255, layout._BAND_ALPHA]
 
