@@ -1,4 +1,4 @@
-"""Answers from one window: the estimate and, if asked for, forces with intervals and the time to a limit."""
+"""Answers from one window: the estimate and, on request, forces with intervals and the time to a limit."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ class Asked:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """The estimate, the guess for the next window, and the other answers asked for, as JSON values.
+    """The estimate, the guess for the next window, and the other requested answers, as JSON values.
 
-    also : `forces` and `forecast` if asked for; null, with `<name>_error`, where there is no answer
+    also : `forces` and `forecast` on request; null, with `<name>_error`, where there is no answer
     """
 
     estimate: Estimate
@@ -54,7 +54,7 @@ class Answer:
 
 
 def answer(scene: Scene, window: Window, guess: Guess, asked: Asked) -> Answer:
-    """Estimate from a window, beginning at `guess`, and give the other answers asked for."""
+    """Estimate from a window, beginning at `guess`, and give the other requested answers."""
     result, following = estimate_window(scene, window.load, window.pose, window.lost, guess, window.gaps)
     also: dict[str, Any] = {}
     if asked.members:

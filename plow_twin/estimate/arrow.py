@@ -25,7 +25,7 @@ class Arrow:
     """A symmetric matrix of k shared unknowns and six of each of s swings.
 
     border : (k, k)
-    coupling : (6 s, k) of the swings' unknowns with the shared ones
+    coupling : (6 s, k) of the swings' unknowns with the shared unknowns
     bands : (12, 6 s) diagonals of the rest from the main one down, as LAPACK has them
     """
 

@@ -50,7 +50,7 @@ _CHANGES: Final = (1, 2, 4, 8, 16, 32)
 _CHANGES_BY_PHASE: Final = (1, 4)
 #: Guard: a square that counts as zero, in m2 or rad2.
 _NO_SCATTER = 1e-14
-#: Bound: work of a longer motion, in that of ten load periods.
+#: Bound: work of a longer motion, over the work of ten load periods.
 _LONGER = 2.0
 #: Guard: bounds of the penetrations in m that are drawn for a hard and for a firm contact.
 _HARD_BOUNDS, _FIRM_BOUNDS = (8e-7, 6e-4), (2e-6, 2e-2)
@@ -71,7 +71,7 @@ class Bounced:
     distance : of the measured motion from nearby drawn ones, over the distance of drawn ones from each other
     path : distance of mean and scatter of the pose over the load's period from the prediction by the drawn motions, as
         a normal deviate among the distances of the drawn ones
-    law : likeness of the motion to those of another contact law, as a normal deviate among motions of the law
+    law : likeness of the motion to motions of another contact law, as a normal deviate among motions of the law
         believed; 0 if no other law is known
     odds : log odds of the other law; minus infinity if no other law is known
     """
@@ -414,7 +414,7 @@ def path_deviate(seen: Array, features: Array, drawn: list[Array], measured: Arr
 
 
 def _distance_of_paths(features: Array, paths: Array, measured: Array, seen: Array) -> float:
-    """Return the mean square distance of a seen path (lags, k) from the prediction of the drawn ones (n, lags, k).
+    """Return the mean square distance of a seen path (lags, k) from the prediction by the drawn paths (n, lags, k).
 
     The distance is Mahalanobis's, with the covariance of the drawn paths' residuals, shrunk toward equal variances
     (Ledoit and Wolf, J. Multivar. Anal. 88 (2004) 365).
@@ -481,7 +481,7 @@ class _Near:
 def regress_near(features: Array, targets: Array, measured: Array) -> _Regressed:
     """Regress targets (n, k) on features (n, m), weighting draws near the measured features most.
 
-    The deviations are those of a prediction at `measured`, which may lie at the edge of the draws.
+    The deviations belong to a prediction at `measured`, which may lie at the edge of the draws.
     """
     near = _Near.to(features, measured)
     value, error = near.regress(targets)

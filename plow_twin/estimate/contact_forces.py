@@ -106,7 +106,7 @@ class Cells:
 
 
 class Feeling:
-    """The forces that motions of a fit's swings give at the times of measured ones."""
+    """The forces of a fit's swings at the times of the measured forces."""
 
     def __init__(self, problem: Problem, t: Array) -> None:
         window = Window(Poses(t, np.zeros((len(t), 3))), problem.window.starts, problem.window.states)
@@ -169,7 +169,7 @@ def cells_of(feeling: Feeling, found: Fit, forces: ContactForces) -> tuple[Cells
     measured = forces.force - offset
     found_out, pairs = [], []
     largest = float(np.nanmax(felt.force))
-    # digits of a cell that shows nothing in flight
+    # digits of a cell that shows 0 in flight
     noise = np.maximum(noise, 1e-4 * largest)
     for i, name in enumerate(PAIR_NAMES):
         there = np.isfinite(measured[:, i]) & (felt.swing >= 0)

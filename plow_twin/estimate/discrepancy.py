@@ -62,7 +62,7 @@ _WALL_STEP, _PUSH_STEP = 0.02, 5e-3
 _LEAST_PUSH = 1e-5
 #: Bound: rounds of expectation and maximisation, between which the noise is tempered.
 _ROUNDS = (8, 5, 3)
-#: Derived: probability that a quantity differs from the scene; nothing is known of it.
+#: Derived: probability that a quantity differs from the scene, without prior knowledge.
 _DIFFERS = 0.5
 #: Bound: sweeps of the sampler, and the first of them, which are not counted.
 _SWEEPS, _BURNT = 50, 10
@@ -214,7 +214,7 @@ def _moved(scene: Scene, path: str, step: float, depth: float) -> Scene:
 
 
 class _Linearised:
-    """The linearised problem: the border holds the shared unknowns and the further ones, each swing its state and load.
+    """The linearised problem: the border holds the shared and the further unknowns, each swing its state and load.
 
     inflation : (3,) of the variance of each component
     load : (3,) deviation of the load's error in a swing

@@ -680,7 +680,7 @@ def _damping(unknowns: Unknowns, value: Interval) -> Interval | None:
 
 
 def priors(scene: Scene, load: Load, poses: Poses) -> dict[str, Interval]:
-    """Return what is known of each quantity before the motion, by the names of `QUANTITIES`, in SI."""
+    """Return the prior of each quantity, by the names of `QUANTITIES`, in SI."""
     unknowns = Unknowns.stated(scene, load, poses)
     normal = [Interval.normal(*pair) for pair in zip(unknowns.nominal(), unknowns.deviations(), strict=True)]
     numbers = {name: value for name, value in _numbers(unknowns, normal).items() if value is not None}

@@ -5,7 +5,7 @@ of it does no harm. Each is simulated from its own starting state (multiple shoo
 hard contact nor an error of the load can grow from swing to swing. Levenberg-Marquardt minimises Huber's function of
 the residuals and the prior. Under a load that is unknown between its samples the swings are short, and
 each is linked to the next by the covariance of that unknown part (weak constraints). Runs from displaced starting
-states give the variance of the prediction at each moment, which is added to that of the measurement.
+states give the variance of the prediction at each moment, which is added to the measurement's.
 
 References: Bock, Recent advances in parameter identification techniques for ODE (1983); Nocedal and Wright, Numerical
 Optimization, ch. 10; Huber, Robust Statistics, ch. 7; Tremolet, Q. J. R. Meteorol. Soc. 132 (2006) 2483.
@@ -39,7 +39,7 @@ _DISPLACED = np.array([2e-4, 2e-4, 1e-3, 5e-3, 5e-3, 3e-2])
 _LEAST_DRIFT = 1e-8
 #: Definition: walls by their two pads: left, right (top pad first), top, bottom (left pad first).
 WALLS: Final = ((1, 7), (3, 5), (0, 2), (6, 4))
-#: Derived: three numbers a row against the six of a swing's start; with fewer rows it knows nothing else.
+#: Derived: three numbers a row against the six of a swing's start; fewer rows determine the start alone.
 FEWEST_OF_SWING = 4
 
 
@@ -77,7 +77,7 @@ class Point:
 
     shared, states : (11,), (s, 6)
     swing : (n,) swing of each pose, -1 outside of all swings
-    residual : (n, 3) measured minus predicted; NaN where nothing was measured
+    residual : (n, 3) measured minus predicted; NaN where not measured
     rate : (n, 3) predicted rates
     contact : (s, 8) time in contact of each pair in s
     defect : (s - 1, 6) from the end of each swing to the start of the next; (0, 6) where they are not linked
@@ -107,7 +107,7 @@ class Linear:
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """A part of the normal equations: the shared unknowns and those of consecutive swings from `swing` on.
+    """A part of the normal equations: the shared unknowns and the unknowns of consecutive swings from `swing` on.
 
     rows, weighted : (m, 17) or (m, 23)
     residual : (m,)
@@ -406,7 +406,7 @@ def freed(swings: int, unknowns: int) -> float:
 
 
 def joint_step(problem: Problem, found: Fit, columns: Array, precision: Array, pull: Array) -> tuple[Array, Array]:
-    """Return the linearised step of the shared unknowns and of further ones together, and its covariance.
+    """Return the linearised step of the shared and the further unknowns together, and its covariance.
 
     `columns` (n, 3, k) are the derivatives of the prediction by the further unknowns, `precision` and `pull` (k,) the
     prior's terms in their normal equations. Each swing's starting state is eliminated.

@@ -32,7 +32,7 @@ POINTS: Final = (0.05, 0.5, 0.95)
 FEWEST: Final = 20
 #: Guard: least drawn clearance, in the estimated one.
 _LEAST_SHARE = 0.02
-#: Derived: tolerance of the members, that of the fit.
+#: Derived: tolerance of the members, equal to the fit's.
 TOLERANCE: Final = tuning.TOLERANCE
 #: Bound: samples advanced in one call; the rows of all members stay in the processor's cache.
 _CALL = 10
@@ -87,7 +87,7 @@ class ForceEnsemble:
     scene : Scene
         The nominal scene: geometry, masses and gravity hold.
     found : Estimate
-        Its intervals are drawn from; not one that is withdrawn.
+        Its intervals are drawn from; a withdrawn one is refused.
     members : int
         At least 20: fewer have no 5 % point.
     start : float
@@ -145,7 +145,7 @@ def quantiles(values: Array) -> Array:
     """Return the nearest-rank quantiles over the first axis, in the order of `POINTS`; no value is below zero."""
     places = [min(int(share * len(values)), len(values) - 1) for share in POINTS]
     out = np.zeros((len(POINTS), *values.shape[1:]))
-    # most pairs are apart in all members: nothing to put in order
+    # most pairs are apart in all members: no order to find
     there = values.any(axis=0)
     out[:, there] = np.partition(np.ascontiguousarray(values[:, there].T), places, axis=1)[:, places].T
     return out

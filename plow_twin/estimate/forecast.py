@@ -282,7 +282,7 @@ def with_clearances(scene: Scene, horizontal_m: float, vertical_m: float, depth:
     """Return the scene with the estimated clearances, which include all wear so far.
 
     `depth`, shape (8,) in m, is the wear of the pads if known; the clearances before it follow.
-    With running-in they are as worn as the clearances have grown, for they no longer wear as new ones.
+    With running-in they are worn by the growth of the clearances, because they no longer wear like new pads.
     """
     wear, new = scene.wear, scene.clearance
     if wear is None:

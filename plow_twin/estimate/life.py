@@ -26,7 +26,7 @@ from plow_twin.run.simulate import simulate
 
 Array = NDArray[np.float64]
 
-#: Guard: wear in m by which the travel of sliding pads is found; it moves nothing.
+#: Guard: wear in m by which the travel of sliding pads is found; too small to matter.
 _TRACE_M = 1e-12
 #: Bound: rows for one of a path with running-in.
 _FINER = 16

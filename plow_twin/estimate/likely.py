@@ -28,7 +28,7 @@ _CURVED = tuple(combinations_with_replacement(range(4), 2))
 _PARTS = 10
 #: Bound: Gauss-Newton steps, and the longest one in deviations of the draws.
 _STEPS, _LONGEST = 5, 1.5
-#: Guard: prior deviation of an unknown parameter, in that of the draws.
+#: Guard: prior deviation of an unknown parameter, over the deviation of the draws.
 _FREE = 100.0
 
 

@@ -71,7 +71,7 @@ class Poses:
         return Poses(times[index], rows[index], deviation), len(times) - len(index)
 
     def interval(self) -> float:
-        """Return the distance in s of whole poses, partial ones counted as merged."""
+        """Return the distance in s of whole poses, partial poses counted as merged."""
         measured = int(np.isfinite(self.q).sum())
         return float(np.median(np.diff(self.t))) * self.q.size / max(measured, 1)
 
@@ -87,7 +87,7 @@ class Poses:
     def without_spikes(self, level: Array) -> tuple[Poses, int]:
         """Leave out values far from all four about them; return how many. `level`, shape (3,): noise from row to row.
 
-        Where many are, the sensor is a bad one, and nothing is left out.
+        Where many are, the sensor is bad, and no row is left out.
         """
         if len(self.t) < FEWEST_FOR_SCATTER:
             return self, 0
@@ -230,7 +230,7 @@ class Load:
         rows = self.wrench / np.where(scale > 0.0, scale, 1.0)
         out = np.zeros(len(rows))
         out[[0, -1]] = np.inf
-        # all lines of one generation at once; lines within one that is left out are left out
+        # all lines of a generation at once; lines within a line that is left out are left out
         left, right, least = np.array([0]), np.array([len(rows) - 1]), np.array([np.inf])
         while len(left):
             inner = right - left > 1

@@ -31,7 +31,7 @@ class State(Enum):
     ESTIMATED = "estimated"
     ROUGH = "rough"  #: the machine differs from the model: an interval that allows for it
     NOT_OBSERVABLE = "not_observable"  #: the motion does not determine it: the prior, with its interval
-    PRIOR = "prior"  #: nothing was measured
+    PRIOR = "prior"  #: not measured
     WITHDRAWN = "withdrawn"  #: the sensor is broken, or the data contradict themselves or every motion of the model
 
     @property
@@ -107,7 +107,7 @@ class ForcesUsed:
 
     cells : by pair
     delay : by which their stamps are later than the motion, in s
-    unused : why they make nothing better; empty where they do
+    unused : why they do not improve the estimate; empty where they do
     """
 
     cells: dict[str, Cell] = field(default_factory=dict)
@@ -141,10 +141,10 @@ class ForcesUsed:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A measured motion beside that of the model, as its sensor would show it: with bias and delay.
+    """A measured motion beside the model's, as its sensor would show it: with bias and delay.
 
     t : (n,) stamps in s
-    measured, model : (n, 3) x, y in m, theta in rad; NaN where nothing was measured, or the model was not fitted
+    measured, model : (n, 3) x, y in m, theta in rad; NaN where not measured, or the model was not fitted
     """
 
     t: Array

@@ -62,7 +62,7 @@ def refine(
     From a start `close` to the optimum, long swings of a hard contact converge too.
 
     `drift` (3,) is the spectral density of the acceleration by the unknown part of a broad-band load in m2/s3 and
-    rad2/s3, None for another load; `turns` (4,) are those of the walls, in m.
+    rad2/s3, None for another load; `turns` (4,) are the turns of the walls, in m.
     """
     hard = not close and bool(np.exp(shared[SOFTNESS]) < tuning.HARD)
     rows = poses.interval() * np.array(_FEWEST_ROWS)

@@ -83,7 +83,7 @@ def cut(scene: Scene, poses: Poses, period: float, shortest: float) -> Window:
     while t[-1] > starts[-1] + 2.0 * apart:
         near = np.flatnonzero((t > starts[-1] + apart) & (t < starts[-1] + 2.0 * apart) & (room > clear))
         if not len(near):
-            # nothing clear for long: a whole period at most is one swing
+            # long without a clear start: a swing is a whole period at most
             far = np.flatnonzero((t > starts[-1] + 2.0 * apart) & (room > clear))
             end = min(float(t[far[0]]) if len(far) else np.inf, starts[-1] + period)
             near = np.flatnonzero((t >= end) & (t < end + apart))

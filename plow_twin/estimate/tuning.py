@@ -1,4 +1,4 @@
-"""The numbers of the estimator that were chosen rather than derived, each with what it was set on.
+"""The numbers of the estimator that were chosen rather than derived, each with the data that it was set on.
 
 They are read as `tuning.NAME` where they are used, so that `benchmark/tuning_sensitivity.py` can vary them;
 `benchmark/results/tuning.md` shows them with the sensitivity that it measured. Seeds: `benchmark/estimate.py`.

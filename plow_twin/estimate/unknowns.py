@@ -189,7 +189,7 @@ class Unknowns:
         return math.exp(psi) - tuning.RESOLVED
 
     def stiffness_of(self, psi: float) -> float:
-        """Return the stiffness of psi, at most that of the hardest simulated contact."""
+        """Return the stiffness of psi, at most the hardest simulated contact's."""
         u = max(math.exp(psi) - tuning.RESOLVED, _HARDEST)
         return float(self.force / u**self.scene.contact.exponent)
 

@@ -34,7 +34,7 @@ class Verdict:
 
     figures : statistics of the tests
     by_scale : whether the scales are the sensor's only fault
-    broken : whether the sensor fails or the data contradict themselves, so that nothing can be estimated
+    broken : whether the sensor fails or the data contradict themselves, so that no estimate is possible
     """
 
     model: list[str] = field(default_factory=list)

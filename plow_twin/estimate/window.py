@@ -38,7 +38,7 @@ MOST_KEPT = 600_000
 class Window:
     """Measurements in [start_ns, end_ns); times in s count from `start_ns`.
 
-    samples, poses : numbers of rows received; `poses` counts those of gaps too
+    samples, poses : numbers of rows received; `poses` includes rows of gaps
     lost : rows left out
     gaps : None without measured gaps
     """
@@ -124,7 +124,7 @@ class Windows:
         return self._form(end_ns)
 
     def last(self) -> Window | str:
-        """Return the window that ends with the newest sample, for nothing comes any more; or why there is none."""
+        """Return the window that ends with the newest sample, when the input has ended; or the reason without one."""
         if self._newest_ns is None:
             return "got no load"
         window = self._form(self._newest_ns + 1)

@@ -58,7 +58,7 @@ class Found:
     """The estimate of one window: its bounds [ns], numbers of rows, guess, and result.
 
     wall_s : duration of the computation; skipped : windows dropped before it; restarts : restarts before it
-    text : the whole answer as JSON, with `forces` and `forecast` if asked for, which `also` holds too
+    text : the whole answer as JSON, with `forces` and `forecast` on request, which `also` holds too
     """
 
     start_ns: int
@@ -130,7 +130,7 @@ class Worker:
         self._waiting.append(("restart",))
 
     def finish(self) -> None:
-        """Let the last window be estimated: nothing comes any more. Once that is done `ended` is no longer None."""
+        """Let the last window be estimated, as the input has ended. When it is done, `ended` is no longer None."""
         self._waiting.append(("end",))
 
     @property
