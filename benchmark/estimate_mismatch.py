@@ -130,7 +130,7 @@ KINDS = {
 
 @dataclass(frozen=True, eq=False)
 class Mismatch:
-    """What is true, and what the estimate gets."""
+    """The truth and the estimate's inputs."""
 
     scene: Scene
     nominal: Scene

@@ -99,7 +99,7 @@ def restitution_laws() -> list[str]:
 
 
 def valid_ranges(rows: Sequence[Row]) -> str:
-    """Return in words where the restitution delivered is within 5 % of the one asked for (asked > 0)."""
+    """Return in words where the restitution delivered is within 5 % of the nominal one (asked > 0)."""
     inside = [row.asked > 0.0 and abs(row.delivered / row.asked - 1.0) <= VALID for row in rows]
     edges = np.flatnonzero(np.diff([False, *inside, False])).reshape(-1, 2)
     parts = [

@@ -1,4 +1,4 @@
-"""What a build is: the version of the package, and all that the exact bits of a run depend on."""
+"""The identity of a build: the version of the package, and all that the exact bits of a run depend on."""
 
 from __future__ import annotations
 

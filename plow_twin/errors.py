@@ -122,7 +122,7 @@ class RunInterrupted(_StoppedError, KeyboardInterrupt):
 
 
 class ToleranceWarning(UserWarning):
-    """A motion amplifies errors so much that the tolerance asked for does not hold."""
+    """A motion amplifies errors so much that the requested tolerance does not hold."""
 
 
 class RecordingError(PlowTwinError, ValueError):
@@ -142,4 +142,4 @@ class TakenError(RecordingError):
 
 
 class ForeignRecordingError(RecordingError):
-    """A recording that was asked for as a run of plow_twin is none; it may be a recording of another kind."""
+    """A recording is no run of plow_twin; it may be a recording of another kind."""

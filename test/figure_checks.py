@@ -1,4 +1,4 @@
-"""What a reader of a figure objects to: legends over the data, texts over each other, axes without words."""
+"""Faults of a figure: legends over the data, texts over each other, axes without words."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What verbs print fits a terminal of 80 columns, whole: no cell is cut, no Python is shown."""
+"""Output of verbs fits a terminal of 80 columns: no cell is cut, no Python is shown."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Pinned motions: no bit and no count of steps, evaluations or events changes unless somebody means it to.
 
-`pytest test/test_golden.py --golden-update` pins anew for the present build. A build without a file of its own is
+`pytest test/test_golden.py --golden-update` pins them again for the present build. A build without a file of its own is
 held to the counts of another one: rounding moves single events, not the work.
 """
 

@@ -367,7 +367,7 @@ def test_a_mapping_takes_units_offsets_clocks_and_names_its_faults(tmp_path: Pat
 
 
 def test_files_wait_for_a_recorder_that_is_slow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What comes as fast as it goes comes in batches, each of which fills a quarter of this queue."""
+    """Input without a clock comes in batches, each of which fills a quarter of this queue."""
     monkeypatch.setattr("plow_twin.live.recording._QUEUE_SIZE", 2400)
     monkeypatch.setattr("plow_twin.record.recorder._POLL_S", 0.3)
     path = _csv(tmp_path / "load.csv", 2000)

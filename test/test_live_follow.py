@@ -301,7 +301,7 @@ def test_late_samples_and_poses_end_in_the_bits_of_those_in_order_and_replay_giv
 
 
 def test_publications_do_not_change_the_motion_where_poses_samples_and_a_hold_are_late(truth: Truth) -> None:
-    """What has been published decides how far a late sample goes back."""
+    """Publications decide how far a late sample goes back."""
     live, part = Live(truth.nominal), _in_turn(truth, 0.5, 1.5)
     live.take([*_in_turn(truth, 0.0, 0.5), _known(truth), *part[30:60], *part[:30], *part[90:120], *part[60:90]])
     live.take([Hold(_stamp(1.2)), *part[150:], _known(truth, State.WITHDRAWN), *_in_turn(truth, 1.5, 1.6)])

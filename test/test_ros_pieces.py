@@ -1,4 +1,4 @@
-"""What others look for beside the node: markers, layouts, groups of diagnostics, rights."""
+"""Files and topics beside the node: markers, layouts, groups of diagnostics, rights."""
 
 from __future__ import annotations
 

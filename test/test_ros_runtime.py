@@ -1,4 +1,4 @@
-"""What a node holds is given back: in this process, where threads, objects and topics can be counted."""
+"""A node releases its resources: in this process, where threads, objects and topics can be counted."""
 
 from __future__ import annotations
 

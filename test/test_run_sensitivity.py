@@ -1,4 +1,4 @@
-"""What a tolerance is worth: growth of errors against finite differences, a map's exponent, a scene that amplifies."""
+"""The worth of a tolerance: growth of errors against finite differences, a map's exponent, a scene that amplifies."""
 
 from __future__ import annotations
 

@@ -80,7 +80,7 @@ VARIANTS = {
 
 
 def test_an_exponent_that_is_no_integer_keeps_to_the_tolerance_when_separations_are_slow() -> None:
-    """What is left out before a separation is the more, the slower it is: a thrown head that its damping slows down."""
+    """The force left out before a separation is larger for a slower one: a thrown head that its damping slows down."""
     scene = preset("bench_hc")
     contact = Contact("hunt_crossley", 3e9 * 1e-3**-1.2, 2.2, damping=3.0)
     scene = dataclasses.replace(scene, contact=contact, initial=Initial((0.0, 0.0, 0.0), (-1.1, 0.3, -6.0)))

@@ -28,7 +28,7 @@ def _publication(
 
 
 def _changes(alarms: Alarms, published: Published) -> bool:
-    """Tell whether a publication changes a level."""
+    """Return whether a publication changes a level."""
     return list(alarms.feed(published)) == [0]
 
 

@@ -331,7 +331,7 @@ def _certificate(folder: Path, name: str) -> None:
 
 
 class EdgeNode:
-    """What a host of Sparkplug B hears of the node `mine/plough`."""
+    """Messages of the node `mine/plough` at a host of Sparkplug B."""
 
     def __init__(self, port: int) -> None:
         self.subscriber = Subscriber(port, topics="spBv1.0/#")

@@ -1,4 +1,4 @@
-"""What the checks promise: examples that are new each time under stress, versions that are really the lowest."""
+"""Promises of the checks: examples that are new each time under stress, versions that are really the lowest."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_stress_draws_new_examples_prints_its_seed_and_shrinks() -> None:
 
 @pytest.fixture
 def metadata(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """What setup.py states."""
+    """The arguments of setup() in setup.py."""
     stated: dict[str, Any] = {}
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr("setuptools.setup", lambda **keywords: stated.update(keywords))

@@ -1,4 +1,4 @@
-"""Who may look at the screen: the address it is offered on, the token, and the names it may be asked for under."""
+"""Access to the screen: its address, the token, and the host names that it answers to."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _SHORTEST: Final = 16
 
 
 class DashboardError(InputError):
-    """The screen cannot be offered as asked for."""
+    """The screen cannot be offered as requested."""
 
     def __init__(self, key: str, got: object, expected: str) -> None:
         super().__init__([Problem(key, got, expected)], "dashboard")
@@ -70,7 +70,7 @@ class PageAccess:
         return hmac.compare_digest(given.encode("utf-8", "replace"), self.token.encode())
 
     def answers_to(self, host: str) -> bool:
-        """Return whether the page may be asked for under a name, as in `Host`: a name that others own may not.
+        """Return whether the page answers to a name, as in `Host`; it does not to names that others may own.
 
         Else a page of theirs could have its name lead here and read the screen (DNS rebinding).
         """

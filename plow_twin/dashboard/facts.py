@@ -1,4 +1,4 @@
-"""What the page shows of a machine: its cross-section, its pads, the thresholds of its alarms."""
+"""Facts of a machine for the page: its cross-section, its pads, the thresholds of its alarms."""
 
 from __future__ import annotations
 

@@ -139,7 +139,7 @@ class Feed:
         What is known of the machine (`facts.facts_of`).
     answer
         Carries out an operator's request, `acknowledge` or `mark` with a text; returns success and a text.
-        None: nothing can be asked for.
+        None: no request is possible.
     load
         Returns the newest load Fx, Fy [N], M [N m] that is known with a publication, shape (3,).
     on_error

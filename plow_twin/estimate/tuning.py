@@ -23,7 +23,7 @@ JUDGED = "judgement"
 
 @dataclass(frozen=True)
 class Tuned:
-    """What a chosen number means.
+    """The meaning of a chosen number.
 
     Attributes
     ----------

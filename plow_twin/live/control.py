@@ -42,7 +42,7 @@ class Control:
     Attributes
     ----------
     services : Services or None
-        What can be asked for, once the twin is there.
+        The services, once the twin is there.
 
     Raises
     ------

@@ -404,7 +404,7 @@ class Settings:
 
     @property
     def follows(self) -> str:
-        """What follows the machine: `follow`, and `off` without an estimate."""
+        """The effective value of `follow`: `off` without an estimate."""
         return self.follow if self.estimate else "off"
 
 

@@ -1,4 +1,4 @@
-"""Priority, processors and locked memory of this process: each is asked for, and its refusal is a warning."""
+"""Priority, processors and locked memory of this process: each is requested, and a refusal is a warning."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an operator may ask of a live twin: each service with its answer, done or not, and a text."""
+"""Services of a live twin for an operator: each answers with success or failure, and a text."""
 
 from __future__ import annotations
 

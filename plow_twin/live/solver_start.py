@@ -24,7 +24,7 @@ _started: list[Future[Prepared]] = []
 
 
 class StartAbandoned(PlowTwinError):
-    """A stop was asked for while the solver was compiled."""
+    """A stop was requested while the solver was compiled."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Preparation:
         SceneError, OSError
             The scene cannot be used.
         StartAbandoned
-            A stop was asked for; the compiler cannot be interrupted and still works.
+            A stop was requested; the compiler cannot be interrupted and still works.
         """
         while not wait((self._future,), _LOOK_S).done:
             if stop_asked():

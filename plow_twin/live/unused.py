@@ -1,4 +1,4 @@
-"""What arrived and was not used, for the journal: from whom, why, with stamp and values."""
+"""Messages that were not used, for the journal: sender, reason, stamp and values."""
 
 from __future__ import annotations
 

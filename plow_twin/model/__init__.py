@@ -1,1 +1,1 @@
-"""What the machine is: parameters, geometry, contact laws, loads. Knows nothing of time stepping."""
+"""The machine: parameters, geometry, contact laws, loads; independent of time stepping."""

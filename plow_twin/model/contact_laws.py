@@ -99,7 +99,7 @@ class ContactLaw:
 
     @property
     def takes_restitution(self) -> bool:
-        """Whether the law can be asked for a restitution."""
+        """Whether the law takes a restitution."""
         return self.number_of is not None
 
     def damping_number(self, restitution: float) -> float:

@@ -128,7 +128,7 @@ class Contact:
     """Normal contact of every pair: one law and one uniform set of parameters.
 
     Exactly one of `damping` and `restitution` is given, or neither for a law without damping. The default law returns
-    exactly the restitution asked for.
+    exactly the given restitution.
     """
 
     law: str = _choice("contact law", LAWS, "exact_restitution")

@@ -47,7 +47,7 @@ _NEEDED: Final = tuple(("excitation", name) for name in ROLES["excitation"])
 
 @dataclass
 class Guess:
-    """What a file holds.
+    """The content of a file.
 
     `columns` by role and number; `units` of those that are not SI, by number; `time` is the column of the time and
     `time_unit` its unit, empty for dates in words. `because` says how each was found. `open` are the undecided

@@ -539,7 +539,7 @@ class _SeriesItem(NamedTuple):
 
     @property
     def keys(self) -> Mapping[str, int]:
-        """What is lost with it."""
+        """Keys of the losses with it."""
         return {JOURNAL: len(self.series.stamps) + len(self.series.digests)}
 
     def write(self, writer: RunWriter) -> None:
@@ -586,7 +586,7 @@ class _EntryItem(NamedTuple):
 
     @property
     def keys(self) -> tuple[str, ...]:
-        """What is lost with it."""
+        """Keys of the losses with it."""
         return (JOURNAL,)
 
     def write(self, writer: RunWriter) -> None:
@@ -604,7 +604,7 @@ class _OutputItem(NamedTuple):
 
     @property
     def keys(self) -> tuple[str, ...]:
-        """What is lost with it."""
+        """Keys of the losses with it."""
         return (self.topic,)
 
     def write(self, writer: RunWriter) -> None:

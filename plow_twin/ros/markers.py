@@ -1,4 +1,4 @@
-"""What RViz draws: walls of the cavity, frame, worn pads and forces as markers, and the head's pose on /tf."""
+"""Markers for RViz: walls of the cavity, frame, worn pads and forces as markers, and the head's pose on /tf."""
 
 from __future__ import annotations
 

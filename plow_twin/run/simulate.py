@@ -65,9 +65,9 @@ class Result:
     wall_s, compile_s : float
         Time taken by the run, and by compiling before it, in s.
     energy_balance : EnergyBalance or None
-        Energy and momentum, when asked for.
+        Energy and momentum, on request.
     sensitivity : Sensitivity or None
-        How errors grow along the motion, when asked for.
+        How errors grow along the motion, on request.
     frame : ndarray, shape (n, 6), or None
         Displacement of a frame that gives way (`Support`), x, y [m], theta [rad], and its rate; q and v are as seen
         from it.

@@ -15,7 +15,7 @@ _MOST_SENDERS = 64
 
 
 class Senders:
-    """Follow the first sender heard until it has gone or a switch is asked for."""
+    """Follow the first sender heard until it has gone or a switch is requested."""
 
     def __init__(self) -> None:
         #: the sender followed; None before the first sample and after it has gone

@@ -74,7 +74,7 @@ def _uplot(name: str) -> str:
 
 @dataclass
 class _Log:
-    """What happened in a run, with its times as texts."""
+    """The events of a run, with its times as texts."""
 
     samples: int = 0
     first_ns: int | None = None

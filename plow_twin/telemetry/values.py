@@ -1,4 +1,4 @@
-"""What goes out: the newest numbers and texts of a twin, in groups with the same names on every way out."""
+"""Values of the outputs: the newest numbers and texts of a twin, in groups with the same names on every way out."""
 
 from __future__ import annotations
 

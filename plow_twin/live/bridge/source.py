@@ -24,7 +24,7 @@ class BridgeError(PlowTwinError):
 
 
 class Messages(Protocol):
-    """Messages in order of arrival; some sources read them when they are asked for."""
+    """Messages in order of arrival; some sources read them on request."""
 
     def __len__(self) -> int: ...
     def __iter__(self) -> Iterator[Arrived]: ...

@@ -61,7 +61,7 @@ OnProgress = Callable[[float], object]
 
 @dataclass
 class Prediction:
-    """What one scene predicts: its rows, and the sums of its contacts over all of them."""
+    """The prediction by a scene: its rows, and the sums of its contacts over all of them."""
 
     name: str
     scene: Scene
@@ -168,7 +168,7 @@ class Measured:
 
 @dataclass
 class Analysis:
-    """What was found in one recording."""
+    """The analysis of a recording."""
 
     path: Path
     kind: str
@@ -188,7 +188,7 @@ class Analysis:
 
     @property
     def lost(self) -> dict[str, int]:
-        """What could not be read or used, and measured signals no value of which lies in the time of the load."""
+        """Losses, and measured signals without a value in the time of the load."""
         counts = ((self.predictions[0].outside(signal), signal.came) for signal in self.measured.signals.values())
         outside = sum(count for count, came in counts if count == came)
         found = {"measured_implausible": self.measured.implausible, "measured_outside_the_load": outside}

@@ -1,4 +1,4 @@
-"""What the contacts bore: impacts, forces, duty, cycles, energy and forces along the face, summed batch by batch."""
+"""Loads of the contacts: impacts, forces, duty, cycles, energy and forces along the face, summed batch by batch."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ Values = Mapping[str, Value]
 
 
 class Objective(Protocol):
-    """What a calibration needs to know of an objective."""
+    """The facts of an objective for a calibration."""
 
     #: runs made so far
     runs: int

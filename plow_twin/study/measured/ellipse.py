@@ -26,7 +26,7 @@ _LEAST, _LARGEST = 0.05, 0.98
 
 @dataclass(frozen=True)
 class EllipseContact:
-    """What an impact of the ellipse is computed with.
+    """The numbers of an impact of the ellipse.
 
     Attributes
     ----------

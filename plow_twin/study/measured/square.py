@@ -80,7 +80,7 @@ MARKER: Final = Marker(-0.0308, (2.3e-4, 5.2e-4))
 
 @dataclass(frozen=True)
 class Scatter:
-    """What no parameter explains, as standard deviations.
+    """Scatter that no parameter explains, as standard deviations.
 
     Attributes
     ----------
@@ -155,7 +155,7 @@ class Flight:
     covariance : ndarray, shape (3, 2, 2)
         Of place and rate of x, z, theta there.
     times : ndarray, shape (k,)
-        Times of the rows from the last one on, in s: whole rows that were lost are told by the way made.
+        Times of the rows from the last one on, in s: lost whole rows show by the way made.
     """
 
     state: Array

@@ -77,7 +77,7 @@ def parse_axis(text: str, scene: Scene) -> Axis:
 
 @dataclass(frozen=True)
 class Sweep:
-    """What to compute: plain data, so that it can be stored and sent; `scene_yaml` is self-contained."""
+    """The task as plain data, so that it can be stored and sent; `scene_yaml` is self-contained."""
 
     scene_yaml: str
     axes: tuple[Axis, ...]

@@ -19,7 +19,7 @@ _CARRIES = 1
 
 @dataclass(frozen=True)
 class Hold:
-    """One set of corners, e.g. `abd`, that carries force without a change from `start_s` to `end_s`; "" is none."""
+    """A set of corners, e.g. `abd`, that carries force unchanged from `start_s` to `end_s`; "" is the empty set."""
 
     start_s: float
     end_s: float

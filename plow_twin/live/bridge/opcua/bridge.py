@@ -53,7 +53,7 @@ class OpcUa:
     roles
         The mapping: each role is a topic, its fields are nodes.
     rate_hz
-        Expected rate of the samples [Hz]; 0: not known, the server is asked for its fastest sampling.
+        Expected rate of the samples [Hz]; 0: not known, the server's fastest sampling is requested.
     connect_s
         Longest wait for the first connection [s].
 
@@ -152,7 +152,7 @@ class OpcUa:
             asyncio.run(self._serve())
 
     async def _serve(self) -> None:
-        """Connect again and again until a stop is asked for."""
+        """Connect again and again until a stop is requested."""
         self._loop, self._task = asyncio.get_running_loop(), asyncio.current_task()
         wait_s = _FIRST_WAIT_S
         while not self._stop.is_set():

@@ -42,7 +42,7 @@ Take = Callable[[list[tuple[int, Any]], bool], Awaitable[None]]
 
 @dataclass(frozen=True)
 class Revised:
-    """What the server grants: intervals [ms] and values kept between two messages."""
+    """The server's grants: intervals [ms] and values kept between two messages."""
 
     publishing_ms: float
     sampling_ms: float
@@ -67,7 +67,7 @@ class Link:
     nodes
         Identifiers of the nodes.
     sampling_ms
-        Sampling interval that is asked for [ms]; 0: the fastest that the server has.
+        Requested sampling interval [ms]; 0: the server's fastest.
     take
         Receives the values.
     counts
