@@ -168,7 +168,10 @@ FIGURES: dict[str, Callable[[], str]] = {
     "random_scenes": random_scenes, "siconos": siconos, "lives": life_table, "month": month_table,
     "follow": follow_table, **estimate_pages.FIGURES, **measured_pages.FIGURES,
     "tuning": tuning_sensitivity.table,
-    **{name: stored(name) for name in ("live_node", "replay", "estimate_forces", "estimate_scales", "estimate_live")},
+    **{
+        name: stored(name)
+        for name in ("live_node", "live_opcua", "replay", "estimate_forces", "estimate_scales", "estimate_live")
+    },
 }  # fmt: skip
 
 

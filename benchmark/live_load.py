@@ -7,6 +7,7 @@ whether each message sent was used or counted. `--beside` runs the echo, the nod
 the same samples: what else the machine does meets all of them, so that their ratios hold on a busy one too.
 `--estimate` runs the node without and with the estimate and its 256 twins in turn, under the paper's load and a
 synthetic pose at 100 Hz, `--repeats` times each, for `--seconds` after the first window has been formed.
+`--opcua` runs `plow-twin live` beside an OPC UA server for `--minutes` (10) instead: see `opcua_load.py`.
 The machine is shared by publisher, node and subscriber: what is compared is the node and the echo in the same run.
 """
 
@@ -445,7 +446,12 @@ def main() -> None:
     parser.add_argument("--beside", action="store_true", help="all at once, for --seconds")
     parser.add_argument("--role", nargs="+", default=[])
     parser.add_argument("--estimate", action="store_true", help="without and with the estimate, for --seconds each")
+    parser.add_argument("--opcua", action="store_true", help="beside an OPC UA server, for --minutes")
     options = parser.parse_args()
+    if options.opcua:
+        import opcua_load
+
+        sys.exit(0 if opcua_load.measure(options.minutes or 10.0, options.rate) else 1)
     if options.role:
         role, *numbers = options.role
         roles: dict[str, Callable[..., None]] = {"echo": echo, "raw_echo": partial(echo, True), "send": send,

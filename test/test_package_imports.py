@@ -58,7 +58,7 @@ LIBRARIES = {
     "solve": {"scipy"},
     "estimate": {"scipy"},
     "run": {"matplotlib"},  # as the type of `Result.plot`; a test sees that it is not imported
-    "scene_file": {"yaml", "jsonschema"},
+    "scene_file": {"yaml", "jsonschema", "pyarrow"},
     "record": {
         "mcap",
         "rosbags",

@@ -104,9 +104,10 @@ def estimate(
 
     INPUT is a folder with scene.yaml (the nominal scene), load.csv (t, fx, fy, m: the load believed), pose.csv (t, x,
     y, theta: the measured pose, a cell left empty was not measured) and, beside or instead of that, gaps.csv (t and
-    columns named after pairs: measured gaps) and contact_forces.csv (the same: measured forces), a run of ours, or
-    another recording (MCAP, rosbag2's sqlite3). Where the node of a run estimated, its newest estimate is made again
-    from the journal and compared, bit for bit; else the measured pose is one recorded beside the run.
+    columns named after pairs: measured gaps) and contact_forces.csv (the same: measured forces); each of them may be
+    .parquet. Or it is a run of ours, or another recording (MCAP, rosbag2's sqlite3, CSV, Parquet). Where the node of a
+    run estimated, its newest estimate is made again from the journal and compared, bit for bit; else the measured pose
+    is one recorded beside the run.
 
     With --follow each row of followed.csv tells forces and clearances, with 90 % intervals, from what was measured up
     to its time.
@@ -115,12 +116,12 @@ def estimate(
 
     from plow_twin.estimate.estimate import warm_up
     from plow_twin.record.durable import whole_file, write_whole
-    from plow_twin.record.measured import LOAD_FILE
+    from plow_twin.record.measured import is_measured
     from plow_twin.record.reader import own_run
 
     if following and out is None:
         raise click.UsageError("--follow: got no --out, expected the folder for followed.csv")
-    folder = mapping is None and (source / LOAD_FILE).is_file()
+    folder = mapping is None and is_measured(source)
     live = scene is None and mapping is None and not folder and own_run(source) is not None
     task = (_repeated(source) if live else None) or _given(source, scene, mapping, folder)
     begin = time.perf_counter()

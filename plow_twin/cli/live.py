@@ -51,7 +51,7 @@ _FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 
 
 @click.command(
-    short_help="Run the twin on CSV files, standard input, MQTT or OPC UA.",
+    short_help="Run the twin on CSV or Parquet files, standard input, MQTT or OPC UA.",
     epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 done with counted loss.",
 )
 @click.argument("source")
@@ -85,7 +85,7 @@ _FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 @json_option
 @quiet_option
 def live(source: str, as_json: bool, quiet: bool, lines: bool, seconds: float | None, **options: Any) -> int:
-    """Run the twin on SOURCE: CSV files (a folder, or one file), -, mqtt[s]://HOST:PORT, or opc.tcp://HOST:PORT."""
+    """Run the twin on SOURCE: CSV or Parquet (a folder, or one file), -, mqtt[s]://HOST:PORT, opc.tcp://HOST:PORT."""
     from plow_twin.live.stop import StopSignals
 
     with StopSignals() as stop:
@@ -291,12 +291,21 @@ def _bridge(source: str, options: dict[str, Any], rate_hz: float) -> Bridge:
     if source == "-":
         return StandardInput()
     path = Path(source)
-    paths = sorted(path.glob("*.csv")) if path.is_dir() else [path]
+    paths = _tables(path, growing=options["follow"]) if path.is_dir() else [path]
     if not paths:
-        raise BridgeError(f"{path}: got a folder without .csv, expected some")
+        kinds = ".csv" if options["follow"] else ".csv or .parquet"
+        raise BridgeError(f"{path}: got a folder without {kinds}, expected some")
     if options["follow"] and not (paths[0].exists() or (is_pattern(path) and any(path.parent.glob(path.name)))):
         say_error(f"plow-twin: {path}: is not there yet, it is waited for")
     return Files(paths, follow=options["follow"])
+
+
+def _tables(folder: Path, *, growing: bool) -> list[Path]:
+    """Return the files of a folder; of those that are read while they grow, Parquet is none."""
+    from plow_twin.scene_file.csv_rows import tables
+    from plow_twin.scene_file.parquet_lines import is_parquet
+
+    return [path for path in tables(folder) if not (growing and is_parquet(path))]
 
 
 def _opcua(access: Access, mapping: Path | None, rate_hz: float) -> Bridge:

@@ -1,4 +1,4 @@
-"""`plow-twin setup`: a mapping and a stub of a scene for a CSV file of one's own."""
+"""`plow-twin setup`: a mapping and a stub of a scene for a CSV or Parquet file of one's own."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 @click.command(
-    short_help="Guess the columns of a CSV file; write a mapping and a stub of a scene.",
+    short_help="Guess the columns of a CSV or Parquet file; write a mapping and a stub of a scene.",
     epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, or a column that cannot be assigned.",
 )
 @click.argument("file", type=click.Path(path_type=Path, exists=True, dir_okay=False))
@@ -86,11 +86,14 @@ _STUB = """\
 def _show(guess: Guess) -> None:
     import numpy as np
 
+    from plow_twin.scene_file.parquet_lines import is_parquet
+
     names = {",": "comma", ";": "semicolon", "\t": "tab"}
     comma = ", decimal commas" if guess.decimal_comma else ""
+    form = "Parquet" if is_parquet(guess.path) else f"separated by {names[guess.delimiter]}{comma}"
     spacing = float(np.nanmedian(np.diff(guess.stamps_s))) if len(guess.stamps_s) > 1 else float("nan")
     rate = f", a row each {spacing:.4g} s"
-    click.echo(f"{guess.path}: separated by {names[guess.delimiter]}{comma}{rate}")
+    click.echo(f"{guess.path}: {form}{rate}")
     shown = table("Columns", "number", "column", "unit", "largest [SI]", "found")
     unit = guess.time_unit or "date"
     shown.add_row("t", guess.time, unit, "", guess.because["t"])

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 @click.option(
     "--recording",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    help="Motion to fit to: .csv or .npz with t, x, y, theta, or a recording of the node (.mcap).",
+    help="Motion to fit to: .csv, .parquet or .npz with t, x, y, theta, or a recording of the node (.mcap).",
 )
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="The same seed gives the same bits.")
 @click.option("--starts", type=click.IntRange(1), default=8, show_default=True, help="Independent random starts.")

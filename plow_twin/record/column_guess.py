@@ -91,7 +91,7 @@ class Guess:
 
 
 def guess_columns(path: Path, scene: Scene, columns: Mapping[str, str], units: Mapping[str, str]) -> Guess:
-    """Guess the meanings of a CSV file's columns, from its first 20,000 rows, or two million cells.
+    """Guess the meanings of a CSV or Parquet file's columns, from its first 20,000 rows, or two million cells.
 
     Parameters
     ----------
@@ -172,7 +172,8 @@ def _find_time(
     if not np.isfinite(found).any():
         index = guess.names.index(guess.time)
         stamps = [time_ns(row[index]) for row in rows]
-        guess.stamps_s = np.array([np.nan if stamp is None else stamp * 1e-9 for stamp in stamps])
+        first = next((stamp for stamp in stamps if stamp is not None), 0)  # a float of today resolves 0.2 us
+        guess.stamps_s = np.array([np.nan if stamp is None else (stamp - first) * 1e-9 for stamp in stamps])
         if stamps and np.isnan(guess.stamps_s).all():
             got = f"{rows[0][index]!r} in the column {guess.time}"
             raise RecordingError(f"{guess.path}: t: got {got}, expected a number or a date as 2026-01-02T03:04:05.678Z")

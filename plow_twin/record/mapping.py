@@ -29,6 +29,7 @@ from plow_twin.record.map_file import (
 from plow_twin.record.merging import StampOf
 from plow_twin.record.sources import Arrived, Columns, Source, TopicType
 from plow_twin.record.times import NO_TIME, NUMBER, STAMP_UNITS, TIMES, time_ns
+from plow_twin.scene_file.parquet_lines import SUFFIX
 
 Number = TypeVar("Number", float, NDArray[np.float64])
 #: Begin of the reasons under which messages are counted that do not fit their role.
@@ -408,7 +409,7 @@ def _topic(
     """Return name and type of a role's topic."""
     if topics is None:
         return entry["topic"], str(entry.get("type", "json"))
-    topic = entry["topic"].removesuffix(".csv")
+    topic = entry["topic"].removesuffix(".csv").removesuffix(SUFFIX)
     topic = (
         topic if topic in topics else next((name for name in topics if name.lstrip("/") == topic.lstrip("/")), topic)
     )

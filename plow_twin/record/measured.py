@@ -2,6 +2,7 @@
 
 A folder holds scene.yaml, load.csv (t, fx, fy, m), pose.csv (t, x, y, theta) and, where gaps were measured, gaps.csv (t
 and columns named after pairs), beside which pose.csv may be missing. contact_forces.csv is optional and like gaps.csv.
+Each of the tables may be Parquet instead: load.parquet.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from plow_twin.record.reader import RunReader, own_run
 from plow_twin.record.sources import open_source, read_table
 from plow_twin.record.times import EPOCH_S, time_ns
 from plow_twin.scene_file import load_scene
+from plow_twin.scene_file.parquet_lines import SUFFIX
 from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.journal import Gaps, PartOfPose, Pose, Reset, SetWear, Spread, whole_pose
 
@@ -75,22 +77,34 @@ def read_measured(folder: Path, scene: Path | None = None) -> Measured:
     SceneError
         When the scene cannot be used.
     """
-    load, bad_load = _read(folder / LOAD_FILE, _LOAD_COLUMNS)
+    load, bad_load = _read(_table(folder, LOAD_FILE), _LOAD_COLUMNS)
     gaps, bad_gaps = np.zeros((0, 1 + PAIR_COUNT)), 0
-    if (folder / GAPS_FILE).is_file():
-        gaps, bad_gaps = _read(folder / GAPS_FILE, ("t",), PAIR_NAMES)
+    if (file := _table(folder, GAPS_FILE)).is_file():
+        gaps, bad_gaps = _read(file, ("t",), PAIR_NAMES)
     forces, bad_forces = np.zeros((0, 1 + PAIR_COUNT)), 0
-    if (folder / FORCES_FILE).is_file():
-        forces, bad_forces = _read(folder / FORCES_FILE, ("t",), PAIR_NAMES)
+    if (file := _table(folder, FORCES_FILE)).is_file():
+        forces, bad_forces = _read(file, ("t",), PAIR_NAMES)
     poses, bad_poses = np.zeros((0, 4)), 0
-    if not len(gaps) or (folder / POSE_FILE).is_file():
-        poses, bad_poses = _read(folder / POSE_FILE, _POSE_COLUMNS)
+    if (file := _table(folder, POSE_FILE)).is_file() or not len(gaps):
+        poses, bad_poses = _read(file, _POSE_COLUMNS)
     model = load_scene(scene_path(str(scene)) if scene else folder / SCENE_FILE)
     if len(load) and load[0, 0] >= EPOCH_S:
         # as in a recording: dates count from the first sample of the load
         for table in (poses, gaps, forces, load):
             table[:, 0] -= load[0, 0]
     return Measured(model, load, poses, bad_load + bad_poses + bad_gaps + bad_forces, gaps=gaps, forces=forces)
+
+
+def is_measured(folder: Path) -> bool:
+    """Return whether a folder has a table of the load."""
+    return _table(folder, LOAD_FILE).is_file()
+
+
+def _table(folder: Path, name: str) -> Path:
+    """Return the place of a table: Parquet where there is no CSV."""
+    file = folder / name
+    other = file.with_suffix(SUFFIX)
+    return other if other.is_file() and not file.is_file() else file
 
 
 def read_recording(path: Path, scene: Path | None = None, mapping: Path | None = None) -> Measured:

@@ -1,4 +1,4 @@
-"""Any recording as a stream of messages: MCAP and rosbag2's sqlite3, files or folders of parts, and CSV.
+"""Any recording as a stream of messages: MCAP and rosbag2's sqlite3, files or folders of parts, CSV, and Parquet.
 
 Messages come in the order in which they were written. Unreadable messages are counted and passed over: a file is read
 as far as it goes. Only some chunks are in memory at a time.
@@ -23,7 +23,8 @@ from plow_twin.record.merging import StampOf, merged
 from plow_twin.record.metadata_yaml import missing_files
 from plow_twin.record.reader import part_number, run_parts
 from plow_twin.record.times import NO_TIME, NUMBER, STAMP_UNITS, TIMES, time_ns
-from plow_twin.scene_file.csv_rows import csv_rows, open_csv
+from plow_twin.scene_file.csv_rows import csv_rows, open_csv, tables
+from plow_twin.scene_file.parquet_lines import is_parquet
 
 _SQLITE_MAGIC: Final = b"SQLite format 3\0"
 _ROWS: Final = 1000
@@ -110,10 +111,10 @@ def open_source(path: Path) -> Source:
             source = McapSource(run_parts(path), missing)
         elif databases := list(path.glob("*.db3")):
             source = SqliteSource(databases, missing)
-        elif tables := sorted(path.glob("*.csv")):
-            return CsvSource(tables)
+        elif files := tables(path):
+            return CsvSource(files)
         else:
-            found = f"a folder without .mcap, .db3 or .csv{packed(path)}"
+            found = f"a folder without .mcap, .db3, .csv or .parquet{packed(path)}"
             raise RecordingError(f"{path}: got {found}, expected a recording")
         if missing:
             source.losses.counts["missing_parts"] = len(missing)
@@ -126,9 +127,11 @@ def open_source(path: Path) -> Source:
         return McapSource([path])
     if head == _SQLITE_MAGIC:
         return SqliteSource([path])
-    if path.suffix.lower() == ".csv":
+    if path.suffix.lower() == ".csv" or is_parquet(path):
         return CsvSource([path])
-    raise RecordingError(f"{path}: got neither MCAP nor sqlite3 nor .csv, expected a recording{packed(path)}")
+    raise RecordingError(
+        f"{path}: got neither MCAP nor sqlite3 nor .csv nor .parquet, expected a recording{packed(path)}"
+    )
 
 
 def packed(path: Path) -> str:
@@ -357,7 +360,7 @@ def _rows(connection: sqlite3.Connection) -> Iterator[tuple[Any, Any, Any]]:
 
 
 class CsvSource:
-    """CSV files with a header line, each a topic under its name without `.csv`."""
+    """CSV files with a header line and Parquet files, each a topic under its name without its ending."""
 
     def __init__(self, parts: list[Path]) -> None:
         self.parts = parts
@@ -402,7 +405,9 @@ class CsvSource:
 
 
 def read_table(path: Path) -> tuple[Columns, list[list[str]]]:
-    """Return the columns of a CSV file and its rows, as `CsvSource` reads them; lines that begin with `#` are left out.
+    """Return the columns of a CSV or Parquet file and its rows, as `CsvSource` reads them.
+
+    Lines that begin with `#` are left out.
 
     Raises
     ------

@@ -18,6 +18,7 @@ STAMP_UNITS: Final = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 NO_TIME: Final = -1
 NUMBER: Final = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|inf|nan)", re.IGNORECASE)
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
+_NANOSECONDS: Final = re.compile(r"[.,]\d{6}(\d{1,3})")
 #: Times below this [s] count from some start and are moved away from 0, which means a missing stamp.
 EPOCH_S: Final = 1e9
 #: A time of 0 is at this stamp [ns].
@@ -88,4 +89,5 @@ def _date_ns(text: str) -> int | None:
     except ValueError:
         return None
     time = time if time.tzinfo else time.replace(tzinfo=UTC)
-    return (time - _EPOCH) // timedelta(microseconds=1) * 1000
+    digits = _NANOSECONDS.search(text)  # beyond those that a datetime keeps
+    return (time - _EPOCH) // timedelta(microseconds=1) * 1000 + (int(digits[1].ljust(3, "0")) if digits else 0)

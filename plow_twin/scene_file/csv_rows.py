@@ -1,8 +1,9 @@
-"""Reader of CSV files as spreadsheets of many countries write them."""
+"""Reader of CSV files as spreadsheets of many countries write them, and of Parquet files as the same rows."""
 
 from __future__ import annotations
 
 import csv
+import io
 import re
 from collections.abc import Iterator
 from itertools import chain
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import IO, Final
 
 from plow_twin.errors import ExcessError
+from plow_twin.scene_file.parquet_lines import SUFFIX, ParquetLines, is_parquet
 
 #: Longest row [characters] and most columns; a historian's export has some hundred.
 LONGEST_ROW: Final = 2**20
@@ -17,8 +19,24 @@ MOST_COLUMNS: Final = 10_000
 
 
 def open_csv(path: Path) -> IO[str]:
-    """Open a text file without the byte order mark that spreadsheets write."""
+    """Open a text file without the byte order mark that spreadsheets write, or a Parquet file as text.
+
+    Raises
+    ------
+    OSError
+        It cannot be opened.
+    csv.Error, ExcessError
+        As of `ParquetLines`.
+    """
+    if is_parquet(path):
+        return io.TextIOWrapper(io.BufferedReader(ParquetLines(path)), encoding="utf-8", errors="replace", newline="")
     return path.open(newline="", encoding="utf-8-sig", errors="replace")
+
+
+def tables(folder: Path) -> list[Path]:
+    """Return the CSV and Parquet files of a folder in order of their names; of two with one name the CSV."""
+    found = {path.stem: path for ending in (SUFFIX, ".csv") for path in folder.glob(f"*{ending}")}
+    return [found[name] for name in sorted(found)]
 
 
 def is_utf16(begin: bytes) -> bool:

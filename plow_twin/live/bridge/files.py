@@ -1,14 +1,15 @@
-"""CSV or JSON lines from files, read once or followed while they grow, and from standard input."""
+"""CSV or JSON lines, or Parquet, from files, read once or followed while they grow, and from standard input."""
 
 from __future__ import annotations
 
+import csv
 import os
 import re
 import select
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from itertools import chain, islice
 from pathlib import Path
@@ -20,6 +21,7 @@ from plow_twin.record.merging import StampOf, merged
 from plow_twin.record.sources import Arrived, TopicType, columns_of
 from plow_twin.record.times import NO_TIME
 from plow_twin.scene_file.csv_rows import is_utf16
+from plow_twin.scene_file.parquet_lines import ParquetLines, is_parquet
 
 #: Most bytes read from a source at once.
 _BLOCK: Final = 1 << 18
@@ -54,7 +56,7 @@ class _Tail:
         """Return the columns by the first line; None: there is no file, or no line, and a whole one if it `grows`."""
         rows = Rows()
         try:
-            with self.path.open("rb") as stream:
+            with _readable(self.path), _open(self.path) as stream:
                 while rows.columns is None and (line := stream.readline(_BLOCK)):
                     if is_utf16(line):
                         raise BridgeError(f"{self.path}: got UTF-16 text, expected UTF-8 (of a spreadsheet: CSV UTF-8)")
@@ -78,7 +80,8 @@ class _Tail:
             if rest:  # the rest of the file that was moved away
                 return rest
             try:
-                file = self.path.open("rb")
+                with _readable(self.path):
+                    file = _open(self.path)
             except FileNotFoundError:
                 return b""
             self.close()
@@ -90,7 +93,8 @@ class _Tail:
         return self._read()
 
     def _read(self) -> bytes:
-        data = bytes(self._file.read(_BLOCK))
+        with _readable(self.path):
+            data = bytes(self._file.read(_BLOCK))
         self._newest = (self._newest + data)[-_REMEMBERED:]
         return data
 
@@ -101,6 +105,8 @@ class _Tail:
 
     def _is_another(self) -> bool:
         """Return whether the file was rewritten, or another file is at its path."""
+        if isinstance(self._file, ParquetLines):  # it is read once
+            return False
         try:
             found = self.path.stat()
         except FileNotFoundError:
@@ -108,10 +114,29 @@ class _Tail:
         ours = os.fstat(self._file.fileno())
         return (found.st_dev, found.st_ino) != (ours.st_dev, ours.st_ino) or self._is_anew()
 
+    @property
+    def place(self) -> int:
+        """Bytes of the file that have been read."""
+        return 0 if self._file is None else int(self._file.tell())
+
     def close(self) -> None:
         if self._file is not None:
             self._file.close()
         self._file = None
+
+
+def _open(path: Path) -> Any:
+    """Open a file of lines, or one that stands for lines."""
+    return ParquetLines(path) if is_parquet(path) else path.open("rb")
+
+
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    """Turn the errors of files that are no table into those of a source."""
+    try:
+        yield
+    except csv.Error as error:
+        raise BridgeError(f"{path}: {error}") from error
 
 
 class _Dated:
@@ -214,6 +239,8 @@ class Files:
         for tail in self._tails:
             if self.ends and not (tail.files() if isinstance(tail, _Dated) else tail.path.is_file()):
                 raise BridgeError(f"{tail.path}: no such file")
+            if follow and is_parquet(tail.path):
+                raise BridgeError(f"{tail.path}: got Parquet, which does not grow by lines; expected CSV for --follow")
             if not tail.path.parent.is_dir():
                 raise BridgeError(f"{tail.path.parent}: no such folder")
         self._merged: Iterator[Arrived] | None = None
@@ -279,9 +306,10 @@ class Files:
                 with closing(_Tail(file, tail.topic)) as part:
                     yield from self._all(part)
             return
+        place = 0
         while True:
             data = tail._block()
-            self._done += len(data)
+            self._done, place = self._done + tail.place - place, tail.place
             lines = tail.lines.add(data) if data else tail.lines.end()
             begin = 0
             while begin < len(lines):

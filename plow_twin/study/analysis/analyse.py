@@ -27,6 +27,7 @@ from plow_twin.record.unit_check import check_units
 from plow_twin.record.walking import JournalWalk, Walked, Walker
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import dump_scene, load_scene
+from plow_twin.scene_file.parquet_lines import SUFFIX
 from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.intake import Intake
 from plow_twin.stream.journal import Loss, Pose, Reset, Restore, SetWear
@@ -503,6 +504,8 @@ def expand(paths: Sequence[Path]) -> list[Path]:
             # a recording whose parts are missing counts too: its analysis names them
             if item.suffix in (".mcap", ".db3") or _holds_recording(item) or (item / "metadata.yaml").is_file()
         ]
+        if not inside and any(path.glob(f"*{SUFFIX}")):  # beside recordings it is the result of an analysis
+            inside = [path]
         if not inside:
             raise RecordingError(f"{path}: got a folder without recordings, expected some{packed(path)}")
         found += inside

@@ -67,7 +67,7 @@ class PoseRecording:
 
 
 def load_poses(path: Path) -> PoseRecording:
-    """Read a pose recording: .csv or .npz with t, x, y, theta (or q of shape (n, 3)), or .mcap of this package.
+    """Read t, x, y, theta of .csv or .parquet, the same or q of shape (n, 3) of .npz, or .mcap of this package.
 
     Raises
     ------
@@ -75,16 +75,16 @@ def load_poses(path: Path) -> PoseRecording:
         When it cannot be read or its rows cannot be used.
     """
     readers: dict[str, Callable[[Path], tuple[Array, Array, Table | None]]]
-    readers = {".csv": _read_csv, ".npz": _read_npz, ".mcap": _read_mcap}
+    readers = {".csv": _read_csv, ".parquet": _read_csv, ".npz": _read_npz, ".mcap": _read_mcap}
     if path.suffix not in readers:
-        raise StudyError(f"recording: got {path.name!r}, expected .csv, .npz or .mcap")
+        raise StudyError(f"recording: got {path.name!r}, expected .csv, .parquet, .npz or .mcap")
     try:
         t, q, load = readers[path.suffix](path)
     except ExcessError:
         raise
     except OSError as error:
         raise StudyError(f"{path}: {error.strerror or error}") from None
-    except (ValueError, AttributeError, MemoryError, BadZipFile, EOFError) as error:  # of np.load
+    except (csv.Error, ValueError, AttributeError, MemoryError, BadZipFile, EOFError) as error:  # the last of np.load
         raise StudyError(f"{path}: {error}") from None
     if t.ndim != 1 or q.shape != (len(t), 3) or len(t) < 2:
         raise StudyError(f"{path}: got t {t.shape} and q {q.shape}, expected (n,) and (n, 3) with n >= 2")
