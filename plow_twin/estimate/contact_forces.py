@@ -56,13 +56,8 @@ class ContactForces:
         ContactForcesError
             For arrays of the wrong shape.
         """
-        times, rows = np.asarray(t, dtype=np.float64), np.array(force, dtype=np.float64)
-        if times.ndim != 1 or rows.shape != (len(times), PAIR_COUNT):
-            raise ContactForcesError(
-                f"contact forces: got t {times.shape} and force {rows.shape}, expected (n,) and (n, {PAIR_COUNT})"
-            )
-        index = usable_rows(times, rows, _LARGEST)
-        return ContactForces(times[index], rows[index]), len(times) - len(index)
+        times, rows, left_out = usable_rows(t, force, _LARGEST, ("contact forces", "force"), ContactForcesError)
+        return ContactForces(times, rows), left_out
 
     def between(self, start: float, end: float) -> ContactForces:
         """Return the rows stamped in [start, end)."""

@@ -18,7 +18,7 @@ from plow_twin.estimate import tuning
 from plow_twin.estimate.measurements import FEWEST_POSES, Poses, usable_rows
 from plow_twin.estimate.result import Interval
 from plow_twin.model.geometry import penetration_rows
-from plow_twin.model.pairs import NORMAL_X, NORMAL_Y, PAIR_COUNT
+from plow_twin.model.pairs import NORMAL_X, NORMAL_Y
 from plow_twin.model.scene import Clearance, Scene
 
 Array = NDArray[np.float64]
@@ -64,11 +64,8 @@ class Gaps:
         GapsError
             For arrays of the wrong shape.
         """
-        times, rows = np.asarray(t, dtype=np.float64), np.array(gap, dtype=np.float64)
-        if times.ndim != 1 or rows.shape != (len(times), PAIR_COUNT):
-            raise GapsError(f"gaps: got t {times.shape} and gap {rows.shape}, expected (n,) and (n, {PAIR_COUNT})")
-        index = usable_rows(times, rows, _LARGEST)
-        return Gaps(times[index], rows[index], deviation), len(times) - len(index)
+        times, rows, left_out = usable_rows(t, gap, _LARGEST, ("gaps", "gap"), GapsError)
+        return Gaps(times, rows, deviation), left_out
 
     def between(self, start: float, end: float) -> Gaps:
         """Return the rows stamped in [start, end)."""

@@ -13,6 +13,7 @@ from scipy.linalg import solveh_banded
 
 from plow_twin.errors import PlowTwinError
 from plow_twin.estimate import priors, tuning
+from plow_twin.model.pairs import PAIR_COUNT
 
 Array = NDArray[np.float64]
 Deviation = tuple[float, ...]
@@ -338,11 +339,19 @@ def _in_order(times: Array, usable: Any) -> NDArray[np.int64]:
     return index
 
 
-def usable_rows(times: Array, rows: Array, largest: float) -> NDArray[np.int64]:
-    """Return which rows of numbers by pair can be used, in order of time; those without a number are blanked in place.
+def usable_rows(
+    t: ArrayLike, values: ArrayLike, largest: float, names: tuple[str, str], error: type[PlowTwinError]
+) -> tuple[Array, Array, int]:
+    """Return stamps (n,) and rows of numbers by pair (n, 8) in order of time, and how many rows had to be left out.
 
-    Left out are rows without a finite stamp or any number, with one beyond `largest`, or with a stamp that is there.
+    Left out are rows without a finite stamp or any number, with one beyond `largest`, or with a repeated stamp. `names`
+    are those of the rows and of a number in the `error` that arrays of the wrong shape raise.
     """
+    times, rows = np.asarray(t, dtype=np.float64), np.array(values, dtype=np.float64)
+    if times.ndim != 1 or rows.shape != (len(times), PAIR_COUNT):
+        got = f"t {times.shape} and {names[1]} {rows.shape}"
+        raise error(f"{names[0]}: got {got}, expected (n,) and (n, {PAIR_COUNT})")
     rows[~np.isfinite(rows)] = np.nan
     absurd = (np.abs(rows) > largest).any(axis=1)
-    return _in_order(times, np.isfinite(rows).any(axis=1) & ~absurd)
+    index = _in_order(times, np.isfinite(rows).any(axis=1) & ~absurd)
+    return times[index], rows[index], len(times) - len(index)
