@@ -7,6 +7,7 @@ import re
 import runpy
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 
 import click
@@ -17,7 +18,9 @@ import plow_twin
 from plow_twin.cli.app import commands
 from plow_twin.model.contact_laws import LAWS
 from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.record.mapping import read_map
 from plow_twin.scene_file import loads_scene
+from plow_twin.telemetry.access import Credentials
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -65,6 +68,23 @@ def test_every_call_that_a_page_shows_has_a_verb_and_options_that_exist() -> Non
         if (isinstance(command, click.Group) and given != {"--help"}) or given - known:
             unknown.append((page, call))
     assert unknown == []
+
+
+def test_the_mappings_and_credentials_of_the_how_to_are_read(tmp_path: Path) -> None:
+    page = (ROOT / "docs" / "how_to_connect.md").read_text()
+    shown = re.findall(r"^ *```yaml\n(.*?)^ *```", page, re.DOTALL | re.MULTILINE)
+    assert len(shown) == 2
+    for block in shown:
+        (tmp_path / "map.yaml").write_text(textwrap.dedent(block))
+        assert read_map(tmp_path / "map.yaml", None).keys() == {"excitation", "travel"}
+    for section, names in (("mqtt", ["mqtt.secret", "broker.pem"]), ("influx", ["influx.token"])):
+        line = next(text for text in re.findall(r"`(\w+: \{.*?\})`", page) if text.startswith(section))
+        (tmp_path / "access.yaml").write_text(line)
+        for name in names:
+            (tmp_path / name).write_text("x")
+        read = Credentials.read(tmp_path / "access.yaml")
+        files = [read.file(section, key) for key in read.sections[section] if key != "user"]
+        assert {Path(str(file)).name for file in files} == {*names}
 
 
 def public_names() -> set[str]:
