@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import gc
 import json
 import math
@@ -12,6 +13,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 import tracemalloc
 from bisect import bisect_right
@@ -31,6 +33,7 @@ from pwdlib import PasswordHash
 from record_support import PAPER_AMPLITUDE, rewrite
 
 from plow_twin.cli.app import run as run_cli
+from plow_twin.cli.outlet import MOST_WAITING, Outlet
 from plow_twin.errors import RecordingError
 from plow_twin.live import parameters
 from plow_twin.live.bridge.access import Access
@@ -389,6 +392,54 @@ def test_a_full_disk_under_the_log_does_not_end_the_twin(tmp_path: Path) -> None
     for name in ("log", "lines"):
         report = replay(tmp_path / name)
         assert (report.samples, report.exit_code) == (50, 0)
+
+
+def test_a_reader_of_the_lines_that_hangs_stops_nothing_and_what_it_does_not_get_is_counted() -> None:
+    taken: list[str] = []
+    hangs, lost_at = threading.Event(), list[int]()
+
+    def write(line: str) -> bool:
+        hangs.wait(60.0)
+        taken.append(line)
+        return True
+
+    outlet = Outlet(write, lambda: lost_at.append(outlet.lost))
+    for number in range(MOST_WAITING + 100):
+        outlet.put(str(number))
+    assert lost_at == [1] and 99 <= outlet.lost <= 100
+    hangs.set()
+    # the newest are there, in order, behind the one that was being written
+    assert outlet.close() and len(taken) + outlet.lost == MOST_WAITING + 100
+    assert taken[-MOST_WAITING:] == list(map(str, range(100, MOST_WAITING + 100)))
+
+
+def test_a_live_twin_whose_standard_output_nobody_reads_goes_on_and_ends_when_it_is_stopped(tmp_path: Path) -> None:
+    path, port = _csv(tmp_path / "load.csv", 100), _free_port()
+    more = ["--metrics", str(port), "--record", str(tmp_path / "run")]
+    with _live(str(path), "--follow", "--scene", "paper", *more) as live:
+        pipe = live.process.stdout
+        assert pipe is not None
+        fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, 4096)  # less than the lines of a second
+        live.until_count("samples_used", 100)
+        give_up = time.monotonic() + START_S
+        for count in range(1000, 4000, 1000):  # nobody reads from here on
+            with path.open("a") as file:
+                file.writelines(",".join(map(repr, _row(index))) + "\n" for index in range(count - 900, count + 100))
+            while _metric(port, "plow_twin_input_samples_used") < count + 100:
+                assert time.monotonic() < give_up
+                time.sleep(0.1)
+        live.process.send_signal(signal.SIGTERM)
+        assert live.process.wait(60.0) == 3
+        errors = live.process.stderr
+        assert errors is not None and re.search(rb"standard output took \d+ lines not", errors.read())
+    assert replay(tmp_path / "run").samples == 3100
+
+
+def _metric(port: int, name: str) -> float:
+    """Return a number of the page for Prometheus."""
+    with urlopen(f"http://127.0.0.1:{port}/metrics", timeout=10) as page:
+        lines = [line.split() for line in page.read().decode().splitlines() if line.startswith(f"{name} ")]
+    return float(lines[0][1]) if lines else 0.0
 
 
 class Live:

@@ -109,6 +109,7 @@ def _live(
     from plow_twin.live.solver_start import Preparation, leave
     from plow_twin.live.stop import StopRequested
 
+    report = Report(lines=lines, quiet=quiet, stamp_ns=lambda: front.runtime.stamp_ns)
     try:
         settings = _settings(options)
         access = access_of(options) if options["dashboard"] else None
@@ -119,14 +120,9 @@ def _live(
         with busy("preparing the solver", quiet or not error_console().is_terminal):
             prepared = Preparation(settings).result(lambda: stop.stopped)
 
-        report = Report(lines=lines, quiet=quiet, stamp_ns=lambda: front.runtime.stamp_ns)
-
-        def on_error(text: str) -> None:
-            say_error(f"plow-twin: {text}")
-
-        with _control(options["control"]) as control, ExitStack() as opened:
+        with report, _control(options["control"]) as control, ExitStack() as opened:
             say = _also_metrics(report.say, options["metrics"], opened)
-            front = BridgeFront(bridge, options["mapping"], settings, prepared, say, on_error, options["units"])
+            front = BridgeFront(bridge, options["mapping"], settings, prepared, say, report.error, options["units"])
             _say_what_differs(front, settings)
             if control is not None:
                 _answer_on(control, front)
@@ -143,17 +139,20 @@ def _live(
         return leave(DONE)
     parts = front.parts()
     facts = {name: values for name, (_, _, values) in parts.items()}
+    taken = report.close_lines()
     if report.lost:
         lost = [*lost, f"standard output took {report.lost} lines not, or in part"]
     for text in (*lost, *front.causes()):
-        on_error(text)
-    if as_json:
+        report.error(text)
+    hangs = not report.close() or not taken
+    if as_json and taken:
         click.echo(json.dumps(facts, indent=2))
     elif not quiet and not lines:
         show_facts(output_console(), {"input": {key: facts["input"][key] for key in _shown(facts["input"])}})
         _show_estimate(front)
     unused = any(int(facts["input"][key]) for key in facts["input"] if _LOST.fullmatch(key))
-    return leave(DONE_WITH_LOSS if lost or unused or facts["recorder"]["lost"] else DONE)
+    code = DONE_WITH_LOSS if lost or unused or facts["recorder"]["lost"] else DONE
+    return leave(code, at_once=hangs)
 
 
 def _say_what_differs(front: BridgeFront, settings: Settings) -> None:

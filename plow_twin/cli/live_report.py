@@ -6,10 +6,12 @@ import json
 import math
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 
 import click
 
 from plow_twin.cli.console import say_error
+from plow_twin.cli.outlet import Outlet
 
 _LEVELS = ("OK", "WARN", "ERROR")
 
@@ -21,6 +23,7 @@ class Report:
     """Says status and alarms when they change, and with `lines` all parts as JSON lines.
 
     An alarm is reported when it is raised and when it is acknowledged, not each time its quantity passes a threshold.
+    A reader that hangs holds nobody up: lines give way and are counted.
 
     Parameters
     ----------
@@ -33,8 +36,34 @@ class Report:
     def __init__(self, *, lines: bool, quiet: bool, stamp_ns: Callable[[], int]) -> None:
         self._lines, self._quiet, self._stamp_ns = lines, quiet, stamp_ns
         self._alarms: list[str] = []
-        #: lines that standard output did not take
-        self.lost = 0
+        self._out = Outlet(_printed, lambda: self.error("standard output is not read: lines are lost"))
+        self._errors = Outlet(_said)
+
+    def __enter__(self) -> Report:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is not None:  # else there is more to say
+            with suppress(BrokenPipeError):
+                self.close_lines()
+            self.close()
+
+    @property
+    def lost(self) -> int:
+        """Lines that standard output did not take."""
+        return self._out.lost
+
+    def error(self, text: str) -> None:
+        """Say an error; may be called from any thread."""
+        self._errors.put(f"plow-twin: {text}")
+
+    def close_lines(self) -> bool:
+        """End the JSON lines; return False if their reader hangs."""
+        return self._out.close()
+
+    def close(self) -> bool:
+        """End what is said to a person; return False if the terminal, or who reads it, hangs."""
+        return self._errors.close()
 
     def say(self, name: str, part: Part) -> None:
         """Say a part."""
@@ -50,9 +79,9 @@ class Report:
         if self._lines:
             typed = {key: _typed(value) for key, value in values.items()}
             said = {"topic": name, "stamp_ns": self._stamp_ns(), "level": level, "message": message, "values": typed}
-            self.lost += not _printed(json.dumps(said))
+            self._out.put(json.dumps(said))
         elif name in ("status", "alarms") and not self._quiet:
-            say_error(f"{_LEVELS[level]} {name}: {message}")
+            self._errors.put(f"{_LEVELS[level]} {name}: {message}")
 
 
 def _typed(value: str) -> int | float | str:
@@ -75,4 +104,9 @@ def _printed(line: str) -> bool:
         raise
     except OSError:
         return False
+    return True
+
+
+def _said(line: str) -> bool:
+    say_error(line)
     return True

@@ -102,8 +102,10 @@ def _prepare(settings: Settings, warm_up: Callable[[], None]) -> Prepared:
     return Prepared(scene, twin, compile_s)
 
 
-def leave(code: int) -> int:
-    """Return the exit code; end the process here when an abandoned compiler would hold it up."""
+def leave(code: int, *, at_once: bool = False) -> int:
+    """Return the exit code; end the process here when an abandoned compiler would hold it up, or `at_once`."""
+    if at_once:  # a stream that nobody reads can be flushed no more
+        os._exit(code)
     if all(future.done() for future in _started):
         return code
     sys.stdout.flush()

@@ -1,0 +1,81 @@
+"""Lines for a reader that may be slow, or hang: who writes them never waits for it."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from typing import Final
+
+#: Bound: lines that wait for the reader; the oldest give way.
+MOST_WAITING: Final = 1000
+#: Bound: time at the end for which the reader may take nothing [s].
+_PATIENCE_S: Final = 2.0
+
+
+class Outlet:
+    """Writes lines in a thread of its own, in order.
+
+    Parameters
+    ----------
+    write
+        Writes a line; returns whether it was taken.
+    on_loss
+        Called once, when the first line gives way.
+    """
+
+    def __init__(self, write: Callable[[str], bool], on_loss: Callable[[], object] = lambda: None) -> None:
+        self._write, self._on_loss = write, on_loss
+        self._waiting: deque[str] = deque()
+        self._news = threading.Condition()
+        self._thread: threading.Thread | None = None
+        self._closed = self._broken = False
+        #: lines that were not taken, and those that gave way
+        self.lost = 0
+
+    def put(self, line: str) -> None:
+        """Queue a line; raise `BrokenPipeError` once the reader is gone."""
+        if self._broken:
+            raise BrokenPipeError
+        with self._news:
+            first = len(self._waiting) == MOST_WAITING and not self.lost
+            if len(self._waiting) == MOST_WAITING:
+                self._waiting.popleft()
+                self.lost += 1
+            self._waiting.append(line)
+            self._news.notify()
+        if first:
+            self._on_loss()
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._run, name="outlet", daemon=True)
+            self._thread.start()
+
+    def close(self) -> bool:
+        """Wait for the reader as long as it takes anything; return False if it hangs; raises as `put`."""
+        with self._news:
+            self._closed = True
+            self._news.notify()
+        while self._thread is not None and self._thread.is_alive():
+            left = len(self._waiting)
+            self._thread.join(_PATIENCE_S)
+            if self._thread.is_alive() and len(self._waiting) == left:
+                self.lost += left + 1  # with the line that is being written
+                return False
+        if self._broken:
+            raise BrokenPipeError
+        return True
+
+    def _run(self) -> None:
+        while True:
+            with self._news:
+                self._news.wait_for(lambda: self._waiting or self._closed)
+                if not self._waiting:
+                    return
+                line = self._waiting.popleft()
+            try:
+                taken = self._write(line)
+            except BrokenPipeError:
+                self._broken = True
+                return
+            with self._news:
+                self.lost += not taken
