@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
@@ -232,6 +232,10 @@ def _followed(given: _Given, members: int, dt: float | None) -> tuple[list[str],
     return offline.table(stretch.rows)
 
 
+#: What to do about numbers in another unit.
+_REMEDY: Final = "convert the file, or state the unit in a mapping (--map)"
+
+
 def _check_units(source: Path, measured: Measured) -> None:
     """Refuse poses that no head can have, and warn of a load that looks as if it were in another unit."""
     from plow_twin.record.unit_check import unit_doubts
@@ -240,8 +244,8 @@ def _check_units(source: Path, measured: Measured) -> None:
     values |= {("head_pose", name): measured.poses[:, 1 + place] for place, name in enumerate(("x", "y", "theta"))}
     for doubt in unit_doubts(values, measured.load[:, 0], measured.scene):
         if doubt.is_impossible:
-            raise UnitError(f"{source}: {doubt}: convert the file, or state the unit in a mapping (--map)")
-        say_error(f"plow-twin: {source}: {doubt}")
+            raise UnitError(f"{source}: {doubt}: {_REMEDY}")
+        say_error(f"plow-twin: {source}: {doubt}: {doubt.advice or _REMEDY}")
 
 
 def _repeated(source: Path) -> _Task | None:

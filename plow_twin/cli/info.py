@@ -16,6 +16,7 @@ from rich.padding import Padding
 from rich.text import Text
 
 from plow_twin.cli.console import DONE, DONE_WITH_LOSS, json_option, output_console, show_facts, table, unit_option
+from plow_twin.errors import RecordingError
 from plow_twin.scene_file.presets import PRESETS
 
 
@@ -47,6 +48,8 @@ def info(target: str | None, unused: bool, mapping: Path | None, units: dict[str
         return _show(_environment(), as_json)
     if Path(target).suffix == ".mcap" or Path(target).is_dir():
         return _recording(Path(target), as_json)
+    if Path(target).suffix.lower() in (".csv", ".jsonl"):
+        raise RecordingError(f"{target}: got a table, expected --map with where its load, travel and pose stand")
     return _scene(target, as_json)
 
 

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 def setup(file: Path, scene: str | None, given: tuple[str, ...], units: dict[str, str], out: Path, quiet: bool) -> int:
     """Guess separator, time, columns and units of FILE; ask in a terminal what cannot be told; write map and scene."""
     from plow_twin.record.column_guess import guess_columns
+    from plow_twin.record.sources import Columns
     from plow_twin.scene_file import load_scene
 
     columns = dict(text.partition("=")[::2] for text in given)
@@ -39,7 +40,7 @@ def setup(file: Path, scene: str | None, given: tuple[str, ...], units: dict[str
         name, choices = next(iter(guess.open.items()))
         if quiet or not sys.stdin.isatty():
             raise click.UsageError(
-                f"{file}: {', '.join(guess.open)} cannot be told from the columns {', '.join(guess.names)}; "
+                f"{file}: {', '.join(guess.open)} cannot be told from the {Columns(guess.names)}; "
                 + "state " + " ".join(f"--column {one}=COLUMN" for one in guess.open)
             )  # fmt: skip
         columns[name] = click.prompt(f"Column of {name}", type=click.Choice(choices or guess.names))

@@ -146,6 +146,7 @@ def _objective(
     """Return the scene, the objective, its name, and the unknowns that the target file proposes."""
     from dataclasses import replace
 
+    from plow_twin.record.unit_check import check_poses
     from plow_twin.study.calibration.objective import RecordingObjective, TargetObjective
     from plow_twin.study.calibration.pose_recording import load_poses
     from plow_twin.study.calibration.targets import load_targets
@@ -157,6 +158,7 @@ def _objective(
     model = study_scene(scene, settings)
     if recording is not None:
         poses = load_poses(recording)
+        check_poses(poses.t, poses.q, model, recording)
         if poses.load is not None:
             model = replace(model, loads=(poses.load,))
         return (

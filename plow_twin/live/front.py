@@ -24,7 +24,6 @@ from plow_twin.record.alarms import ALARMS, alarms_message
 from plow_twin.record.map_file import OPCUA
 from plow_twin.record.mapping import Role, read_map, stamps_by, with_units
 from plow_twin.record.messages import DiagnosticStatus, JointState, Message
-from plow_twin.record.sources import Columns
 from plow_twin.record.times import time_text
 from plow_twin.record.unit_check import CHECKED, check_units
 from plow_twin.stream.intake import Verdict
@@ -300,11 +299,9 @@ def _roles(
     if source == "excitation" and not {"drive", "excitation"} & roles.keys():
         # the content may be no text at all
         there = "; ".join(f"{topic} ({str(kind)[:120]})" for topic, kind in (topics or {}).items())
-        single = any(isinstance(kind, Columns) and len(kind.names) == 1 for kind in (topics or {}).values())
-        between = " with commas, semicolons or tabs between them" if single else ""
         setup = "" if topics is None else "; plow-twin setup FILE writes a mapping"
         raise BridgeError(
-            f"excitation: got no load by names or mapping in {there}, expected the columns fx, fy, m{between}{setup}"
+            f"excitation: got no load by names or mapping in {there}, expected the columns fx, fy, m{setup}"
         )
     return with_units(roles, units)
 

@@ -31,6 +31,8 @@ DAMAGE_RECORD: Final = "plow_twin_damage"
 MAGIC: Final = b"\x89MCAP0\r\n"
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _METADATA = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x0C
 _ATTACHMENT: Final = 0x09
+#: Endings of the names of tables, which are no recordings.
+_TABLES: Final = (".csv", ".jsonl")
 _HEAD: Final = struct.Struct("<BQ")
 _HEAD_SIZE: Final = _HEAD.size
 #: A head and the number that an index record begins with [B].
@@ -496,6 +498,8 @@ def open_mcap(path: Path) -> IO[bytes]:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
     if stream.read(len(MAGIC)) != MAGIC:
         stream.close()
-        raise ForeignRecordingError(f"{path}: not an MCAP file (its first bytes are not {MAGIC!r})")
+        table = path.suffix.lower() in _TABLES
+        more = "; of a table plow-twin live makes a recording, and --map opens it where a verb has it" if table else ""
+        raise ForeignRecordingError(f"{path}: not an MCAP file (its first bytes are not {MAGIC!r}){more}")
     stream.seek(0)
     return stream

@@ -49,10 +49,16 @@ class Columns:
     names: tuple[str, ...]
 
     def __str__(self) -> str:
-        """Return the names in a form to read; names that are numbers hint at a missing header row."""
+        """Return the names in a form to read, with a hint at a missing header row or another separator."""
+        if not any(self.names):
+            return "columns (none: is it empty?)"
         names = ", ".join(ascii(name) if "," in name or not name.isprintable() else name for name in self.names)
-        numbers = bool(self.names) and all(NUMBER.fullmatch(name.strip()) for name in self.names)
-        return f"columns {names}" + (" (no header row?)" if numbers else "")
+        hint = ""
+        if all(NUMBER.fullmatch(name.strip()) for name in self.names):
+            hint = " (no header row?)"
+        elif len(self.names) == 1:
+            hint = " (expected commas, semicolons or tabs between them)"
+        return f"columns {names}{hint}"
 
 
 #: The name of a ROS type, `json`, or columns.

@@ -132,6 +132,28 @@ def check_units(messages: Iterable[Arrived], roles: Mapping[str, Role], scene: S
         raise UnitError(f"{source}: " + "; ".join(f"{doubt}: {doubt.remedy}" for doubt in doubts))
 
 
+def check_poses(t: Array, q: Array, scene: Scene, source: object) -> None:
+    """Refuse measured poses whose numbers look as if they were in another unit.
+
+    Parameters
+    ----------
+    t, q
+        Times, shape (n,), and x, y, theta, shape (n, 3).
+    scene, source
+        Of the head; the name of the recording.
+
+    Raises
+    ------
+    UnitError
+        It names the numbers and their values.
+    """
+    magnitudes = {("head_pose", name): _usual_magnitude(q[:, place]) for place, name in enumerate(("x", "y", "theta"))}
+    doubts = [*_pose(magnitudes, scene), *_spacing(t, q)]
+    if doubts:
+        remedy = doubts[0].advice or "convert the file to SI"
+        raise UnitError(f"{source}: {'; '.join(map(str, doubts))}: {remedy}")
+
+
 def _stated(doubt: UnitDoubt, roles: Mapping[str, Role]) -> bool:
     """Return whether the mapping states how each of the numbers is to be read."""
     role = roles[doubt.role]
@@ -212,4 +234,4 @@ def _spacing(stamps_s: Array, load: Array) -> list[UnitDoubt]:
     if not float(change.max()) < _SMOOTH:
         return []
     found = f"stamps {spacing:.4g} s apart"
-    return [UnitDoubt("excitation", ("t",), found, "many in a period of a load that changes so smoothly", "ms")]
+    return [UnitDoubt("excitation", ("t",), found, "many in a period of what changes so smoothly", "ms")]

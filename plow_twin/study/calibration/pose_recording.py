@@ -124,7 +124,9 @@ def _read_npz(path: Path) -> tuple[Array, Array, None]:
 
 def _require(lacking: list[str], got: list[str]) -> None:
     if lacking:
-        raise ValueError(f"got the columns {', '.join(got)}, expected {', '.join(COLUMNS)}")
+        from plow_twin.record.sources import Columns
+
+        raise ValueError(f"got the {Columns(tuple(got))}, expected {', '.join(COLUMNS)}")
 
 
 def _read_mcap(path: Path) -> tuple[Array, Array, Table | None]:

@@ -1,0 +1,133 @@
+"""Mistakes of a stranger at verbs beside `live`: each ends with one clear message and an exit code."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from plow_twin.cli.app import run as cli
+from plow_twin.scene_file.presets import scene_path
+
+TIMES = np.arange(0.0, 20.0, 0.01)
+ROWS = np.column_stack((
+    TIMES,
+    np.sin(2.0 * TIMES)[:, None] * [30e3, -10e3, -40e3],
+    np.sin(2.0 * TIMES)[:, None] * [0.012, 0.014, 0.01],
+))  # fmt: skip
+LOAD, POSE = ("t", "fx", "fy", "m"), ("t", "x", "y", "theta")
+ALL = (*LOAD, *POSE[1:])
+CALIBRATE = ["study", "calibrate", "paper", "--unknown", "clearance.horizontal_m=0.02:0.03", "--out", "fit"]
+CALIBRATE += ["--recording"]
+MAP = ["--map", "own.yaml", "--scene", "paper"]
+
+
+def _write(
+    path: str, names: tuple[str, ...] = ALL, *, separator: str = ",", header: bool = True, **scale: float
+) -> None:
+    rows = ROWS[:, [ALL.index(name) for name in names]] * [scale.get(name, 1.0) for name in names]
+    Path(path).parent.mkdir(exist_ok=True)
+    head = separator.join(names) if header else ""
+    np.savetxt(path, rows, "%.9g", separator, header=head, comments="")
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with files of a stranger."""
+    folder = tmp_path_factory.mktemp("desk")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        _write("own.csv")
+        _write("kilonewtons.csv", fx=1e-3, fy=1e-3, m=1e-3)
+        _write("headless.csv", header=False)
+        _write("bars.csv", separator="|")
+        _write("millimetres.csv", POSE, x=1e3, y=1e3)
+        _write("milliseconds.csv", POSE, t=1e3)
+        _write("degrees.csv", POSE, theta=180.0 / np.pi * 10.0)
+        for name, scale in {"kN": {"fx": 1e-3, "fy": 1e-3}, "mm": {"x": 1e3, "y": 1e3}, "bars": {}}.items():
+            separator = "|" if name == "bars" else ","
+            _write(f"{name}/load.csv", LOAD, separator=separator, **scale)
+            _write(f"{name}/pose.csv", POSE, separator=separator, **scale)
+            Path(name, "scene.yaml").write_text(scene_path("paper").read_text())
+        for name in ("empty.csv", "taken/notes.txt"):
+            Path(name).parent.mkdir(exist_ok=True)
+            Path(name).write_text("")
+        Path("own.yaml").write_text("excitation: {topic: own}\nhead_pose: {topic: own}\n")
+        Path("misspelt.yaml").write_text("exitation: {topic: own}\n")
+        Path("knots.yaml").write_text("excitation: {topic: own, unit: {fx: knots}}\n")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (["estimate", "mm"], 2, "x: got 12, expected less than half the frame or the clearance, 0.165 m; they look"),
+        (["estimate", "bars"], 1, "t|fx|fy|m (expected commas, semicolons or tabs between them), expected t, fx, fy"),
+        (["estimate", "headless.csv", *MAP], 1, "(no header row?)"),
+        (["estimate", "empty.csv", "--scene", "paper"], 1, "empty.csv: got no load, expected some"),
+        (["estimate", "nowhere"], 2, "'nowhere' does not exist"),
+        (
+            ["estimate", "own.csv", "--scene", "paper", "--map", "misspelt.yaml"],
+            2,
+            "known key; did you mean excitation?",
+        ),
+        (["analyse", "kilonewtons.csv", "--scene", "paper"], 2, "look like kN: state the unit: --unit fx=kN"),
+        (["analyse", "headless.csv", "--scene", "paper"], 1, "(no header row?)"),
+        (["analyse", "bars.csv", "--scene", "paper"], 1, "(expected commas, semicolons or tabs between them)"),
+        (["analyse", "empty.csv", "--scene", "paper"], 1, "columns (none: is it empty?)"),
+        (["analyse", "own.csv"], 1, "a scene is needed, expected --scene or scene.yaml"),
+        (["analyse", "own.csv", "--scene", "paper", "--map", "knots.yaml"], 2, "got 'knots', expected one of N, kN"),
+        (["compare", "own.csv", "empty.csv"], 1, "own.csv: not an MCAP file"),
+        (["compare", "own.csv", "nowhere"], 2, "'nowhere' does not exist"),
+        (["view", "own.csv"], 1, "of a table plow-twin live makes a recording, and --map opens it"),
+        (["view", "headless.csv", *MAP], 1, "(no header row?)"),
+        (["view", "own.csv", "--scene", "paper", "--map", "misspelt.yaml"], 2, "did you mean excitation?"),
+        (["info", "own.csv"], 1, "own.csv: got a table, expected --map"),
+        (
+            [*CALIBRATE, "millimetres.csv"],
+            2,
+            "y: got 14, expected less than half the frame or the clearance",
+        ),
+        ([*CALIBRATE, "milliseconds.csv"], 2, "t: got stamps 10 s apart"),
+        ([*CALIBRATE, "degrees.csv"], 2, "theta: got 5.73, expected less than 0.785 rad; they look like deg"),
+        ([*CALIBRATE, "headless.csv"], 2, "(no header row?), expected t, x, y, theta"),
+        ([*CALIBRATE, "bars.csv"], 2, "(expected commas, semicolons or tabs between them)"),
+        ([*CALIBRATE, "empty.csv"], 2, "columns (none: is it empty?)"),
+        (["setup", "headless.csv"], 1, "got no header row or no rows"),
+        (["setup", "bars.csv"], 2, "(expected commas, semicolons or tabs between them); state --column t=COLUMN"),
+        (["setup", "empty.csv"], 1, "got no header row or no rows"),
+        (["setup", "nowhere.csv"], 2, "'nowhere.csv' does not exist"),
+        (["export", "own.csv", "--to", "csv", "--out", "out"], 1, "of a table plow-twin live makes a recording"),
+        (["export", "taken", "--to", "csv", "--out", "out"], 1, "taken"),
+        (["export", "own.csv", "--to", "xls", "--out", "out"], 2, "is not one of 'csv', 'parquet', 'npz'"),
+        (["dashboard", "own.csv"], 1, "own.csv: not an MCAP file"),
+    ],
+)
+def test_a_stranger_s_mistake_is_named_in_a_message(
+    arguments: list[str],
+    code: int,
+    said: str,
+    desk: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(desk)
+    before = sorted(desk.rglob("*"))
+    assert cli(arguments) == code
+    shown = capsys.readouterr().err
+    assert said in " ".join(shown.split()), shown
+    # one line says what is wrong; nothing of the file is printed, and nothing is left behind
+    assert len([line for line in shown.splitlines() if not line.startswith("Usage")]) <= 3 and len(shown) < 500
+    assert sorted(desk.rglob("*")) == before
+
+
+def test_a_load_that_looks_like_kilonewtons_is_named_before_it_is_estimated(
+    desk: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(desk)
+    # gains of the load are estimated: such a load is a warning there, and no result stands on it
+    assert cli(["estimate", "kN", "--json"]) == 0
+    shown = capsys.readouterr()
+    assert "fx, fy: got 30, expected some 3.2e+04 N as in the scene; they look like kN: convert the file" in shown.err
+    assert '"state": "withdrawn"' in shown.out
