@@ -10,10 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_support import MAP, PAPER, STORE, motion, wrench_message, write_bag
+from bag_support import MAP, PAPER, STORE, measured, motion, wrench_message, write_bag
 from figure_checks import kept_figures
 from mcap.writer import Writer
 from record_support import BASE_NS, STEP_NS, paper_sample, record_run
+from rerun.chunk import RrdReader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as BagWriter
 
@@ -312,7 +313,13 @@ def test_a_bag_of_another_program_is_drawn_by_its_mapping(tmp_path: Path, monkey
     assert largest == pytest.approx(analyse_force(tmp_path) / 1e3, rel=1e-6)
     np.testing.assert_allclose(load.lines[0].get_ydata(), motion()[1][:400, 0] / 1e3)
     assert run_cli([*arguments, "--out", str(tmp_path / "bag.rrd")]) == 0
-    assert (tmp_path / "bag.rrd").stat().st_size > 10_000
+    drawn = [
+        chunk.to_record_batch()["Scalars:scalars"].to_pylist()
+        for chunk in RrdReader(str(tmp_path / "bag.rrd")).stream()
+        if chunk.entity_path == "/pose/measured/x" and not chunk.is_static
+    ]
+    poses = [q[0] for _, q in measured(tuple(part[:400] for part in motion()))]
+    np.testing.assert_allclose([value for part in drawn for row in part for value in row], 1e3 * np.array(poses))
 
 
 def analyse_force(folder: Path) -> float:

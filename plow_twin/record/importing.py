@@ -10,11 +10,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from plow_twin.errors import RecordingError
+from plow_twin.model.scene import DOF_NAMES
 from plow_twin.record.mapping import Role, readings
 from plow_twin.record.sources import Arrived
 from plow_twin.record.walking import BATCH, Walker
 from plow_twin.stream.intake import Intake, Verdict
-from plow_twin.stream.journal import Reset, Travel
+from plow_twin.stream.journal import PartOfPose, Pose, Reset, Travel
 from plow_twin.stream.steps import Steps
 
 
@@ -31,6 +32,9 @@ class Feed:
     intake: Intake = field(default_factory=Intake)
     #: messages that were not used, by reason; the intake counts the load's too
     unfit: Counter[str] = field(default_factory=Counter)
+    #: whether the first walker's journal gets the measured poses, which move nothing
+    with_poses: bool = False
+    _poses: list[Pose | PartOfPose] = field(default_factory=list)
     _stamps: list[int] = field(default_factory=list)
     _wrench: list[tuple[float, float, float]] = field(default_factory=list)
     _log_times: list[int] = field(default_factory=list)
@@ -92,6 +96,8 @@ class Feed:
                 self._sample(*settled)
         elif stamp_ns > 0:
             self.measured(name, stamp_ns, values)
+            if self.with_poses and name == "head_pose":
+                self._poses.append(_pose(stamp_ns, values))
         else:
             self.unfit[f"{name}: {self.roles[name].topic} has stamps of 0"] += 1
 
@@ -111,7 +117,11 @@ class Feed:
             self.flush()
 
     def flush(self) -> None:
-        """Advance by the samples that wait."""
+        """Advance by the samples that wait, after the poses that came with them."""
+        first_ns = self._log_times[0] if self._log_times else 0
+        for pose in self._poses if self._log_times or self._reached_ns is not None else ():
+            self.walkers[0].apply(pose, first_ns)
+        self._poses = []
         if not self._stamps:
             return
         stamps, wrench = np.array(self._stamps, np.int64), np.array(self._wrench)
@@ -119,3 +129,12 @@ class Feed:
         self._stamps, self._wrench, self._log_times = [], [], []
         for walker in self.walkers:
             walker.samples(stamps, wrench, times)
+
+
+def _pose(stamp_ns: int, values: dict[str, float]) -> Pose | PartOfPose:
+    """Return the entry of a measured pose."""
+    pose = tuple(values.get(name, math.nan) for name in DOF_NAMES)
+    known = tuple(place for place, value in enumerate(pose) if math.isfinite(value))
+    if len(known) < len(pose):
+        return PartOfPose(stamp_ns, known, tuple(pose[place] for place in known))
+    return Pose(stamp_ns, pose)

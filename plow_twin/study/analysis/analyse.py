@@ -440,7 +440,7 @@ def _walk_other(
     def add(role: str, stamp_ns: int, numbers: dict[str, float]) -> None:
         measured.add(role, stamp_ns, numbers, predictions[0].resets)
 
-    feed = Feed(walkers, roles, add, Intake())
+    feed = Feed(walkers, roles, add, Intake(), with_poses=writer is not None)
     try:
         feed.run(messages_of(source, roles))
     except RecordingError as error:
