@@ -54,7 +54,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
             Path(name).parent.mkdir(exist_ok=True)
             Path(name).write_text("")
         Path("own.yaml").write_text("excitation: {topic: own}\nhead_pose: {topic: own}\n")
-        Path("misspelt.yaml").write_text("exitation: {topic: own}\n")
+        Path("misspelt.yaml").write_text("excitations: {topic: own}\n")
         Path("knots.yaml").write_text("excitation: {topic: own, unit: {fx: knots}}\n")
     return folder
 

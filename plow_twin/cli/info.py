@@ -48,7 +48,7 @@ def info(target: str | None, unused: bool, mapping: Path | None, units: dict[str
         return _show(_environment(), as_json)
     if Path(target).suffix == ".mcap" or Path(target).is_dir():
         return _recording(Path(target), as_json)
-    if Path(target).suffix.lower() in (".csv", ".jsonl"):
+    if Path(target).suffix.lower() in (".csv", ".parquet"):
         raise RecordingError(f"{target}: got a table, expected --map with where its load, travel and pose stand")
     return _scene(target, as_json)
 

@@ -32,7 +32,7 @@ MAGIC: Final = b"\x89MCAP0\r\n"
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _METADATA = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x0C
 _ATTACHMENT: Final = 0x09
 #: Endings of the names of tables, which are no recordings.
-_TABLES: Final = (".csv", ".jsonl")
+_TABLES: Final = (".csv", ".parquet")
 _HEAD: Final = struct.Struct("<BQ")
 _HEAD_SIZE: Final = _HEAD.size
 #: A head and the number that an index record begins with [B].
