@@ -51,7 +51,7 @@ def telemetry_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def ways_of(options: dict[str, Any]) -> list[WayOut]:
-    """Return the ways out that the options ask for; raises as the functions of `telemetry.access`."""
+    """Return the outputs named by the options; raises as the functions of `telemetry.access`."""
     if options["sparkplug"] and not options["mqtt_out"]:
         raise click.UsageError("--sparkplug: expected --mqtt-out with the broker")
     if not any(options[name] for name in ("mqtt_out", "influx", "opcua")):

@@ -398,7 +398,7 @@ def path_deviate(seen: Array, features: Array, drawn: list[Array], measured: Arr
     Nearby drawn motions are compared with the rest in the same way. This gives the distances of right models,
     whatever the contact, the noise and the length of the window.
     """
-    # (n, lags, parts); stamps may be late or early: a delay is no other path
+    # (n, lags, parts); stamps may be late or early: a delayed path counts as the same
     paths = np.array(drawn)
     there = np.isfinite(paths).all(axis=(0, 1)) & np.isfinite(seen).all(axis=0)
     if there.sum() < tuning.PATH_PHASES:

@@ -98,7 +98,7 @@ def estimate_window(
 ) -> tuple[Estimate, Guess]:
     """Estimate as `estimate` does, from the result of the window before; return the guess for the next one too.
 
-    Where the fit from `guess` does not hold, all is searched as without one.
+    Where the fit from `guess` does not hold, the whole search follows, as without a guess.
     """
     if scene.head.carries == "corners":
         span = (float(load.t[0]), float(load.t[-1]))

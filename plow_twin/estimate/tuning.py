@@ -40,7 +40,7 @@ class Tuned:
     basis: str = JUDGED
 
 
-# When something counts as estimated
+# Conditions for an estimated quantity
 OBSERVED: Annotated[
     float,
     Tuned(

@@ -435,7 +435,7 @@ class _Replay:
 
     def output(self, record: OutputRecord) -> None:
         """Compare a recorded message with the model's at that place."""
-        if self.sink is not None:  # another topic goes over as it is
+        if self.sink is not None:  # other topics are copied unchanged
             place = (record.topic, record.sequence, record.log_time_ns, record.publish_time_ns)
             self.sink.write_output(*place, record.message())
             return

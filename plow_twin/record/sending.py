@@ -94,7 +94,7 @@ class _Group(NamedTuple):
 
 
 def _sources(topic: Topic) -> NDArray[np.int64]:
-    """Return where the numbers of a message stand in its record [words]."""
+    """Return the places of a message's numbers in its record [words]."""
     fields: Any = topic.record_type.fields
     return np.concatenate([fields[name][1] // _WORD + np.arange(count) for name, count in topic.parts])
 

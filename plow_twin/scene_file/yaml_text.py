@@ -119,7 +119,7 @@ def _excess(text: str, most_values: float) -> Problem | None:
     values = repeated = 0
     sizes: dict[str, _Size | None] = {}  # by anchor; None: the node has not ended
     outer, is_mapping, anchor = _Size(), False, None
-    stack: list[tuple[_Size, bool, str | None]] = []  # the same of the collections around it
+    stack: list[tuple[_Size, bool, str | None]] = []  # size, kind and anchor of the collections around it
     event: Any
     for event in yaml.parse(text, SceneLoader):
         kind = type(event)
