@@ -1,4 +1,4 @@
-"""A real OPC UA server in a process of its own: `opcua_server.py PORT [CERTIFICATE KEY]`; commands on its input."""
+"""A real OPC UA server: `opcua_server.py PORT [CERTIFICATE KEY [USER]]`; commands on its input."""
 
 from __future__ import annotations
 
@@ -13,16 +13,24 @@ from typing import Any
 from asyncua import Server, ua
 from asyncua.crypto.permission_rules import User, UserRole
 from asyncua.server.user_managers import UserManager
+from cryptography import x509
+from cryptography.hazmat.primitives.serialization import Encoding
 
 NODES = ("Load.Fx", "Load.Fy", "Load.M")
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 class OneUser(UserManager):
-    """Only the user `plough` may come."""
+    """Only the user `plough` may come, or the one with a certificate."""
+
+    def __init__(self, certificate: Path | None) -> None:
+        read = None if certificate is None else x509.load_pem_x509_certificate(certificate.read_bytes())
+        self._known = None if read is None else read.public_bytes(Encoding.DER)
 
     def get_user(self, iserver: Any, username: Any = None, password: Any = None, certificate: Any = None) -> Any:
-        return User(UserRole.User) if (username, password) == ("plough", "s3cret") else None
+        # without a token of the user the certificate is that of the client's program
+        known = (username, password) == ("plough", "s3cret") or (username is None and certificate == self._known)
+        return User(UserRole.User) if known else None
 
 
 class Plant:
@@ -56,11 +64,11 @@ class Plant:
 async def serve() -> None:
     logging.disable()
     port, *security = sys.argv[1:]
-    server = Server(user_manager=OneUser() if security else None)
+    server = Server(user_manager=OneUser(Path(security[2]) if security[2:] else None) if security else None)
     await server.init()
     server.set_endpoint(f"opc.tcp://127.0.0.1:{port}/plant")
     if security:
-        certificate, key = map(Path, security)
+        certificate, key = map(Path, security[:2])
         server.set_security_policy([ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt])
         await server.load_certificate(certificate)
         await server.load_private_key(key)

@@ -292,6 +292,7 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("server", "urn:freeopcua:python:server"),
         ("client", "urn:plow-twin:client"),
         ("other", "urn:x"),
+        ("user", "urn:y"),
     ):
         subprocess.run(
             ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", f"/CN={name}",
@@ -306,7 +307,7 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def secured(certificates: Path) -> Iterator[tuple[Plant, Access]]:
-    plant = Plant(str(certificates / "server.pem"), str(certificates / "server.key.pem"))
+    plant = Plant(*(str(certificates / name) for name in ("server.pem", "server.key.pem", "user.pem")))
     yield (
         plant,
         Access(
@@ -340,6 +341,38 @@ def test_an_encrypted_session_of_a_user_leaves_no_secret_in_the_recording(
     recorded = b"".join(path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file())
     key = Path(str(access.key)).read_bytes().splitlines()[5]
     assert access.password.encode() not in shown + recorded and key not in recorded
+
+
+def test_a_user_signs_in_by_certificate_and_no_other_one_does(
+    secured: tuple[Plant, Access], certificates: Path, roles: Any, tmp_path: Path
+) -> None:
+    plant, access = secured
+    access = replace(access, user="", password="")
+    for name, admitted in (("user", True), ("other", False)):
+        files = {"user_certificate": certificates / f"{name}.pem", "user_key": certificates / f"{name}.key.pem"}
+        bridge = OpcUa(replace(access, **files), roles)
+        if not admitted:
+            with pytest.raises(BridgeError, match="refused"):
+                bridge.start(list(bridge.topics()))
+            continue
+        bridge.start(list(bridge.topics()))
+        try:
+            plant.do("rows", _rows(time.time_ns() // MS * MS, 0, 5))
+            assert len(_until(bridge, lambda found: len(found) >= 5)) >= 5
+        finally:
+            bridge.close()
+    # a certificate that was copied, without its key
+    stolen = replace(access, user_certificate=certificates / "user.pem", user_key=certificates / "other.key.pem")
+    bridge = OpcUa(stolen, roles)
+    with pytest.raises(BridgeError, match="refused"):
+        bridge.start(list(bridge.topics()))
+    (tmp_path / "no.key").write_text("none")
+    bridge = OpcUa(replace(stolen, user_key=tmp_path / "no.key"), roles)
+    with pytest.raises(BridgeError, match="--user-key cannot be used"):
+        bridge.start(list(bridge.topics()))
+    for wrong in (replace(stolen, user_key=None), replace(stolen, user="a"), replace(stolen, ca=None)):
+        with pytest.raises(BridgeError, match=r"expected --|--user-cert stands for"):
+            OpcUa(wrong, roles)
 
 
 def test_untrusted_and_unencrypted_connections_are_refused(

@@ -69,6 +69,8 @@ _FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
     help="User at the broker or server; password: PLOW_TWIN_MQTT_PASSWORD, PLOW_TWIN_OPCUA_PASSWORD, or a file.",
 )
 @click.option("--password-file", type=_FILE, help="File whose first line is the password.")
+@click.option("--user-cert", type=_FILE, help="Certificate of the user at an OPC UA server, in the place of --user.")
+@click.option("--user-key", type=_FILE, help="Key of that certificate.")
 @click.option("--tls-ca", type=_FILE, help="Authority that the broker's or server's certificate is checked against.")
 @click.option("--tls-cert", type=_FILE, help="Certificate of this client.")
 @click.option("--tls-key", type=_FILE, help="Key of that certificate.")
@@ -279,6 +281,8 @@ def _bridge(source: str, options: dict[str, Any], rate_hz: float) -> Bridge:
             ca=options["tls_ca"],
             certificate=options["tls_cert"],
             key=options["tls_key"],
+            user_certificate=options["user_cert"],
+            user_key=options["user_key"],
             plain=options["plain"],
             client_id=options["client_id"],
         )

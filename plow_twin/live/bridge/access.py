@@ -17,8 +17,8 @@ class Access:
 
     `url` is `SCHEME://HOST:PORT`; without a host it is this machine. `user` and `password` may be empty. `ca` is the
     authority, or the certificate itself, that the other side's certificate is checked against; `certificate` and `key`
-    identify this side. `plain` allows a connection to another machine without encryption. `client_id` names the
-    session at a broker.
+    identify this side, `user_certificate` and `user_key` its user in the place of name and password. `plain` allows a
+    connection to another machine without encryption. `client_id` names the session at a broker.
     """
 
     url: str
@@ -27,6 +27,8 @@ class Access:
     ca: Path | None = None
     certificate: Path | None = None
     key: Path | None = None
+    user_certificate: Path | None = None
+    user_key: Path | None = None
     plain: bool = False
     client_id: str = "plow_twin"
 

@@ -335,6 +335,10 @@ def _check_encryption(access: Access, host: str) -> None:
     given = (access.certificate, access.key, access.ca)
     if any(given) and not all(given):
         raise BridgeError("certificates: expected --tls-cert, --tls-key and --tls-ca (of the server) together")
+    if bool(access.user_certificate) != bool(access.user_key):
+        raise BridgeError("user: expected --user-cert and --user-key together")
+    if access.user_certificate and (access.user or not all(given)):
+        raise BridgeError("user: --user-cert stands for --user, and needs --tls-cert, --tls-key and --tls-ca")
     if not any(given) and not access.plain and not is_loopback(host):
         raise BridgeError(
             f"{access.url}: got another machine without certificates, expected --tls-cert or this machine"

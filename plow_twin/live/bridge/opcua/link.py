@@ -16,7 +16,7 @@ from asyncua.ua.uaerrors import UaError
 
 from plow_twin.live.bridge.access import Access
 from plow_twin.live.bridge.opcua.readings import Counts, date_of
-from plow_twin.live.bridge.opcua.security import secure
+from plow_twin.live.bridge.opcua.security import identify, secure
 from plow_twin.live.bridge.source import BridgeError
 
 #: Interval at which the server is asked to send [ms]: two thirds of the age that a sample may have at the twin.
@@ -103,6 +103,8 @@ class Link:
         """
         if self._access.certificate is not None:
             await secure(self._client, self._access, self._host)
+        if self._access.user_certificate is not None:
+            await identify(self._client, self._access)
         await self._client.connect()
         return await self._subscribe()
 

@@ -55,6 +55,22 @@ async def secure(client: Client, access: Access, host: str) -> None:
         raise BridgeError(f"{access.url}: the files of certificate and key cannot be used: {error}") from error
 
 
+async def identify(client: Client, access: Access) -> None:
+    """Have a client sign in as the user of a certificate.
+
+    Raises
+    ------
+    BridgeError
+        A file cannot be read.
+    """
+    assert access.user_key, "checked with the address"
+    try:
+        await client.load_client_certificate(str(access.user_certificate))
+        await client.load_private_key(access.user_key)
+    except (OSError, ValueError, TypeError) as error:
+        raise BridgeError(f"user: --user-cert and --user-key cannot be used: {error}") from error
+
+
 def _first(chain: bytes) -> bytes:
     """Return the server's certificate, without the authorities that may follow it (DER, long form of the length)."""
     return chain[: int.from_bytes(chain[2:4], "big") + 4]
