@@ -17,7 +17,7 @@ from bench_scenes import DENSE, SPARSE, T_END, bench_scene, constants, error_sca
 from cases import Array, Case, Row, Sample, pose_error, timed
 from lean import rk4
 
-from plow_twin import Scene, SolverError, Status, simulate
+from plow_twin import Result, Scene, SolverError, Status, simulate
 from plow_twin.run.motion import BUDGET, Motion, run_events
 from plow_twin.run.simulate import Method, output_times
 from plow_twin.solve.compiled_scene import compile_scene
@@ -67,6 +67,7 @@ def prepare_simulate(
     dt: float | None = None,
     *,
     energy_balance: bool = False,
+    sensitivity: bool | tuple[str, ...] = False,
     whole_call: bool = False,
 ) -> Callable[[], Sample]:
     """Prepare `simulate` with everything it gives: poses, rates, forces, penetrations, events, statistics.
@@ -75,8 +76,14 @@ def prepare_simulate(
     """
     method: Method = "events" if dt is None else "rk4"
 
+    def call(end: float) -> Result:
+        return simulate(scene, end, output_dt, tol, method, dt, energy_balance, sensitivity=sensitivity)
+
+    if sensitivity:
+        call(output_dt or t_end)  # compiles
+
     def run() -> Sample:
-        wall, result = timed(lambda: simulate(scene, t_end, output_dt, tol, method, dt, energy_balance))
+        wall, result = timed(lambda: call(t_end))
         solver = result.solver
         return Sample(
             wall if whole_call else result.wall_s, result.q, solver["steps"], solver["evaluations"], len(result.events)

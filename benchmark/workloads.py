@@ -10,7 +10,7 @@ from bench_scenes import SPARSE, T_END, bench_scene, error_scale
 from cases import Array, Case, Row, pose_error
 from work_precision import OURS, OURS_BARE, prepare_bare, prepare_simulate
 
-from plow_twin import Friction, Gravity, Harmonic, Initial, Scene
+from plow_twin import Friction, Gravity, Harmonic, Initial, Scene, sensitivity_parameters
 
 TOL = 1e-6
 HOUR_S = 3600.0
@@ -114,13 +114,28 @@ def add_steps_per_event(rows: Sequence[Row]) -> None:
 
 
 def feature_cases() -> Iterator[Case]:
-    """Yield the KV scene plain, with energy and momentum balanced, with friction, with both."""
+    """Yield the KV scene plain, with energy and momentum balanced, with friction, with both, with derivatives."""
     scene = bench_scene("kv")
     rubbing = dataclasses.replace(scene, friction=Friction(coefficient=0.1))
     features = (("plain", scene, False), ("energy balance", scene, True), ("friction 0.1", rubbing, False))
     for name, chosen, energy_balance in (*features, ("friction 0.1 and energy balance", rubbing, True)):
         row = Row("features", f"kv, {name}", OURS, f"tol={TOL:g}", SPARSE, T_END)
-        yield Case(row, partial(prepare_simulate, chosen, SPARSE, tol=TOL, energy_balance=energy_balance))
+        call = partial(prepare_simulate, chosen, SPARSE, tol=TOL, energy_balance=energy_balance, whole_call=True)
+        yield Case(row, call)
+    shared = _shared_load_scene()
+    paths = tuple(sensitivity_parameters(shared))
+    for name, wanted in (("growth of errors", True), (f"derivatives by {len(paths)} parameters", paths)):
+        row = Row("features", f"kv, {name}", OURS, f"tol={TOL:g}", SPARSE, T_END)
+        yield Case(row, partial(prepare_simulate, shared, SPARSE, tol=TOL, sensitivity=wanted, whole_call=True))
+
+
+def _shared_load_scene() -> Scene:
+    """Return the KV scene with its load in six equal parts: ten parameters with stiffness, damping and clearances."""
+    scene = bench_scene("kv")
+    load = _harmonic(scene)
+    x, y = load.force_n
+    part = dataclasses.replace(load, force_n=(x / 6.0, y / 6.0), moment_n_m=load.moment_n_m / 6.0)
+    return dataclasses.replace(scene, loads=tuple(dataclasses.replace(part, name=f"part {i}") for i in range(6)))
 
 
 def add_ratios(rows: Sequence[Row]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -27,6 +28,7 @@ from plow_twin import (
     simulate,
 )
 from plow_twin.model.loads import compile_loads
+from plow_twin.run import sensitivity
 from plow_twin.study.parameters import with_parameters
 
 
@@ -91,6 +93,80 @@ def test_the_derivatives_by_parameters_are_finite_differences_of_the_motion(name
         assert found == pytest.approx(expected, abs=1e-3 * np.abs(expected).max()), path
     with pytest.raises(ArgumentError, match=r"got 'contact\.exponent', expected some of contact\.stiffness"):
         simulate(scene, 0.5, sensitivity=("contact.exponent",))
+
+
+def _law(name: str) -> Scene:
+    """The paper's scene, thrown, with a law whose force is not linear, or one that reads the speed of a touch."""
+    scene = replace(preset("paper"), initial=Initial((0.001, 0.002, 0.003), (0.4, 0.1, 0.8)))
+    stiffness = scene.contact.stiffness
+    contact = {
+        "restitution": Contact("exact_restitution", stiffness, restitution=0.7),
+        "Hertz with restitution": Contact("exact_restitution", 30.0 * stiffness, 1.5, restitution=0.7),
+        "square": Contact("hunt_crossley", 300.0 * stiffness, 2.0, damping=0.5),
+        "cube": Contact("hunt_crossley", 3e4 * stiffness, 3.0, damping=0.5),
+    }[name]
+    return replace(scene, contact=contact)
+
+
+@pytest.mark.parametrize("name", ["restitution", "Hertz with restitution", "square", "cube"])
+def test_the_linearised_equations_agree_with_displaced_motions(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Laws that no difference of two runs covers above; the equations run, they are not replaced by shadows."""
+    scene, used = _law(name), list[int]()
+    paths = tuple(sensitivity_parameters(scene))
+    beside = sensitivity.columns_beside
+    monkeypatch.setattr(sensitivity, "columns_beside", lambda *given: used.append(1) or beside(*given))
+    found = sensitivity.sensitivity_of(scene, 0.5, 1e-9, paths)
+    assert used
+    monkeypatch.setattr(sensitivity, "fits_tangents", lambda compiled: False)
+    shadows = sensitivity.sensitivity_of(scene, 0.5, 1e-9, paths)
+    assert found.growth.max() == pytest.approx(shadows.growth.max(), rel=1e-4)
+    assert found.exponent == pytest.approx(shadows.exponent, rel=1e-4)
+    for place in (50, 100, 150, 200):
+        pairs = [(found.from_start[place], shadows.from_start[place])]
+        pairs += [(found.by_parameter[path][place], shadows.by_parameter[path][place]) for path in paths]
+        for equations, differences in pairs:
+            assert equations == pytest.approx(differences, abs=1e-4 * np.abs(differences).max())
+
+
+def test_derivatives_where_errors_grow_follow_a_motion_that_is_known_better(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stiff walls multiply errors: the motion at the first tolerance would soon be another one."""
+    scene = replace(preset("bench_kv"), contact=Contact("kelvin_voigt", 1e9, damping=1e4))
+    tolerances, follow = [], sensitivity._by_equations
+
+    def noted(scene: Scene, t_end: float, tol: float, parameters: Sequence[str]) -> object:
+        tolerances.append(tol)
+        return follow(scene, t_end, tol, parameters)
+
+    monkeypatch.setattr(sensitivity, "_by_equations", noted)
+    assert sensitivity.sensitivity_of(scene, 2.0, 1e-9).growth.max() > 1e4
+    assert tolerances == [1e-6, 1e-9]
+    tolerances.clear()
+    assert sensitivity.sensitivity_of(preset("bench_kv"), 2.0, 1e-9).trusted and tolerances == [1e-6]
+
+
+def test_products_of_stretches_grow_as_their_matrices_do() -> None:
+    """Growth against numpy's norms, in one call and in portions, with stretches that go on at some ends."""
+    random = np.random.default_rng(3)
+    matrices = 0.5 * random.normal(size=(300, 4, 4))
+    changes, ends = random.normal(size=(300, 2, 4)), random.random(300) < 0.7
+    product = sensitivity.StretchProduct(4, 2)
+    totals, rows, growth, logs = product.follow(matrices, changes, ends)
+    since, total, row = np.zeros((0, 4, 4)), np.eye(4), np.zeros((2, 4))
+    for i, (matrix, change) in enumerate(zip(matrices, changes, strict=True)):
+        grown = matrix @ np.concatenate([since, np.eye(4)[None]])
+        height = 4 if ends[i] else 2
+        expected = max(1.0, np.linalg.norm(grown[:, :height], 2, axis=(1, 2)).max())
+        assert growth[i] == pytest.approx(expected, rel=1e-6)
+        assert totals[i] == pytest.approx(matrix @ total, rel=1e-9, abs=1e-300)
+        assert rows[i] == pytest.approx(row @ matrix.T + change)
+        if ends[i]:
+            since, total, row = grown if len(grown) < 256 else grown[::2], matrix @ total, row @ matrix.T + change
+    assert (logs[~ends] == 0.0).all() and logs[ends].sum() == pytest.approx(np.linalg.slogdet(matrices[ends])[1].sum())
+    other = sensitivity.StretchProduct(4, 2)
+    for begin in range(0, 300, 7):
+        part = slice(begin, begin + 7)
+        found = other.follow(matrices[part], changes[part], ends[part])
+        assert found[0].tobytes() == totals[part].tobytes() and found[2].tobytes() == growth[part].tobytes()
 
 
 def test_a_live_twin_has_the_derivatives_too() -> None:

@@ -1,16 +1,18 @@
 """Growth of errors along a motion, which shows how long a tolerance holds.
 
-Displaced motions are followed beside the motion itself, over short stretches, from states close to it. Their
-differences are the columns of the fundamental matrix. They include the jumps at touches and separations (saltation),
-since each shadow has its own events.
+The columns of the fundamental matrix come from the linearised equations (`solve.tangents`). For terms that these do not
+have, displaced motions are followed beside the motion itself, over short stretches, from states close to it: their
+differences are the columns. They include the jumps at touches and separations (saltation), since each shadow has its
+own events.
 """
 
 from __future__ import annotations
 
 import math
+import time as _time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +20,12 @@ from numpy.typing import NDArray
 from plow_twin.errors import ArgumentError, SolverError
 from plow_twin.model import geometry
 from plow_twin.model.scene import DOF_NAMES, Load, Scene, Table
-from plow_twin.run.motion import Motion, run_events
+from plow_twin.run.motion import BUDGET, Motion, next_slice, run_events
+from plow_twin.run.tangent_columns import columns_beside, fits_tangents, is_curved
 from plow_twin.solve.compiled_scene import TOLERANCE_RANGE, CompiledScene, compile_scene
-from plow_twin.solve.state import State, Status, Work, first_of, new_records, new_work
+from plow_twin.solve.growth import MOST_KEPT, follow_growth
+from plow_twin.solve.state import State, Status, Work, first_of, new_record, new_records, new_work
+from plow_twin.solve.tangents import ALONG, STATE_COLUMNS, follow_columns
 
 Array = NDArray[np.float64]
 
@@ -29,8 +34,6 @@ DISPLACEMENT: Final = 1e-7
 _LEAST_DISPLACEMENT: Final = 1e-10
 SHADOW_TOLERANCE: Final = 1e-12
 _STRETCHES: Final = 200
-#: Earlier times from which growth is kept; every second one is dropped beyond.
-_MOST_KEPT: Final = 256
 #: Change of a parameter that is no length, in shares of it.
 _RELATIVE_CHANGE: Final = 1e-6
 #: Least distance from walls at the beginning of a stretch, in displacements. If this leaves too small a displacement,
@@ -38,7 +41,12 @@ _RELATIVE_CHANGE: Final = 1e-6
 _CLEAR_OF_WALLS: Final = 100.0
 _MOST_MERGED: Final = 20
 #: Steps of one shadow over one stretch.
-_BUDGET: Final = 10**7
+_SHADOW_BUDGET: Final = 10**7
+#: Tolerance of the motion along which the equations are linearised: its derivatives then are good to some 1e-6 times
+#: what an error grows. Where that is more than the other, the motion is followed at the tolerance asked for.
+_EQUATIONS_TOLERANCE, _LARGEST_ERROR = 1e-6, 1e-2
+#: Steps before the first look at the clock, and beyond which explicit ones are too many where implicit ones may serve.
+_FIRST_SLICE, _MOST_WITHOUT_IMPLICIT = 2048, 200_000
 #: Growth above which an error is no longer within ten tolerances (`docs/solver.md`).
 TRUSTED_GROWTH: Final = 1e4
 
@@ -182,40 +190,44 @@ class StretchProduct:
 
     def __init__(self, size: int, parameters: int) -> None:
         self.total, self.rows, self.growth = np.eye(size), np.zeros((parameters, size)), 1.0
-        self._total, self._rows = self.total, self.rows
-        self._since, self._basis = np.zeros((0, size, size)), np.eye(size)
+        self._since, self._kept = np.zeros((2, size, MOST_KEPT, size)), np.zeros(1, np.int64)
+        self._basis, self._scratch = np.eye(size), np.zeros((5 + MOST_KEPT, size, size))
 
-    def look(self, matrix: Array, changes: Array) -> None:
-        """Update the public numbers within a stretch, of which `matrix` is the fundamental matrix so far.
+    def follow(self, matrices: Array, changes: Array, ends: NDArray[np.bool_]) -> tuple[Array, Array, Array, Array]:
+        """Multiply by stretches one after the other; the public numbers are those after the last.
 
-        `changes`, shape (p, k), is the effect of the parameters in it. Growth counts places alone: in the middle of an
-        impact a stiff contact turns any displacement into a large, passing difference of velocities.
+        Growth counts places alone within a stretch: in the middle of an impact a stiff contact turns any displacement
+        into a large, passing difference of velocities.
+
+        Parameters
+        ----------
+        matrices : ndarray, shape (n, k, k)
+            Fundamental matrices of the stretches so far.
+        changes : ndarray, shape (n, p, k)
+            Effects of the parameters in them.
+        ends : ndarray of bool, shape (n,)
+            Whether a stretch ends there.
+
+        Returns
+        -------
+        totals, rows, growth : ndarray, shapes (n, k, k), (n, p, k) and (n,)
+            The public numbers after each.
+        logs : ndarray, shape (n, k)
+            Logarithms of the factors by which each stretch that ends stretched a basis, 0 for the others.
         """
-        self._grown = matrix @ np.concatenate([self._since, np.eye(len(matrix))[None]])
-        self.growth = _largest(self._grown[:, : len(matrix) // 2])
-        self.total, self.rows = matrix @ self._total, self._rows @ matrix.T + changes
-
-    def add(self, matrix: Array, changes: Array) -> Array:
-        """Multiply by a whole stretch.
-
-        Returns the logarithms of the factors by which it stretched a basis, shape (k,).
-        """
-        self.look(matrix, changes)
-        self.growth = _largest(self._grown)
-        self._total, self._rows = self.total, self.rows
-        self._since = self._grown if len(self._grown) < _MOST_KEPT else self._grown[::2]
-        self._basis, upper = np.linalg.qr(matrix @ self._basis)
-        stretched: Array = np.log(np.maximum(np.abs(np.diag(upper)), 1e-300))
-        return stretched
-
-
-def _largest(grown: Array) -> float:
-    """Return the largest factor of matrices (n, i, k), at least 1."""
-    return max(1.0, float(np.linalg.norm(grown, 2, axis=(1, 2)).max()))
+        count, size = matrices.shape[:2]
+        totals, rows = np.zeros((count, size, size)), np.zeros((count, len(self.rows), size))
+        growth, logs = np.ones(count), np.zeros((count, size))
+        follow_growth(
+            np.ascontiguousarray(matrices), np.ascontiguousarray(changes), ends.astype(np.int64), self._since,
+            self._kept, (self.total, self.rows), self._basis, self._scratch, totals, rows, growth, logs,
+        )  # fmt: skip
+        self.growth = float(growth[-1])
+        return totals, rows, growth, logs
 
 
 def sensitivity_of(scene: Scene, t_end: float, tol: float, parameters: Sequence[str] = ()) -> Sensitivity:
-    """Follow shadows of a scene's motion up to `t_end`.
+    """Follow the derivatives of a scene's motion up to `t_end`.
 
     Parameters
     ----------
@@ -235,61 +247,118 @@ def sensitivity_of(scene: Scene, t_end: float, tol: float, parameters: Sequence[
         When a shadow could not be followed.
     """
     refuse_support(scene)
-    # five digits finer than the displacement
-    fine = min(max(SHADOW_TOLERANCE, TOLERANCE_RANGE[0]), tol)
-    compiled, known = compile_scene(scene, fine), sensitivity_parameters(scene)
+    known = sensitivity_parameters(scene)
     for path in parameters:
         if path not in known:
             raise ArgumentError(f"sensitivity: got {path!r}, expected some of {', '.join(known)}")
+    free = free_places(scene)
+    scale, size = scale_of(compile_scene(scene, tol))[free], len(free)
+
+    def follow(stretches: _Stretches) -> tuple[Array, Array, Array, Array]:
+        return StretchProduct(size, len(parameters)).follow(*stretches)
+
+    stretches = _by_equations(scene, t_end, _EQUATIONS_TOLERANCE, parameters)
+    if stretches is None:
+        stretches = _by_shadows(scene, t_end, tol, parameters)
+    totals, rows, growth, logs = follow(stretches)
+    if tol < _EQUATIONS_TOLERANCE and _EQUATIONS_TOLERANCE * growth.max() > _LARGEST_ERROR:
+        # the motion itself must be known better
+        stretches = _by_equations(scene, t_end, tol, parameters) or stretches
+        totals, rows, growth, logs = follow(stretches)
+    times, ends = _ends(t_end), stretches.ends
+    # the exponent is that of stretches that begin in the second half
+    edges = np.concatenate([[0.0], times[ends]])
+    first = int(np.searchsorted(edges, 0.5 * t_end))
+    stretched = logs[ends][first:].sum(axis=0)
+    exponent = float(stretched.max()) / (edges[-1] - edges[first]) if first < len(edges) - 1 else 0.0
+    from_start = np.concatenate([np.eye(size)[None], totals]) * (scale[:, None] / scale[None, :])
+    by_parameter = np.concatenate([np.zeros((1, len(parameters), size)), rows]) * scale
+    derivatives = {path: by_parameter[:, index] for index, path in enumerate(parameters)}
+    t = np.concatenate([[0.0], times])
+    return Sensitivity(t, np.concatenate([[1.0], growth]), from_start, exponent, tol, derivatives)
+
+
+class _Stretches(NamedTuple):
+    """Derivatives at the times of `_ends` since the last stretch that ended, scaled as by `scale_of`."""
+
+    matrices: Array  #: by the state, shape (n, k, k)
+    changes: Array  #: by the parameters, shape (n, p, k)
+    ends: NDArray[np.bool_]  #: whether a stretch ends, and the next one begins, shape (n,)
+
+
+def _by_equations(scene: Scene, t_end: float, tol: float, parameters: Sequence[str]) -> _Stretches | None:
+    """Follow the linearised equations beside the motion; None where that cannot be done or takes too many steps."""
+    compiled = compile_scene(scene, tol)
+    changed = [ChangedScene.of(scene, path, tol) for path in parameters]
+    if not fits_tangents(compiled) or any(one.compiled.parts.terms != compiled.parts.terms for one in changed):
+        return None
+    scale, parts = scale_of(compiled), compiled.parts
+    ends, count = _ends(t_end), STATE_COLUMNS + len(changed)
+    columns, omegas, amplitudes = columns_beside(compiled, [(one.compiled, one.change) for one in changed])
+    out, whole, reached = np.zeros((len(ends), STATE_COLUMNS, count)), np.zeros(len(ends), np.int64), np.zeros(1, int)
+    state, work, along = compiled.initial_state(), new_work(), new_record(ALONG)
+    room, size = _CLEAR_OF_WALLS * DISPLACEMENT * scale[0], _FIRST_SLICE
+    most = BUDGET if parts.implicit is None else _MOST_WITHOUT_IMPLICIT
+    code = int(Status.BUDGET)
+    while code == Status.BUDGET:
+        if int(state.steps) >= most:
+            return None
+        begin, allowed = _time.perf_counter(), min(most, int(state.steps) + size)
+        code = follow_columns(
+            compiled.params, parts, state, work, along, columns, omegas, amplitudes, is_curved(parts.terms), ends, room,
+            _MOST_MERGED, reached, allowed, out, whole,
+        )  # fmt: skip
+        size = next_slice(size, _time.perf_counter() - begin)
+    if code != Status.OK:
+        raise SolverError(f"sensitivity at t = {float(state.step_start):.9g} s: {Status(code).text}")
+    matrices = out[:, :, :STATE_COLUMNS] * (scale[None, :] / scale[:, None])
+    changes = (out[:, :, STATE_COLUMNS:] / scale[:, None]).transpose(0, 2, 1)
+    return _Stretches(matrices, changes, whole == 1)
+
+
+def _by_shadows(scene: Scene, t_end: float, tol: float, parameters: Sequence[str]) -> _Stretches:
+    """Follow displaced motions beside the motion."""
+    # five digits finer than the displacement
+    fine = min(max(SHADOW_TOLERANCE, TOLERANCE_RANGE[0]), tol)
+    compiled = compile_scene(scene, fine)
     changed = [ChangedScene.of(scene, path, fine) for path in parameters]
     scale, free = scale_of(compiled), free_places(scene)
     work, merged, size = new_work(), 0, len(free)
-    product, logs = StretchProduct(size, len(changed)), np.zeros(size)
-    times, growth, from_start, by_parameter = [0.0], [1.0], [product.total], [product.rows]
-    # where the stretch under way began, and the first one that counts for the exponent
-    begun, first, moved, implicit = 0.0, None, DISPLACEMENT, 0
+    moved, implicit = DISPLACEMENT, 0
     scenes = [compiled] * (1 + size) + [one.compiled for one in changed]
     first_states = [one.compiled.initial_state() for one in changed]
     states = _beside(compiled, compiled.initial_state(), moved * scale, free, first_states, work)
-    for end in _ends(t_end):
+    matrices, changes, ended = [], [], []
+    for end in _ends(t_end).tolist():
         followed = [_follow(one, state, end, work) for one, state in zip(scenes, states, strict=True)]
         states = [motion.state for motion in followed]
         reached = np.array([_pose_and_rate(motion) for motion in followed])
         away = (reached[1:] - reached[0])[:, free] / scale[free]
-        matrix = away[:size].T / moved
-        changes = away[size:] / np.array([one.change for one in changed])[:, None]
+        matrices.append(away[:size].T / moved)
+        changes.append(away[size:] / np.array([one.change for one in changed])[:, None])
         assert followed[0].penetration is not None
         held = int(states[0].implicit_steps) > implicit
         depths = followed[0].penetration[0, compiled.params.enabled == 1]
         possible = displacement_beside(
             depths, scale[0], held=held, reads_speed=bool(compiled.params.damping_number >= 0.0)
         )
-        if possible is None and merged < _MOST_MERGED:
-            # growth is reported, although no stretch begins here
-            merged += 1
-            product.look(matrix, changes)
-        else:
-            stretched = product.add(matrix, changes)
-            if begun >= 0.5 * t_end:
-                first = begun if first is None else first
-                logs += stretched
-            begun, merged, moved, implicit = end, 0, possible or DISPLACEMENT, int(states[0].implicit_steps)
+        ends = possible is not None or merged >= _MOST_MERGED
+        if ends:
+            merged, moved, implicit = 0, possible or DISPLACEMENT, int(states[0].implicit_steps)
             states = _beside(compiled, states[0], moved * scale, free, states[1 + size :], work)
-        times.append(end)
-        growth.append(product.growth)
-        from_start.append(product.total * scale[free][:, None] / scale[free][None, :])
-        by_parameter.append(product.rows)
-    exponent = 0.0 if first is None else float(logs.max()) / (begun - first)
-    rows = np.array(by_parameter) * scale[free]
-    derivatives = {one.path: rows[:, index] for index, one in enumerate(changed)}
-    return Sensitivity(np.array(times), np.array(growth), np.array(from_start), exponent, tol, derivatives)
+        else:
+            merged += 1
+        ended.append(ends)
+    return _Stretches(np.array(matrices), np.array(changes), np.array(ended))
 
 
-def _ends(t_end: float) -> list[float]:
+def _ends(t_end: float) -> Array:
     """Return the ends of stretches, at uneven distances so that they do not align with a period."""
     ends = np.arange(1, _STRETCHES + 1, dtype=np.float64)
     ends[:-1] += 0.4 * (np.mod(ends[:-1] * 0.5 * (math.sqrt(5.0) - 1.0), 1.0) - 0.5)
-    return [*(ends[:-1] / _STRETCHES * t_end).tolist(), t_end]
+    ends *= t_end / _STRETCHES
+    ends[-1] = t_end
+    return ends
 
 
 def scale_of(compiled: CompiledScene) -> Array:
@@ -373,7 +442,7 @@ def _follow(compiled: CompiledScene, state: State, end: float, work: Work) -> Mo
     """Bring a copy of a state to `end`; return the motion with the row there."""
     motion = Motion.start(compiled, np.zeros((1, 3)), np.zeros((1, 3)), outputs=True)
     motion.state = _copy(state)
-    code, _ = run_events(compiled, motion, np.array([end]), end, work, int(motion.state.steps) + _BUDGET)
+    code, _ = run_events(compiled, motion, np.array([end]), end, work, int(motion.state.steps) + _SHADOW_BUDGET)
     if code != Status.OK:
         raise SolverError(f"shadow at t = {motion.time:.9g} s: {Status(code).text}")
     return motion

@@ -166,9 +166,10 @@ def simulate(
     on_progress : callable, optional
         Called with the share of the motion that is done, 0..1, some fifty times a second.
     sensitivity : bool or sequence of str
-        Follow displaced motions too, which shows whether the tolerance holds (`Result.sensitivity`); some ten times the
-        work of the run. Paths of parameters (`sensitivity_parameters`) give the derivatives by them too. Warns with
-        `ToleranceWarning` where errors grow too much for it.
+        Follow the linearised motion too, which shows whether the tolerance holds (`Result.sensitivity`). Paths of
+        parameters (`sensitivity_parameters`) give the derivatives by them too. Warns with `ToleranceWarning` where
+        errors grow too much for it. Some five times the work of the run; a hundred times and more for scenes with
+        friction, wear, a ramp, a table, a locked degree of freedom or overdamped contact.
 
     Returns
     -------

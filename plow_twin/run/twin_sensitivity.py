@@ -143,7 +143,8 @@ class TwinSensitivity:
 
     def _end(self, t: float, matrix: Array, changes: Array) -> None:
         """End a stretch: `matrix` is its fundamental matrix, `changes` the scaled effect of the parameters in it."""
-        self._logs += self._product.add(matrix, changes / np.array([one.change for one in self._changed])[:, None])
+        by_unit = changes / np.array([one.change for one in self._changed])[:, None]
+        self._logs += self._product.follow(matrix[None], by_unit[None], np.ones(1, bool))[3][0]
         self.t = t
         self._start()
 

@@ -58,14 +58,21 @@ def _set_load(p, segments, state, w):
 
 
 @kernel()
-def lay_out_step(p, parts, state, w, stop_time) -> bool:
-    """Lay out the next step, at most to `stop_time`; return False when it is not finite."""
+def _begin_step(p, parts, state, w, stop_time):
+    """Start to lay out a step; return how long it may be and whether any pair penetrates."""
     terms = parts.terms
     penetrating = weigh_pairs(p, state, w, terms.viscous, terms.fraction, terms.ramp, terms.stick)
     state.stop_time = min(stop_time, _set_load(p, parts.segments, state, w))
-    span = min(state.stop_time - state.step_start, LONGEST_STEP)
     state.alpha, state.beta, state.elapsed, state.event_pair = 1.0, 0.0, 0.0, -1
     state.steps += 1
+    return min(state.stop_time - state.step_start, LONGEST_STEP), penetrating
+
+
+@kernel()
+def lay_out_step(p, parts, state, w, stop_time) -> bool:
+    """Lay out the next step, at most to `stop_time`; return False when it is not finite."""
+    terms = parts.terms
+    span, penetrating = _begin_step(p, parts, state, w, stop_time)
     if flight.lay_out(p, parts, flight.own(parts), state, w, span, penetrating) or rest.lay_out(
         p, parts, rest.own(parts), state, w, span, penetrating
     ):
@@ -78,6 +85,19 @@ def lay_out_step(p, parts, state, w, stop_time) -> bool:
         implicit.note_step(parts.implicit, state, w, state.step_size, state.event_pair >= 0)
     else:
         return False
+    if span == LONGEST_STEP:
+        state.ends_at_stop = 0
+    return True
+
+
+@kernel()
+def lay_out_series_step(p, parts, state, w, stop_time) -> bool:
+    """Lay out the next step by Taylor series, also where the head flies free or is at rest."""
+    terms = parts.terms
+    span, penetrating = _begin_step(p, parts, state, w, stop_time)
+    if not taylor.lay_out(p, parts, taylor.own(parts), state, w, span, penetrating):
+        return False
+    _end_at_event(p, state, w, span, penetrating, law_terms(terms), terms.stick)
     if span == LONGEST_STEP:
         state.ends_at_stop = 0
     return True

@@ -1,0 +1,66 @@
+"""What the columns of `solve.tangents` change: from scenes in which one number differs a little to their records."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.solve.compiled_scene import CompiledScene, per_mass
+from plow_twin.solve.state import Terms, new_records
+from plow_twin.solve.tangents import COLUMNS, STATE_COLUMNS, WIDTH
+
+_Array = NDArray[np.float64]
+
+#: Terms that the linearised equations have.
+_COVERED: Final = {"harmonics", "second", "viscous", "hysteretic", "integer", "fraction", "flight", "rest"}
+
+
+def fits_tangents(compiled: CompiledScene) -> bool:
+    """Tell whether the linearised equations have all terms of a scene: no exponent but integers and 1.5.
+
+    Overdamped contact is not followed, but the law of a restitution only seems to need it: at slow touches.
+    """
+    terms, contact = compiled.parts.terms, compiled.scene.contact
+    there = {name for name, term in zip(Terms._fields, terms, strict=True) if term is not None}
+    known = terms.fraction is None or contact.exponent == 1.5
+    explicit = compiled.parts.implicit is None or contact.restitution is not None
+    return known and explicit and there <= _COVERED and compiled.scene.head.carries == "walls"
+
+
+def is_curved(terms: Terms) -> int | None:
+    """Return 1 where the force is not linear in penetration and rate, else None."""
+    return 1 if terms.hysteretic or terms.integer or terms.fraction else None
+
+
+def columns_beside(
+    compiled: CompiledScene, changed: Sequence[tuple[CompiledScene, float]]
+) -> tuple[NDArray[np.void], _Array, _Array]:
+    """Return columns of the state's displacements and of scenes in which a number is larger by a change.
+
+    Returns
+    -------
+    columns : ndarray of `COLUMNS`, shape (b,)
+    omegas : ndarray, shape (h,)
+        Angular frequencies of the loads in rad/s.
+    amplitudes : ndarray, shape (b, h, 2, 3, 8)
+        What each column changes of sine and cosine amplitudes, per mass and inertia.
+    """
+    blocks = -(-(STATE_COLUMNS + len(changed)) // WIDTH)
+    columns, omegas = new_records(COLUMNS, blocks), compiled.loads.omega
+    amplitudes, start = np.zeros((blocks, len(omegas), 2, 3, WIDTH)), compiled.initial_state()
+    for index, (other, change) in enumerate(changed, STATE_COLUMNS):
+        block, lane = divmod(index, WIDTH)
+        one, there, here = columns[block], other.params, compiled.params
+        for name, of in (("stiffness", "stiffness"), ("viscous", "viscous"), ("number", "damping_number")):
+            one[name][lane] = (there[of] - here[of]) / change
+        one["edge"][:, lane] = (there.penetration_rows[4] - here.penetration_rows[4]) / change
+        one["constant"][:, lane] = (there.constant - here.constant) / change
+        one["factor"][:, lane] = (other.initial_state().damping_factor - start.damping_factor) / change
+        waves = np.stack([other.loads.sine - compiled.loads.sine, other.loads.cosine - compiled.loads.cosine], axis=1)
+        amplitudes[block, ..., lane] = per_mass(compiled.scene, waves) / change
+        if one["constant"][:, lane].any() or waves.any():
+            columns["loaded"][block] = 1
+    return columns, omegas, amplitudes

@@ -1,0 +1,175 @@
+"""Products of the fundamental matrices of a motion's stretches, and how much an error has grown since earlier times."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+from plow_twin.kernel.compiler import kernel
+
+#: Earlier times from which growth is kept; every second one is dropped beyond.
+MOST_KEPT: Final = 256
+#: Squarings at most: singular values that are closer than 1e-6 count as one. What is left has rank one where the
+#: trace of its square is larger than this share of its trace's.
+_SQUARINGS, _RANK_ONE = 18, 1.0 - 1e-9
+
+
+@kernel(fast=True)
+def _multiply(a, b, out) -> None:
+    size = len(a)
+    for i in range(size):
+        out[i] = 0.0
+        for k in range(size):
+            factor = a[i, k]
+            for j in range(size):
+                out[i, j] += factor * b[k, j]
+
+
+@kernel(fast=True)
+def _larger_norm(a, height, most, gram, power, square) -> float:
+    """Return the largest singular value of the first rows of a matrix, or `most` where that is larger.
+
+    With G = A^T A it lies between trace(G^(m+1)) / trace(G^m) and the root m of trace(G^m), squared: G is squared
+    until the upper bound is below `most`, or what is left has rank one.
+    """
+    size, trace = a.shape[1], 0.0
+    for i in range(size):
+        for j in range(size):
+            value = 0.0
+            for k in range(height):
+                value += a[k, i] * a[k, j]
+            gram[i, j] = value
+        trace += gram[i, i]
+    if not 0.0 < trace < math.inf:
+        return max(most, trace)
+    for i in range(size):
+        for j in range(size):
+            power[i, j] = gram[i, j] / trace
+    logarithm, degree = math.log(trace), 1.0
+    for _ in range(_SQUARINGS):
+        if logarithm <= 2.0 * math.log(most) * degree:
+            return most
+        _multiply(power, power, square)
+        trace = 0.0
+        for i in range(size):
+            trace += square[i, i]
+        for i in range(size):
+            for j in range(size):
+                power[i, j] = square[i, j] / trace
+        logarithm, degree = 2.0 * logarithm + math.log(trace), 2.0 * degree
+        if trace > _RANK_ONE:
+            break
+    largest = 0.0
+    for i in range(size):
+        for j in range(size):
+            largest += gram[i, j] * power[j, i]
+    return max(most, math.sqrt(largest))
+
+
+@kernel(fast=True)
+def _multiply_all(matrix, since, count, grown) -> None:
+    """Multiply matrices since[:, i, :] from the left: all columns of all of them are one long row."""
+    size = len(matrix)
+    length = count * size
+    for i in range(size):
+        out = grown[i].reshape(-1)
+        out[:length] = 0.0
+        for k in range(size):
+            factor, row = matrix[i, k], since[k].reshape(-1)
+            for j in range(length):
+                out[j] += factor * row[j]
+
+
+@kernel(fast=True)
+def _largest(grown, count, height, scratch) -> float:
+    """Return the largest spectral norm of the first rows of matrices grown[:, i, :], at least 1.
+
+    Its square is no larger than the sum of squares: few have to be looked at once the largest sum has been.
+    """
+    most, begin, size = 1.0, 0, len(grown)
+    squares = scratch[5:].reshape(-1)
+    for i in range(count):
+        squares[i] = 0.0
+        for row in range(height):
+            for column in range(size):
+                squares[i] += grown[row, i, column] ** 2
+        if squares[i] > squares[begin]:
+            begin = i
+    for j in range(count):
+        i = (begin + j) % count
+        if not squares[i] <= most * most:
+            for row in range(height):
+                scratch[4, row] = grown[row, i]
+            most = _larger_norm(scratch[4], height, most, scratch[0], scratch[1], scratch[2])
+    return most
+
+
+@kernel()
+def _stretch_basis(matrix, basis, moved, logs) -> None:
+    """Multiply a basis by a matrix and make it orthonormal again; write the logarithms of what stretched it."""
+    size = len(matrix)
+    _multiply(matrix, basis, moved)
+    for j in range(size):
+        for i in range(2 * j):
+            # orthogonal to all before, twice: once leaves roundings of what is taken away
+            before, share = i % j, 0.0
+            for k in range(size):
+                share += basis[k, before] * moved[k, j]
+            for k in range(size):
+                moved[k, j] -= share * basis[k, before]
+        length = 0.0
+        for k in range(size):
+            length += moved[k, j] ** 2
+        length = max(math.sqrt(length), 1e-300)
+        logs[j] = math.log(length)
+        for k in range(size):
+            basis[k, j] = moved[k, j] / length
+
+
+@kernel(entry=True)
+def follow_growth(matrices, changes, ends, since, kept, whole, basis, scratch, totals, rows, growth, logs) -> None:
+    """Multiply by the fundamental matrices of n stretches, one after the other.
+
+    Parameters
+    ----------
+    matrices : ndarray, shape (n, k, k)
+        Fundamental matrices since the last stretch that ended.
+    changes : ndarray, shape (n, p, k)
+        What the parameters give in it.
+    ends : ndarray of int64, shape (n,)
+        1 where a stretch ends; others tell of the stretch so far. There growth counts places alone.
+    since : ndarray, shape (2, k, m, k)
+        Products since earlier times, since[0, :, i, :], of which there are `kept[0]`; the other half is scratch space.
+    whole : tuple of ndarray, shapes (k, k) and (p, k)
+        Products of all whole stretches; changed where one ends.
+    basis : ndarray, shape (k, k)
+        Orthonormal; changed where one ends.
+    scratch : ndarray, shape (5 + s, k, k)
+        With at least m numbers beyond the first five.
+    totals, rows, growth, logs : ndarray, shapes (n, k, k), (n, p, k), (n,) and (n, k)
+        Receive the products, the largest growth since an earlier time, and the logarithms of what stretched the basis.
+    """
+    most = since.shape[2]
+    for index in range(len(matrices)):
+        matrix, count = matrices[index], kept[0]
+        grown, size = since[1], len(matrix)
+        _multiply_all(matrix, since[0], count, grown)
+        # since the stretch's own beginning
+        grown[:, count] = matrix
+        ended = ends[index] == 1
+        growth[index] = _largest(grown, count + 1, size if ended else size // 2, scratch)
+        _multiply(matrix, whole[0], totals[index])
+        for i in range(changes.shape[1]):
+            for j in range(size):
+                value = changes[index, i, j]
+                for k in range(size):
+                    value += matrix[j, k] * whole[1][i, k]
+                rows[index, i, j] = value
+        if not ended:
+            continue
+        whole[0][:], whole[1][:] = totals[index], rows[index]
+        _stretch_basis(matrix, basis, scratch[3], logs[index])
+        step = 1 if count + 1 < most else 2
+        kept[0] = (count + step) // step
+        for i in range(kept[0]):
+            since[0, :, i] = grown[:, i * step]
