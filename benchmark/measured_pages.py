@@ -1,4 +1,4 @@
-"""The tables of `docs/measured.md`, from `benchmark/results/measured.json`."""
+"""The tables of measurements, of `docs/measured.md` and beside the results, from `benchmark/results/measured.json`."""
 
 from __future__ import annotations
 

@@ -306,7 +306,7 @@ def test_a_decimated_recording_keeps_every_peak(tmp_path: Path) -> None:
         publication = session.outputs.pop()
         assert len(publication.rows)
         sent.append(publication)
-        wanted = decimation.take(publication)
+        wanted = decimation.select(publication)
         if wanted is not None:
             kept.append(wanted)
             recorder.publication(wanted)
@@ -317,7 +317,7 @@ def test_a_decimated_recording_keeps_every_peak(tmp_path: Path) -> None:
     report = replay(tmp_path / "run")
     assert (report.exit_code, report.compared["contact_forces"]) == (0, len(kept))
     assert report.not_compared["contact_peaks"] == len(kept)
-    assert Decimation("none", 20.0).take(sent[0]) is None and Decimation("all", 20.0).take(sent[0]) is sent[0]
+    assert Decimation("none", 20.0).select(sent[0]) is None and Decimation("all", 20.0).select(sent[0]) is sent[0]
 
 
 @pytest.mark.parametrize("which", [0, 1, -1])

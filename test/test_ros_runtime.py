@@ -51,7 +51,7 @@ class _Flood:
         self.fd = os.eventfd(1)
         self.taken = 0
 
-    def take(self, most: int, *, all_there_are: bool = False) -> tuple[list[Taken], bool]:
+    def pop(self, most: int, *, all_there_are: bool = False) -> tuple[list[Taken], bool]:
         return [Taken(b"", 0, 0, b"")] * most, True
 
     def receive(self, topic: str, batch: list[Taken]) -> None:
@@ -327,7 +327,7 @@ def test_a_queue_that_fills_while_it_is_emptied_is_emptied_to_its_end() -> None:
         send(50)
 
         def take() -> bool:
-            taken, more = queue.take(20)
+            taken, more = queue.pop(20)
             heard.extend(message.number for message in taken)
             return more
 

@@ -123,7 +123,7 @@ def view(
         if foreign:
             run, lossy = opened.enter_context(_made_run(recording, scene, mapping, units, quiet))
         if png is not None or html is not None:
-            lossy |= _tell_loss(recording, *_still(run, png, html))
+            lossy |= _print_losses(recording, *_still(run, png, html))
             if not quiet:
                 click.echo(f"{png or html}")
             return DONE_WITH_LOSS if lossy else DONE
@@ -196,7 +196,7 @@ def _scenes(files: tuple[str, ...]) -> dict[str, Scene]:
 
 def _show(recording: Path, out: object, summary: ViewSummary, quiet: bool) -> int:
     """Print the content of the drawing and the losses; return the exit code."""
-    lossy = _tell_loss(recording, summary.status, summary.lost, summary.failed)
+    lossy = _print_losses(recording, summary.status, summary.lost, summary.failed)
     if not quiet:
         thinned = "" if summary.curve_rows == summary.rows else f" of {summary.rows} read"
         click.echo(
@@ -205,7 +205,7 @@ def _show(recording: Path, out: object, summary: ViewSummary, quiet: bool) -> in
     return DONE_WITH_LOSS if lossy else DONE
 
 
-def _tell_loss(recording: Path, status: FileStatus, lost: Mapping[str, int], failed: int) -> bool:
+def _print_losses(recording: Path, status: FileStatus, lost: Mapping[str, int], failed: int) -> bool:
     """Print the losses and failed advances of a recording; return whether it has any."""
     from plow_twin.record.reader import FileStatus
 

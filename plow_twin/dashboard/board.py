@@ -30,7 +30,7 @@ class Board:
         self.news = asyncio.Event()
         self.pages = 0
 
-    def take(self, update: dict[str, Any]) -> None:
+    def add(self, update: dict[str, Any]) -> None:
         """Take in an update of the feed."""
         self.version = version = self.version + 1
         self._updated_s = time.monotonic()

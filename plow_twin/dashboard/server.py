@@ -122,7 +122,7 @@ class Pages:
         return False
 
     async def _serve(self, socket: WebSocket) -> None:
-        tasks = [asyncio.ensure_future(work) for work in (self._tell(socket), self._listen(socket))]
+        tasks = [asyncio.ensure_future(work) for work in (self._send_updates(socket), self._listen(socket))]
         try:
             done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
             for task in done:
@@ -132,7 +132,7 @@ class Pages:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
 
-    async def _tell(self, socket: WebSocket) -> None:
+    async def _send_updates(self, socket: WebSocket) -> None:
         """Send newer values to the page in a loop; count updates that it was too slow for."""
         board, version, skipped = self._board, 0, 0
         while not self._link.broken:
@@ -187,7 +187,7 @@ async def serve(link: Link, listening: socket.socket, access: PageAccess) -> Non
 
     def take() -> None:
         while (update := link.receive()) is not None:
-            board.take(update)
+            board.add(update)
         if link.broken:
             asyncio.get_running_loop().remove_reader(link.fileno())
             board.tell()

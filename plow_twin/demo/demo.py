@@ -52,7 +52,7 @@ class Watch:
     parts: dict[str, dict[str, str]] = field(default_factory=dict)
     reports: int = 0
 
-    def take(self, message: Any) -> None:
+    def receive(self, message: Any) -> None:
         """Take in one DiagnosticArray."""
         for status in message.status:
             part = status.name.partition(": ")[2]
@@ -277,7 +277,7 @@ def _watching() -> Iterator[tuple[Watch, Any]]:
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     try:
         watch, node, executor = Watch(), WithoutEvents("plow_twin_demo"), make_executor()
-        node.create_subscription(DiagnosticArray, "/diagnostics", watch.take, DIAGNOSTICS)
+        node.create_subscription(DiagnosticArray, "/diagnostics", watch.receive, DIAGNOSTICS)
         executor.add_node(node)
         yield watch, lambda: executor.spin_once(timeout_sec=0.1)
         executor.remove_node(node)

@@ -97,7 +97,7 @@ class Recording:
 
     def publication(self, published: Published, sent: Mapping[str, bytes]) -> None:
         """Take the messages of a publication that has been published; `sent`: their bytes, where there are some."""
-        wanted = self._decimation.take(published)
+        wanted = self._decimation.select(published)
         if wanted is not None:
             self._recorder.publication(wanted, sent if wanted is published else {})
         if published.rows["marked"][0] and not (sent and wanted is published):
@@ -115,7 +115,7 @@ class Recording:
             self._recorder.publications(published, self._series)
             return
         for number, sequence in enumerate(self._series.tolist()):
-            wanted = self._decimation.take(published.at(number))
+            wanted = self._decimation.select(published.at(number))
             if wanted is not None:
                 self._recorder.publications(wanted, np.array([sequence]))
 

@@ -11,7 +11,7 @@ from typing import Final
 from plow_twin.build import package_version
 from plow_twin.record.chunks import is_begun, is_mcap
 from plow_twin.record.mcap_file import ChunkBuilder, McapFile, UnbufferedFile
-from plow_twin.record.metadata_yaml import LOST, PartFacts, TopicCount, bag_metadata, told_lost, write_metadata
+from plow_twin.record.metadata_yaml import LOST, PartFacts, TopicCount, bag_metadata, recorded_losses, write_metadata
 from plow_twin.record.writer import BESIDE, make_folder, shortage
 
 _CHUNK_SIZE: Final = 2**20
@@ -121,7 +121,7 @@ def readable_beside(run: Path, lost: Counter[str]) -> list[Path]:
     """
     found = []
     for folder in beside_folders(run):
-        lost.update(told_lost(folder))
+        lost.update(recorded_losses(folder))
         parts = [*folder.glob("*.mcap")]
         if any(is_begun(part) and is_mcap(part) for part in parts):  # its reader counts the others
             found.append(folder)

@@ -32,7 +32,7 @@ class Decimation:
         """Whether every publication is recorded."""
         return self._outputs == "all"
 
-    def take(self, published: Published) -> Published | None:
+    def select(self, published: Published) -> Published | None:
         """Return the publication to record after one of one row, or None."""
         if self._outputs == "all":
             return published

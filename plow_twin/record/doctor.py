@@ -27,7 +27,7 @@ from plow_twin.record.metadata_yaml import (
     bag_metadata,
     listed_parts,
     qos_text,
-    told_lost,
+    recorded_losses,
     write_metadata,
 )
 from plow_twin.record.reader import FileStatus, RunReader, run_parts
@@ -154,7 +154,7 @@ def examine(path: Path) -> RunReport:
     for folder in beside_folders(reader.path.parent) if path.is_dir() else ():
         for part in run_parts(folder):
             report.problems += [f"{folder.name}/{text}" for text in _part_problems(_part(part))]
-        for topic, count in told_lost(folder).items():
+        for topic, count in recorded_losses(folder).items():
             report.problems.append(f"{folder.name}: {count} lost on {topic}, as counted by the recorder")
     return report
 
@@ -310,7 +310,7 @@ def _put_aside(file: Path, ending: str) -> None:
 def _list_parts(folder: Path, parts: Sequence[Path], repaired: Sequence[str]) -> None:
     """Write `metadata.yaml` for the readable parts."""
     facts = [_facts(part) for part in parts if part.exists() and is_begun(part) and is_mcap(part)]
-    custom = {f"{LOST}{topic}": str(count) for topic, count in told_lost(folder).items()}
+    custom = {f"{LOST}{topic}": str(count) for topic, count in recorded_losses(folder).items()}
     if repaired:
         custom[f"plow_twin_{REPAIRED_KEY}"] = ", ".join(repaired)
     if facts:

@@ -55,7 +55,7 @@ class Feed:
             if arrived.after_hole:
                 self._hole()
             if found is not None:
-                self._take(name, *found, arrived.log_time_ns)
+                self._add(name, *found, arrived.log_time_ns)
             else:
                 self.unfit[f"{name}: {self.roles[name].why_unfit(arrived)}"] += 1
                 if name == "excitation":
@@ -81,7 +81,7 @@ class Feed:
             for walker in self.walkers:
                 walker.apply(Reset(self._reached_ns, "loss"))
 
-    def _take(self, name: str, stamp_ns: int, values: dict[str, float], log_time_ns: int) -> None:
+    def _add(self, name: str, stamp_ns: int, values: dict[str, float], log_time_ns: int) -> None:
         if name == "travel":
             speed = values["speed"]
             if math.isfinite(speed) and speed != self.walkers[0].speed_m_s:

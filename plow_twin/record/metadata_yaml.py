@@ -157,7 +157,7 @@ def _parsed(read: tuple[Any, list[Problem]]) -> Any:
     return document
 
 
-def told_lost(folder: Path) -> dict[str, int]:
+def recorded_losses(folder: Path) -> dict[str, int]:
     """Return the losses by topic in `metadata.yaml`; empty where it cannot be read."""
     try:
         custom = _information(folder)["custom_data"] or {}

@@ -344,12 +344,12 @@ class _Merger:
         newest = max((part.newest for part in self._outputs), default=-1)
         if not self._with_outputs or self._count > _PENDING:
             newest = self._newest(newest) + 1
-        yield from self._take(newest)
+        yield from self._read_to(newest)
 
     def finish(self) -> Iterator[Batch]:
         """Yield the rest."""
         newest = max((part.newest for part in self._outputs), default=-1)
-        yield from self._take(self._newest(newest) + 1)
+        yield from self._read_to(self._newest(newest) + 1)
 
     def _newest(self, least: int) -> int:
         """Return the highest number of the entries, at least `least`."""
@@ -360,7 +360,7 @@ class _Merger:
         unwrap(sequence, self._base, unwrapped)
         return unwrapped
 
-    def _take(self, end: int) -> Iterator[Batch]:
+    def _read_to(self, end: int) -> Iterator[Batch]:
         """Yield everything with a sequence number below `end`."""
         waiting = Entries.joined(self._entries)
         later = np.flatnonzero(waiting.sequence >= end)

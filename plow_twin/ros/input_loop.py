@@ -143,7 +143,7 @@ class InputLoop:
     def _receive(self, fd: int, *, all_there_are: bool = False) -> bool:
         """Take messages from a queue; return True if more are waiting."""
         queue, receiver, topic = self._queues[fd]
-        batch, more = queue.take(_MOST, all_there_are=all_there_are)
+        batch, more = queue.pop(_MOST, all_there_are=all_there_are)
         if batch:
             receiver.receive(topic, batch)
         return more

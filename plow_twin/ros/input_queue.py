@@ -98,7 +98,7 @@ class InputQueue:
         with subscription.handle:
             self._listen(subscription.handle.pointer, _count_up(), self.fd)
 
-    def take(self, most: int, *, all_there_are: bool = False) -> tuple[list[Taken], bool]:
+    def pop(self, most: int, *, all_there_are: bool = False) -> tuple[list[Taken], bool]:
         """Return up to `most` waiting messages in order of arrival, and whether there are more.
 
         It takes as many messages as were signalled, or `most` with `all_there_are`: a take from an empty queue costs a

@@ -142,7 +142,7 @@ class TopicRecorder:
         )
         self._loop.add(InputQueue(self._node, subscription), _Subscription(self, quality, number), name)
 
-    def take(self, name: str, quality: _Quality, number: int, taken: list[Taken]) -> None:
+    def add(self, name: str, quality: _Quality, number: int, taken: list[Taken]) -> None:
         """Write messages of a subscription, each message once."""
         for message in taken:
             key = (name, message.sender)
@@ -170,7 +170,7 @@ class _Subscription(NamedTuple):
 
     def receive(self, topic: str, batch: list[Taken]) -> None:
         """Receive the messages that were in the queue."""
-        self.recorder.take(topic, self.quality, self.number, batch)
+        self.recorder.add(topic, self.quality, self.number, batch)
 
 
 def record_topics(

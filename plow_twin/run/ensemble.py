@@ -189,7 +189,7 @@ class _Run:
         if self.stopped.is_set() or _time.perf_counter() > self._end:
             raise OutOfTimeError
 
-    def _tell(self, count: int) -> None:
+    def _report_progress(self, count: int) -> None:
         with self._lock:
             self.done += count
             if self._on_progress is not None and count > 0:
@@ -202,8 +202,8 @@ class _Run:
             self._look()
             left = run.go_on(waiting, self._work())
             for index in np.setdiff1d(waiting, left, assume_unique=True).tolist():
-                self._take(index, run.totals[index], run.states[index], int(run.status[index]))
-            self._tell(len(waiting) - len(left))
+                self._store(index, run.totals[index], run.states[index], int(run.status[index]))
+            self._report_progress(len(waiting) - len(left))
             waiting = left
 
     def _run_alone(self, index: int) -> None:
@@ -212,10 +212,10 @@ class _Run:
         compiled, ensemble = self._compiled[index], self._ensemble
         motion = Motion.start(compiled, ensemble.q[index], ensemble.v[index])
         status, _ = run_events(compiled, motion, ensemble.t, self._t_end, self._work(), self._max_steps, self._look)
-        self._take(index, motion.totals, motion.state, status)
-        self._tell(1)
+        self._store(index, motion.totals, motion.state, status)
+        self._report_progress(1)
 
-    def _take(self, index: int, totals: Totals, state: np.record | np.void, status: int) -> None:
+    def _store(self, index: int, totals: Totals, state: np.record | np.void, status: int) -> None:
         """Take over the results of a finished member."""
         ensemble = self._ensemble
         ensemble.peak[index], ensemble.impulse[index] = totals["peak"], totals["impulse"]

@@ -195,13 +195,13 @@ class Alarms:
         self.raised, changed = [], False
         if self._model is not None and not held:
             for at_ns, residual in self._model.add(stamp_ns, x, y):
-                changed |= self._take("residual", residual, at_ns)
-        changed |= self._take("force", force, stamp_ns)
+                changed |= self._update("residual", residual, at_ns)
+        changed |= self._update("force", force, stamp_ns)
         if slow is not None:
             clearance = float(slow["clearance"][:2].max())
-            changed |= self._take("clearance", clearance, stamp_ns)
-            changed |= self._take("wear_rate", float(slow["wear_rate"].max()), stamp_ns)
-            changed |= self._take("clearance_rate", self._growth(stamp_ns, clearance), stamp_ns)
+            changed |= self._update("clearance", clearance, stamp_ns)
+            changed |= self._update("wear_rate", float(slow["wear_rate"].max()), stamp_ns)
+            changed |= self._update("clearance_rate", self._growth(stamp_ns, clearance), stamp_ns)
         if self.raised:
             self._place(rows[number], slow)
         return changed
@@ -254,9 +254,9 @@ class Alarms:
         if found is None:
             return False
         self.raised = []
-        return self._take("residual", found[1], found[0])
+        return self._update("residual", found[1], found[0])
 
-    def _take(self, name: str, value: float, stamp_ns: int) -> bool:
+    def _update(self, name: str, value: float, stamp_ns: int) -> bool:
         alarm = self.alarms.get(name)
         if alarm is None:
             return False

@@ -68,7 +68,7 @@ class Influx:
             except (ApiException, HTTPError, OSError) as error:
                 self._fail(error, len(lines))
                 return
-            self._take(len(lines))
+            self._drop(len(lines))
             self.state.sent += len(lines)
             self.state.connected, self.state.trouble, self._wait_s = True, "", 0.0
 
@@ -86,12 +86,12 @@ class Influx:
         reason = f"{status} {error.reason}" if status else str(error)
         self.state.trouble = f"not written: {reason}"[:300]
         if status in (400, 413, 422):
-            self._take(count)
+            self._drop(count)
             self.state.lost += count
         self._wait_s = min(max(2.0 * self._wait_s, _FIRST_WAIT_S), _LONGEST_WAIT_S)
         self._again_s = time.monotonic() + self._wait_s
 
-    def _take(self, count: int) -> None:
+    def _drop(self, count: int) -> None:
         for _ in range(count):
             self._waiting.popleft()
 

@@ -65,9 +65,9 @@ class Outlet(Beside):
     def turn(self) -> None:
         """Send an update, and report changes at the receiver."""
         self.feed.turn()
-        self._say()
+        self._report()
 
-    def _say(self) -> None:
+    def _report(self) -> None:
         trouble = self.feed.report["trouble"]
         if trouble != self._trouble:
             self._on_error(f"{self.address}: {trouble or 'takes messages now'}")

@@ -50,7 +50,7 @@ async def serve(link: Link, way: Way, newest: Newest) -> None:
         while not ends and (update := link.receive()) is not None:
             ends = "end" in update
             if not ends:
-                await way.send(newest.take(update), newest)
+                await way.send(newest.update(update), newest)
         await way.turn()
         report = _report(way)
         if report != told and link.send(report):
@@ -71,7 +71,7 @@ async def _readable(link: Link) -> None:
 async def _run(link: Link, first: dict[str, Any]) -> None:
     module, name = WAYS[first.pop("way")]
     newest = Newest()
-    newest.take({"facts": first.pop("facts")})
+    newest.update({"facts": first.pop("facts")})
     try:
         way: Way = getattr(import_module(module), name)(**first)
         await way.open(link, newest)

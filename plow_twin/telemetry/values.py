@@ -56,7 +56,7 @@ class Newest:
         self._time_s = 0.0
         self._held = False
 
-    def take(self, update: Mapping[str, Any]) -> dict[str, Group]:
+    def update(self, update: Mapping[str, Any]) -> dict[str, Group]:
         """Take in an update; return the groups that it has changed."""
         self.not_taken = update.get("not_taken", self.not_taken)
         changed: dict[str, dict[str, Value]] = {}

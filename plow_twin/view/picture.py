@@ -116,14 +116,14 @@ def _draw_instant(upper: Any, lower: Any, section: Section, curves: RunCurves) -
     instant = curves.instant
     if instant is None or curves.instant_s is None:
         for place, name in ((upper, "pose"), (lower, "penetrations")):
-            _say_nothing(place, f"no {name} in the recording")
+            _note_absence(place, f"no {name} in the recording")
             place.set(xticks=[])
         return
     _draw_section(upper, section, instant, curves.instant_s)
     _draw_gaps(lower, instant.penetration)
 
 
-def _say_nothing(axis: Any, text: str) -> None:
+def _note_absence(axis: Any, text: str) -> None:
     """Write a text in place of a drawing."""
     axis.text(0.5, 0.5, text, ha="center", va="center", transform=axis.transAxes)
     axis.set(yticks=[])
@@ -191,7 +191,7 @@ def _curves(
     """Draw curves, or of bins the band between least and largest values; bands of forces would all begin at zero."""
     axis.set_ylabel(label)
     if not rows:
-        _say_nothing(axis, "not in the recording")
+        _note_absence(axis, "not in the recording")
         return
     for index, name in enumerate(names):
         color = colors[index] if colors else f"C{index}"
@@ -213,7 +213,7 @@ def _clearance(axis: Any, curves: RunCurves) -> None:
     """Draw both clearances with their intervals, and the changes by other causes than wear."""
     axis.set_ylabel("clearance with its\n90 % interval [mm]")
     if not curves.clearance:
-        _say_nothing(axis, "not in the recording")
+        _note_absence(axis, "not in the recording")
         return
     for index, name in enumerate(("horizontal", "vertical")):
         times, _, value = curves.clearance.bands(3 * index)

@@ -84,7 +84,7 @@ class Conditions:
         general = ua.NodeId(ObjectIds.AcknowledgeableConditionType_Acknowledge)
         self._server.link_method(self._server.get_node(general), self._called)
 
-    async def take(self, alarms: Group) -> None:
+    async def update(self, alarms: Group) -> None:
         """Take in the alarms, and send an event for each that has changed."""
         self._values = values = alarms.values
         for name, condition in self._conditions.items():

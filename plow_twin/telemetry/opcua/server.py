@@ -116,7 +116,7 @@ class OpcUaServer:
             for key, value in group.values.items():
                 await self._server.write_attribute_value(self._model.nodes[f"{name}/{key}"], _data(value, group))
             if name == "alarms":
-                await self._conditions.take(group)
+                await self._conditions.update(group)
         self.state.sent += 1
 
     async def turn(self) -> None:
