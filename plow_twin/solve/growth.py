@@ -30,7 +30,7 @@ def _larger_norm(a, height, most, gram, power, square) -> float:
     """Return the largest singular value of the first rows of a matrix, or `most` where that is larger.
 
     With G = A^T A it lies between trace(G^(m+1)) / trace(G^m) and the root m of trace(G^m), squared: G is squared
-    until the upper bound is below `most`, or what is left has rank one.
+    until the upper bound is below `most`, or the rest has rank one.
     """
     size, trace = a.shape[1], 0.0
     for i in range(size):
@@ -106,7 +106,7 @@ def _largest(grown, count, height, scratch) -> float:
 
 @kernel()
 def _stretch_basis(matrix, basis, moved, logs) -> None:
-    """Multiply a basis by a matrix and make it orthonormal again; write the logarithms of what stretched it."""
+    """Multiply a basis by a matrix and make it orthonormal again; write the logarithms of the stretching."""
     size = len(matrix)
     _multiply(matrix, basis, moved)
     for j in range(size):
@@ -147,7 +147,7 @@ def follow_growth(matrices, changes, ends, since, kept, whole, basis, scratch, t
     scratch : ndarray, shape (5 + s, k, k)
         With at least m numbers beyond the first five.
     totals, rows, growth, logs : ndarray, shapes (n, k, k), (n, p, k), (n,) and (n, k)
-        Receive the products, the largest growth since an earlier time, and the logarithms of what stretched the basis.
+        Receive the products, the largest growth since an earlier time, and the logarithms of the basis' stretching.
     """
     most = since.shape[2]
     for index in range(len(matrices)):

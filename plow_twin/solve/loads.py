@@ -25,7 +25,7 @@ def load_at(p, harmonics, segments, t, out) -> None:
 
 @kernel()
 def add_harmonics(p, harmonics, t, out) -> None:
-    """Add what the harmonics give at t, in the same units."""
+    """Add the harmonics at t, in the same units."""
     for i in range(harmonics.size):
         one = harmonics[i]
         sine, cosine = math.sin(one.omega * t), math.cos(one.omega * t)

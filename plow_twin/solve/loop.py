@@ -188,7 +188,7 @@ def _begin_slice(pace) -> None:
 
 @kernel(inline="source")
 def _is_over(pace) -> bool:
-    """Tell whether the slice is used up between two advances."""
+    """Return whether the slice is used up between two advances."""
     return bool(pace.left <= 0 and pace.underway == 0)
 
 

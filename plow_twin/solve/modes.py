@@ -1,4 +1,4 @@
-"""The eight pairs: how deep they are, in which mode, what they contribute, and the range in which the model holds."""
+"""The eight pairs: penetration, mode, contribution to the series, and the range in which the model holds."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ _ROWS: Final = MAX_ORDER + 1
 _EIGHT: Final = (PAIR_COUNT, WIDTH)
 _OF_PAIRS: Final = (PAIR_COUNT, _ROWS, WIDTH)
 
-#: Eight columns: what each changes, and their series over a step.
+#: Eight columns: their parameters, and their series over a step.
 COLUMNS: Final = np.dtype(
     [
         ("series", "f8", (6, _ROWS, WIDTH)),
@@ -315,7 +315,7 @@ def _second_rate(state, w, pair):
 
 @kernel()
 def _touch(p, state, w, columns, pair, viscous) -> None:
-    """Let a pair touch in eight columns: the impulse of those that touch sooner, what each reads as its speed."""
+    """Let a pair touch in eight columns: the impulse of columns that touch sooner, and the speed that each reads."""
     y, now = state.y, columns.now
     c, s, om = y[COS], y[SIN], y[OMEGA]
     arm = row_value(p.arm_rows, pair, c, s, y[X], y[Y])
@@ -341,7 +341,7 @@ def _touch(p, state, w, columns, pair, viscous) -> None:
 
 @kernel()
 def _start_columns(c, s, columns, first) -> None:
-    """Begin a stretch: the columns of the state with a displacement of 1 each, those of parameters with none.
+    """Begin a stretch: the columns of the state with a displacement of 1 each, columns of parameters with 0.
 
     A contact that has read its speed keeps what the parameters have changed of it.
     """

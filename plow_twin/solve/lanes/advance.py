@@ -1,4 +1,4 @@
-"""Many live twins under sampled loads in lanes: each goes from sample to sample, and a row tells of each sample.
+"""Many live twins under sampled loads in lanes: each goes from sample to sample and writes a row at each.
 
 Under a load that is sampled often a step ends at the next sample, long before its series stops being accurate: a series
 ends where its terms vanish over that step (`series.expand`).
@@ -44,9 +44,9 @@ from plow_twin.solve.method.rest import slow_enough
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, Status, X, Y
 from plow_twin.solve.step import LONGEST_STEP
 
-#: Steps to one sample after which a head that a constant load holds may be at rest: it costs as much to find out.
+#: Steps to a sample after which rest is looked for under a constant load: the check costs as much.
 _MAY_REST: Final = 32
-#: A share of what the last order may have, below which a term has vanished (`method.series`).
+#: Share of the last order's admissible size, below which a term has vanished (`method.series`).
 _VANISHED: Final = 0.4
 _SHORTEST_SPAN: Final = 1e-100
 
@@ -56,7 +56,7 @@ _AT_SAMPLE: Final = 7
 
 
 class Samples(NamedTuple):
-    """What twins are advanced through, and where they stand."""
+    """The samples that twins are advanced through, and the progress of each twin."""
 
     params: NDArray[np.void]  #: of all twins, shape (m,)
     states: NDArray[np.void]
@@ -73,7 +73,7 @@ class Samples(NamedTuple):
 
 @kernel(inline="source")
 def _unowned_samples(s):
-    """Return the arrays without counting who holds them."""
+    """Return the arrays without reference counts."""
     return Samples(
         unowned(s.params), unowned(s.states), unowned(s.saved), unowned(s.totals), unowned(s.times), unowned(s.wrench),
         unowned(s.rows), unowned(s.place), unowned(s.queue), unowned(s.progress), unowned(s.other),
@@ -108,7 +108,7 @@ def _load_next(s, lanes, lane) -> None:
 
 @kernel()
 def _clear_sums(s, lanes, lane) -> None:
-    """Begin to count anew what a row tells."""
+    """Clear the sums of a row."""
     for pair in range(PAIR_COUNT):
         lanes.peak[pair, lane] = lanes.impulse[pair, lane] = lanes.time_in_contact[pair, lane] = 0.0
         s.totals[lane].makes[pair] = 0
@@ -198,7 +198,7 @@ def _write_row(s, lanes, lane) -> None:
 
 @kernel()
 def _clear_reached(s, lanes, reached) -> None:
-    """Begin to count anew in the lanes that have reached a sample."""
+    """Clear the sums of the lanes that have reached a sample."""
     zero = exact_splat(0.0)
     for pair in range(PAIR_COUNT):
         set_row(lanes.peak, pair, choose(reached, zero, exact_row(lanes.peak, pair)))
@@ -216,7 +216,7 @@ def _clear_reached(s, lanes, reached) -> None:
 def _go_on(s, lanes, lane) -> bool:
     """Let a lane that has reached a sample go on to the next one, or its twin leave after the last.
 
-    Tells whether it can take a step at once: nothing else has to be looked at.
+    Returns whether it can take a step at once, without another check.
     """
     member = lanes.member[lane]
     state = s.states[member]
@@ -239,7 +239,7 @@ def _is_steady(lanes, lane) -> bool:
 
 @kernel()
 def _look(s, rest, lanes, lane, budget, in_range) -> int:
-    """Return `OK` where a lane takes a step, `_AT_SAMPLE` where it has reached one, else why it leaves."""
+    """Return `OK` where a lane takes a step, `_AT_SAMPLE` where it has reached a sample, else why it leaves."""
     member = lanes.member[lane]
     p, state = s.params[member], s.states[member]
     if not in_range and not lane_in_range(lanes, p, state, lane):
@@ -260,7 +260,7 @@ def _look(s, rest, lanes, lane, budget, in_range) -> int:
 
 @kernel()
 def _get_ready(s, viscous, hysteretic, rest, lanes, budget) -> bool:
-    """Write rows of the samples that were reached and fill the lanes; tell whether any lane has a step to take."""
+    """Write rows of the samples that were reached and fill the lanes; return whether any lane has a step to take."""
     while True:
         in_range, reached, live, changed = bits_in_range(lanes), 0, False, False
         for lane in range(WIDTH):

@@ -1,6 +1,6 @@
 """The first event of each lane's step: guards of all pairs in all lanes at once, roots of one guard a lane at a time.
 
-A clipped pair that parts changes no force: it ends no step. Its penetration is searched on from there for a touch.
+A clipped pair that parts changes no force and ends no step; the rest of the step is searched for its next touch.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from plow_twin.solve.state import CLIPPED, COS, OFF, ON, SIN, X, Y
 
 #: Events are one instant when they are closer than this share of the step before them.
 _AT_ONCE = 1e-12
-#: Changes of a root after which the next would be of the order of its cube, and roundings.
+#: Change of a root that is small enough, as the next is of the order of its cube, and its roundings.
 _FOUND, _STRAIGHT, _ROUNDED = 1e-6, 1e-3, 2e-16
 _MOST_CHANGES = 80
 
@@ -76,7 +76,7 @@ def _unsafe(guard, order, within):
 
 @kernel()
 def _first_guard(lanes, pair, place, order):
-    """Write the penetration of a pair with the sign of its mode; return what `_unsafe` does."""
+    """Write the penetration of a pair with the sign of its mode; return as `_unsafe`."""
     guard, sign, h = lanes.guard[pair], exact_row(lanes.sign, pair), exact_row(lanes.step, 0)
     rows, cosine, sine = lanes.rows[pair], lanes.series[COS], lanes.series[SIN]
     a, b, n = exact_row(rows, 0) * sign, exact_row(rows, 1) * sign, exact_row(rows, 2) * sign
@@ -96,7 +96,7 @@ def _first_guard(lanes, pair, place, order):
 
 @kernel()
 def _force_guards(lanes, pair, rate, order):
-    """Make the guard of pairs that are on F / K; return what `_unsafe` does."""
+    """Write F / K as the guard of pairs that are on; return as `_unsafe`."""
     guard, h, ratio = lanes.guard[pair], exact_row(lanes.step, 0), exact_row(lanes.ratio, pair)
     cosine, sine = lanes.turning[DC], lanes.turning[DS]
     reach, term, zero = _reach(exact_splat(0.0), exact_row(guard, order), h), exact_splat(0.0), exact_splat(0.0)
@@ -115,7 +115,7 @@ def _force_guards(lanes, pair, rate, order):
 
 @kernel()
 def _second_guard(lanes, pair, order):
-    """Write -F / K of clipped pairs: it turns negative where the force would push again; return what `_unsafe` does."""
+    """Write -F / K of clipped pairs: it turns negative where the force would push again; return as `_unsafe`."""
     first, guard = lanes.guard[pair], lanes.guard[SECOND + pair]
     rate = lanes.turning[DX] if pair % 2 == 1 else lanes.turning[DY]
     ratio = exact_row(lanes.viscous, 0) / exact_row(lanes.stiffness, 0)
@@ -133,7 +133,7 @@ def _second_guard(lanes, pair, order):
 
 @kernel()
 def _pull_guard(lanes, pair, rate, order):
-    """Write 1 + lambda d' of pairs that are on, with the other sign of clipped ones; return what `_unsafe` does."""
+    """Write 1 + lambda d' of pairs that are on, and its negative of clipped pairs; return as `_unsafe`."""
     guard, rows, zero = lanes.guard[SECOND + pair], lanes.rows[pair], exact_splat(0.0)
     sense = choose(lanes.on[pair], exact_splat(1.0), exact_splat(-1.0))
     factor, cosine, sine = sense * exact_row(lanes.factor, pair), lanes.turning[DC], lanes.turning[DS]
@@ -166,7 +166,7 @@ def _leaves(lanes, pair, order):
 def _take_column(lanes, lane, guard, order, full) -> None:
     """Write one guard of a lane to its column, and how far it is searched to `lanes.reach`.
 
-    A column has `full` orders whatever the series have: Bernstein coefficients depend on it.
+    A column has `full` orders, however many the series have: Bernstein coefficients depend on the number.
     """
     lanes.guarded[lane] = guard
     for k in range(order + 1, full + 1):
@@ -207,7 +207,7 @@ def _next_columns(lanes, order, full) -> int:
 
 @kernel()
 def _isolate(lanes, w, order, bits):
-    """Return a bit for each lane whose column has one root in [0, reach), one for several; the chord's root in `root`.
+    """Return bits for the lanes whose column has one root in [0, reach), and several; write the chord's root to `root`.
 
     The Bernstein coefficients have as many sign changes as roots, or an even number more.
     """
@@ -289,7 +289,7 @@ def _note_root(lanes, lane, root) -> None:
 def first_events(states, lanes, w, order, full, viscous, hysteretic) -> None:
     """Let each lane's step end at its first event; note the guard in `lanes.event`, -1 without one.
 
-    `order` is that of the series, `full` the one that they may have.
+    `order` is the order of the series, `full` their largest.
     """
     never = exact_splat(np.inf)
     for pair in range(PAIR_COUNT):
@@ -302,7 +302,7 @@ def first_events(states, lanes, w, order, full, viscous, hysteretic) -> None:
         bits = _next_columns(lanes, order, full)
         if bits == 0:
             return
-        # an event found before may be sooner
+        # the event found before may be earlier
         bits &= _unsafe(lanes.column, full, lanes.reach)
         if bits == 0:
             continue
@@ -337,7 +337,7 @@ def _other_mode(mode):
 
 @kernel()
 def _ends_with(guard, order, at, within):
-    """Return a bit for each lane whose guard turns negative no more than `within` after `at`."""
+    """Return a bit for each lane whose guard turns negative at most `within` after `at`."""
     value, slope, zero = exact_row(guard, order), exact_splat(0.0), exact_splat(0.0)
     for k in range(order - 1, -1, -1):
         slope = fused(slope, at, value)
@@ -349,7 +349,7 @@ def _ends_with(guard, order, at, within):
 def note_switches(lanes, order, viscous, hysteretic) -> None:
     """Write the modes that pairs take at the end of the steps to `lanes.switch`, -1 for those that stay.
 
-    Events of one instant but for rounding happen together: a symmetric motion stays symmetric.
+    Events that differ in time by rounding only happen together: a symmetric motion stays symmetric.
     """
     ending = 0
     for lane in range(WIDTH):

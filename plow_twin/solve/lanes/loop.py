@@ -1,4 +1,4 @@
-"""The loop over lanes: each takes its own steps through its own scene, and the next scene when that is done."""
+"""The loop over lanes: each takes its own steps through its own scene, and then takes the next scene."""
 
 from __future__ import annotations
 
@@ -49,14 +49,14 @@ class Members(NamedTuple):
 
 _OK, _RANGE, _NON_FINITE = int(Status.OK), int(Status.OUT_OF_RANGE), int(Status.NON_FINITE)
 _BUDGET, _PAUSED = int(Status.BUDGET), int(Status.PAUSED)
-#: Internal: the next step is one of another method; the scene has reached the end.
+#: Internal: another method takes the next step; the scene has reached the end.
 OTHER_METHOD: Final = 6
 _DONE: Final = 7
 
 
 @kernel()
 def lane_in_range(lanes, p, state, lane) -> bool:
-    """Tell whether the model holds for the scene in a lane."""
+    """Return whether the model holds for the scene in a lane."""
     write_place(state, lanes, lane)
     return within_range(p, state, state.y)
 
@@ -74,7 +74,7 @@ def bits_in_range(lanes):
 
 @kernel()
 def _another_method(p, harmonics, extent, flight, rest, state, lanes, lane, w, span) -> bool:
-    """Tell whether the next step of a lane may be one of free flight or of rest, which the lanes do not take."""
+    """Return whether the next step of a lane may be free flight or rest, which the lanes do not take."""
     if lanes.inside[lane] == 0:
         if flight is not None:
             for j in range(3):
@@ -216,7 +216,7 @@ def complete(p, state, sums, lanes, lane, hysteretic) -> None:
 
 @kernel()
 def move(lanes) -> None:
-    """Add the changes over the steps to the states; set cosine and sine from the angle anew."""
+    """Add the changes over the steps to the states; compute cosine and sine again from the angle."""
     for component in range(COMPONENTS):
         set_row(lanes.y, component, exact_row(lanes.y, component) + exact_row(lanes.change, component))
     turn_lanes(lanes.y[THETA], lanes.y[COS], lanes.y[SIN])
@@ -224,7 +224,7 @@ def move(lanes) -> None:
 
 @kernel()
 def go_past_an_instant(params, states, lanes) -> None:
-    """Go on past an instant at which modes flip without end, with the modes as they are."""
+    """Step past an instant at which modes flip without end, with the present modes."""
     for lane in range(WIDTH):
         member = lanes.member[lane]
         if member >= 0 and lanes.event[lane] >= 0:
@@ -238,7 +238,7 @@ def go_past_an_instant(params, states, lanes) -> None:
 
 @kernel()
 def _leave(members, lanes, lane, code, t) -> None:
-    """Take the scene out of a lane, with its status; at the end write the rows that are left."""
+    """Take the scene out of a lane, with its status; at the end write the remaining rows."""
     member = lanes.member[lane]
     p, state = members.params[member], members.states[member]
     save_lane(state, members.totals[member], lanes, lane)
@@ -254,7 +254,7 @@ def _leave(members, lanes, lane, code, t) -> None:
 
 @kernel(inline="source")
 def _unowned_members(members):
-    """Return the arrays of all scenes without counting who holds them."""
+    """Return the arrays of all scenes without reference counts."""
     return Members(
         unowned(members.params),
         unowned(members.states),
@@ -274,7 +274,7 @@ def run_lanes(
 ) -> bool:
     """Take the members numbered in `queue` to `t_end`, eight at a time; return False where `iterations` are used up.
 
-    `t` are the times of the rows, `order` that of the series, `budget` the steps that each scene may take. A scene
+    `t` are the times of the rows, `order` is the series' order, `budget` the steps that each scene may take. A scene
     leaves its lane with a `Status`, `OTHER_METHOD` or, where the iterations are used up, `PAUSED`.
     """
     members, queue, t = _unowned_members(members), unowned(queue), unowned(t)

@@ -1,4 +1,4 @@
-"""What eight scenes have side by side: their series and constants, one number a lane in each row."""
+"""Eight scenes side by side: their series and constants, one number a lane in each row."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ WIDTH: Final = 8
 COMPONENTS: Final = 8
 #: Indices of the rates of cosine, sine, X and Y, and of the factors of cosine, sine, X and Y in the moment.
 DC, DS, DX, DY = range(4)
-#: First guards of the eight pairs, second ones of clipped pairs, pairs that part within the step and touch again.
+#: First guards of the eight pairs, second guards of clipped pairs, pairs that part within the step and touch again.
 SECOND: Final = PAIR_COUNT
 AGAIN: Final = 2 * PAIR_COUNT
 
@@ -31,7 +31,7 @@ LANES: Final = np.dtype(
     [
         ("series", "f8", (COMPONENTS, _ROWS, WIDTH)),  # state
         ("turning", "f8", (4, _ROWS, WIDTH)),  # rates of cosine, sine, X, Y
-        ("moment", "f8", (4, _ROWS, WIDTH)),  # what cosine, sine, X and Y are multiplied by in the contacts' moment
+        ("moment", "f8", (4, _ROWS, WIDTH)),  # factors of cosine, sine, X and Y in the contacts' moment
         ("load", "f8", (3, _ROWS, WIDTH)),  # S1, S2, M
         ("depth", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # with lambda d': penetration of pairs that are on in some lane
         ("push", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # and their F / K
@@ -72,7 +72,7 @@ LANES: Final = np.dtype(
         ("reach", "f8", _LANES_OF),  # how far a column is searched
         ("root", "f8", _LANES_OF),  # its first root
         ("parted", "f8", _PAIRS),  # when a clipped pair parts within the step, infinity where it does not
-        ("parting", "i8", (1,)),  # a bit for each lane in which one does
+        ("parting", "i8", (1,)),  # a bit for each lane in which a clipped pair parts
         ("peak", "f8", _PAIRS),
         ("impulse", "f8", _PAIRS),
         ("time_in_contact", "f8", _PAIRS),
@@ -104,7 +104,7 @@ _COVERED: Final = {"harmonics", "second", "viscous", "hysteretic", "flight", "re
 
 
 def fits_lanes(compiled: CompiledScene, *, sampled: bool = False) -> bool:
-    """Tell whether the lanes take the steps of a scene.
+    """Return whether the lanes take the steps of a scene.
 
     Its exponent is 1, it has no other term than damping and harmonics or samples, and the head carries the walls.
     """
@@ -117,7 +117,7 @@ def new_lanes() -> NDArray[np.void]:
     """Return empty lanes, shape (1,)."""
     lanes = new_records(LANES, 1)
     lanes["member"] = -1
-    # an empty lane computes with a scene that stands still
+    # an empty lane computes with a scene at rest
     lanes["y"][:, COS] = lanes["half_cavity"] = lanes["whole"] = 1.0
     return lanes
 
@@ -153,7 +153,7 @@ def load_lane(p, state, totals, lanes, lane, member) -> None:
 
 @kernel()
 def write_place(state, lanes, lane) -> None:
-    """Write to a state's record where its lane stands."""
+    """Write the place of a lane to a state's record."""
     for i in range(COMPONENTS):
         state.y[i] = lanes.y[i, lane]
     state.step_start = lanes.time[lane]
@@ -190,7 +190,7 @@ def clear_lane(lanes, lane) -> None:
 
 @kernel()
 def note_modes(p, lanes, lane) -> None:
-    """Write what the modes of a lane's pairs are to their guards and maps."""
+    """Write the modes of a lane's pairs to their guards and maps."""
     bit, inside, carrying = 1 << lane, 0, 0
     for pair in range(PAIR_COUNT):
         mode = lanes.mode[pair, lane]
@@ -205,7 +205,7 @@ def note_modes(p, lanes, lane) -> None:
 
 @kernel()
 def weigh_lanes(lanes) -> None:
-    """Sum over the acting pairs of each lane: the orders of all forces together are a linear map of those of the state.
+    """Sum over the acting pairs of each lane: the orders of all forces together are a linear map of the state's orders.
 
     Along a wall's normal  f = -n F,  F = K (a c + b s + n Z) + C (a c' + b s' + n Z'), Z = X or Y; the moment is
     c Gc + s Gs - X fy + Y fx  with  Gc, Gs = sum of the arms' factors times F.

@@ -18,7 +18,7 @@ from plow_twin.solve.lanes.record import DC, DS, DX, DY, WIDTH, damped_at, penet
 from plow_twin.solve.lanes.waves import turn_lanes
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, X, Y
 
-#: A term beyond this is not finite, or will not be when it is multiplied.
+#: A term beyond this is not finite, or its products would not be.
 _FINITE = 1e300
 #: A series that ends because its terms vanish has at least so many orders.
 _FEWEST_ORDERS = 4
@@ -54,7 +54,7 @@ def _add_wave(load, k, lanes, first, sine, cosine) -> None:
 def expand_loads(harmonics, extent, second, lanes, w, order) -> None:
     """Write the series of the harmonic loads S1, S2, M of each lane's scene.
 
-    sin and cos follow from one another. `extent` (n, 2) tells where each scene's harmonics begin, and their number.
+    sin and cos follow from one another. `extent` (n, 2) has the begin of each scene's harmonics, and their number.
     """
     zero, most = exact_splat(0.0), 0
     for k in range(order):
@@ -80,7 +80,7 @@ def expand(lanes, w, limit, waves, second, viscous, hysteretic, segments) -> int
     """Write the series of the state and, up to the order before, those of `lanes.turning`; return the order.
 
     Under sampled loads a lane's terms are zero beyond the order from which on they vanish over the longest step wanted:
-    what the others go on with moves no bit of it.
+    later orders of other lanes change no bit of it.
     """
     series, turning, moment = lanes.series, lanes.turning, lanes.moment
     zero = exact_splat(0.0)
@@ -247,8 +247,8 @@ def _waves(load, series, k, c0, s0, c, s, share):
 def _write_start(lanes, viscous, c, s, x, y, dc, ds, dx, dy) -> None:
     """Write the contacts' forces along X and Y and their factors of cosine and sine in the moment at the start.
 
-    They come from the penetrations as the guards have them: a sum of maps would round them otherwise, and walls that
-    push and walls that let go would stand 1e-17 m apart.
+    They come from the very penetrations of the guards: a sum of maps would round them otherwise, and walls that
+    push and walls that let go would lie 1e-17 m apart.
     """
     zero = exact_splat(0.0)
     for i in range(4):
@@ -338,7 +338,7 @@ def _size(lanes, vx, vy, om, c, s):
 def accurate_steps(params, lanes, order) -> int:
     """Write the step over which each lane's series meets its share of the tolerance to `lanes.step`.
 
-    As `method.step_size.accurate_step`, which see. Returns a bit for each lane whose series is not finite.
+    As `method.step_size.accurate_step`. Returns a bit for each lane whose series is not finite.
     """
     infinite = 0
     for lane in range(WIDTH):

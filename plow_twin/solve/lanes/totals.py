@@ -1,4 +1,4 @@
-"""What is kept of the motions in the lanes: impulses, peaks and times from the series of one step of each."""
+"""Totals of the motions in the lanes: impulses, peaks and times from the series of one step of each."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from plow_twin.solve.lanes.record import COMPONENTS, WIDTH, penetration_at
 from plow_twin.solve.state import COS, SIN, X, Y
 from plow_twin.solve.totals import add_set_times
 
-#: Newton's steps to a maximum at most, and the change as a share of the step that is small enough: its cube is left.
+#: Most Newton steps to a maximum, and the change, as a share of the step, that is small enough: its cube remains.
 _MOST_CHANGES, _NEAR = 60, 1e-5
-#: What a bound of a force allows for rounding.
+#: Allowance of a force's bound for rounding.
 _ROUNDED = 1.0 + 1e-9
 
 
@@ -20,7 +20,7 @@ _ROUNDED = 1.0 + 1e-9
 def sum_step(lanes, w, order) -> None:
     """Write the change of the state over each lane's step, and the integrals of cosine, sine, X and Y.
 
-    The integrals are those of the change: what the start gives is left out.
+    The integrals are those of the change, without the values at the start.
     """
     h = exact_row(lanes.step, 0)
     for i in range(COMPONENTS):
@@ -62,7 +62,7 @@ def add_step(totals, lanes, w, order, full, viscous, hysteretic) -> None:
             if viscous is not None:
                 impulse = fused(exact_row(lanes.viscous, 0), way, impulse)
             else:
-                # lambda / 2 times what d^2 has changed by
+                # lambda / 2 times the change of d^2
                 damped = exact_row(lanes.factor, pair) * (way * fused(way, exact_splat(0.5), depth))
                 impulse = fused(exact_row(lanes.stiffness, 0), damped, impulse)
         impulse = choose(below(zero, impulse) & on, impulse, zero)
@@ -84,7 +84,7 @@ def add_step(totals, lanes, w, order, full, viscous, hysteretic) -> None:
 def _raise_peaks(lanes, w, push, pair, order, full, on) -> None:
     """Raise the peaks of a pair by the series of F / K: first a bound, the maximum only where that exceeds the peak.
 
-    Between its ends a function exceeds them by h^2 / 8 times its largest curvature downward at most.
+    Between its ends a function exceeds them at most by h^2 / 8 times its largest downward curvature.
     """
     h, zero, half = exact_row(lanes.step, 0), exact_splat(0.0), exact_splat(0.5)
     end = fall = bend = zero
@@ -136,7 +136,7 @@ def _top(push, order, h, rise, fall, bits):
             bend = fused(bend, x, slope)
             slope = fused(slope, x, value)
             value = fused(value, x, exact_row(push, k))
-        # a chord's slope bounds what is left: once the change is small, its square does not count
+        # a chord's slope bounds the rest: once the change is small, its square does not count
         change = slope / (bend * -2.0)
         rises = below(exact_splat(0.0), slope)
         low, high = choose(rises, x, low), choose(rises, high, x)

@@ -43,7 +43,7 @@ def _smallest_gap(p, state) -> float:
 
 @kernel()
 def _bounds(p, harmonics, t, z, w) -> None:
-    """Write what bounds the motion along x, y and theta to `w.flight[1:]`, shape (4, 3).
+    """Write bounds of the motion along x, y and theta to `w.flight[1:]`, shape (4, 3).
 
     Rows: speed now; speed without the harmonics' swing; largest acceleration of the harmonics; reach of their swing.
     """
