@@ -62,6 +62,9 @@ class Subscriber:
         found = [payload for name, payload, _ in self.messages if name == topic]
         return json.loads(found[-1]) if found else None
 
+    def all(self, topic: str) -> list[Any]:
+        return [json.loads(payload) for name, payload, _ in self.messages if name == topic]
+
     def close(self) -> None:
         self.client.disconnect()
         self.client.loop_stop()

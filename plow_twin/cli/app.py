@@ -29,6 +29,7 @@ from plow_twin.cli.replay import replay
 from plow_twin.cli.setup import setup
 from plow_twin.cli.simulate import simulate
 from plow_twin.cli.study import study
+from plow_twin.cli.telemetry import telemetry
 from plow_twin.cli.view import view
 from plow_twin.errors import ExcessError, InputError, PlowTwinError, RunInterrupted, UnitError
 
@@ -95,6 +96,7 @@ for _verb in (
     live,
     call,
     dashboard,
+    telemetry,
     estimate,
     forecast,
     record,

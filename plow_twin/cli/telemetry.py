@@ -1,14 +1,16 @@
-"""Options of the ways out, and the ways that they ask for."""
+"""Options of the ways out, and `plow-twin telemetry`: the ways out of a node."""
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from plow_twin.cli.console import POSITIVE
+from plow_twin.cli.console import DONE, DONE_WITH_LOSS, POSITIVE, say_error
 
 if TYPE_CHECKING:
     from plow_twin.telemetry.access import WayOut
@@ -68,3 +70,40 @@ def ways_of(options: dict[str, Any]) -> list[WayOut]:
         acknowledges = options["opcua_acknowledge"]
         ways.append(access.opcua_out(options["opcua"], credentials, plain=plain, acknowledges=acknowledges))
     return ways
+
+
+@click.command(
+    short_help="Send the results of a node to MQTT, Sparkplug, InfluxDB or OPC UA.",
+    epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, 3 done, and messages were lost.",
+)
+@click.option("--namespace", default="", help="Its namespace.")
+@click.option("--name", default="plow_twin", show_default=True, help="Its name.")
+@click.option("--scene", help="Its scene, where the name that it has there cannot be read here.")
+@click.option(
+    "--wait", type=click.FloatRange(0.0), default=10.0, show_default=True, help="How long to look for the node [s]."
+)
+@click.option("--plain", is_flag=True, help="Allow receivers on other machines without encryption.")
+@telemetry_options
+def telemetry(namespace: str, name: str, scene: str | None, wait: float, **options: Any) -> int:
+    """Send the results of a running node, by its topics, until interrupted."""
+    ways = ways_of(options)
+    if not ways:
+        raise click.UsageError("expected --mqtt-out, --influx or --opcua")
+    from plow_twin.live.stop import StopRequested, StopSignals
+
+    with StopSignals() as stop:
+        os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)  # ROS from wheels
+        from plow_twin.telemetry.node import send_node
+
+        def on_error(text: str) -> None:
+            say_error(f"plow-twin: {text}")
+
+        def stopped() -> bool:
+            stop.interrupt = False
+            return stop.stopped
+
+        try:
+            lost = send_node(namespace, name, scene, ways, options["out_rate"], wait, stopped, on_error)
+        except StopRequested:
+            return DONE
+    return DONE_WITH_LOSS if lost else DONE

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager
 from functools import partial
 from typing import Any, Final
 
@@ -191,6 +192,16 @@ class NodeWatch:
                 self.feed.part(part, told)
 
 
+@contextmanager
+def ros() -> Iterator[None]:
+    """Take part in the ROS graph, without ROS's own handling of signals."""
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        yield
+    finally:
+        rclpy.utilities.try_shutdown()
+
+
 def show_node(
     namespace: str,
     name: str,
@@ -209,10 +220,9 @@ def show_node(
     SceneError
         The scene cannot be read.
     """
-    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-    watch = None
-    try:
-        watch = NodeWatch(namespace, name, wait_s, stopped)
+    with ExitStack() as opened:
+        opened.enter_context(ros())
+        watch = opened.enter_context(closing(NodeWatch(namespace, name, wait_s, stopped)))
         parameters = watch.parameters()
         found = load_scene(scene_path(scene or str(parameters.get("scene", ""))))
         with Screen(access, facts_of(found, parameters, f"node {watch.name}"), watch.answer) as screen:
@@ -222,7 +232,3 @@ def show_node(
             while not (stopped() or screen.has_ended):
                 watch.spin()
                 timer.look()
-    finally:
-        if watch is not None:
-            watch.close()
-        rclpy.utilities.try_shutdown()

@@ -1,0 +1,74 @@
+"""The ways out of a node: from its topics, by a process beside it; acknowledgements go to its service."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, closing
+
+from plow_twin.dashboard.facts import facts_of
+from plow_twin.dashboard.node import NodeWatch, ros
+from plow_twin.live.timer import Timer
+from plow_twin.scene_file import load_scene
+from plow_twin.scene_file.presets import scene_path
+from plow_twin.telemetry.access import WayOut
+from plow_twin.telemetry.outlet import Outlet
+
+
+def send_node(
+    namespace: str,
+    name: str,
+    scene: str | None,
+    ways: Sequence[WayOut],
+    rate_hz: float,
+    wait_s: float,
+    stopped: Callable[[], bool],
+    on_error: Callable[[str], object],
+) -> int:
+    """Send the results of a node until `stopped`; return the number of messages that were lost on the way.
+
+    Parameters
+    ----------
+    namespace, name
+        Of the node.
+    scene
+        Its scene, where that cannot be read here under the name it has there.
+    ways
+        Where the results go; each has a process and a listener of its own.
+    rate_hz
+        Updates a second [Hz].
+    wait_s
+        How long to wait for the node [s].
+    stopped
+        Whether to end.
+    on_error
+        Receives in words when a receiver stops and begins to take messages.
+
+    Raises
+    ------
+    DashboardError
+        There is no such node.
+    SceneError
+        The scene cannot be read.
+    TelemetryError, ModuleNotFoundError
+        A way cannot be opened.
+    """
+    with ExitStack() as opened:
+        opened.enter_context(ros())
+        listeners: list[tuple[NodeWatch, Outlet]] = []
+        timers = []
+        for way in ways:
+            watch = opened.enter_context(closing(NodeWatch(namespace, name, wait_s, stopped)))
+            parameters = watch.parameters()
+            found = load_scene(scene_path(scene or str(parameters.get("scene", ""))))
+            facts = facts_of(found, parameters, f"node {watch.name}")
+            answer = watch.answer if way.may_acknowledge else None
+            outlet = opened.enter_context(Outlet(way, facts, answer, on_error))
+            watch.listen(outlet.feed, str(parameters.get("excitation_source", "")))
+            listeners.append((watch, outlet))
+            timers.append(Timer(1.0 / rate_hz, outlet.turn))
+        while not stopped() and any(not outlet.link.broken for _, outlet in listeners):
+            for watch, _ in listeners:
+                watch.spin()
+            for timer in timers:
+                timer.look()
+    return sum(int(outlet.feed.report["lost"]) for _, outlet in listeners)

@@ -1,0 +1,55 @@
+"""Outputs of a node to a plant: a process beside it sends what its topics say, and calls its service."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy")
+
+from ros_processes import Process, bench
+from test_live import _free_port
+from test_telemetry import Subscriber, _open_broker
+
+MS = 1_000_000
+RELIABLE_INPUT = {"qos_overrides.{ns}/excitation.subscription.reliability": "reliable"}
+
+
+def test_a_process_beside_a_node_sends_its_results_and_ends_with_them(tmp_path: Path) -> None:
+    port = _free_port()
+    parameters = {"alarm_force": "[1.0, 1e9]", "excitation_timeout": 60.0, **RELIABLE_INPUT}
+    with _open_broker(tmp_path, port), bench(tmp_path, **parameters) as running:
+        probe, heard = running.probe, Subscriber(port)
+        words = ["telemetry", "--namespace", running.namespace, "--mqtt-out", f"mqtt://127.0.0.1:{port}/face"]
+        words += ["--influx", f"http://127.0.0.1:{_free_port()}/org/bucket", "--out-rate", "5"]
+        beside = Process("plow_twin", words, tmp_path / "telemetry.log")
+        try:
+            probe.until(lambda: heard.newest("face/status") is not None, "the status")
+            send, begin_ns = probe.excitation(), time.time_ns()
+            for index in range(600):
+                send(begin_ns + index * MS, (32e3, 0.0, -45e3))
+                probe.pace(index)
+            probe.until(lambda: (heard.newest("face/alarms") or {"values": {}})["values"].get("force_level") == "warn",
+                        "the alarm")  # fmt: skip
+            peaks = max(max(filter(None, found["values"].values()), default=0.0) for found in heard.all("face/peaks"))
+            assert peaks > 1e4 and heard.newest("face/clearance")["values"]["horizontal"] == pytest.approx(0.025)
+            assert "influx" in beside.output() or "http" in beside.output()  # a receiver that is not there is named
+            # points for the database that is not there are lost, and the exit code says so
+            assert beside.stop() == 3
+            probe.until(lambda: heard.newest("face/online") is False, "the end")
+        finally:
+            beside.close()
+            heard.close()
+
+
+def test_a_node_that_is_not_there_is_named(tmp_path: Path) -> None:
+    words = ["telemetry", "--namespace", f"/none_{os.getpid()}", "--wait", "0.5"]
+    for more, code, said in (
+        (["--mqtt-out", f"mqtt://127.0.0.1:{_free_port()}/face"], 2, "a running node within 0.5 s"),
+        ([], 2, "expected --mqtt-out, --influx or --opcua"),
+    ):
+        process = Process("plow_twin", [*words, *more], tmp_path / f"{len(more)}.log")
+        assert process.wait() == code and said in process.output()
