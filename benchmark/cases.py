@@ -1,4 +1,4 @@
-"""What is measured: cases, interleaved timing, rows of the table."""
+"""Measurements: cases, interleaved timing, rows of the table."""
 
 from __future__ import annotations
 

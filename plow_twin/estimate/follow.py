@@ -89,7 +89,7 @@ _LENGTH: Final = struct.Struct("<q")
 
 @dataclass(frozen=True, eq=False)
 class Span:
-    """What is known of a span of time.
+    """Knowledge over a span of time.
 
     Attributes
     ----------
@@ -359,7 +359,7 @@ class Follower:
         return np.repeat(_moved(self.scene, worn), 3, axis=-1)
 
     def _tell_clearance(self) -> None:
-        """Tell the clearances that unworn pads would have from what is known now."""
+        """Note the clearances that unworn pads would have by present knowledge."""
         self._cell = math.floor(self.time * _KNOWN_HZ)
         known = self._known
         if self.estimate is None and self._ensemble.moved:
@@ -720,7 +720,7 @@ class Ensemble:
         return values[0].copy(), np.minimum(low, values[0]), np.maximum(high, values[0])
 
     def _used(self) -> NDArray[np.bool_]:
-        """Tell which members determine intervals: those in the model's range, or all where none is."""
+        """Return which members determine intervals: those in the model's range, or all without such members."""
         return self.good if self.good.any() else np.ones(len(self.good), dtype=bool)
 
     def clearance(self) -> Array:
@@ -860,7 +860,7 @@ class Ensemble:
         return found
 
     def _allowed(self, q: Array, force: Array) -> NDArray[np.bool_]:
-        """Tell which members may be put to poses (m, 3): no pair is pressed by much more than a force, (m, 8)."""
+        """Return which members may be put to poses (m, 3): no pair is pressed by much more than a force, (m, 8)."""
         return np.asarray((self._force(self._penetration(q)) < force + self._pressed).all(axis=1))
 
     def _put(self, which: NDArray[np.int64], q: Array, v: Array) -> None:

@@ -1,4 +1,4 @@
-"""What the columns of `solve.tangents` change: from scenes in which one number differs a little to their records."""
+"""The parameters of the columns of `solve.tangents`: from scenes in which a number differs to their records."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _COVERED: Final = {"harmonics", "second", "viscous", "hysteretic", "integer", "f
 
 
 def fits_tangents(compiled: CompiledScene) -> bool:
-    """Tell whether the linearised equations have all terms of a scene: no exponent but integers and 1.5.
+    """Return whether the linearised equations have all terms of a scene: no exponent but integers and 1.5.
 
     Overdamped contact is not followed, but the law of a restitution only seems to need it: at slow touches.
     """

@@ -372,7 +372,7 @@ def _read_columns(c, s, columns, first, out) -> None:
 
 @kernel()
 def _is_clear(p, state, room) -> bool:
-    """Tell whether a stretch may begin: every pair is `room` from its wall, and no contact has read its speed."""
+    """Return whether a stretch may begin: every pair is `room` from its wall, and no contact has read its speed."""
     for pair in range(PAIR_COUNT):
         if p.enabled[pair] == 1:
             if abs(penetration_of(p, state, pair, state.y)) < room:

@@ -1,4 +1,4 @@
-"""What the paper publishes, as data with its place in the text; every number here is `given`.
+"""The paper's published values, as data with their place in the text; every number here is `given`.
 
 Source: Mao, Zhang et al., "Dynamic characteristics of plough head under contact-impact with clearances", J. Vibration
 and Shock 34(19), 2015. Its curves are known through its text alone, so places are sections and figures. The criteria by
