@@ -252,6 +252,16 @@ class RunReader:
 
     def duration_s(self) -> float:
         """Return the span of the receive times [s] by the index of the parts, or a guess by their size."""
+        first_ns, last_ns, known = self._received_ns()
+        return float(last_ns - first_ns) * 1e-9 if known else self.size() / _BYTES_PER_S
+
+    def began_ns(self) -> int | None:
+        """Return the first receive time by the index of the parts [ns]; None while a part has no index."""
+        first_ns, _, known = self._received_ns()
+        return first_ns if known else None
+
+    def _received_ns(self) -> tuple[int, int, bool]:
+        """Return the first and the last receive time [ns], and whether each part has told its own."""
         from mcap.reader import make_reader
 
         first, last = [], []
@@ -264,8 +274,7 @@ class RunReader:
             if summary is not None and summary.statistics is not None and summary.statistics.message_count:
                 first.append(summary.statistics.message_start_time)
                 last.append(summary.statistics.message_end_time)
-        known = first and len(first) == len(self.parts)
-        return float(max(last) - min(first)) * 1e-9 if known else self.size() / _BYTES_PER_S
+        return min(first, default=0), max(last, default=0), bool(first) and len(first) == len(self.parts)
 
     def _metadata(self, name: str, record: dict[str, str]) -> None:
         if name != LOSS_RECORD:

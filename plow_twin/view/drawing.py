@@ -27,6 +27,7 @@ from plow_twin.view.columns import Array, Batches, Curves, Indexes, TimeAxis, bu
 from plow_twin.view.contact_sets import ContactSets, masks_of, set_color
 from plow_twin.view.events import Events
 from plow_twin.view.face import FaceChart
+from plow_twin.view.figures import signed
 from plow_twin.view.residuals import Residuals
 from plow_twin.view.section import ARROW_MM_PER_N, LABEL_MM, LOAD_COLOR, PAIR_COLORS, Section
 from plow_twin.view.what_if import WhatIf
@@ -407,7 +408,7 @@ class Drawing:
         fx, fy, moment = load.tolist()
         if self.header.excitation_source != "scene" and math.isfinite(fx):
             vector = (ARROW_MM_PER_N * fx, -ARROW_MM_PER_N * fy)
-            label = f"load {math.hypot(fx, fy) / 1e3:.0f} kN, {moment / 1e3:+.0f} kN m"
+            label = f"load {math.hypot(fx, fy) / 1e3:.0f} kN, {signed(moment / 1e3, '+.0f')} kN m"
             self.load_arrow.add(stamp_ns, step, origins=[centre], vectors=[vector], labels=[label])
 
     def _statuses(self, batch: Batch) -> None:

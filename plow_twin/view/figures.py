@@ -13,6 +13,8 @@ from plow_twin.record.times import EPOCH_S
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from plow_twin.record.reader import RunReader
+
 #: The sign of negative numbers as matplotlib writes it on its axes.
 MINUS: Final = "\N{MINUS SIGN}"
 
@@ -43,6 +45,15 @@ def legend_beside(axis: Any, **options: Any) -> None:
 def signed(value: float, form: str) -> str:
     """Return a number as text with a proper minus sign."""
     return f"{value:{form}}".replace("-", MINUS)
+
+
+def scene_and_date(reader: RunReader, first_ns: int | None = None) -> str:
+    """Return scene and date of a recording for a title; `first_ns` is its first stamp where that is known."""
+    scene = reader.header.parameters.get("scene")
+    parts = [f"scene {Path(scene).name}"] if isinstance(scene, str) and scene else []
+    # stamps that count from a start of their own have no date
+    date = date_text(reader.began_ns() if first_ns is None else first_ns)
+    return ", ".join([*parts, date or f"file of {date_text(reader.path.stat().st_mtime_ns)}"])
 
 
 def date_text(stamp_ns: int | None) -> str:

@@ -62,10 +62,13 @@ _BAND_WIDTH: Final = 6.0
 _CLEARANCE_COLORS: Final = {"horizontal": (86, 180, 233), "vertical": (240, 160, 60)}
 
 
-def blueprint(section: Section, exaggerate: float, what_if: bool = False, followed: bool = False) -> rrb.Blueprint:
+def blueprint(
+    section: Section, exaggerate: float, what_if: bool = False, followed: bool = False, *, title: str = ""
+) -> rrb.Blueprint:
     """Return the arrangement: the cross-sections beside the curves, the events and data quality below.
 
-    With `what_if` the view of other scenes is in front; with `followed` there are intervals of the forces.
+    With `what_if` the view of other scenes is in front; with `followed` there are intervals of the forces. `title` goes
+    with the name of the forces.
     """
     half_x, half_y = (float(half) for half in section.half_view)
     picture = rrb.Spatial2DView(
@@ -96,7 +99,8 @@ def blueprint(section: Section, exaggerate: float, what_if: bool = False, follow
         active_tab=0,
     )
     curves = rrb.Vertical(
-        _plot("force", "Contact force, largest between two messages [kN]"),
+        # the widest view has the title, which is cut in the others
+        _plot("force", f"Largest contact force [kN]{title and '; '}{title}"),
         rrb.StateTimelineView(origin=ENTITY, name="Corners that carry force"),
         _plot("load", "Load on the head"),
         rrb.Tabs(

@@ -18,6 +18,7 @@ from plow_twin.record.follow import Tail
 from plow_twin.record.reader import RunReader
 from plow_twin.view import layout
 from plow_twin.view.drawing import Drawing
+from plow_twin.view.figures import scene_and_date
 from plow_twin.view.rrd import ViewSummary
 from plow_twin.view.section import Section
 
@@ -50,7 +51,12 @@ def follow(
     scene = reader.header.scene(reader.path)
     wide = exaggerate or Section.of(scene).exaggeration()
     stream = rr.RecordingStream("plow_twin")
-    sink(stream, layout.blueprint(Section.of(scene), wide, bool(others), reader.header.follow == "full"))
+    sink(
+        stream,
+        layout.blueprint(
+            Section.of(scene), wide, bool(others), reader.header.follow == "full", title=scene_and_date(reader)
+        ),
+    )
     drawing = Drawing(
         stream,
         reader.header,

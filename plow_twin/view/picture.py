@@ -16,7 +16,7 @@ from plow_twin.record.alarms import alarms_of
 from plow_twin.record.reader import FileStatus, RunReader
 from plow_twin.stream.alarms import Thresholds
 from plow_twin.view.envelope import Envelope
-from plow_twin.view.figures import date_text, legend_beside, signed, write_png
+from plow_twin.view.figures import legend_beside, scene_and_date, signed, write_png
 from plow_twin.view.run_curves import Instant, RunCurves
 from plow_twin.view.section import PAIR_COLORS, Section
 
@@ -99,11 +99,7 @@ def _meanings(curves: RunCurves) -> list[str]:
 def _title(reader: RunReader, curves: RunCurves, lost: dict[str, int]) -> str:
     """Return run, scene, date and end of the recording."""
     parts = ["/".join(reader.path.absolute().parent.parts[-2:])]
-    scene = reader.header.parameters.get("scene")
-    if isinstance(scene, str) and scene:
-        parts.append(f"scene {Path(scene).name}")
-    # stamps that count from a start of their own have no date
-    parts.append(date_text(curves.first_ns) or f"file of {date_text(reader.path.stat().st_mtime_ns)}")
+    parts.append(scene_and_date(reader, curves.first_ns))
     losses = [f"lost {name.replace('_', ' ')}: {count}" for name, count in lost.items()]
     if curves.failed:
         losses.append(f"{curves.failed} advances failed: no forces")

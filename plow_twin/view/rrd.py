@@ -13,6 +13,7 @@ from plow_twin.model.scene import Scene
 from plow_twin.record.reader import FileStatus, RunReader
 from plow_twin.view import layout
 from plow_twin.view.drawing import Drawing
+from plow_twin.view.figures import scene_and_date
 from plow_twin.view.rrd_file import RrdFile
 from plow_twin.view.section import Section
 
@@ -101,7 +102,12 @@ def to_rrd(
     stream = rr.RecordingStream("plow_twin")
     duration_s = reader.duration_s()
     with RrdFile(out) as file:
-        file.attach(stream, layout.blueprint(Section.of(scene), wide, bool(others), reader.header.follow == "full"))
+        file.attach(
+            stream,
+            layout.blueprint(
+                Section.of(scene), wide, bool(others), reader.header.follow == "full", title=scene_and_date(reader)
+            ),
+        )
         drawing = Drawing(
             stream,
             reader.header,
