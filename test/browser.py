@@ -1,9 +1,10 @@
-"""A headless Chromium driven by its own protocol: a page opened, looked at as a picture, and its console read."""
+"""A headless Chromium, or Firefox: a page opened, looked at as a picture, and its console read."""
 
 from __future__ import annotations
 
 import base64
 import json
+import os
 import shutil
 import subprocess
 import time
@@ -94,6 +95,74 @@ def page(folder: Path, url: str) -> Iterator[Page]:
             target = next(one for one in json.load(answer) if one["type"] == "page")
         with connect(target["webSocketDebuggerUrl"], max_size=None) as socket:
             opened = Page(socket)
+            opened.open(url)
+            yield opened
+    finally:
+        process.terminate()
+        process.wait(20)
+
+
+#: Firefox's program, or None.
+FIREFOX = shutil.which("firefox-esr") or shutil.which("firefox")
+
+
+class FirefoxPage:
+    """An open page of a headless Firefox, driven by WebDriver BiDi; `errors` are the exceptions of its scripts."""
+
+    def __init__(self, socket: ClientConnection) -> None:
+        self._socket = socket
+        self._number = 0
+        self.errors: list[str] = []
+        self._call("session.new", capabilities={})
+        self._call("session.subscribe", events=["log.entryAdded"])
+        self._context = self._call("browsingContext.getTree")["contexts"][0]["context"]
+
+    def _call(self, method: str, **params: Any) -> dict[str, Any]:
+        self._number += 1
+        self._socket.send(json.dumps({"id": self._number, "method": method, "params": params}))
+        while True:
+            message = json.loads(self._socket.recv(timeout=60.0))
+            if message.get("id") == self._number:
+                assert message["type"] == "success", message
+                found: dict[str, Any] = message["result"]
+                return found
+            if message.get("method") == "log.entryAdded" and message["params"]["level"] == "error":
+                self.errors.append(str(message["params"]["text"]))
+
+    def open(self, url: str) -> None:
+        """Go to an address and wait until it has been loaded."""
+        self._call("browsingContext.navigate", context=self._context, url=url, wait="complete")
+
+    def evaluate(self, expression: str) -> Any:
+        """Return the value of an expression in the page: text, number or truth value."""
+        target = {"context": self._context}
+        found = self._call("script.evaluate", expression=expression, target=target, awaitPromise=False)
+        assert found["type"] == "success", found
+        return found["result"].get("value")
+
+    def picture(self) -> bytes:
+        """Return the page as a PNG."""
+        return base64.b64decode(self._call("browsingContext.captureScreenshot", context=self._context)["data"])
+
+
+@contextmanager
+def firefox_page(folder: Path, url: str) -> Iterator[FirefoxPage]:
+    """Open a page in a Firefox of its own, whose files lie in `folder`."""
+    assert FIREFOX is not None
+    folder.mkdir(exist_ok=True)
+    options = ["--headless", "--no-remote", "--profile", str(folder), "--remote-debugging-port", "0"]
+    process = subprocess.Popen(
+        [FIREFOX, *options, "--window-size", "1500,1000"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        env={**os.environ, "HOME": str(folder)},
+    )  # fmt: skip
+    try:
+        place, deadline = folder / "WebDriverBiDiServer.json", time.monotonic() + 60.0
+        while not (place.exists() and place.read_text().endswith("}")):
+            assert process.poll() is None and time.monotonic() < deadline, "the browser does not answer"
+            time.sleep(0.05)
+        server = json.loads(place.read_text())
+        with connect(f"ws://{server['ws_host']}:{server['ws_port']}/session", max_size=None) as socket:
+            opened = FirefoxPage(socket)
             opened.open(url)
             yield opened
     finally:

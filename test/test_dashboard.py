@@ -463,3 +463,21 @@ def test_a_browser_shows_the_twin_takes_names_as_text_and_fetches_nothing_from_e
         _stopped(process)
         seen(lambda found: "ended" in found["banner"] or "lost" in found["banner"])
         assert not page.errors and {urlsplit(asked).netloc for asked in page.requests} == {urlsplit(url).netloc}
+
+
+@pytest.mark.skipif(browser.FIREFOX is None, reason="no Firefox is installed")
+def test_firefox_shows_the_twin_too(tmp_path: Path) -> None:
+    with _twin("--scene", "paper") as (process, said):
+        url = said.partition("#")[0].split()[-1]
+        with browser.firefox_page(tmp_path / "firefox", url) as page:
+            _feed(process)
+            give_up = time.monotonic() + 60.0
+            while not (
+                "6000" in (found := json.loads(page.evaluate(_SEEN)))["inputs"] and "was warn" in found["alarms"]
+            ):
+                assert time.monotonic() < give_up, (found, page.errors)
+                time.sleep(0.2)
+                found = json.loads(page.evaluate(_SEEN))
+            assert (found["pads"], found["charts"], page.errors) == (8, 3, [])
+            assert "25.000 mm" in found["clearance"] and not found["banner"]
+        _stopped(process)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+from contextlib import ExitStack
 from datetime import time
 from pathlib import Path
+from typing import Any
 from zoneinfo import ZoneInfo
 
 import numpy as np
@@ -114,12 +116,42 @@ def test_two_runs_are_compared_on_the_terminal_as_json_and_as_a_page(
     assert ratio == pytest.approx(1.3)
     changes = facts["changes"]["tuesday"]
     assert set(changes) == set(PAIR_NAMES) and changes["top_right_top"]["peak"]["verdict"] != "machine"
+    assert facts["clearance_changes"]["tuesday"]["horizontal"]["verdict"] == "chance"  # the pads do not wear
     page = (tmp_path / "compare.html").read_text(encoding="utf-8")
     assert "tuesday beside monday" in page and "data:image/png;base64," in page and "http" not in page
     table = pyarrow.parquet.read_table(tmp_path / "windows.parquet")
     assert len(table) == 4 * SECONDS and set(table["group"].to_pylist()) == {"monday", "tuesday"}
     assert cli(["compare", *folders, "--window", "0.5", "--workers", "1"]) == 0
-    assert "tuesday beside monday" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "tuesday beside monday" in printed and "clearance: horizontal +0.0 % chance, vertical" in printed
+
+
+@pytest.mark.parametrize("dask", [False, pytest.param(True, marks=pytest.mark.stress)])
+def test_a_folder_of_runs_is_compared_and_its_picture_has_the_dates(
+    dask: bool,
+    runs: tuple[Run, Run],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    titles: list[str] = []
+
+    def keep(figure: Any) -> str:
+        titles.append(figure.axes[0].get_title())
+        return ""
+
+    monkeypatch.setattr("plow_twin.study.comparison.report.embedded_figure", keep)
+    arguments = ["compare", str(runs[0].folder.parent), "--window", "0.5", "--out", str(tmp_path), "--json"]
+    with ExitStack() as opened:
+        if dask:
+            from distributed import LocalCluster
+
+            options = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "dashboard_address": None}
+            cluster = opened.enter_context(LocalCluster(**options))
+            arguments += ["--dask", cluster.scheduler_address]
+        assert cli([*arguments, "--workers", "1"]) == 0
+    assert list(json.loads(capsys.readouterr().out)["groups"]) == ["monday", "tuesday"]
+    assert titles[0].startswith("Largest contact forces; 2027-01-15 08:00:00 UTC to 2027-01-15 08:00:07 UTC")
 
 
 def test_one_group_and_a_run_without_outputs_are_refused(

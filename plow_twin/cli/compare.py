@@ -23,6 +23,7 @@ from plow_twin.cli.console import (
 )
 
 if TYPE_CHECKING:
+    from plow_twin.study.comparison.change import Change
     from plow_twin.study.comparison.compare import Comparison
 
 
@@ -72,7 +73,8 @@ def compare(
     lost = {result["run"]: result["lost"] for result in results if result.get("lost")}
     for run, counts in lost.items():
         say_error(f"plow-twin: {run}: lost {counts}")
-    comparison = compared(runs, label)
+    scenes = [result["scene"] for result in results if result.get("scene")]
+    comparison = compared(runs, label, scenes=scenes)
     if out is not None:
         from plow_twin.study.comparison.report import write_comparison
 
@@ -120,9 +122,13 @@ def _show(found: Comparison) -> None:
         for pair, by_quantity in by_pair.items():
             view.add_row(
                 pair,
-                *(
-                    "-" if change is None else f"{100.0 * change.share:+.1f} % {change.verdict}"
-                    for change in by_quantity.values()
-                ),
+                *map(_text, by_quantity.values()),
             )
         console.print(view)
+        changes = (f"{axis} {_text(change)}" for axis, change in found.clearance_changes[name].items())
+        console.print(f"clearance: {', '.join(changes)}", highlight=False)
+
+
+def _text(change: Change | None) -> str:
+    """Return a change and its cause."""
+    return "-" if change is None else f"{100.0 * change.share:+.1f} % {change.verdict}"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, time, timedelta, tzinfo
 from pathlib import Path
@@ -37,11 +37,17 @@ class Comparison:
         Runs that have windows in a group.
     changes : dict
         By group (but the first), pair and quantity: `Change`, or None where there are too few windows.
+    clearance_changes : dict
+        By group (but the first), horizontal and vertical: the same.
+    scenes : list of str
+        Names of the scenes of all runs.
     """
 
     groups: dict[str, Windows]
     runs: dict[str, list[str]]
     changes: dict[str, dict[str, dict[str, Change | None]]] = field(default_factory=dict)
+    clearance_changes: dict[str, dict[str, Change | None]] = field(default_factory=dict)
+    scenes: list[str] = field(default_factory=list)
 
     def facts(self) -> dict[str, Any]:
         """Return plain values for JSON."""
@@ -66,17 +72,20 @@ class Comparison:
                 for name, windows in self.groups.items()
             },
             "units": dict(QUANTITIES),
+            "scenes": self.scenes,
             "changes": {
-                name: {
-                    pair: {
-                        quantity: None if found is None else {**vars(found), "verdict": found.verdict}
-                        for quantity, found in by_quantity.items()
-                    }
-                    for pair, by_quantity in by_pair.items()
-                }
+                name: {pair: _facts(by_quantity) for pair, by_quantity in by_pair.items()}
                 for name, by_pair in self.changes.items()
             },
+            "clearance_changes": {name: _facts(by_axis) for name, by_axis in self.clearance_changes.items()},
         }
+
+
+def _facts(changes: Mapping[str, Change | None]) -> dict[str, Any]:
+    """Return changes as plain values."""
+    return {
+        name: None if found is None else {**vars(found), "verdict": found.verdict} for name, found in changes.items()
+    }
 
 
 def by_run(name: str, stamp_ns: int) -> str:
@@ -117,7 +126,9 @@ def by_time(kind: str, shifts: Sequence[time] = SHIFTS, zone: tzinfo = UTC) -> L
     return label
 
 
-def compare(runs: Iterable[tuple[str, Windows]], label: Label = by_run, seed: int = 0) -> Comparison:
+def compare(
+    runs: Iterable[tuple[str, Windows]], label: Label = by_run, seed: int = 0, scenes: Iterable[str] = ()
+) -> Comparison:
     """Return the groups of some runs, and the changes from the first group to each other.
 
     Parameters
@@ -128,6 +139,8 @@ def compare(runs: Iterable[tuple[str, Windows]], label: Label = by_run, seed: in
         Names the group of a window.
     seed
         Of the draws of the bootstrap.
+    scenes
+        Names of the runs' scenes.
 
     Raises
     ------
@@ -144,6 +157,7 @@ def compare(runs: Iterable[tuple[str, Windows]], label: Label = by_run, seed: in
     if len(parts) < 2:
         raise RecordingError(f"got {len(parts)} group of windows ({', '.join(parts)}), expected two or more")
     found = Comparison({group: _joined(chosen) for group, chosen in parts.items()}, names)
+    found.scenes = sorted(set(scenes))
     first, *others = found.groups.items()
     random = np.random.default_rng(seed)
     for group, windows in others:
@@ -157,6 +171,14 @@ def compare(runs: Iterable[tuple[str, Windows]], label: Label = by_run, seed: in
                 for quantity in QUANTITIES
             }
             for place, pair in enumerate(PAIR_NAMES)
+        }
+        found.clearance_changes[group] = {
+            axis: change(
+                (first[1].clearance[:, place], first[1].load[:, 0]),
+                (windows.clearance[:, place], windows.load[:, 0]),
+                random,
+            )
+            for place, axis in enumerate(("horizontal", "vertical"))
         }
     return found
 
@@ -182,7 +204,7 @@ class WindowsTask:
         return None
 
     def run(self) -> dict[str, Any]:
-        """Return the windows under the key `windows`, and the run's losses under `lost`.
+        """Return the windows under the key `windows`, the run's losses under `lost`, its scene's name under `scene`.
 
         Raises
         ------
@@ -191,4 +213,5 @@ class WindowsTask:
         """
         recording = read_recording(self.path)
         windows = windows_of(recording, self.window_s)
-        return {"run": str(self.path), "windows": windows, "lost": recording.losses()}
+        scene = Path(str(recording.header.parameters.get("scene", ""))).name
+        return {"run": str(self.path), "windows": windows, "lost": recording.losses(), "scene": scene}

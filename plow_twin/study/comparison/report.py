@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from plow_twin.record.durable import whole_file
 from plow_twin.study.comparison.compare import Comparison
 from plow_twin.study.comparison.windows import QUANTITIES
 from plow_twin.study.report import embedded_figure, write_html, write_json
+from plow_twin.view.figures import date_text
 
 
 def write_comparison(found: Comparison, lost: dict[str, Any], out: Path) -> None:
@@ -48,9 +50,18 @@ def _picture(found: Comparison) -> str:
         axis.plot([], [], color=f"C{number % 10}", lw=6, label=name)
     axis.set_xticks(range(len(PAIR_NAMES)), PAIR_NAMES, rotation=20, ha="right")
     axis.set_ylabel("largest force in a window [kN]")
-    axis.set_title("Box: quartiles and median of the windows; whiskers: 5 % and 95 %")
+    axis.set_title(f"{_title(found)}\nBox: quartiles and median of the windows; whiskers: 5 % and 95 %", fontsize=10)
     axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return embedded_figure(figure)
+
+
+def _title(found: Comparison) -> str:
+    """Return the scenes, and the dates of the first and the last window where their stamps are dates."""
+    starts = np.concatenate([windows.start_ns for windows in found.groups.values()])
+    first, last = date_text(int(starts.min())), date_text(int(starts.max()))
+    span = f"{first} to {last}" if first else f"drawn {datetime.now(UTC):%Y-%m-%d}"
+    scenes = f"scene {', '.join(found.scenes)}; " if found.scenes else ""
+    return f"Largest contact forces; {scenes}{span}"
 
 
 def _write_windows(found: Comparison, path: Path) -> None:
