@@ -59,7 +59,7 @@ def test_an_analysis_of_runs_without_measurements_shows_the_model_and_no_empty_t
     assert cli(["analyse", str(run.folder), str(other), "--workers", "1", "--out", str(tmp_path / "out")]) == 0
     said = capsys.readouterr().out
     assert said.count("Contacts computed") == 1 and "plow-twin compare" in said
-    assert "bias" not in said and said.count("nothing measured") == 2
+    assert "bias" not in said and said.count("no measured values to compare") == 2
 
 
 def test_replay_of_an_untouched_recording_ends_with_0(run: Run) -> None:

@@ -123,7 +123,7 @@ def test_two_runs_are_compared_on_the_terminal_as_json_and_as_a_page(
     assert len(table) == 4 * SECONDS and set(table["group"].to_pylist()) == {"monday", "tuesday"}
     assert cli(["compare", *folders, "--window", "0.5", "--workers", "1"]) == 0
     printed = capsys.readouterr().out
-    assert "tuesday beside monday" in printed and "clearance: horizontal +0.0 % chance, vertical" in printed
+    assert "tuesday beside monday" in printed and "clearance [%]: horizontal +0.0" in printed
 
 
 @pytest.mark.parametrize("dask", [False, pytest.param(True, marks=pytest.mark.stress)])

@@ -6,7 +6,7 @@ import json
 import os
 from datetime import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
@@ -117,8 +117,8 @@ def _show(found: Comparison) -> None:
     console.print(groups)
     first = next(iter(found.groups))
     for name, by_pair in found.changes.items():
-        quantities = list(next(iter(by_pair.values())))
-        view = table(f"{name} beside {first}: change of the means, and its cause", "pad", *quantities)
+        quantities = ["energy" if name == "dissipation" else name for name in next(iter(by_pair.values()))]
+        view = table(f"{name} beside {first}: change of the means [%] {_KEY}", "pad", *quantities)
         for pair, by_quantity in by_pair.items():
             view.add_row(
                 pair,
@@ -126,9 +126,14 @@ def _show(found: Comparison) -> None:
             )
         console.print(view)
         changes = (f"{axis} {_text(change)}" for axis, change in found.clearance_changes[name].items())
-        console.print(f"clearance: {', '.join(changes)}", highlight=False)
+        console.print(f"clearance [%]: {', '.join(changes)}", highlight=False)
+
+
+#: Signs of the causes of a change, and what they mean.
+_SIGNS: Final = {"chance": "", "machine": "M", "load": "L", "load or machine": "?"}
+_KEY: Final = "(M: the machine, L: the load, ?: either; no letter: may be chance)"
 
 
 def _text(change: Change | None) -> str:
-    """Return a change and its cause."""
-    return "-" if change is None else f"{100.0 * change.share:+.1f} % {change.verdict}"
+    """Return a change in percent and the sign of its cause."""
+    return "-" if change is None else f"{100.0 * change.share:+.1f}{_SIGNS[change.verdict]}"
