@@ -67,7 +67,7 @@ class Kind:
     friction: float = 0.0
     exponent: float = 1.0
     walls: float = 0.0
-    #: true over believed mass and inertia, and frame size in m beyond that believed
+    #: true over believed mass and inertia, and excess of the true frame size over the believed one in m
     mass: float = 0.0
     inertia: float = 0.0
     frame_m: float = 0.0

@@ -238,7 +238,7 @@ def test_intervals_of_peaks_and_impulses_are_those_of_the_span_that_is_published
     for name in ("force", "peak", "impulse"):
         value, low, high = (live.column(f"{name}{end}") for end in ("", "_low", "_high"))
         assert (low <= value).all() and (value <= high).all() and (high > low).any()
-    # a publication of all tells of all: more than any of its parts
+    # the peaks of one publication are at least those of its parts
     other = Live(truth.nominal)
     for entry in _in_turn(truth, 0.0, 1.0):
         other.session.apply(entry)

@@ -249,7 +249,7 @@ def test_an_interrupted_analysis_goes_on_and_a_run_that_a_twin_recorded_stays(ru
     half = tmp_path / "out" / "run" / "run_0.mcap"
     half.write_bytes(half.read_bytes()[:-4000])
     other = Task(runs / "r1", PAPER, None, (), tmp_path / "out")
-    other.clear()  # as one that is interrupted later
+    other.clear()  # as a task that is interrupted later
     assert task.stored() is None and not half.exists()
     assert task.run()["loads"] == first["loads"]
     recorded = record_run(tmp_path / "mine" / "run", map(paper_sample, range(10))).file

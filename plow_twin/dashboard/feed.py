@@ -189,7 +189,7 @@ class Feed:
         """Take in a status: the newest of each name counts."""
         level, message, values = part
         if name == "estimate" and "estimates" not in values:  # no part of the diagnostics, which has that name too
-            self._sum_up()  # what was published before it
+            self._sum_up()  # the publications before it
             self.motion.estimate = values
         elif name == "status":
             self.motion.status = values

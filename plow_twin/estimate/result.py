@@ -75,7 +75,7 @@ class Interval:
 def _tail(least: float) -> tuple[float, float, float]:
     """Return mean, 5 % and 95 % points of a standard normal number that is known to be above `least`.
 
-    Beside scipy's `truncnorm`, whose import takes half a second.
+    In place of scipy's `truncnorm`, whose import takes half a second.
     """
     if least > _FAR:  # exponential there
         return least + 1.0 / least, least - math.log(0.95) / least, least - math.log(0.05) / least

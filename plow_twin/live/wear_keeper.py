@@ -33,7 +33,7 @@ class KeptWear:
     depth_m
         Depths [m].
     older_files
-        What a file may hold that these depths should have replaced and could not.
+        Contents of files that these depths should have replaced but could not.
     """
 
     depth_m: tuple[float, ...]

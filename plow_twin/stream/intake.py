@@ -171,7 +171,7 @@ class Intake:
             return verdict
         if self._newest_ns is None or verdict.resets:
             self._missing_before, self._first_ns, self._since_first = self.missing, stamp_ns, 0
-            # the stamps between are not to be gone back to
+            # stamps within the jump may not be returned to
             self._before_jump_ns = None if self.returned else self._newest_ns
         self._since_first += 1
         if self._newest_ns is None or verdict.resets or stamp_ns > self._newest_ns:

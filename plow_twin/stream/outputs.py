@@ -55,7 +55,7 @@ FOLLOWED_FIELDS: Final = (
 )  # fmt: skip
 #: Fields of the motion at a row's time.
 _MOTION: Final = ("t", "stamp_ns", "held", "q", "v", "penetration", "rate", "force", "wear_depth", *FOLLOWED_FIELDS)
-#: Fields whose sum `summary` finds finite or not.
+#: Fields that `summary` checks for finite numbers by their sum.
 _SUMMED: Final = ("q", "v", "penetration", "rate", "force", "impulse", "peak")
 #: Places of `known_clearance` in `clearance`.
 _KNOWN: Final = np.array([0, len(_CLEARANCES), len(_CLEARANCES) + 1, 1, len(_CLEARANCES) + 2, len(_CLEARANCES) + 3])
@@ -233,7 +233,7 @@ class Outputs:
         return Published(rows, self._slow(rows))
 
     def correct(self, stamp_ns: int, oldest_ns: int) -> int:
-        """Note that all from `stamp_ns` on is computed again; return the first such stamp since the last publication.
+        """Note that the motion from `stamp_ns` on is computed again; return the first such stamp since a publication.
 
         It is later than `oldest_ns`: earlier corrections stay as they are.
         """

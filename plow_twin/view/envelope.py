@@ -12,7 +12,7 @@ Indexes = NDArray[np.int64]
 
 #: Rows up to which a curve keeps each of them.
 MOST_ROWS: Final = 8000
-#: Bins at most, about one for each pixel of an axis: narrower bins would draw beats between their width and a period.
+#: Most bins, about one for each pixel of an axis: narrower bins would show beats with the load's period.
 _MOST_BINS: Final = 700
 
 
