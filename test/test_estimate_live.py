@@ -348,6 +348,7 @@ context.try_shutdown()
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.timeout(600)  # twin and worker compile 65 s of processor time each first time
 @pytest.mark.parametrize(("rows", "code"), [(None, 0), (100, 3)])
 def test_of_a_file_that_ends_the_last_window_is_estimated_or_too_few_data_are_named(
     rows: int | None, code: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]

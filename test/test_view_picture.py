@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 
@@ -73,6 +74,19 @@ def test_an_estimate_and_a_changed_parameter_are_marked_and_are_no_wear(tmp_path
     np.testing.assert_allclose(np.unique(horizontal.round(6)), [25.0, 26.0, 31.0])  # a changed model ends the estimate
     marks = {text.get_text(): text.xy[0] for text in clearance.texts if isinstance(text, Annotation)}
     assert marks == {"first estimate": pytest.approx(0.4), "parameters set": pytest.approx(0.5)}
+
+
+def test_an_estimate_after_the_last_publication_ends_the_curves_of_the_clearances(
+    tmp_path: Path, figures: list[Figure]
+) -> None:
+    found = {"mean_m": 26.5e-3, "p05_m": 26.3e-3, "p95_m": 26.8e-3, "state": "estimated"}
+    result = json.dumps({"horizontal": found, "vertical": {**found, "state": "not_observable"}})
+    stamp = BASE_NS + 400 * STEP_NS
+    estimated = Estimated(BASE_NS, stamp, 400, 40, (), (1.5e-3, 1.3e-3, 1.8e-3, 0.0, 0.0, 0.0), result)
+    run = record_run(tmp_path / "run", [*(paper_sample(index) for index in range(400)), estimated])
+    to_png(run.folder, tmp_path / "run.png")
+    horizontal, vertical = figures[0].axes[4].get_legend_handles_labels()[1][:2]
+    assert "26.50 mm (26.30 to 26.80)" in horizontal and "30.000 mm" in vertical
 
 
 def test_a_stretch_without_samples_is_shaded(tmp_path: Path, figures: list[Figure]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -26,6 +27,8 @@ _CLEARANCE_COLUMNS: Final = np.array(
     [CLEARANCE_NAMES.index(f"{axis}{point}") for axis in ("horizontal", "vertical") for point in ("", "/p05", "/p95")]
 )
 _NS: Final = 1e-9
+#: States of a clearance that the measurements determine.
+_KNOWN_STATES: Final = ("estimated", "rough")
 #: Events and held stretches beyond this number would cover the picture.
 _MOST_MARKS: Final = 40
 
@@ -60,6 +63,9 @@ class RunCurves:
     _estimated: bool = False
     _held_since_ns: int | None = None
     _newest_ns: int | None = None
+    #: number of the newest estimate's entry, its result, and the newest clearances that were published
+    _estimate: tuple[int, str] | None = None
+    _clearance: Array | None = None
 
     @classmethod
     def of(cls, reader: RunReader) -> RunCurves:
@@ -78,6 +84,7 @@ class RunCurves:
                 curves._entries(part)
                 curves._messages(rows_by_topic(part.outputs, topics, templates))
         curves._end_of_held(curves._newest_ns)
+        curves._last_estimate()
         return curves
 
     @property
@@ -111,9 +118,10 @@ class RunCurves:
                     if self._held_since_ns is None:
                         self._held_since_ns = stamp_ns if self._newest_ns is None else self._newest_ns
                     self._newest_ns = stamp_ns
-                case Estimated(end_ns=end_ns) if not self._estimated:
-                    self._estimated = True
-                    self._change(end_ns, "first estimate")
+                case Estimated(end_ns=end_ns, result=result):
+                    if not self._estimated:
+                        self._change(end_ns, "first estimate")
+                    self._estimated, self._estimate = True, (int(batch.entries.sequence[index]), result)
                 case Failed(stamp_ns, since_ns, advances):
                     self._failed(stamp_ns, since_ns, advances)
                 case SetModel(stamp_ns):
@@ -151,13 +159,28 @@ class RunCurves:
         if self.first_ns is not None and len(self.changes) < _MOST_MARKS:
             self.changes.append(((stamp_ns - self.first_ns) * _NS, reason))
 
+    def _last_estimate(self) -> None:
+        """End the clearances with those of an estimate that came after the last publication, at the last stamp."""
+        if self._estimate is None or self._clearance is None or self._newest_ns is None:
+            return
+        result, values = json.loads(self._estimate[1]), self._clearance.copy()
+        for place, axis in enumerate(("horizontal", "vertical")):
+            found = result.get(axis, {})
+            if found.get("state") in _KNOWN_STATES:
+                values[3 * place : 3 * place + 3] = [1e3 * found[f"{point}_m"] for point in ("mean", "p05", "p95")]
+        self.clearance.add(self._seconds(np.array([self._newest_ns])), values[None])
+
     def _messages(self, found: dict[str, Rows]) -> None:
         if "contact_peaks" in found:
             rows = found["contact_peaks"]
             self.force.add(self._seconds(rows.stamp_ns), rows.numbers[:, 2 * PAIR_COUNT :] / 1e3)
         if "clearance" in found:
             rows = found["clearance"]
-            self.clearance.add(self._seconds(rows.stamp_ns), 1e3 * rows.numbers[:, _CLEARANCE_COLUMNS])
+            values = 1e3 * rows.numbers[:, _CLEARANCE_COLUMNS]
+            self.clearance.add(self._seconds(rows.stamp_ns), values)
+            self._clearance = values[-1]
+            if self._estimate is not None and rows.sequence[-1] > self._estimate[0]:
+                self._estimate = None  # the publications since have it
         if "contact_forces" in found and "head_state" in found:
             for instant in _largest(found["contact_forces"], found["head_state"]):
                 if self.instant is None or instant.force.max() > self.instant.force.max():
