@@ -966,6 +966,16 @@ def test_failed_advances_are_no_success_in_any_view_of_a_run(
     assert replay(run).exit_code == 0
 
 
+@pytest.mark.parametrize(("given", "said"), [("follow=full", True), ("follow=parameters", False)])
+def test_a_file_that_ends_is_read_at_the_pace_of_the_twins_that_follow_and_this_is_said(
+    given: str, said: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = _csv(tmp_path / "load.csv", 50)
+    options = ["--set", "estimate=true", "--set", given, "--set", "follow_members=20"]
+    assert run_cli(["live", str(path), "--scene", "paper", *options]) == 3  # too little for an estimate
+    assert ("20 twins follow the machine" in capsys.readouterr().err) == said
+
+
 def _mistaken(name: str) -> str:
     """Return a file as a plant engineer may have it, with a mistake."""
     rows = [_row(index)[1:] for index in range(3000)]

@@ -132,6 +132,7 @@ def _live(
             for way in ways:
                 opened.enter_context(_open_way(front, way, options["out_rate"], source))
             if bridge.ends:
+                _say_pace(settings, quiet)
                 _show_progress(front, bridge, opened.enter_context(progress_bar("reading", quiet or lines)))
             stop.interrupt = False
             lost = front.run(lambda: stop.stopped, seconds or float("inf"))
@@ -167,6 +168,15 @@ def _say_what_differs(front: BridgeFront, settings: Settings) -> None:
     doubt = small_thresholds(settings.alarm_force, front.runtime.scene)
     if doubt:
         say_error(f"plow-twin: {doubt}")
+
+
+def _say_pace(settings: Settings, quiet: bool) -> None:
+    """Say before a file that ends is read why that takes long, and what is faster."""
+    if settings.follows == "full" and not quiet:
+        say_error(
+            f"plow-twin: {settings.follow_members} twins follow the machine, which takes about as long as the file's "
+            "measurements did; --set follow=parameters is faster, without intervals of the forces"
+        )
 
 
 def _also_metrics(say: Say, port: int | None, opened: ExitStack) -> Say:
