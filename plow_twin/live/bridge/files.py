@@ -15,7 +15,7 @@ from itertools import chain, islice
 from pathlib import Path
 from typing import Any, Final
 
-from plow_twin.live.bridge.source import BATCH, BridgeError, Lines, Messages, Rows
+from plow_twin.live.bridge.source import BATCH, BridgeError, Lines, Messages, Rows, SourceState
 from plow_twin.live.bridge.table import Table
 from plow_twin.record.merging import StampOf, merged
 from plow_twin.record.sources import Arrived, TopicType, columns_of
@@ -213,7 +213,7 @@ def messages(topic: str, lines: list[bytes | None], rows: Rows) -> list[Arrived]
     return found
 
 
-class Files:
+class Files(SourceState):
     """Files, each a topic under its name without ending; files of a pattern (`load_*.csv`) are one topic.
 
     Parameters
@@ -230,11 +230,7 @@ class Files:
     """
 
     def __init__(self, paths: list[Path], *, follow: bool) -> None:
-        self.ends = not follow
-        self.finished = False
-        self.connected = True
-        self.lost = 0
-        self.trouble = ""
+        super().__init__(ends=not follow, connected=True)
         self._tails = [_Dated(path) if is_pattern(path) else _Tail(path) for path in paths]
         for tail in self._tails:
             if self.ends and not (tail.files() if isinstance(tail, _Dated) else tail.path.is_file()):
@@ -338,7 +334,7 @@ def _sent_ns(row: Arrived, stamp_ns: StampOf[Arrived] | None) -> int | None:
     return None if stamp_ns is None else stamp_ns(Arrived(row.topic, NO_TIME, row.content))
 
 
-class StandardInput:
+class StandardInput(SourceState):
     """Lines on standard input or another descriptor, until its end.
 
     Raises
@@ -350,11 +346,7 @@ class StandardInput:
     def __init__(self, descriptor: int = 0) -> None:
         if descriptor == 0 and sys.stdin is None:
             raise BridgeError("-: got a closed standard input, expected lines")
-        self.ends = False
-        self.finished = False
-        self.connected = True
-        self.lost = 0
-        self.trouble = ""
+        super().__init__(connected=True)
         self._descriptor = descriptor
         self._lines, self._rows = Lines(), Rows()
         self._first: list[Arrived] = []

@@ -16,7 +16,7 @@ from plow_twin.live.bridge.paho_client import (
     subscription_refusal,
     use_tls,
 )
-from plow_twin.live.bridge.source import BridgeError, read_json
+from plow_twin.live.bridge.source import BridgeError, SourceState, read_json
 from plow_twin.record.merging import StampOf
 from plow_twin.record.sources import Arrived
 
@@ -25,7 +25,7 @@ _QUEUE: Final = 100_000
 _PORTS: Final = {"mqtt": 1883, "mqtts": 8883}
 
 
-class Mqtt:
+class Mqtt(SourceState):
     """A session with a broker that outlives a broken connection: messages of QoS 1 sent meanwhile come later.
 
     Parameters
@@ -42,11 +42,7 @@ class Mqtt:
     """
 
     def __init__(self, access: Access, connect_s: float = 10.0) -> None:
-        self.ends = False
-        self.finished = False
-        self.connected = False
-        self.lost = 0
-        self.trouble = ""
+        super().__init__()
         self._access, self._connect_s = access, connect_s
         self.host, self.port, tls = _address(access)
         self._topics: list[str] = []

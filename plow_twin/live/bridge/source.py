@@ -65,6 +65,14 @@ class Bridge(Protocol):
         """Close the source."""
 
 
+class SourceState:
+    """The attributes of a `Bridge` before it is started."""
+
+    def __init__(self, *, ends: bool = False, connected: bool = False) -> None:
+        self.ends, self.finished, self.connected = ends, False, connected
+        self.lost, self.trouble = 0, ""
+
+
 @runtime_checkable
 class Reporting(Protocol):
     """A source with figures of its own."""

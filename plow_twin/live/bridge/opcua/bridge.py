@@ -20,7 +20,7 @@ from plow_twin.live.bridge.access import Access, host_and_port, is_loopback
 from plow_twin.live.bridge.opcua.link import PUBLISHING_MS, Link, Revised
 from plow_twin.live.bridge.opcua.readings import Counts, overflowed, reading
 from plow_twin.live.bridge.opcua.samples import Samples
-from plow_twin.live.bridge.source import BATCH, BridgeError
+from plow_twin.live.bridge.source import BATCH, BridgeError, SourceState
 from plow_twin.live.part import Part
 from plow_twin.record.map_file import OPCUA, SERVER_STAMP, SOURCE_STAMP
 from plow_twin.record.mapping import Role
@@ -43,7 +43,7 @@ _FIRST_WAIT_S: Final = 1.0
 _LONGEST_WAIT_S: Final = 30.0
 
 
-class OpcUa:
+class OpcUa(SourceState):
     """A subscription to the nodes of a mapping that outlives a broken connection.
 
     Parameters
@@ -66,11 +66,7 @@ class OpcUa:
     def __init__(
         self, access: Access, roles: Mapping[str, Role], rate_hz: float = 0.0, connect_s: float = 20.0
     ) -> None:
-        self.ends = False
-        self.finished = False
-        self.connected = False
-        self.lost = 0
-        self.trouble = ""
+        super().__init__()
         self._access, self._connect_s = access, connect_s
         _, self.host, self.port = host_and_port(access, _PORTS, has_path=True)
         _check_encryption(access, self.host)
