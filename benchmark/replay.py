@@ -1,10 +1,10 @@
 """Replay beside plain reading of the same file, and the cost of a recording: `python benchmark/replay.py [SECONDS]`.
 
-Records the paper's head at 1 kHz with all outputs, then prints size, replay multiples (all messages, digests alone),
-what bounds them (the motion alone, decompressing alone), the same for a drawing thinned as that of an hour, and the
-time that `mcap` and `rosbags` take to read the same file. Times are processor time of one thread, the least of some
-runs. What a replay's start takes (scene, twin, compiled code that has been loaded) is a row of its own, in the time of
-each replay, and taken off in its last column: of an hour it is nothing, of 100 s a tenth of a replay of digests alone.
+Records the paper's head at 1 kHz with all outputs, then prints size and replay multiples (all messages, digests alone),
+their bounds (the motion alone, decompressing alone), the same for a drawing thinned like that of an hour, and the time
+that `mcap` and `rosbags` take to read the same file. Times are processor time of one thread, the least of some runs.
+The start of a replay (scene, twin, loading of compiled code) has a row of its own. It is part of each time but not of
+the last column; it is negligible in an hour and a tenth of a replay of 100 s by digests alone.
 """
 
 from __future__ import annotations

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 from collections.abc import Iterator
 from typing import Any
@@ -12,6 +13,7 @@ from scenes import ROOT
 
 #: Declared with unit and meaning in the source; the site shows both.
 DECLARED = re.compile(r"_(quantity|choice)\(")
+DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 ARRAYS = re.compile(r"NDArray|ArrayLike|\bArray\b")
 
 
@@ -93,3 +95,14 @@ def test_errors_that_a_function_raises_are_documented(package: griffe.Module) ->
             said += "ArgumentError" if "ValueError" in said else ""
             lacking += [f"{name}: {error}" for error in raised if error not in said]
     assert lacking == []
+
+
+def test_no_docstring_begins_with_a_word_that_names_nothing() -> None:
+    """A docstring begins with a verb, or with the name of its thing; `Tell whether` is `Return whether`."""
+    found = []
+    for folder in ("plow_twin", "test", "benchmark", "tools", "studies", "examples", "launch"):
+        for path in (ROOT / folder).rglob("*.py"):
+            nodes = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, DOCUMENTED)]
+            first = [(ast.get_docstring(node) or "-").split(maxsplit=1)[0] for node in nodes]
+            found += [f"{path.relative_to(ROOT)}: {word}" for word in first if word in ("What", "Tell", "Tells")]
+    assert found == []
