@@ -105,7 +105,7 @@ class Sensitivity:
 
 
 def sensitivity_parameters(scene: Scene) -> dict[str, float]:
-    """Return the parameters by which a motion has derivatives, by their paths, and their values in the scene.
+    """Return the parameters with respect to which a motion has derivatives: values in the scene by path.
 
     Stiffness, damping or restitution, both clearances, and a factor of each load.
 
