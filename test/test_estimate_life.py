@@ -312,6 +312,11 @@ def test_unusable_input_of_a_forecast_is_refused_and_not_left_out(
     assert "--stop: got 20 h, expected at most the horizon, --horizon 5" in said("--horizon", "5", "--stop", "20")
     assert "scenario: got 'hard:mass=1.3'" in said("--scenario", "hard:mass=1.3")
     assert "wear: got none" in said(scene_file="paper")
+    assert "got 0.028 mm, expected more than the present clearance, 25.000 mm; is it in m?" in " ".join(
+        said("--limit-horizontal", "0.028").split()
+    )
+    assert cli(["forecast", str(file), "-q", *limits, "--limit-horizontal", "24"]) == 0
+    assert "--limit-horizontal: the present clearance, 25.000 mm, is past 24 mm already" in capsys.readouterr().err
     whole = {"mean_m": 0.026, "p05_m": 0.0259, "p95_m": 0.0261, "state": "estimated"}
     for text, expected in (
         ("null", "got NoneType, expected JSON of an estimate"),

@@ -809,6 +809,18 @@ def test_a_broker_keeps_messages_for_an_absent_twin_and_garbage_is_counted(broke
 
 # paho leaves the socket of a failed handshake to the collector
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_misspelt_topic_of_a_broker_is_no_success(
+    broker: Access, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("PLOW_TWIN_MQTT_PASSWORD", broker.password)
+    mapping = tmp_path / "map.yaml"
+    mapping.write_text("excitation: {topic: plough/mistaken, fields: {fx: fx, fy: fy, m: m}}\n")
+    access = ["--user", broker.user, "--tls-ca", str(broker.ca)]
+    arguments = ["live", broker.url, "--map", str(mapping), "--scene", "paper", "--seconds", "1", "--quiet"]
+    assert run_cli([*arguments, *access]) == 3
+    assert "no sample came on plough/mistaken" in capsys.readouterr().err
+
+
 def test_a_wrong_password_a_strange_certificate_and_a_broker_without_tls_are_refused(broker: Access) -> None:
     for wrong, said in (
         ({"password": "guess"}, "refused"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 import runpy
 import subprocess
@@ -101,3 +102,16 @@ def test_ci_is_bounded_and_runs_every_check() -> None:
     assert "test_stream_session.py" in dry_run("coverage") and "--cov" not in dry_run("test")
     lowest = dry_run("lowest")
     assert all(name in lowest for name in ("test_solve_reference.py", "test_record_file.py", "test_ros_lifecycle.py"))
+
+
+def test_a_screenshot_leaves_the_settings_of_the_user_s_viewer_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "tools"))
+    screenshot = importlib.import_module("screenshot")
+    given: list[dict[str, str]] = []
+    monkeypatch.setattr(screenshot.subprocess, "run", lambda command, **options: given.append(options["env"]))
+    monkeypatch.setattr(screenshot.subprocess, "Popen", lambda command, **options: given.append(options["env"]))
+    screenshot.start_viewer(9, tmp_path)
+    for name in ("HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME", "XDG_CACHE_HOME"):
+        assert [environment[name] for environment in given] == [str(tmp_path)] * 2

@@ -6,7 +6,7 @@ import json
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
@@ -27,6 +27,10 @@ from plow_twin.scene_file.presets import scene_path
 if TYPE_CHECKING:
     from plow_twin.estimate.coefficient import History
     from plow_twin.model.scene import Scene
+
+
+#: A limit below this share of the clearance is no limit in mm; in m it would be the thousandth of one.
+_METRES: Final = 1e-2
 
 
 @click.command(
@@ -108,6 +112,7 @@ def forecast(
     with busy("forecasting", quiet or as_json):
         if history is None:
             model, deviation = _now(model, facts_now)
+            _check_limits(limits, model)
             found = run(model, plan, deviation)
             facts = found.as_dict()
         else:
@@ -116,6 +121,7 @@ def forecast(
             known = coefficient(model, _history(history))
             low, high = (float(value) for value in known.deviation)
             model = with_clearances(model, float(known.clearance[0]), float(known.clearance[1]), known.depth)
+            _check_limits(limits, model)
             found = run(model, plan, (low, high), known)
             facts = found.as_dict()
             facts["coefficient_m2_n"] = asdict(known.interval())
@@ -131,6 +137,22 @@ def forecast(
     elif not quiet:
         _show(facts)
     return DONE_WITH_LOSS if lost else DONE
+
+
+def _check_limits(limits_m: tuple[float, float], scene: Scene) -> None:
+    """Refuse limits that look like metres, and name a clearance that has passed its limit already."""
+    import numpy as np
+
+    from plow_twin.stream.outputs import clearances
+
+    assert scene.wear is not None
+    now_m = clearances(scene, np.array(scene.wear.initial_depth_m, np.float64))[:2].tolist()
+    for name, limit, now in zip(("horizontal", "vertical"), limits_m, now_m, strict=True):
+        option, present = f"--limit-{name}", f"the present clearance, {1e3 * now:.3f} mm"
+        if limit <= _METRES * now:
+            raise click.UsageError(f"{option}: got {1e3 * limit:g} mm, expected more than {present}; is it in m?")
+        if limit <= now:
+            say_error(f"plow-twin: {option}: {present}, is past {1e3 * limit:g} mm already")
 
 
 def _scene(name: str) -> tuple[Scene, dict[str, Any] | None, dict[str, int]]:
