@@ -17,6 +17,7 @@ from plow_twin.estimate.contact_forces import ContactForces
 from plow_twin.estimate.measurements import Load, Poses
 from plow_twin.model.loads import compile_loads
 from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.model.scene import Friction
 from plow_twin.scene_file import dump_scene, load_scene
 from plow_twin.stream.outputs import clearances
 
@@ -50,6 +51,7 @@ class Group:
     load_step: float = 0.01
     third_harmonic: float = 0.0
     load_scale: float = 1.0
+    friction: float = 0.0
     jam_m: float = 0.0
     shift_m: float = 0.0
     stuck: bool = False
@@ -163,6 +165,7 @@ def draw(group: Group, seed: int) -> Truth:
         nominal,
         clearance=Clearance(*rng.uniform(0.018, 0.034, 2)),
         contact=_contact(group, rng),
+        friction=Friction(group.friction) if group.friction else nominal.friction,
         loads=(Table("cutting", fine, true_load),),
         wear=Wear(group.wear_m2_n, 0.015, 2.0) if group.wear_m2_n else None,
     )

@@ -84,7 +84,7 @@ def _play(runtime: Runtime, truth: Truth) -> tuple[list[int], list[int]]:
     for now, (fx, fy, m) in zip(t.tolist(), wrench.tolist(), strict=True):
         while truth.poses.t[pose] <= now:
             x, y, theta = truth.poses.q[pose].tolist()
-            runtime.take_pose(_T0 + round(1e9 * float(truth.poses.t[pose])), (x, y, theta))
+            runtime.add_pose(_T0 + round(1e9 * float(truth.poses.t[pose])), (x, y, theta))
             pose += 1
         if not estimated and now >= _ESTIMATED:
             runtime.driver.session.apply(_known(truth))

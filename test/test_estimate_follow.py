@@ -73,7 +73,7 @@ def _run(follower: Follower, truth: Truth, end: float, begin: float = -1.0, late
     for row, index in enumerate(there.tolist()):
         follower.advance_rows(load.t[index : index + 1], load.wrench[index : index + 1], rows[row : row + 1])
         while place < len(poses.t) and poses.t[place] + late <= load.t[index]:
-            follower.take_pose(float(poses.t[place]), poses.q[place])
+            follower.add_pose(float(poses.t[place]), poses.q[place])
             place += 1
     return np.asarray(rows["force"])
 
@@ -81,7 +81,7 @@ def _run(follower: Follower, truth: Truth, end: float, begin: float = -1.0, late
 def _take(follower: Follower, found: Estimate) -> bool:
     """Let an estimate be known now; return whether it is followed, or the prior again."""
     before = follower.drawn
-    follower.take_estimate(json.dumps(found.as_dict()), follower.time)
+    follower.add_estimate(json.dumps(found.as_dict()), follower.time)
     return follower.drawn != before
 
 
@@ -199,8 +199,37 @@ def test_late_poses_correct_too_and_later_poses_have_no_effect(truth: Truth, for
     follower, same = Follower(truth.nominal, MEMBERS), Follower(truth.nominal, MEMBERS)
     for one in (follower, same):
         _run(one, truth, 1.0)
-    follower.take_pose(1.0 - 2.0 * LATEST_S, np.full(3, 0.1))
+    follower.add_pose(1.0 - 2.0 * LATEST_S, np.full(3, 0.1))
     assert np.array_equal(_run(follower, truth, 1.1, 1.005), _run(same, truth, 1.1, 1.005))
+
+
+def test_the_load_error_of_a_rough_estimate_lets_the_intervals_hold(truth: Truth, forces: Array) -> None:
+    """A constant force that is not believed: 4 kN, an eighth of the load's amplitude."""
+    figures = {f"load_error_{name}": 0.01 for name in ("fx", "fy", "m")}
+    rough = replace(_known(truth, State.ROUGH), figures=figures)
+    wrench = truth.load.wrench + np.array([4e3, 0.0, 0.0])
+    held, there = {}, slice(200, 401)
+    for name, found in (("plain", _known(truth)), ("rough", rough)):
+        follower = Follower(truth.nominal, MEMBERS)
+        follower.every_row = True
+        _run(follower, truth, 1.0)
+        assert _take(follower, found)
+        off = replace(truth, load=replace(truth.load, wrench=wrench))
+        _run(follower, off, 1.995, 1.0)
+        saved, told = follower.snapshot(), np.zeros(201, ROW)
+        for one in (follower, Follower(truth.nominal, MEMBERS)):
+            one.every_row = True
+            one.restore(saved)
+            rows = np.zeros(201, ROW)
+            for row, index in enumerate(range(200, 401)):
+                one.add_pose(float(truth.poses.t[index - 1]), truth.poses.q[index - 1])
+                one.advance_rows(off.load.t[index : index + 1], wrench[index : index + 1], rows[row : row + 1])
+            assert one is follower or np.array_equal(rows, told)
+            told = rows
+        true = forces[there]
+        inside = (told["force_low"] <= true) & (true <= told["force_high"])
+        held[name] = float(inside[true > 0.0].mean())
+    assert held["plain"] < 0.6 and held["rough"] > 0.8
 
 
 def test_a_machine_without_gravity_is_steered_too(truth: Truth, monkeypatch: pytest.MonkeyPatch) -> None:

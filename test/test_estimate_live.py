@@ -263,7 +263,7 @@ def test_other_pads_and_other_model_numbers_discard_earlier_estimates(
     monkeypatch.setattr("plow_twin.live.estimation.Worker", _Finished)
     scene = replace(preset("paper"), wear=Wear(1e-13, 0.015, 2.0))
     estimation = Estimation(settings({"estimate": True, "forecast_limits": [0.04, 0.05]}), scene)
-    session = Session(Twin(scene, excitation="sampled"), on_entry=estimation.take)
+    session = Session(Twin(scene, excitation="sampled"), on_entry=estimation.add)
     session.apply(Sample(START_NS, (0.0, 0.0, 0.0)))
 
     def told() -> dict[str, JointStateMessage]:

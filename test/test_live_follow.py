@@ -54,6 +54,7 @@ from plow_twin.stream.journal import (
 from plow_twin.stream.outputs import CLEARANCE_NAMES, NONE, Published
 from plow_twin.stream.session import Session
 from plow_twin.stream.topics import TOPICS
+from plow_twin.study.analysis.analyse import analyse
 from plow_twin.view import layout, to_rrd
 
 sys.path.insert(0, str(ROOT / "benchmark"))
@@ -294,7 +295,7 @@ def test_late_samples_and_poses_end_in_the_bits_of_those_in_order_and_replay_giv
     assert late.session.stamp_ns == ordered.session.stamp_ns
     again = _again(late.journal, truth.nominal)
     assert again.twin.digest() == late.twin.digest()
-    assert again.following is not None and again.following.taken == late.twin.taken
+    assert again.following is not None and again.following.added == late.twin.added
     assert _again(ordered.journal, truth.nominal, 1000).twin.digest() == ordered.twin.digest()
     force, expected = (one.session.twin.advance(one.twin.time).force for one in (late, ordered))
     assert force == pytest.approx(expected, rel=0.02, abs=2e3)
@@ -389,6 +390,21 @@ def test_the_guard_of_a_steered_twin_knows_its_penetrations_with_an_offset_centr
     assert rows["penetration"][0] == pytest.approx(ensemble._penetration(ensemble.pose)[0], abs=1e-12)
 
 
+@pytest.mark.parametrize("wear", [None, Wear(2e-14, 0.015, 2.0)])
+def test_a_restored_motion_goes_on_with_what_is_known_now(truth: Truth, wear: Wear | None) -> None:
+    live = Live(replace(truth.nominal, wear=wear))
+    live.take(_in_turn(truth, 0.0, 0.5))
+    before = live.session.snapshot()
+    live.take([_known(truth), *_in_turn(truth, 0.5, 0.7)])
+    known = live.clearance()
+    live.take([Restore(_stamp(0.7), before.data), *_in_turn(truth, 0.7, 0.9)])
+    assert live.twin.estimate is not None and live.clearance() == pytest.approx(known, abs=1e-7)
+    known_then = live.session.snapshot()
+    live.take([_known(truth, State.WITHDRAWN), Restore(_stamp(0.9), known_then.data), *_in_turn(truth, 0.9, 1.0)])
+    assert live.twin.estimate is None
+    assert _again(live.journal, live.session.twin.scene).twin.digest() == live.twin.digest()
+
+
 def test_counts_of_poses_go_on_with_other_numbers_of_the_model(truth: Truth) -> None:
     live = Live(truth.nominal)
     live.take(_in_turn(truth, 0.0, 0.5))
@@ -460,12 +476,12 @@ def test_waiting_poses_are_bounded_dropped_ones_counted_and_no_estimate_is_dropp
     live.take(_in_turn(truth, 0.0, 0.5))
     live.take([Pose(_stamp(t), (0.0, 0.0, 0.0)) for t in (3601.0, 7200.0)])
     assert live.session.poses_dropped == 2
-    before, more = live.twin.taken, 10_050
+    before, more = live.twin.added, 10_050
     # the load is silent, and a late sample would need all of these again
     live.take([Pose(_stamp(0.51) + 100_000 * index, (0.0, 0.0, 0.0)) for index in range(more)])
     assert live.session.poses_dropped == 2 + before + more - 10_000
     assert live.twin.poses_dropped == more - 10_000
-    live.twin.take_estimate(_known(truth).result, 0.505)
+    live.twin.add_estimate(_known(truth).result, 0.505)
     live.take(_samples(truth, 0.5, 0.52))
     assert live.twin.estimate is not None
 
@@ -596,7 +612,7 @@ def test_a_runtime_reports_its_followers_and_falls_back_to_the_parameters_where_
     def play(begin: float, end: float) -> None:
         for entry in _in_turn(truth, begin, end):
             if isinstance(entry, Pose):
-                runtime.take_pose(entry.stamp_ns, (entry.pose[0], entry.pose[1], entry.pose[2]))
+                runtime.add_pose(entry.stamp_ns, (entry.pose[0], entry.pose[1], entry.pose[2]))
                 continue
             assert isinstance(entry, Sample)
             for topic, message in runtime.step([(entry.stamp_ns, entry.wrench)]):
@@ -634,6 +650,11 @@ def test_a_runtime_reports_its_followers_and_falls_back_to_the_parameters_where_
     report = replay(tmp_path / "run")
     assert (report.exit_code, report.first_divergence) == (0, None)
     assert report.compared["force_intervals"] == sent["force_intervals"]
+    residual = {}
+    for name, given_scene in (("followed", None), ("nominal", scene)):
+        found = analyse(tmp_path / "run", scene=given_scene)
+        residual[name] = found.comparisons(found.predictions[0])["x"].rms
+    assert residual["followed"] < 0.5 * residual["nominal"]
     drawn = to_rrd(tmp_path / "run", tmp_path / "run.rrd")
     entities = {chunk.entity_path for chunk in RrdReader(str(drawn.path)).stream() if not chunk.is_static}
     assert {f"/{name}" for name in (*layout.FORCE_BOUNDS, *layout.POSE, *layout.MEASURED)} <= entities

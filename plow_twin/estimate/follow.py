@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from plow_twin.errors import ArgumentError
+from plow_twin.estimate import tuning
 from plow_twin.estimate.estimate import prior_of
 from plow_twin.estimate.forces import FEWEST, TOLERANCE, draw_scenes, quantiles
 from plow_twin.estimate.measurements import Load, Poses
@@ -49,39 +50,33 @@ from plow_twin.stream.outputs import clearances
 Array = NDArray[np.float64]
 Rows = NDArray[np.void]
 
-#: Members by default.
+#: Definition: members by default.
 MEMBERS: Final = 128
-#: Seconds of motion that are kept for poses that are late, by their delay among it, and least distance of what is kept.
+#: Bound: seconds of motion that are kept for poses that are late, their delay included.
 LATEST_S: Final = 0.25
+#: Bound: least distance in s of what is kept of the motion.
 _PATH_S: Final = 2e-3
-#: Least distance in s of poses that are used: nearer ones tell little more and cost as much.
+#: Bound: least distance in s of poses that are used; nearer ones tell little more and cost as much.
 APART_S: Final = 4e-3
-#: Poses from whose quick changes the noise is told: fewest, and most.
+#: Bound: poses from whose quick changes the noise is told: fewest, and most.
 _NOISE_ROWS: Final = (20, 400)
-#: Share of the head's weight on earth that a correction may press a pair with, beyond its force.
-_PRESSED: Final = 0.5
-#: Members that carry the clearance of the prior at least, as a share, and never fewer than `FEWEST`, that have points:
-#: of fewer the poses would be trusted too far.
-_FEWEST_CARRY: Final = 0.1
-#: Standard deviations by which a pose may differ from its prediction: noise reaches five in one of a million poses. Of
-#: 780 poses of three truths none was left out behind soft contacts, eight behind a hard one.
-_OUTLYING: Final = 5.0
-#: Outlying poses in a row after which they are used: the head has jumped, a single glitch does not last so long.
+#: Bound: outlying poses in a row after which they are used: the head has jumped, a single glitch does not last so long.
 _MOST_OUTLYING: Final = 5
-#: Samples that are advanced through at once: the rows of all members stay in the processor's cache.
+#: Bound: samples that are advanced through at once: the rows of all members stay in the processor's cache.
 _CALL: Final = 20
-#: What is known of the clearances is told anew so often [1/s]: as often as it is published.
+#: Definition: what is known of the clearances is told again so often [1/s], as often as it is published.
 _KNOWN_HZ: Final = 10.0
-#: Poses that wait for the model to reach their stamps at most: as many as a session keeps to use again.
+#: Bound: poses that wait for the model to reach their stamps; as many as a session keeps to use again.
 _MOST_DUE: Final = MOST_MEASURED
 _THETA: Final = DOF_NAMES.index("theta")
 #: Derived: places of c, s, X, Y in the solver's state.
 _PLACES: Final = (5, 6, 0, 1)
+#: Definition: one row, which is wanted or not; no digest; clearances that do not move.
 _YES: Final = np.ones(1, bool)
 _NO: Final = np.zeros(1, bool)
-_NO_MARKS: Final = np.zeros(0, np.int64)
+_NO_DIGESTS: Final = np.zeros(0, np.int64)
 _UNMOVED: Final = np.zeros(6)
-#: Nothing is stated of either.
+#: Definition: nothing is stated of either.
 _NO_LOAD: Final = Load(np.array([0.0, 1.0]), np.zeros((2, 3)))
 _NO_POSES: Final = Poses(np.zeros(0), np.zeros((0, 3)))
 _LENGTH: Final = struct.Struct("<q")
@@ -158,13 +153,15 @@ class Follower:
         self._prior = prior(scene)
         self._speed = scene.wear.travel_speed_m_s if scene.wear is not None else 0.0
         #: poses and estimates so far, whether they were used or not
-        self.taken = 0
+        self.added = 0
         #: whether the intervals of the forces are wanted at each row, beside those published
         self.every_row = False
         #: whether a row that is published by itself does not wait for the other members, which `catch_up` advances
         self.defers = False
         self._behind: _Behind | None = None
-        self._ends, self._begins = _NO_MARKS, False
+        #: smallest and largest load so far, shape (2, 3)
+        self._range = np.zeros((2, 3))
+        self._ends, self._begins = _NO_DIGESTS, False
         self._span_start = start
         self._wrench = np.zeros(3)
         #: poses that have moved the members, poses that are outliers, and poses that were dropped because too many wait
@@ -191,6 +188,7 @@ class Follower:
         self._text = text
         #: the estimate that is followed; None: the prior
         self.estimate = Estimate.from_dict(json.loads(text)) if text else None
+        self._load_share = _load_share(text)
         self._known = self._prior if self.estimate is None else _whole(self.estimate, self._prior)
         rng = np.random.default_rng([self._seed, self.drawn])
         self._ensemble = Ensemble(self.scene, self._known, self._members, rng, time, self.tol, worn)
@@ -283,7 +281,7 @@ class Follower:
         self._ends, self._begins = ends, begins
 
     def advance_rows(
-        self, t: Array, wrench: Array, rows: Rows | None, marks: NDArray[np.int64] = _NO_MARKS
+        self, t: Array, wrench: Array, rows: Rows | None, digest_after: NDArray[np.int64] = _NO_DIGESTS
     ) -> Advanced:
         """Advance to some times, as `Twin.advance_rows`; a row knows what was measured before it.
 
@@ -292,19 +290,20 @@ class Follower:
         self.catch_up()
         if wrench.shape != (len(t), 3) or not np.isfinite(wrench).all():
             raise ArgumentError(f"wrench: got {wrench!r}, expected finite numbers of shape ({len(t)}, 3)")
-        if self.defers and self._begins and len(t) == len(self._ends) == 1 and not len(marks) and rows is not None:
+        alone = self._begins and len(t) == len(self._ends) == 1 and not len(digest_after)
+        if self.defers and alone and rows is not None:
             failed = self._advance_first(t, wrench, rows, _YES if self.steered else _NO, _YES)
             if failed:
                 self.catch_up()
             return Advanced(failed, [])
         ends = np.zeros(len(t), bool)
         ends[self._ends] = True
-        self._ends = _NO_MARKS
+        self._ends = _NO_DIGESTS
         wanted = ends.copy()
         wanted[-1] = True
         if self.every_row or not self.steered:
             wanted[:] = self.every_row
-        stops = Counter(marks.tolist())
+        stops = Counter(digest_after.tolist())
         failed, digests, begin = 0, list[str](), 0
         while begin < len(t):
             end = self._stop(t, begin, stops)
@@ -337,18 +336,20 @@ class Follower:
         if behind.begins:
             self._ensemble.begin_span()
         self._ensemble.advance_others(*behind[:-1])
+        ends = behind.wrench.min(axis=0), behind.wrench.max(axis=0)
+        self._range = np.stack([np.minimum(self._range[0], ends[0]), np.maximum(self._range[1], ends[1])])
         if math.floor(self.time * _KNOWN_HZ) != self._cell:
             self._tell_clearance()
         while self._due and self._due[0][0] <= self.time:
             when, _, what = self._due.pop(0)
-            self._take_in(when, what)
+            self._use(when, what)
 
-    def _stop(self, t: Array, begin: int, marks: Container[int]) -> int:
+    def _stop(self, t: Array, begin: int, digest_after: Container[int]) -> int:
         """Return up to where to go at once: nothing happens on the way."""
         end = min(begin + _CALL, len(t))
         due = self._due[0][0] if self._due else math.inf
         for place in range(begin, end):
-            if place + 1 in marks or t[place] >= due or math.floor(t[place] * _KNOWN_HZ) != self._cell:
+            if place + 1 in digest_after or t[place] >= due or math.floor(t[place] * _KNOWN_HZ) != self._cell:
                 return place + 1
         return end
 
@@ -407,10 +408,10 @@ class Follower:
         noise = np.array(self._noise_rows).reshape(-1, 3)
         blobs += [noise.tobytes(), self._clearance.tobytes(), self._wrench.tobytes()]
         facts = {
-            "members": self._members, "taken": self.taken, "drawn": self.drawn, "estimate": self._text,
+            "members": self._members, "added": self.added, "drawn": self.drawn, "estimate": self._text,
             "due": self._due, "used": list(self._used), "speed": self._speed, "cell": self._cell,
             "span": self._span_start, "worn": self._ensemble.worn_before.tolist(), "random": random,
-            "outlying": self._ensemble.outlying, "sizes": [len(blob) for blob in blobs],
+            "outlying": self._ensemble.outlying, "range": self._range.tolist(), "sizes": [len(blob) for blob in blobs],
         }  # fmt: skip
         head = json.dumps(facts).encode()
         return b"".join([_LENGTH.pack(len(head)), head, *blobs])
@@ -433,42 +434,42 @@ class Follower:
         if drawn != (self.drawn, self._members, self._text, self._ensemble.worn_before.tolist()):
             self.drawn, self._members = int(facts["drawn"]), int(facts["members"])
             self._draw(facts["estimate"], 0.0, worn)
-        self.taken, self._cell, self._span_start = int(facts["taken"]), int(facts["cell"]), float(facts["span"])
+        self.added, self._cell, self._span_start = int(facts["added"]), int(facts["cell"]), float(facts["span"])
         self._due = [(float(when), int(number), what) for when, number, what in facts["due"]]
         self._used = deque(facts["used"])
         *own, noise, clearance, wrench = blobs
         self._ensemble.set_state(own, facts["random"])
-        self._ensemble.outlying = int(facts["outlying"])
+        self._ensemble.outlying, self._range = int(facts["outlying"]), np.array(facts["range"])
         self._noise_rows = deque(np.frombuffer(noise).reshape(-1, 3).copy(), maxlen=_NOISE_ROWS[1])
         self._clearance, self._wrench = np.frombuffer(clearance).reshape(2, 3).copy(), np.frombuffer(wrench).copy()
 
     # -- what is measured --------------------------------------------------------------------------------------------
 
-    def take_pose(self, t: float, q: ArrayLike, known: float = -math.inf) -> None:
+    def add_pose(self, t: float, q: ArrayLike, known: float = -math.inf) -> None:
         """Take in a pose measured at `t` in s, shape (3,), NaN where it was not; it acts once the model has come there.
 
         It acts at `known` in s where that is later. One of the last `LATEST_S` acts at once.
         """
-        self._take(max(t, known), [t, *np.asarray(q, dtype=np.float64).tolist()])
+        self._add(max(t, known), [t, *np.asarray(q, dtype=np.float64).tolist()])
 
-    def take_estimate(self, text: str, t: float) -> None:
+    def add_estimate(self, text: str, t: float) -> None:
         """Take in an estimate, JSON as of `Estimate.as_dict`, that is known from `t` in s on.
 
         It is followed if it says more than what is followed; one that is withdrawn lets the prior hold again.
         """
-        self._take(t, text)
+        self._add(t, text)
 
-    def _take(self, t: float, what: list[float] | str) -> None:
-        self.taken += 1
+    def _add(self, t: float, what: list[float] | str) -> None:
+        self.added += 1
         if t <= self.time:
             self.catch_up()
-            self._take_in(t, what)
+            self._use(t, what)
         elif isinstance(what, str) or len(self._due) < _MOST_DUE:
-            insort(self._due, (t, self.taken, what), key=lambda due: due[:2])
+            insort(self._due, (t, self.added, what), key=lambda due: due[:2])
         else:
             self.poses_dropped += 1
 
-    def _take_in(self, t: float, what: list[float] | str) -> None:
+    def _use(self, t: float, what: list[float] | str) -> None:
         if not isinstance(what, str):
             self._use_pose(what[0], np.array(what[1:]))
             return
@@ -479,6 +480,17 @@ class Follower:
                 self._begin_anew("")
         elif all(state.known for state in states) or (self.estimate is None and any(state.known for state in states)):
             self._begin_anew(what)
+
+    @property
+    def known(self) -> str:
+        """The estimate that is followed, JSON; empty: the prior."""
+        return self._text
+
+    def follow_estimate(self, known: str) -> None:
+        """Go on from here with what another one's `known` was."""
+        if known != self._text:
+            self.catch_up()
+            self._begin_anew(known)
 
     def _begin_anew(self, text: str) -> None:
         """Draw from what is known now; the members begin where those before them stand."""
@@ -503,13 +515,18 @@ class Follower:
         noise, bias, delay = self._sensor()
         if noise is not None:
             before = self._ensemble.outlying
-            used = self._ensemble.take_pose(t - delay, q - bias, noise)
+            used = self._ensemble.correct(t - delay, q - bias, noise, self._load_error())
             self.poses_used += used
             if not used and self._ensemble.outlying > before:
                 self.poses_outlying += 1
                 return
         if newest and np.isfinite(q).all():
             self._noise_rows.append(q)
+
+    def _load_error(self) -> Array:
+        """Return the error of the load, N and N m, that the estimate has found where the model describes roughly."""
+        found: Array = tuning.LOAD_ERROR_SHARE * self._load_share * 0.5 * (self._range[1] - self._range[0])
+        return found
 
     def _sensor(self) -> tuple[Array | None, Array, float]:
         """Return noise, None where too little was measured to tell, bias and delay of the sensor."""
@@ -555,6 +572,14 @@ class Follower:
 def follower(scene: Scene, follow: str, members: int, tol: float) -> Follower:
     """Return the twin of a scene that follows `full`, with so many members, or `parameters` alone."""
     return Follower(scene, members) if follow == "full" else Follower(scene, 1, tol=tol)
+
+
+def _load_share(text: str) -> Array:
+    """Return the load's error in shares of half its range, (3,), of an estimate, JSON; zero unless it is rough."""
+    found = json.loads(text) if text else {}
+    rough = State.ROUGH.value in [found.get(axis, {}).get("state") for axis in ("horizontal", "vertical")]
+    figures = found.get("figures", {}) if rough else {}
+    return np.array([figures.get(f"load_error_{name}", 0.0) for name in ("fx", "fy", "m")])
 
 
 def _facts(data: bytes) -> tuple[dict[str, Any], int]:
@@ -604,11 +629,13 @@ class Ensemble:
         self.first = Twin(scenes[0], tol=tol, excitation="sampled", start=start)
         self.others = TwinBatch(scenes[1:], tol=tol, start=start) if members > 1 else None
         self._scene, self._gain, self._rng = scene, gain, rng
+        #: error of each member's load, N and N m, and time in s up to which it has drifted
+        self._load_off, self._drifted = np.zeros((members, 3)), start
         self._walls = np.stack([penetration_rows(one) for one in scenes])
         self._clearance = np.array([[one.clearance.horizontal_m, one.clearance.vertical_m] for one in scenes])
         self._fastest = np.array([fastest_travel(one.wear, one.contact) for one in scenes])
         self._stiffness, self._exponent = np.array([one.contact.stiffness for one in scenes]), scene.contact.exponent
-        self._pressed = _PRESSED * scene.head.mass_kg * Gravity().acceleration_m_s2
+        self._pressed = tuning.PRESSED * scene.head.mass_kg * Gravity().acceleration_m_s2
         self.good = np.ones(members, dtype=bool)
         #: force, and peak and impulse since the span's begin
         self._told = np.zeros((members, 3, PAIR_COUNT))
@@ -644,7 +671,7 @@ class Ensemble:
 
     def advance_first(self, t: Array, wrench: Array, rows: Rows) -> int:
         """Advance the first member and write its rows, shape (n,); return how many advances failed."""
-        failed, _ = self.first.advance_rows(t, wrench * self._gain[0], rows)
+        failed, _ = self.first.advance_rows(t, wrench * self._gain[0] + self._load_off[0], rows)
         rows["followed"] = FOLLOWED
         return failed
 
@@ -657,7 +684,8 @@ class Ensemble:
         """
         parts = [_bytes(rows[None])]
         if self.others is not None:
-            parts.append(_bytes(self.others.advance_samples(t, wrench * self._gain[1:, None, :]).rows))
+            loads = wrench * self._gain[1:, None, :] + self._load_off[1:, None, :]
+            parts.append(_bytes(self.others.advance_samples(t, loads).rows))
         whole = np.concatenate(parts).view(ROW)
         good = whole["status"] == 0
         if len(self.good) == 1:
@@ -731,11 +759,10 @@ class Ensemble:
         use = self._used()
         excess = np.clip(self.square - self.square[use].min(), 0.0, 1e9)
         low, high = 0.0, 1.0
-        fewest = max(_FEWEST_CARRY * len(excess), FEWEST)
         for _ in range(40):
             share = 0.5 * (low + high)
             weight = np.where(use, np.exp(-0.5 * share * excess), 0.0)
-            enough = weight.sum() ** 2 > fewest * (weight**2).sum()
+            enough = weight.sum() ** 2 > FEWEST * (weight**2).sum()
             low, high = (share, high) if enough else (low, share)
         weight = np.where(use, np.exp(-0.5 * low * excess), 0.0)
         out = np.zeros((2, 3))
@@ -758,9 +785,11 @@ class Ensemble:
         if before._steers_first and not self._steers_first and before.good[0]:
             from_[1:2] = 0
         share = self._shares(before._room()[from_])
-        self.first.advance(self.first.time, wrench * self._gain[0])
+        self._load_off = before._load_off[from_]
+        loads = wrench * self._gain + self._load_off
+        self.first.advance(self.first.time, loads[0])
         if self.others is not None:
-            self.others.set_wrench(wrench * self._gain[1:])
+            self.others.set_wrench(loads[1:])
         self._path = deque((t, q[from_] * share) for t, q in before._path)
         self._told[1:], self._told[0] = before._told[from_[1:]], before._told[0]
         self._stand(self._path[-1][1], before._v[from_], before._force(before._depth)[from_])
@@ -796,9 +825,10 @@ class Ensemble:
         """Return poses nearer to the middle, as far as the head is free to move."""
         return np.where(self._free, share[:, None] * q, q)
 
-    def take_pose(self, t: float, q: Array, noise: Array) -> bool:
+    def correct(self, t: float, q: Array, noise: Array, load_error: Array) -> bool:
         """Move the members toward a pose measured at `t`, by their covariance with it; False if it is not used.
 
+        Their loads err by `load_error`, N and N m, shape (3,), and the pose corrects these errors too.
         Not used are poses that are too late, and outliers as long as few of them come in a row.
         """
         self.settle()
@@ -810,7 +840,8 @@ class Ensemble:
         path = np.stack([self._path[index][1] for index in range(after - 1, len(times))])
         share = min((t - times[after - 1]) / (times[after] - times[after - 1]), 1.0)
         then = ((1.0 - share) * path[0] + share * path[1])[:, there]
-        state = np.concatenate([self._v, *path], axis=1)
+        self._drift(load_error)
+        state = np.concatenate([self._v, *path, self._load_off], axis=1)
         use = self._used()
         if not self._steers_first and use[1:].any():
             use = use & (np.arange(len(use)) > 0)
@@ -818,7 +849,7 @@ class Ensemble:
         freedom = max(int(use.sum()) - 1, 1)
         scatter = seen[use].T @ seen[use] / freedom + np.diag(noise[there] ** 2)
         center = _off(q, then[use].mean(axis=0), there)
-        if (np.abs(center) <= _OUTLYING * np.sqrt(np.diag(scatter))).all():
+        if (np.abs(center) <= tuning.OUTLYING * np.sqrt(np.diag(scatter))).all():
             self.outlying = 0
         else:
             self.outlying += 1
@@ -828,19 +859,30 @@ class Ensemble:
         white[0] = 0.0
         off = _off(q, then, there)
         # no member is worse than an outlier: a bad pose that is used does not outweigh all others
-        most = _OUTLYING * noise[there]
+        most = tuning.OUTLYING * noise[there]
         self.square += ((off.clip(-most, most) / noise[there]) ** 2).sum(axis=1)
         weight = np.linalg.solve(scatter, seen[use].T @ about[use] / freedom)
-        weight[:, ~np.tile(self._free, len(path) + 1)] = 0.0
+        weight[:, ~np.tile(self._free, len(path) + 2)] = 0.0
         moved = state + (off + noise[there] * white) @ weight
-        v, places = moved[:, :3], moved[:, 3:].reshape(len(moved), -1, 3).transpose(1, 0, 2)
+        v, places = moved[:, :3], moved[:, 3:-3].reshape(len(moved), -1, 3).transpose(1, 0, 2)
         allowed = np.flatnonzero(self._allowed(places[-1], self._force(self._depth)))
         allowed = allowed[allowed >= 1 - self._steers_first]
         for place, index in enumerate(range(after - 1, len(times))):
             self._path[index][1][allowed] = places[place, allowed]
+        self._load_off[allowed] = moved[allowed, -3:]
         self._put(allowed, places[-1, allowed], v[allowed])
         self._recover()
         return True
+
+    def _drift(self, load_error: Array) -> None:
+        """Let the errors of the loads drift, as Ornstein-Uhlenbeck processes; that of the first has no noise."""
+        now, before = self.first.time, self._drifted
+        self._drifted = now
+        if load_error.any() or self._load_off.any():
+            kept = math.exp(-(now - before) / tuning.LOAD_ERROR_LASTS)
+            white = self._rng.standard_normal(self._load_off.shape)
+            white[0] = 0.0
+            self._load_off = kept * self._load_off + math.sqrt(1.0 - kept**2) * load_error * white
 
     def _recover(self) -> None:
         """Put members that have left the model's range where others are; if all have, they go on as they are."""
@@ -893,7 +935,8 @@ class Ensemble:
         """Return all that changes, as bytes and as JSON."""
         self.settle()
         times, path = np.array([time for time, _ in self._path]), np.stack([q for _, q in self._path])
-        arrays = (self.good, self.square, self._peak, self._impulse, self._v, self.worn, self._depth, times, path)
+        wide = (self._peak, self._impulse, self._v, self.worn, self._depth, self._load_off)
+        arrays = (self.good, self.square, *wide, np.array([self._drifted]), times, path)
         return [*self.twins(), *(one.tobytes() for one in arrays)], self._rng.bit_generator.state
 
     def set_state(self, blobs: list[bytes], random: Any) -> None:
@@ -901,8 +944,10 @@ class Ensemble:
         self.set_twins(blobs[:2])
         self.good = np.frombuffer(blobs[2], np.bool_).copy()
         count = len(self.good)
-        self.square, *wide, times, path = (np.frombuffer(blob).copy() for blob in blobs[3:])
-        self._peak[:], self._impulse[:], self._v, self.worn, self._depth = (one.reshape(count, -1) for one in wide)
+        self.square, *wide, drifted, times, path = (np.frombuffer(blob).copy() for blob in blobs[3:])
+        own = [one.reshape(count, -1) for one in wide]
+        self._peak[:], self._impulse[:], self._v, self.worn, self._depth, self._load_off = own
+        self._drifted = float(drifted[0])
         self._newest = None
         self._path = deque(zip(times.tolist(), path.reshape(-1, count, 3), strict=True))
         self._rng.bit_generator.state = random

@@ -266,7 +266,7 @@ class Health:
                 "real_time_factor_mean": f"{driver.real_time.mean():.4f}",
                 "solver_failures": str(driver.failed.count),
                 "coarse_advances": str(driver.session.twin.bounded),
-                "error_estimate_m": f"{driver.session.take_error_estimate():.3g}",
+                "error_estimate_m": f"{driver.session.pop_error_estimate():.3g}",
                 "resets": str(driver.resets),
             }
             keeper = runtime.wear_keeper

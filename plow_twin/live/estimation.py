@@ -91,7 +91,7 @@ class Estimation:
         """Whether much waits to be read by the estimate."""
         return self._worker.behind
 
-    def take(self, entry: Entry) -> None:
+    def add(self, entry: Entry) -> None:
         """Hand an entry that the session has accepted to the estimate."""
         match entry:
             case Sample(stamp_ns, wrench):
@@ -119,7 +119,7 @@ class Estimation:
                 if self._follows:
                     self._forget()
 
-    def take_series(self, series: Series) -> None:
+    def add_series(self, series: Series) -> None:
         """Hand samples that have been applied at once to the estimate."""
         for stamp_ns, wrench in zip(series.stamps.tolist(), series.wrench.tolist(), strict=True):
             self._worker.add_load(stamp_ns, tuple(wrench))

@@ -391,7 +391,7 @@ class Runtime:
         if self.recording:
             self.recording.series(series)
         if self.estimation:
-            self.estimation.take_series(series)
+            self.estimation.add_series(series)
 
     def _send(self, outgoing: Iterable[Outgoing]) -> None:
         for topic, message in outgoing:
@@ -451,20 +451,20 @@ class Runtime:
         if estimation is None:
             return recording.journal if recording else _ignore
         if recording is None:
-            return estimation.take
+            return estimation.add
 
         def both(entry: Entry) -> None:
             recording.journal(entry)
-            estimation.take(entry)
+            estimation.add(entry)
 
         return both
 
-    def take_travel(self, stamp_ns: int, speed_m_s: float) -> None:
+    def add_travel(self, stamp_ns: int, speed_m_s: float) -> None:
         """Take a speed along the face."""
         if self.inputs.uses_travel(stamp_ns, speed_m_s):
             self.driver.travel(stamp_ns, speed_m_s)
 
-    def take_pose(self, stamp_ns: int, pose: tuple[float, float, float], deviation: tuple[float, ...] = ()) -> None:
+    def add_pose(self, stamp_ns: int, pose: tuple[float, float, float], deviation: tuple[float, ...] = ()) -> None:
         """Take a measured pose, as `Inputs.uses_pose`."""
         if not self.inputs.uses_pose(stamp_ns, pose, deviation):
             return
@@ -476,7 +476,7 @@ class Runtime:
         if self.alarms.feed_pose(stamp_ns, pose):
             self._send(self.publishing.alarms_changed(stamp_ns))
 
-    def take_gaps(self, stamp_ns: int, gaps: Mapping[int, float]) -> None:
+    def add_gaps(self, stamp_ns: int, gaps: Mapping[int, float]) -> None:
         """Take measured gaps [m] by number of their pairs."""
         if self.inputs.uses_gaps(stamp_ns, gaps):
             self.driver.session.apply(Gaps(stamp_ns, tuple(gaps), tuple(gaps.values())))

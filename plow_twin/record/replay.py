@@ -118,6 +118,13 @@ def _sink(folder: Path, header: RunHeader) -> RunWriter:
     return RunWriter(folder, full, chunk_size=2**20, min_free_bytes=0)
 
 
+def following_twin(header: RunHeader, scene: Scene) -> Driven:
+    """Return a twin that follows its measurements as that of a run did."""
+    from plow_twin.estimate.follow import MEMBERS, follower
+
+    return follower(scene, header.follow, int(header.parameters.get("follow_members", MEMBERS)), header.tol)
+
+
 class _Replay:
     """The state of one replay: a session, and whether it is where the live one was."""
 
@@ -138,9 +145,7 @@ class _Replay:
         twin: Driven = Twin(scene, tol=header.tol, excitation=excitation, max_evaluations=bound)
         self.follows = header.follow != "off"
         if self.follows:
-            from plow_twin.estimate.follow import MEMBERS, follower
-
-            twin = follower(scene, header.follow, int(header.parameters.get("follow_members", MEMBERS)), header.tol)
+            twin = following_twin(header, scene)
         twin.warm_up()
         templates = publication_templates(header.frame_id, header.child_frame_id)
         self.templates = Templates.of(templates[name] for name in PUBLICATION_TOPICS)

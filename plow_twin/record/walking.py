@@ -18,7 +18,21 @@ from plow_twin.record.entries import Entries, Holes
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.run.advance import AdvanceSeries
 from plow_twin.solve.state import ROW
-from plow_twin.stream.journal import Digest, Entry, Loss, Reset, Restore, SetModel, SetWear, Snapshot, Travel
+from plow_twin.stream.journal import (
+    Digest,
+    Entry,
+    Estimated,
+    Loss,
+    Parameter,
+    PartOfPose,
+    Pose,
+    Reset,
+    Restore,
+    SetModel,
+    SetWear,
+    Snapshot,
+    Travel,
+)
 from plow_twin.stream.outputs import Published
 from plow_twin.stream.session import DIGEST_INTERVAL, Applied, Session
 
@@ -29,6 +43,8 @@ if TYPE_CHECKING:
 BATCH: Final = 4096
 #: Entries that change the walk of a journal; late samples are sorted in across all others.
 _ACTING: Final = (Travel, Reset, Loss, Restore, Snapshot, SetModel, SetWear)
+#: Those that change a motion that follows measurements, too.
+_FOLLOWED: Final = (Pose, PartOfPose, Estimated, Parameter)
 #: Failed advances in a row after which the model is reset.
 _FAILURE_LIMIT: Final = 10
 
@@ -172,7 +188,8 @@ class JournalWalk:
     whole
         Whether the journal begins with the run; otherwise its first snapshot is restored.
     same_scene
-        Whether `own` have the scene of the run: then they follow changes of the model and restored motions.
+        Whether `own` have the scene of the run: then they follow changes of the model and restored motions; one whose
+        twin follows measurements gets these too.
     """
 
     def __init__(
@@ -180,6 +197,8 @@ class JournalWalk:
     ) -> None:
         self._own, self._all = own, (*own, *others)
         self._same = own if same_scene else ()
+        self._following = [walker for walker in self._same if walker.session.following is not None]
+        self._acting = (*_ACTING, *_FOLLOWED) if self._following else _ACTING
         #: speeds by their stamps, which have not been reached
         self._travels: list[Travel] = []
         self._lost = not whole
@@ -203,7 +222,7 @@ class JournalWalk:
 
     def _whole(self, entries: Entries) -> None:
         stamps, wrench, begin = entries.stamp_ns, entries.wrench, 0
-        acting = sorted(place for place, entry in entries.rest.items() if isinstance(entry, _ACTING))
+        acting = sorted(place for place, entry in entries.rest.items() if isinstance(entry, self._acting))
         for place in (*acting, len(entries)):
             samples = begin + np.flatnonzero(entries.sample[begin:place])
             if samples.size:
@@ -256,6 +275,9 @@ class JournalWalk:
                     walker.apply(entry if walker in self._same else Reset(0, "restore"))
             case SetModel():
                 for walker in self._same:
+                    walker.apply(entry)
+            case Pose() | PartOfPose() | Estimated() | Parameter():
+                for walker in self._following:
                     walker.apply(entry)
             case Snapshot() if self._lost:
                 for walker in self._own:

@@ -231,14 +231,14 @@ class Subscriptions:
 
     def _travel_speeds(self, batch: list[Taken]) -> None:
         for message in self._messages("travel", TwistStamped, self._inputs.travel, batch):
-            self._runtime.take_travel(stamp_ns(message.header), message.twist.linear.z)
+            self._runtime.add_travel(stamp_ns(message.header), message.twist.linear.z)
 
     def _measured_gaps(self, batch: list[Taken]) -> None:
         for message in self._messages("gaps", JointState, self._inputs.gaps, batch):
             named, stamp = set(message.name), stamp_ns(message.header)
             if len(message.position) == len(message.name) == len(named) and named <= _PAIR_NUMBERS.keys():
                 gaps = {_PAIR_NUMBERS[name]: gap for name, gap in zip(message.name, message.position, strict=True)}
-                self._runtime.take_gaps(stamp, gaps)
+                self._runtime.add_gaps(stamp, gaps)
             else:
                 self._inputs.gaps.refuse(Verdict.MALFORMED, stamp, tuple(message.position))
 
@@ -252,7 +252,7 @@ class Subscriptions:
                 continue
             theta = 2.0 * math.atan2(turn.z, turn.w)
             deviation = deviations(message.pose.covariance) if with_covariance else ()
-            self._runtime.take_pose(stamp, (pose.position.x, pose.position.y, theta), deviation)
+            self._runtime.add_pose(stamp, (pose.position.x, pose.position.y, theta), deviation)
 
     def _messages(self, topic: str, kind: type, intake: Intake, batch: list[Taken]) -> Iterator[Any]:
         """Yield the messages of an input other than the load; count unreadable ones."""

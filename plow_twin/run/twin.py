@@ -47,7 +47,7 @@ __all__ = ["Advance", "AdvanceSeries", "Status", "Twin"]
 DEFAULT_BUDGET = 50_000_000
 #: The compiled kernels, by a key that determines the types of their arguments; numba's dispatch takes milliseconds.
 _entries: dict[tuple[Any, ...], Callable[..., bool]] = {}
-_NO_MARKS = np.zeros(0, np.int64)
+_NO_DIGESTS = np.zeros(0, np.int64)
 _THE_ONE = np.zeros(1, np.int64)
 #: Fewest evaluations that an advance can be bounded to: four Runge-Kutta steps.
 LEAST_EVALUATIONS = 16
@@ -225,7 +225,7 @@ class Twin:
         t: NDArray[np.float64],
         wrench: NDArray[np.float64],
         rows: NDArray[np.void] | None,
-        marks: NDArray[np.int64] = _NO_MARKS,
+        digest_after: NDArray[np.int64] = _NO_DIGESTS,
     ) -> Advanced:
         """Advance to some times: the way of every advance.
 
@@ -237,7 +237,7 @@ class Twin:
             Fx, Fy [N] and M [N m] about the cavity's centre at each time; not used with `excitation="scene"`.
         rows : ndarray of `ROW`, shape (n,), or None
             Receives a row for each time. Without rows the motion is the same, and no forces are computed for output.
-        marks : ndarray of int64, shape (m,)
+        digest_after : ndarray of int64, shape (m,)
             Rising numbers from 1 to n: counts of advances after which a digest is made.
 
         Returns
@@ -259,11 +259,11 @@ class Twin:
             per_inertia = self._one_load if count == 1 else np.empty((1, count + 1, 3))
             if wrench.shape != (count, 3) or not lay_out(self._wrench, wrench, self._inertias, per_inertia[0]):
                 raise ArgumentError(f"wrench: got {wrench!r}, expected finite numbers of shape ({count}, 3)")
-        snapshots = np.zeros(len(marks), self._states.dtype) if len(marks) else self._no_snapshots
+        snapshots = np.zeros(len(digest_after), self._states.dtype) if len(digest_after) else self._no_snapshots
         arguments = (
             self._params, self._parts, self._states, self._pace.saved, self._works,
             None if rows is None else self._all_totals, 0, 1, t, per_inertia, self._budget,
-            None if rows is None else rows[None], marks, snapshots, self._bound, self._pace.argument,
+            None if rows is None else rows[None], digest_after, snapshots, self._bound, self._pace.argument,
         )  # fmt: skip
         if with_rows not in self._kernels:
             self._kernels[with_rows] = self._kernel((sampled, with_rows), arguments)
@@ -273,7 +273,7 @@ class Twin:
             self._stopped(stop, count, wrench if sampled else None, rows)
         if sampled and count:
             self._wrench[:] = wrench[-1]
-        digests = self._digests(snapshots, wrench[marks - 1]) if len(marks) else []
+        digests = self._digests(snapshots, wrench[digest_after - 1]) if len(digest_after) else []
         return Advanced(self._pace.failed.item(), digests)
 
     @property

@@ -42,7 +42,7 @@ class Driven(Protocol):
     def warm_up(self) -> float: ...  # noqa: D102
     def advance(self, t: float, wrench: ArrayLike | None = None) -> Advance: ...  # noqa: D102
     def advance_rows(  # noqa: D102
-        self, t: Array, wrench: Array, rows: NDArray[np.void] | None, marks: NDArray[np.int64] = ...
+        self, t: Array, wrench: Array, rows: NDArray[np.void] | None, digest_after: NDArray[np.int64] = ...
     ) -> Advanced: ...
     def reset(self, t: float, *, wear_depth: ArrayLike | None = None, pose: Any = None) -> None: ...  # noqa: D102
     def set_travel_speed(self, speed_m_s: float) -> None: ...  # noqa: D102
@@ -56,18 +56,25 @@ class Following(Driven, Protocol):
     """A twin that follows measurements; its rows have more columns (`followed` in `plow_twin.solve.state.ROW`)."""
 
     #: poses and estimates that it has taken in
-    taken: int
+    added: int
     #: whether a row that is published by itself gets its intervals, and what was measured acts, with `catch_up` only
     defers: bool
 
     def catch_up(self) -> None:
         """Do what the newest row left over, if it is not done; every other call does it first."""
 
-    def take_pose(self, t: float, q: ArrayLike, known: float = ...) -> None:
+    def add_pose(self, t: float, q: ArrayLike, known: float = ...) -> None:
         """Add a pose measured at model time `t` in s, shape (3,), NaN where not measured; it acts from `known` on."""
 
-    def take_estimate(self, text: str, t: float) -> None:
+    def add_estimate(self, text: str, t: float) -> None:
         """Add an estimate, JSON, known from model time `t` in s on."""
+
+    @property
+    def known(self) -> str:
+        """The estimate that is followed, JSON; empty: the prior."""
+
+    def follow_estimate(self, known: str) -> None:
+        """Continue from the present state with the estimate that `known` was."""
 
     def follow_parameters(self) -> None:
         """Continue with a single twin from the state of the median twin, without corrections by poses."""

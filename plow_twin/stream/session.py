@@ -358,14 +358,16 @@ class Session:
             return None
         count = len(stamps)
         first = DIGEST_INTERVAL - self._advances % DIGEST_INTERVAL
-        marks = np.arange(first, count + 1, DIGEST_INTERVAL)
+        digest_after = np.arange(first, count + 1, DIGEST_INTERVAL)
         taken = np.arange(count) if each else NONE
         try:
-            found = self._advance(stamps, wrench, self._stock.new(count), taken, marks, undo=self.twin.snapshot())
+            found = self._advance(
+                stamps, wrench, self._stock.new(count), taken, digest_after, undo=self.twin.snapshot()
+            )
         except _UndoneError:
             return None
         self._advances += count
-        return Series(stamps, wrench, found.published, found.digests, marks)
+        return Series(stamps, wrench, found.published, found.digests, digest_after)
 
     @property
     def wear_depth(self) -> NDArray[np.float64]:
@@ -384,7 +386,7 @@ class Session:
         wrench: NDArray[np.float64],
         rows: Rows | None,
         taken: NDArray[np.int64] = NONE,
-        marks: NDArray[np.int64] = NONE,
+        digest_after: NDArray[np.int64] = NONE,
     ) -> Applied:
         """Advance to samples: the way of every sample, live or replayed. Nothing is emitted.
 
@@ -398,7 +400,7 @@ class Session:
             Receives the rows; None: no row is read out, and `outputs` gets none.
         taken : ndarray of int64
             As of `Outputs.add`.
-        marks : ndarray of int64, shape (m,)
+        digest_after : ndarray of int64, shape (m,)
             Rising numbers from 1 to n: counts of samples after which a digest is made.
 
         Raises
@@ -411,9 +413,9 @@ class Session:
                 f"stamp: got {stamps[0]} ns first, expected stamps that do not fall, after {self.stamp_ns} ns"
             )
         if self.held or self._travels:
-            found = self._advance_in_pieces(stamps, wrench, rows, taken, marks)
+            found = self._advance_in_pieces(stamps, wrench, rows, taken, digest_after)
         else:
-            found = self._advance(stamps, wrench, rows, taken, marks)
+            found = self._advance(stamps, wrench, rows, taken, digest_after)
         self._advances += len(stamps)
         return found
 
@@ -423,7 +425,7 @@ class Session:
         wrench: NDArray[np.float64],
         rows: Rows | None,
         taken: NDArray[np.int64],
-        marks: NDArray[np.int64],
+        digest_after: NDArray[np.int64],
     ) -> Applied:
         """Advance where speeds along the face are to come, or the load was held until now."""
         if not np.isfinite(wrench).all():
@@ -441,12 +443,9 @@ class Session:
                 end = begin + 1
             here = slice(begin, end)
             chosen = taken[(taken >= begin) & (taken < end)] - begin
-            marked = marks[(marks > begin) & (marks <= end)] - begin
-            parts.append(
-                self._advance(
-                    stamps[here], wrench[here], None if rows is None else rows[here], chosen, marked, resumed=resumed
-                )
-            )
+            here_after = digest_after[(digest_after > begin) & (digest_after <= end)] - begin
+            told = None if rows is None else rows[here]
+            parts.append(self._advance(stamps[here], wrench[here], told, chosen, here_after, resumed=resumed))
             if resumed:
                 self._remember()
             begin, resumed = end, False
@@ -462,7 +461,7 @@ class Session:
         """Raise an `ArgumentError` when the model cannot be changed so while it runs."""
         self._changed_twin(changes)
 
-    def take_error_estimate(self) -> float:
+    def pop_error_estimate(self) -> float:
         """Return the largest error [m] that `max_evaluations` is estimated to have made since the last call."""
         largest, self._largest_error_m = self._largest_error_m, 0.0
         return largest
@@ -507,7 +506,7 @@ class Session:
         wrench: NDArray[np.float64],
         rows: Rows | None,
         taken: NDArray[np.int64],
-        marks: NDArray[np.int64],
+        digest_after: NDArray[np.int64],
         *,
         resumed: bool = False,
         undo: bytes | None = None,
@@ -524,7 +523,7 @@ class Session:
             self.following.end_spans(taken, begins=not self.outputs.waits)
         times = np.empty(len(stamps))
         model_times(stamps, origin_ns, times)
-        failed, digests = self.twin.advance_rows(times, wrench, rows, marks)
+        failed, digests = self.twin.advance_rows(times, wrench, rows, digest_after)
         if undo is not None and (failed or not _all_finite(rows)):
             self.twin.restore(undo)
             raise _UndoneError
@@ -544,12 +543,12 @@ class Session:
             return
         time = (stamp_ns - self.origin_ns) * 1e-9
         if isinstance(entry, Estimated):
-            self.following.take_estimate(entry.result, time)
+            self.following.add_estimate(entry.result, time)
         else:
-            self.following.take_pose(time, entry.pose if isinstance(entry, Pose) else whole_pose(entry), known)
+            self.following.add_pose(time, entry.pose if isinstance(entry, Pose) else whole_pose(entry), known)
         measured, earliest_ns, reached_ns = self._measured, self.history.earliest_ns, self.stamp_ns or 0
         known = max(known, self.following.time)
-        measured.append(_Measured(self.following.taken, reached_ns, known, stamp_ns, entry))
+        measured.append(_Measured(self.following.added, reached_ns, known, stamp_ns, entry))
         while measured and (earliest_ns is None or measured[0].reached_ns < earliest_ns):
             measured.popleft()
         if len(measured) > MOST_MEASURED:
@@ -606,7 +605,7 @@ class Session:
             # each as early as it was known: going back depends on publications, which must not change the motion
             measured, self._measured = self._measured, deque()
             for one in measured:
-                if one.number > self.following.taken:
+                if one.number > self.following.added:
                     self._follow(one.stamp_ns, one.entry, one.known)
                 else:
                     self._measured.append(one)
@@ -759,12 +758,15 @@ class Session:
         end = _HEADER.size + travels * _TRAVEL.size
         depth = np.frombuffer(data, np.float64, PAIR_COUNT, offset=end)
         twin_data, changes = self._split_twin(data[end + _WEAR_SIZE + self.outputs.state_size() :])
+        known = "" if self.following is None else self.following.known
         if changes == self.changes and (depth == self.wear_depth).all():
             self.twin.restore(twin_data)
         else:
             saved = self.twin.like(changed_scene(self._scene, changes))
             saved.restore(twin_data)
             self._carry(saved)
+        if self.following is not None:
+            self.following.follow_estimate(known)
         if self._wears:
             self.twin.set_travel_speed(self._speed)
         self.outputs.restart()

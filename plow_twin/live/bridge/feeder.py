@@ -250,10 +250,10 @@ class Feeder:
         elif not role.plausible(found[1]):
             intake.refuse(Verdict.IMPLAUSIBLE, found[0], tuple(found[1].values()))
         elif name == "travel":
-            self._runtime.take_travel(found[0], found[1]["speed"])
+            self._runtime.add_travel(found[0], found[1]["speed"])
         elif name == "gaps":
             gaps = {PAIR_NAMES.index(pair): gap for pair, gap in found[1].items() if not math.isnan(gap)}
-            self._runtime.take_gaps(found[0], gaps)
+            self._runtime.add_gaps(found[0], gaps)
         else:
             x, y, theta = (found[1].get(name, math.nan) for name in ROLES["head_pose"])
-            self._runtime.take_pose(found[0], (x, y, theta))
+            self._runtime.add_pose(found[0], (x, y, theta))

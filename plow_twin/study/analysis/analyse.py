@@ -22,6 +22,7 @@ from plow_twin.record.follow import Tail
 from plow_twin.record.importing import Feed
 from plow_twin.record.mapping import UNFIT, Role, messages_of, read_map, readings, roles_by_source, with_units
 from plow_twin.record.reader import FileStatus, RunReader, own_run
+from plow_twin.record.replay import following_twin
 from plow_twin.record.sources import open_source, packed
 from plow_twin.record.unit_check import check_units
 from plow_twin.record.walking import JournalWalk, Walked, Walker
@@ -351,13 +352,14 @@ def _walk_own(
     header = reader.header
     if header.excitation_source == "scene":
         raise RecordingError(f"{reader.path}: excitation_source: got scene, expected a run under sampled loads")
-    walkers = [
-        Walker(_session(prediction.scene, header.tol, header.origin_ns), prediction.walked)
-        for prediction in predictions
-    ]
+    own = predictions[0].name == _OF_THE_RUN
+    sessions = [_session(prediction.scene, header.tol, header.origin_ns) for prediction in predictions]
+    if own and header.follow != "off":
+        sessions[0] = Session(following_twin(header, predictions[0].scene), header.origin_ns)
+    walkers = [Walker(session, prediction.walked) for session, prediction in zip(sessions, predictions, strict=True)]
     for walker, prediction in zip(walkers, predictions, strict=True):
         walker.on_reset = prediction.restart
-    walk = JournalWalk(walkers[:1], walkers[1:], whole=not header.part, same_scene=predictions[0].name == _OF_THE_RUN)
+    walk = JournalWalk(walkers[:1], walkers[1:], whole=not header.part, same_scene=own)
     journalled = Measured()  # where the node estimates
 
     def so_far() -> Analysis:
