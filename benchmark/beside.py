@@ -19,7 +19,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "benchmark" / "results" / "beside.md"
-#: Only what both commits offer: runs as in README.
+#: Only features of both commits: runs as in README.
 _WORK = """
 import json, sys, time
 import numpy as np

@@ -26,7 +26,7 @@ def package_version() -> str:
 
 @cache
 def build_fingerprint() -> Mapping[str, str]:
-    """Return what the exact bits of a run depend on: versions, processor, platform, a hash of the numeric sources."""
+    """Return the causes of the exact bits of a run: versions, processor, platform, a hash of the numeric sources."""
     import llvmlite.binding
     import numba
 

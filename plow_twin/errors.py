@@ -60,7 +60,7 @@ class InputError(PlowTwinError, ValueError):
     problems : tuple of Problem
         All that is wrong.
     source : str
-        Name of the file, or of what was given.
+        Name of the file or other input.
     """
 
     def __init__(self, problems: Iterable[Problem], source: str) -> None:
@@ -130,7 +130,7 @@ class RecordingError(PlowTwinError, ValueError):
 
 
 class ExcessError(RecordingError):
-    """A file is larger, deeper or wider than what is read; the message names the bound."""
+    """A file is larger, deeper or wider than the bounds; the message names the bound."""
 
 
 class UnitError(RecordingError):

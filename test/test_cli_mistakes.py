@@ -117,7 +117,7 @@ def test_a_stranger_s_mistake_is_named_in_a_message(
     assert cli(arguments) == code
     shown = capsys.readouterr().err
     assert said in " ".join(shown.split()), shown
-    # one line says what is wrong; nothing of the file is printed, and nothing is left behind
+    # one line names the mistake; no content of the file is printed, and no file is left behind
     assert len([line for line in shown.splitlines() if not line.startswith("Usage")]) <= 3 and len(shown) < 500
     assert sorted(desk.rglob("*")) == before
 

@@ -115,7 +115,7 @@ def test_a_file_is_fed_recorded_and_replayed_and_every_row_is_counted(
     report = replay(tmp_path / "run")
     assert (report.samples, report.exit_code, report.first_divergence) == (1000, 0, None)
     assert report.compared["contact_forces"] == 1000
-    # the file tells the same of what was not used as the counters, and what it was
+    # the file agrees with the counters of unused messages, and has their content
     told = {key.removeprefix("dropped_"): int(count) for key, count in dropped.items()}
     assert report.inputs == examine(tmp_path / "run").inputs == {"excitation": {"used": 1000, **told}}
     unused = {found["reason"]: found for found in unused_messages(tmp_path / "run")}
@@ -274,7 +274,7 @@ def test_the_senders_own_numbers_show_loss_repetition_and_a_new_start(tmp_path: 
         json.dumps({"time": 1000 + index, "load": {"f": [index, 2, 3]}, "n": n}) for index, n in enumerate(numbers)
     ]
     path = tmp_path / "plough.csv"
-    # what cannot be read before the first number is no number 1
+    # an unreadable message before the first number does not count as number 1
     path.write_text("\n".join(["{}", "nothing", *lines, '{"n": 60, "load"']) + "\n", encoding="utf-8")
     mapping = tmp_path / "map.yaml"
     mapping.write_text(
@@ -329,7 +329,7 @@ def test_a_mapping_takes_units_offsets_clocks_and_names_its_faults(tmp_path: Pat
     assert time_ns(1_767_323_045_123_456_789, "ns") == 1_767_323_045_123_456_789
     assert time_ns(0.5) == 1_500_000_000  # counts from some start: 0 would be no stamp
     assert time_ns("yesterday") is None and time_ns(float("inf")) is None and time_ns(1e300) is None
-    # what many a database writes for no date, and what no stamp can hold
+    # the empty date of many databases, and a date that no stamp can hold
     assert time_ns("9999-12-31") is None and time_ns("2300-01-01T00:00:00") is None and time_ns("0001-01-01") is None
     assert time_ns(10**400) is None and time_ns("20260102") == (20_260_102 + 1) * 10**9
     for text, said in (
@@ -455,7 +455,7 @@ class Live:
         self.alarms: list[dict[str, Any]] = []
 
     def until(self, reached: Callable[[dict[str, dict[str, Any]]], bool], what: str) -> dict[str, str]:
-        """Read what it says until something is true; return the values of its input part."""
+        """Read its output until a condition holds; return the values of its input part."""
         give_up = time.monotonic() + START_S
         assert self.process.stdout is not None
         while not ("input" in self.heard and reached(self.heard)):
@@ -515,7 +515,7 @@ def test_an_alarm_is_reported_once_with_value_pad_threshold_and_time_and_acknowl
     # the address of a socket is short, unlike a folder of tests
     path, control = _csv(tmp_path / "load.csv", 5000), Path(tempfile.mkdtemp(dir="/tmp")) / "twin.socket"
     control.touch()
-    assert run_cli(["live", str(path), "--control", str(control)]) == 1  # what is there is no socket of a twin
+    assert run_cli(["live", str(path), "--control", str(control)]) == 1  # the existing file is no socket of a twin
     assert "cannot be a socket" in capsys.readouterr().err
     control.unlink()
     thresholds = ("--set", "alarm_force=[20e3,1e9]", "--set", "alarm_duration=0.002")
@@ -1080,7 +1080,7 @@ def _troubled_rows(seed: int, count: int) -> Iterator[str]:
 def _recorded(run: Path) -> tuple[list[Any], list[Any]]:
     """Return journal and outputs of a recording, each output with the number of entries before it.
 
-    Without what the time on the wall decides: the status, and when unused messages are noted.
+    Without the parts that wall-clock time decides: the status, and the time of notes on unused messages.
     """
     entries: list[EntryRecord] = []
     outputs = []

@@ -1,4 +1,4 @@
-"""A live twin that follows its machine: what it takes over, undoes, corrects, and gives again from the journal."""
+"""A live twin that follows its machine: estimates taken over, undone, corrected, and the same from the journal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The load made of what the drive tells: figures by hand, the interval by chance, and the way into the journal."""
+"""The load from the drive's signals: figures by hand, the interval by random draws, and the way into the journal."""
 
 from __future__ import annotations
 

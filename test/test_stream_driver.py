@@ -340,7 +340,7 @@ def test_single_calls_of_the_session_give_the_driver_s_bits_for_any_input(max_st
     done = 0
 
     def follow() -> None:
-        """Apply what the driver has journaled, entry by entry."""
+        """Apply the driver's journal, entry by entry."""
         nonlocal done
         for entry in journal[done:]:
             if not isinstance(entry, Digest):

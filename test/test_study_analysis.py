@@ -140,7 +140,7 @@ def test_poses_in_the_journal_are_measured_ones(tmp_path: Path) -> None:
 
 
 def test_a_run_is_predicted_with_all_that_was_done_to_the_model_while_it_ran(tmp_path: Path) -> None:
-    """Other numbers, a motion restored, poses and speeds between the samples: the contacts bore what was recorded."""
+    """Other numbers, a motion restored, poses and speeds between the samples: the contacts bore the recorded forces."""
     samples = [*map(paper_sample, range(1500))]
     session = Session(Twin(load_scene(PAPER), excitation="sampled"))
     for sample in samples[:400]:

@@ -1,4 +1,4 @@
-"""Outputs of a node to a plant: a process beside it sends what its topics say, and calls its service."""
+"""Outputs of a node to a plant: a process beside it sends the numbers of its topics, and calls its service."""
 
 from __future__ import annotations
 

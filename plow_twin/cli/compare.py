@@ -129,7 +129,7 @@ def _show(found: Comparison) -> None:
         console.print(f"clearance [%]: {', '.join(changes)}", highlight=False)
 
 
-#: Signs of the causes of a change, and what they mean.
+#: Signs of the causes of a change, and their meanings.
 _SIGNS: Final = {"chance": "", "machine": "M", "load": "L", "load or machine": "?"}
 _KEY: Final = "(M: the machine, L: the load, ?: either; no letter: may be chance)"
 

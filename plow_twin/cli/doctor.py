@@ -19,7 +19,7 @@ from plow_twin.cli.console import DONE, DONE_WITH_LOSS, json_option, output_cons
 @click.option("--repair", is_flag=True, help="Rewrite parts that were cut off or damaged; the old ones are kept.")
 @json_option
 def doctor(recording: Path, repair: bool, as_json: bool) -> int:
-    """Say what is in RECORDING and what is missing; with --repair give its parts their end again."""
+    """Report content and losses of RECORDING; with --repair complete its parts."""
     from plow_twin.record.doctor import examine
     from plow_twin.record.doctor import repair as make_whole
 

@@ -37,7 +37,7 @@ from plow_twin.cli.console import (
 def record(
     run: Path, topics: tuple[str, ...], every: bool, exclude: str | None, wait: float, as_json: bool, quiet: bool
 ) -> int:
-    """Record topics into the folder of RUN, beside what the twin records, until interrupted.
+    """Record topics into the folder of RUN, beside the twin's recording, until interrupted.
 
     RUN is the recording that the twin is making (its `record_path`, or the newest of RUN_2, ...); without one the
     folder is made, and the twin takes it later.

@@ -96,7 +96,7 @@ def view(
 ) -> int:
     """Make a .rrd of RECORDING: the cross-section in motion, force and clearance curves, the event log.
 
-    A recording of another program (--scene, --map) is drawn with what the model computes of its load, as by analyse.
+    A recording of another program (--scene, --map) is drawn with the motion that the model computes, as by analyse.
     """
     from plow_twin.record.reader import mcap_path
 

@@ -1,4 +1,4 @@
-"""The messages of a batch as arrays of numbers: what a view or a table needs, at a fraction of the cost of objects."""
+"""The messages of a batch as arrays of numbers, for views and tables, at a fraction of the cost of objects."""
 
 from __future__ import annotations
 

@@ -106,7 +106,7 @@ def _integers(topic: Topic) -> NDArray[np.bool_]:
 
 
 def warm_up() -> None:
-    """Compile what is needed, or load it from the cache on disk."""
+    """Compile the kernels, or load them from the cache on disk."""
     Messages("", "").write(Published(np.zeros(1, ROW), NOTHING.slow))
 
 

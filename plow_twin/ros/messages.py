@@ -48,7 +48,7 @@ def set_stamp(header: Header, stamp: int) -> None:
 def read_wrench(data: bytes) -> Read:
     """Decode the CDR bytes of a `WrenchStamped`: Fx, Fy [N] and M [N m].
 
-    One sample costs a tenth of what rclpy's own message objects cost.
+    One sample costs a tenth of the time of rclpy's own message objects.
     """
     try:
         start, numbers = _WRENCH_LAYOUTS[data[1] & 1]

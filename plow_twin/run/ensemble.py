@@ -141,7 +141,7 @@ _SHARES = 4
 
 
 class _Run:
-    """The run of an ensemble: what its threads share."""
+    """The run of an ensemble: the state that its threads share."""
 
     def __init__(
         self,

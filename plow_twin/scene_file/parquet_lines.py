@@ -151,7 +151,7 @@ def _is_plain(kind: pa.DataType) -> bool:
 
 
 def _as_text(batch: pa.RecordBatch) -> pa.RecordBatch:
-    """Return columns that are written as what they mean: instants in UTC, durations in seconds, numbers exactly."""
+    """Return columns written by their meaning: instants in UTC, durations in seconds, numbers exactly."""
     import pyarrow as pa
 
     columns = []
