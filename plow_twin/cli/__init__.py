@@ -26,7 +26,11 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
             import plow_twin.run.twin  # noqa: F401
             from plow_twin.cli.app import main as run
         except (ImportError, OSError, MemoryError) as error:  # memory for libraries is short, or one is missing
-            sys.exit(f"plow-twin: a library cannot be loaded: {error.__context__ or error or 'not enough memory'}")
+            newer = (
+                "" if sys.version_info < (3, 13) else f"; this is Python 3.{sys.version_info[1]}, expected 3.11 or 3.12"
+            )
+            why = error.__context__ or error or "not enough memory"
+            sys.exit(f"plow-twin: a library cannot be loaded: {why}{newer}")
 
     run(arguments)
 

@@ -1,0 +1,134 @@
+"""A machine that lacks something: the twin works, or names in one line what is missing."""
+
+from __future__ import annotations
+
+import os
+import resource
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from test_live import ROOT, _csv
+
+from plow_twin.cli.app import EXTRA_OF_MODULE
+from plow_twin.record.replay import replay
+
+LIVE = ("live", "load.csv", "--scene", "paper", "--record", "run", "-q")
+
+
+def _limit(kind: int, most: int) -> Callable[[], None]:
+    return lambda: resource.setrlimit(kind, (most, most))
+
+
+def _run(
+    folder: Path, *words: str, before: Callable[[], None] | None = None, **environment: str | None
+) -> tuple[int, list[str]]:
+    """Run a command where something is missing; return its exit code and what it said on standard error."""
+    given = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "10000", **environment}
+    done = subprocess.run(
+        [sys.executable, "-m", "plow_twin", *words],
+        cwd=folder,
+        env={name: value for name, value in given.items() if value is not None},
+        preexec_fn=before,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        check=False,
+    )
+    return done.returncode, done.stderr.splitlines()
+
+
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Have the compiled code in the cache: the compiler needs more than what a run does."""
+    folder = tmp_path_factory.mktemp("compiled")
+    _csv(folder / "load.csv", 100)
+    assert _run(folder, *LIVE) == (0, [])
+
+
+@pytest.fixture
+def folder(compiled: None, tmp_path: Path) -> Path:
+    _csv(tmp_path / "load.csv", 1500)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    "lacking",
+    [
+        {"before": _limit(resource.RLIMIT_AS, 3_000_000_000)},
+        {"before": _limit(resource.RLIMIT_NOFILE, 64)},
+        {"HOME": None, "XDG_CACHE_HOME": None},
+        {"HOME": "/proc/nothing", "XDG_CACHE_HOME": "/proc/nothing"},
+        {"LC_ALL": "C", "LANG": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
+        {"TERM": None, "COLUMNS": "20"},
+    ],
+    ids=["3 GB of addresses", "64 files", "no home", "a home that is not there", "the locale C", "no terminal"],
+)
+def test_a_run_works_and_is_repeated_where_little_is_there(lacking: dict[str, object], folder: Path) -> None:
+    assert _run(folder, *LIVE, **lacking) == (0, [])  # type: ignore[arg-type]
+    report = replay(folder / "run")
+    assert (report.exit_code, report.samples) == (0, 1500)
+
+
+@pytest.mark.parametrize(
+    ("lacking", "code", "said"),
+    [
+        ({"before": _limit(resource.RLIMIT_AS, 150_000_000)}, 1, "a library cannot be loaded"),
+        ({"before": _limit(resource.RLIMIT_FSIZE, 0)}, 1, "File too large"),
+        ({"before": _limit(resource.RLIMIT_FSIZE, 100_000)}, 3, "File too large"),
+        ({"NUMBA_DISABLE_JIT": "1"}, 1, "NUMBA_DISABLE_JIT is set, expected it unset"),
+    ],
+    ids=["150 MB of addresses", "no room for a file", "100 kB for a file", "no compiled code"],
+)
+def test_lacking_resources_are_named(lacking: dict[str, object], code: int, said: str, folder: Path) -> None:
+    found, lines = _run(folder, *LIVE, **lacking)  # type: ignore[arg-type]
+    assert found == code and said in lines[0], lines
+    assert len(lines) <= (2 if code == 3 else 1), lines  # with loss: the reason, then what was lost
+
+
+#: A command for each library of an extra that it cannot do without.
+NEEDING: dict[str, tuple[str, ...]] = {
+    "mcap": LIVE,
+    "paho": ("live", "mqtt://127.0.0.1:9", "--map", "map.yaml", "--scene", "paper"),
+    "asyncua": ("live", "opc.tcp://127.0.0.1:9", "--map", "nodes.yaml", "--scene", "paper"),
+    "influxdb_client": ("live", "load.csv", "--scene", "paper", "--influx", "http://127.0.0.1:9/a/b"),
+    "google": ("live", "load.csv", "--scene", "paper", "--mqtt-out", "mqtt://127.0.0.1:9", "--sparkplug", "a/b"),
+    "prometheus_client": ("live", "load.csv", "--scene", "paper", "--metrics", "9464"),
+    "starlette": ("live", "load.csv", "--scene", "paper", "--dashboard", "--listen", "127.0.0.1:0"),
+    "pyarrow": ("live", "load.parquet", "--scene", "paper"),
+    "rclpy": ("telemetry", "--mqtt-out", "mqtt://127.0.0.1:9/a"),
+}
+
+
+@pytest.mark.parametrize("module", NEEDING)
+def test_a_missing_library_is_named_with_its_extra(module: str, tmp_path: Path) -> None:
+    _csv(tmp_path / "load.csv", 10)
+    (tmp_path / "load.parquet").write_bytes(b"PAR1")
+    (tmp_path / "map.yaml").write_text("excitation: {topic: a, fields: {fx: x, fy: y, m: m}}\n")
+    (tmp_path / "nodes.yaml").write_text("excitation: {fx: {node: i=1}, fy: {node: i=2}, m: {node: i=3}}\n")
+    (tmp_path / "sitecustomize.py").write_text(
+        "import sys\n"
+        "class Missing:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        f"        if name.partition('.')[0] == {module!r}:\n"
+        "            raise ModuleNotFoundError(f'No module named {name!r}', name=name)\n"
+        "sys.meta_path.insert(0, Missing())\n"
+    )
+    path = os.pathsep.join([str(tmp_path), str(ROOT)])
+    code, said = _run(tmp_path, *NEEDING[module], PYTHONPATH=path)
+    lines = [line for line in said if not line.startswith("OK status")]
+    assert code == 1 and len(lines) == 1, said
+    assert f"needs {module}, which is not installed: pip install 'plow_twin[{EXTRA_OF_MODULE[module]}]'" in lines[0]
+
+
+def test_two_runs_into_one_folder_both_end_and_are_both_whole(folder: Path) -> None:
+    words = [sys.executable, "-m", "plow_twin", *LIVE]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    runs = [subprocess.Popen(words, cwd=folder, env=environment, stderr=subprocess.PIPE, text=True) for _ in range(2)]
+    said = [run.communicate()[1] for run in runs]
+    assert [run.returncode for run in runs] == [0, 0], said
+    found = sorted(folder.glob("run*"))
+    assert len(found) == 2 and any("is not empty" in text for text in said), (found, said)
+    assert [(replay(run).exit_code, replay(run).samples) for run in found] == [(0, 1500)] * 2
