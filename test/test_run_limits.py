@@ -215,6 +215,13 @@ print(json.dumps(told))
 """
 
 
+def test_slices_of_lanes_stay_bounded_through_many_short_ones() -> None:
+    """A scene at rest leaves its lane again and again: more than thirty slices in a row take no time."""
+    scene = replace(preset("bench_kv"), loads=())
+    found = simulate_many([scene], 1e6, 1e6, 1e-6, workers=1)
+    assert found.status[0] == Status.OK and found.steps[0] > 10_000
+
+
 def test_a_process_that_gets_sigint_returns_within_a_slice_of_work() -> None:
     with started([sys.executable, "-c", INTERRUPTED], stdout=subprocess.PIPE) as process:
         assert process.stdout is not None and process.stdout.readline() == "under way\n"

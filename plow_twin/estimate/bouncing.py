@@ -424,11 +424,13 @@ def _distance_of_paths(features: Array, paths: Array, measured: Array, seen: Arr
     variance = (near.weight[:, None] * left**2).sum(axis=0) / near.weight.sum()
     deviation = np.sqrt(variance * (1.0 + near.inverse[0, 0]))
     left *= np.sqrt(near.weight / near.weight.sum())[:, None] / deviation
-    common = left.T @ left
-    share, size = tuning.SHRINKAGE[1], len(common)
-    covariance = (1.0 - share) * common + share * np.trace(common) / size * np.eye(size)
+    share, size = tuning.SHRINKAGE[1], left.shape[1]
     off = (seen - value) / deviation
-    square = np.einsum("ki,ik->k", off, np.linalg.solve(covariance, off.T))
+    # (a L^T L + b I)^-1 = (I - L^T (b/a I + L L^T)^-1 L) / b: there are fewer draws than numbers in a path
+    equal = share * float(np.square(left).sum()) / size
+    among = left @ left.T + equal / (1.0 - share) * np.eye(len(left))
+    along = left @ off.T
+    square = (np.square(off).sum(axis=1) - (along * np.linalg.solve(among, along)).sum(axis=0)) / equal
     return float(square.min() / seen.shape[1])
 
 

@@ -96,8 +96,8 @@ def run_events(
 
 
 def next_slice(size: int, took_s: float) -> int:
-    """Return the steps of the next slice of a run, from the steps and the time of the last one."""
-    return max(1, int(size * min(4.0, max(0.1, _SLICE_S / max(took_s, 1e-6)))))
+    """Return the steps of the next slice of a run, from the steps and the time of the last one; at most `BUDGET`."""
+    return min(BUDGET, max(1, int(size * min(4.0, max(0.1, _SLICE_S / max(took_s, 1e-6))))))
 
 
 def run_fixed(
