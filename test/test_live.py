@@ -947,6 +947,7 @@ def test_poses_gaps_and_speeds_that_cannot_be_are_not_used() -> None:
     ("text", "code", "said"),
     [
         ("t,fx,fy,m\n", 3, "no sample came on load"),
+        ("t,fx,fy,m\n" + "1.0,inf,2.0,3.0\n" * 40, 3, "40 loads have a number that is not finite (nan or inf)"),
         ("0.0,1.0,2.0,3.0\n0.1,1.0,2.0,3.0\n", 1, "columns 0.0, 1.0, 2.0, 3.0 (no header row?)"),
     ],
 )

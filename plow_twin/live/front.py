@@ -202,6 +202,8 @@ class BridgeFront:
             found.append(f"{counts[Verdict.MALFORMED]} malformed; the first: {self._feeder.unfit}")
         if counts[Verdict.DUPLICATE] > many:
             found.append(f"{counts[Verdict.DUPLICATE]} stamps came twice: have the times too few digits?")
+        if counts[Verdict.NON_FINITE] > many:
+            found.append(f"{counts[Verdict.NON_FINITE]} loads have a number that is not finite (nan or inf)")
         if counts[Verdict.IMPLAUSIBLE] > many:
             most = self.runtime.driver.intake.limits
             force = "" if most is None else f" (forces to {most.largest[0]:.3g} N, by {most.fastest[0]:.3g} N/s)"

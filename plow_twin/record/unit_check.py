@@ -227,7 +227,8 @@ def _spacing(stamps_s: Array, load: Array) -> list[UnitDoubt]:
     if low <= stamps_s[0] <= high and np.ptp(stamps_s) < 1.0 and spacing < _SHORTEST_SPACING_S:
         found = f"{stamps_s[0] - _START_S:.6g} and stamps {spacing:.2g} s apart"
         return [UnitDoubt("excitation", ("t",), found, "seconds", "days of a spreadsheet", False, _WRITE_SECONDS)]
-    span = np.ptp(load, axis=0)
+    load = load[np.isfinite(load).all(axis=1)]
+    span = np.ptp(load, axis=0) if len(load) >= _FEW else np.zeros(0)
     if spacing < _SLOW_S or not span.any():
         return []
     change = np.median(np.abs(np.diff(load[:, span > 0.0], axis=0)), axis=0) / span[span > 0.0]

@@ -45,7 +45,8 @@ class Limits:
         `duration_s`, shape (n-1,), are the times between them in s.
         """
         within = np.abs(values[1:]) <= np.array(self.largest)
-        steady = np.abs(np.diff(values, axis=0)) <= np.array(self.fastest) * duration_s[:, None]
+        with np.errstate(invalid="ignore"):  # between two infinite numbers: not steady
+            steady = np.abs(np.diff(values, axis=0)) <= np.array(self.fastest) * duration_s[:, None]
         return np.asarray((within & steady).all(axis=1))
 
     def too_fast(self, before: Sequence[float], values: Sequence[float], duration_s: float) -> bool:
