@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
 from collections import Counter
 from collections.abc import Sequence
@@ -682,6 +683,35 @@ def test_forces_go_out_before_the_other_twins_are_advanced(
     assert runtime.close() == []
     for topic, before in (("contact_forces", 0), ("contact_peaks", 0), ("head_state", 0), ("force_intervals", 1)):
         assert [count for name, count in order if name == topic] == list(range(before, 50 + before)), topic
+
+
+@pytest.mark.parametrize(("follow", "there"), [("off", "False"), ("full", "True")])
+def test_the_code_of_following_is_not_loaded_where_it_is_off(tmp_path: Path, follow: str, there: str) -> None:
+    code = f"""
+import sys
+from plow_twin.live import parameters
+from plow_twin.live.runtime import Runtime
+from plow_twin.live.solver_start import Preparation
+import test_live_follow_front as front
+given = parameters.settings({{"estimate": True, "follow": {follow!r}}})
+runtime = Runtime(front.Front(), given, Preparation(given).result(lambda: False))
+runtime.start()
+runtime.activate()
+for index in range(20):
+    for _ in runtime.step([(10**18 + index * 10**6, (1e4, 0.0, 0.0))]):
+        pass
+print("plow_twin.estimate.follow" in sys.modules)
+runtime.close()
+"""
+    (tmp_path / "test_live_follow_front.py").write_text(
+        "class Front:\n"
+        "    name, follows_samples, sends_motion, topics = '/plow_twin', False, True, {}\n"
+        "    now_ns = lambda self: 10**18\n"
+        "    __getattr__ = lambda self, name: lambda *_: ''\n",
+        encoding="utf-8",
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.stdout.strip() == there, done.stderr
 
 
 def test_nothing_follows_in_bounded_time(truth: Truth) -> None:
