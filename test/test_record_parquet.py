@@ -246,3 +246,11 @@ def test_the_share_that_has_been_read_rises_to_all(tmp_path: Path) -> None:
             places.append(lines.tell())
     assert places[0] == 0 and places == sorted(places) and len(set(places)) > 3
     assert places[-1] == path.stat().st_size
+
+
+def test_a_number_beside_a_sign_that_only_python_strips_is_read(tmp_path: Path) -> None:
+    (tmp_path / "load.csv").write_bytes(b"t,fx,fy,m\n0,1,2,-2\x1c\n1,1,2,\x1c\n")
+    source = open_source(tmp_path / "load.csv")
+    roles = read_map(None, source.topics())
+    read = [found for _, _, found in readings(messages_of(source, roles), roles) if found is not None]
+    assert read[0][1]["m"] == -2.0 and np.isnan(read[1][1]["m"])
