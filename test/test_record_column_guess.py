@@ -7,6 +7,7 @@ import json
 import math
 import os
 import pty
+import signal
 import subprocess
 import sys
 import termios
@@ -106,6 +107,7 @@ def _in_terminal(folder: Path, *said: bytes) -> tuple[int, str]:
 
     def own_terminal() -> None:
         fcntl.ioctl(far, termios.TIOCSCTTY, 0)
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # a suite in the background hands on that it is ignored
 
     process = subprocess.Popen(
         command, cwd=folder, stdin=far, stdout=far, stderr=far, start_new_session=True, preexec_fn=own_terminal

@@ -26,8 +26,8 @@ from plow_twin.solve.support import to_ground
 #: Nodes of the quadrature, exact to degree 15: more nodes leave the imbalance as it is, for over a step the higher
 #: terms of a series are as small as its error.
 _NODES = 8
-#: Radians of the fastest harmonic in one panel of a flight, or of rest.
-_PANEL_PHASE = 8.0
+#: Radians of the fastest harmonic in one panel of a flight, or of rest: a product of two is then exact to 1e-13.
+_PANEL_PHASE = 2.0
 # indices into the powers and impulses at one instant
 LOADS, NORMAL, FRICTION, SUPPORT, LOAD_X, LOAD_Y, LOAD_M, CONTACT_X, CONTACT_Y, CONTACT_M, SIZE = range(11)
 
