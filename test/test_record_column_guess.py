@@ -107,7 +107,7 @@ def _in_terminal(folder: Path, *said: bytes) -> tuple[int, str]:
 
     def own_terminal() -> None:
         fcntl.ioctl(far, termios.TIOCSCTTY, 0)
-        signal.signal(signal.SIGINT, signal.default_int_handler)  # a suite in the background hands on that it is ignored
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # a background suite ignores it
 
     process = subprocess.Popen(
         command, cwd=folder, stdin=far, stdout=far, stderr=far, start_new_session=True, preexec_fn=own_terminal
