@@ -23,6 +23,7 @@ from plow_twin.estimate.result import NORMAL_P95, Estimate, ForcesUsed, Interval
 from plow_twin.estimate.search import candidate, refine
 from plow_twin.estimate.similar import Units
 from plow_twin.estimate.start import filled, noise_level, range_of_motion
+from plow_twin.estimate.uncertain_load import compare_under_uncertain_load
 from plow_twin.estimate.unknowns import (
     BIAS,
     DAMPING,
@@ -109,7 +110,13 @@ def estimate_window(
         return _estimate(scene, load, poses, lost, guess, gaps, forces)
     its = units.load(load), units.poses(poses)
     found, following = _estimate(units.scene(scene), *its, lost, guess, units.gaps(gaps), units.forces(forces))
-    return units.in_si(found, scene), following
+    found = units.in_si(found, scene)
+    if units.only_time and found.sensor == "ok":
+        # a machine of the paper's size under a quick or slow load: its impacts last as long as there
+        period = min(load.period(), float(poses.t[-1] - poses.t[0]))
+        unknowns = Unknowns.stated(scene, load, poses)
+        found = under_uncertain_load(found, unknowns, thinned(load, period)[0], poses, period)
+    return found, following
 
 
 def _estimate(
@@ -159,6 +166,10 @@ def _from_motion(
         few = f"got {len(poses.t)} poses from {span[0]:g} s to {span[1]:g} s, the load's span, expected {FEWEST_POSES}"
         return replace(prior_of(unknowns, span, lost), reasons=(few,)), ()
     lacking = _lacking(poses)
+    if lacking and _all_but_angle(poses) and not _is_dead(load, poses):
+        period = min(load.period(), float(poses.t[-1] - poses.t[0]))
+        nothing = replace(prior_of(unknowns, (float(poses.t[0]), float(poses.t[-1])), lost), reasons=lacking)
+        return under_uncertain_load(nothing, unknowns, thinned(load, period)[0], poses, period), ()
     if lacking:
         nothing = prior_of(unknowns, (float(poses.t[0]), float(poses.t[-1])), lost)
         unseen = State.NOT_OBSERVABLE
@@ -222,18 +233,56 @@ def _searched(
     if bounced is not None and (first is None or bounced.ln_penetration[0] < math.log(tuning.FITTED)):
         return summarise_bounced(unknowns, poses, bounced, lost, forward.work), ()
     if first is None:
-        return _without_fit(unknowns, poses, lost), ()
+        return under_uncertain_load(_without_fit(unknowns, poses, lost), unknowns, forward.load, poses, period), ()
     start = first.shared if bounced is None else _from_bounced(unknowns, first.shared, bounced)
     spent, forward = forward.work, forward.renewed() if bounced else forward
     found = refine(forward, unknowns, poses, period, start, first.noise, drift, close=bounced is not None)
     if bounced is not None and (found is None or not found[1].finished):
         return summarise_bounced(unknowns, poses, bounced, lost, spent + forward.work), ()
     if found is None:
-        return _without_fit(unknowns, poses, lost), ()
+        return under_uncertain_load(_without_fit(unknowns, poses, lost), unknowns, forward.load, poses, period), ()
     found, verdict = _with_turns(found, judge(*found, period), period)
     result = summarise(*found, verdict, lost, forces if bounced is None else None)
+    unexplained = bool(verdict.model or verdict.sensor) or not found[1].finished
+    if bounced is None and unexplained and not verdict.broken:
+        result = under_uncertain_load(result, unknowns, forward.load, poses, period)
     following = () if verdict.model or verdict.sensor else _next_guess(*found)
     return result if bounced is None else with_bounced(result, bounced, spent), following
+
+
+def under_uncertain_load(result: Estimate, unknowns: Unknowns, felt: Load, poses: Poses, period: float) -> Estimate:
+    """Return an estimate whose withdrawn clearances allow for a load, or an angle, that is not known.
+
+    `result` comes from the load believed; it stays where it knows a clearance, or nothing is found.
+    """
+    if result.horizontal_state.known or result.vertical_state.known or np.median(np.diff(felt.t)) > tuning.COARSEST:
+        return result
+    found, work = compare_under_uncertain_load(felt, unknowns, poses, period)
+    figures = result.figures | {"work": result.figures.get("work", 0.0) + float(work)}
+    if found is None or found.distance > tuning.MOST_DISTANCE or found.ln_depth[0] < math.log(tuning.FITTED):
+        return replace(result, figures=figures)
+    values, known = [], []
+    for index in (GX, GY):
+        prior = float(unknowns.nominal()[index]), float(unknowns.deviations()[index])
+        mean, deviation = _both((float(found.clearance[index]), float(found.deviation[index])), prior)
+        observed = bool(found.touched[index]) and deviation < tuning.OBSERVED_SHARE * prior[1]
+        values.append(Interval.normal(*((mean, deviation) if observed else prior)).above(0.0))
+        known.append(_state(False, observed, rough=True))
+    exponent = unknowns.scene.contact.exponent
+    log = Interval.normal(*found.ln_depth)
+    mean, soft, hard = (unknowns.force / math.exp(value) ** exponent for value in (log.mean, log.p95, log.p05))
+    return replace(
+        result,
+        horizontal=values[0],
+        vertical=values[1],
+        horizontal_state=known[0],
+        vertical_state=known[1],
+        stiffness=Interval(mean, soft, hard),
+        damping=_damping(unknowns, Interval.normal(*found.ln_damping)),
+        correlation=None,
+        groups={},
+        figures=figures | {"distance": found.distance, "load_error": found.load_error},
+    )
 
 
 def _from_bounced(unknowns: Unknowns, shared: Array, bounced: Bounced) -> Array:
@@ -715,6 +764,13 @@ def _lacking(poses: Poses) -> tuple[str, ...]:
     if not lacking and poses.interval() > tuning.SPARSEST:
         lacking = (f"poses: got {1.0 / poses.interval():.1f} a second, expected at least {1.0 / tuning.SPARSEST:.1f}",)
     return lacking
+
+
+def _all_but_angle(poses: Poses) -> bool:
+    """Return whether x and y were measured well, and theta was not."""
+    counts, usable = np.isfinite(poses.q).sum(axis=0), np.array(poses.deviation) <= useless_deviation()
+    good = (counts >= FEWEST_POSES) & usable
+    return bool(good[:2].all() and not counts[2] and poses.interval() <= tuning.SPARSEST)
 
 
 def _is_dead(load: Load, poses: Poses) -> bool:

@@ -47,6 +47,11 @@ class Units:
         return Units(*(2.0 ** round(math.log2(size)) for size in sizes))
 
     @property
+    def only_time(self) -> bool:
+        """Whether only the load's period differs from the paper's."""
+        return self.length == self.mass == 1.0
+
+    @property
     def force(self) -> float:
         """The unit of force in N."""
         return self.mass * self.length / self.time**2

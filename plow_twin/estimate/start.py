@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +17,8 @@ from plow_twin.model.scene import Scene
 
 Array = NDArray[np.float64]
 
+#: Definition: pairs of the walls to the right, left, top and bottom.
+WALLS: Final = (NORMAL_X > 0.0, NORMAL_X < 0.0, NORMAL_Y > 0.0, NORMAL_Y < 0.0)
 #: Bound: moments tried for the start of a swing.
 _CANDIDATES = 12
 
@@ -48,8 +52,7 @@ def reaches(scene: Scene, q: Array) -> Array:
     body = np.stack([c, s, c * q[:, 0] + s * q[:, 1], -s * q[:, 0] + c * q[:, 1]], axis=1)
     toward = body @ rows
     half = np.array([scene.frame.width_m, scene.frame.width_m, scene.frame.height_m, scene.frame.height_m]) / 2.0
-    walls = (NORMAL_X > 0.0, NORMAL_X < 0.0, NORMAL_Y > 0.0, NORMAL_Y < 0.0)
-    return np.stack([toward[:, wall].max(axis=1) for wall in walls], axis=1) - half
+    return np.stack([toward[:, wall].max(axis=1) for wall in WALLS], axis=1) - half
 
 
 def smooth_width(poses: Poses, span: float = 0.06) -> int:

@@ -368,6 +368,40 @@ LOAD_ERROR_LASTS: Annotated[
     Tuned("s", "time for which that error is correlated", "the same seeds; 0.05 gives the same within 0.04"),
 ] = 0.2
 
+# Loads that do not explain the motion
+MODULATED: Annotated[
+    float, Tuned("s", "span of a function that the equations are multiplied by", "kinds `load_10`, `averages_1hz`")
+] = 0.12
+UNCERTAIN_DRAWS: Annotated[
+    tuple[int, ...], Tuned("motions", "draws of each of three rounds: with an angle, without one")
+] = (60, 120)
+UNCERTAIN_SPREAD: Annotated[
+    tuple[float, ...],
+    Tuned("m, 1, 1", "first deviations of the clearances, and of the logarithms of penetration and damping"),
+] = (3e-3, 0.35, 0.7)
+UNCERTAIN_GAIN: Annotated[float, Tuned("1", "deviation of the gains of a load that does not explain the motion")] = 0.15
+UNCERTAIN_EXPONENT: Annotated[
+    float, Tuned("1", "deviation of the exponent beyond the scene's, in half of the draws", "truths with exponent 1.5")
+] = 0.3
+COARSEST: Annotated[
+    float,
+    Tuned("s", "distance of the samples of a load up to which its error is no loss of amplitude", "`averages_1hz`"),
+] = 0.25
+LOAD_ERRORS: Annotated[tuple[float, ...], Tuned("1", "least and largest error of a load over its amplitude")] = (
+    0.01,
+    0.3,
+)
+LOAD_CORRELATION: Annotated[tuple[float, ...], Tuned("s", "shortest and longest correlation of that error")] = (
+    0.15,
+    1.5,
+)
+CORRECTED: Annotated[
+    tuple[float, ...],
+    Tuned(
+        "1, m", "share of the regression's correction that counts as a deviation, and least one", "seeds 80000 to 80003"
+    ),
+] = (0.3, 4e-4)
+
 # Forces
 HEAD_ROOM: Annotated[
     float, Tuned("m", "head room from which on a pad is in flight; up to twice it a pad may touch")

@@ -1,0 +1,183 @@
+"""Walls and stiffness from the equations of motion in weak form; no motion is integrated, so no load error adds up.
+
+The equations are multiplied by short smooth functions psi and integrated by parts, which needs no derivative of a
+measured pose:
+
+    integral psi'' q  =  integral psi (load + contact) / M,
+    contact = K sum n p (1 + d p'),   integral psi p p' = -1/2 integral psi' p^2,
+
+with the penetrations p behind four walls. Gauss-Newton steps find the walls, K and K d; what the load leaves over
+counts as noise. The result is biased where a contact lasts a few samples; `uncertain_load` corrects it.
+
+References: Shinbrot, Trans. ASME 79 (1957) 67 (modulating functions); Messenger and Bortz, J. Comput. Phys. 443 (2021)
+110525 (weak form).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.estimate import tuning
+from plow_twin.estimate.measurements import Load
+from plow_twin.estimate.start import WALLS
+from plow_twin.estimate.unknowns import Unknowns
+from plow_twin.model import geometry
+from plow_twin.model.pairs import NORMAL_X, NORMAL_Y
+from plow_twin.solve.compiled_scene import inertias
+
+Array = NDArray[np.float64]
+
+#: Definition: wall of each pair, in the order right, left, top, bottom.
+_WALL: Final = np.argmax(np.stack(WALLS), axis=0)
+#: Bound: Gauss-Newton steps; a step in m below which they end, and the longest one.
+_STEPS, _SMALL, _LONGEST = 8, 2e-5, 3e-3
+#: Guard: shortest distance of rows in s, and fewest in half of a function.
+_SHORTEST, _FEWEST = 5e-3, 3
+#: Derived: scale of the stiffness in N/m that gives its column the size of the others.
+_UNIT = 1e7
+#: Derived: deviates beyond which Huber's function is linear; MAD to standard deviation.
+_HUBER, _MAD = 2.0, 1.4826
+#: Bound: starts of a search, as shares of the range of motion and as penetrations in m.
+_SHARES, _DEPTHS = (0.25, 0.5, 0.75, 0.95), (3e-3, 6e-3, 12e-3, 20e-3)
+#: Guard: penetrations in m of the hardest and of the softest contact that is looked for.
+DEPTHS: Final = (2e-4, 3e-2)
+#: Guard: columns without information.
+_SINGULAR = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Walls:
+    """Result of a fit.
+
+    reach : (4,) distance in m by which the corners move toward the right, left, top and bottom before they touch
+    ln_depth : logarithm of the penetration in m under the reference force
+    damping : of Hunt and Crossley in s/m
+    left_over : (3,) logarithm of the scatter that is left over, over that of the acceleration
+    loss : sum of the logarithms of the scatters
+    """
+
+    reach: Array
+    ln_depth: float
+    damping: float
+    left_over: Array
+    loss: float
+
+    @property
+    def clearance(self) -> Array:
+        """Clearances in m, shape (2,)."""
+        return self.reach[::2] + self.reach[1::2]
+
+    @property
+    def features(self) -> Array:
+        """The result as numbers that a regression compares, shape (7,): first the clearances."""
+        return np.concatenate([self.clearance, [self.ln_depth, np.clip(self.damping, -2.0, 3.0)], self.left_over])
+
+
+class EquationError:
+    """The equations of a scene under a load believed, for poses at some times.
+
+    Parameters
+    ----------
+    unknowns : Unknowns
+        The scene, and the force to which penetrations refer.
+    load : Load
+        The load believed.
+    t : ndarray, shape (n,)
+        Times of the poses in s.
+    """
+
+    def __init__(self, unknowns: Unknowns, load: Load, t: Array) -> None:
+        scene = unknowns.scene
+        step = max(float(np.median(np.diff(t))), _SHORTEST)
+        self._t, self._grid = t, np.arange(t[0], t[-1], step)
+        half = max(_FEWEST, round(0.5 * tuning.MODULATED / step))
+        s, span = np.arange(1 - half, half) / half, half * step
+        bump = 1.0 - s * s
+        # (1 - s^2)^3 and its first two derivatives by time
+        self._value = step * bump**3
+        self._slope = -6.0 * step / span * s * bump**2
+        self._curve = step / span**2 * (24.0 * s * s * bump - 6.0 * bump**2)
+        self._apart = max(1, half // 2)
+        self._force = unknowns.force
+        self._rows, self._arms = geometry.penetration_rows(scene)[:4], geometry.arm_rows(scene)
+        self._inertia = np.asarray(inertias(scene))
+        self._half_size = np.where(NORMAL_X != 0.0, scene.frame.width_m, scene.frame.height_m) / 2.0
+        wrench = np.stack([np.interp(self._grid, load.t, column) for column in load.wrench.T], axis=1)
+        self._load = self._weighed(wrench, self._value) / self._inertia
+
+    def search(self, q: Array, span: Array) -> Walls:
+        """Return the best fit to poses (n, 3) from several starts, with the range of motion (2,) in m."""
+        found = [
+            self.fit(q, np.repeat(0.5 * share * span, 2), math.log(depth)) for depth in _DEPTHS for share in _SHARES
+        ]
+        return min(found, key=lambda one: one.loss)
+
+    def fit(self, q: Array, reach: Array, ln_depth: float) -> Walls:
+        """Return the fit to poses (n, 3) from walls (4,) in m and a penetration on."""
+        poses = np.stack([np.interp(self._grid, self._t, column) for column in q.T], axis=1)
+        corners, normals = self._geometry(poses)
+        acceleration = self._weighed(poses, self._curve)
+        stiffness, weight = self._force / math.exp(ln_depth), np.ones_like(acceleration)
+        for _ in range(_STEPS):
+            columns = self._columns(corners, normals, reach, stiffness)
+            found, left = self._solve(columns, acceleration - self._load, weight)
+            scale = _MAD * np.median(np.abs(left), axis=0) + _SINGULAR
+            weight = np.minimum(1.0, np.sqrt(_HUBER * scale / np.maximum(np.abs(left), _SINGULAR))) / scale
+            ln_depth = float(np.clip(math.log(self._force / max(_UNIT * found[0], 1.0)), *np.log(DEPTHS)))
+            stiffness = self._force / math.exp(ln_depth)
+            step = np.clip(found[2:6], -_LONGEST, _LONGEST)
+            reach = reach + step
+            if np.abs(step).max() < _SMALL:
+                break
+        all_of_it = np.median(np.abs(acceleration), axis=0) + _SINGULAR
+        damping = float(_UNIT * found[1] / stiffness)
+        return Walls(reach, ln_depth, damping, np.log(scale / all_of_it), float(np.log(scale).sum()))
+
+    def touched(self, q: Array, walls: Walls, deeper: float) -> Array:
+        """Return the time in s for which the corners lie `deeper` m behind each wall, shape (4,)."""
+        poses = np.stack([np.interp(self._grid, self._t, column) for column in q.T], axis=1)
+        beyond = self._geometry(poses)[0] - walls.reach[_WALL] > deeper
+        step = self._grid[1] - self._grid[0]
+        return np.array([step * beyond[:, wall].any(axis=1).sum() for wall in WALLS])
+
+    def _geometry(self, q: Array) -> tuple[Array, Array]:
+        """Return reaches (n, 8) in m and accelerations (n, 3, 8) that a newton at each pair gives the head."""
+        c, s = np.cos(q[:, 2]), np.sin(q[:, 2])
+        body = np.stack([c, s, c * q[:, 0] + s * q[:, 1], -s * q[:, 0] + c * q[:, 1]], axis=1)
+        x = c[:, None] * NORMAL_X - s[:, None] * NORMAL_Y
+        y = s[:, None] * NORMAL_X + c[:, None] * NORMAL_Y
+        directions = np.stack([x, y, body @ self._arms], axis=1) / self._inertia[:, None]
+        return body @ self._rows - self._half_size, directions
+
+    def _columns(self, corners: Array, normals: Array, reach: Array, stiffness: float) -> Array:
+        """Return the derivatives by stiffness, damping, four walls and three constant loads, shape (m, 3, 9)."""
+        beyond = np.maximum(corners - reach[_WALL], 0.0)
+        touching = (beyond > 0.0).astype(np.float64)
+        spring = self._weighed(np.einsum("nik,nk->ni", normals, beyond), self._value)
+        damper = -0.5 * self._weighed(np.einsum("nik,nk->ni", normals, beyond**2), self._slope)
+        by_wall = [np.einsum("nik,nk->ni", normals[:, :, wall], touching[:, wall]) for wall in WALLS]
+        walls = -stiffness * self._weighed(np.stack(by_wall, axis=2), self._value)
+        constant = np.broadcast_to(self._value.sum() * np.eye(3), (len(spring), 3, 3))
+        return np.concatenate([_UNIT * spring[:, :, None], _UNIT * damper[:, :, None], walls, constant], axis=2)
+
+    @staticmethod
+    def _solve(columns: Array, target: Array, weight: Array) -> tuple[Array, Array]:
+        """Return the weighted least-squares solution (9,) and what it leaves over, shape (m, 3)."""
+        rows = (columns * weight[:, :, None]).reshape(-1, columns.shape[2])
+        normal = rows.T @ rows
+        held = np.zeros(len(normal))
+        held[2:6] = _LONGEST**-2.0
+        normal += np.diag(held + _SINGULAR * np.diag(normal) + _SINGULAR)
+        found = np.asarray(np.linalg.solve(normal, rows.T @ (target * weight).ravel()), np.float64)
+        return found, target - columns @ found
+
+    def _weighed(self, values: Array, kernel: Array) -> Array:
+        """Return the integrals of rows (n, ...) times the function, shape (m, ...)."""
+        windows = np.lib.stride_tricks.sliding_window_view(values, len(kernel), axis=0)[:: self._apart]
+        out: Array = windows @ kernel
+        return out

@@ -1,0 +1,218 @@
+"""Clearances where the load believed does not explain the motion, or where its angle was not measured.
+
+Motions with drawn clearances, contacts and errors of the load are simulated and seen as the sensor sees. A regression
+among those near the measured motion corrects what `equation_error` finds (without an angle: how far the head moves),
+and gives its deviation (approximate Bayesian computation with local-linear adjustment, as in `bouncing`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.estimate import tuning
+from plow_twin.estimate.bouncing import MotionFeatures, regress_near
+from plow_twin.estimate.equation_error import DEPTHS, EquationError
+from plow_twin.estimate.forward import Forward
+from plow_twin.estimate.measurements import Load, Poses
+from plow_twin.estimate.start import noise_level, range_of_motion
+from plow_twin.estimate.unknowns import DAMPING, Unknowns
+from plow_twin.model import geometry
+
+Array = NDArray[np.float64]
+
+#: Derived: distance of the knots of a load's error, a third of its shortest correlation, in that correlation.
+_KNOTS = 1.0 / 3.0
+#: Bound: rounds of draws, the second and third about the result of the round before.
+_ROUNDS = 3
+#: Bound: fewest draws that a regression is made of.
+_FEWEST = 40
+#: Guard: least clearance in m that is drawn.
+_LEAST_CLEARANCE = 5e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """Result of a comparison.
+
+    clearance, deviation : (2,) in m
+    touched : (2,) whether the head was seen to touch both walls of a direction
+    ln_depth, ln_damping : mean and deviation of the logarithms of the penetration in m under the reference force and
+        of the damping
+    distance : of the measured motion from nearby drawn ones, over the distance of drawn ones from each other
+    load_error : error of the load over its amplitude
+    """
+
+    clearance: Array
+    deviation: Array
+    touched: NDArray[np.bool_]
+    ln_depth: tuple[float, float]
+    ln_damping: tuple[float, float]
+    distance: float
+    load_error: float
+
+
+@dataclass
+class _Spread:
+    """Distribution of the draws: centre of the clearances (2,) in m, means and deviations of all that is drawn."""
+
+    centre: Array
+    about: float
+    ln_depth: tuple[float, float]
+    ln_damping: tuple[float, float]
+    ln_error: tuple[float, float]
+
+
+def compare_under_uncertain_load(
+    felt: Load, unknowns: Unknowns, poses: Poses, period: float, seed: int = 0
+) -> tuple[Compared | None, int]:
+    """Compare the measured motion with those under drawn errors of the load.
+
+    Parameters
+    ----------
+    felt : Load
+        The load believed, thinned to the samples that move the head.
+    unknowns : Unknowns
+        The prior.
+    poses : Poses
+        The measured poses; theta may be missing.
+    period : float
+        Of the load in s.
+    seed : int
+        Of the draws.
+
+    Returns
+    -------
+    Compared, or None where too few motions could be run, and the work done.
+    """
+    rng = np.random.default_rng(seed)
+    seen = MotionFeatures(unknowns, poses, period)
+    angle = bool(np.isfinite(poses.q[:, 2]).any())
+    features, spread, touched = (_with_angle if angle else _without_angle)(seen, felt, unknowns, poses)
+    measured = features(seen.q)
+    rows: list[Array] = []
+    targets: list[Array] = []
+    work = 0
+    found = None
+    for _ in range(_ROUNDS):
+        for _ in range(tuning.UNCERTAIN_DRAWS[0 if angle else 1]):
+            clearance, numbers, ln_error = _draw(spread, rng)
+            other = _with_exponent(unknowns, rng)
+            forward = Forward(other.scene, _with_error(felt, math.exp(ln_error), rng))
+            q = seen.look(forward, other, clearance, numbers, 0.0, rng)
+            work += forward.work
+            if q is not None:
+                rows.append(features(q))
+                targets.append(np.concatenate([clearance - rows[-1][:2], numbers[:2], [ln_error]]))
+        if len(rows) < _FEWEST:
+            return None, work
+        found = regress_near(np.array(rows)[:, 2:], np.array(targets), measured[2:])
+        value, deviation, before = found.value, found.deviation, spread.centre
+        spread = _Spread(
+            measured[:2] + value[:2],
+            max(tuning.UNCERTAIN_SPREAD[0] / 2.0, tuning.FIRM_SPREAD[1] * float(deviation[:2].max())),
+            (value[2], max(tuning.FIRM_SPREAD[2], tuning.FIRM_SPREAD[1] * deviation[2])),
+            (value[3], tuning.UNCERTAIN_SPREAD[2]),
+            (value[4], max(tuning.FIRM_SPREAD[2], tuning.FIRM_SPREAD[1] * deviation[4])),
+        )
+    assert found is not None
+    share, least = tuning.CORRECTED
+    unexplained = np.hypot(share * value[:2], least) if angle else np.zeros(2)
+    # a clearance that still moves has not converged
+    moved = spread.centre - before
+    return Compared(
+        spread.centre,
+        np.sqrt(deviation[:2] ** 2 + unexplained**2 + moved**2),
+        touched,
+        (float(value[2]), float(deviation[2])),
+        (float(value[3]), float(deviation[3])),
+        found.distance,
+        math.exp(float(value[4])),
+    ), work
+
+
+_Look = tuple[Callable[[Array], Array], _Spread, NDArray[np.bool_]]
+
+
+def _with_angle(seen: MotionFeatures, felt: Load, unknowns: Unknowns, poses: Poses) -> _Look:
+    """Return the features, the first draws, and which directions were touched on both sides."""
+    about, softness, damping = tuning.UNCERTAIN_SPREAD
+    equations = EquationError(unknowns, felt, poses.t)
+    first = equations.search(seen.q, range_of_motion(unknowns.scene, poses)[0])
+    level = noise_level(seen.q)
+    noise = math.hypot(max(level[0], level[1]), level[2] * geometry.half_diagonal(unknowns.scene))
+    times = equations.touched(seen.q, first, tuning.OUTLYING * noise)
+    start, ln_depth = np.repeat(0.5 * first.clearance, 2), first.ln_depth
+
+    def features(q: Array) -> Array:
+        return equations.fit(q, start, ln_depth).features
+
+    spread = _Spread(
+        first.clearance, about, (ln_depth, softness), (_damping(unknowns), damping), _middle(tuning.LOAD_ERRORS)
+    )
+    touched = np.asarray((times.reshape(2, 2) > tuning.TOUCHED).all(axis=1))
+    return features, spread, touched
+
+
+def _without_angle(seen: MotionFeatures, felt: Load, unknowns: Unknowns, poses: Poses) -> _Look:
+    """Return the same where only x and y were measured: the head's range stands for the walls."""
+    nominal, deviations = unknowns.nominal(), unknowns.deviations()
+
+    def features(q: Array) -> Array:
+        values = seen.features(q)
+        return np.concatenate([values[:2], values[5:]])
+
+    depth = _middle(DEPTHS)
+    damping = (_damping(unknowns), tuning.UNCERTAIN_SPREAD[2])
+    spread = _Spread(nominal[:2], float(deviations[:2].max()) / 2.0, depth, damping, _middle(tuning.LOAD_ERRORS))
+    moved = np.nanstd(poses.q[:, :2], axis=0) > tuning.RESTS * noise_level(seen.q)[:2]
+    return features, spread, moved
+
+
+def _middle(bounds: tuple[float, ...]) -> tuple[float, float]:
+    """Return mean and deviation of a logarithm that is uniform between two bounds."""
+    low, high = np.log(bounds)
+    return 0.5 * (low + high), (high - low) / math.sqrt(12.0)
+
+
+def _damping(unknowns: Unknowns) -> float:
+    return float(unknowns.nominal()[DAMPING])
+
+
+def _draw(spread: _Spread, rng: np.random.Generator) -> tuple[Array, Array, float]:
+    """Return clearances (2,) in m, logarithms of penetration and damping with three gains (5,), and of the error."""
+    white = rng.standard_normal(8)
+    clearance = np.maximum(spread.centre + spread.about * white[:2], _LEAST_CLEARANCE)
+    ln_depth = np.clip(spread.ln_depth[0] + spread.ln_depth[1] * white[2], *np.log(DEPTHS))
+    ln_damping = spread.ln_damping[0] + spread.ln_damping[1] * white[3]
+    gains = 1.0 + tuning.UNCERTAIN_GAIN * white[4:7]
+    ln_error = np.clip(spread.ln_error[0] + spread.ln_error[1] * white[7], *np.log(tuning.LOAD_ERRORS))
+    return clearance, np.array([ln_depth, ln_damping, *gains]), float(ln_error)
+
+
+def _with_exponent(unknowns: Unknowns, rng: np.random.Generator) -> Unknowns:
+    """Return the prior about a scene whose exponent is larger in half of the draws: no wall is stiffest at its face."""
+    step = tuning.UNCERTAIN_EXPONENT * max(0.0, rng.standard_normal())
+    contact = unknowns.scene.contact
+    return replace(unknowns, scene=replace(unknowns.scene, contact=replace(contact, exponent=contact.exponent + step)))
+
+
+def _with_error(load: Load, share: float, rng: np.random.Generator) -> Load:
+    """Return a load with an error of a `share` of its amplitude, an Ornstein-Uhlenbeck process."""
+    least, most = tuning.LOAD_CORRELATION
+    time = math.exp(rng.uniform(math.log(least), math.log(most)))
+    grid = np.arange(load.t[0], load.t[-1], _KNOTS * least)
+    keep = math.exp(-_KNOTS * least / time)
+    error = rng.standard_normal((len(grid), 3))
+    error[1:] *= math.sqrt(1.0 - keep * keep)
+    for index in range(1, len(grid)):
+        error[index] += keep * error[index - 1]
+    t = np.union1d(load.t, grid)
+    amplitude = 0.5 * share * np.ptp(load.wrench, axis=0)
+    wrench = [np.interp(t, load.t, column) for column in load.wrench.T]
+    added = [np.interp(t, grid, column) for column in error.T]
+    return Load(t, np.stack(wrench, axis=1) + amplitude * np.stack(added, axis=1))

@@ -1,0 +1,58 @@
+"""Rough clearances where the load does not explain the motion, or where no angle was measured."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from estimate_support import KINDS, known, mismatched
+
+from plow_twin.estimate.equation_error import EquationError
+from plow_twin.estimate.estimate import estimate
+from plow_twin.estimate.measurements import Poses
+from plow_twin.estimate.result import Estimate, State
+from plow_twin.estimate.start import filled, range_of_motion
+from plow_twin.estimate.unknowns import Unknowns
+
+
+def _holds(result: Estimate, truth: np.ndarray) -> bool:
+    values = (result.horizontal, result.vertical)
+    return all(abs(value.mean - true) < 3.0 * value.deviation for value, true in zip(values, truth, strict=True))
+
+
+def test_the_equations_of_motion_give_walls_and_stiffness_without_a_simulation() -> None:
+    truth, _ = known()[0]
+    equations = EquationError(Unknowns(truth.nominal), truth.load, truth.poses.t)
+    q = filled(truth.poses)
+    walls = equations.search(q, range_of_motion(truth.nominal, truth.poses)[0])
+    assert walls.clearance == pytest.approx(truth.clearance, abs=4e-3)
+    assert 1e5 / np.exp(walls.ln_depth) == pytest.approx(truth.scene.contact.stiffness, rel=0.4)
+    assert (equations.touched(q, walls, 1e-3) > 1.0).all()
+
+
+def test_a_load_that_does_not_explain_the_motion_gives_a_rough_clearance_whose_interval_holds() -> None:
+    truth = mismatched(replace(KINDS["load_10"], periods=6.0), 80001)
+    result = estimate(truth.nominal, truth.load, truth.poses)
+    assert result.model == "suspect" and result.reasons
+    assert result.horizontal_state is result.vertical_state is State.ROUGH
+    assert 5e-4 < result.horizontal.deviation < 4e-3 and _holds(result, truth.clearance)
+    assert result.figures["load_error"] > 0.03
+    assert estimate(truth.nominal, truth.load, truth.poses) == result, "the same data give the same bits"
+
+
+def test_without_an_angle_the_range_of_the_head_gives_a_rough_clearance_whose_interval_holds() -> None:
+    truth, exact = known()[0]
+    q = truth.poses.q.copy()
+    q[:, 2] = np.nan
+    result = estimate(truth.nominal, truth.load, Poses(truth.poses.t, q))
+    assert result.horizontal_state is State.ROUGH and (result.model, result.sensor) == ("ok", "ok")
+    assert result.reasons == ("theta: measured 0 times, expected at least 20",)
+    assert _holds(result, truth.clearance) and result.horizontal.deviation > 5.0 * exact.horizontal.deviation
+
+
+def test_a_quick_load_is_no_reason_to_look_at_the_poses_in_its_own_time() -> None:
+    """Chatter of 8 Hz made poses at 100 Hz too sparse in units in which its period was the paper's."""
+    truth = mismatched(replace(KINDS["chatter"], periods=6.0), 80001)
+    result = estimate(truth.nominal, truth.load, truth.poses)
+    assert result.horizontal_state is State.ROUGH and _holds(result, truth.clearance)
