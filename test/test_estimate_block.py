@@ -171,3 +171,27 @@ def test_contacts_that_are_no_impacts_between_two_poses_determine_nothing(elasti
     found = of_guide(t[::every], q[::every], stiffness)
     assert found.horizontal_state is State.NOT_OBSERVABLE
     assert "impacts" in found.reasons[0]
+
+
+@pytest.mark.parametrize("too_stiff", [300.0, 30.0])
+def test_a_contact_far_softer_than_believed_leaves_the_clearance_in_its_interval(too_stiff) -> None:
+    """The impacts scatter more than rigid ones would, and the interval is as wide as that."""
+    motion = simulate(guide(1e7), t_end=12.0, output_dt=0.004, tol=1e-6)
+    noise = np.random.default_rng(1).normal(0.0, [3e-5, 3e-5, 2e-4], motion.q.shape)
+    found = of_guide(motion.t, motion.q + noise, 1e7 * too_stiff)
+    for value, true in ((found.horizontal, 0.030), (found.vertical, 0.022)):
+        assert abs(value.mean - true) < 1.5e-3
+        assert value.p05 < true < value.p95
+
+
+def test_rounded_block_between_four_walls_is_estimated() -> None:
+    rounded = replace(guide(1e8), frame=Frame(0.2, 0.2, corner_radius_m=0.03))
+    motion = simulate(rounded, t_end=12.0, output_dt=0.004, tol=1e-6)
+    noise = np.random.default_rng(1).normal(0.0, [3e-5, 3e-5, 2e-4], motion.q.shape)
+    at = np.arange(0.0, 12.01, 0.01)
+    wrench = np.stack([60.0 * np.sin(7.0 * at), 55.0 * np.sin(11.0 * at), 0.0 * at], axis=1)
+    nominal = replace(rounded, clearance=Clearance(0.034, 0.019), loads=())
+    found = estimate(nominal, Load(at, wrench), Poses(motion.t, motion.q + noise))
+    for value, true in ((found.horizontal, 0.030), (found.vertical, 0.022)):
+        assert abs(value.mean - true) < 5e-4
+        assert value.p05 < true < value.p95

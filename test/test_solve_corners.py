@@ -207,3 +207,16 @@ def test_block_that_is_not_square_ends_at_45_degrees_with_a_named_error() -> Non
 def test_estimate_refuses_a_block() -> None:
     with pytest.raises(Exception, match=r"head\.carries"):
         Forward(block(), None)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("radius", [None, 0.01], ids=["sharp", "rounded"])
+def test_twins_with_walls_and_with_corners_share_no_compiled_code(radius: float | None) -> None:
+    """Both have the same terms: only the records of their constants differ."""
+    walls = replace(mirrored(block()), frame=Frame(SIDE, SIDE))
+    corners = block(frame=Frame(SIDE, SIDE, corner_radius_m=radius))
+    expected = simulate(corners, t_end=0.3, output_dt=0.1).q[-1]
+    for scenes in ((walls, corners), (corners, walls)):
+        twins = [Twin(scene) for scene in scenes]
+        ends = [twin.advance(0.3).q for twin in twins]
+        np.testing.assert_allclose(ends[scenes.index(corners)], expected, atol=1e-9)
+        assert twins[0].signature != twins[1].signature

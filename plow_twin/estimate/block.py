@@ -340,7 +340,8 @@ def _meeting(scene: Scene, inertia: Array, flights: list[Array], room: float) ->
         return None
     mass = 1.0 / (1.0 / inertia[0] + arm**2 / inertia[2])
     energy = (inertia * v**2).sum(axis=1)
-    distance = float(normal @ (q[:2] + corner))
+    # that of a rounded corner is the centre of its arc
+    distance = float(normal @ (q[:2] + corner)) + geometry.corner_radius(scene)
     turned = np.array([c * normal[0] + s * normal[1], -s * normal[0] + c * normal[1]])
     deeper = _deeper(scene, mass, before, after)
     return Impact(t, wall, distance, deeper, after / before, float(energy[1] / energy[0]), turned, arm)

@@ -71,7 +71,12 @@ class Units:
                 inertia_kg_m2=head.inertia_kg_m2 / (mass * length**2),
                 com_offset_m=(x / length, y / length),
             ),
-            frame=replace(frame, width_m=frame.width_m / length, height_m=frame.height_m / length),
+            frame=replace(
+                frame,
+                width_m=frame.width_m / length,
+                height_m=frame.height_m / length,
+                corner_radius_m=None if frame.corner_radius_m is None else frame.corner_radius_m / length,
+            ),
             clearance=Clearance(clearance.horizontal_m / length, clearance.vertical_m / length),
             contact=self._contact(scene.contact),
             gravity=replace(
@@ -154,12 +159,15 @@ class Units:
         return self.mass / self.time if LAWS[contact.law].additive else self.time / self.length
 
     def _contact(self, contact: Contact) -> Contact:
-        damping, ramp = contact.damping, contact.ramp_m
+        damping, ramp, speed = contact.damping, contact.ramp_m, self.length / self.time
+        fastest, along = contact.restitution_speed_m_s, contact.restitution_fall_along_s_m
         return replace(
             contact,
             stiffness=contact.stiffness * self.length**contact.exponent / self.force,
             damping=None if damping is None else damping / self._damping(contact),
             impact_speed_floor_m_s=contact.impact_speed_floor_m_s * self.time / self.length,
+            restitution_speed_m_s=None if fastest is None else fastest / speed,
+            restitution_fall_along_s_m=None if along is None else along * speed,
             ramp_m=None if ramp is None else ramp / self.length,
         )
 

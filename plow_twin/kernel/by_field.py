@@ -10,7 +10,7 @@ from numba.extending import overload
 from plow_twin.errors import ArgumentError
 
 
-def by_field(name: str, present: Callable[[Any], Any], absent: Callable[[Any], Any]) -> Callable[[Any], Any]:
+def by_field(name: str, present: Callable[..., Any], absent: Callable[..., Any]) -> Callable[..., Any]:
     """Return a function of a record p for use in kernels: `present` for types with the field, `absent` for the others.
 
     Parameters
@@ -18,14 +18,15 @@ def by_field(name: str, present: Callable[[Any], Any], absent: Callable[[Any], A
     name : str
         The field.
     present, absent : callable
-        Functions of one argument p that numba compiles.
+        Functions of p, and of the same further arguments, that numba compiles.
     """
 
-    def choose(p: Any) -> Any:
+    def choose(p: Any, *more: Any) -> Any:
         raise ArgumentError(f"by_field({name!r}): called from Python, expected a call from a kernel")
 
-    def implementation(p):  # type: ignore[no-untyped-def]  # numba compares this signature with the chosen one
+    def implementation(p, *more):  # type: ignore[no-untyped-def]
         return present if name in p.fields else absent
 
-    overload(choose)(implementation)
+    # strict would compare this signature with the chosen one
+    overload(choose, strict=False)(implementation)
     return choose

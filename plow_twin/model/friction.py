@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.kernel.compiler import kernel
-from plow_twin.model.geometry import arm_rows, slip_arm_rows
+from plow_twin.model.geometry import arm_rows, roll, slip_arm_rows
 
 if TYPE_CHECKING:
     from plow_twin.model.scene import Scene
@@ -37,7 +37,7 @@ def painleve_coefficients(scene: Scene) -> NDArray[np.float64]:
     """
     c, s, (x, y) = 1.0, 0.0, scene.head.com_offset_m
     normal, along = (rows.T @ np.array([c, s, x, y]) for rows in (arm_rows(scene), slip_arm_rows(scene)))
-    product = np.abs(normal * along)
+    product = np.abs(normal * (along - roll(scene)))
     if "theta" in scene.locked:
         product[:] = 0.0
     with np.errstate(divide="ignore"):

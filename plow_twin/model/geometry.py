@@ -19,6 +19,9 @@ corner c = (cx, cy) is at
     p_x = X + c cx - s cy              p_y = Y + s cx + c cy
 
 so penetrations and arms are linear again, and the same equations hold with other coefficients.
+
+A rounded corner meets a wall as the centre of its arc meets one that is nearer by the radius. C is that centre then,
+and only friction needs to know: the point that touches is nearer to the wall by the radius (`roll`).
 """
 
 from __future__ import annotations
@@ -39,8 +42,51 @@ STATE_SIZE = 8
 
 
 def corner_positions(scene: Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the frame corner (Cx, Cy) of each pair, shape (8,) each, in m, world axes."""
-    return 0.5 * scene.frame.width_m * CORNER_X, 0.5 * scene.frame.height_m * CORNER_Y
+    """Return the frame corner (Cx, Cy) of each pair, shape (8,) each, in m, world axes; of a rounded one the centre."""
+    radius = corner_radius(scene)
+    return (0.5 * scene.frame.width_m - radius) * CORNER_X, (0.5 * scene.frame.height_m - radius) * CORNER_Y
+
+
+def corner_radius(scene: Scene) -> float:
+    """Return the radius of the corners in m, 0 for sharp ones."""
+    return scene.frame.corner_radius_m or 0.0
+
+
+#: Sides that an arc of an outline is drawn with.
+_ARC_SIDES = 6
+
+
+def outline(sides: NDArray[np.float64], radius: float) -> NDArray[np.float64]:
+    """Return the closed outline of a rectangle with rounded corners about the origin, clockwise from the top left.
+
+    Parameters
+    ----------
+    sides : ndarray, shape (2,)
+        Width and height.
+    radius : float
+        That of the corners in the same unit; 0 for sharp ones.
+
+    Returns
+    -------
+    ndarray, shape (n, 2)
+        The first point is the last one too.
+    """
+    angles = np.linspace(math.pi, 0.5 * math.pi, _ARC_SIDES + 1 if radius > 0.0 else 1)
+    points = []
+    for turn, corner in enumerate(((-1.0, 1.0), (1.0, 1.0), (1.0, -1.0), (-1.0, -1.0))):
+        arc = angles - 0.5 * math.pi * turn
+        centre = (0.5 * sides - radius) * corner
+        points.append(centre + radius * np.stack([np.cos(arc), np.sin(arc)], axis=1))
+    closed: NDArray[np.float64] = np.concatenate([*points, points[0][:1]])
+    return closed
+
+
+def roll(scene: Scene) -> float:
+    """Return the way in m along its wall by which the angle in rad moves the point of a rounded corner that touches.
+
+    It counts along the wall's tangent (`slip_rows`); the arm of a force there is less by it (`slip_arm_rows`).
+    """
+    return corner_radius(scene) * (1.0 if scene.head.carries == "corners" else -1.0)
 
 
 def wall_distances(scene: Scene) -> NDArray[np.float64]:
@@ -63,7 +109,7 @@ def penetration_rows(scene: Scene) -> NDArray[np.float64]:
             NORMAL_X * corner_y - NORMAL_Y * corner_x,
             -NORMAL_X,
             -NORMAL_Y,
-            NORMAL_X * offset_x + NORMAL_Y * offset_y - wall_distances(scene),
+            NORMAL_X * offset_x + NORMAL_Y * offset_y - (wall_distances(scene) - corner_radius(scene)),
         ]
     )
     return _of_places(scene, rows)

@@ -110,6 +110,7 @@ class Frame:
 
     width_m: float = _quantity("m", "horizontal side", gt=0.0)
     height_m: float = _quantity("m", "vertical side", gt=0.0)
+    corner_radius_m: float | None = _quantity("m", "radius of rounded corners, sharp unless given", None, gt=0.0)
     labels: Mapping[str, str] = field(
         default_factory=dict, metadata={"doc": "letters for corners, e.g. a: bottom_right", "choices": CORNER_NAMES}
     )
@@ -129,6 +130,16 @@ class Contact:
 
     Exactly one of `damping` and `restitution` is given, or neither for a law without damping. The default law returns
     exactly the given restitution.
+
+    With `restitution_speed_m_s` v1 and `restitution_fall` q the restitution of impacts faster than v1 falls as
+    (w / v1)^-q, w = v (m' / m)^p of the speed of approach v and the effective mass m' of the head at the corner, p the
+    `restitution_mass_power`. With `restitution_fall_along_s_m` it is less by that times the speed of the centre of mass
+    along the wall.
+
+    References
+    ----------
+    Fall with the speed, v^-1/4 of plastic contact: Johnson, Contact Mechanics, 1985, sec. 11.5. The other two were
+    found in measured impacts (docs/measured.md).
     """
 
     law: str = _choice("contact law", LAWS, "exact_restitution")
@@ -142,10 +153,29 @@ class Contact:
         ge=0.0,
     )
     restitution: float | None = _quantity("1", "restitution asked of the law", None, ge=0.0, le=1.0)
+    restitution_fall: float | None = _quantity(
+        "1", "power by which it falls with the impact above restitution_speed_m_s", None, ge=0.0, le=1.0
+    )
+    restitution_speed_m_s: float | None = _quantity("m/s", "impact up to which it does not fall", None, gt=0.0)
+    restitution_mass_power: float | None = _quantity(
+        "1", "power of the effective mass over the head's in the impact, 0 unless given", None, ge=0.0, le=4.0
+    )
+    restitution_fall_along_s_m: float | None = _quantity(
+        "s/m", "its fall with the speed of the centre of mass along the wall, 0 unless given", None, ge=0.0
+    )
     impact_speed_floor_m_s: float = _quantity(
         "m/s", "smallest impact speed v0 used in lambda = D(e)/v0, bounds the damping of a touch at rest", 1e-3, gt=0.0
     )
     ramp_m: float | None = _quantity("m", "ramped_damping: penetration over which C grows to its value", None, gt=0.0)
+
+
+#: What makes the restitution depend on the impact; all absent where it does not.
+FALL_NAMES: Final = (
+    "restitution_fall",
+    "restitution_speed_m_s",
+    "restitution_mass_power",
+    "restitution_fall_along_s_m",
+)
 
 
 @dataclass(frozen=True)
@@ -369,6 +399,7 @@ def check(scene: Scene) -> Iterator[Problem]:
     if not found:
         yield from _check_contact(scene.contact)
         yield from _check_rotation(scene)
+        yield from _check_corners(scene)
         yield from _check_loads(scene.loads)
         if scene.friction is not None:
             yield from _check_friction(scene.friction)
@@ -529,6 +560,7 @@ def _check_contact(contact: Contact) -> Iterator[Problem]:
             )
     if allowed and not names:
         yield Problem("contact", given, f"{' or '.join(allowed)} for {contact.law}")
+    yield from _check_fall(contact)
     if law.exponent is not None and contact.exponent != law.exponent:
         yield Problem("contact.exponent", contact.exponent, f"{law.exponent:g} for {contact.law}")
     if not law.additive and contact.damping is not None and contact.damping > MOST_DAMPING_FACTOR:
@@ -538,6 +570,30 @@ def _check_contact(contact: Contact) -> Iterator[Problem]:
     if law.ramped != (contact.ramp_m is not None):
         expected = "a penetration > 0 [m]" if law.ramped else "nothing"
         yield Problem("contact.ramp_m", contact.ramp_m, f"{expected} for {contact.law}")
+
+
+def _check_fall(contact: Contact) -> Iterator[Problem]:
+    if contact.restitution is None:
+        for name in FALL_NAMES:
+            if getattr(contact, name) is not None:
+                yield Problem(f"contact.{name}", getattr(contact, name), "nothing without contact.restitution")
+        return
+    if (contact.restitution_fall is None) != (contact.restitution_speed_m_s is None):
+        given = {name: getattr(contact, name) for name in ("restitution_fall", "restitution_speed_m_s")}
+        yield Problem("contact", given, "both or neither")
+    if contact.restitution_fall is None and contact.restitution_mass_power is not None:
+        expected = "nothing without contact.restitution_fall"
+        yield Problem("contact.restitution_mass_power", contact.restitution_mass_power, expected)
+
+
+def _check_corners(scene: Scene) -> Iterator[Problem]:
+    radius, frame = scene.frame.corner_radius_m, scene.frame
+    if radius is None:
+        return
+    if not radius < 0.5 * min(frame.width_m, frame.height_m):
+        yield Problem("frame.corner_radius_m", radius, "less than half the frame's shorter side [m]")
+    if scene.support is not None:
+        yield Problem("support", scene.support, "none with frame.corner_radius_m")
 
 
 def _check_friction(friction: Friction) -> Iterator[Problem]:

@@ -12,7 +12,7 @@ from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
 from plow_twin.live.parameters import Settings
-from plow_twin.model.geometry import corner_positions, wall_distances
+from plow_twin.model.geometry import corner_positions, corner_radius, outline, wall_distances
 from plow_twin.model.pairs import NORMAL_X, NORMAL_Y, PAIR_COUNT
 from plow_twin.model.scene import Scene
 from plow_twin.ros.messages import set_stamp
@@ -51,7 +51,7 @@ class Markers:
         self._transforms = _transforms(node) if settings.tf else None
         corners_x, corners_y = corner_positions(scene)
         self._corners = np.stack([corners_x, corners_y], axis=1)
-        self._walls = wall_distances(scene)
+        self._walls, self._radius = wall_distances(scene), corner_radius(scene)
         self._scale = scene.frame.height_m
         self._weight = scene.head.mass_kg * max(scene.gravity.acceleration_m_s2, 1.0)
 
@@ -65,7 +65,7 @@ class Markers:
         walls, frame = (still, q) if self._scene.head.carries == "corners" else (q, still)
         markers = [
             self._line("cavity", 0, placed(_rectangle(cavity), walls), _BLUE),
-            self._line("frame", 0, placed(_rectangle(block), frame), _GREY),
+            self._line("frame", 0, placed(outline(2.0 * block, self._radius), frame), _GREY),
         ]
         normal = np.stack([NORMAL_X, NORMAL_Y], axis=1)
         along = np.stack([-NORMAL_Y, NORMAL_X], axis=1) * 0.1 * self._scale
@@ -76,9 +76,9 @@ class Markers:
             foot = self._corners[pair] + normal[pair] * (self._walls[pair] - normal[pair] @ self._corners[pair])
             worn = placed(np.stack([foot - along[pair], foot + along[pair]]) + depth * normal[pair], walls)
             markers.append(self._line("pads", pair, worn, _ORANGE))
-            begin = placed(self._corners[pair][None], frame)[0]
-            out = side * placed(normal[pair][None], np.array([0.0, 0.0, walls[2]]))[0]
-            markers.append(self._arrow(pair, begin, out * force / self._weight * _ARROW * self._scale))
+            out = placed(normal[pair][None], np.array([0.0, 0.0, walls[2]]))[0]
+            begin = placed(self._corners[pair][None], frame)[0] + self._radius * out
+            markers.append(self._arrow(pair, begin, side * out * force / self._weight * _ARROW * self._scale))
         message = MarkerArray(markers=markers)
         for marker in markers:
             marker.header.frame_id = self._settings.frame_id

@@ -20,7 +20,7 @@ from plow_twin.run.lane_twins import LaneTwins
 from plow_twin.run.pace import MOST_SECONDS, OutOfTimeError, Pace, check_limits
 from plow_twin.run.twin import DEFAULT_BUDGET, read_snapshot
 from plow_twin.solve import loop
-from plow_twin.solve.compiled_scene import CompiledScene, compile_scene, inertias, wear_rate
+from plow_twin.solve.compiled_scene import CompiledScene, compile_scene, inertias, options, wear_rate
 from plow_twin.solve.lanes.record import fits_lanes
 from plow_twin.solve.method.implicit import new_implicit
 from plow_twin.solve.modes import settle_moved
@@ -112,7 +112,7 @@ class TwinBatch:
     def signature(self) -> tuple[bool, ...]:
         """Which terms the equations have, as of `Twin`: batches of one signature share their compiled code."""
         parts = self._workers[0].parts
-        return tuple(part is not None for part in (*parts.terms, parts.implicit))
+        return (*(part is not None for part in (*parts.terms, parts.implicit)), *options(self.scenes[0]))
 
     def set_wrench(self, wrench: ArrayLike) -> None:
         """Set the samples at which the load begins; it runs from there to the next samples on straight lines.
@@ -407,6 +407,11 @@ def _merge(compiled: Sequence[CompiledScene]) -> Terms:
             raise ArgumentError(
                 f"scenes[{index}].head.carries: got {one.scene.head.carries}, expected that of scenes[0]: "
                 f"{compiled[0].scene.head.carries}"
+            )
+        if options(one.scene) != options(compiled[0].scene):
+            raise ArgumentError(
+                f"scenes[{index}]: got {options(one.scene)}, expected a corner_radius_m and a restitution that falls "
+                f"in all or in none: scenes[0] has {options(compiled[0].scene)}"
             )
         if terms.support != first.support:
             raise ArgumentError(

@@ -20,7 +20,7 @@ from plow_twin.model.scene import Initial, Scene, check_travel_speed
 from plow_twin.run.advance import Advance, AdvanceSeries, check_times
 from plow_twin.run.pace import MOST_SECONDS, OutOfTimeError, Pace, check_limits
 from plow_twin.solve import loop
-from plow_twin.solve.compiled_scene import CompiledScene, compile_scene, inertias, wear_rate
+from plow_twin.solve.compiled_scene import CompiledScene, compile_scene, inertias, options, wear_rate
 from plow_twin.solve.method.rest import AT_REST
 from plow_twin.solve.method.step_size import PARTING_ORDER
 from plow_twin.solve.modes import LARGEST_ANGLE, settle_moved
@@ -130,7 +130,7 @@ class Twin:
         """Which terms the equations have: twins of one signature share their compiled code."""
         parts = self._parts
         there = (*parts.terms, parts.harmonics, parts.segments, parts.implicit, self._bound)
-        return tuple(part is not None for part in there)
+        return (*(part is not None for part in there), *options(self.scene))
 
     def like(self, scene: Scene) -> Twin:
         """Return a twin of another scene, with the tolerance, excitation and limits of this one.

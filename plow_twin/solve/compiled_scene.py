@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from numbers import Real
 from typing import Any, TypeVar
 
@@ -20,16 +21,17 @@ from plow_twin.model.scene import DOF_NAMES, Contact, Head, Scene, Wear
 from plow_twin.solve.method.implicit import OVERDAMPED_RATIO, new_implicit
 from plow_twin.solve.modes import settle_modes
 from plow_twin.solve.state import (
-    CORNER_PARAMS,
     COS,
     HARMONIC,
     MAX_ORDER,
     PARAMS,
+    RESTITUTIONS,
     SEGMENT,
     SIN,
     Array,
     Harmonics,
     Implicit,
+    Options,
     Params,
     Parts,
     Segments,
@@ -39,6 +41,7 @@ from plow_twin.solve.state import (
     Y,
     new_record,
     new_records,
+    params_type,
     state_type,
 )
 
@@ -114,9 +117,9 @@ def compile_scenes(scenes: Sequence[Scene], tol: float) -> tuple[NDArray[np.void
     Returns
     -------
     params : ndarray of `PARAMS`, shape (m,)
-        Constants of all scenes in one block; zeros for those whose head carries corners.
+        Constants of all scenes in one block; zeros for those with `Options`.
     compiled : list of CompiledScene
-        The scenes; their constants are the rows of `params`, or records of their own where the head carries corners.
+        The scenes; their constants are the rows of `params`, or records of their own with `Options`.
 
     Raises
     ------
@@ -126,7 +129,7 @@ def compile_scenes(scenes: Sequence[Scene], tol: float) -> tuple[NDArray[np.void
     _check_tolerance(tol)
     shared, params = _Shared(), new_records(PARAMS, len(scenes))
     descriptions = [_describe(scene, tol, False, shared) for scene in scenes]
-    shares = [_params_type(scene) is PARAMS for scene in scenes]
+    shares = [not any(options(scene)) for scene in scenes]
     for name in PARAMS.names or ():
         there = [index for index, one in enumerate(descriptions) if shares[index] and name in one.values]
         if there:
@@ -172,7 +175,7 @@ class _Description:
     def compiled(self, params: Params | None = None) -> CompiledScene:
         """Return the compiled scene, its constants in `params` or in a record of its own."""
         if params is None:
-            params = new_record(_params_type(self.scene))
+            params = new_record(params_type(options(self.scene)))
             for name, value in self.values.items():
                 params[name] = value
         return CompiledScene(self.scene, params, self.parts, self.loads)
@@ -223,8 +226,7 @@ def _describe(scene: Scene, tol: float, sampled: bool, shared: _Shared) -> _Desc
         half_cavity=0.5 * float(geometry.wall_distances(scene).min()),
         max_events=MAX_EVENTS_AT_ONCE,
     )
-    if scene.head.carries == "corners":
-        values["tumbles"] = float(geometry.tumbles(scene))
+    values |= _of_options(scene)
     values |= _rubbing(scene) | _slip(scene) | _frame(scene)
     segments = _segments(scene, loads.pieces) if loads.pieces is not None else None
     if sampled:
@@ -233,8 +235,36 @@ def _describe(scene: Scene, tol: float, sampled: bool, shared: _Shared) -> _Desc
     return _Description(scene, values, Parts(terms, harmonics, segments, _implicit(scene, terms, values)), loads)
 
 
-def _params_type(scene: Scene) -> np.dtype[np.void]:
-    return PARAMS if scene.head.carries == "walls" else CORNER_PARAMS
+def options(scene: Scene) -> Options:
+    """Return which options a scene has, which its constants have fields for."""
+    falls = scene.contact.restitution_fall is not None or scene.contact.restitution_fall_along_s_m is not None
+    return Options(scene.head.carries == "corners", scene.frame.corner_radius_m is not None, falls)
+
+
+def _of_options(scene: Scene) -> dict[str, Any]:
+    """Return the constants of a scene's options."""
+    there, contact, found = options(scene), scene.contact, dict[str, Any]()
+    if there.corners:
+        found["tumbles"] = float(geometry.tumbles(scene))
+    if there.rounded:
+        found["roll"] = geometry.roll(scene)
+    if there.falling:
+        found |= dict(
+            damping_numbers=damping_numbers(contact.law),
+            restitution=contact.restitution,
+            fall=contact.restitution_fall or 0.0,
+            fall_speed=contact.restitution_speed_m_s or 1.0,
+            fall_mass=contact.restitution_mass_power or 0.0,
+            fall_along=contact.restitution_fall_along_s_m or 0.0,
+        )
+    return found
+
+
+@cache
+def damping_numbers(law: str) -> Array:
+    """Return e D(e) of a law on a grid of restitutions from 0 to 1, shape (RESTITUTIONS + 1,)."""
+    grid = np.arange(RESTITUTIONS + 1) / RESTITUTIONS
+    return grid * [LAWS[law].damping_number(float(e)) for e in grid]
 
 
 def _scene_terms(

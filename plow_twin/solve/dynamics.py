@@ -15,8 +15,10 @@ from plow_twin.solve.kinematics import (
     named_angle,
     penetration_at,
     rate_at,
-    row_rate,
     row_value,
+    slip_arm,
+    slip_place,
+    slip_rate,
     to_body_axes,
     to_world_axes,
 )
@@ -44,7 +46,7 @@ def acting(parts):
 
 
 @kernel()
-def push(p, slip, stick, state, frozen, pair, force, c, s, omega, x, y, vx, vy):
+def push(p, slip, stick, state, frozen, pair, force, c, s, theta, omega, x, y, vx, vy):
     """Return the effect of a pair that pushes with `force`, in body axes: force, moment, power of its friction.
 
     The wall's tangent is its normal turned by +90 degrees; the penetration's rows for X and Y are minus the normal.
@@ -52,15 +54,15 @@ def push(p, slip, stick, state, frozen, pair, force, c, s, omega, x, y, vx, vy):
     fx, fy = -p.penetration_rows[2, pair] * force, -p.penetration_rows[3, pair] * force
     torque, power = row_value(p.arm_rows, pair, c, s, x, y) * force, 0.0
     if slip is not None or stick is not None:
-        rate = row_rate(p, p.slip_rows, pair, c, s, omega, x, y, vx, vy)
+        rate = slip_rate(p, pair, c, s, omega, x, y, vx, vy)
         if stick is not None:
-            place = row_value(p.slip_rows, pair, c, s, x, y)
+            place = slip_place(p, pair, c, s, x, y, theta)
             drag = tangential_force(p, state, frozen, pair, force, place, rate)
         else:
             drag = friction_force(force, rate, p.friction, p.slip_speed)
         fx += p.penetration_rows[3, pair] * drag
         fy -= p.penetration_rows[2, pair] * drag
-        torque += row_value(p.slip_arm_rows, pair, c, s, x, y) * drag
+        torque += slip_arm(p, pair, c, s, x, y) * drag
         power = drag * rate
     return fx, fy, torque, power
 
@@ -87,7 +89,7 @@ def accelerate(p, acts, frozen, state, t, z, load, out) -> None:
 
 
 @kernel()
-def _contacts(p, slip, stick, frozen, state, c, s, om, x, y, vx, vy):
+def _contacts(p, slip, stick, frozen, state, c, s, theta, om, x, y, vx, vy):
     """Return force in head axes and moment about the centre of mass of all pairs."""
     fx = fy = torque = 0.0
     for pair in range(PAIR_COUNT):
@@ -99,7 +101,7 @@ def _contacts(p, slip, stick, frozen, state, c, s, om, x, y, vx, vy):
             f = law_force(p, state, pair, d, r)
             if not frozen:
                 f = max(f, 0.0)
-            push_x, push_y, moment, _ = push(p, slip, stick, state, frozen, pair, f, c, s, om, x, y, vx, vy)
+            push_x, push_y, moment, _ = push(p, slip, stick, state, frozen, pair, f, c, s, theta, om, x, y, vx, vy)
             fx += push_x
             fy += push_y
             torque += moment
@@ -116,7 +118,7 @@ def _accelerate(p, offset, free, slip, stick, support, frozen, state, z, load, o
     ca, sa = along(p, c, s)
     x, y = to_body_axes(ca, sa, z[0], z[1])
     vx, vy = to_body_axes(ca, sa, z[3], z[4])
-    fx, fy, torque = _contacts(p, slip, stick, frozen, state, c, s, om, x, y, vx, vy)
+    fx, fy, torque = _contacts(p, slip, stick, frozen, state, c, s, z[2], om, x, y, vx, vy)
     out[0], out[1], out[2] = z[3], z[4], z[5]
     along_x, along_y = to_world_axes(ca, sa, fx, fy)
     _accelerate_head(p, offset, free, c, s, load, along_x, along_y, torque, 3, out)
@@ -144,8 +146,9 @@ def _accelerate_both(p, offset, free, slip, stick, frozen, state, z, load, out) 
     x, y = to_body_axes(c, s, z[0] - z[3], z[1] - z[4])
     vx, vy = to_body_axes(c, s, z[6] - z[9], z[7] - z[10])
     fx, fy, torque = _contacts(
-        p, slip, stick, frozen, state, math.cos(angle), math.sin(angle), om - spin, x, y, vx + spin * y, vy - spin * x
-    )
+        p, slip, stick, frozen, state, math.cos(angle), math.sin(angle), angle, om - spin, x, y, vx + spin * y,
+        vy - spin * x,
+    )  # fmt: skip
     along_x, along_y = to_world_axes(c, s, fx, fy)
     for j in range(6):
         out[j] = z[6 + j]

@@ -116,7 +116,7 @@ def _powers_under(p, offset, free, slip, stick, state, wear_depth, y, ground, lo
     for pair in range(PAIR_COUNT):
         force = pairs[2, pair]
         push_x, push_y, moment, power = push(
-            p, slip, stick, state, True, pair, force, y[COS], y[SIN], y[OMEGA], y[X], y[Y], y[VX], y[VY]
+            p, slip, stick, state, True, pair, force, y[COS], y[SIN], y[THETA], y[OMEGA], y[X], y[Y], y[VX], y[VY]
         )
         fx += push_x
         fy += push_y

@@ -17,8 +17,23 @@ from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import row
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.contact_force import law_force
-from plow_twin.solve.kinematics import penetration_of, rate_of, row_rate, row_value
-from plow_twin.solve.state import CLIPPED, COS, OFF, OMEGA, ON, SIN, SLIPS_BACKWARD, SLIPS_FORWARD, STICKS, VX, VY, X, Y
+from plow_twin.solve.kinematics import penetration_of, rate_of, slip_place, slip_rate
+from plow_twin.solve.state import (
+    CLIPPED,
+    COS,
+    OFF,
+    OMEGA,
+    ON,
+    SIN,
+    SLIPS_BACKWARD,
+    SLIPS_FORWARD,
+    STICKS,
+    THETA,
+    VX,
+    VY,
+    X,
+    Y,
+)
 
 #: A guard below this share of its terms at the step's start, or of the largest over the step, is zero up to rounding.
 _ROUNDING, _ROUNDING_OVER_STEP = 1e-10, 1e-13
@@ -29,8 +44,8 @@ _FINEST = 4e-15
 @kernel(inline="code")
 def _along(p, pair, y):
     """Return the place of a corner along its wall and the rate at which it slips, in body coordinates y."""
-    place = row_value(p.slip_rows, pair, y[COS], y[SIN], y[X], y[Y])
-    return place, row_rate(p, p.slip_rows, pair, y[COS], y[SIN], y[OMEGA], y[X], y[Y], y[VX], y[VY])
+    place = slip_place(p, pair, y[COS], y[SIN], y[X], y[Y], y[THETA])
+    return place, slip_rate(p, pair, y[COS], y[SIN], y[OMEGA], y[X], y[Y], y[VX], y[VY])
 
 
 @kernel(inline="code")

@@ -11,7 +11,7 @@ import numpy as np
 
 from plow_twin.kernel.by_field import by_field
 from plow_twin.kernel.compiler import kernel
-from plow_twin.kernel.simd import row
+from plow_twin.kernel.simd import row, splat
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, X, Y
 
 #: A quarter turn in rad, after which each corner of a block takes the name of the next.
@@ -22,6 +22,11 @@ QUARTER_TURN = 0.5 * math.pi
 fixed_axes = by_field("tumbles", lambda p: 1, lambda p: None)
 #: Whether the head may turn beyond 45 degrees (`model.geometry.tumbles`).
 may_tumble = by_field("tumbles", lambda p: p.tumbles != 0.0, lambda p: False)
+
+
+#: 1 where the corners are rounded, else None; and by which way along its wall the angle moves the point that touches.
+_is_rounded = by_field("roll", lambda p: 1, lambda p: None)
+_roll = by_field("roll", lambda p: p.roll, lambda p: 0.0)
 
 
 @kernel(inline="code")
@@ -69,6 +74,49 @@ def row_rate(p, rows, pair, c, s, omega, x, y, vx, vy):
     """Return the rate of rows . (c, s, x, y) of one pair."""
     spin = spin_of_axes(p, omega)
     return row_value(rows, pair, -omega * s, omega * c, vx + spin * y, vy - spin * x)
+
+
+@kernel(inline="code")
+def slip_place(p, pair, c, s, x, y, theta):
+    """Return the place in m along its wall of the point of a corner that touches."""
+    place = row_value(p.slip_rows, pair, c, s, x, y)
+    if _is_rounded(p) is not None:
+        place += _roll(p) * theta
+    return place
+
+
+@kernel(inline="code")
+def slip_rate(p, pair, c, s, omega, x, y, vx, vy):
+    """Return the rate in m/s at which that point slides along the wall."""
+    rate = row_rate(p, p.slip_rows, pair, c, s, omega, x, y, vx, vy)
+    if _is_rounded(p) is not None:
+        rate += _roll(p) * omega
+    return rate
+
+
+@kernel(inline="code")
+def slip_arm(p, pair, c, s, x, y):
+    """Return the arm in m of a force along the wall at that point."""
+    arm = row_value(p.slip_arm_rows, pair, c, s, x, y)
+    if _is_rounded(p) is not None:
+        arm -= _roll(p)
+    return arm
+
+
+@kernel(fast=True, inline="code")
+def rolled(p, values, angle):
+    """Return places or slip rates of all pairs with what the angle, or its rate, adds to those of rounded corners."""
+    if _is_rounded(p) is not None:
+        values = values + splat(_roll(p) * angle)
+    return values
+
+
+@kernel(fast=True, inline="code")
+def slip_arms(p, arms, k):
+    """Return order k of the arms (`slip_arm`) of all pairs from those of sharp corners: the difference is constant."""
+    if _is_rounded(p) is not None and k == 0:
+        arms = arms - splat(_roll(p))
+    return arms
 
 
 @kernel(inline="code")

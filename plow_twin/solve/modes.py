@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from plow_twin.kernel.by_field import by_field
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import below, row, splat
 from plow_twin.model.geometry import STATE_SIZE
@@ -23,14 +24,19 @@ from plow_twin.solve.state import (
     ON,
     RAMPS,
     RELEASED,
+    RESTITUTIONS,
     SIN,
     THETA,
+    VX,
+    VY,
     X,
     Y,
 )
 
 #: Share of the release penetration, and of the speed that leads there, that counts as zero.
 _SHALLOW = 1e-3
+#: Rounds in which the damping of an impact under way and its speed are found from each other.
+_ROUNDS = 8
 #: Halvings of a bracket: to the last bit of a double.
 _BISECTIONS = 60
 #: Largest |theta| in rad at which each corner still meets the walls that belong to it: 45 degrees, and some roundings.
@@ -45,11 +51,34 @@ def penetration_and_rate(p, state, pair):
 
 
 @kernel()
+def _fallen_number(p, y, pair, speed):
+    """Return D of the restitution that is left of an impact of a speed (`model.scene.Contact`)."""
+    arm = row_value(p.arm_rows, pair, y[COS], y[SIN], y[X], y[Y])
+    mobility = 1.0 + p.free[2] * arm * arm * p.inverse_inertia / p.inverse_mass
+    impact = speed * mobility**-p.fall_mass
+    # the penetration's rows for X and Y are along the wall's normal
+    along = p.penetration_rows[2, pair] * y[VY] - p.penetration_rows[3, pair] * y[VX]
+    e = p.restitution * max(impact / p.fall_speed, 1.0) ** -p.fall - p.fall_along * abs(along)
+    at = max(e, 1.0 / RESTITUTIONS) * RESTITUTIONS
+    index = min(int(at), RESTITUTIONS - 1)
+    low, high = p.damping_numbers[index], p.damping_numbers[index + 1]
+    return (low + (at - index) * (high - low)) * RESTITUTIONS / at
+
+
+#: D of an impact, and whether it depends on the impact.
+_damping_number = by_field(
+    "fall", lambda p, y, pair, speed: _fallen_number(p, y, pair, speed), lambda p, y, pair, speed: p.damping_number
+)
+_falls = by_field("fall", lambda p: 1, lambda p: None)
+
+
+@kernel()
 def touch(p, state, pair) -> None:
     """Start a contact: read its impact speed, lambda = D / v0."""
     if p.damping_number >= 0.0:
         _, speed = penetration_and_rate(p, state, pair)
-        state.damping_factor[pair] = p.damping_number / max(speed, p.speed_floor)
+        number = _damping_number(p, state.y, pair, speed)
+        state.damping_factor[pair] = number / max(speed, p.speed_floor)
 
 
 @kernel()
@@ -90,8 +119,14 @@ def _start_inside(p, state, pair, energy) -> None:
         mobility = p.inverse_mass + p.free[2] * arm * arm * p.inverse_inertia
         mobility += p.frame_mobility[0] + arm_of_frame * arm_of_frame * p.frame_mobility[2]
         _, rate = penetration_and_rate(p, state, pair)
-        speed = _impact_speed(p.damping_number, rate, energy * mobility)
-        state.damping_factor[pair] = p.damping_number / max(speed, p.speed_floor)
+        number = p.damping_number
+        speed = _impact_speed(number, rate, energy * mobility)
+        if _falls(p) is not None:
+            # the speed tells the damping, which tells the speed
+            for _ in range(_ROUNDS):
+                number = _damping_number(p, y, pair, speed)
+                speed = _impact_speed(number, rate, energy * mobility)
+        state.damping_factor[pair] = number / max(speed, p.speed_floor)
 
 
 @kernel()

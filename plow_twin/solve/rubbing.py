@@ -12,7 +12,7 @@ import math
 from typing import Final
 
 from plow_twin.kernel.compiler import kernel
-from plow_twin.solve.kinematics import row_rate
+from plow_twin.solve.kinematics import slip_rate
 from plow_twin.solve.state import COS, OMEGA, SIN, VX, VY, X, Y
 
 #: Speed along the face in m/s below which the sliding in the plane counts as at this one, by the speed's share.
@@ -32,7 +32,7 @@ def rubbing(p, pair, y, depth, sliding, running_in) -> float:
     """Return by how much a pad at a wear depth wears faster than by travel alone, with the head at y, shape (8,)."""
     factor = 1.0
     if sliding is not None:
-        rate = row_rate(p, p.slip_rows, pair, y[COS], y[SIN], y[OMEGA], y[X], y[Y], y[VX], y[VY])
+        rate = slip_rate(p, pair, y[COS], y[SIN], y[OMEGA], y[X], y[Y], y[VX], y[VY])
         factor = math.sqrt(1.0 + (rate * time_per_way(p, pair)) ** 2)
     if running_in is not None:
         factor *= 1.0 + p.running_in * math.exp(-depth * p.running_in_rate)

@@ -110,6 +110,9 @@ def _in_lines(fields: list[tuple[Any, ...]]) -> np.dtype[np.void]:
     )
 
 
+#: Steps of the grid of restitutions on which their damping numbers are known; the least restitution that can be is one.
+RESTITUTIONS: Final = 1000
+
 #: Constants of one scene and one tolerance, per mass and inertia where that saves work.
 _PARAM_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("penetration_rows", "f8", (5, PAIR_COUNT)),  # penetration rows for c, s, X, Y, 1
@@ -157,8 +160,36 @@ _PARAM_FIELDS: Final[list[tuple[Any, ...]]] = [
 ]
 PARAMS: Final = _in_lines(_PARAM_FIELDS)
 
-#: The same for a head that carries corners; 1 where the block may tumble. The further field comes first (`state_type`).
-CORNER_PARAMS: Final = _in_lines([("tumbles", "f8"), *_PARAM_FIELDS])
+#: What only some scenes have, by their `Options`.
+_OPTION_FIELDS: Final[dict[str, list[tuple[Any, ...]]]] = {
+    "corners": [("tumbles", "f8")],  # the head carries corners; 1 where the block may tumble
+    "rounded": [("roll", "f8")],  # way of a rounded corner along its wall by the angle [m]
+    "falling": [  # a restitution that falls with the impact
+        ("damping_numbers", "f8", (RESTITUTIONS + 1,)),  # e D(e) on a grid from 0 to 1
+        ("restitution", "f8"),  # of impacts up to `fall_speed`
+        ("fall", "f8"),  # power by which it falls
+        ("fall_speed", "f8"),  # in m/s
+        ("fall_mass", "f8"),  # power of the effective mass
+        ("fall_along", "f8"),  # by the speed along the wall in s/m
+    ],
+}
+
+
+class Options(NamedTuple):
+    """Which fields the constants of a scene have beside those of every scene."""
+
+    corners: bool  #: the head carries corners
+    rounded: bool  #: the corners are rounded
+    falling: bool  #: the restitution falls with the impact
+
+
+@cache
+def params_type(options: Options) -> np.dtype[np.void]:
+    """Return the record type of a scene's constants."""
+    # what is more comes first, as in `state_type`
+    more = [field for name in Options._fields if getattr(options, name) for field in _OPTION_FIELDS[name]]
+    return _in_lines([*more, *_PARAM_FIELDS]) if more else PARAMS
+
 
 #: The whole state of the motion, and the step under way. Times in s.
 _STATE_FIELDS: Final[list[tuple[Any, ...]]] = [

@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from plow_twin.model.geometry import corner_radius, outline
 from plow_twin.model.pairs import CORNER_NAMES, CORNER_X, CORNER_Y, NORMAL_X, NORMAL_Y, PAIR_COUNT
 from plow_twin.model.scene import Scene
 
@@ -55,6 +56,8 @@ class Section:
     #: name of the fixed body; with a support the section is drawn in its axes
     frame_name: str = "frame (fixed)"
     is_block: bool = False
+    #: of the frame's, or the block's, corners
+    radius: float = 0.0
 
     @classmethod
     def of(cls, scene: Scene) -> Section:
@@ -65,7 +68,8 @@ class Section:
         name = "frame (fixed)" if scene.support is None else "frame (on springs)"
         labels = tuple(letters.get(corner, "") for corner in CORNER_NAMES)
         is_block = scene.head.carries == "corners"
-        return cls(frame, frame + gaps, labels, "guide (fixed)" if is_block else name, is_block)
+        radius = _MM * corner_radius(scene)
+        return cls(frame, frame + gaps, labels, "guide (fixed)" if is_block else name, is_block, radius)
 
     @property
     def half_view(self) -> Array:
@@ -73,24 +77,26 @@ class Section:
         return 0.5 * self.cavity + BODY_MARGIN_MM + 70.0
 
     def frame_strip(self) -> Array:
-        """Outline of the frame, or of the cavity about a block, shape (5, 2)."""
-        return 0.5 * (self.cavity if self.is_block else self.frame) * _SQUARE * _FLIP
+        """Outline of the frame, or of the cavity about a block, shape (5, 2), or more points for rounded corners."""
+        return (outline(self.cavity, 0.0) if self.is_block else outline(self.frame, self.radius)) * _FLIP
 
     def corners(self, pose: Iterable[float] = (0.0, 0.0, 0.0)) -> Array:
         """Corners of the frame, or of a block at a pose, in the order of `CORNER_NAMES`, shape (4, 2).
 
         A block's corners are named by their place: beyond 45 degrees the names have turned.
         """
-        corners = (0.5 * self.frame * _SIGNS)[::2]
+        # in the middle of an arc
+        within = self.radius * (1.0 - math.sqrt(0.5))
+        corners = ((0.5 * self.frame - within) * _SIGNS)[::2]
         if not self.is_block:
             return corners * _FLIP
         x, y, theta = pose
         return np.roll(_placed(corners, (x, y, theta)), -round(theta / (0.5 * math.pi)), axis=0)
 
     def head_strips(self, pose: Iterable[float]) -> Array:
-        """Outlines of the head at a pose x, y [m], theta [rad]: cavity and body, shape (2, 5, 2); block: (1, 5, 2)."""
+        """Outlines of the head at a pose x, y [m], theta [rad]: cavity and body, shape (2, 5, 2); block: (1, n, 2)."""
         if self.is_block:
-            return _placed(0.5 * self.frame * _SQUARE[None], pose)
+            return _placed(outline(self.frame, self.radius)[None], pose)
         sides = np.stack((self.cavity, self.cavity + 2.0 * BODY_MARGIN_MM))
         return _placed(0.5 * sides[:, None, :] * _SQUARE, pose)
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import choose, exact_row, exact_splat, fused, set_row
 from plow_twin.model.pairs import PAIR_COUNT
-from plow_twin.solve.compiled_scene import CompiledScene
+from plow_twin.solve.compiled_scene import CompiledScene, options
 from plow_twin.solve.state import CLIPPED, COS, MAX_ORDER, OFF, ON, Terms, new_records
 
 #: Scenes in a vector.
@@ -106,11 +106,11 @@ _COVERED: Final = {"harmonics", "second", "viscous", "hysteretic", "flight", "re
 def fits_lanes(compiled: CompiledScene, *, sampled: bool = False) -> bool:
     """Return whether the lanes take the steps of a scene.
 
-    Its exponent is 1, it has no other term than damping and harmonics or samples, and the head carries the walls.
+    Its exponent is 1, it has no other term than damping and harmonics or samples, and no `Options`.
     """
     parts = compiled.parts._replace(terms=compiled.parts.terms._replace(segments=None)) if sampled else compiled.parts
     there = (name for name, term in zip(Terms._fields, parts.terms, strict=True) if term is not None)
-    return parts.implicit is None and _COVERED.issuperset(there) and compiled.scene.head.carries == "walls"
+    return parts.implicit is None and _COVERED.issuperset(there) and not any(options(compiled.scene))
 
 
 def new_lanes() -> NDArray[np.void]:

@@ -21,7 +21,17 @@ from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.contact_force import law_force
 from plow_twin.solve.dynamics import accelerate, acting
 from plow_twin.solve.grip import grip_guard, grip_terms
-from plow_twin.solve.kinematics import penetration_of, rate_of, row_rate, row_value, row_values, to_body, to_world
+from plow_twin.solve.kinematics import (
+    penetration_of,
+    rate_of,
+    rolled,
+    row_value,
+    row_values,
+    slip_arm,
+    slip_rate,
+    to_body,
+    to_world,
+)
 from plow_twin.solve.rubbing import rubbing
 from plow_twin.solve.state import CLIPPED, COS, OMEGA, ON, SIN, THETA, VX, VY, Implicit, X, Y, new_record
 from plow_twin.solve.support import (
@@ -147,12 +157,12 @@ def decay_rate(p, state, slip, stick, support) -> float:
         decay += (faster - force) * mobility
         spring += slope * mobility
         if slip is not None:
-            sticking = 1.0 - math.tanh(row_rate(p, p.slip_rows, pair, c, s, om, x, yy, vx, vy) / p.slip_speed) ** 2
-            arm = row_value(p.slip_arm_rows, pair, c, s, x, yy)
+            sticking = 1.0 - math.tanh(slip_rate(p, pair, c, s, om, x, yy, vx, vy) / p.slip_speed) ** 2
+            arm = slip_arm(p, pair, c, s, x, yy)
             mobility = p.inverse_mass + arm * arm * p.inverse_inertia
             decay += p.friction * max(force, 0.0) / p.slip_speed * sticking * mobility
         if stick is not None and state.grip[pair] == 0:
-            arm = row_value(p.slip_arm_rows, pair, c, s, x, yy)
+            arm = slip_arm(p, pair, c, s, x, yy)
             mobility = p.inverse_mass + arm * arm * p.inverse_inertia
             decay += p.stick_damping * mobility
             spring += p.stick_stiffness * mobility
@@ -487,11 +497,11 @@ def _write_grip(p, state, h, w, implicit, seen, series) -> None:
     for i in range(s):
         y = seen[i + 1]
         for pair in range(PAIR_COUNT):
-            rates[i, pair] = row_rate(p, p.slip_rows, pair, y[COS], y[SIN], y[OMEGA], y[X], y[Y], y[VX], y[VY])
+            rates[i, pair] = slip_rate(p, pair, y[COS], y[SIN], y[OMEGA], y[X], y[Y], y[VX], y[VY])
     _interpolate(rates, implicit.from_stages, h, w.slip[0])
     for k in range(s):
         y = series[k]
-        place = row_values(p.slip_rows, y[COS], y[SIN], y[X], y[Y])
+        place = rolled(p, row_values(p.slip_rows, y[COS], y[SIN], y[X], y[Y]), y[THETA])
         set_row(w.slip[4], k, grip_terms(p, state, w, k, place, row(w.slip[0], k)))
 
 

@@ -21,9 +21,9 @@ from plow_twin.model.contact import power_term, power_terms, ramp_terms, root_te
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.contact_force import law_terms
 from plow_twin.solve.grip import grip_terms
-from plow_twin.solve.kinematics import fixed_axes, row_values
+from plow_twin.solve.kinematics import fixed_axes, rolled, row_values, slip_arms
 from plow_twin.solve.rubbing import time_per_way
-from plow_twin.solve.state import ACTS, BASE, COS, DAMPS, OMEGA, RAMPS, SIN, VX, VY, X, Y
+from plow_twin.solve.state import ACTS, BASE, COS, DAMPS, OMEGA, RAMPS, SIN, THETA, VX, VY, X, Y
 from plow_twin.solve.support import (
     FRAME_THETA,
     FRAME_VX,
@@ -262,15 +262,15 @@ def _applied(p, along_x, along_y, torque):
 
 
 @kernel(fast=True)
-def _drag(p, w, k, c, s, x, y, dc, ds, dx, dy):
+def _drag(p, w, k, c, s, x, y, om, dc, ds, dx, dy):
     """Return order k of the accelerations by friction (`_applied`, `model.friction`).
 
     With r = s' / v_s and tau = tanh(r):  k tau_k = sum_j j r_j (1 - tau^2)_{k-j}.
     """
     weighted, tau, rest, drag, arm = w.slip[1], w.slip[2], w.slip[3], w.slip[4], w.slip[5]
-    rate = row_values(p.slip_rows, dc, ds, dx, dy) * (1.0 / p.slip_speed)
+    rate = rolled(p, row_values(p.slip_rows, dc, ds, dx, dy), om) * (1.0 / p.slip_speed)
     set_row(w.slip[0], k, rate)
-    set_row(arm, k, row_values(p.slip_arm_rows, c, s, x, y))
+    set_row(arm, k, slip_arms(p, row_values(p.slip_arm_rows, c, s, x, y), k))
     if k == 0:
         for pair in range(PAIR_COUNT):
             tau[0, pair] = math.tanh(lane(rate, pair))
@@ -290,13 +290,13 @@ def _drag(p, w, k, c, s, x, y, dc, ds, dx, dy):
 
 
 @kernel(fast=True)
-def _hold_on(p, state, w, k, c, s, x, y, dc, ds, dx, dy):
+def _hold_on(p, state, w, k, c, s, x, y, theta, om, dc, ds, dx, dy):
     """Return order k of the accelerations by friction with stick (`_applied`, `solve.grip`)."""
     drag, arm = w.slip[4], w.slip[5]
-    rate = row_values(p.slip_rows, dc, ds, dx, dy)
+    rate = rolled(p, row_values(p.slip_rows, dc, ds, dx, dy), om)
     set_row(w.slip[0], k, rate)
-    set_row(arm, k, row_values(p.slip_arm_rows, c, s, x, y))
-    force = grip_terms(p, state, w, k, row_values(p.slip_rows, c, s, x, y), rate)
+    set_row(arm, k, slip_arms(p, row_values(p.slip_arm_rows, c, s, x, y), k))
+    force = grip_terms(p, state, w, k, rolled(p, row_values(p.slip_rows, c, s, x, y), theta), rate)
     set_row(drag, k, force)
     return _applied(
         p, row(p.penetration_rows, 3) * force, row(p.penetration_rows, 2) * force * -1.0, _multiply(arm, drag, k)
@@ -304,13 +304,13 @@ def _hold_on(p, state, w, k, c, s, x, y, dc, ds, dx, dy):
 
 
 @kernel(fast=True)
-def _slide(p, w, k, dc, ds, dx, dy) -> None:
+def _slide(p, w, k, om, dc, ds, dx, dy) -> None:
     """Write order k of the force times the way that a corner slides per travel to `w.rub[2]`.
 
     The way is sqrt(q) with q = 1 + (s' / v)^2:  2 root_0 root_k = q_k - sum of root_j root_{k-j} without its ends.
     """
     sliding, way = w.rub[0], w.rub[1]
-    rate = row_values(p.slip_rows, dc, ds, dx, dy)
+    rate = rolled(p, row_values(p.slip_rows, dc, ds, dx, dy), om)
     for pair in range(PAIR_COUNT):
         sliding[k, pair] = lane(rate, pair) * time_per_way(p, pair)
     square = _multiply(sliding, sliding, k)
@@ -354,10 +354,10 @@ def _grow(p, w, rubbed, k, alpha, beta) -> None:
 
 
 @kernel(fast=True, inline="code")
-def _wear(p, state, w, k, alpha, beta, dc, ds, dx, dy, sliding, running_in) -> None:
+def _wear(p, state, w, k, alpha, beta, om, dc, ds, dx, dy, sliding, running_in) -> None:
     """Write order k + 1 of the growth of the pads' penetrations from force, sliding and running-in."""
     if sliding is not None:
-        _slide(p, w, k, dc, ds, dx, dy)
+        _slide(p, w, k, om, dc, ds, dx, dy)
         if running_in is not None:
             _run_in(p, state, w, w.rub[2], k)
             _grow(p, w, w.rub[5], k, alpha, beta)
@@ -555,13 +555,14 @@ def expand(
             )
             applied = applied + pushed
             if slip is not None:
-                dragged = _drag(p, w, k, seen_c, seen_s, seen_x, seen_y, dc, ds, dx, dy)
+                dragged = _drag(p, w, k, seen_c, seen_s, seen_x, seen_y, om, dc, ds, dx, dy)
                 applied, pushed = applied + dragged, pushed + dragged
             if stick is not None:
-                dragged = _hold_on(p, state, w, k, seen_c, seen_s, seen_x, seen_y, dc, ds, dx, dy)
+                theta = lane(here, THETA)
+                dragged = _hold_on(p, state, w, k, seen_c, seen_s, seen_x, seen_y, theta, om, dc, ds, dx, dy)
                 applied, pushed = applied + dragged, pushed + dragged
             if wear is not None:
-                _wear(p, state, w, k, alpha, beta, dc, ds, dx, dy, *rub_terms)
+                _wear(p, state, w, k, alpha, beta, om, dc, ds, dx, dy, *rub_terms)
             # the penetration of the next order needs this order's rates alone: no forces to wait for
             penetration = rate * steady + closing * bent
             closing = rate

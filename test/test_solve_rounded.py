@@ -1,0 +1,179 @@
+"""Rounded corners: a block that rolls on them, a frame that has them, and that sharp ones know nothing of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from plow_twin import (
+    Clearance,
+    Constant,
+    Contact,
+    Frame,
+    Friction,
+    Gravity,
+    Harmonic,
+    Head,
+    Initial,
+    Scene,
+    SceneError,
+    Support,
+    Twin,
+    TwinBatch,
+    Wear,
+    simulate,
+)
+from plow_twin.errors import ArgumentError
+from plow_twin.model.friction import painleve_coefficients
+
+SIDE, RADIUS, MASS = 0.06, 0.01, 1.0
+INERTIA = MASS * SIDE**2 / 6.0
+STIFFNESS, DAMPING, MU, SLIP_SPEED = 3e6, 0.8, 0.2, 0.05
+STICK = Friction(MU, stick_stiffness_n_m=1e6, stick_damping_n_s_m=20.0)
+
+
+def block(**changes: object) -> Scene:
+    """Return a rounded square block above a table 1 m below the cavity's centre."""
+    scene = Scene(
+        Head(MASS, INERTIA, carries="corners"),
+        Frame(SIDE, SIDE, corner_radius_m=RADIUS),
+        Clearance(2.0 - SIDE, 2.0 - SIDE),
+        Contact("hunt_crossley", stiffness=STIFFNESS, damping=DAMPING),
+        Gravity(),
+        initial=Initial(q=(0.0, -0.85, 0.3), v=(0.4, 0.0, 6.0)),
+        friction=Friction(MU, SLIP_SPEED),
+    )
+    return replace(scene, **changes)  # type: ignore[arg-type]
+
+
+def in_guide(carries: str, **changes: object) -> Scene:
+    """Return a head that is driven against the walls of its guide and turns."""
+    scene = block(
+        head=Head(MASS, 0.01, carries=carries),
+        frame=Frame(0.3, 0.2, corner_radius_m=0.03),
+        clearance=Clearance(0.01, 0.012),
+        loads=(Harmonic("push", (60.0, 40.0), omega_rad_s=9.0), Harmonic("turn", (0.0, 0.0), 15.0, moment_n_m=2.0)),
+        initial=Initial(v=(0.3, -0.2, 0.5)),
+    )
+    return replace(scene, **changes)  # type: ignore[arg-type]
+
+
+def on_table(t: float, z: np.ndarray) -> list[float]:
+    """Return the rate of z = (x, y, theta, vx, vy, omega) of the block: four discs that touch where they are lowest."""
+    _, y, theta, vx, vy, omega = z
+    c, s, half = math.cos(theta), math.sin(theta), 0.5 * SIDE - RADIUS
+    fx = fy = moment = 0.0
+    for cx, cy in ((-half, half), (half, half), (half, -half), (-half, -half)):
+        ax, ay = c * cx - s * cy, s * cx + c * cy - RADIUS
+        depth, rate = -1.0 - (y + ay), -(vy + omega * ax)
+        if depth > 0.0:
+            normal = max(STIFFNESS * depth * (1.0 + DAMPING * rate), 0.0)
+            drag = -MU * normal * math.tanh((vx - omega * ay) / SLIP_SPEED)
+            fx, fy, moment = fx + drag, fy + normal, moment + ax * normal - ay * drag
+    return [vx, vy, omega, fx / MASS, fy / MASS - 9.81, moment / INERTIA]
+
+
+def test_rounded_block_agrees_with_an_independent_integration_of_four_discs() -> None:
+    found = simulate(block(), t_end=0.4, output_dt=0.004, tol=1e-9)
+    reference = solve_ivp(
+        on_table, (0.0, 0.4), [0.0, -0.85, 0.3, 0.4, 0.0, 6.0], "DOP853", found.t, rtol=1e-9, atol=1e-11, max_step=2e-5
+    )
+    np.testing.assert_allclose(found.q, reference.y[:3].T, atol=1e-6)
+    # it has turned over a corner, and sharp corners move otherwise
+    assert abs(found.q[-1, 2]) > 1.0
+    sharp = simulate(block(frame=Frame(SIDE, SIDE)), t_end=0.4, output_dt=0.004)
+    assert np.abs(sharp.q - found.q).max() > 1e-3
+
+
+def test_disc_of_rounded_corners_rolls_without_sliding() -> None:
+    """Pushed along a table that it sticks to, a disc rolls: x = -r theta, x'' = F / (m + I / r^2)."""
+    radius = 0.5 * SIDE * (1.0 - 1e-9)
+    inertia, push = 0.5 * MASS * radius**2, 0.5
+    disc = block(
+        head=Head(MASS, inertia, carries="corners"),
+        frame=Frame(SIDE, SIDE, corner_radius_m=radius),
+        friction=Friction(0.5, stick_stiffness_n_m=1e7, stick_damping_n_s_m=200.0),
+        loads=(Constant("push", (push, 0.0)),),
+        initial=Initial(q=(0.0, -1.0 + 0.5 * SIDE, 0.0)),
+    )
+    found = simulate(disc, t_end=0.6, output_dt=0.01)
+    expected = 0.5 * push / (MASS + inertia / radius**2) * found.t**2
+    np.testing.assert_allclose(found.q[:, 0], expected, atol=1e-5)
+    np.testing.assert_allclose(found.q[:, 2], -expected / radius, atol=1e-3)
+    # more than a quarter turn
+    assert found.q[-1, 2] < -1.6
+
+
+@pytest.mark.parametrize("carries", ["corners", "walls"])
+@pytest.mark.parametrize("friction", [Friction(MU, SLIP_SPEED), STICK], ids=["regularised", "stick"])
+def test_rounded_corners_balance_energy_and_momentum(carries: str, friction: Friction) -> None:
+    result = simulate(in_guide(carries, friction=friction), t_end=0.5, output_dt=0.01, energy_balance=True)
+    balance = result.energy_balance
+    assert balance is not None
+    assert sum(pair["makes"] for pair in result.statistics.values()) > 5
+    assert abs(balance.imbalance_j) < 1e-8
+    assert np.abs(balance.momentum_imbalance).max() < 1e-8
+
+
+@pytest.mark.parametrize("carries", ["corners", "walls"])
+@pytest.mark.parametrize("friction", [Friction(MU, SLIP_SPEED), STICK], ids=["regularised", "stick"])
+def test_rounded_corners_move_the_same_by_fixed_steps_a_live_twin_and_a_batch(carries: str, friction: Friction) -> None:
+    scene = in_guide(carries, friction=friction)
+    run = simulate(scene, t_end=0.1, output_dt=0.01)
+    fixed = simulate(scene, t_end=0.1, output_dt=0.01, method="rk4", dt=1e-5)
+    # fixed steps know of a touch and a slip at their ends only
+    np.testing.assert_allclose(fixed.q, run.q, atol=1e-3)
+    twin = Twin(scene)
+    np.testing.assert_allclose([twin.advance(float(t)).q for t in run.t[1:]], run.q[1:], atol=1e-9)
+    free = replace(scene, loads=())
+    alone = simulate(free, t_end=0.1, output_dt=0.1)
+    np.testing.assert_allclose(TwinBatch([free, free]).advance(0.1).q[:, 0], [alone.q[-1]] * 2, atol=1e-9)
+
+
+def test_rounded_corners_hold_with_implicit_steps_and_wear() -> None:
+    """A damper that outweighs its spring, and pads that wear by sliding: the balance of energy still closes."""
+    damped = in_guide(
+        "corners",
+        contact=Contact("kelvin_voigt", 1e6, damping=2e5),
+        friction=Friction(MU, 1e-3),
+        wear=Wear(1e-13, 1e-3, 0.2, sliding="total"),
+    )
+    result = simulate(damped, t_end=0.3, output_dt=0.01, energy_balance=True)
+    twin = Twin(damped)
+    twin.advance(0.3)
+    assert twin._state.implicit_steps > 0
+    assert result.energy_balance is not None and abs(result.energy_balance.imbalance_j) < 1e-6
+    assert result.wear_depth.max() > 0.0
+
+
+def test_sliding_rounded_corner_is_painleves_case_at_the_point_that_touches() -> None:
+    scene = block(initial=Initial())
+    half, arm = 0.5 * SIDE - RADIUS, 0.5 * SIDE
+    expected = (INERTIA / MASS + half**2) / (half * arm)
+    np.testing.assert_allclose(painleve_coefficients(scene), expected)
+    np.testing.assert_allclose(
+        painleve_coefficients(replace(scene, head=replace(scene.head, carries="walls")))[0], expected
+    )
+
+
+@pytest.mark.parametrize(
+    ("make", "expected"),
+    [
+        (lambda: block(frame=Frame(SIDE, 0.5 * SIDE, corner_radius_m=0.25 * SIDE)), "shorter side"),
+        (lambda: block(frame=Frame(SIDE, SIDE, corner_radius_m=-1e-3)), "> 0"),
+        (lambda: in_guide("walls", support=Support(1.0, 1.0, 1e6, 1e6, 1e6)), "none with frame.corner_radius_m"),
+    ],
+)
+def test_what_rounded_corners_cannot_be_is_named(make: Callable[[], Scene], expected: str) -> None:
+    with pytest.raises(SceneError, match=expected):
+        make()
+
+
+def test_batch_of_sharp_and_rounded_corners_is_refused() -> None:
+    with pytest.raises(ArgumentError, match=r"scenes\[1\].*corner_radius_m"):
+        TwinBatch([block(), block(frame=Frame(SIDE, SIDE))])
