@@ -110,10 +110,10 @@ class Frame:
 
     width_m: float = _quantity("m", "horizontal side", gt=0.0)
     height_m: float = _quantity("m", "vertical side", gt=0.0)
-    corner_radius_m: float | None = _quantity("m", "radius of rounded corners, sharp unless given", None, gt=0.0)
     labels: Mapping[str, str] = field(
         default_factory=dict, metadata={"doc": "letters for corners, e.g. a: bottom_right", "choices": CORNER_NAMES}
     )
+    corner_radius_m: float | None = _quantity("m", "radius of rounded corners, sharp unless given", None, gt=0.0)
 
 
 @dataclass(frozen=True)
@@ -153,6 +153,10 @@ class Contact:
         ge=0.0,
     )
     restitution: float | None = _quantity("1", "restitution asked of the law", None, ge=0.0, le=1.0)
+    impact_speed_floor_m_s: float = _quantity(
+        "m/s", "smallest impact speed v0 used in lambda = D(e)/v0, bounds the damping of a touch at rest", 1e-3, gt=0.0
+    )
+    ramp_m: float | None = _quantity("m", "ramped_damping: penetration over which C grows to its value", None, gt=0.0)
     restitution_fall: float | None = _quantity(
         "1", "power by which it falls with the impact above restitution_speed_m_s", None, ge=0.0, le=1.0
     )
@@ -163,10 +167,6 @@ class Contact:
     restitution_fall_along_s_m: float | None = _quantity(
         "s/m", "its fall with the speed of the centre of mass along the wall, 0 unless given", None, ge=0.0
     )
-    impact_speed_floor_m_s: float = _quantity(
-        "m/s", "smallest impact speed v0 used in lambda = D(e)/v0, bounds the damping of a touch at rest", 1e-3, gt=0.0
-    )
-    ramp_m: float | None = _quantity("m", "ramped_damping: penetration over which C grows to its value", None, gt=0.0)
 
 
 #: What makes the restitution depend on the impact; all absent where it does not.
