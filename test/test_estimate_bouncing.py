@@ -17,16 +17,19 @@ from plow_twin.estimate.bouncing import (
     MotionFeatures,
     bias_of_hard,
     class_deviate,
+    hidden_by_geometry,
     path_delay,
     path_deviate,
     regress_near,
 )
 from plow_twin.estimate.estimate import MOST_OTHER_LAW, estimate, summarise_bounced, with_bounced
+from plow_twin.estimate.forces import draw_scenes
 from plow_twin.estimate.laws import Draws, log_odds
 from plow_twin.estimate.likely import Seen, likeliest
 from plow_twin.estimate.measurements import Poses
-from plow_twin.estimate.result import Interval
+from plow_twin.estimate.result import Estimate, Interval, State
 from plow_twin.estimate.unknowns import Unknowns
+from plow_twin.model.scene import Mark, Provenance
 
 
 @pytest.mark.stress
@@ -183,6 +186,45 @@ def test_a_motion_like_those_of_another_law_is_suspect_unless_that_law_is_unlike
     known = (-8.0, 0.5), (0.0, 1.0)
     bounced = Bounced(two, 0.1 * two, np.zeros(3), np.ones(3), *known, np.ones(3), 1.0, 1.0, deviate, odds)
     assert summarise_bounced(Unknowns(preset("paper")), poses, bounced, 0, 0).model == model
+
+
+def test_what_a_hard_motion_hides_widens_the_clearances_and_not_the_twins() -> None:
+    """Corners rounded by 5 mm made clearances 0.7 mm too large, ten of their deviations."""
+    truth = draw(replace(GROUPS["hard"], periods=4.0), 3)
+    unknowns, period = Unknowns(truth.nominal), truth.load.period()
+    eye = MotionFeatures(unknowns, truth.poses, period)
+    unseen, rounded = hidden_by_geometry(unknowns, truth.poses, period, eye.features(eye.q)[:2])
+    assert (unseen > 1.5e-4).all() and (rounded > 3e-4).all()
+    zero, narrow = np.zeros(3), np.full(2, 5e-5)
+    found = (-12.0, 1.0), (0.0, 1.0), np.ones(3), 1.0, 1.0, 0.0, -np.inf
+    bounced = Bounced(truth.clearance, narrow, zero, zero, *found, unseen, rounded)
+    result = summarise_bounced(unknowns, truth.poses, bounced, 0, 0)
+    assert (
+        result.horizontal.mean - result.horizontal.p05
+        > 1.9 * rounded[0]
+        > result.horizontal.p95 - result.horizontal.mean
+    )
+    assert result.apparent is not None and result.apparent[0].deviation == pytest.approx(5e-5)
+    back = Estimate.from_dict(json.loads(json.dumps(result.as_dict())))
+    assert back.apparent == result.apparent
+    scenes, _ = draw_scenes(truth.nominal, back, 50, np.random.default_rng(0))
+    assert np.std([scene.clearance.horizontal_m for scene in scenes]) < 7e-5
+    # a scene that states how well its sides are known states its corners with it
+    exact = Provenance(Mark.MEASURED, deviation=0.0)
+    marks = {**truth.nominal.marks, "frame.width_m": exact, "frame.height_m": exact}
+    stated = replace(unknowns, scene=replace(truth.nominal, marks=marks))
+    unseen, rounded = hidden_by_geometry(stated, truth.poses, period, eye.features(eye.q)[:2])
+    assert not rounded.any() and (unseen > 1e-4).all(), "theta's scale is left"
+
+
+def test_a_hard_motion_unlike_the_model_is_rough() -> None:
+    rng = np.random.default_rng(1)
+    poses = Poses.of(np.arange(100) * 0.01, 1e-3 * rng.standard_normal((100, 3)))[0]
+    found = (-12.0, 1.0), (0.0, 1.0), np.ones(3), 2.0 * tuning.MOST_DISTANCE, 1.0, 0.0, -np.inf
+    bounced = Bounced(np.full(2, 0.02), np.full(2, 5e-5), np.zeros(3), np.zeros(3), *found)
+    result = summarise_bounced(Unknowns(preset("paper")), poses, bounced, 0, 0)
+    assert result.model == "suspect" and result.horizontal_state is State.ROUGH
+    assert result.horizontal.deviation > 2.0 * tuning.UNEXPLAINED_HARD
 
 
 def test_the_likeliest_clearances_are_found_from_paths_with_more_parts_than_drawn_motions() -> None:

@@ -13,17 +13,18 @@ References: Beaumont, Zhang and Balding, Genetics 162 (2002) 2025; Fearnhead and
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.estimate import tuning
+from plow_twin.estimate import priors, tuning
 from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.laws import Draws, log_odds
 from plow_twin.estimate.likely import Seen, likeliest
 from plow_twin.estimate.measurements import FEWEST_FOR_SCATTER, Poses
+from plow_twin.estimate.priors import deviation_of, is_stated
 from plow_twin.estimate.regression import ridge
 from plow_twin.estimate.start import filled, noise_level, range_of_motion, reaches, smooth_width
 from plow_twin.estimate.unknowns import DAMPING, GAIN, GX, GY, OTHER_LAW, SOFTNESS, Unknowns, with_other_law
@@ -48,6 +49,8 @@ _NO_LAG = len(_OF_DRAWN_S) // 2
 #: Derived: powers of two, distances in rows over which pose and reaches change; the second for each phase of the load.
 _CHANGES: Final = (1, 2, 4, 8, 16, 32)
 _CHANGES_BY_PHASE: Final = (1, 4)
+#: Definition: the sides of the frame in a scene.
+_SIDES: Final = ("frame.width_m", "frame.height_m")
 #: Guard: a square that counts as zero, in m2 or rad2.
 _NO_SCATTER = 1e-14
 #: Bound: work of a longer motion, over the work of ten load periods.
@@ -74,6 +77,8 @@ class Bounced:
     law : likeness of the motion to motions of another contact law, as a normal deviate among motions of the law
         believed; 0 if no other law is known
     odds : log odds of the other law; minus infinity if no other law is known
+    unseen : (2,) deviation of the clearances in m by sides of the frame and theta's scale, which the motion hides
+    rounded : (2,) by how much corners rounded by `priors.ROUNDING` make them too large, in m
     """
 
     clearance: Array
@@ -87,6 +92,8 @@ class Bounced:
     path: float
     law: float
     odds: float
+    unseen: Array = field(default_factory=lambda: np.zeros(2))
+    rounded: Array = field(default_factory=lambda: np.zeros(2))
 
 
 def bounces(unknowns: Unknowns, poses: Poses) -> bool:
@@ -215,7 +222,8 @@ def compare(
             if len(rounds) == 3 and count == tuning.DRAWS[2] and not followed:
                 rounds.append((tuning.DRAWS[3], tuning.DRAWN_CLEARANCE[3]))
     assert found is not None
-    deviation[np.abs(moved) > tuning.ASTRAY] = np.inf
+    # where it has gone astray the last corrections say by how much
+    deviation = np.where(np.abs(moved) > tuning.ASTRAY, np.hypot(deviation, tuning.UNEXPLAINED_HARD), deviation)
     law, odds = 0.0, -math.inf
     if found.value[5] < math.log(tuning.FITTED):
         law, odds = _of_other_law(drawn, centre, delay, int(longer * tuning.MOST_WORK[2]))
@@ -231,7 +239,31 @@ def compare(
         path_deviate(eye.paths(eye.q, _LAGS_S), features[:, 5:], paths, measured[5:]),
         law,
         odds if near is None else -math.inf,  # its limit was set with draws of hard contacts
+        *hidden_by_geometry(unknowns, poses, period, measured[:2]),
     )
+
+
+def hidden_by_geometry(unknowns: Unknowns, poses: Poses, period: float, reach: Array) -> tuple[Array, Array]:
+    """Return `unseen` and `rounded` of `Bounced`, from the `reach` (2,) of the clearances in m.
+
+    A head that rests touches three corners at one angle. Sides, a scale and corners that change its reach there act
+    like another clearance.
+    """
+    scene = unknowns.scene
+    width, height = (deviation_of(scene, path) for path in _SIDES)
+
+    def moved(width: float = 0.0, height: float = 0.0, scale: float = 0.0) -> Array:
+        frame = replace(scene.frame, width_m=scene.frame.width_m + width, height_m=scene.frame.height_m + height)
+        other = replace(unknowns, scene=replace(scene, frame=frame))
+        seen = MotionFeatures(other, poses, period)
+        off: Array = np.abs(seen.features(seen.q * [1.0, 1.0, 1.0 + scale])[:2] - reach)
+        return off
+
+    unseen = np.sqrt(moved(width) ** 2 + moved(0.0, height) ** 2 + moved(scale=priors.SCALES[2]) ** 2)
+    # a stated deviation of the sides includes their corners
+    known = scene.frame.corner_radius_m is not None or any(is_stated(scene, path) for path in _SIDES)
+    across = 0.0 if known else -2.0 * priors.ROUNDING
+    return unseen, moved(across, across) if across else np.zeros(2)
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,7 +28,7 @@ from plow_twin.estimate import tuning
 from plow_twin.estimate.fit import FEWEST_OF_SWING, WALLS, Fit, Problem, freed, huber_weight
 from plow_twin.estimate.measurements import FEWEST_FOR_SCATTER
 from plow_twin.estimate.pads import TURN_STEP
-from plow_twin.estimate.priors import deviation_of
+from plow_twin.estimate.priors import SCALES, deviation_of
 from plow_twin.estimate.unknowns import GX, GY, MOVING, SIZE, SOFTNESS
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import Friction, Scene
@@ -41,7 +41,7 @@ Array = NDArray[np.float64]
 UNSTATED: Final = {
     **{f"stiffness_{wall}": 0.1 for wall in ("left", "right", "top", "bottom")},
     **{f"turn_{wall}": 1e-3 for wall in ("left", "right", "top", "bottom")},
-    **{f"scale_{axis}": 5e-3 for axis in ("x", "y", "theta")},
+    **{f"scale_{axis}": scale for axis, scale in zip(("x", "y", "theta"), SCALES, strict=True)},
     **{f"lever_{axis}": 4e-3 for axis in ("x", "y")},
     "filter": 1e-4,
     "clock": 1e-4,

@@ -54,6 +54,8 @@ MOST_PERIODS, MOST_SPAN_S = 20.0, 60.0
 _LONGEST_S = 600.0
 #: Derived: normal deviate that a right model exceeds in one of a hundred cases, to two digits.
 MOST_OTHER_LAW = round(float(ndtri(0.99)), 2)
+#: Derived: 95 % point of half a normal distribution, in its deviations.
+_HALF_NORMAL_P95 = float(ndtri(0.975))
 #: Guard: logarithms of the penetrations in m that a contact can have.
 _LN_PENETRATIONS = (math.log(1e-9), math.log(0.12))
 #: Definition: pairs of the left, right, top and bottom walls of the cavity.
@@ -149,11 +151,26 @@ def _estimate(
         forces = forces.between(span[0], span[1] + 1e-9)
     try:
         result, following = _from_motion(scene, load, poses, lost, guess, forces)
+        if _unexplained(result) and load.interval() > tuning.COARSEST:
+            smooth = load.smooth(0.1 * tuning.COARSEST)
+            other, following = _from_motion(scene, smooth, poses, lost, (), forces)
+            why = f"load: a sample each {load.interval():.2g} s, expected {tuning.COARSEST:g} s: taken as averages"
+            result = replace(other, reasons=(why, *other.reasons)) if _known(other) else result
     except (np.linalg.LinAlgError, OverflowError) as error:
         result, following = _without_fit(Unknowns(scene), poses, lost, f"the fit cannot be computed: {error}"), ()
     if forces is not None and result.forces_measured is None:
         result = replace(result, forces_measured=ForcesUsed(unused="the motion is not known moment by moment"))
     return (result, following) if by_gaps is None else (with_gaps(result, by_gaps), following)
+
+
+def _known(result: Estimate) -> bool:
+    """Return whether a clearance is known."""
+    return result.horizontal_state.known or result.vertical_state.known
+
+
+def _unexplained(result: Estimate) -> bool:
+    """Return whether the load does not explain the motion."""
+    return result.model == "suspect" and not _known(result)
 
 
 def _from_motion(
@@ -255,7 +272,7 @@ def under_uncertain_load(result: Estimate, unknowns: Unknowns, felt: Load, poses
 
     `result` comes from the load believed; it stays where it knows a clearance, or nothing is found.
     """
-    if result.horizontal_state.known or result.vertical_state.known or np.median(np.diff(felt.t)) > tuning.COARSEST:
+    if _known(result) or felt.interval() > tuning.COARSEST:
         return result
     found, work = compare_under_uncertain_load(felt, unknowns, poses, period)
     figures = result.figures | {"work": result.figures.get("work", 0.0) + float(work)}
@@ -404,15 +421,21 @@ def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: 
         odds = f"ln odds {bounced.odds:.1f}, expected at most {tuning.MOST_ODDS[0]:g}"
         model.append(f"motion likely under another contact law: {odds}")
     reasons = sensor or model
-    clearances, states = [], []
+    beyond = max(1.0, *(value / most for _, value, most in found)) if model else 0.0
+    apparent, clearances, states = [], [], []
     for index in (GX, GY):
-        deviation = float(bounced.clearance_deviation[index])
-        observed = deviation < tuning.BOUNCED_MOST
-        value = Interval.normal(bounced.clearance[index], deviation)
+        deviation = math.hypot(bounced.clearance_deviation[index], beyond * tuning.UNEXPLAINED_HARD)
+        rough = bool(model) or deviation > tuning.BOUNCED_MOST
+        value = Interval.normal(float(bounced.clearance[index]), deviation)
+        apparent.append(value)
+        value = Interval.normal(value.mean, math.hypot(deviation, bounced.unseen[index]))
+        lowest = math.hypot(value.mean - value.p05, _HALF_NORMAL_P95 * bounced.rounded[index])
+        value = replace(value, p05=value.mean - lowest)
+        observed = deviation < tuning.OBSERVED
         if not observed:
             value = _unobserved(unknowns, np.zeros(2), index, 0.0, bounced.noise)
         clearances.append(value.above(0.0))
-        states.append(_state(bool(reasons), observed))
+        states.append(_state(bool(sensor), observed, rough))
     exponent = unknowns.scene.contact.exponent
     log = Interval.normal(*bounced.ln_penetration)
     # a regression that extrapolates gives no bound
@@ -426,6 +449,7 @@ def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: 
         vertical=clearances[1],
         horizontal_state=states[0],
         vertical_state=states[1],
+        apparent=(apparent[0], apparent[1]) if all(state.known for state in states) else None,
         # it follows from the bounces alone: the hard side stays open
         stiffness=Interval(float(mean), float(soft), max(float(hard), unknowns.hardest_believed)),
         damping=_damping(unknowns, Interval.normal(*bounced.ln_damping)),

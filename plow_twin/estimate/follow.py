@@ -1011,6 +1011,7 @@ def middle_of(scene: Scene, known: Estimate) -> tuple[Scene, Array]:
 
     middle = replace(
         known,
+        apparent=None,
         horizontal=point(known.horizontal),
         vertical=point(known.vertical),
         stiffness=point(known.stiffness),

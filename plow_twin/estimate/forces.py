@@ -172,7 +172,7 @@ def draw_scenes(scene: Scene, found: Estimate, members: int, rng: np.random.Gene
         white = white @ np.linalg.cholesky(np.array(found.correlation) + 1e-9 * np.eye(7)).T
     horizontal, vertical = (
         np.maximum(_normal(value, white[:, index]), _LEAST_SHARE * value.mean)
-        for index, value in enumerate((found.horizontal, found.vertical))
+        for index, value in enumerate(found.apparent or (found.horizontal, found.vertical))
     )
     stiffness = np.exp(_normal(_logarithm(found.stiffness), -white[:, 2]))
     restitution = scene.contact.restitution is not None

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicSpline
 from scipy.linalg import solveh_banded
 
 from plow_twin.errors import PlowTwinError
@@ -180,6 +181,10 @@ class Load:
         first = min(first, len(self.t) - 2)
         return Load(self.t[first:], self.wrench[first:], self.deviation)
 
+    def interval(self) -> float:
+        """Return the usual distance of samples in s."""
+        return float(np.median(np.diff(self.t)))
+
     def gain_deviations(self) -> Array:
         """Return the stated deviations as shares of the components' root mean squares, shape (3,); 0 without a load."""
         size = np.sqrt((self.wrench**2).mean(axis=0))
@@ -213,6 +218,16 @@ class Load:
             return self
         value = [np.interp(t, self.t, column) for column in self.wrench.T]
         return Load(np.insert(self.t, place, t), np.insert(self.wrench, place, value, axis=0), self.deviation)
+
+    def smooth(self, step: float) -> Load:
+        """Return a cubic spline through the samples, each `step` s, with `tuning.COARSE_GAIN` as stated deviation.
+
+        A sample taken so rarely may be an average, which lessens the amplitude and keeps the shape.
+        """
+        t = np.linspace(self.t[0], self.t[-1], math.ceil((self.t[-1] - self.t[0]) / step) + 1)
+        size = tuning.COARSE_GAIN * np.sqrt((self.wrench**2).mean(axis=0))
+        fx, fy, moment = np.hypot(size, self.deviation).tolist()
+        return Load(t, np.asarray(CubicSpline(self.t, self.wrench)(t), np.float64), (fx, fy, moment))
 
     def thinned(self, share: float = 1e-3) -> Load:
         """Leave out samples that straight lines give within `share` of the range (Ramer, Douglas and Peucker)."""

@@ -21,6 +21,10 @@ DEFAULTS: Final[dict[str, dict[Mark, float]]] = {
     "exponent": {Mark.GIVEN: 0.07, Mark.MEASURED: 0.03, Mark.RECONSTRUCTED: 0.07, Mark.ASSUMED: 0.07},
     "friction": {Mark.GIVEN: 0.05, Mark.MEASURED: 0.02, Mark.RECONSTRUCTED: 0.05, Mark.ASSUMED: 0.05},
 }
+#: Prior: deviation in m of the radius of corners, half of a normal distribution, where the scene states none.
+ROUNDING: Final = 3e-3
+#: Prior: standard deviations of a sensor's scales of x, y and theta; an angle often comes from two distances.
+SCALES: Final = (5e-3, 5e-3, 1e-2)
 #: Prior: standard deviation of a sensor's constant error of x, y [m] and theta [rad].
 BIAS: Final = (5e-3, 5e-3, 0.02)
 #: Row of the table for each number.

@@ -200,6 +200,9 @@ class Estimate:
     differs : dict of str to (float, float, float)
         Of each further quantity of machine and sensor: probability that it differs from the scene, and the difference
         then: mean and standard deviation.
+    apparent : tuple of (Interval, Interval), optional
+        The clearances of a machine of exactly the scene's frame that moves like the measured one, in m, where they are
+        known better than the clearances: twins are drawn from them.
     motion : Motion, optional
         What was fitted; None where the motion is not known moment by moment. It is no part of `as_dict`.
     """
@@ -229,6 +232,7 @@ class Estimate:
     groups: dict[str, tuple[Interval, State]] = field(default_factory=dict)
     forces_measured: ForcesUsed | None = None
     differs: dict[str, tuple[float, float, float]] = field(default_factory=dict)
+    apparent: tuple[Interval, Interval] | None = None
     motion: Motion | None = field(default=None, compare=False, repr=False)
 
     @classmethod
@@ -245,7 +249,9 @@ class Estimate:
             for quantity in QUANTITIES
             if quantity.name in data and quantity.name not in ("horizontal", "vertical")
         }
-        correlation = data["correlation"]
+        correlation, apparent = data["correlation"], data.get("apparent")
+        if apparent is not None:
+            others["apparent"] = tuple(Interval(**apparent[name]) for name in ("horizontal", "vertical"))
         return cls(
             data["t_start"], data["t_end"], horizontal, vertical, horizontal_state, vertical_state,
             noise=None if data["noise"] is None else tuple(data["noise"]), model=data["model"], sensor=data["sensor"],
@@ -299,5 +305,10 @@ class Estimate:
                 name: {"probability": share, "by": mean, "deviation": deviation}
                 for name, (share, mean, deviation) in self.differs.items()
             },
+            **(
+                {}
+                if self.apparent is None
+                else {"apparent": dict(zip(("horizontal", "vertical"), map(asdict, self.apparent), strict=True))}
+            ),
             **({} if self.forces_measured is None else {"forces_measured": self.forces_measured.as_dict()}),
         }

@@ -151,6 +151,9 @@ class Units:
             if found.forces_measured is None
             else found.forces_measured.in_units(self.force, self.time),
             reasons=found.reasons + scale if found.reasons else (),
+            apparent=None
+            if found.apparent is None
+            else (found.apparent[0].times(length), found.apparent[1].times(length)),
             motion=None if found.motion is None else found.motion.in_units(length, time),
         )
 

@@ -53,7 +53,7 @@ BOUNCED_MOST: Annotated[
     float,
     Tuned(
         "m",
-        "the same behind a hard contact, where a wall touched too seldom gives wrong answers",
+        "largest deviation behind a hard contact that is not rough: a wall touched too seldom gives wrong answers",
         "seeds 40400 to 40409",
     ),
 ] = 2e-4
@@ -326,7 +326,15 @@ NOT_HARD: Annotated[
     ),
 ] = 1.2
 ENOUGH_FOR_FIT: Annotated[float, Tuned("m", "deviation below which no further round comes before a fit")] = 1.2e-4
-ASTRAY: Annotated[float, Tuned("m", "correction of the last round from which on nothing is observable")] = 1.5e-4
+ASTRAY: Annotated[float, Tuned("m", "correction of the last round from which on the next deviation counts")] = 1.5e-4
+UNEXPLAINED_HARD: Annotated[
+    float,
+    Tuned(
+        "m",
+        "deviation of a clearance where a hard motion has gone astray or, times its distance over the limit, differs",
+        "`hard_kelvin_voigt`, `hard_shape`: 0.1 off in the median",
+    ),
+] = 3e-4
 WIDENED_SOFTNESS: Annotated[
     float, Tuned("1", "widening of the logarithm of stiffness, which has long tails", "seeds 40400 to 40409")
 ] = 1.6
@@ -387,6 +395,14 @@ COARSEST: Annotated[
     float,
     Tuned("s", "distance of the samples of a load up to which its error is no loss of amplitude", "`averages_1hz`"),
 ] = 0.25
+COARSE_GAIN: Annotated[
+    float,
+    Tuned(
+        "1",
+        "deviation of the gains of a load that is sampled more rarely",
+        "averages over a third of a period lose 0.16 of the amplitude",
+    ),
+] = 0.2
 LOAD_ERRORS: Annotated[tuple[float, ...], Tuned("1", "least and largest error of a load over its amplitude")] = (
     0.01,
     0.3,
