@@ -80,6 +80,13 @@ class Kind:
     theta_missing: bool = False
     theta_scale: float = 0.0
     clock: float = 0.0
+    #: held out from all tuning: bursts without poses, largest pose of a saturating sensor as a share of the motion's,
+    #: excess of gravity's arm, delay of the load, drift of the bias of x and y over the window
+    bursts: int = 0
+    saturated: float = 0.0
+    arm_m: float = 0.0
+    late_s: float = 0.0
+    drift_m: float = 0.0
 
 
 _HARD = (1e9, 1e11)
@@ -120,11 +127,17 @@ KINDS = {
     "pressed": Kind("pressed to one side while cutting", shape="pressed"),
     "chatter": Kind("8 Hz chatter", shape="chatter"),
     "vertical": Kind("load vertical, x at rest", shape="vertical"),
+    "bursts": Kind("bursts without poses", bursts=12),
+    "saturated": Kind("sensor saturates at 0.9 of the motion", saturated=0.9),
+    "arm": Kind("arm of gravity 10 mm", arm_m=0.01),
+    "late_load": Kind("load 20 ms late", late_s=0.02),
+    "drift": Kind("bias drifts by 1 mm", drift_m=1e-3),
     "hard": Kind("hard: nothing", stiffness=_HARD),
     "hard_corners": Kind("hard: corners rounded 5 mm", stiffness=_HARD, radius_m=5e-3),
     "hard_askew": Kind("hard: pads askew 1 mm", stiffness=_HARD, askew_m=1e-3),
     "hard_theta": Kind("hard: theta's scale 1 %", stiffness=_HARD, theta_scale=0.01),
     "hard_friction": Kind("hard: friction .05", stiffness=_HARD, friction=0.05),
+    "hard_harmonic": Kind("hard: load: third harmonic 5 %", stiffness=_HARD, harmonic=0.05),
 }
 
 
@@ -205,6 +218,7 @@ def _true_scene(kind: Kind, nominal: Scene, rng: np.random.Generator) -> Scene:
             exponent=kind.exponent,
             damping=damping,
         ),
+        gravity=replace(nominal.gravity, arm_m=nominal.gravity.arm_m + kind.arm_m * sign[0]),
         head=replace(
             head,
             mass_kg=head.mass_kg * (1.0 + kind.mass * sign[0]),
@@ -260,6 +274,12 @@ def _measured(kind: Kind, rng: np.random.Generator, t: Array, fine: Array, motio
     if kind.steps_m:
         step = kind.steps_m * np.array([1.0, 1.0, 4.0])
         q = np.round(q / step) * step
+    if kind.saturated:
+        most = kind.saturated * np.abs(motion[:, :2]).max(axis=0)
+        q[:, :2] = np.clip(q[:, :2], -most, most)
+    q[:, :2] += kind.drift_m * (t / t[-1] - 0.5)[:, None]
+    for start in rng.uniform(0.0, t[-1], kind.bursts):
+        q[(t >= start) & (t < start + 0.3)] = np.nan
     if kind.theta_missing:
         q[:, 2] = np.nan
     return t * (1.0 + kind.clock), q
@@ -268,7 +288,7 @@ def _measured(kind: Kind, rng: np.random.Generator, t: Array, fine: Array, motio
 def _telemetry(kind: Kind, fine: Array, believed: Array) -> tuple[Array, Array]:
     if not kind.averaged_s:
         knots = np.arange(0.0, fine[-1] + kind.sampled_s, kind.sampled_s)
-        return knots, np.stack([np.interp(knots, fine, column) for column in believed.T], axis=1)
+        return knots + kind.late_s, np.stack([np.interp(knots, fine, column) for column in believed.T], axis=1)
     rows = round(kind.averaged_s / _FINE)
     count = len(fine) // rows
     # stamped in the middle of the averaged span

@@ -118,23 +118,21 @@ def coverage(held: Sequence[bool]) -> str:
 
 
 def mismatch() -> str:
-    """Return the estimates of machines that differ from the model, before and with the step beside the fit."""
-    now, before = (load_rows(RESULTS / f"estimate_mismatch{name}.jsonl") for name in ("", "_before"))
+    """Return the estimates of machines that differ from the model."""
+    now = load_rows(RESULTS / "estimate_mismatch.jsonl")
     lines = [
-        "| what differs | clearances | published before | published | interval below 4 mm | RMSE [mm] | "
+        "| what differs | clearances | published | interval below 4 mm | RMSE [mm] | "
         "90 % interval holds | median width [mm] | beyond 3 deviations |",
-        "|---|---|---|---|---|---|---|---|---|",
+        "|---|---|---|---|---|---|---|---|",
     ]
     for name in (None, *KINDS):
-        rows, old = ([row for row in some if name in (None, row["kind"])] for some in (now, before))
+        rows = [row for row in now if name in (None, row["kind"])]
         if not rows:
             continue
-        asked = {(row["kind"], row["seed"]) for row in rows}
-        before_it = of_kind([row for row in old if (row["kind"], row["seed"]) in asked])
         one, title = of_kind(rows), "all" if name is None else KINDS[name].title
         numbers = f"{one['rmse_mm']:.2f} | {one['coverage']:.2f} | {one['width_mm']:.2f} | {one['far_off']:.2f}"
         lines.append(
-            f"| {title} | {one['clearances']} | {before_it['published']:.2f} | {one['published']:.2f} | "
+            f"| {title} | {one['clearances']} | {one['published']:.2f} | "
             f"{one['useful']:.2f} | {numbers.replace('nan', '-') if one['published'] else '- | - | - | -'} |"
         )
     return "\n".join(lines)

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from estimate_support import KINDS, known, mismatched
 
+from plow_twin.estimate import tuning
 from plow_twin.estimate.equation_error import EquationError
 from plow_twin.estimate.estimate import estimate
-from plow_twin.estimate.measurements import Poses
+from plow_twin.estimate.measurements import Load, Poses
 from plow_twin.estimate.result import Estimate, State
 from plow_twin.estimate.start import filled, range_of_motion
 from plow_twin.estimate.unknowns import Unknowns
@@ -36,9 +37,22 @@ def test_a_load_that_does_not_explain_the_motion_gives_a_rough_clearance_whose_i
     result = estimate(truth.nominal, truth.load, truth.poses)
     assert result.model == "suspect" and result.reasons
     assert result.horizontal_state is result.vertical_state is State.ROUGH
-    assert 5e-4 < result.horizontal.deviation < 4e-3 and _holds(result, truth.clearance)
+    assert 5e-4 < result.horizontal.deviation < 1.2e-3 and _holds(result, truth.clearance)
     assert result.figures["load_error"] > 0.03
     assert estimate(truth.nominal, truth.load, truth.poses) == result, "the same data give the same bits"
+
+
+def test_a_rare_sample_is_an_average_whose_shape_is_smooth_and_whose_amplitude_is_unknown() -> None:
+    t = np.arange(0.0, 20.0, 1e-3)
+    true = np.stack([3e4 * np.sin(2.0 * t), 1e4 * np.cos(2.0 * t), 0.0 * t], axis=1)
+    means = Load(t.reshape(-1, 1000).mean(axis=1), true.reshape(-1, 1000, 3).mean(axis=1))
+    smooth = means.smooth(0.02)
+    inner = (smooth.t > 3.0) & (smooth.t < 17.0)
+    amplitude = np.sin(1.0) * np.stack([3e4 * np.sin(2.0 * smooth.t), 1e4 * np.cos(2.0 * smooth.t)], axis=1)
+    off = (smooth.wrench[:, :2] - amplitude)[inner]
+    lines = np.stack([np.interp(smooth.t, means.t, column) for column in means.wrench[:, :2].T], axis=1)
+    assert off.std() < 0.4 * (lines - amplitude)[inner].std()
+    assert smooth.gain_deviations()[:2] == pytest.approx(tuning.COARSE_GAIN, rel=0.1)
 
 
 def test_without_an_angle_the_range_of_the_head_gives_a_rough_clearance_whose_interval_holds() -> None:

@@ -28,7 +28,7 @@ from plow_twin.estimate import tuning
 from plow_twin.estimate.fit import FEWEST_OF_SWING, WALLS, Fit, Problem, freed, huber_weight
 from plow_twin.estimate.measurements import FEWEST_FOR_SCATTER
 from plow_twin.estimate.pads import TURN_STEP
-from plow_twin.estimate.priors import SCALES, deviation_of
+from plow_twin.estimate.priors import ROUNDING, SCALES, deviation_of
 from plow_twin.estimate.unknowns import GX, GY, MOVING, SIZE, SOFTNESS
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import Friction, Scene
@@ -62,8 +62,6 @@ _WALL_STEP, _PUSH_STEP = 0.02, 5e-3
 _LEAST_PUSH = 1e-5
 #: Bound: rounds of expectation and maximisation, between which the noise is tempered.
 _ROUNDS = (8, 5, 3)
-#: Derived: probability that a quantity differs from the scene, without prior knowledge.
-_DIFFERS = 0.5
 #: Bound: sweeps of the sampler, and the first of them, which are not counted.
 _SWEEPS, _BURNT = 50, 10
 #: Bound: longest lag in rows over which residuals are compared.
@@ -97,13 +95,15 @@ class Graded:
     surprise: float
 
 
-def graded(problem: Problem, found: Fit, seed: int = 0) -> Graded:
+def graded(problem: Problem, found: Fit, doubtful: bool = False, seed: int = 0) -> Graded:
     """Return the result of a fit when the machine may differ from the model.
 
     Parameters
     ----------
     problem, found : Problem, Fit
         The fit; it need not have come to its end.
+    doubtful : bool
+        Whether the fit shows that the machine differs, whatever the selection finds.
     seed : int
         Draws which quantities differ.
 
@@ -118,12 +118,15 @@ def graded(problem: Problem, found: Fit, seed: int = 0) -> Graded:
         linear.learn(rounds)
         linear.temper()
     linear.eliminate()
-    mean, covariance, differs = linear.averaged(np.random.default_rng(seed))
+    mean, covariance, often, exact = linear.averaged(np.random.default_rng(seed))
+    surprise, named = linear.surprise(mean, often), linear.named(mean, often)
+    if doubtful or not exact:
+        # of a machine that differs no quantity is exact
+        mean, covariance = linear.free()
+        surprise = max(surprise, linear.surprise(mean, np.ones(len(often))))
     step = mean[:SIZE]
-    surprise = linear.surprise(mean, differs)
     covariance = covariance[:SIZE, :SIZE] * max(1.0, linear.scatter()) * surprise
     covariance += np.diag((tuning.BENT * step) ** 2)
-    named = linear.named(mean, differs)
     share, exponent, _ = named.get("contact.exponent", (0.0, 0.0, 0.0))
     bent = tuning.BENT_BY_EXPONENT * share * exponent**2
     unexplained = tuning.UNEXPLAINED * math.sqrt(float(linear.inflation.mean()) - 1.0)
@@ -147,6 +150,10 @@ def _columns(problem: Problem, found: Fit) -> tuple[dict[str, tuple[float, Array
         moved = problem.predicted(found.point, change=change) if deviation > 0.0 else None
         if moved is not None:
             out[path] = deviation, np.nan_to_num((moved[0] - base[0]) / step)
+    sides = [out[path][1] for path in ("frame.width_m", "frame.height_m") if path in out]
+    if len(sides) == 2 and scene.frame.corner_radius_m is None:
+        # at small angles a round corner acts as sides shorter by twice its radius
+        out["corner_radius"] = ROUNDING, -2.0 * (sides[0] + sides[1])
     for index, wall in enumerate(("left", "right", "top", "bottom")):
         share, turns = np.ones(PAIR_COUNT), problem.turns.copy()
         share[list(WALLS[index])] += _WALL_STEP
@@ -298,8 +305,16 @@ class _Linearised:
             square = float((column[known] ** 2).mean())
             self.inflation[index] = max(1.0, square / usual) * _lasting(column, self._swing, square)
 
-    def averaged(self, rng: np.random.Generator) -> tuple[Array, Array, Array]:
-        """Return mean and covariance of the border over which quantities differ, and how often each does."""
+    def free(self) -> tuple[Array, Array]:
+        """Return mean and covariance of the border if every quantity differs."""
+        covariance = np.linalg.inv(self._normal)
+        return covariance @ self._score, covariance
+
+    def averaged(self, rng: np.random.Generator) -> tuple[Array, Array, Array, bool]:
+        """Return mean and covariance of the border over which quantities differ, how often each does, and if none may.
+
+        The scene may be exact if that is drawn at all.
+        """
         count, size = len(self.names), len(self._precision)
         differs, log_precision = np.zeros(count, np.bool_), np.log(self._precision)
 
@@ -307,10 +322,10 @@ class _Linearised:
             use = np.append(np.arange(SIZE), SIZE + np.flatnonzero(which))
             lower = np.linalg.cholesky(self._normal[np.ix_(use, use)])
             half = np.linalg.solve(lower, self._score[use])
-            log_odds = which.sum() * np.log(_DIFFERS / (1.0 - _DIFFERS))
+            log_odds = which.sum() * np.log(tuning.DIFFERS / (1.0 - tuning.DIFFERS))
             return float(0.5 * half @ half - np.log(np.diag(lower)).sum() + 0.5 * log_precision[use].sum() + log_odds)
 
-        now = evidence(differs)
+        now, exact = evidence(differs), False
         mean, second, often, counted = np.zeros(size), np.zeros((size, size)), np.zeros(count), _SWEEPS - _BURNT
         for sweep in range(_SWEEPS):
             for index in rng.permutation(count):
@@ -319,6 +334,7 @@ class _Linearised:
                 instead = evidence(other)
                 if np.log(rng.random()) < instead - now:
                     differs, now = other, instead
+                exact |= sweep >= _BURNT and not differs.any()
             if sweep >= _BURNT:
                 use = np.append(np.arange(SIZE), SIZE + np.flatnonzero(differs))
                 inverse = np.linalg.inv(self._normal[np.ix_(use, use)])
@@ -329,7 +345,7 @@ class _Linearised:
                 mean += step
                 often += differs
         mean /= counted
-        return mean, second / counted - np.outer(mean, mean), often / counted
+        return mean, second / counted - np.outer(mean, mean), often / counted, exact
 
     def scatter(self) -> float:
         """Return the variance by the swings' scatter over that by the noise, for the unknowns of the motion."""

@@ -262,15 +262,23 @@ def _searched(
     result = summarise(*found, verdict, lost, forces if bounced is None else None)
     unexplained = bool(verdict.model or verdict.sensor) or not found[1].finished
     if bounced is None and unexplained and not verdict.broken:
-        result = under_uncertain_load(result, unknowns, forward.load, poses, period)
+        result = under_uncertain_load(result, unknowns, forward.load, poses, period, found)
     following = () if verdict.model or verdict.sensor else _next_guess(*found)
     return result if bounced is None else with_bounced(result, bounced, spent), following
 
 
-def under_uncertain_load(result: Estimate, unknowns: Unknowns, felt: Load, poses: Poses, period: float) -> Estimate:
+def under_uncertain_load(
+    result: Estimate,
+    unknowns: Unknowns,
+    felt: Load,
+    poses: Poses,
+    period: float,
+    fitted: tuple[Problem, Fit] | None = None,
+) -> Estimate:
     """Return an estimate whose withdrawn clearances allow for a load, or an angle, that is not known.
 
-    `result` comes from the load believed; it stays where it knows a clearance, or nothing is found.
+    `result` comes from the load believed; it stays where it knows a clearance, or nothing is found. Where the
+    comparison agrees with what `fitted` says of a machine that differs, that was no false optimum: both are combined.
     """
     if _known(result) or felt.interval() > tuning.COARSEST:
         return result
@@ -278,10 +286,15 @@ def under_uncertain_load(result: Estimate, unknowns: Unknowns, felt: Load, poses
     figures = result.figures | {"work": result.figures.get("work", 0.0) + float(work)}
     if found is None or found.distance > tuning.MOST_DISTANCE or found.ln_depth[0] < math.log(tuning.FITTED):
         return replace(result, figures=figures)
+    beside = None if fitted is None else _if_it_differs(*fitted)
     values, known = [], []
     for index in (GX, GY):
         prior = float(unknowns.nominal()[index]), float(unknowns.deviations()[index])
         mean, deviation = _both((float(found.clearance[index]), float(found.deviation[index])), prior)
+        if beside is not None:
+            by_fit = float(beside.shared[index]), math.sqrt(beside.covariance[index, index])
+            if abs(by_fit[0] - mean) < tuning.AGREES * math.hypot(deviation, by_fit[1]):
+                mean, deviation = _both((mean, deviation), by_fit)
         observed = bool(found.touched[index]) and deviation < tuning.OBSERVED_SHARE * prior[1]
         values.append(Interval.normal(*((mean, deviation) if observed else prior)).above(0.0))
         known.append(_state(False, observed, rough=True))
@@ -508,11 +521,18 @@ def _graded(problem: Problem, fit: Fit, verdict: Verdict) -> Graded | None:
     clean = fit.finished and not (verdict.model or verdict.sensor)
     if (problem.turns.any() and clean) or (len(problem.link) and (clean or not fit.finished)):
         return None
+    found = _if_it_differs(problem, fit, doubtful=not clean)
+    if found is None or (not fit.finished and found.inflation.mean() >= tuning.MOST_INFLATED):
+        return None
+    return found
+
+
+def _if_it_differs(problem: Problem, fit: Fit, doubtful: bool = True) -> Graded | None:
+    """Return the result of a fit, even of one that has not converged, where the machine differs from the model."""
     try:
-        found = graded(problem, fit)
+        return graded(problem, fit, doubtful)
     except np.linalg.LinAlgError:
         return None
-    return found if fit.finished or found.inflation.mean() < tuning.MOST_INFLATED else None
 
 
 def _next_guess(problem: Problem, fit: Fit) -> Guess:

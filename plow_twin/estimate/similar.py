@@ -133,7 +133,7 @@ class Units:
         def length_of(name: str) -> float:
             if name == "filter":
                 return time**2
-            return length if name.startswith(("frame.", "turn_", "lever_")) else 1.0
+            return length if name.startswith(("frame.", "corner_", "turn_", "lever_")) else 1.0
 
         scale = (f"all in units of {length:g} m, {self.mass:g} kg, {time:g} s: the machine is not of the paper's size",)
         return replace(

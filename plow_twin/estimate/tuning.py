@@ -250,6 +250,10 @@ LEFT_OPEN: Annotated[
 # Machines that differ from the model
 PUSH: Annotated[float, Tuned("half range", "first guess of the load's error in a swing")] = 0.02
 UNCORRELATED: Annotated[float, Tuned("1", "correlation of residuals that ends the sum over lags")] = 0.05
+DIFFERS: Annotated[
+    float,
+    Tuned("1", "probability that a quantity differs from the scene", "`none`, `frame`, `theta_scale`, seed 96000"),
+] = 0.2
 BENT: Annotated[float, Tuned("1", "share of the linearised step by which it may be wrong")] = 0.3
 BENT_BY_EXPONENT: Annotated[
     float,
@@ -403,6 +407,10 @@ COARSE_GAIN: Annotated[
         "averages over a third of a period lose 0.16 of the amplitude",
     ),
 ] = 0.2
+AGREES: Annotated[
+    float,
+    Tuned("deviations", "distance up to which such a comparison and a fit that has not converged agree"),
+] = 2.0
 LOAD_ERRORS: Annotated[tuple[float, ...], Tuned("1", "least and largest error of a load over its amplitude")] = (
     0.01,
     0.3,
