@@ -73,6 +73,20 @@ def test_a_feed_without_a_reader_does_not_wait_and_keeps_the_peaks() -> None:
     link.close()
 
 
+def test_each_second_of_a_file_has_its_update_on_the_screen_and_a_way_out_keeps_its_rate() -> None:
+    for by_second, expected in ((True, [float(second) for second in range(1, 30)]), (False, [])):
+        link, theirs = pair()
+        feed = Feed(link, FACTS, by_second=by_second)
+        for index in range(580):  # of 20 Hz, as fast as they can be computed
+            feed.publication(_published(1.0 + 0.05 * index, 1.0 + index // 20))
+        with theirs:
+            far, peaks = Link(theirs), []
+            while (update := far.receive()) is not None:
+                peaks.append(update["motion"]["peak"][0])
+        assert peaks == expected[:-1]
+        link.close()
+
+
 def test_the_hour_is_bounded_has_each_second_once_and_is_cleared_where_stamps_step_back() -> None:
     history = History()
     motion = {"load_low": [0, -1, None], "load_high": [0, 1, None], "was_held": False}

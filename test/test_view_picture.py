@@ -86,21 +86,27 @@ def test_an_estimate_after_the_last_publication_ends_the_curves_of_the_clearance
     run = record_run(tmp_path / "run", [*(paper_sample(index) for index in range(400)), estimated])
     to_png(run.folder, tmp_path / "run.png")
     horizontal, vertical = figures[0].axes[4].get_legend_handles_labels()[1][:2]
-    assert "26.50 mm (26.30 to 26.80)" in horizontal and "30.000 mm" in vertical
+    assert horizontal == "horizontal, at the end\n26.50 mm (26.30 to 26.80),\nestimated"
+    assert vertical == "vertical, at the end\n30.000 mm,\nnot observable"
 
 
-def test_a_stretch_without_samples_is_shaded(tmp_path: Path, figures: list[Figure]) -> None:
-    held = [Hold(BASE_NS + (200 + index) * STEP_NS) for index in range(300)]
-    run = record_run(
-        tmp_path / "run",
-        [*(paper_sample(index) for index in range(200)), *held, *(paper_sample(index) for index in range(500, 700))],
-    )
+def test_a_stretch_without_samples_is_shaded_and_crossed_by_no_line(tmp_path: Path, figures: list[Figure]) -> None:
+    def held(first: int, last: int) -> list[Entry]:
+        return [Hold(BASE_NS + index * STEP_NS) for index in range(first, last)]
+
+    # the second stretch is filled by late samples and leaves no shade, the third lasts to the end
+    entries: list[Entry] = [*map(paper_sample, range(200)), *held(200, 500), *map(paper_sample, range(500, 700))]
+    entries += [*held(750, 751), *map(paper_sample, range(700, 900)), *held(900, 1000)]
+    run = record_run(tmp_path / "run", entries, rollback_span_s=0.2)
     to_png(run.folder, tmp_path / "run.png")
     check_figure(figures[0])
     assert "grey: without samples" in figures[0].axes[4].get_xlabel()
     for axis in figures[0].axes[2:]:
-        (shade,) = axis.patches
-        assert (shade.get_x(), shade.get_x() + shade.get_width()) == pytest.approx((0.199, 0.5))
+        shades = [(shade.get_x(), shade.get_x() + shade.get_width()) for shade in axis.patches]
+        assert [pytest.approx(shade) for shade in shades] == [(0.199, 0.5), (0.699, 0.7), (0.899, 0.999)]
+    times, load = figures[0].axes[3].lines[0].get_data()
+    gap = np.flatnonzero(np.isnan(load))[:2]
+    np.testing.assert_allclose([times[gap - 1], times[gap + 1]], [[0.199, 0.699], [0.5, 0.7]])
 
 
 def test_every_force_of_the_instant_shown_has_its_arrow_and_its_value_inside_the_axes(

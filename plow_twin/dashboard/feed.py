@@ -146,6 +146,8 @@ class Feed:
         Receives the reason when the feed has ended.
     process, consequence
         Name of the process, and the consequence of its end.
+    by_second
+        Give each second of stamps an update, also where samples come faster than their time, as from a file.
     """
 
     def __init__(
@@ -157,8 +159,11 @@ class Feed:
         on_error: Callable[[str], object] = lambda text: None,
         process: str = "the server of the screen",
         consequence: str = "nothing is shown any more",
+        *,
+        by_second: bool = False,
     ) -> None:
         self._link, self._answer, self._load, self._on_error = link, answer, load, on_error
+        self._by_second = by_second
         self._end = f"{process} has ended: {consequence}, the twin goes on"
         #: newest report of the process on itself
         self.report: dict[str, Any] = {}
@@ -169,21 +174,22 @@ class Feed:
         self._waiting: list[Published] = []
         self._loads: list[Array] = []
         self.motion = Motion()
-        #: second of stamps of the newest update
+        #: second of stamps of the newest publication
         self._second = 0
         #: updates that the server took, and those that it had no room for
         self.taken = self.not_taken = 0
 
     def publication(self, published: Published) -> None:
         """Take in a publication of at least one row: it is kept for the next update."""
+        second = int(published.rows["stamp_ns"][-1]) // NS_PER_S
+        if self._by_second and second != self._second and self._waiting:
+            self.send()
+        self._second = second
         self._waiting.append(published)
         if self._load is not None:
             self._loads.append(self._load())
         if len(self._waiting) >= _MOST:
             self._sum_up()
-            # samples that come faster than their time, as from a file: each second has its update
-            if self.motion.stamp_ns // NS_PER_S != self._second:
-                self.send()
 
     def part(self, name: str, part: Part) -> None:
         """Take in a status: the newest of each name counts."""
@@ -223,7 +229,6 @@ class Feed:
     def send(self) -> bool:
         """Send an update; False, and counted, where there was no room."""
         self._sum_up()
-        self._second = self.motion.stamp_ns // NS_PER_S
         update: dict[str, Any] = {**self._news, "not_taken": self.not_taken}
         if self._parts:
             update["parts"] = self._parts

@@ -47,7 +47,7 @@ class Screen(Beside):
         host = f"[{access.host}]" if ":" in access.host else access.host
         #: address of the page
         self.url = f"http://{host}:{port}/"
-        self.feed = Feed(self.link, facts, answer, load, on_error)
+        self.feed = Feed(self.link, facts, answer, load, on_error, by_second=True)
 
     @property
     def has_ended(self) -> bool:

@@ -26,6 +26,14 @@ if TYPE_CHECKING:
 #: Room about the end of an arrow for its label [mm].
 _LABEL_ROOM_MM: Final = 50.0
 _LOAD_NAMES: Final = ("Fx [kN]", "Fy [kN]", "M [kN m]")
+#: Where a clearance comes from, by its state, in the words of the screen.
+_STATES: Final = {
+    "prior": "assumed",
+    "estimated": "estimated",
+    "rough": "rough estimate",
+    "not_observable": "not observable",
+    "withdrawn": "withdrawn",
+}
 
 
 def to_png(path: Path, out: Path) -> tuple[FileStatus, dict[str, int], int]:
@@ -69,7 +77,7 @@ def run_figure(reader: RunReader, curves: RunCurves) -> Figure:
     _curves(force, curves.force, PAIR_NAMES, "largest force [kN]", colors, only_largest=True)
     _thresholds(force, alarms["force"].thresholds, 1e-3)
     force.set_ylim(bottom=0.0)
-    _curves(load, curves.load, _LOAD_NAMES, "load: forces [kN],\nmoment [kN m]", None)
+    _curves(load, curves.load, _LOAD_NAMES, "load: forces [kN],\nmoment [kN m]", None, gaps=curves.held_s)
     _clearance(clearance, curves)
     _thresholds(clearance, alarms["clearance"].thresholds, 1e3)
     if curves.instant_s is not None:
@@ -183,8 +191,12 @@ def _curves(
     colors: Sequence[Any] | None,
     *,
     only_largest: bool = False,
+    gaps: Sequence[tuple[float, float]] = (),
 ) -> None:
-    """Draw curves, or of bins the band between least and largest values; bands of forces would all begin at zero."""
+    """Draw curves, or of bins the band between least and largest values; bands of forces would all begin at zero.
+
+    No line crosses a gap, given by its ends [s].
+    """
     axis.set_ylabel(label)
     if not rows:
         _note_absence(axis, "not in the recording")
@@ -192,10 +204,18 @@ def _curves(
     for index, name in enumerate(names):
         color = colors[index] if colors else f"C{index}"
         times, least, largest = rows.bands(index)
+        behind = [_widest(times, *gap) for gap in gaps if gap[1] - gap[0] > 2.0 * rows.bin_s]
+        times, least, largest = (np.insert(values, behind, np.nan) for values in (times, least, largest))
         axis.plot(times, largest, lw=0.7, label=name, color=color)
         if rows.bin_s and not only_largest:
             axis.plot(times, least, lw=0.7, color=color)
             axis.fill_between(times, least, largest, color=color, alpha=0.2, lw=0)
+
+
+def _widest(times: NDArray[np.float64], begin: float, end: float) -> int:
+    """Return the place behind the longest step of times [s] that meets a gap; the end where no step does."""
+    steps = np.where((times[1:] > begin) & (times[:-1] < end), np.diff(times), 0.0)
+    return int(steps.argmax()) + 1 if steps.any() else len(times)
 
 
 def _thresholds(axis: Any, thresholds: Thresholds, factor: float) -> None:
@@ -214,7 +234,9 @@ def _clearance(axis: Any, curves: RunCurves) -> None:
     for index, name in enumerate(("horizontal", "vertical")):
         times, _, value = curves.clearance.bands(3 * index)
         low, high = curves.clearance.bands(3 * index + 1)[1], curves.clearance.bands(3 * index + 2)[2]
-        line = axis.plot(times, value, label=f"{name}, at the end\n{_with_interval(value[-1], low[-1], high[-1])}")[0]
+        end = _with_interval(value[-1], low[-1], high[-1])
+        label = f"{name}, at the end\n{end},\n{_STATES[curves.states[name]]}"
+        line = axis.plot(times, value, label=label)[0]
         axis.fill_between(times, low, high, alpha=0.25, color=line.get_color(), lw=0)
     for time_s, reason in curves.changes:
         axis.axvline(time_s, color="0.4", ls=":", lw=1.0)

@@ -60,6 +60,8 @@ class RunCurves:
     failed_s: list[tuple[float, float]] = field(default_factory=list)
     failed: int = 0
     changes: list[tuple[float, str]] = field(default_factory=list)
+    #: states of the newest clearances, as in the status of the twin
+    states: dict[str, str] = field(default_factory=lambda: {"horizontal": "prior", "vertical": "prior"})
     _estimated: bool = False
     _held_since_ns: int | None = None
     _newest_ns: int | None = None
@@ -96,6 +98,7 @@ class RunCurves:
         return bool(self.force or self.load or self.clearance)
 
     def _break_lines(self) -> None:
+        self._end_of_held(self._newest_ns)
         for envelope in (self.force, self.load, self.clearance):
             envelope.break_line()
 
@@ -108,13 +111,12 @@ class RunCurves:
     def _entries(self, batch: Batch) -> None:
         stamps, wrench = batch.entries.samples()
         self.load.add(self._seconds(stamps), wrench / 1e3)
-        samples = np.flatnonzero(batch.entries.sample)
+        samples, done = np.flatnonzero(batch.entries.sample), 0
         for index, entry in sorted(batch.entries.others.items()):
             match entry:
                 case Hold(stamp_ns) | Unload(stamp_ns):
-                    before = batch.entries.stamp_ns[samples[: np.searchsorted(samples, index)]]
-                    self._newest_ns = int(before[-1]) if len(before) else self._newest_ns
-                    self._end_of_held(self._next_sample(before))
+                    self._samples(batch.entries.stamp_ns[samples[(samples >= done) & (samples < index)]])
+                    done = index
                     if self._held_since_ns is None:
                         self._held_since_ns = stamp_ns if self._newest_ns is None else self._newest_ns
                     self._newest_ns = stamp_ns
@@ -122,20 +124,24 @@ class RunCurves:
                     if not self._estimated:
                         self._change(end_ns, "first estimate")
                     self._estimated, self._estimate = True, (int(batch.entries.sequence[index]), result)
+                    found = json.loads(result)
+                    self.states = {axis: found.get(axis, {}).get("state", "prior") for axis in self.states}
                 case Failed(stamp_ns, since_ns, advances):
                     self._failed(stamp_ns, since_ns, advances)
                 case SetModel(stamp_ns):
                     self._change(stamp_ns, "parameters set")
+                    self.states = dict.fromkeys(self.states, "prior")
                 case SetWear(stamp_ns):
                     self._change(stamp_ns, "wear set")
-        if len(stamps):
-            self._end_of_held(self._next_sample(stamps))
-            self._newest_ns = int(stamps[-1])
+        self._samples(batch.entries.stamp_ns[samples[samples >= done]])
 
-    def _next_sample(self, stamps: NDArray[np.int64]) -> int | None:
-        """Return the first of these stamps behind the held stretch, if one began."""
-        behind = stamps[stamps > (self._newest_ns or 0)]
-        return int(behind[0]) if len(behind) else None
+    def _samples(self, stamps: NDArray[np.int64]) -> None:
+        """Take in the stamps of samples; the first after the beginning of a held stretch, also a late one, ends it."""
+        if not len(stamps):
+            return
+        behind = stamps[stamps > (self._held_since_ns or 0)]
+        self._end_of_held(int(behind[0]) if len(behind) else None)
+        self._newest_ns = int(stamps[-1])
 
     def _end_of_held(self, stamp_ns: int | None) -> None:
         if self._held_since_ns is None or stamp_ns is None:

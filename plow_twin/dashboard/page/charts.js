@@ -43,7 +43,8 @@ export class Charts {
     const axis = {stroke: ink, grid: {stroke: grid, width: 1}, ticks: {stroke: grid}};
     return new uPlot({
       title, width: this.width(), height: HEIGHT, series: [{label: "time", value: (_, at) => (at === null ? "" : dated ? clock(at) : `${at} s`)}, ...series],
-      scales: {x: {time: dated}}, axes: [dated ? {...axis, space: 80, values: (_, at) => at.map(clock)} : axis, {...axis, size: 60}],
+      scales: {x: {time: dated}}, axes: [{...axis, size: 36, ...(dated ? {space: 80, values: (_, at) => at.map(clock)} : {values: (_, at) => at.map((second) => `${second} s`)})}, {...axis, size: 60}],
+      padding: [null, 34, 0, 0],
       cursor: {drag: {x: false, y: false}, sync: {key: "screen"}},
       hooks: {drawClear: [(plot) => this.shade(plot)], draw: [(plot) => this.rule(plot, more.limits ?? [])]},
       ...more.options,

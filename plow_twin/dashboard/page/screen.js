@@ -30,6 +30,8 @@ const kilo = (newton) => fixed(newton === null ? null : newton / 1e3, 1);
 const depth = (metre) => (metre === undefined || metre === null ? "–" : metre >= 1e-3 ? `${fixed(metre * 1e3, 2)} mm` : `${fixed(metre * 1e6, 1)} µm`);
 const padName = (name) => { const words = name.split("_"); const wall = words.pop(); return `${words.join(" ")}, ${wall} wall`; };
 const clock = (seconds) => (seconds > 1e9 ? new Date(seconds * 1e3).toLocaleTimeString("en-GB") : `${fixed(seconds, 1)} s`);
+// A time with date and zone: all times of the page are in the browser's zone.
+const moment = (seconds) => (seconds > 1e9 ? new Date(seconds * 1e3).toLocaleString("en-GB", {dateStyle: "medium", timeStyle: "long"}) : clock(seconds));
 
 function cell(row, text, kind = "") {
   const found = row.insertCell();
@@ -121,11 +123,11 @@ function show() {
   showEvents();
   showInputs();
   if (!motion) return;
-  by("stamp").textContent = clock(motion.t);
+  by("stamp").textContent = moment(motion.t);
   const {largest, peak, points} = extremes();
   const wear = facts.pads.map((pad) => motion.clearance?.[`pad_${pad.name}`] ?? 0);
   section.draw(motion, peak, wear, Math.max(...largest));
-  by("section-note").textContent = `Seen from the front; gaps drawn ${section.factor.toFixed(0)} times as wide. Outer stripe and number: peak force of the last second [kN]; inner stripe: wear.`;
+  by("section-note").textContent = `Seen from the front; gaps drawn ${section.factor.toFixed(0)} times as wide. Outer stripe and number: peak force of the last second [kN]; inner stripe: wear. Orange: walls in contact.`;
   showPads(peak, largest, wear, points);
   showClearance();
   const [fx, fy, m] = motion.load;
