@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +43,9 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
         _write("kilonewtons.csv", fx=1e-3, fy=1e-3, m=1e-3)
         _write("headless.csv", header=False)
         _write("bars.csv", separator="|")
+        _write("decimal.csv")
+        text = Path("decimal.csv").read_text()
+        Path("decimal.csv").write_text(re.sub(r"-?[0-9.]+(e-?[0-9]+)?", "1,5", text))
         _write("millimetres.csv", POSE, x=1e3, y=1e3)
         _write("milliseconds.csv", POSE, t=1e3)
         _write("degrees.csv", POSE, theta=180.0 / np.pi * 10.0)
@@ -96,6 +100,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ([*CALIBRATE, "empty.csv"], 2, "columns (none: is it empty?)"),
         (["setup", "headless.csv"], 1, "got no header row or no rows"),
         (["setup", "bars.csv"], 2, "(expected commas, semicolons or tabs between them); state --column t=COLUMN"),
+        (["setup", "decimal.csv"], 1, "got 14 cells in a row, expected the 7 of its header (where commas are decimal"),
         (["setup", "empty.csv"], 1, "got no header row or no rows"),
         (["setup", "nowhere.csv"], 2, "'nowhere.csv' does not exist"),
         (["export", "own.csv", "--to", "csv", "--out", "out"], 1, "of a table plow-twin live makes a recording"),

@@ -438,8 +438,9 @@ def _check_readable(page: browser.Page) -> None:
     for theme in ("dark", "light"):
         page.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": theme}])
         assert page.evaluate(_CONTRAST) >= 4.5, theme
-    page.call("Emulation.setDeviceMetricsOverride", width=390, height=800, deviceScaleFactor=1, mobile=False)
-    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    for width in (390, 1366):
+        page.call("Emulation.setDeviceMetricsOverride", width=width, height=800, deviceScaleFactor=1, mobile=False)
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
     page.call("Emulation.clearDeviceMetricsOverride")
 
 

@@ -990,6 +990,9 @@ def test_a_file_that_ends_is_read_at_the_pace_of_the_twins_that_follow_and_this_
     options = ["--set", "estimate=true", "--set", given, "--set", "follow_members=20"]
     assert run_cli(["live", str(path), "--scene", "paper", *options]) == 3  # too little for an estimate
     assert ("20 twins follow the machine" in capsys.readouterr().err) == said
+    if not said:
+        assert run_cli(["live", str(path), "--scene", "paper", *options, "--follow", "--seconds", "0.5"]) == 0
+        assert "no estimate was made: the run ended before the first" in capsys.readouterr().err
 
 
 def _mistaken(name: str) -> str:
@@ -999,6 +1002,7 @@ def _mistaken(name: str) -> str:
         "decimal commas": lambda t, f: f"{t:.3f},{f[0]:.1f},{f[1]:.1f},{f[2]:.1f}".replace(".", ","),
         "local dates": lambda t, f: f"25.10.2026 02:59:{t:06.3f},{f[0]},{f[1]},{f[2]}",
         "coarse times": lambda t, f: f"{t:.1f},{f[0]},{f[1]},{f[2]}",
+        "milliseconds since 1970": lambda t, f: f"{1.764e12 + 1e3 * t:.1f},{f[0]},{f[1]},{f[2]}",
         "newest first": lambda t, f: f"{100.0 - t},{f[0]},{f[1]},{f[2]}",
         "swapped": lambda t, f: f"{f[0]},{t},{f[1]},{f[2]}",
         "days": lambda t, f: f"{45000.0 + t / 86400.0:.9f},{f[0]},{f[1]},{f[2]}",
@@ -1016,6 +1020,7 @@ def _mistaken(name: str) -> str:
     [
         ("decimal commas", 3, "3000 malformed; the first: load has a line without the 4 cells of its header"),
         ("local dates", 3, "load has no time at 't': got '25.10.2026 02:59:00.000', expected a number or a date"),
+        ("milliseconds since 1970", 3, "got '1764000000000.0', expected seconds; they look like ms: state the unit"),
         ("coarse times", 3, "stamps came twice: have the times too few digits?"),
         ("newest first", 2, "they look like rows from the newest to the oldest: sort the rows by time"),
         ("swapped", 2, "t: got stamps of which"),

@@ -31,7 +31,9 @@ def _write(path: Path, scale: dict[str, float]) -> Path:
     ("scale", "options"),
     [
         ({"fx": 1e-3, "fy": 1e-3, "m": 1e-3}, ["fx=kN", "fy=kN"]),
+        ({"fx": 1e-6, "fy": 1e-6}, ["fx=MN", "fy=MN"]),
         ({"t": 1e3}, ["t=ms"]),
+        ({"t": 1e6}, ["t=us"]),
         ({"x": 1e3, "y": 1e3}, ["x=mm", "y=mm"]),
         ({"theta": 180.0 / np.pi}, ["theta=deg"]),
     ],

@@ -211,6 +211,9 @@ class BridgeFront:
                 f"{counts[Verdict.IMPLAUSIBLE]} loads are larger or change faster than plausible{force}: "
                 "is the unit of load or time another one? Else set limit_force and its like"
             )
+        estimation = self.runtime.estimation
+        if estimation is not None and not (estimation.count or self._bridge.ends):
+            found.append("no estimate was made: the run ended before the first")
         jumps = counts[Verdict.JUMP_BACK]
         if jumps and self._bridge.ends:
             found.append(

@@ -129,6 +129,13 @@ def guess_columns(path: Path, scene: Scene, columns: Mapping[str, str], units: M
             guess.columns[key], guess.because[key[1]] = alike[0], "by its name"
         elif alike:
             guess.open[key[1]] = tuple(alike)
+    for (_, name), column in guess.columns.items():
+        cells = [row[guess.names.index(column)].strip() for row in rows]
+        texts = [cell for cell in cells if cell and not NUMBER.fullmatch(cell)]
+        if 2 * len(texts) > len(cells):
+            raise RecordingError(
+                f"{path}: {name}: got {texts[0]!r} in the column {column}, expected numbers as -1199.7"
+            )
     left = [name for name in guess.names if name not in guess.columns.values() and name != guess.time]
     for _, name in _NEEDED:
         if ("excitation", name) not in guess.columns:
@@ -153,7 +160,14 @@ def _read(path: Path) -> tuple[Guess, list[list[str]]]:
     names = columns_of(path, tuple(name.strip() for name in rows[0])).names
     delimiter = delimiter_of(first[0])
     comma = delimiter != "," and any("," in line for line in first[1:])
-    return Guess(path, delimiter, comma, names), [row for row in rows[1:] if len(row) == len(names)]
+    fit = [row for row in rows[1:] if len(row) == len(names)]
+    if 2 * len(fit) < len(rows) - 1:
+        other = next(len(row) for row in rows[1:] if len(row) != len(names))
+        raise RecordingError(
+            f"{path}: got {other} cells in a row, expected the {len(names)} of its header (where commas are decimal "
+            "signs, semicolons or tabs must stand between the columns)"
+        )
+    return Guess(path, delimiter, comma, names), fit
 
 
 def _find_time(
@@ -205,7 +219,8 @@ def _find_units(guess: Guess, numbers: Mapping[str, Array], scene: Scene, given:
         for name in set(doubt.names) - stated:
             if name == "t":
                 if "its unit by" in guess.because.get("t", ""):
-                    guess.time_unit, guess.stamps_s = doubt.likely, guess.stamps_s * 1e-3
+                    guess.time_unit = doubt.likely
+                    guess.stamps_s = guess.stamps_s * STAMP_UNITS[doubt.likely] / STAMP_UNITS["s"]
                 continue
             guess.units[name] = doubt.likely
             guess.because[name] += f", {doubt.likely} by its size"

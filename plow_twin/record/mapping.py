@@ -28,7 +28,7 @@ from plow_twin.record.map_file import (
 )
 from plow_twin.record.merging import StampOf
 from plow_twin.record.sources import Arrived, Columns, Source, TopicType
-from plow_twin.record.times import NO_TIME, NUMBER, STAMP_UNITS, TIMES, time_ns
+from plow_twin.record.times import NO_TIME, NUMBER, STAMP_UNITS, TIMES, likely_unit, time_ns
 from plow_twin.scene_file.parquet_lines import SUFFIX
 
 Number = TypeVar("Number", float, NDArray[np.float64])
@@ -134,8 +134,15 @@ class Role:
         stamp = self.stamp
         if stamp == "header" and isinstance(content, Mapping):
             stamp = next((name for name in TIMES if name in content), stamp)
-        expected = f"{got(stamp)}, expected a number or a date as 2026-01-02T03:04:05.678Z" if with_value else ""
-        return f"{self.topic} has no time at {stamp!r}{expected}"
+        if not with_value:
+            return f"{self.topic} has no time at {stamp!r}"
+        likely = likely_unit(_at(content, stamp)) if isinstance(content, Mapping) else None
+        expected = (
+            f"seconds; they look like {likely}: state the unit: --unit t={likely}"
+            if likely
+            else "a number or a date as 2026-01-02T03:04:05.678Z"
+        )
+        return f"{self.topic} has no time at {stamp!r}{got(stamp)}, expected {expected}"
 
     def plausible(self, values: Mapping[str, float]) -> bool:
         """Return whether all numbers are within their limits; a missing number is."""

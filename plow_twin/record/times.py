@@ -51,6 +51,13 @@ def time_ns(value: Any, unit: str = "s") -> int | None:
     return stamp_ns if stamp_ns is None or stamp_ns >= EPOCH_S * 1e9 else stamp_ns + START_NS
 
 
+def likely_unit(value: Any) -> str | None:
+    """Return the coarsest unit but seconds in which a number beyond all dates in seconds is a date; else None."""
+    if time_ns(value) is not None:
+        return None
+    return next((unit for unit in STAMP_UNITS if (time_ns(value, unit) or 0) >= EPOCH_S * 1e9), None)
+
+
 def times_ns(texts: Sequence[bytes], unit: str) -> NDArray[np.int64] | None:
     """Return the stamps [ns] of texts, shape (n,), each as of `time_ns`; None where one is no time."""
     try:

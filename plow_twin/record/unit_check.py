@@ -23,10 +23,11 @@ _START_S: Final = START_NS * 1e-9
 
 #: Messages that are looked at: 20 s at 1 kHz hold several periods of a load.
 CHECKED: Final = 20_000
-#: A machine that idles draws more than the hundredth part of the scene's largest force; the thousandth is the same in
-#: kN; below the ten-thousandth the unit is unknown.
+#: A machine that idles draws more than the hundredth part of the scene's largest force. Forces between that part and
+#: the ten-thousandth look like kN, forces a thousand times smaller like MN; others may be an idle sensor's noise.
 _IDLE_SHARE: Final = 1e-2
 _BROKEN_SHARE: Final = 1e-4
+_SMALLER: Final = {"kN": 1.0, "MN": 1e-3}
 #: An angle beyond this [rad] leaves the model, which ends at 45 degrees.
 _LARGEST_ANGLE_RAD: Final = 0.25 * np.pi
 #: Stamps further apart than this [s] cannot follow a load that changes smoothly from one to the next.
@@ -37,6 +38,8 @@ _SMOOTH: Final = 0.05
 _FASTEST_M_S: Final = 5.0
 #: Stamps of which so many fall are no times; where nearly all fall, the newest row is first.
 _FALLING, _REVERSED = 0.2, 0.9
+#: Units that a time may be in, in s.
+_TIMES: Final = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 #: Spreadsheets count days since 1900: dates of this century lie between these numbers.
 _SHEET_DAYS: Final = (36_525.0, 73_050.0)
 #: Least number of samples for a judgement of their spacing.
@@ -171,9 +174,11 @@ def _load(magnitudes: Mapping[tuple[str, str], float], scene: Scene) -> list[Uni
     found = [magnitudes[key] for key in (("excitation", "fx"), ("excitation", "fy")) if key in magnitudes]
     usual = _largest_force(scene)
     largest = max(found, default=0.0)
-    if not _BROKEN_SHARE * usual < largest < _IDLE_SHARE * usual:
-        return []
-    return [UnitDoubt("excitation", ("fx", "fy"), f"{largest:.3g}", f"some {usual:.2g} N as in the scene", "kN")]
+    for unit, size in _SMALLER.items():
+        if _BROKEN_SHARE * size * usual < largest < _IDLE_SHARE * size * usual:
+            expected = f"some {usual:.2g} N as in the scene"
+            return [UnitDoubt("excitation", ("fx", "fy"), f"{largest:.3g}", expected, unit)]
+    return []
 
 
 def _pose(magnitudes: Mapping[tuple[str, str], float], scene: Scene) -> list[UnitDoubt]:
@@ -235,4 +240,5 @@ def _spacing(stamps_s: Array, load: Array) -> list[UnitDoubt]:
     if not float(change.max()) < _SMOOTH:
         return []
     found = f"stamps {spacing:.4g} s apart"
-    return [UnitDoubt("excitation", ("t",), found, "many in a period of what changes so smoothly", "ms")]
+    likely = next((unit for unit, size in _TIMES.items() if spacing * size < _SLOW_S), "ns")
+    return [UnitDoubt("excitation", ("t",), found, "many in a period of what changes so smoothly", likely)]

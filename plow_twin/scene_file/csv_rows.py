@@ -26,10 +26,12 @@ def open_csv(path: Path) -> IO[str]:
     OSError
         It cannot be opened.
     csv.Error, ExcessError
-        As of `ParquetLines`.
+        As of `check_text` and `ParquetLines`.
     """
     if is_parquet(path):
         return io.TextIOWrapper(io.BufferedReader(ParquetLines(path)), encoding="utf-8", errors="replace", newline="")
+    with path.open("rb") as file:
+        check_text(file.read(4))
     return path.open(newline="", encoding="utf-8-sig", errors="replace")
 
 
@@ -39,9 +41,26 @@ def tables(folder: Path) -> list[Path]:
     return [found[name] for name in sorted(found)]
 
 
-def is_utf16(begin: bytes) -> bool:
-    """Return whether a file that begins so is UTF-16, as spreadsheets write "Unicode text"."""
-    return begin[:2] in (b"\xff\xfe", b"\xfe\xff")
+#: Files that are taken for CSV, by their first bytes.
+_OTHERS: Final = {
+    b"\xff\xfe": "UTF-16 text",
+    b"\xfe\xff": "UTF-16 text",
+    b"PK\x03\x04": "a workbook or another ZIP file",
+    b"\x1f\x8b": "a file that gzip has packed",
+}
+
+
+def check_text(begin: bytes) -> None:
+    """Refuse a file that begins so and is no CSV.
+
+    Raises
+    ------
+    csv.Error
+        It is UTF-16, as spreadsheets write "Unicode text", a workbook or packed.
+    """
+    for first, kind in _OTHERS.items():
+        if begin.startswith(first):
+            raise csv.Error(f"got {kind}, expected UTF-8 (of a spreadsheet: CSV UTF-8)")
 
 
 def delimiter_of(header: str) -> str:

@@ -132,6 +132,7 @@ def _plot(
     legend: rrb.Corner2D = rrb.Corner2D.RightTop,
     contents: Sequence[str] = ("$origin/**",),
 ) -> rrb.TimeSeriesView:
+    # rerun offers a corner inside the plot, or no legend
     return rrb.TimeSeriesView(origin=origin, contents=list(contents), name=name, plot_legend=legend)
 
 

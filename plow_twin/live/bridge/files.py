@@ -20,7 +20,7 @@ from plow_twin.live.bridge.table import Table
 from plow_twin.record.merging import StampOf, merged
 from plow_twin.record.sources import Arrived, TopicType, columns_of
 from plow_twin.record.times import NO_TIME
-from plow_twin.scene_file.csv_rows import is_utf16
+from plow_twin.scene_file.csv_rows import check_text
 from plow_twin.scene_file.parquet_lines import ParquetLines, is_parquet
 
 #: Most bytes read from a source at once.
@@ -58,8 +58,7 @@ class _Tail:
         try:
             with _readable(self.path), _open(self.path) as stream:
                 while rows.columns is None and (line := stream.readline(_BLOCK)):
-                    if is_utf16(line):
-                        raise BridgeError(f"{self.path}: got UTF-16 text, expected UTF-8 (of a spreadsheet: CSV UTF-8)")
+                    check_text(line)
                     if grows and not line.endswith(b"\n") and len(line) < _BLOCK:
                         break
                     rows.read(line)
