@@ -19,7 +19,7 @@ from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record.messages import JointState
 from plow_twin.record.recording import read_recording
 from plow_twin.stream.journal import Parameter, Sample
-from plow_twin.study.comparison.change import change
+from plow_twin.study.comparison.change import change, with_neighbours
 from plow_twin.study.comparison.compare import by_time
 from plow_twin.study.comparison.windows import windows_of
 
@@ -90,6 +90,30 @@ def test_a_change_of_the_machine_is_distinguished_from_a_change_of_the_load(
     steady = change((force[0], np.ones(300)), (force[1], np.full(300, 1.2)), random, draws=300)
     assert steady is not None and steady.verdict == "load or machine"
     assert change((force[0][:5], load[0][:5]), (force[1], load[1]), random) is None
+
+
+def test_a_lasting_change_of_a_load_that_windows_cut_through_is_the_load_s() -> None:
+    random = np.random.default_rng(4)
+    verdicts = []
+    for _ in range(40):
+        groups = []
+        for scale in (1.0, 1.15):
+            true = scale * random.normal(
+                1.0, 0.15, 62
+            )  # of each period; a window has halves of two, its peak that of one
+            start_ns = 10**9 * np.arange(61)
+            seen = with_neighbours(0.5 * (true[1:] + true[:-1]), start_ns)
+            groups.append((1e5 * true[1:] * random.normal(1.0, 0.02, 61), seen))
+        found = change(*groups, random, draws=100)
+        assert found is not None
+        verdicts.append(found.verdict)
+    assert verdicts.count("load") >= 34
+    np.testing.assert_array_equal(
+        with_neighbours(np.array([1.0, 2.0, 3.0]), np.array([0, 10, 90])), [[1, 1, 2], [2, 1, 2], [3, 3, 3]]
+    )
+    equal = np.full(93, 0.025)  # its mean is rounded
+    constant = change((equal[:62], np.ones(62)), (equal, np.ones(93)), random, draws=100)
+    assert constant is not None and constant.verdict == "chance"
 
 
 def test_days_and_shifts_begin_in_their_zone() -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from plow_twin.record.durable import whole_file, write_whole
+from plow_twin.view.figures import signed
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -60,8 +61,8 @@ def _embedded(png: bytes) -> str:
 
 
 def percent(share: float | None) -> str:
-    """Return a signed share as text, e.g. +3.5 %; nothing for None."""
-    return "" if share is None else f"{100.0 * share:+.1f} %"
+    """Return a share as text with a proper sign, e.g. +3.5 %; nothing for None."""
+    return "" if share is None else signed(100.0 * share, "+.1f") + " %"
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:

@@ -18,6 +18,10 @@ FEWEST: Final = 8
 _LEAST_VARIATION: Final = 0.01
 #: Loads of two groups that differ by less than this share count as equal.
 _EQUAL_LOAD: Final = 0.01
+#: Means of equal numbers differ by rounding, less than by this share.
+_ROUNDING: Final = 1e-12
+#: A window whose start follows within this many lengths is the next one.
+_NEXT: Final = 1.5
 
 
 @dataclass(frozen=True)
@@ -42,7 +46,7 @@ class Change:
     @property
     def verdict(self) -> str:
         """`chance`, or the cause of a change that is more: `machine`, `load`, or `load or machine`."""
-        if self.low <= 0.0 <= self.high:
+        if self.low <= _ROUNDING and self.high >= -_ROUNDING:
             return "chance"
         if self.machine_low is None or self.machine_high is None:
             return "load or machine"
@@ -55,18 +59,33 @@ def points(values: Array) -> dict[str, float]:
     return {"mean": float(values.mean()), "p05": p05, "p50": p50, "p95": p95}
 
 
+def with_neighbours(load: Array, start_ns: NDArray[np.int64]) -> Array:
+    """Return the load of each window, of the one before and of the one after, shape (n, 3).
+
+    Where there is no such neighbour, the window's own load takes its place. A window cuts through changes of the load,
+    and the head's motion remembers the load before: the slope over a window's own load alone is not the effect of a
+    lasting change, the sum of the slopes over all three is.
+    """
+    steps = np.diff(start_ns)
+    joined = (steps > 0) & (steps < _NEXT * np.median(steps)) if len(steps) else steps > 0
+    before = np.where(joined, load[:-1], load[1:])
+    after = np.where(joined, load[1:], load[:-1])
+    return np.column_stack((load, np.append(load[:1], before), np.append(after, load[-1:])))
+
+
 def change(
     before: tuple[Array, Array], after: tuple[Array, Array], random: np.random.Generator, draws: int = _DRAWS
 ) -> Change | None:
     """Return the change between two groups of windows, None where there are too few.
 
-    Means are compared by a bootstrap over windows. At equal load: less the part that follows the load, by the slope
+    Means are compared by a bootstrap over windows. At equal load: less the part that follows the load, by the slopes
     over the load's variation within the groups (analysis of covariance).
 
     Parameters
     ----------
     before, after
-        Values of a quantity, shape (n,), and load, shape (n,), of the windows of each group.
+        Values of a quantity, shape (n,), and load of the windows of each group, shape (n,), or as of
+        `with_neighbours`, shape (n, 3).
     random
         Source of the draws.
     """
@@ -94,14 +113,16 @@ def _drawn(group: tuple[Array, Array], random: np.random.Generator) -> tuple[Arr
 
 def _at_equal_load(before: tuple[Array, Array], after: tuple[Array, Array]) -> float | None:
     """Return the change of the mean at the first group's load, as a share of the first mean."""
-    (first, load_before), (second, load_after) = before, after
-    mean, difference = float(first.mean()), float(load_after.mean() - load_before.mean())
-    if abs(difference) < _EQUAL_LOAD * float(load_before.mean()):
+    (first, load_before), (second, load_after) = (
+        (values, load.reshape(len(load), -1)) for values, load in (before, after)
+    )
+    mean, usual = float(first.mean()), float(load_before.mean())
+    difference = load_after.mean(axis=0) - load_before.mean(axis=0)
+    if abs(difference[0]) < _EQUAL_LOAD * usual:
         return float(second.mean()) / mean - 1.0
-    centred_load = np.concatenate((load_before - load_before.mean(), load_after - load_after.mean()))
+    centred_load = np.concatenate((load_before - load_before.mean(axis=0), load_after - load_after.mean(axis=0)))
     centred = np.concatenate((first - first.mean(), second - second.mean()))
-    variation = float(np.sqrt((centred_load**2).mean()))
-    if variation < _LEAST_VARIATION * float(load_before.mean()):
+    if float(np.sqrt((centred_load[:, 0] ** 2).mean())) < _LEAST_VARIATION * usual:
         return None
-    slope = float((centred * centred_load).sum() / (centred_load**2).sum())
-    return (float(second.mean()) - slope * difference) / mean - 1.0
+    slopes = np.linalg.lstsq(centred_load, centred)[0]
+    return (float(second.mean()) - float(slopes @ difference)) / mean - 1.0

@@ -13,7 +13,7 @@ import numpy as np
 from plow_twin.errors import RecordingError
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record.recording import read_recording
-from plow_twin.study.comparison.change import Change, change, points
+from plow_twin.study.comparison.change import Change, change, points, with_neighbours
 from plow_twin.study.comparison.windows import QUANTITIES, Windows, windows_of
 
 #: Stamps before this [ns] are no dates: 1e18 ns is in the year 2001.
@@ -158,14 +158,15 @@ def compare(
         raise RecordingError(f"got {len(parts)} group of windows ({', '.join(parts)}), expected two or more")
     found = Comparison({group: _joined(chosen) for group, chosen in parts.items()}, names)
     found.scenes = sorted(set(scenes))
-    first, *others = found.groups.items()
+    (reference, first), *others = found.groups.items()
+    loads = {group: with_neighbours(windows.load[:, 0], windows.start_ns) for group, windows in found.groups.items()}
     random = np.random.default_rng(seed)
     for group, windows in others:
         found.changes[group] = {
             pair: {
                 quantity: change(
-                    (first[1].pairs[quantity][:, place], first[1].load[:, 0]),
-                    (windows.pairs[quantity][:, place], windows.load[:, 0]),
+                    (first.pairs[quantity][:, place], loads[reference]),
+                    (windows.pairs[quantity][:, place], loads[group]),
                     random,
                 )
                 for quantity in QUANTITIES
@@ -174,8 +175,8 @@ def compare(
         }
         found.clearance_changes[group] = {
             axis: change(
-                (first[1].clearance[:, place], first[1].load[:, 0]),
-                (windows.clearance[:, place], windows.load[:, 0]),
+                (first.clearance[:, place], loads[reference]),
+                (windows.clearance[:, place], loads[group]),
                 random,
             )
             for place, axis in enumerate(("horizontal", "vertical"))
