@@ -70,6 +70,11 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["estimate", "bars"], 1, "t|fx|fy|m (expected commas, semicolons or tabs between them), expected t, fx, fy"),
         (["estimate", "headless.csv", *MAP], 1, "(no header row?)"),
         (["estimate", "empty.csv", "--scene", "paper"], 1, "empty.csv: got no load, expected some"),
+        (
+            ["estimate", "own.csv", "--scene", "papper", *MAP[:2]],
+            2,
+            "a scene file, or one of the presets paper, bench_kv",
+        ),
         (["estimate", "nowhere"], 2, "'nowhere' does not exist"),
         (
             ["estimate", "own.csv", "--scene", "paper", "--map", "misspelt.yaml"],

@@ -30,9 +30,13 @@ def open_csv(path: Path) -> IO[str]:
     """
     if is_parquet(path):
         return io.TextIOWrapper(io.BufferedReader(ParquetLines(path)), encoding="utf-8", errors="replace", newline="")
-    with path.open("rb") as file:
-        check_text(file.read(4))
-    return path.open(newline="", encoding="utf-8-sig", errors="replace")
+    file = path.open("rb")
+    try:
+        check_text(file.peek(4))
+    except csv.Error:
+        file.close()
+        raise
+    return io.TextIOWrapper(file, encoding="utf-8-sig", errors="replace", newline="")
 
 
 def tables(folder: Path) -> list[Path]:

@@ -23,7 +23,7 @@ from plow_twin.model.scene import (
     Scene,
     Table,
 )
-from plow_twin.scene_file.presets import scene_path
+from plow_twin.scene_file.presets import PRESETS, scene_path
 from plow_twin.scene_file.schema import LOAD_KINDS, SECTIONS, scene_schema
 from plow_twin.scene_file.table import read_table, sample_table
 from plow_twin.scene_file.validation import Schema, validate
@@ -60,6 +60,9 @@ def load_scene(path: str | Path) -> Scene:
         When the file cannot be read or used; it lists every problem.
     """
     path = scene_path(path)
+    if not (path.suffix or path.exists()):
+        problem = Problem("file", str(path), f"a scene file, or one of the presets {', '.join(PRESETS)}")
+        return _scene(None, [problem], path.parent, str(path))
     return _scene(*read_yaml(path, "scene", _SECTIONS), path.parent, str(path))
 
 

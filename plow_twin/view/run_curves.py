@@ -133,6 +133,7 @@ class RunCurves:
                     self.states = dict.fromkeys(self.states, "prior")
                 case SetWear(stamp_ns):
                     self._change(stamp_ns, "wear set")
+                    self.states = dict.fromkeys(self.states, "prior")
         self._samples(batch.entries.stamp_ns[samples[samples >= done]])
 
     def _samples(self, stamps: NDArray[np.int64]) -> None:
