@@ -122,12 +122,16 @@ export class Charts {
       const y = plot.valToPos(limit / 1e3, "y", true);
       if (limit > 0) line(at ? "#c8001e" : "#e69f00", bbox.left, y, bbox.left + bbox.width, y);
     });
+    let before = -Infinity, row = 0;
     for (const event of (this.events ?? []).filter((one) => one.done && one.t >= plot.scales.x.min)) {
       const x = plot.valToPos(event.t, "x", true);
       line("#b04a8c", x, bbox.top, x, bbox.top + bbox.height);
       ctx.fillStyle = "#b04a8c";
       ctx.textAlign = "right";
-      ctx.fillText(event.kind === "mark" ? event.text.split(": ")[0].slice(0, 24) : event.kind, x - 4, bbox.top + 12);
+      const text = event.kind === "mark" ? event.text.split(": ")[0].slice(0, 24) : event.kind;
+      row = x - 4 - ctx.measureText(text).width < before ? (row + 1) % 5 : 0;
+      before = x;
+      ctx.fillText(text, x - 4, bbox.top + 12 + 12 * row);
     }
     ctx.restore();
   }
