@@ -131,9 +131,10 @@ def test_every_table_of_the_pages_is_that_of_the_results_and_the_code() -> None:
     assert done.stdout.splitlines() == ["[]", "set() True"], done.stderr or done.stdout
 
 
-def test_the_picture_of_the_subpackages_is_the_script_s() -> None:
-    made = runpy.run_path(str(ROOT / "tools" / "architecture.py"))
-    assert made["OUT"].read_text() == made["drawing"]()
+def test_drawn_pictures_are_their_scripts() -> None:
+    pictures = [runpy.run_path(str(ROOT / "tools" / name)) for name in ("lanes_picture.py", "architecture.py")]
+    assert all(made["OUT"].read_text() == made["drawing"]() for made in pictures)
+    made = pictures[-1]
     subpackages = {name for row in made["SUBPACKAGES"] for name, _ in row}
     folders = {path.parent.name for path in (ROOT / "plow_twin").glob("*/__init__.py")}
     assert folders <= subpackages

@@ -30,7 +30,7 @@ from plow_twin.solve.lanes.loop import (
 from plow_twin.solve.lanes.record import (
     COMPONENTS,
     WIDTH,
-    damped_at,
+    linear_at,
     load_lane,
     penetration_at,
     save_lane,
@@ -156,11 +156,9 @@ def _tell(lanes, reached, viscous, hysteretic) -> None:
     x, y = exact_row(lanes.y, X), exact_row(lanes.y, Y)
     dc, ds = om * s * -1.0, om * c
     dx, dy = fused(om, y, exact_row(lanes.y, VX)), exact_row(lanes.y, VY) - om * x
-    zero, none = exact_splat(0.0), exact_splat(0.0)
+    zero = exact_splat(0.0)
     for pair in range(PAIR_COUNT):
-        place, rate = (x, dx) if pair % 2 == 1 else (y, dy)
-        depth = penetration_at(lanes, pair, c, s, place)
-        closing = damped_at(lanes, pair, exact_splat(1.0), none, dc, ds, rate)
+        depth, closing = penetration_at(lanes.rows[pair], c, s, x, y), linear_at(lanes.rows[pair], dc, ds, dx, dy)
         push = depth
         if viscous is not None:
             push = fused(exact_row(lanes.ratio, pair), closing, depth)
@@ -312,9 +310,9 @@ def _step(s, viscous, hysteretic, order, lanes, w) -> None:
         for lane in range(WIDTH):
             if infinite >> lane & 1:
                 _fail(s, lanes, lane, _NON_FINITE)
-    first_events(s.states, lanes, w, used, order, viscous, hysteretic)
+    first_events(s.states, lanes, w, used, order, hysteretic)
     go_past_an_instant(s.params, s.states, lanes)
-    note_switches(lanes, used, viscous, hysteretic)
+    note_switches(lanes, used, viscous)
     sum_step(lanes, w, used)
     add_step(None, lanes, w, used, order, viscous, hysteretic)
     move(lanes)

@@ -1,6 +1,7 @@
-"""The first event of each lane's step: guards of all pairs in all lanes at once, roots of one guard a lane at a time.
+"""The first event of each lane's step.
 
-A clipped pair that parts changes no force and ends no step; the rest of the step is searched for its next touch.
+Few guards can turn negative within a step. Each lane lists its own; in each round all lanes search one of theirs. A
+clipped pair that parts changes no force and ends no step; the rest of the step is searched for its next touch.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.polynomial import first_root
 from plow_twin.kernel.simd import below, choose, exact_row, exact_splat, fused, magnitude, set_row
 from plow_twin.model.pairs import PAIR_COUNT
-from plow_twin.solve.lanes.record import AGAIN, DC, DS, DX, DY, SECOND, WIDTH, damped_at, penetration_at
+from plow_twin.solve.lanes.record import AGAIN, GUARDS, SECOND, WIDTH, linear_at, penetration_at, to_bernstein
 from plow_twin.solve.state import CLIPPED, COS, OFF, ON, SIN, X, Y
 
 #: Events are one instant when they are closer than this share of the step before them.
@@ -19,210 +20,155 @@ _AT_ONCE = 1e-12
 #: Change of a root that is small enough, as the next is of the order of its cube, and its roundings.
 _FOUND, _STRAIGHT, _ROUNDED = 1e-6, 1e-3, 2e-16
 _MOST_CHANGES = 80
+#: Rows of `lanes.chosen` after those of a penetration.
+_DEPTH, _RATE, _CONSTANT = 5, 6, 7
 
 
 @kernel()
-def _write_guards(lanes, order, viscous, hysteretic) -> None:
-    """Write the guards of all pairs, and to `lanes.todo` a bit for each that is not proved to stay positive.
+def _list_guards(lanes, order, hysteretic) -> None:
+    """Write to `lanes.todo` a bit for each guard of a lane that is not proved to stay positive.
 
-    off: -d; on: F / K = d + (C / K) d', or d and 1 + lambda d'; clipped: d, and the force with the other sign. A guard
-    g is positive on [0, h] where g_0 and g_0 + g_1 h - sum over k > 1 of max(-g_k, 0) h^k are: that bound is concave.
+    off: -d; on: F / K = d + (C / K) d', or d and 1 + lambda d'; clipped: d, and the force with the other sign.
     """
-    live = 0
     for lane in range(WIDTH):
-        lanes.todo[lane] = 0
-        live |= 1 << lane if lanes.member[lane] >= 0 else 0
-    for pair in range(PAIR_COUNT):
-        place, rate = (lanes.series[X], lanes.turning[DX]) if pair % 2 == 1 else (lanes.series[Y], lanes.turning[DY])
-        unsafe, inside = _first_guard(lanes, pair, place, order) & live, (lanes.on[pair] | lanes.clipped[pair]) & live
-        if viscous is None:
-            _note(lanes, unsafe, pair)
+        lanes.todo[lane] = lanes.watched[lane]
+    _list_off(lanes, order)
+    one, none, h = exact_splat(1.0), exact_splat(0.0), exact_row(lanes.step, 0)
+    damped = exact_row(lanes.viscous, 0) / exact_row(lanes.stiffness, 0)
+    for slot in range(PAIR_COUNT):
+        taken, gear = lanes.taken[slot], lanes.gear[slot]
+        if taken == 0:
+            break
+        if hysteretic is None:
+            _note(lanes, slot, 0, _write_guard(lanes, gear, one, damped, none, lanes.push[slot], order, h) & taken)
         else:
-            _note(lanes, unsafe & ~lanes.on[pair], pair)
-        if inside == 0:
-            continue
-        if viscous is not None:
-            _note(lanes, _force_guards(lanes, pair, rate, order) & lanes.on[pair] & live, pair)
-        if (viscous is not None or hysteretic is not None) and lanes.clipped[pair] & live != 0:
-            lanes.leaves[pair] = _leaves(lanes, pair, order)
-        if viscous is not None and lanes.clipped[pair] & live != 0:
-            _note(lanes, _second_guard(lanes, pair, order) & lanes.clipped[pair] & live, SECOND + pair)
-        if hysteretic is not None:
-            _note(lanes, _pull_guard(lanes, pair, rate, order) & inside, SECOND + pair)
+            _note(lanes, slot, 0, _write_guard(lanes, gear, one, none, none, lanes.guard[0], order, h) & taken)
+            pull = _write_guard(lanes, gear, none, exact_row(gear, 7), one, lanes.guard[0], order, h)
+            _note(lanes, slot, SECOND, pull & taken)
 
 
-@kernel(inline="code")
-def _note(lanes, bits, guard) -> None:
+@kernel()
+def _note(lanes, slot, kind, bits) -> None:
     if bits != 0:
         for lane in range(WIDTH):
-            lanes.todo[lane] |= (bits >> lane & 1) << guard
-
-
-@kernel(inline="code")
-def _reach(reach, term, h):
-    """Return (reach + max(-term, 0)) h."""
-    return fused(magnitude(term) - term, exact_splat(0.5), reach) * h
+            lanes.todo[lane] |= (bits >> lane & 1) << kind + lanes.slot[slot, lane]
 
 
 @kernel()
-def _unsafe(guard, order, within):
-    """Return a bit for each lane whose guard is not proved to stay positive up to `within`."""
-    h, reach = exact_row(within, 0), exact_splat(0.0)
+def _later(series, order, h):
+    """Return the sum of abs(term k) h^k for k > 1."""
+    reach = exact_splat(0.0)
     for k in range(order, 1, -1):
-        reach = _reach(reach, exact_row(guard, k), h)
-    first = exact_row(guard, 0)
-    return below(fused(exact_row(guard, 1), h, first), reach * h) | below(first, exact_splat(0.0))
+        reach = fused(reach, h, magnitude(exact_row(series, k)))
+    return reach * h * h
 
 
 @kernel()
-def _first_guard(lanes, pair, place, order):
-    """Write the penetration of a pair with the sign of its mode; return as `_unsafe`."""
-    guard, sign, h = lanes.guard[pair], exact_row(lanes.sign, pair), exact_row(lanes.step, 0)
-    rows, cosine, sine = lanes.rows[pair], lanes.series[COS], lanes.series[SIN]
-    a, b, n = exact_row(rows, 0) * sign, exact_row(rows, 1) * sign, exact_row(rows, 2) * sign
-    reach, term = exact_splat(0.0), exact_splat(0.0)
+def _list_off(lanes, order) -> None:
+    """List pairs that are off: their penetration stays negative if its first terms and bounds of the others say so."""
+    h, series, cosine, sine = exact_row(lanes.step, 0), lanes.series, lanes.series[COS], lanes.series[SIN]
+    x, y = series[X], series[Y]
+    later_c, later_s = _later(cosine, order, h), _later(sine, order, h)
+    later_x, later_y = _later(x, order, h), _later(y, order, h)
+    for pair in range(PAIR_COUNT):
+        if lanes.off[pair] == 0:
+            continue
+        rows = lanes.rows[pair]
+        depth = penetration_at(rows, exact_row(cosine, 0), exact_row(sine, 0), exact_row(x, 0), exact_row(y, 0))
+        rate = linear_at(rows, exact_row(cosine, 1), exact_row(sine, 1), exact_row(x, 1), exact_row(y, 1))
+        bound = fused(magnitude(exact_row(rows, 0)), later_c, magnitude(exact_row(rows, 1)) * later_s)
+        bound = bound + (later_y if pair % 2 == 0 else later_x)
+        unsafe = lanes.off[pair] & ~below(fused(rate, h, depth) + bound, exact_splat(0.0))
+        if unsafe != 0:
+            for lane in range(WIDTH):
+                lanes.todo[lane] |= (unsafe >> lane & 1) << pair
+
+
+@kernel()
+def _write_guard(lanes, rows, of_depth, of_rate, constant, guard, order, h):
+    """Write a guard, given by factors of d and d' and a constant; return a bit for each lane where it may end.
+
+    A guard g is positive on [0, h] where g_0 and g_0 + g_1 h - sum over k > 1 of max(-g_k, 0) h^k are: that bound is
+    concave.
+    """
+    cosine, sine, x, y = lanes.series[COS], lanes.series[SIN], lanes.series[X], lanes.series[Y]
+    reach = term = deeper = zero = exact_splat(0.0)
     for k in range(order, 0, -1):
-        term = fused(a, exact_row(cosine, k), fused(b, exact_row(sine, k), n * exact_row(place, k)))
+        depth = linear_at(rows, exact_row(cosine, k), exact_row(sine, k), exact_row(x, k), exact_row(y, k))
+        term = fused(of_rate * (k + 1.0), deeper, of_depth * depth)
+        deeper = depth
         set_row(guard, k, term)
         if k > 1:
-            reach = _reach(reach, term, h)
-    zero = exact_splat(0.0)
-    first = sign * penetration_at(lanes, pair, exact_row(cosine, 0), exact_row(sine, 0), exact_row(place, 0))
+            reach = fused(magnitude(term) - term, exact_splat(0.5), reach) * h
+    depth = penetration_at(rows, exact_row(cosine, 0), exact_row(sine, 0), exact_row(x, 0), exact_row(y, 0))
+    first = fused(of_rate, deeper, of_depth * depth) + constant
     first = choose(below(zero, first), first, zero)
-    first = first + (magnitude(sign) * -1.0 + 1.0)  # a pair that cannot touch
     set_row(guard, 0, first)
     return below(fused(term, h, first), reach * h)
 
 
 @kernel()
-def _force_guards(lanes, pair, rate, order):
-    """Write F / K as the guard of pairs that are on; return as `_unsafe`."""
-    guard, h, ratio = lanes.guard[pair], exact_row(lanes.step, 0), exact_row(lanes.ratio, pair)
-    cosine, sine = lanes.turning[DC], lanes.turning[DS]
-    reach, term, zero = _reach(exact_splat(0.0), exact_row(guard, order), h), exact_splat(0.0), exact_splat(0.0)
-    for k in range(order - 1, -1, -1):
-        before = term
-        term = damped_at(
-            lanes, pair, ratio, exact_row(guard, k), exact_row(cosine, k), exact_row(sine, k), exact_row(rate, k)
-        )
-        set_row(guard, k, term)
-        if k > 1:
-            reach = _reach(reach, term, h)
-    first = choose(below(zero, term), term, zero)
-    set_row(guard, 0, first)
-    return below(fused(before, h, first), reach * h)
-
-
-@kernel()
-def _second_guard(lanes, pair, order):
-    """Write -F / K of clipped pairs: it turns negative where the force would push again; return as `_unsafe`."""
-    first, guard = lanes.guard[pair], lanes.guard[SECOND + pair]
-    rate = lanes.turning[DX] if pair % 2 == 1 else lanes.turning[DY]
-    ratio = exact_row(lanes.viscous, 0) / exact_row(lanes.stiffness, 0)
-    cosine, sine, zero = lanes.turning[DC], lanes.turning[DS], exact_splat(0.0)
-    set_row(guard, order, exact_row(first, order) * -1.0)
-    for k in range(order - 1, -1, -1):
-        force = damped_at(
-            lanes, pair, ratio, exact_row(first, k), exact_row(cosine, k), exact_row(sine, k), exact_row(rate, k)
-        )
-        set_row(guard, k, force * -1.0)
-    start = exact_row(guard, 0)
-    set_row(guard, 0, choose(below(zero, start), start, zero))
-    return _unsafe(guard, order, lanes.step)
-
-
-@kernel()
-def _pull_guard(lanes, pair, rate, order):
-    """Write 1 + lambda d' of pairs that are on, and its negative of clipped pairs; return as `_unsafe`."""
-    guard, rows, zero = lanes.guard[SECOND + pair], lanes.rows[pair], exact_splat(0.0)
-    sense = choose(lanes.on[pair], exact_splat(1.0), exact_splat(-1.0))
-    factor, cosine, sine = sense * exact_row(lanes.factor, pair), lanes.turning[DC], lanes.turning[DS]
-    a, b, n = exact_row(rows, 0) * factor, exact_row(rows, 1) * factor, exact_row(rows, 2) * factor
-    h, reach, term = exact_row(lanes.step, 0), exact_splat(0.0), exact_splat(0.0)
-    set_row(guard, order, zero)
-    for k in range(order - 1, -1, -1):
-        before = term
-        term = fused(a, exact_row(cosine, k), fused(b, exact_row(sine, k), n * exact_row(rate, k)))
-        set_row(guard, k, term)
-        if k > 1:
-            reach = _reach(reach, term, h)
-    first = term + sense
-    first = choose(below(zero, first), first, zero)
-    set_row(guard, 0, first)
-    return below(fused(before, h, first), reach * h)
-
-
-@kernel()
-def _leaves(lanes, pair, order):
-    """Return a bit for each lane in which the penetration of a clipped pair surely falls all the time."""
-    guard, h, rise, half = lanes.guard[pair], exact_row(lanes.step, 0), exact_splat(0.0), exact_splat(0.5)
-    for k in range(order, 1, -1):
-        term = exact_row(guard, k)
-        rise = fused((magnitude(term) + term) * half, exact_splat(1.0 * k), rise) * h
-    return below(rise + exact_row(guard, 1), exact_splat(0.0))
-
-
-@kernel()
-def _take_column(lanes, lane, guard, order, full) -> None:
-    """Write one guard of a lane to its column, and how far it is searched to `lanes.reach`.
-
-    A column has `full` orders, however many the series have: Bernstein coefficients depend on the number.
-    """
-    lanes.guarded[lane] = guard
-    for k in range(order + 1, full + 1):
-        lanes.column[k, lane] = 0.0
-    if guard < AGAIN:
-        lanes.reach[lane] = lanes.step[lane]
-        for k in range(order + 1):
-            lanes.column[k, lane] = lanes.guard[guard, k, lane]
-        return
-    # a pair that has parted: minus its penetration, from there on
-    pair = guard - AGAIN
-    x = lanes.parted[pair, lane]
-    lanes.reach[lane] = lanes.step[lane] - x
-    for k in range(order + 1):
-        lanes.column[k, lane] = -lanes.guard[pair, k, lane]
-    for r in range(order):
-        for j in range(order - 1, r - 1, -1):
-            lanes.column[j, lane] += x * lanes.column[j + 1, lane]
-    lanes.column[0, lane] = 0.0
-
-
-@kernel()
-def _next_columns(lanes, order, full) -> int:
-    """Take the next guard of each lane that has one; return a bit for each such lane."""
-    bits = 0
+def _choose_guards(lanes, at, hysteretic):
+    """Choose the next guard of each lane that has one; return bits for these lanes, and where a pair touches again."""
+    bits = again = 0
     for lane in range(WIDTH):
+        lanes.guarded[at, lane] = -1
+        lanes.reach[lane] = 0.0
         if lanes.todo[lane] == 0:
-            lanes.reach[lane] = 0.0
             continue
         guard = 0
         while lanes.todo[lane] >> guard & 1 == 0:
             guard += 1
         lanes.todo[lane] &= ~(1 << guard)
-        _take_column(lanes, lane, guard, order, full)
+        lanes.guarded[at, lane] = guard
+        lanes.reach[lane] = lanes.step[lane]
         bits |= 1 << lane
-    return bits
+        if guard >= AGAIN:
+            again |= 1 << lane
+            lanes.reach[lane] -= lanes.parted[guard % PAIR_COUNT, lane]
+        _write_choice(lanes, lane, guard, hysteretic)
+    return bits, again
 
 
 @kernel()
-def _isolate(lanes, w, order, bits):
+def _write_choice(lanes, lane, guard, hysteretic) -> None:
+    """Write the factors of a guard of a lane."""
+    chosen, pair = lanes.chosen, guard % PAIR_COUNT
+    mode, sign, constant, rate = lanes.mode[pair, lane], 1.0, 0.0, lanes.viscous[lane] / lanes.stiffness[lane]
+    for i in range(5):
+        chosen[i, lane] = lanes.rows[pair, i, lane]
+    if guard < SECOND:
+        sign, rate = -1.0 if mode == OFF else 1.0, rate if mode == ON else 0.0
+    elif guard >= AGAIN:
+        sign, rate = -1.0, 0.0
+    elif hysteretic is None:
+        sign, rate = -1.0, -rate
+    else:
+        constant = 1.0 if mode == ON else -1.0
+        sign, rate = 0.0, constant * lanes.factor[pair, lane]
+    chosen[_DEPTH, lane], chosen[_RATE, lane], chosen[_CONSTANT, lane] = sign, rate, constant
+
+
+@kernel()
+def _shift(lanes, guard, pair, lane, order) -> None:
+    """Let the guard of a pair that has parted begin there."""
+    x = lanes.parted[pair, lane]
+    for r in range(order):
+        for j in range(order - 1, r - 1, -1):
+            guard[j, lane] += x * guard[j + 1, lane]
+    guard[0, lane] = 0.0
+
+
+@kernel()
+def _isolate(lanes, column, w, order, bits):
     """Return bits for the lanes whose column has one root in [0, reach), and several; write the chord's root to `root`.
 
     The Bernstein coefficients have as many sign changes as roots, or an even number more.
     """
     h, b, zero = exact_row(lanes.reach, 0), lanes.bernstein, exact_splat(0.0)
-    power = exact_splat(1.0)
-    for k in range(order + 1):
-        set_row(b, k, exact_row(lanes.column, k) * (power * w.binomial[order, k]))
-        power = power * h
-    for r in range(1, order + 1):
-        before = exact_row(b, r - 1)
-        for j in range(r, order + 1):
-            here = exact_row(b, j)
-            set_row(b, j, here + before)
-            before = here
-    negative, once, more, before, root = 0, 0, 0, exact_row(b, 0), zero
+    to_bernstein(lanes, column, w, order, h)
+    negative = once = more = 0
+    before, root = exact_row(b, 0), zero
     for k in range(1, order + 1):
         here = exact_row(b, k)
         now = below(here, zero) & bits
@@ -238,16 +184,16 @@ def _isolate(lanes, w, order, bits):
 
 
 @kernel()
-def _cross(lanes, order, bits) -> None:
+def _cross(lanes, column, order, bits) -> None:
     """Follow each column to its only root in [0, reach] by Halley's method within the bracket (`polynomial`)."""
     low, high, x = exact_splat(0.0), exact_row(lanes.reach, 0), exact_row(lanes.root, 0)
     zero, open_bits = exact_splat(0.0), bits
     for _ in range(_MOST_CHANGES):
-        value, slope, bend = exact_row(lanes.column, order), zero, zero
+        value, slope, bend = exact_row(column, order), zero, zero
         for k in range(order - 1, -1, -1):
             bend = fused(bend, x, slope)
             slope = fused(slope, x, value)
-            value = fused(value, x, exact_row(lanes.column, k))
+            value = fused(value, x, exact_row(column, k))
         behind = below(value, zero)
         low, high = choose(behind, low, x), choose(behind, x, high)
         steepness = slope * slope - value * bend
@@ -267,14 +213,23 @@ def _cross(lanes, order, bits) -> None:
 
 
 @kernel()
-def _note_root(lanes, lane, root) -> None:
-    """Take a root of the column of a lane: it ends the step there, or is a pair that parts."""
-    guard = lanes.guarded[lane]
+def _leaves(guard, lane, order, h) -> bool:
+    """Return whether a penetration surely falls all the time."""
+    rise = 0.0
+    for k in range(order, 1, -1):
+        rise = (rise + k * max(guard[k, lane], 0.0)) * h
+    return rise + guard[1, lane] < 0.0
+
+
+@kernel()
+def _note_root(lanes, lane, at, order) -> None:
+    """Take a root of a lane's guard: it ends the step there, or is a pair that parts."""
+    guard, root = lanes.guarded[at, lane], lanes.root[lane]
     pair = guard % PAIR_COUNT
     if guard < SECOND and lanes.mode[pair, lane] == CLIPPED:
         lanes.parted[pair, lane] = root
         lanes.parting[0] |= 1 << lane
-        if lanes.leaves[pair] >> lane & 1 == 0:
+        if not _leaves(lanes.guard[at], lane, order, lanes.step[lane]):
             lanes.todo[lane] |= 1 << AGAIN + pair
         return
     if guard >= AGAIN:
@@ -286,10 +241,10 @@ def _note_root(lanes, lane, root) -> None:
 
 
 @kernel()
-def first_events(states, lanes, w, order, full, viscous, hysteretic) -> None:
+def first_events(states, lanes, w, order, full, hysteretic) -> None:
     """Let each lane's step end at its first event; note the guard in `lanes.event`, -1 without one.
 
-    `order` is the order of the series, `full` their largest.
+    `order` is the order of the series. Guards have `full` orders, the largest: Bernstein coefficients depend on them.
     """
     never = exact_splat(np.inf)
     for pair in range(PAIR_COUNT):
@@ -297,28 +252,51 @@ def first_events(states, lanes, w, order, full, viscous, hysteretic) -> None:
     lanes.parting[0] = 0
     for lane in range(WIDTH):
         lanes.event[lane] = -1
-    _write_guards(lanes, order, viscous, hysteretic)
-    while True:
-        bits = _next_columns(lanes, order, full)
+    _list_guards(lanes, order, hysteretic)
+    for at in range(GUARDS):
+        lanes.rounds[0] = at
+        bits, again = _choose_guards(lanes, at, hysteretic)
         if bits == 0:
             return
-        # the event found before may be earlier
-        bits &= _unsafe(lanes.column, full, lanes.reach)
-        if bits == 0:
-            continue
-        single, several = _isolate(lanes, w, full, bits)
-        if single != 0:
-            _cross(lanes, full, single)
-        for lane in range(WIDTH):
-            if (single | several) >> lane & 1:
-                states[lanes.member[lane]].guard_roots += 1
-                if several >> lane & 1:
-                    column = w.column[0]
-                    for k in range(full + 1):
-                        column[k] = lanes.column[k, lane]
-                    lanes.root[lane] = first_root(column, full, lanes.reach[lane], w)
-                if lanes.root[lane] < lanes.reach[lane]:
-                    _note_root(lanes, lane, lanes.root[lane])
+        bits &= again | _write_chosen(lanes, lanes.guard[at], order, full)
+        if again != 0:
+            for lane in range(WIDTH):
+                if again >> lane & 1:
+                    _shift(lanes, lanes.guard[at], lanes.guarded[at, lane] - AGAIN, lane, order)
+        if bits != 0:
+            _search(states, lanes, w, at, full, bits)
+    lanes.rounds[0] = GUARDS
+
+
+@kernel()
+def _write_chosen(lanes, guard, order, full):
+    """Write the guards chosen; return as `_write_guard`."""
+    chosen, zero = lanes.chosen, exact_splat(0.0)
+    for k in range(order + 1, full + 1):
+        set_row(guard, k, zero)
+    return _write_guard(
+        lanes, chosen, exact_row(chosen, _DEPTH), exact_row(chosen, _RATE), exact_row(chosen, _CONSTANT), guard, order,
+        exact_row(lanes.reach, 0),
+    )  # fmt: skip
+
+
+@kernel()
+def _search(states, lanes, w, at, order, bits) -> None:
+    """Look for the first root of each lane's guard."""
+    guard = lanes.guard[at]
+    single, several = _isolate(lanes, guard, w, order, bits)
+    if single != 0:
+        _cross(lanes, guard, order, single)
+    for lane in range(WIDTH):
+        if (single | several) >> lane & 1:
+            states[lanes.member[lane]].guard_roots += 1
+            if several >> lane & 1:
+                column = w.column[0]
+                for k in range(order + 1):
+                    column[k] = guard[k, lane]
+                lanes.root[lane] = first_root(column, order, lanes.reach[lane], w)
+            if lanes.root[lane] < lanes.reach[lane]:
+                _note_root(lanes, lane, at, order)
 
 
 @kernel()
@@ -346,7 +324,7 @@ def _ends_with(guard, order, at, within):
 
 
 @kernel()
-def note_switches(lanes, order, viscous, hysteretic) -> None:
+def note_switches(lanes, order, viscous) -> None:
     """Write the modes that pairs take at the end of the steps to `lanes.switch`, -1 for those that stay.
 
     Events that differ in time by rounding only happen together: a symmetric motion stays symmetric.
@@ -354,35 +332,33 @@ def note_switches(lanes, order, viscous, hysteretic) -> None:
     ending = 0
     for lane in range(WIDTH):
         ending |= 1 << lane if lanes.event[lane] >= 0 else 0
+        for pair in range(PAIR_COUNT):
+            lanes.switch[pair, lane] = -1
     if ending == 0:
         return
-    at = exact_row(lanes.step, 0)
-    within = at * _AT_ONCE
-    for pair in range(PAIR_COUNT):
+    step = exact_row(lanes.step, 0)
+    for at in range(lanes.rounds[0]):
+        ended = _ends_with(lanes.guard[at], order, step, step * _AT_ONCE) & ending
         for lane in range(WIDTH):
-            lanes.switch[pair, lane] = -1
-        first, again = _ends_with(lanes.guard[pair], order, at, within) & ending, 0
-        guarded = 0
-        if hysteretic is not None:
-            guarded = (lanes.on[pair] | lanes.clipped[pair]) & ending
-        elif viscous is not None:
-            guarded = lanes.clipped[pair] & ending
-        if guarded != 0:
-            again = _ends_with(lanes.guard[SECOND + pair], order, at, within) & guarded
-        if first | again == 0:
-            continue
-        for lane in range(WIDTH):
-            if lanes.parted[pair, lane] < lanes.step[lane]:
-                continue
-            if first >> lane & 1:
-                lanes.switch[pair, lane] = _next_mode(lanes.mode[pair, lane], viscous)
-            elif again >> lane & 1:
-                lanes.switch[pair, lane] = _other_mode(lanes.mode[pair, lane])
+            if ended >> lane & 1 and 0 <= lanes.guarded[at, lane] < AGAIN:
+                pair = lanes.guarded[at, lane] % PAIR_COUNT
+                # a first guard comes before a second
+                if lanes.switch[pair, lane] < 0 and lanes.parted[pair, lane] >= lanes.step[lane]:
+                    _note_switch(lanes, lane, lanes.guarded[at, lane], viscous)
     for lane in range(WIDTH):
-        event = lanes.event[lane]
-        if event >= AGAIN:
-            lanes.switch[event - AGAIN, lane] = ON
-        elif event >= SECOND:
-            lanes.switch[event - SECOND, lane] = _other_mode(lanes.mode[event - SECOND, lane])
-        elif event >= 0:
-            lanes.switch[event, lane] = _next_mode(lanes.mode[event, lane], viscous)
+        if lanes.event[lane] >= 0:
+            _note_switch(lanes, lane, lanes.event[lane], viscous)
+
+
+@kernel()
+def _note_switch(lanes, lane, guard, viscous) -> None:
+    """Note the mode that follows when a guard ends."""
+    pair = guard % PAIR_COUNT
+    mode = lanes.mode[pair, lane]
+    if guard >= AGAIN:
+        mode = ON
+    elif guard >= SECOND:
+        mode = _other_mode(mode)
+    else:
+        mode = _next_mode(mode, viscous)
+    lanes.switch[pair, lane] = mode

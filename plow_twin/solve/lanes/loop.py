@@ -64,11 +64,10 @@ def lane_in_range(lanes, p, state, lane) -> bool:
 @kernel()
 def bits_in_range(lanes):
     """Return a bit for each lane in which surely the model holds (`modes.within_range`)."""
-    c, s = exact_row(lanes.y, COS), exact_row(lanes.y, SIN)
+    c, s, x, y = exact_row(lanes.y, COS), exact_row(lanes.y, SIN), exact_row(lanes.y, X), exact_row(lanes.y, Y)
     bits = below(magnitude(exact_row(lanes.y, THETA)), exact_splat(LARGEST_ANGLE))
     for pair in range(PAIR_COUNT):
-        along = exact_row(lanes.y, X if pair % 2 == 1 else Y)
-        bits &= below(penetration_at(lanes, pair, c, s, along), exact_row(lanes.half_cavity, 0))
+        bits &= below(penetration_at(lanes.rows[pair], c, s, x, y), exact_row(lanes.half_cavity, 0))
     return bits
 
 
@@ -321,9 +320,9 @@ def _step(members, waves, second, viscous, hysteretic, order, lanes, w, t) -> No
         for lane in range(WIDTH):
             if infinite >> lane & 1:
                 _leave(members, lanes, lane, _NON_FINITE, t)
-    first_events(members.states, lanes, w, order, order, viscous, hysteretic)
+    first_events(members.states, lanes, w, order, order, hysteretic)
     go_past_an_instant(members.params, members.states, lanes)
-    note_switches(lanes, order, viscous, hysteretic)
+    note_switches(lanes, order, viscous)
     sum_step(lanes, w, order)
     add_step(members.totals, lanes, w, order, order, viscous, hysteretic)
     for lane in range(WIDTH):

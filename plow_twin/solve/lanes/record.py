@@ -17,11 +17,12 @@ from plow_twin.solve.state import CLIPPED, COS, MAX_ORDER, OFF, ON, Terms, new_r
 WIDTH: Final = 8
 #: Components of the state in a lane's series.
 COMPONENTS: Final = 8
-#: Indices of the rates of cosine, sine, X and Y, and of the factors of cosine, sine, X and Y in the moment.
+#: Indices of the factors of cosine, sine, X and Y in the moment.
 DC, DS, DX, DY = range(4)
 #: First guards of the eight pairs, second guards of clipped pairs, pairs that part within the step and touch again.
 SECOND: Final = PAIR_COUNT
 AGAIN: Final = 2 * PAIR_COUNT
+GUARDS: Final = 3 * PAIR_COUNT
 
 _ROWS: Final = MAX_ORDER + 1
 _PAIRS: Final = (PAIR_COUNT, WIDTH)
@@ -30,20 +31,18 @@ _LANES_OF: Final = (WIDTH,)
 LANES: Final = np.dtype(
     [
         ("series", "f8", (COMPONENTS, _ROWS, WIDTH)),  # state
-        ("turning", "f8", (4, _ROWS, WIDTH)),  # rates of cosine, sine, X, Y
         ("moment", "f8", (4, _ROWS, WIDTH)),  # factors of cosine, sine, X and Y in the contacts' moment
         ("load", "f8", (3, _ROWS, WIDTH)),  # S1, S2, M
-        ("depth", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # with lambda d': penetration of pairs that are on in some lane
-        ("push", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # and their F / K
-        ("guard", "f8", (2 * PAIR_COUNT, _ROWS, WIDTH)),
-        ("column", "f8", (_ROWS, WIDTH)),  # one guard of each lane
+        ("depth", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # with lambda d': penetration of each slot's pairs
+        ("push", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # F / K of each slot's pairs
+        ("guard", "f8", (GUARDS, _ROWS, WIDTH)),  # in each round one guard of each lane
         ("bernstein", "f8", (_ROWS, WIDTH)),
-        ("rows", "f8", (PAIR_COUNT, 4, WIDTH)),  # penetration: factors of cosine, sine, X or Y, constant
+        ("rows", "f8", (PAIR_COUNT, 5, WIDTH)),  # penetration: factors of cosine, sine, X, Y, constant
         ("arms", "f8", (PAIR_COUNT, 2, WIDTH)),  # arm: factors of cosine and sine
-        ("sign", "f8", _PAIRS),  # of the penetration in a pair's first guard, 0 for pairs that cannot touch
         ("ratio", "f8", _PAIRS),  # C / K of pairs that are on
         ("factor", "f8", _PAIRS),  # lambda
-        ("start", "f8", (4, WIDTH)),  # contact forces along X and Y, factors of c and s in the moment, at the start
+        ("gear", "f8", (PAIR_COUNT, 8, WIDTH)),  # of each slot's pairs: rows, arms, lambda
+        ("chosen", "f8", (8, WIDTH)),  # one guard of each lane: rows, factors of d and d', further constant
         ("along", "f8", (2, 6, WIDTH)),  # higher orders of the forces: of c, s, X or Y, their rates
         ("turn", "f8", (2, 8, WIDTH)),  # and of the factors in the moment: of c, s, X, Y, their rates
         ("constant", "f8", (3, WIDTH)),
@@ -62,6 +61,7 @@ LANES: Final = np.dtype(
         ("half_cavity", "f8", _LANES_OF),
         ("y", "f8", (COMPONENTS, WIDTH)),  # state at the step's start
         ("change", "f8", (COMPONENTS, WIDTH)),  # of the state over the step
+        ("gained", "f8", (2, WIDTH)),  # of one slot: impulse over the step, peak
         ("sum", "f8", (4, WIDTH)),  # integrals of cosine, sine, X, Y over the step, less their values at its start
         ("harmonic", "f8", (10, WIDTH)),  # one load: frequency, sine, cosine, amplitudes of S1, S2, M; phase
         ("size", "f8", (2, WIDTH)),  # of the last two orders as velocities
@@ -83,13 +83,16 @@ LANES: Final = np.dtype(
         ("mode", "i8", _PAIRS),
         ("switch", "i8", _PAIRS),  # modes that pairs take at the step's end, -1 for no change
         ("on", "i8", (PAIR_COUNT,)),  # a bit for each lane in which the pair is on
-        ("clipped", "i8", (PAIR_COUNT,)),
-        ("leaves", "i8", (PAIR_COUNT,)),  # clipped, and cannot touch again within the step
+        ("off", "i8", (PAIR_COUNT,)),  # and in which it is off and can touch
+        ("taken", "i8", (PAIR_COUNT,)),  # a bit for each lane with a pair in the slot
+        ("slot", "i8", _PAIRS),  # the pair in each slot
+        ("watched", "i8", _LANES_OF),  # a bit for each guard that is searched in any case
         ("inside", "i8", _LANES_OF),  # pairs that penetrate
         ("event", "i8", _LANES_OF),  # the guard that ends the step, or -1
         ("ends_at_stop", "i8", _LANES_OF),
         ("todo", "i8", _LANES_OF),  # a bit for each guard that is still to be searched
-        ("guarded", "i8", _LANES_OF),  # the guard in the column
+        ("guarded", "i8", (GUARDS, WIDTH)),  # the guard in each round, or -1
+        ("rounds", "i8", (1,)),
         ("orders", "i8", _LANES_OF),  # of the series of each lane: the terms beyond have vanished
         ("vanished", "i8", (1,)),  # a bit for each lane whose series ends early
         ("before", "i8", _LANES_OF),  # steps before the sample
@@ -130,10 +133,9 @@ def load_lane(p, state, totals, lanes, lane, member) -> None:
         lanes.y[i, lane] = state.y[i]
     lanes.time[lane] = state.step_start
     for pair in range(PAIR_COUNT):
-        along = 3 - pair % 2  # horizontal walls first: Y, then X
-        lanes.rows[pair, 0, lane], lanes.rows[pair, 1, lane] = p.penetration_rows[0, pair], p.penetration_rows[1, pair]
-        lanes.rows[pair, 2, lane] = p.penetration_rows[along, pair]
-        lanes.rows[pair, 3, lane] = p.penetration_rows[4, pair] - state.wear_depth[pair]
+        for i in range(5):
+            lanes.rows[pair, i, lane] = p.penetration_rows[i, pair]
+        lanes.rows[pair, 4, lane] -= state.wear_depth[pair]
         lanes.arms[pair, 0, lane], lanes.arms[pair, 1, lane] = p.arm_rows[0, pair], p.arm_rows[1, pair]
         lanes.mode[pair, lane], lanes.factor[pair, lane] = state.mode[pair], state.damping_factor[pair]
         lanes.peak[pair, lane], lanes.impulse[pair, lane] = totals.peak[pair], totals.impulse[pair]
@@ -181,26 +183,43 @@ def save_lane(state, totals, lanes, lane) -> None:
 @kernel()
 def clear_lane(lanes, lane) -> None:
     """Empty a lane."""
-    lanes.member[lane] = -1
-    rest = ~(1 << lane)
+    lanes.member[lane], lanes.watched[lane], rest = -1, 0, ~(1 << lane)
     for pair in range(PAIR_COUNT):
         lanes.on[pair] &= rest
-        lanes.clipped[pair] &= rest
+        lanes.off[pair] &= rest
+        lanes.taken[pair] &= rest
 
 
 @kernel()
 def note_modes(p, lanes, lane) -> None:
-    """Write the modes of a lane's pairs to their guards and maps."""
-    bit, inside, carrying = 1 << lane, 0, 0
+    """Write the modes of a lane's pairs to its guards, and the pairs that are on to slots, one after the other."""
+    bit, inside, carrying, taken, watched = 1 << lane, 0, 0, 0, 0
     for pair in range(PAIR_COUNT):
-        mode = lanes.mode[pair, lane]
-        lanes.sign[pair, lane] = 0.0 if p.enabled[pair] == 0 else -1.0 if mode == OFF else 1.0
+        mode, rest = lanes.mode[pair, lane], ~bit
         lanes.ratio[pair, lane] = p.viscous / p.stiffness if mode == ON else 0.0
-        lanes.on[pair] = lanes.on[pair] | bit if mode == ON else lanes.on[pair] & ~bit
-        lanes.clipped[pair] = lanes.clipped[pair] | bit if mode == CLIPPED else lanes.clipped[pair] & ~bit
+        lanes.on[pair] = lanes.on[pair] & rest | (bit if mode == ON else 0)
+        lanes.off[pair] = lanes.off[pair] & rest | (bit if mode == OFF and p.enabled[pair] != 0 else 0)
+        lanes.taken[pair] &= rest
         inside += 0 if mode == OFF else 1
-        carrying |= 1 << pair if mode == ON else 0
-    lanes.inside[lane], lanes.carrying[lane] = inside, carrying
+        if mode == ON:
+            carrying |= 1 << pair
+            _take_slot(lanes, lane, pair, taken)
+            taken += 1
+        elif mode == CLIPPED:
+            watched |= 1 << pair | 1 << SECOND + pair
+    for slot in range(taken):
+        lanes.taken[slot] |= bit
+    lanes.inside[lane], lanes.carrying[lane], lanes.watched[lane] = inside, carrying, watched
+
+
+@kernel()
+def _take_slot(lanes, lane, pair, slot) -> None:
+    """Put a pair of a lane that is on into one of its slots."""
+    gear = lanes.gear[slot]
+    for i in range(5):
+        gear[i, lane] = lanes.rows[pair, i, lane]
+    gear[5, lane], gear[6, lane] = lanes.arms[pair, 0, lane], lanes.arms[pair, 1, lane]
+    gear[7, lane], lanes.slot[slot, lane] = lanes.factor[pair, lane], pair
 
 
 @kernel()
@@ -217,38 +236,52 @@ def weigh_lanes(lanes) -> None:
     for i in range(8):
         set_row(turn[0], i, zero)
         set_row(turn[1], i, zero)
-    for pair in range(PAIR_COUNT):
-        if lanes.on[pair] == 0:
-            continue
-        stiffness = choose(lanes.on[pair], exact_row(lanes.stiffness, 0), zero)
-        viscous = choose(lanes.on[pair], exact_row(lanes.viscous, 0), zero)
-        rows, axis = lanes.rows[pair], 1 - pair % 2
-        _add(along[axis], 2, 3, exact_row(rows, 2) * -1.0, rows, stiffness, viscous)
-        for i in range(2):
-            _add(turn[i], 2 + axis, 4, exact_row(lanes.arms[pair], i), rows, stiffness, viscous)
+    for slot in range(PAIR_COUNT):
+        taken, gear = lanes.taken[slot], lanes.gear[slot]
+        if taken == 0:
+            break
+        stiffness = choose(taken, exact_row(lanes.stiffness, 0), zero)
+        viscous = choose(taken, exact_row(lanes.viscous, 0), zero)
+        for axis in range(2):
+            _add(along[axis], 3, exact_row(gear, 2 + axis) * -1.0, gear, 2 + axis, 0, stiffness, viscous)
+            _add(turn[axis], 4, exact_row(gear, 5 + axis), gear, 2, 3, stiffness, viscous)
 
 
 @kernel()
-def _add(there, third, rates, factor, rows, stiffness, viscous) -> None:
-    """Add a factor times the force of one pair to an affine map."""
+def _add(there, rates, factor, gear, third, fourth, stiffness, viscous) -> None:
+    """Add a factor times the force of a slot to a linear map: its parts of cosine, sine and some further rows."""
     spring, damper = factor * stiffness, factor * viscous
-    for i in range(3):
-        at = third if i == 2 else i
-        set_row(there, at, fused(spring, exact_row(rows, i), exact_row(there, at)))
-        set_row(there, rates + at, fused(damper, exact_row(rows, i), exact_row(there, rates + at)))
-
-
-@kernel()
-def penetration_at(lanes, pair, c, s, along):
-    """Return the penetrations of a pair in all lanes."""
-    rows = lanes.rows[pair]
-    constant = exact_row(rows, 3)
-    return fused(exact_row(rows, 0), c, fused(exact_row(rows, 1), s, fused(exact_row(rows, 2), along, constant)))
+    for i in range(rates):
+        at = third if i == 2 else fourth if i == 3 else i
+        set_row(there, i, fused(spring, exact_row(gear, at), exact_row(there, i)))
+        set_row(there, rates + i, fused(damper, exact_row(gear, at), exact_row(there, rates + i)))
 
 
 @kernel(inline="code")
-def damped_at(lanes, pair, ratio, depth, dc, ds, rate):
-    """Return penetration and `ratio` times its rate of a pair in all lanes."""
-    rows = lanes.rows[pair]
-    a, b, n = exact_row(rows, 0) * ratio, exact_row(rows, 1) * ratio, exact_row(rows, 2) * ratio
-    return fused(a, dc, fused(b, ds, fused(n, rate, depth)))
+def penetration_at(rows, c, s, x, y):
+    """Return the penetrations of one pair or slot in all lanes."""
+    normal = fused(exact_row(rows, 2), x, fused(exact_row(rows, 3), y, exact_row(rows, 4)))
+    return fused(exact_row(rows, 0), c, fused(exact_row(rows, 1), s, normal))
+
+
+@kernel(inline="code")
+def linear_at(rows, c, s, x, y):
+    """Return the same without the constant: of later orders, of rates."""
+    return fused(
+        exact_row(rows, 0), c, fused(exact_row(rows, 1), s, fused(exact_row(rows, 2), x, exact_row(rows, 3) * y))
+    )
+
+
+@kernel()
+def to_bernstein(lanes, column, w, order, h) -> None:
+    """Write the Bernstein coefficients of one polynomial of each lane on [0, h] to `lanes.bernstein`."""
+    b, power = lanes.bernstein, exact_splat(1.0)
+    for k in range(order + 1):
+        set_row(b, k, exact_row(column, k) * (power * w.binomial[order, k]))
+        power = power * h
+    for r in range(1, order + 1):
+        before = exact_row(b, r - 1)
+        for j in range(r, order + 1):
+            here = exact_row(b, j)
+            set_row(b, j, here + before)
+            before = here

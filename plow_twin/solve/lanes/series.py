@@ -2,7 +2,8 @@
 
 Where the contacts' force is linear in penetration and rate, all acting pairs of a scene are one affine map of the
 state: an order takes twelve Cauchy products, however many pairs act and whichever they are. With lambda d' the force
-K d (1 + lambda d') is K (d + lambda / 2 (d^2)'): half a product more for each pair that acts in some lane.
+K d (1 + lambda d') is K (d + lambda / 2 (d^2)'): half a product more for each slot, which holds one acting pair of each
+lane, whichever that is.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import below, choose, exact_row, exact_splat, fused, magnitude, set_row
 from plow_twin.model.pairs import PAIR_COUNT
-from plow_twin.solve.lanes.record import DC, DS, DX, DY, WIDTH, damped_at, penetration_at
+from plow_twin.solve.lanes.record import DC, DS, DX, DY, WIDTH, linear_at, penetration_at
 from plow_twin.solve.lanes.waves import turn_lanes
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, X, Y
 
@@ -77,12 +78,12 @@ def expand_loads(harmonics, extent, second, lanes, w, order) -> None:
 
 @kernel()
 def expand(lanes, w, limit, waves, second, viscous, hysteretic, segments) -> int:
-    """Write the series of the state and, up to the order before, those of `lanes.turning`; return the order.
+    """Write the series of the state; return the order.
 
     Under sampled loads a lane's terms are zero beyond the order from which on they vanish over the longest step wanted:
     later orders of other lanes change no bit of it.
     """
-    series, turning, moment = lanes.series, lanes.turning, lanes.moment
+    series, moment = lanes.series, lanes.moment
     zero = exact_splat(0.0)
     x0, y0, vx0, vy0 = (exact_row(lanes.y, X), exact_row(lanes.y, Y), exact_row(lanes.y, VX), exact_row(lanes.y, VY))
     om0, c0, s0, angle = (
@@ -134,10 +135,6 @@ def expand(lanes, w, limit, waves, second, viscous, hysteretic, segments) -> int
             dx, dy, dc, ds = (
                 choose(active, dx, zero), choose(active, dy, zero), choose(active, dc, zero), choose(active, ds, zero),
             )  # fmt: skip
-        set_row(turning[DC], k, dc)
-        set_row(turning[DS], k, ds)
-        set_row(turning[DX], k, dx)
-        set_row(turning[DY], k, dy)
         ax, ay = fused(start_x, c, fused(start_y, s, pvy)), fused(start_y, c, (fused(start_x, s, pvx)) * -1.0)
         turned_by = turned_at * (1.0 - share)
         if segments is not None:
@@ -162,11 +159,7 @@ def expand(lanes, w, limit, waves, second, viscous, hysteretic, segments) -> int
                 acts = active
             fx, fy, gc, gs = _push(lanes, w, k, acts, c, s, x, y, dc, ds, dx, dy)
         elif k == 0:
-            _write_start(lanes, viscous, c, s, x, y, dc, ds, dx, dy)
-            fx, fy, gc, gs = (
-                exact_row(lanes.start, 0), exact_row(lanes.start, 1), exact_row(lanes.start, 2),
-                exact_row(lanes.start, 3),
-            )  # fmt: skip
+            fx, fy, gc, gs = _start(lanes, viscous, c, s, x, y, dc, ds, dx, dy)
         else:
             fx = _force(along[0], viscous, c, s, x, dc, ds, dx)
             fy = _force(along[1], viscous, c, s, y, dc, ds, dy)
@@ -244,48 +237,50 @@ def _waves(load, series, k, c0, s0, c, s, share):
 
 
 @kernel()
-def _write_start(lanes, viscous, c, s, x, y, dc, ds, dx, dy) -> None:
-    """Write the contacts' forces along X and Y and their factors of cosine and sine in the moment at the start.
+def _start(lanes, viscous, c, s, x, y, dc, ds, dx, dy):
+    """Return the contacts' forces along X and Y and their factors of cosine and sine in the moment at the start.
 
     They come from the very penetrations of the guards: a sum of maps would round them otherwise, and walls that
     push and walls that let go would lie 1e-17 m apart.
     """
-    zero = exact_splat(0.0)
-    for i in range(4):
-        set_row(lanes.start, i, zero)
-    for pair in range(PAIR_COUNT):
-        on = lanes.on[pair]
-        if on == 0:
-            continue
-        place, rate = (x, dx) if pair % 2 == 1 else (y, dy)
-        depth = penetration_at(lanes, pair, c, s, place)
+    fx = fy = gc = gs = exact_splat(0.0)
+    for slot in range(PAIR_COUNT):
+        taken, gear = lanes.taken[slot], lanes.gear[slot]
+        if taken == 0:
+            break
+        push = penetration_at(gear, c, s, x, y)
         if viscous is not None:
-            depth = damped_at(lanes, pair, exact_row(lanes.ratio, pair), depth, dc, ds, rate)
-        force = choose(on, exact_row(lanes.stiffness, 0) * depth, zero)
-        axis, arms = 1 - pair % 2, lanes.arms[pair]
-        set_row(lanes.start, axis, fused(exact_row(lanes.rows[pair], 2) * -1.0, force, exact_row(lanes.start, axis)))
-        for i in range(2):
-            set_row(lanes.start, 2 + i, fused(exact_row(arms, i), force, exact_row(lanes.start, 2 + i)))
+            push = fused(
+                exact_row(lanes.viscous, 0) / exact_row(lanes.stiffness, 0), linear_at(gear, dc, ds, dx, dy), push
+            )
+        fx, fy, gc, gs = _add_force(lanes, gear, choose(taken, push, exact_splat(0.0)), fx, fy, gc, gs)
+    return fx, fy, gc, gs
+
+
+@kernel(inline="code")
+def _add_force(lanes, gear, push, fx, fy, gc, gs):
+    """Add the forces of a slot, from F / K, to those along X and Y and to the factors of c and s in the moment."""
+    force = exact_row(lanes.stiffness, 0) * push
+    return (
+        fused(exact_row(gear, 2) * -1.0, force, fx), fused(exact_row(gear, 3) * -1.0, force, fy),
+        fused(exact_row(gear, 5), force, gc), fused(exact_row(gear, 6), force, gs),
+    )  # fmt: skip
 
 
 @kernel(inline="code")
 def _push(lanes, w, k, acts, c, s, x, y, dc, ds, dx, dy):
     """Return order k of the forces along X and Y and of the factors of cosine and sine in the contacts' moment.
 
-    For F = K d (1 + lambda d'), pair by pair. Writes the penetrations of the next order and F / K.
+    For F = K d (1 + lambda d'), slot by slot. Writes the penetrations of the next order and F / K.
     """
     fx = fy = gc = gs = exact_splat(0.0)
-    for pair in range(PAIR_COUNT):
-        on = lanes.on[pair]
-        if on == 0:
-            continue
-        on &= acts
-        rows, arms, depth = lanes.rows[pair], lanes.arms[pair], lanes.depth[pair]
-        place, rate = (x, dx) if pair % 2 == 1 else (y, dy)
+    for slot in range(PAIR_COUNT):
+        taken, gear, depth = lanes.taken[slot] & acts, lanes.gear[slot], lanes.depth[slot]
+        if lanes.taken[slot] == 0:
+            break
         if k == 0:
-            set_row(depth, 0, penetration_at(lanes, pair, c, s, place))
-        closing = fused(exact_row(rows, 0), dc, fused(exact_row(rows, 1), ds, exact_row(rows, 2) * rate))
-        deeper = closing * w.inverse[k + 1]
+            set_row(depth, 0, penetration_at(gear, c, s, x, y))
+        deeper = linear_at(gear, dc, ds, dx, dy) * w.inverse[k + 1]
         set_row(depth, k + 1, deeper)
         half = exact_row(depth, 0) * deeper
         for j in range(1, k // 2 + 1):
@@ -294,15 +289,9 @@ def _push(lanes, w, k, acts, c, s, x, y, dc, ds, dx, dy):
             middle = exact_row(depth, k // 2 + 1)
             half = fused(middle * 0.5, middle, half)
         damped = half * (k + 1.0)
-        push = choose(on, fused(exact_row(lanes.factor, pair), damped, exact_row(depth, k)), exact_splat(0.0))
-        set_row(lanes.push[pair], k, push)
-        force = exact_row(lanes.stiffness, 0) * push
-        along = exact_row(rows, 2) * -1.0
-        if pair % 2 == 1:
-            fx = fused(along, force, fx)
-        else:
-            fy = fused(along, force, fy)
-        gc, gs = fused(exact_row(arms, 0), force, gc), fused(exact_row(arms, 1), force, gs)
+        push = choose(taken, fused(exact_row(gear, 7), damped, exact_row(depth, k)), exact_splat(0.0))
+        set_row(lanes.push[slot], k, push)
+        fx, fy, gc, gs = _add_force(lanes, gear, push, fx, fy, gc, gs)
     return fx, fy, gc, gs
 
 

@@ -6,14 +6,12 @@ from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.polynomial import maximum
 from plow_twin.kernel.simd import below, choose, exact_row, exact_splat, fused, magnitude, set_row
 from plow_twin.model.pairs import PAIR_COUNT
-from plow_twin.solve.lanes.record import COMPONENTS, WIDTH, penetration_at
+from plow_twin.solve.lanes.record import COMPONENTS, WIDTH, linear_at, penetration_at, to_bernstein
 from plow_twin.solve.state import COS, SIN, X, Y
 from plow_twin.solve.totals import add_set_times
 
-#: Most Newton steps to a maximum, and the change, as a share of the step, that is small enough: its cube remains.
-_MOST_CHANGES, _NEAR = 60, 1e-5
-#: Allowance of a force's bound for rounding.
-_ROUNDED = 1.0 + 1e-9
+#: Allowance of a force's bound for rounding, and between a peak and the maximum.
+_ROUNDED, _SAME = 1.0 + 1e-9, 1.0 + 1e-12
 
 
 @kernel()
@@ -42,37 +40,29 @@ def add_step(totals, lanes, w, order, full, viscous, hysteretic) -> None:
 
     `order` and `full` are as for `first_events`.
     """
-    h, last = exact_row(lanes.step, 0), order - 1
+    last = order - 1
     if totals is None:
         # under samples the series of a lane may end before; then its guard has one more term
         last = order
-    for pair in range(PAIR_COUNT):
-        on = lanes.on[pair]
-        if on == 0:
-            continue
-        place, which = (3, Y) if pair % 2 == 0 else (2, X)
-        rows, zero = lanes.rows[pair], exact_splat(0.0)
-        a, b, n = exact_row(rows, 0), exact_row(rows, 1), exact_row(rows, 2)
-        depth = penetration_at(lanes, pair, exact_row(lanes.y, COS), exact_row(lanes.y, SIN), exact_row(lanes.y, which))
-        swept = fused(a, exact_row(lanes.sum, 0), fused(b, exact_row(lanes.sum, 1), n * exact_row(lanes.sum, place)))
-        impulse = exact_row(lanes.stiffness, 0) * fused(depth, h, swept)
-        if viscous is not None or hysteretic is not None:
-            way = fused(b, exact_row(lanes.change, SIN), n * exact_row(lanes.change, which))
-            way = fused(a, exact_row(lanes.change, COS), way)
-            if viscous is not None:
-                impulse = fused(exact_row(lanes.viscous, 0), way, impulse)
-            else:
-                # lambda / 2 times the change of d^2
-                damped = exact_row(lanes.factor, pair) * (way * fused(way, exact_splat(0.5), depth))
-                impulse = fused(exact_row(lanes.stiffness, 0), damped, impulse)
-        impulse = choose(below(zero, impulse) & on, impulse, zero)
-        set_row(lanes.impulse, pair, exact_row(lanes.impulse, pair) + impulse)
-        time = exact_row(lanes.time_in_contact, pair)
-        set_row(lanes.time_in_contact, pair, choose(on, time + h, time))
+    for slot in range(PAIR_COUNT):
+        taken = lanes.taken[slot]
+        if taken == 0:
+            break
+        set_row(lanes.gained, 0, _impulses(lanes, lanes.gear[slot], viscous, hysteretic))
+        for lane in range(WIDTH):
+            if taken >> lane & 1:
+                pair = lanes.slot[slot, lane]
+                lanes.impulse[pair, lane] += max(lanes.gained[0, lane], 0.0)
+                lanes.time_in_contact[pair, lane] += lanes.step[lane]
+                lanes.gained[1, lane] = lanes.peak[pair, lane]
         if hysteretic is not None:
-            _raise_peaks(lanes, w, lanes.push[pair], pair, order - 1, full - 1, on)
+            raised = _raise_peaks(lanes, w, lanes.push[slot], order - 1, full - 1, taken)
         else:
-            _raise_peaks(lanes, w, lanes.guard[pair], pair, last, last + full - order, on)
+            raised = _raise_peaks(lanes, w, lanes.push[slot], last, last + full - order, taken)
+        if raised != 0:
+            for lane in range(WIDTH):
+                if raised >> lane & 1:
+                    lanes.peak[lanes.slot[slot, lane], lane] = lanes.gained[1, lane]
     if totals is None:
         return
     for lane in range(WIDTH):
@@ -81,71 +71,69 @@ def add_step(totals, lanes, w, order, full, viscous, hysteretic) -> None:
 
 
 @kernel()
-def _raise_peaks(lanes, w, push, pair, order, full, on) -> None:
-    """Raise the peaks of a pair by the series of F / K: first a bound, the maximum only where that exceeds the peak.
-
-    Between its ends a function exceeds them at most by h^2 / 8 times its largest downward curvature.
-    """
-    h, zero, half = exact_row(lanes.step, 0), exact_splat(0.0), exact_splat(0.5)
-    end = fall = bend = zero
-    for k in range(order, -1, -1):
-        term = exact_row(push, k)
-        fall = fused(fall, h, end)
-        end = fused(end, h, term)
-        if k > 1:
-            downward = (magnitude(term) - term) * half
-            bend = fused(downward, exact_splat(0.125 * k * (k - 1)), bend) * h
-    start, stiffness, peak = exact_row(push, 0), exact_row(lanes.stiffness, 0), exact_row(lanes.peak, pair)
-    most = choose(below(start, end), end, start)
-    exceeds = below(peak, stiffness * fused(bend, h, most) * _ROUNDED) & on
-    if exceeds == 0:
-        return
-    # convex terms count against the curvature, all against the slope
-    curve, slope = zero, zero
-    for k in range(order, 1, -1):
-        term = exact_row(push, k)
-        slope = fused(magnitude(term), exact_splat(1.0 * k), slope) * h
-        upward = (magnitude(term) + term) * half if k > 2 else term
-        curve = fused(upward, exact_splat(1.0 * k * (k - 1)), curve * h)
-    first = exact_row(push, 1)
-    monotonic, concave = ~below(magnitude(first), slope), below(curve, zero)
-    bulges = concave & below(zero, first) & below(fall, zero) & ~monotonic
-    inside = bulges & exceeds
-    if inside != 0:
-        most = choose(inside, _top(push, order, h, first, fall, inside), most)
-    known = exceeds & (monotonic | concave)
-    reached = stiffness * most
-    set_row(lanes.peak, pair, choose(known & below(peak, reached), reached, peak))
-    if exceeds & ~known != 0:
-        for lane in range(WIDTH):
-            if (exceeds & ~known) >> lane & 1:
-                column, k = w.column[0], lanes.stiffness[lane]
-                for i in range(full + 1):
-                    column[i] = k * push[i, lane] if i <= order else 0.0
-                lanes.peak[pair, lane] = maximum(column, full, lanes.step[lane], lanes.peak[pair, lane], w)
+def _impulses(lanes, gear, viscous, hysteretic):
+    """Return the impulses of a slot's pairs over the step."""
+    y, sums, change = lanes.y, lanes.sum, lanes.change
+    depth = penetration_at(gear, exact_row(y, COS), exact_row(y, SIN), exact_row(y, X), exact_row(y, Y))
+    swept = linear_at(gear, exact_row(sums, 0), exact_row(sums, 1), exact_row(sums, 2), exact_row(sums, 3))
+    impulse = exact_row(lanes.stiffness, 0) * fused(depth, exact_row(lanes.step, 0), swept)
+    if viscous is not None or hysteretic is not None:
+        way = linear_at(
+            gear, exact_row(change, COS), exact_row(change, SIN), exact_row(change, X), exact_row(change, Y)
+        )
+        if viscous is not None:
+            impulse = fused(exact_row(lanes.viscous, 0), way, impulse)
+        else:
+            # lambda / 2 times the change of d^2
+            damped = exact_row(gear, 7) * (way * fused(way, exact_splat(0.5), depth))
+            impulse = fused(exact_row(lanes.stiffness, 0), damped, impulse)
+    return impulse
 
 
 @kernel()
-def _top(push, order, h, rise, fall, bits):
-    """Return the maxima of concave polynomials that rise at 0 and fall at h, by Newton's method for the slope."""
-    low, high, x = exact_splat(0.0), h, h * (rise / (rise - fall))
-    top = exact_splat(0.0)
-    for _ in range(_MOST_CHANGES):
-        value = slope = bend = exact_splat(0.0)
-        for k in range(order, -1, -1):
-            bend = fused(bend, x, slope)
-            slope = fused(slope, x, value)
-            value = fused(value, x, exact_row(push, k))
-        # a chord's slope bounds the rest: once the change is small, its square does not count
-        change = slope / (bend * -2.0)
-        rises = below(exact_splat(0.0), slope)
-        low, high = choose(rises, x, low), choose(rises, high, x)
-        top = choose(bits, fused(slope * change, exact_splat(0.5), value), top)
-        new = x + change
-        within = ~below(new, low) & ~below(high, new)
-        new = choose(within, new, (low + high) * 0.5)
-        bits &= ~(within & below(magnitude(change), h * _NEAR))
-        x = new
-        if bits & 255 == 0:
-            break
+def _raise_peaks(lanes, w, push, order, full, on) -> int:
+    """Raise the peaks in `lanes.gained` by the series of F / K; return a bit for each lane that was looked at.
+
+    First a bound; where it exceeds the peak, the larger end; the maximum only where that may be in between.
+    """
+    h, zero, half = exact_row(lanes.step, 0), exact_splat(0.0), exact_splat(0.5)
+    end = bend = slope = zero
+    for k in range(order, -1, -1):
+        term = exact_row(push, k)
+        end = fused(end, h, term)
+        if k > 1:
+            size = magnitude(term)
+            slope = fused(size, exact_splat(1.0 * k), slope) * h
+            # between its ends a function exceeds them at most by h^2 / 8 times its largest downward curvature
+            bend = fused((size - term) * half, exact_splat(0.125 * k * (k - 1)), bend) * h
+    start, stiffness, peak = exact_row(push, 0), exact_row(lanes.stiffness, 0), exact_row(lanes.gained, 1)
+    most = choose(below(start, end), end, start)
+    exceeds = below(peak, stiffness * fused(bend, h, most) * _ROUNDED) & on
+    if exceeds == 0:
+        return 0
+    reached = stiffness * most
+    peak = choose(exceeds & below(peak, reached), reached, peak)
+    set_row(lanes.gained, 1, peak)
+    bulges = exceeds & below(magnitude(exact_row(push, 1)), slope)
+    if bulges != 0:
+        for k in range(order + 1, full + 1):
+            set_row(push, k, zero)
+        bulges &= below(peak * _SAME, stiffness * _hull_top(lanes, push, w, full))
+        for lane in range(WIDTH):
+            if bulges >> lane & 1:
+                column, k = w.column[0], lanes.stiffness[lane]
+                for i in range(full + 1):
+                    column[i] = k * push[i, lane]
+                lanes.gained[1, lane] = maximum(column, full, lanes.step[lane], lanes.gained[1, lane], w)
+    return exceeds
+
+
+@kernel()
+def _hull_top(lanes, push, w, order):
+    """Return the largest Bernstein coefficient over each lane's step."""
+    to_bernstein(lanes, push, w, order, exact_row(lanes.step, 0))
+    top = exact_row(lanes.bernstein, 0)
+    for k in range(1, order + 1):
+        here = exact_row(lanes.bernstein, k)
+        top = choose(below(top, here), here, top)
     return top
