@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 
 #: Number of components of the body-coordinate state: X, Y, VX, VY, omega, c, s, theta.
 STATE_SIZE = 8
+#: 1 for pairs at walls whose normal is along x, and along y.
+_ALONG_X, _ALONG_Y = np.abs(NORMAL_X), np.abs(NORMAL_Y)
 
 
 def corner_positions(scene: Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -93,7 +95,7 @@ def wall_distances(scene: Scene) -> NDArray[np.float64]:
     """Return the distance of each pair's wall from the cavity's centre, shape (8,), in m, before wear."""
     half_width = 0.5 * (scene.frame.width_m + scene.clearance.horizontal_m)
     half_height = 0.5 * (scene.frame.height_m + scene.clearance.vertical_m)
-    return np.abs(NORMAL_X) * half_width + np.abs(NORMAL_Y) * half_height
+    return _ALONG_X * half_width + _ALONG_Y * half_height
 
 
 def penetration_rows(scene: Scene) -> NDArray[np.float64]:

@@ -23,8 +23,8 @@ from plow_twin.run.motion import BUDGET, Motion, run_events
 from plow_twin.run.pace import MOST_SECONDS, OutOfTimeError, check_limits
 from plow_twin.run.simulate import check_times, output_times
 from plow_twin.solve.compiled_scene import compile_scenes
-from plow_twin.solve.lanes.record import fits_lanes
-from plow_twin.solve.state import Status, Totals, Work, new_work
+from plow_twin.solve.lanes.record import fits_lanes, new_lanes
+from plow_twin.solve.state import State, Status, Totals, Work, first_of, new_work
 
 Array = NDArray[np.float64]
 
@@ -173,7 +173,8 @@ class _Run:
             rows = self._ensemble.t, self._ensemble.q, self._ensemble.v
             run = LaneRun(self._params, self._compiled, members, *rows, self._t_end, self._max_steps)
             for group in groups.values():
-                size = max(_LEAST_SHARE, -(-len(group) // (_SHARES * threads)))
+                parts = 1 if threads == 1 else _SHARES * threads
+                size = max(_LEAST_SHARE, -(-len(group) // parts))
                 for start in range(0, len(group), size):
                     share = np.array(group[start : start + size])
                     shares.append(lambda share=share: self._run_lanes(run, share))  # type: ignore[misc]
@@ -184,6 +185,12 @@ class _Run:
             self._local.work = new_work()
         work: Work = self._local.work
         return work
+
+    def _lanes(self) -> np.record:
+        if not hasattr(self._local, "lanes"):
+            self._local.lanes = first_of(new_lanes())
+        lanes: np.record = self._local.lanes
+        return lanes
 
     def _look(self, motion: Motion | None = None) -> None:
         if self.stopped.is_set() or _time.perf_counter() > self._end:
@@ -200,11 +207,10 @@ class _Run:
         waiting = share
         while len(waiting):
             self._look()
-            left = run.go_on(waiting, self._work())
-            for index in np.setdiff1d(waiting, left, assume_unique=True).tolist():
-                self._store(index, run.totals[index], run.states[index], int(run.status[index]))
-            self._report_progress(len(waiting) - len(left))
-            waiting = left
+            is_done = run.go_on(waiting, self._work(), self._lanes())
+            done, waiting = waiting[is_done], waiting[~is_done]
+            self._store(done, run.totals[done], run.states[done], run.status[done])
+            self._report_progress(len(done))
 
     def _run_alone(self, index: int) -> None:
         """Run a member that takes a whole vector for its pairs."""
@@ -215,14 +221,16 @@ class _Run:
         self._store(index, motion.totals, motion.state, status)
         self._report_progress(1)
 
-    def _store(self, index: int, totals: Totals, state: np.record | np.void, status: int) -> None:
-        """Take over the results of a finished member."""
+    def _store(
+        self, index: int | NDArray[np.int64], totals: Totals, state: State, status: int | NDArray[np.int64]
+    ) -> None:
+        """Take over the results of a finished member, or of some."""
         ensemble = self._ensemble
         ensemble.peak[index], ensemble.impulse[index] = totals["peak"], totals["impulse"]
         ensemble.time_in_contact[index], ensemble.makes[index] = totals["time_in_contact"], totals["makes"]
         ensemble.set_time[index], ensemble.events[index] = totals["set_time"], totals["logged"]
         ensemble.wear_depth[index] = state["wear_depth"]
-        ensemble.steps[index], ensemble.status[index] = state["steps"], Status(status)
+        ensemble.steps[index], ensemble.status[index] = state["steps"], status
 
 
 def _empty(times: Array, members: int) -> Ensemble:

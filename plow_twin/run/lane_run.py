@@ -12,16 +12,14 @@ from numpy.typing import NDArray
 from plow_twin.run.motion import Motion, next_slice, run_events
 from plow_twin.solve.compiled_scene import CompiledScene
 from plow_twin.solve.lanes.loop import OTHER_METHOD, Members, run_lanes
-from plow_twin.solve.lanes.record import new_lanes
 from plow_twin.solve.modes import settle_many
-from plow_twin.solve.state import EVENT, HARMONIC, STATE, TOTALS, Status, Work, first_of, new_records
+from plow_twin.solve.state import EVENT, HARMONIC, STATE, TOTALS, Status, Work, new_records
 
 #: Steps of each lane in the first slice.
 _FIRST_SLICE: Final = 256
 #: Steps that the loop of a single scene takes at most when a lane needs one of another method: a call takes as long as
 #: some thirty steps.
 _OTHER_STEPS: Final = 32
-_UNDER_WAY: Final = (int(Status.PAUSED), OTHER_METHOD)
 
 
 class LaneRun:
@@ -68,19 +66,20 @@ class LaneRun:
             q, v,
         )  # fmt: skip
 
-    def go_on(self, waiting: NDArray[np.int64], work: Work) -> NDArray[np.int64]:
-        """Bring members farther by a slice of work; return those that are not done."""
+    def go_on(self, waiting: NDArray[np.int64], work: Work, lanes: np.record) -> NDArray[np.bool_]:
+        """Bring members farther by a slice of work in empty lanes; return whether each is done."""
         one, begin = self._compiled[waiting[0]], _time.perf_counter()
         terms = one.parts.terms
         run_lanes(
             self._members, terms.harmonics, terms.second, terms.viscous, terms.hysteretic, terms.flight, terms.rest,
-            int(one.params.order), first_of(new_lanes()), work, waiting, self._t_end, self._max_steps, self._size,
+            int(one.params.order), lanes, work, waiting, self._t_end, self._max_steps, self._size,
             self._times,
         )  # fmt: skip
         self._size = next_slice(self._size, _time.perf_counter() - begin)
         for index in waiting[self.status[waiting] == OTHER_METHOD].tolist():
             self._step_otherwise(index, work)
-        return waiting[np.isin(self.status[waiting], _UNDER_WAY)]
+        status = self.status[waiting]
+        return (status != Status.PAUSED) & (status != OTHER_METHOD)
 
     def _step_otherwise(self, index: int, work: Work) -> None:
         """Let the loop of a single scene take some steps of a member."""

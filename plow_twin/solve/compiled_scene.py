@@ -191,7 +191,7 @@ def _describe(scene: Scene, tol: float, sampled: bool, shared: _Shared) -> _Desc
     direction, harmonics = shared.of(_harmonics, scene.head, loads)
     terms, number = shared.of(law_terms, scene.contact)
     length = geometry.length_scale(scene)
-    speed = _velocity_scale(scene, loads, length)
+    speed = _velocity_scale(scene, shared.of(_largest_wrench, loads), length)
     admissible = min(tol * (STEP_SHARE if terms.fraction is None else STEP_SHARE_FRACTION), LARGEST_STEP_ERROR)
     order, radius = order_for(admissible), geometry.half_diagonal(scene)
     rows = geometry.penetration_rows(scene)
@@ -231,7 +231,7 @@ def _describe(scene: Scene, tol: float, sampled: bool, shared: _Shared) -> _Desc
     segments = _segments(scene, loads.pieces) if loads.pieces is not None else None
     if sampled:
         segments = np.zeros(1, SEGMENT)
-    terms = _scene_terms(scene, terms, loads, harmonics, segments)
+    terms = _scene_terms(scene, terms, loads, harmonics, segments, shared)
     return _Description(scene, values, Parts(terms, harmonics, segments, _implicit(scene, terms, values)), loads)
 
 
@@ -268,12 +268,12 @@ def damping_numbers(law: str) -> Array:
 
 
 def _scene_terms(
-    scene: Scene, law: Terms, loads: LoadSet, harmonics: Harmonics | None, segments: Segments | None
+    scene: Scene, law: Terms, loads: LoadSet, harmonics: Harmonics | None, segments: Segments | None, shared: _Shared
 ) -> Terms:
     """Return the terms of the law together with those of the rest of the scene."""
     present = dict(
         harmonics=harmonics is not None,
-        second=harmonics is not None and bool(harmonics["second"].any()),
+        second=harmonics is not None and shared.of(_has_second, harmonics),
         segments=segments is not None,
         **_wear_terms(scene.wear),
         offset=any(scene.head.com_offset_m),
@@ -291,7 +291,7 @@ def _scene_terms(
     if present["harmonics"]:
         # without damping a harmonic can swing the head up
         damped = law.viscous is not None or law.hysteretic is not None
-        present["rest"] &= damped and present["flight"] and _harmonics_are_small(scene, loads)
+        present["rest"] &= damped and present["flight"] and _harmonics_are_small(scene, loads, shared.of(_swing, loads))
     return law._replace(**_flags(present))
 
 
@@ -305,7 +305,7 @@ def _wear_terms(wear: Wear | None) -> dict[str, bool]:
     return {"wear": True, "sliding": wear.sliding == "total", "running_in": wear.running_in_ratio > 1.0}
 
 
-def _harmonics_are_small(scene: Scene, loads: LoadSet) -> bool:
+def _harmonics_are_small(scene: Scene, loads: LoadSet, swing: Array) -> bool:
     """Return whether the harmonics are small beside the steady loads and preload that press the head to its walls."""
     mass, contact = scene.head.mass_kg, scene.contact
     arms = np.array([1.0, 1.0, 1.0 / geometry.half_diagonal(scene)])
@@ -313,7 +313,7 @@ def _harmonics_are_small(scene: Scene, loads: LoadSet) -> bool:
     if loads.pieces is not None:
         pressing += float(np.abs(loads.pieces.start).max(axis=0) @ arms)
     pressing += contact.stiffness * _initial_depth(scene) ** contact.exponent
-    return bool(np.hypot(loads.sine, loads.cosine).sum(axis=0) @ arms <= _SMALL_HARMONICS * pressing)
+    return bool(swing @ arms <= _SMALL_HARMONICS * pressing)
 
 
 def _initial_depth(scene: Scene) -> float:
@@ -406,12 +406,27 @@ def _harmonics(head: Head, loads: LoadSet) -> tuple[Array, Harmonics | None]:
     return directions, harmonics
 
 
-def _velocity_scale(scene: Scene, loads: LoadSet, length: float) -> float:
-    """Return the speed in m/s that the largest steady load gives the head over half the length scale."""
-    force = np.abs(loads.constant) + np.abs(loads.sine).sum(axis=0) + np.abs(loads.cosine).sum(axis=0)
+def _largest_wrench(loads: LoadSet) -> Array:
+    """Return a bound of the loads, shape (3,)."""
+    wrench: Array = np.abs(loads.constant) + np.abs(loads.sine).sum(axis=0) + np.abs(loads.cosine).sum(axis=0)
     if loads.pieces is not None:
-        force = force + np.abs(loads.pieces.start).max(axis=0)
-    acceleration = per_mass(scene, force)
+        wrench = wrench + np.abs(loads.pieces.start).max(axis=0)
+    return wrench
+
+
+def _swing(loads: LoadSet) -> Array:
+    """Return the sum of the harmonics' amplitudes, shape (3,)."""
+    swing: Array = np.hypot(loads.sine, loads.cosine).sum(axis=0)
+    return swing
+
+
+def _has_second(harmonics: Harmonics) -> bool:
+    return bool(harmonics["second"].any())
+
+
+def _velocity_scale(scene: Scene, wrench: Array, length: float) -> float:
+    """Return the speed in m/s that the largest steady load gives the head over half the length scale."""
+    acceleration = per_mass(scene, wrench)
     radius = geometry.half_diagonal(scene)
     total = (
         abs(scene.gravity.acceleration_m_s2)
