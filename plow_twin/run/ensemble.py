@@ -222,7 +222,11 @@ class _Run:
         self._report_progress(1)
 
     def _store(
-        self, index: int | NDArray[np.int64], totals: Totals, state: State, status: int | NDArray[np.int64]
+        self,
+        index: int | NDArray[np.int64],
+        totals: Totals | NDArray[np.void],
+        state: State | NDArray[np.void],
+        status: int | NDArray[np.int64],
     ) -> None:
         """Take over the results of a finished member, or of some."""
         ensemble = self._ensemble

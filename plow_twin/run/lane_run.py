@@ -79,7 +79,8 @@ class LaneRun:
         for index in waiting[self.status[waiting] == OTHER_METHOD].tolist():
             self._step_otherwise(index, work)
         status = self.status[waiting]
-        return (status != Status.PAUSED) & (status != OTHER_METHOD)
+        done: NDArray[np.bool_] = (status != Status.PAUSED) & (status != OTHER_METHOD)
+        return done
 
     def _step_otherwise(self, index: int, work: Work) -> None:
         """Let the loop of a single scene take some steps of a member."""
