@@ -1,4 +1,4 @@
-"""Tables of the reference pages, made from the code: topics, parameters, keys of diagnostics, verbs of the command."""
+"""Tables of the reference pages, made from the code: topics, keys of diagnostics, verbs of the command, priors."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import click
 from plow_twin.cli.app import commands
 from plow_twin.estimate.priors import DEFAULTS
 from plow_twin.live.diagnostics import markdown_tables
-from plow_twin.live.parameters import markdown_table
 from plow_twin.model.scene import Mark
 from plow_twin.stream.topics import TOPICS
 
@@ -58,6 +57,6 @@ def priors() -> str:
 
 
 TABLES: dict[str, Callable[[], str]] = {
-    "topics": topics, "parameters": markdown_table, "status_keys": lambda: markdown_tables()["status"],
-    "diagnostics": diagnostics, "verbs": verbs, "priors": priors,
+    "topics": topics, "status_keys": lambda: markdown_tables()["status"], "diagnostics": diagnostics,
+    "verbs": verbs, "priors": priors,
 }  # fmt: skip

@@ -1,4 +1,4 @@
-"""Pages of the site besides `docs/`: the README as its home, and a page for each example with README and sources."""
+"""Pages of the site besides `docs/`: the README as its home, the examples with README and sources, files in pages."""
 
 from __future__ import annotations
 
@@ -21,8 +21,10 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Lead links to an example to its place in the gallery."""
-    return re.sub(r"\]\((?:\.\./)*examples/(\w+)/README\.md\)", r"](examples.md#\1)", markdown)
+    """Lead links to an example to its place in the gallery, and show the file that a page names as `<!-- file: -->`."""
+    text = re.sub(r"\]\((?:\.\./)*examples/(\w+)/README\.md\)", r"](examples.md#\1)", markdown)
+    text = re.sub(r"\[([^\]]+)\]\(\.\./[^)]+\)", r"`\1`", text)
+    return re.sub(r"<!-- file: (.+) -->", lambda named: _shown(ROOT / named[1]), text)
 
 
 def _for_the_site(text: str) -> str:
@@ -37,6 +39,10 @@ def _for_the_site(text: str) -> str:
     return re.sub(r"(?<!!)\[([^\]]+)\]\(([^)#]+)\)", keep, text)
 
 
+def _shown(file: Path) -> str:
+    return f"```{LANGUAGES[file.suffix]}\n{file.read_text()}```"
+
+
 def _gallery() -> str:
     parts = [(ROOT / "examples" / "README.md").read_text()]
     for folder in sorted(path for path in (ROOT / "examples").iterdir() if path.is_dir()):
@@ -44,6 +50,6 @@ def _gallery() -> str:
         parts.append(f"#{title} {{#{folder.name}}}\n{text}".replace("](../../docs/", "]("))
         for source in sorted(folder.iterdir()):
             if source.suffix in LANGUAGES:
-                parts.append(f"`{source.relative_to(ROOT)}`\n\n```{LANGUAGES[source.suffix]}\n{source.read_text()}```")
+                parts.append(f"`{source.relative_to(ROOT)}`\n\n{_shown(source)}")
     # the list at the top leads to the parts below
     return re.sub(r"\]\((\w+)/README\.md\)", r"](#\1)", "\n\n".join(parts))

@@ -1,13 +1,9 @@
-"""Table of the node's parameters: the source of defaults, checks, ROS descriptors, config/twin.yaml and the docs.
-
-`python -m plow_twin.live.parameters yaml` prints config/twin.yaml, `... markdown` the table of docs/node.md.
-"""
+"""Table of the node's parameters: the source of defaults, checks, ROS descriptors and config/twin.yaml."""
 
 from __future__ import annotations
 
 import difflib
 import re
-import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import Field, dataclass, field, fields
 from enum import Enum
@@ -458,15 +454,6 @@ def expected(spec: Field[Any]) -> str:
     return "true or false" if isinstance(spec.default, bool) else "a text"
 
 
-def _short_range(spec: Field[Any]) -> str:
-    if "choices" in spec.metadata:
-        return ", ".join(spec.metadata["choices"])
-    if "unit" not in spec.metadata:
-        return ""  # the default shows a text, true or false
-    unit = "" if spec.metadata["unit"] in ("1", "as in the scene") else f" {spec.metadata['unit']}"
-    return f"{spec.metadata['low']:g}..{spec.metadata['high']:g}{unit}"
-
-
 def _range(kind: str, spec: Field[Any]) -> str:
     return f"{kind} from {spec.metadata['low']:g} to {spec.metadata['high']:g} [{spec.metadata['unit']}]"
 
@@ -594,16 +581,3 @@ def yaml_text() -> str:
             f"    {spec.name}: {_yaml_value(spec.default)}",
         ]
     return "\n".join(lines) + "\n"
-
-
-def markdown_table() -> str:
-    """Return the table of all parameters for the documentation."""
-    rows = ["| parameter | default | range | effect | meaning |", "|---|---|---|---|---|"]
-    for spec in SPECS.values():
-        default, effect = _yaml_value(spec.default), spec.metadata["effect"].name.lower()
-        rows.append(f"| `{spec.name}` | `{default}` | {_short_range(spec)} | {effect} | {spec.metadata['doc']} |")
-    return "\n".join(rows) + "\n"
-
-
-if __name__ == "__main__":
-    sys.stdout.write({"yaml": yaml_text, "markdown": markdown_table}[sys.argv[1]]())
