@@ -1,15 +1,12 @@
-"""The twin that follows its machine: full twins drawn from what is known, steered by the measured poses.
+"""The twin that follows its machine: members drawn from the prior or an estimate, moved by the measured poses.
 
-The members differ in clearances, contact and load gains. They are drawn from the prior at first and from each estimate
-that stands from then on; new members begin where those before them stand. Each pose moves all members by an ensemble
-Kalman filter with perturbed observations (Burgers et al., Mon. Weather Rev. 126 (1998) 1719), late poses through their
-covariance with the present. A member whose walls the correction would press on with more than half of the head's weight
-goes on as it is: behind a hard contact a tenth of a millimetre would be an impact that never was.
+The members differ in clearances, contact and load gains. They are drawn from the prior at first and again from each
+estimate that stands; new members begin at their places. `members` holds them and their Kalman filter.
 
-The first member has the middle of all that is known and no drawn noise. It is the median twin: a real motion. Before
-the first estimate it is the nominal twin, which no pose moves: steered to where a machine with other clearances is, it
-would press its own walls, and its forces would be further off than those of a twin that does not follow. The second
-member is then its double that the poses move, and shows where a first estimate begins.
+The first member has the middle value of each number and no drawn noise. It is the median twin: a real motion. Before
+the first estimate it is the nominal twin, which no pose moves: moved to the place of a machine with other clearances,
+it would press its own walls, and its forces would be less accurate than without following. The second member is then a
+copy of it that the poses do move: the first estimate begins at its place.
 """
 
 from __future__ import annotations
@@ -19,9 +16,9 @@ import json
 import math
 import struct
 import time as _time
-from bisect import bisect_left, insort
+from bisect import insort
 from collections import Counter, deque
-from collections.abc import Container, Sequence
+from collections.abc import Container
 from dataclasses import dataclass, replace
 from typing import Any, Final, Literal, NamedTuple
 
@@ -31,52 +28,41 @@ from numpy.typing import ArrayLike, NDArray
 from plow_twin.errors import ArgumentError
 from plow_twin.estimate import tuning
 from plow_twin.estimate.estimate import prior_of
-from plow_twin.estimate.forces import FEWEST, TOLERANCE, draw_scenes, quantiles
+from plow_twin.estimate.forces import FEWEST, TOLERANCE
 from plow_twin.estimate.measurements import Load, Poses
+from plow_twin.estimate.members import LATEST_S, Ensemble, widening
 from plow_twin.estimate.result import Estimate, Interval, State
 from plow_twin.estimate.similar import Units
 from plow_twin.estimate.start import noise_level
 from plow_twin.estimate.unknowns import DAMPING, GAIN, Unknowns
-from plow_twin.model.geometry import penetration_rows, states_of
 from plow_twin.model.pairs import PAIR_COUNT
-from plow_twin.model.scene import DOF_NAMES, Clearance, Gravity, Scene, fastest_travel
+from plow_twin.model.scene import Scene
 from plow_twin.run.advance import Advance
-from plow_twin.run.batch import TwinBatch
-from plow_twin.run.twin import Advanced, Twin
-from plow_twin.solve.state import FOLLOWED, ROW, WITH_INTERVALS
+from plow_twin.run.twin import Advanced
+from plow_twin.solve.state import ROW
 from plow_twin.stream.driven import MOST_MEASURED
-from plow_twin.stream.outputs import clearances
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.void]
 
 #: Definition: members by default.
 MEMBERS: Final = 128
-#: Bound: seconds of motion that are kept for poses that are late, their delay included.
-LATEST_S: Final = 0.25
-#: Bound: least distance in s of what is kept of the motion.
-_PATH_S: Final = 2e-3
-#: Bound: least distance in s of poses that are used; nearer ones tell little more and cost as much.
+#: Bound: least time in s between poses that are used: a nearer pose adds little and costs as much.
 APART_S: Final = 4e-3
-#: Bound: poses from whose quick changes the noise is told: fewest, and most.
+#: Bound: number of poses whose quick changes give the noise: smallest, largest.
 _NOISE_ROWS: Final = (20, 400)
-#: Bound: outlying poses in a row after which they are used: the head has jumped, a single glitch does not last so long.
-_MOST_OUTLYING: Final = 5
-#: Bound: samples that are advanced through at once: the rows of all members stay in the processor's cache.
+#: Bound: samples of one call: the rows of all members stay in the processor's cache.
 _CALL: Final = 20
-#: Definition: what is known of the clearances is told again so often [1/s], as often as it is published.
+#: Definition: rate in 1/s at which the clearances are determined, that of their publication.
 _KNOWN_HZ: Final = 10.0
 #: Bound: poses that wait for the model to reach their stamps; as many as a session keeps to use again.
 _MOST_DUE: Final = MOST_MEASURED
-_THETA: Final = DOF_NAMES.index("theta")
-#: Derived: places of c, s, X, Y in the solver's state.
-_PLACES: Final = (5, 6, 0, 1)
 #: Definition: one row, which is wanted or not; no digest; clearances that do not move.
 _YES: Final = np.ones(1, bool)
 _NO: Final = np.zeros(1, bool)
 _NO_DIGESTS: Final = np.zeros(0, np.int64)
 _UNMOVED: Final = np.zeros(6)
-#: Definition: nothing is stated of either.
+#: Definition: no load and no poses.
 _NO_LOAD: Final = Load(np.array([0.0, 1.0]), np.zeros((2, 3)))
 _NO_POSES: Final = Poses(np.zeros(0), np.zeros((0, 3)))
 _LENGTH: Final = struct.Struct("<q")
@@ -84,7 +70,7 @@ _LENGTH: Final = struct.Struct("<q")
 
 @dataclass(frozen=True, eq=False)
 class Span:
-    """Knowledge over a span of time.
+    """Peaks and impulses over a span of time, with intervals.
 
     Attributes
     ----------
@@ -101,9 +87,10 @@ class Span:
 
 
 class _Behind(NamedTuple):
-    """Samples that only the first member has been through: times, loads, its rows.
+    """Samples that only the first member has taken yet: times, loads, its rows.
 
-    Which rows are to have intervals, and end a span of peaks and impulses; whether one begins with the first.
+    `wanted` are the rows that get intervals, `ends` those that end a span of peaks and impulses; with `begins` a span
+    begins with the first row.
     """
 
     t: Array
@@ -115,22 +102,23 @@ class _Behind(NamedTuple):
 
 
 class Follower:
-    """A twin under sampled loads that follows one machine: it takes in poses and estimates too.
+    """A twin under sampled loads that follows one machine: it is given measured poses and estimates too.
 
-    It is driven like a `Twin`. Its motion is that of its first member, which has the middle of what is known.
+    It is driven like a `Twin`. Its motion is that of its first member, the median twin.
 
     Parameters
     ----------
     scene : Scene
         The nominal scene.
     members : int
-        Twins, at least 20; with 1 the parameters alone follow: no pose moves it, and its forces have no intervals.
+        Number of twins, at least 20; with 1 the parameters alone follow: no pose moves the twin, its forces have no
+        intervals.
     tol : float
         As for `Twin`.
     start : float
         Time in s at which the scene's initial state holds.
     seed : int
-        Of all that is drawn.
+        Seed of the random numbers.
 
     Raises
     ------
@@ -140,7 +128,7 @@ class Follower:
 
     excitation: Literal["scene", "sampled"] = "sampled"
     max_evaluations: int | None = None
-    #: advances cut short: none
+    #: advances cut short, which a follower never does
     bounded = 0
 
     def __init__(
@@ -173,7 +161,7 @@ class Follower:
 
     def _forget(self) -> None:
         """Forget all poses."""
-        #: what waits for its time, in order: time in s, number, pose or text of an estimate
+        #: poses and estimates that wait for their time, in order: time in s, number, pose or text of an estimate
         self._due: list[tuple[float, int, list[float] | str]] = []
         #: times of the poses used lately
         self._used: deque[float] = deque()
@@ -184,7 +172,7 @@ class Follower:
         return np.zeros(PAIR_COUNT) if wear is None else np.array(wear.initial_depth_m, dtype=np.float64)
 
     def _draw(self, text: str, time: float, worn: Array) -> None:
-        """Draw members from an estimate, JSON; from the prior without one. They are in the scene's initial state."""
+        """Draw members from an estimate, JSON, or from the prior if it is empty, in the scene's initial state."""
         self._text = text
         #: the estimate that is followed; None: the prior
         self.estimate = Estimate.from_dict(json.loads(text)) if text else None
@@ -193,7 +181,7 @@ class Follower:
         rng = np.random.default_rng([self._seed, self.drawn])
         self._ensemble = Ensemble(self.scene, self._known, self._members, rng, time, self.tol, worn)
         self._ensemble.set_travel_speed(self._speed)
-        self._tell_clearance()
+        self._note_clearance()
 
     # -- as a `Twin` -------------------------------------------------------------------------------------------------
 
@@ -245,7 +233,7 @@ class Follower:
         return self._ensemble.first.failure(status)
 
     def like(self, scene: Scene) -> Follower:
-        """Return a follower of another machine, which counts on."""
+        """Return a follower of another machine that continues the counters."""
         found = Follower(scene, self._members, tol=self.tol, seed=self._seed)
         found.every_row, found.defers = self.every_row, self.defers
         found.poses_used, found.poses_outlying = self.poses_used, self.poses_outlying
@@ -253,7 +241,7 @@ class Follower:
         return found
 
     def warm_up(self) -> float:
-        """Compile what is needed, or load it from the cache on disk; return the seconds it took."""
+        """Compile the kernels, or load them from the cache on disk; return the seconds that it took."""
         begin, before = _time.perf_counter(), self.snapshot()
         self.advance(self.time + 1e-6)
         self._ensemble.stand_like(self._ensemble, self._wrench)
@@ -268,7 +256,7 @@ class Follower:
         return Advance(rows[0])
 
     def end_spans(self, ends: NDArray[np.int64], begins: bool) -> None:
-        """Say what the next `advance_rows` is for.
+        """State which rows of the next `advance_rows` are published.
 
         Parameters
         ----------
@@ -283,7 +271,7 @@ class Follower:
     def advance_rows(
         self, t: Array, wrench: Array, rows: Rows | None, digest_after: NDArray[np.int64] = _NO_DIGESTS
     ) -> Advanced:
-        """Advance to some times, as `Twin.advance_rows`; a row knows what was measured before it.
+        """Advance to some times, as `Twin.advance_rows`; a row allows for all measurements before it.
 
         With `defers`, the other members are left to `catch_up` after a row that is published by itself.
         """
@@ -308,8 +296,8 @@ class Follower:
         while begin < len(t):
             end = self._stop(t, begin, stops)
             here = slice(begin, end)
-            told = rows[here] if rows is not None else np.zeros(end - begin, ROW)
-            failed += self._advance_first(t[here], wrench[here], told, wanted[here], ends[here])
+            out = rows[here] if rows is not None else np.zeros(end - begin, ROW)
+            failed += self._advance_first(t[here], wrench[here], out, wanted[here], ends[here])
             self.catch_up()
             if end in stops:
                 digests += [self.digest()] * stops[end]
@@ -329,7 +317,7 @@ class Follower:
         return failed
 
     def catch_up(self) -> None:
-        """Bring all members to where the first is: its rows get their intervals, and what was measured acts."""
+        """Advance all members to the time of the first: its rows get their intervals, measurements that are due act."""
         behind, self._behind = self._behind, None
         if behind is None:
             return
@@ -339,13 +327,13 @@ class Follower:
         ends = behind.wrench.min(axis=0), behind.wrench.max(axis=0)
         self._range = np.stack([np.minimum(self._range[0], ends[0]), np.maximum(self._range[1], ends[1])])
         if math.floor(self.time * _KNOWN_HZ) != self._cell:
-            self._tell_clearance()
+            self._note_clearance()
         while self._due and self._due[0][0] <= self.time:
-            when, _, what = self._due.pop(0)
-            self._use(when, what)
+            when, _, measured = self._due.pop(0)
+            self._use(when, measured)
 
     def _stop(self, t: Array, begin: int, digest_after: Container[int]) -> int:
-        """Return up to where to go at once: nothing happens on the way."""
+        """Return the end of the samples up to the next digest, measurement or determination of the clearances."""
         end = min(begin + _CALL, len(t))
         due = self._due[0][0] if self._due else math.inf
         for place in range(begin, end):
@@ -357,10 +345,10 @@ class Follower:
         """Return by how much pads that are worn by `worn` (..., 8) widen the clearances and their points, (..., 6)."""
         if self.scene.wear is None:
             return _UNMOVED
-        return np.repeat(_moved(self.scene, worn), 3, axis=-1)
+        return np.repeat(widening(self.scene, worn), 3, axis=-1)
 
-    def _tell_clearance(self) -> None:
-        """Note the clearances that unworn pads would have by present knowledge."""
+    def _note_clearance(self) -> None:
+        """Keep the clearances of unworn pads as the prior, the estimate or the members give them now."""
         self._cell = math.floor(self.time * _KNOWN_HZ)
         known = self._known
         if self.estimate is None and self._ensemble.moved:
@@ -377,7 +365,7 @@ class Follower:
         wear_depth: ArrayLike | None = None,
         pose: tuple[ArrayLike, ArrayLike] | None = None,
     ) -> None:
-        """Begin anew at model time `t`, as `Twin.reset`: what was measured of the motion before holds no longer."""
+        """Begin anew at model time `t`, as `Twin.reset`: measurements of the motion before no longer hold."""
         self.catch_up()
         self.drawn += 1
         worn = self._unworn() if wear_depth is None else np.array(wear_depth, dtype=np.float64)
@@ -435,7 +423,7 @@ class Follower:
             self.drawn, self._members = int(facts["drawn"]), int(facts["members"])
             self._draw(facts["estimate"], 0.0, worn)
         self.added, self._cell, self._span_start = int(facts["added"]), int(facts["cell"]), float(facts["span"])
-        self._due = [(float(when), int(number), what) for when, number, what in facts["due"]]
+        self._due = [(float(when), int(number), measured) for when, number, measured in facts["due"]]
         self._used = deque(facts["used"])
         *own, noise, clearance, wrench = blobs
         self._ensemble.set_state(own, facts["random"])
@@ -443,43 +431,44 @@ class Follower:
         self._noise_rows = deque(np.frombuffer(noise).reshape(-1, 3).copy(), maxlen=_NOISE_ROWS[1])
         self._clearance, self._wrench = np.frombuffer(clearance).reshape(2, 3).copy(), np.frombuffer(wrench).copy()
 
-    # -- what is measured --------------------------------------------------------------------------------------------
+    # -- measurements ------------------------------------------------------------------------------------------------
 
     def add_pose(self, t: float, q: ArrayLike, known: float = -math.inf) -> None:
-        """Take in a pose measured at `t` in s, shape (3,), NaN where it was not; it acts once the model has come there.
+        """Add a pose measured at `t` in s, shape (3,), NaN where not measured; it acts when the model reaches `t`.
 
-        It acts at `known` in s where that is later. One of the last `LATEST_S` acts at once.
+        It acts at `known` in s where that is later. A pose of the last `LATEST_S` acts at once.
         """
         self._add(max(t, known), [t, *np.asarray(q, dtype=np.float64).tolist()])
 
     def add_estimate(self, text: str, t: float) -> None:
-        """Take in an estimate, JSON as of `Estimate.as_dict`, that is known from `t` in s on.
+        """Add an estimate, JSON as of `Estimate.as_dict`, that is known from `t` in s on.
 
-        It is followed if it says more than what is followed; one that is withdrawn lets the prior hold again.
+        It is followed if it knows both clearances, or one while no estimate is followed. After a withdrawn estimate the
+        prior holds again.
         """
         self._add(t, text)
 
-    def _add(self, t: float, what: list[float] | str) -> None:
+    def _add(self, t: float, measured: list[float] | str) -> None:
         self.added += 1
         if t <= self.time:
             self.catch_up()
-            self._use(t, what)
-        elif isinstance(what, str) or len(self._due) < _MOST_DUE:
-            insort(self._due, (t, self.added, what), key=lambda due: due[:2])
+            self._use(t, measured)
+        elif isinstance(measured, str) or len(self._due) < _MOST_DUE:
+            insort(self._due, (t, self.added, measured), key=lambda due: due[:2])
         else:
             self.poses_dropped += 1
 
-    def _use(self, t: float, what: list[float] | str) -> None:
-        if not isinstance(what, str):
-            self._use_pose(what[0], np.array(what[1:]))
+    def _use(self, t: float, measured: list[float] | str) -> None:
+        if not isinstance(measured, str):
+            self._use_pose(measured[0], np.array(measured[1:]))
             return
-        found = Estimate.from_dict(json.loads(what))
+        found = Estimate.from_dict(json.loads(measured))
         states = (found.horizontal_state, found.vertical_state)
         if State.WITHDRAWN in states:
             if self.estimate is not None:
                 self._begin_anew("")
         elif all(state.known for state in states) or (self.estimate is None and any(state.known for state in states)):
-            self._begin_anew(what)
+            self._begin_anew(measured)
 
     @property
     def known(self) -> str:
@@ -487,20 +476,20 @@ class Follower:
         return self._text
 
     def follow_estimate(self, known: str) -> None:
-        """Go on from here with what another one's `known` was."""
+        """Follow the estimate that another follower's `known` has."""
         if known != self._text:
             self.catch_up()
             self._begin_anew(known)
 
     def _begin_anew(self, text: str) -> None:
-        """Draw from what is known now; the members begin where those before them stand."""
+        """Draw members from an estimate, JSON, or the prior; they begin at the places of those before them."""
         before = self._ensemble
         self.drawn += 1
         self._draw(text, self.time, self.wear_depth)
         self._ensemble.stand_like(before, self._wrench)
 
     def follow_parameters(self) -> None:
-        """Go on with one twin that no pose moves, from where the median twin stands."""
+        """Continue with one twin that no pose moves, from the state of the median twin."""
         self.catch_up()
         self._members = 1
         self._begin_anew(self._text)
@@ -524,12 +513,12 @@ class Follower:
             self._noise_rows.append(q)
 
     def _load_error(self) -> Array:
-        """Return the error of the load, N and N m, that the estimate has found where the model describes roughly."""
+        """Return the error of the load, N and N m, that a rough estimate has found."""
         found: Array = tuning.LOAD_ERROR_SHARE * self._load_share * 0.5 * (self._range[1] - self._range[0])
         return found
 
     def _sensor(self) -> tuple[Array | None, Array, float]:
-        """Return noise, None where too little was measured to tell, bias and delay of the sensor."""
+        """Return noise, bias and delay of the sensor; the noise is None after too few poses."""
         found = self.estimate
         noise: Array | None = None
         if found is not None and found.noise is not None:
@@ -543,12 +532,12 @@ class Follower:
         bias = [0.0 if value is None else value.mean for value in (found.bias_x, found.bias_y, found.bias_theta)]
         return noise, np.array(bias), 0.0 if found.delay is None else max(found.delay.mean, 0.0)
 
-    # -- what is known -----------------------------------------------------------------------------------------------
+    # -- clearances and forces ---------------------------------------------------------------------------------------
 
     def clearance(self) -> Array:
         """Return horizontal and vertical clearance, each with its 5 % and 95 % points, shape (2, 3), in m."""
         self.catch_up()
-        self._tell_clearance()
+        self._note_clearance()
         found: Array = self._clearance + self._moved(self.wear_depth).reshape(2, 3)
         return found
 
@@ -561,7 +550,7 @@ class Follower:
         return found
 
     def held(self, t: float) -> Rows:
-        """Return the row, shape (1,), of a time after the newest sample, which is held; nothing changes."""
+        """Return the row, shape (1,), of a later time under the newest sample; the state stays."""
         self.catch_up()
         rows = np.zeros(1, ROW)
         self._ensemble.held(t, rows)
@@ -583,401 +572,14 @@ def _load_share(text: str) -> Array:
 
 
 def _facts(data: bytes) -> tuple[dict[str, Any], int]:
-    """Return the facts at the beginning of a snapshot, and where what follows them begins."""
+    """Return the facts at the beginning of a snapshot, and the place of its arrays."""
     (length,) = _LENGTH.unpack_from(data)
     begin = _LENGTH.size + length
     return json.loads(data[_LENGTH.size : begin]), begin
 
 
-def _moved(scene: Scene, worn: Array) -> Array:
-    """Return by how much pads that are worn by `worn` (..., 8) widen the clearances in m, shape (..., 2)."""
-    own = np.array([scene.clearance.horizontal_m, scene.clearance.vertical_m])
-    found: Array = clearances(scene, worn)[..., :2] - own
-    return found
-
-
-class Ensemble:
-    """Twins drawn from what is known; the first has its middle.
-
-    Parameters
-    ----------
-    scene, known
-        The nominal scene, and what is known: clearances of unworn pads in the prior, those at present in an estimate.
-    members, rng, start, tol
-        How many; for all that is drawn; time of the scene's initial state; tolerance.
-    worn : ndarray, shape (8,)
-        Wear depth of the pads in m.
-    """
-
-    def __init__(
-        self, scene: Scene, known: Estimate, members: int, rng: np.random.Generator, start: float, tol: float,
-        worn: Array,
-    ) -> None:  # fmt: skip
-        scenes, gain = draw_scenes(scene, known, members, rng) if members > 1 else ([scene], np.ones((1, 3)))
-        scenes[0], gain[0] = middle_of(scene, known)
-        #: whether poses move the first member, whose numbers are those of an estimate; else its double, the second
-        self._steers_first = known.horizontal_state is not State.PRIOR
-        if not self._steers_first and members > 1:
-            scenes[1], gain[1] = scenes[0], gain[0]
-        #: wear of the pads at the beginning, and by how much it had widened the clearances that are known, (2, 1)
-        self.worn_before, self.moved_before = worn, np.zeros((2, 1))
-        if scene.wear is not None:
-            states = (known.horizontal_state, known.vertical_state)
-            self.moved_before = np.where([[state.known] for state in states], _moved(scene, worn)[:, None], 0.0)
-            scenes = [_worn(one, scene, worn, self.moved_before[:, 0]) for one in scenes]
-        #: the first member, by itself: its forces need not wait for the others
-        self.first = Twin(scenes[0], tol=tol, excitation="sampled", start=start)
-        self.others = TwinBatch(scenes[1:], tol=tol, start=start) if members > 1 else None
-        self._scene, self._gain, self._rng = scene, gain, rng
-        #: error of each member's load, N and N m, and time in s up to which it has drifted
-        self._load_off, self._drifted = np.zeros((members, 3)), start
-        self._walls = np.stack([penetration_rows(one) for one in scenes])
-        self._clearance = np.array([[one.clearance.horizontal_m, one.clearance.vertical_m] for one in scenes])
-        self._fastest = np.array([fastest_travel(one.wear, one.contact) for one in scenes])
-        self._stiffness, self._exponent = np.array([one.contact.stiffness for one in scenes]), scene.contact.exponent
-        self._pressed = tuning.PRESSED * scene.head.mass_kg * Gravity().acceleration_m_s2
-        self.good = np.ones(members, dtype=bool)
-        #: force, and peak and impulse since the span's begin
-        self._told = np.zeros((members, 3, PAIR_COUNT))
-        self._peak, self._impulse = self._told[:, 1], self._told[:, 2]
-        #: squares of each member's normalised innovations
-        self.square = np.zeros(members)
-        #: degrees of freedom that are not locked, and outlying poses in a row
-        self._free = np.array([name not in scene.locked for name in DOF_NAMES])
-        self.outlying = 0
-        #: times and poses (m, 3) of the newest seconds, oldest first; present rates (m, 3), wear and penetration (m, 8)
-        self._path: deque[tuple[float, Array]] = deque([(start, np.tile(np.array(scene.initial.q), (members, 1)))])
-        self._v, self.worn = np.tile(np.array(scene.initial.v), (members, 1)), np.tile(worn, (members, 1))
-        self._depth = self._penetration(self._path[-1][1])
-        #: the newest rows of all members, while nobody has asked for what they hold
-        self._newest: Rows | None = None
-
-    @property
-    def moved(self) -> bool:
-        """Whether any pose has moved the members."""
-        return bool(self.square.any())
-
-    @property
-    def pose(self) -> Array:
-        """The present pose of each member, (m, 3)."""
-        return self._path[-1][1]
-
-    def set_travel_speed(self, speed_m_s: float) -> None:
-        """Set the speed along the face, of each member as far as its damping allows."""
-        speeds = np.minimum(speed_m_s, self._fastest)
-        self.first.set_travel_speed(float(speeds[0]))
-        if self.others is not None:
-            self.others.set_travel_speed(speeds[1:])
-
-    def advance_first(self, t: Array, wrench: Array, rows: Rows) -> int:
-        """Advance the first member and write its rows, shape (n,); return how many advances failed."""
-        failed, _ = self.first.advance_rows(t, wrench * self._gain[0] + self._load_off[0], rows)
-        rows["followed"] = FOLLOWED
-        return failed
-
-    def advance_others(
-        self, t: Array, wrench: Array, rows: Rows, wanted: NDArray[np.bool_], ends: NDArray[np.bool_]
-    ) -> None:
-        """Advance the other members to where the first is, whose rows are given; write intervals into those `wanted`.
-
-        A span of peaks and impulses ends with each of `ends`.
-        """
-        parts = [_bytes(rows[None])]
-        if self.others is not None:
-            loads = wrench * self._gain[1:, None, :] + self._load_off[1:, None, :]
-            parts.append(_bytes(self.others.advance_samples(t, loads).rows))
-        whole = np.concatenate(parts).view(ROW)
-        good = whole["status"] == 0
-        if len(self.good) == 1:
-            self.good[:] = True
-        for place, (now, is_wanted, is_end) in enumerate(zip(t.tolist(), wanted.tolist(), ends.tolist(), strict=True)):
-            self.good &= good[:, place]
-            np.maximum(self._peak, whole["peak"][:, place], out=self._peak)
-            self._impulse += whole["impulse"][:, place]
-            if is_wanted:
-                self._told[:, 0] = whole["force"][:, place]
-                self._tell(rows[place : place + 1])
-            if is_end:
-                self.begin_span()
-            self._remember(now, whole["q"][:, place].copy())
-        self._newest = whole[:, -1]
-
-    def settle(self) -> None:
-        """Take rates, wear and penetration out of the newest rows: few samples are asked for them."""
-        rows, self._newest = self._newest, None
-        if rows is not None:
-            self._v, self.worn, self._depth = rows["v"].copy(), rows["wear_depth"].copy(), rows["penetration"].copy()
-
-    def _remember(self, now: float, q: Array) -> None:
-        path = self._path
-        if len(path) > 1 and path[-1][0] - path[-2][0] < _PATH_S:
-            path.pop()
-        path.append((now, q))
-        while path[1][0] <= now - LATEST_S:
-            path.popleft()
-
-    def _tell(self, row: Rows) -> None:
-        """Write the intervals of forces, peaks and impulses."""
-        _, low, high = self._points(self._told)
-        for index, name in enumerate(("force", "peak", "impulse")):
-            row[f"{name}_low"], row[f"{name}_high"] = low[index], high[index]
-        if np.isfinite(low.sum() + high.sum()):
-            row["followed"] = WITH_INTERVALS
-
-    def held(self, t: float, row: Rows) -> None:
-        """Write the row of a later time with the newest sample held; nothing changes."""
-        before = self.twins()
-        row[:] = self.first.advance(t).rows
-        self._told[0, 0] = row["force"][0]
-        if self.others is not None:
-            self._told[1:, 0] = self.others.advance(t).force[:, 0]
-        self.set_twins(before)
-        self._tell(row)
-
-    def begin_span(self) -> None:
-        """Let peaks and impulses begin here."""
-        self._peak[:], self._impulse[:] = 0.0, 0.0
-
-    def span(self) -> tuple[Array, Array]:
-        """Return peaks and impulses since the span's begin: of the first member and the points, (3, 8) each."""
-        return np.stack(self._points(self._peak)), np.stack(self._points(self._impulse))
-
-    def _points(self, values: Array) -> tuple[Array, Array, Array]:
-        """Return the first member's values, and the 5 % and 95 % points over the members that are in range."""
-        low, _, high = quantiles(values if self.good.all() else values[self._used()])
-        return values[0].copy(), np.minimum(low, values[0]), np.maximum(high, values[0])
-
-    def _used(self) -> NDArray[np.bool_]:
-        """Return which members determine intervals: those in the model's range, or all without such members."""
-        return self.good if self.good.any() else np.ones(len(self.good), dtype=bool)
-
-    def clearance(self) -> Array:
-        """Return the clearances with their 5 % and 95 % points, (2, 3), of the members that foretell the poses best.
-
-        The likelihoods are tempered until enough members carry the interval. Of unworn pads.
-        """
-        use = self._used()
-        excess = np.clip(self.square - self.square[use].min(), 0.0, 1e9)
-        low, high = 0.0, 1.0
-        for _ in range(40):
-            share = 0.5 * (low + high)
-            weight = np.where(use, np.exp(-0.5 * share * excess), 0.0)
-            enough = weight.sum() ** 2 > FEWEST * (weight**2).sum()
-            low, high = (share, high) if enough else (low, share)
-        weight = np.where(use, np.exp(-0.5 * low * excess), 0.0)
-        out = np.zeros((2, 3))
-        for axis, values in enumerate(self._clearance.T):
-            order = np.argsort(values)
-            share = np.cumsum(weight[order]) / weight.sum()
-            out[axis] = values[order[np.searchsorted(share, [0.5, 0.05, 0.95]).clip(0, len(order) - 1)]]
-        return out
-
-    def stand_like(self, before: Ensemble, wrench: Array) -> None:
-        """Begin where others stand under a load, each by its own clearances, with what they have gone through.
-
-        The first with the numbers of an estimate begins where the second stood, which the poses have moved; the second
-        of a prior begins where the first stood.
-        """
-        before.settle()
-        from_ = np.where(before.good, np.arange(len(before.good)), int(np.argmax(before.good)))[: len(self.good)]
-        if self._steers_first and not before._steers_first and len(before.good) > 1 and before.good[1]:
-            from_[0] = 1
-        if before._steers_first and not self._steers_first and before.good[0]:
-            from_[1:2] = 0
-        share = self._shares(before._room()[from_])
-        self._load_off = before._load_off[from_]
-        loads = wrench * self._gain + self._load_off
-        self.first.advance(self.first.time, loads[0])
-        if self.others is not None:
-            self.others.set_wrench(loads[1:])
-        self._path = deque((t, q[from_] * share) for t, q in before._path)
-        self._told[1:], self._told[0] = before._told[from_[1:]], before._told[0]
-        self._stand(self._path[-1][1], before._v[from_], before._force(before._depth)[from_])
-
-    def stand_about(self, q: Array, v: Array) -> None:
-        """Begin at a pose of the first member, the others by their own clearances."""
-        places = q * self._shares(np.broadcast_to(self._room()[0], (len(self.good), 3)))
-        force = self._force(self._penetration(places))[:1]
-        self._stand(places, np.tile(v, (len(places), 1)), force)
-
-    def _room(self) -> Array:
-        """Return what the head can move by, horizontally, vertically, and at its corners, shape (m, 3); 1 if locked."""
-        room = np.column_stack([self._clearance, self._clearance.min(axis=1)])
-        return np.where(self._free, room, 1.0)
-
-    def _shares(self, room: Array) -> Array:
-        """Return by how much more than a room the head can move by, shape (m, 3)."""
-        return np.divide(self._room(), room, out=np.ones_like(room), where=room > 0.0)
-
-    def _stand(self, q: Array, v: Array, force: Array, which: NDArray[np.int64] | None = None) -> None:
-        """Stand at poses; where a pair would be pressed by more than a force, (m, 8), nearer to the middle."""
-        low, high = np.zeros(len(q)), np.ones(len(q))
-        free = self._allowed(q, force)
-        low[free] = 1.0
-        for _ in range(40) if not free.all() else ():
-            share = 0.5 * (low + high)
-            allowed = self._allowed(self._nearer(q, share), force)
-            low, high = np.where(allowed, share, low), np.where(allowed, high, share)
-        which = np.arange(len(q)) if which is None else which
-        self._put(which, self._nearer(q, low)[which], v[which])
-
-    def _nearer(self, q: Array, share: Array) -> Array:
-        """Return poses nearer to the middle, as far as the head is free to move."""
-        return np.where(self._free, share[:, None] * q, q)
-
-    def correct(self, t: float, q: Array, noise: Array, load_error: Array) -> bool:
-        """Move the members toward a pose measured at `t`, by their covariance with it; False if it is not used.
-
-        Their loads err by `load_error`, N and N m, shape (3,), and the pose corrects these errors too.
-        Not used are poses that are too late, and outliers as long as few of them come in a row.
-        """
-        self.settle()
-        there = np.flatnonzero(np.isfinite(q) & self._free)
-        times = [time for time, _ in self._path]
-        if t <= times[0] or not len(there):
-            return False
-        after = min(bisect_left(times, t), len(times) - 1)
-        path = np.stack([self._path[index][1] for index in range(after - 1, len(times))])
-        share = min((t - times[after - 1]) / (times[after] - times[after - 1]), 1.0)
-        then = ((1.0 - share) * path[0] + share * path[1])[:, there]
-        self._drift(load_error)
-        state = np.concatenate([self._v, *path, self._load_off], axis=1)
-        use = self._used()
-        if not self._steers_first and use[1:].any():
-            use = use & (np.arange(len(use)) > 0)
-        about, seen = state - state[use].mean(axis=0), then - then[use].mean(axis=0)
-        freedom = max(int(use.sum()) - 1, 1)
-        scatter = seen[use].T @ seen[use] / freedom + np.diag(noise[there] ** 2)
-        center = _off(q, then[use].mean(axis=0), there)
-        if (np.abs(center) <= tuning.OUTLYING * np.sqrt(np.diag(scatter))).all():
-            self.outlying = 0
-        else:
-            self.outlying += 1
-            if self.outlying <= _MOST_OUTLYING:
-                return False
-        white = self._rng.standard_normal((len(then), len(there)))
-        white[0] = 0.0
-        off = _off(q, then, there)
-        # no member is worse than an outlier: a bad pose that is used does not outweigh all others
-        most = tuning.OUTLYING * noise[there]
-        self.square += ((off.clip(-most, most) / noise[there]) ** 2).sum(axis=1)
-        weight = np.linalg.solve(scatter, seen[use].T @ about[use] / freedom)
-        weight[:, ~np.tile(self._free, len(path) + 2)] = 0.0
-        moved = state + (off + noise[there] * white) @ weight
-        v, places = moved[:, :3], moved[:, 3:-3].reshape(len(moved), -1, 3).transpose(1, 0, 2)
-        allowed = np.flatnonzero(self._allowed(places[-1], self._force(self._depth)))
-        allowed = allowed[allowed >= 1 - self._steers_first]
-        for place, index in enumerate(range(after - 1, len(times))):
-            self._path[index][1][allowed] = places[place, allowed]
-        self._load_off[allowed] = moved[allowed, -3:]
-        self._put(allowed, places[-1, allowed], v[allowed])
-        self._recover()
-        return True
-
-    def _drift(self, load_error: Array) -> None:
-        """Let the errors of the loads drift, as Ornstein-Uhlenbeck processes; that of the first has no noise."""
-        now, before = self.first.time, self._drifted
-        self._drifted = now
-        if load_error.any() or self._load_off.any():
-            kept = math.exp(-(now - before) / tuning.LOAD_ERROR_LASTS)
-            white = self._rng.standard_normal(self._load_off.shape)
-            white[0] = 0.0
-            self._load_off = kept * self._load_off + math.sqrt(1.0 - kept**2) * load_error * white
-
-    def _recover(self) -> None:
-        """Put members that have left the model's range where others are; if all have, they go on as they are."""
-        lost, left = np.flatnonzero(~self.good), np.flatnonzero(self.good)
-        self.good[:] = True
-        if not len(lost) or not len(left):
-            return
-        from_ = np.arange(len(self.good))
-        from_[lost] = np.resize(left, len(lost))
-        share = self._shares(self._room()[from_])
-        self._path = deque((t, q[from_] * share) for t, q in self._path)
-        self._stand(self._path[-1][1], self._v[from_], self._force(self._depth)[from_], lost)
-
-    def _force(self, depth: Array) -> Array:
-        """Return the elastic force of each pair, (m, 8)."""
-        found: Array = self._stiffness[:, None] * np.maximum(depth, 0.0) ** self._exponent
-        return found
-
-    def _allowed(self, q: Array, force: Array) -> NDArray[np.bool_]:
-        """Return which members may be put to poses (m, 3): no pair is pressed by much more than a force, (m, 8)."""
-        return np.asarray((self._force(self._penetration(q)) < force + self._pressed).all(axis=1))
-
-    def _put(self, which: NDArray[np.int64], q: Array, v: Array) -> None:
-        for place in np.flatnonzero(which == 0):
-            self.first.move(q[place], v[place])
-        rest = which > 0
-        if self.others is not None and rest.any():
-            self.others.move(which[rest] - 1, q[rest], v[rest])
-        self._path[-1][1][which], self._v[which] = q, v
-        self._depth = self._penetration(self._path[-1][1])
-
-    def _penetration(self, q: Array) -> Array:
-        """Return the penetration of each pair in m, (m, 8), with each member's clearances at poses of shape (m, 3)."""
-        state = states_of(self._scene, np.concatenate([q, np.zeros_like(q)], axis=1))
-        body = np.concatenate([state[:, _PLACES], np.ones((len(q), 1))], axis=1)
-        found: Array = np.einsum("mi,mij->mj", body, self._walls) - self.worn
-        return found
-
-    def twins(self) -> list[bytes]:
-        """Return the exact states of the twins: of the first, and of the others."""
-        return [self.first.snapshot(), b"" if self.others is None else self.others.snapshot()]
-
-    def set_twins(self, states: Sequence[bytes]) -> None:
-        """Go on from what `twins` returned."""
-        self.first.restore(states[0])
-        if self.others is not None:
-            self.others.restore(states[1])
-
-    def state(self) -> tuple[list[bytes], Any]:
-        """Return all that changes, as bytes and as JSON."""
-        self.settle()
-        times, path = np.array([time for time, _ in self._path]), np.stack([q for _, q in self._path])
-        wide = (self._peak, self._impulse, self._v, self.worn, self._depth, self._load_off)
-        arrays = (self.good, self.square, *wide, np.array([self._drifted]), times, path)
-        return [*self.twins(), *(one.tobytes() for one in arrays)], self._rng.bit_generator.state
-
-    def set_state(self, blobs: list[bytes], random: Any) -> None:
-        """Go on from what `state` returned."""
-        self.set_twins(blobs[:2])
-        self.good = np.frombuffer(blobs[2], np.bool_).copy()
-        count = len(self.good)
-        self.square, *wide, drifted, times, path = (np.frombuffer(blob).copy() for blob in blobs[3:])
-        own = [one.reshape(count, -1) for one in wide]
-        self._peak[:], self._impulse[:], self._v, self.worn, self._depth, self._load_off = own
-        self._drifted = float(drifted[0])
-        self._newest = None
-        self._path = deque(zip(times.tolist(), path.reshape(-1, count, 3), strict=True))
-        self._rng.bit_generator.state = random
-
-
-def _bytes(rows: Rows) -> NDArray[np.uint8]:
-    """Return rows (m, n) as bytes: numpy copies a record field by field."""
-    found: NDArray[np.uint8] = np.ascontiguousarray(rows).view(np.uint8)
-    return found
-
-
-def _off(q: Array, then: Array, there: NDArray[np.int64]) -> Array:
-    """Return by how much a pose differs from others (..., k) in the coordinates `there`; angles up to full turns."""
-    off: Array = q[there] - then
-    turn = there == _THETA
-    off[..., turn] = np.remainder(off[..., turn] + np.pi, 2.0 * np.pi) - np.pi
-    return off
-
-
-def _worn(one: Scene, scene: Scene, worn: Array, moved: Array) -> Scene:
-    """Return a member's scene with worn pads; its clearances are what is known, by `moved` (2,) due to the wear."""
-    assert scene.wear is not None
-    depths = tuple(worn.tolist())
-    horizontal, vertical = one.clearance.horizontal_m - moved[0], one.clearance.vertical_m - moved[1]
-    clearance = Clearance(max(float(horizontal), 0.0), max(float(vertical), 0.0))
-    return replace(one, clearance=clearance, wear=replace(scene.wear, initial_depth_m=depths))
-
-
 def prior(scene: Scene) -> Estimate:
-    """Return what is known of a scene before anything is measured, its damping and the load's gains among it."""
+    """Return the prior of a scene as an estimate, with damping and gains of the load."""
     units = Units.of(scene, _NO_LOAD)
     unknowns = Unknowns.stated(units.scene(scene), _NO_LOAD, _NO_POSES)
     normal = [Interval.normal(*pair) for pair in zip(unknowns.nominal(), unknowns.deviations(), strict=True)]
@@ -991,7 +593,7 @@ def prior(scene: Scene) -> Estimate:
 
 
 def _whole(found: Estimate, known: Estimate) -> Estimate:
-    """Return an estimate with damping and gains of the prior where it tells none."""
+    """Return an estimate with damping and gains of the prior where it has none of its own."""
     return replace(
         found,
         damping=found.damping or known.damping,
@@ -999,26 +601,3 @@ def _whole(found: Estimate, known: Estimate) -> Estimate:
         gain_fy=found.gain_fy or known.gain_fy,
         gain_m=found.gain_m or known.gain_m,
     )
-
-
-def middle_of(scene: Scene, known: Estimate) -> tuple[Scene, Array]:
-    """Return the scene and the gains of the load, shape (3,), that an estimate has in its middle."""
-    if known.horizontal_state is State.PRIOR:
-        return replace(scene, loads=(), wear=None), np.ones(3)
-
-    def point(value: Interval) -> Interval:
-        return Interval(value.mean, value.mean, value.mean)
-
-    middle = replace(
-        known,
-        apparent=None,
-        horizontal=point(known.horizontal),
-        vertical=point(known.vertical),
-        stiffness=point(known.stiffness),
-        damping=known.damping and point(known.damping),
-        gain_fx=known.gain_fx and point(known.gain_fx),
-        gain_fy=known.gain_fy and point(known.gain_fy),
-        gain_m=known.gain_m and point(known.gain_m),
-    )
-    scenes, gain = draw_scenes(scene, middle, 1, np.random.default_rng(0))
-    return scenes[0], gain[0]

@@ -1,0 +1,452 @@
+"""The members of a follower: twins drawn from a prior or an estimate, moved by an ensemble Kalman filter.
+
+A pose moves all members with perturbed observations (Burgers et al., Mon. Weather Rev. 126 (1998) 1719), a late pose
+through their covariance with the present. A member whose walls the correction would press on with more than half of the
+head's weight is left alone: behind a hard contact a tenth of a millimetre would be an impact that never was.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.estimate import tuning
+from plow_twin.estimate.forces import FEWEST, draw_scenes, quantiles
+from plow_twin.estimate.result import Estimate, Interval, State
+from plow_twin.model.geometry import penetration_rows, states_of
+from plow_twin.model.pairs import PAIR_COUNT
+from plow_twin.model.scene import DOF_NAMES, Clearance, Gravity, Scene, fastest_travel
+from plow_twin.run.batch import TwinBatch
+from plow_twin.run.twin import Twin
+from plow_twin.solve.state import FOLLOWED, ROW, WITH_INTERVALS
+from plow_twin.stream.outputs import clearances
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.void]
+
+#: Bound: seconds of motion that are kept for poses that are late, their delay included.
+LATEST_S: Final = 0.25
+#: Bound: least distance in s of what is kept of the motion.
+_PATH_S: Final = 2e-3
+#: Bound: outlying poses in a row after which they are used: the head has jumped, a single glitch does not last so long.
+_MOST_OUTLYING: Final = 5
+_THETA: Final = DOF_NAMES.index("theta")
+#: Derived: places of c, s, X, Y in the solver's state.
+_PLACES: Final = (5, 6, 0, 1)
+
+
+class Ensemble:
+    """Twins drawn from a prior or an estimate; the first has the middle value of each number.
+
+    Parameters
+    ----------
+    scene, known
+        The nominal scene; prior, with clearances of unworn pads, or estimate, with the present clearances.
+    members, rng, start, tol
+        Number of twins; generator of the random numbers; time in s of the scene's initial state; tolerance.
+    worn : ndarray, shape (8,)
+        Wear depth of the pads in m.
+    """
+
+    def __init__(
+        self, scene: Scene, known: Estimate, members: int, rng: np.random.Generator, start: float, tol: float,
+        worn: Array,
+    ) -> None:  # fmt: skip
+        scenes, gain = draw_scenes(scene, known, members, rng) if members > 1 else ([scene], np.ones((1, 3)))
+        scenes[0], gain[0] = middle_of(scene, known)
+        #: whether poses move the first member, whose numbers are those of an estimate; else its double, the second
+        self._steers_first = known.horizontal_state is not State.PRIOR
+        if not self._steers_first and members > 1:
+            scenes[1], gain[1] = scenes[0], gain[0]
+        #: wear of the pads at the beginning, and the part of the estimated clearances that is due to it, (2, 1)
+        self.worn_before, self.moved_before = worn, np.zeros((2, 1))
+        if scene.wear is not None:
+            states = (known.horizontal_state, known.vertical_state)
+            self.moved_before = np.where([[state.known] for state in states], widening(scene, worn)[:, None], 0.0)
+            scenes = [_worn(one, scene, worn, self.moved_before[:, 0]) for one in scenes]
+        #: the first member, by itself: its forces need not wait for the others
+        self.first = Twin(scenes[0], tol=tol, excitation="sampled", start=start)
+        self.others = TwinBatch(scenes[1:], tol=tol, start=start) if members > 1 else None
+        self._scene, self._gain, self._rng = scene, gain, rng
+        #: error of each member's load, N and N m, and time in s up to which it has drifted
+        self._load_off, self._drifted = np.zeros((members, 3)), start
+        self._walls = np.stack([penetration_rows(one) for one in scenes])
+        self._clearance = np.array([[one.clearance.horizontal_m, one.clearance.vertical_m] for one in scenes])
+        self._fastest = np.array([fastest_travel(one.wear, one.contact) for one in scenes])
+        self._stiffness, self._exponent = np.array([one.contact.stiffness for one in scenes]), scene.contact.exponent
+        self._pressed = tuning.PRESSED * scene.head.mass_kg * Gravity().acceleration_m_s2
+        self.good = np.ones(members, dtype=bool)
+        #: force, and peak and impulse since the span's beginning
+        self._sums = np.zeros((members, 3, PAIR_COUNT))
+        self._peak, self._impulse = self._sums[:, 1], self._sums[:, 2]
+        #: squares of each member's normalised innovations
+        self.square = np.zeros(members)
+        #: degrees of freedom that are not locked, and outlying poses in a row
+        self._free = np.array([name not in scene.locked for name in DOF_NAMES])
+        self.outlying = 0
+        #: times and poses (m, 3) of the newest seconds, oldest first; present rates (m, 3), wear and penetration (m, 8)
+        self._path: deque[tuple[float, Array]] = deque([(start, np.tile(np.array(scene.initial.q), (members, 1)))])
+        self._v, self.worn = np.tile(np.array(scene.initial.v), (members, 1)), np.tile(worn, (members, 1))
+        self._depth = self._penetration(self._path[-1][1])
+        #: the newest rows of all members, until `settle`
+        self._newest: Rows | None = None
+
+    @property
+    def moved(self) -> bool:
+        """Whether any pose has moved the members."""
+        return bool(self.square.any())
+
+    @property
+    def pose(self) -> Array:
+        """The present pose of each member, (m, 3)."""
+        return self._path[-1][1]
+
+    def set_travel_speed(self, speed_m_s: float) -> None:
+        """Set the speed along the face, of each member as far as its damping allows."""
+        speeds = np.minimum(speed_m_s, self._fastest)
+        self.first.set_travel_speed(float(speeds[0]))
+        if self.others is not None:
+            self.others.set_travel_speed(speeds[1:])
+
+    def advance_first(self, t: Array, wrench: Array, rows: Rows) -> int:
+        """Advance the first member and write its rows, shape (n,); return how many advances failed."""
+        failed, _ = self.first.advance_rows(t, wrench * self._gain[0] + self._load_off[0], rows)
+        rows["followed"] = FOLLOWED
+        return failed
+
+    def advance_others(
+        self, t: Array, wrench: Array, rows: Rows, wanted: NDArray[np.bool_], ends: NDArray[np.bool_]
+    ) -> None:
+        """Advance the other members to the time of the first, whose rows are given; write intervals to those `wanted`.
+
+        A span of peaks and impulses ends with each of `ends`.
+        """
+        parts = [_bytes(rows[None])]
+        if self.others is not None:
+            loads = wrench * self._gain[1:, None, :] + self._load_off[1:, None, :]
+            parts.append(_bytes(self.others.advance_samples(t, loads).rows))
+        whole = np.concatenate(parts).view(ROW)
+        good = whole["status"] == 0
+        if len(self.good) == 1:
+            self.good[:] = True
+        for place, (now, is_wanted, is_end) in enumerate(zip(t.tolist(), wanted.tolist(), ends.tolist(), strict=True)):
+            self.good &= good[:, place]
+            np.maximum(self._peak, whole["peak"][:, place], out=self._peak)
+            self._impulse += whole["impulse"][:, place]
+            if is_wanted:
+                self._sums[:, 0] = whole["force"][:, place]
+                self._add_intervals(rows[place : place + 1])
+            if is_end:
+                self.begin_span()
+            self._remember(now, whole["q"][:, place].copy())
+        self._newest = whole[:, -1]
+
+    def settle(self) -> None:
+        """Copy rates, wear and penetration from the newest rows, which few samples need."""
+        rows, self._newest = self._newest, None
+        if rows is not None:
+            self._v, self.worn, self._depth = rows["v"].copy(), rows["wear_depth"].copy(), rows["penetration"].copy()
+
+    def _remember(self, now: float, q: Array) -> None:
+        path = self._path
+        if len(path) > 1 and path[-1][0] - path[-2][0] < _PATH_S:
+            path.pop()
+        path.append((now, q))
+        while path[1][0] <= now - LATEST_S:
+            path.popleft()
+
+    def _add_intervals(self, row: Rows) -> None:
+        """Write the intervals of forces, peaks and impulses."""
+        _, low, high = self._points(self._sums)
+        for index, name in enumerate(("force", "peak", "impulse")):
+            row[f"{name}_low"], row[f"{name}_high"] = low[index], high[index]
+        if np.isfinite(low.sum() + high.sum()):
+            row["followed"] = WITH_INTERVALS
+
+    def held(self, t: float, row: Rows) -> None:
+        """Write the row of a later time under the newest sample; the state stays."""
+        before = self.twins()
+        row[:] = self.first.advance(t).rows
+        self._sums[0, 0] = row["force"][0]
+        if self.others is not None:
+            self._sums[1:, 0] = self.others.advance(t).force[:, 0]
+        self.set_twins(before)
+        self._add_intervals(row)
+
+    def begin_span(self) -> None:
+        """Let peaks and impulses begin here."""
+        self._peak[:], self._impulse[:] = 0.0, 0.0
+
+    def span(self) -> tuple[Array, Array]:
+        """Return peaks and impulses since the span's begin: of the first member and the points, (3, 8) each."""
+        return np.stack(self._points(self._peak)), np.stack(self._points(self._impulse))
+
+    def _points(self, values: Array) -> tuple[Array, Array, Array]:
+        """Return the first member's values, and the 5 % and 95 % points over the members that are in range."""
+        low, _, high = quantiles(values if self.good.all() else values[self._used()])
+        return values[0].copy(), np.minimum(low, values[0]), np.maximum(high, values[0])
+
+    def _used(self) -> NDArray[np.bool_]:
+        """Return which members determine intervals: those in the model's range, or all without such members."""
+        return self.good if self.good.any() else np.ones(len(self.good), dtype=bool)
+
+    def clearance(self) -> Array:
+        """Return the clearances of unworn pads with their 5 % and 95 % points, (2, 3), weighted by the likelihoods.
+
+        The likelihoods of the members are tempered until enough of them carry the interval.
+        """
+        use = self._used()
+        excess = np.clip(self.square - self.square[use].min(), 0.0, 1e9)
+        low, high = 0.0, 1.0
+        for _ in range(40):
+            share = 0.5 * (low + high)
+            weight = np.where(use, np.exp(-0.5 * share * excess), 0.0)
+            enough = weight.sum() ** 2 > FEWEST * (weight**2).sum()
+            low, high = (share, high) if enough else (low, share)
+        weight = np.where(use, np.exp(-0.5 * low * excess), 0.0)
+        out = np.zeros((2, 3))
+        for axis, values in enumerate(self._clearance.T):
+            order = np.argsort(values)
+            share = np.cumsum(weight[order]) / weight.sum()
+            out[axis] = values[order[np.searchsorted(share, [0.5, 0.05, 0.95]).clip(0, len(order) - 1)]]
+        return out
+
+    def stand_like(self, before: Ensemble, wrench: Array) -> None:
+        """Take the places, in shares of the clearances, and the sums of other members under a load.
+
+        The first member of an estimate takes the place of a prior's second, which the poses have moved; the second
+        member of a prior takes that of an estimate's first.
+        """
+        before.settle()
+        from_ = np.where(before.good, np.arange(len(before.good)), int(np.argmax(before.good)))[: len(self.good)]
+        if self._steers_first and not before._steers_first and len(before.good) > 1 and before.good[1]:
+            from_[0] = 1
+        if before._steers_first and not self._steers_first and before.good[0]:
+            from_[1:2] = 0
+        share = self._shares(before._room()[from_])
+        self._load_off = before._load_off[from_]
+        loads = wrench * self._gain + self._load_off
+        self.first.advance(self.first.time, loads[0])
+        if self.others is not None:
+            self.others.set_wrench(loads[1:])
+        self._path = deque((t, q[from_] * share) for t, q in before._path)
+        self._sums[1:], self._sums[0] = before._sums[from_[1:]], before._sums[0]
+        self._stand(self._path[-1][1], before._v[from_], before._force(before._depth)[from_])
+
+    def stand_about(self, q: Array, v: Array) -> None:
+        """Put the first member to a pose, the others to the same shares of their clearances."""
+        places = q * self._shares(np.broadcast_to(self._room()[0], (len(self.good), 3)))
+        force = self._force(self._penetration(places))[:1]
+        self._stand(places, np.tile(v, (len(places), 1)), force)
+
+    def _room(self) -> Array:
+        """Return the room of the head, horizontally, vertically, and at its corners, shape (m, 3); 1 if locked."""
+        room = np.column_stack([self._clearance, self._clearance.min(axis=1)])
+        return np.where(self._free, room, 1.0)
+
+    def _shares(self, room: Array) -> Array:
+        """Return the room of each member over another room, shape (m, 3)."""
+        return np.divide(self._room(), room, out=np.ones_like(room), where=room > 0.0)
+
+    def _stand(self, q: Array, v: Array, force: Array, which: NDArray[np.int64] | None = None) -> None:
+        """Put members to poses, or nearer to the middle where a pair would be pressed by more than a force, (m, 8)."""
+        low, high = np.zeros(len(q)), np.ones(len(q))
+        free = self._allowed(q, force)
+        low[free] = 1.0
+        for _ in range(40) if not free.all() else ():
+            share = 0.5 * (low + high)
+            allowed = self._allowed(self._nearer(q, share), force)
+            low, high = np.where(allowed, share, low), np.where(allowed, high, share)
+        which = np.arange(len(q)) if which is None else which
+        self._put(which, self._nearer(q, low)[which], v[which])
+
+    def _nearer(self, q: Array, share: Array) -> Array:
+        """Return poses nearer to the middle, as far as the head is free to move."""
+        return np.where(self._free, share[:, None] * q, q)
+
+    def correct(self, t: float, q: Array, noise: Array, load_error: Array) -> bool:
+        """Move the members toward a pose measured at `t`, by their covariance with it; return whether it was used.
+
+        Their loads err by `load_error`, N and N m, shape (3,), and the pose corrects these errors too. A pose that is
+        too late is not used, nor is an outlier unless several come in a row.
+        """
+        self.settle()
+        there = np.flatnonzero(np.isfinite(q) & self._free)
+        times = [time for time, _ in self._path]
+        if t <= times[0] or not len(there):
+            return False
+        after = min(bisect_left(times, t), len(times) - 1)
+        path = np.stack([self._path[index][1] for index in range(after - 1, len(times))])
+        share = min((t - times[after - 1]) / (times[after] - times[after - 1]), 1.0)
+        then = ((1.0 - share) * path[0] + share * path[1])[:, there]
+        self._drift(load_error)
+        state = np.concatenate([self._v, *path, self._load_off], axis=1)
+        use = self._used()
+        if not self._steers_first and use[1:].any():
+            use = use & (np.arange(len(use)) > 0)
+        about, seen = state - state[use].mean(axis=0), then - then[use].mean(axis=0)
+        freedom = max(int(use.sum()) - 1, 1)
+        scatter = seen[use].T @ seen[use] / freedom + np.diag(noise[there] ** 2)
+        center = _off(q, then[use].mean(axis=0), there)
+        if (np.abs(center) <= tuning.OUTLYING * np.sqrt(np.diag(scatter))).all():
+            self.outlying = 0
+        else:
+            self.outlying += 1
+            if self.outlying <= _MOST_OUTLYING:
+                return False
+        white = self._rng.standard_normal((len(then), len(there)))
+        white[0] = 0.0
+        off = _off(q, then, there)
+        # bounded, so that one bad pose does not outweigh all others
+        most = tuning.OUTLYING * noise[there]
+        self.square += ((off.clip(-most, most) / noise[there]) ** 2).sum(axis=1)
+        weight = np.linalg.solve(scatter, seen[use].T @ about[use] / freedom)
+        weight[:, ~np.tile(self._free, len(path) + 2)] = 0.0
+        moved = state + (off + noise[there] * white) @ weight
+        v, places = moved[:, :3], moved[:, 3:-3].reshape(len(moved), -1, 3).transpose(1, 0, 2)
+        allowed = np.flatnonzero(self._allowed(places[-1], self._force(self._depth)))
+        allowed = allowed[allowed >= 1 - self._steers_first]
+        for place, index in enumerate(range(after - 1, len(times))):
+            self._path[index][1][allowed] = places[place, allowed]
+        self._load_off[allowed] = moved[allowed, -3:]
+        self._put(allowed, places[-1, allowed], v[allowed])
+        self._recover()
+        return True
+
+    def _drift(self, load_error: Array) -> None:
+        """Let the errors of the loads drift as Ornstein-Uhlenbeck processes, that of the first without noise."""
+        now, before = self.first.time, self._drifted
+        self._drifted = now
+        if load_error.any() or self._load_off.any():
+            kept = math.exp(-(now - before) / tuning.LOAD_ERROR_LASTS)
+            white = self._rng.standard_normal(self._load_off.shape)
+            white[0] = 0.0
+            self._load_off = kept * self._load_off + math.sqrt(1.0 - kept**2) * load_error * white
+
+    def _recover(self) -> None:
+        """Put members that have left the model's range to the places of others; leave them if all have left."""
+        lost, left = np.flatnonzero(~self.good), np.flatnonzero(self.good)
+        self.good[:] = True
+        if not len(lost) or not len(left):
+            return
+        from_ = np.arange(len(self.good))
+        from_[lost] = np.resize(left, len(lost))
+        share = self._shares(self._room()[from_])
+        self._path = deque((t, q[from_] * share) for t, q in self._path)
+        self._stand(self._path[-1][1], self._v[from_], self._force(self._depth)[from_], lost)
+
+    def _force(self, depth: Array) -> Array:
+        """Return the elastic force of each pair, (m, 8)."""
+        found: Array = self._stiffness[:, None] * np.maximum(depth, 0.0) ** self._exponent
+        return found
+
+    def _allowed(self, q: Array, force: Array) -> NDArray[np.bool_]:
+        """Return which members may be put to poses (m, 3): no pair is pressed by much more than a force, (m, 8)."""
+        return np.asarray((self._force(self._penetration(q)) < force + self._pressed).all(axis=1))
+
+    def _put(self, which: NDArray[np.int64], q: Array, v: Array) -> None:
+        for place in np.flatnonzero(which == 0):
+            self.first.move(q[place], v[place])
+        rest = which > 0
+        if self.others is not None and rest.any():
+            self.others.move(which[rest] - 1, q[rest], v[rest])
+        self._path[-1][1][which], self._v[which] = q, v
+        self._depth = self._penetration(self._path[-1][1])
+
+    def _penetration(self, q: Array) -> Array:
+        """Return the penetration of each pair in m, (m, 8), with each member's clearances at poses of shape (m, 3)."""
+        state = states_of(self._scene, np.concatenate([q, np.zeros_like(q)], axis=1))
+        body = np.concatenate([state[:, _PLACES], np.ones((len(q), 1))], axis=1)
+        found: Array = np.einsum("mi,mij->mj", body, self._walls) - self.worn
+        return found
+
+    def twins(self) -> list[bytes]:
+        """Return the exact states of the twins: of the first, and of the others."""
+        return [self.first.snapshot(), b"" if self.others is None else self.others.snapshot()]
+
+    def set_twins(self, states: Sequence[bytes]) -> None:
+        """Restore the states that `twins` returned."""
+        self.first.restore(states[0])
+        if self.others is not None:
+            self.others.restore(states[1])
+
+    def state(self) -> tuple[list[bytes], Any]:
+        """Return the whole state, as bytes and as JSON."""
+        self.settle()
+        times, path = np.array([time for time, _ in self._path]), np.stack([q for _, q in self._path])
+        wide = (self._peak, self._impulse, self._v, self.worn, self._depth, self._load_off)
+        arrays = (self.good, self.square, *wide, np.array([self._drifted]), times, path)
+        return [*self.twins(), *(one.tobytes() for one in arrays)], self._rng.bit_generator.state
+
+    def set_state(self, blobs: list[bytes], random: Any) -> None:
+        """Restore a state that `state` returned."""
+        self.set_twins(blobs[:2])
+        self.good = np.frombuffer(blobs[2], np.bool_).copy()
+        count = len(self.good)
+        self.square, *wide, drifted, times, path = (np.frombuffer(blob).copy() for blob in blobs[3:])
+        own = [one.reshape(count, -1) for one in wide]
+        self._peak[:], self._impulse[:], self._v, self.worn, self._depth, self._load_off = own
+        self._drifted = float(drifted[0])
+        self._newest = None
+        self._path = deque(zip(times.tolist(), path.reshape(-1, count, 3), strict=True))
+        self._rng.bit_generator.state = random
+
+
+def _bytes(rows: Rows) -> NDArray[np.uint8]:
+    """Return rows (m, n) as bytes: numpy copies a record field by field."""
+    found: NDArray[np.uint8] = np.ascontiguousarray(rows).view(np.uint8)
+    return found
+
+
+def _off(q: Array, then: Array, there: NDArray[np.int64]) -> Array:
+    """Return by how much a pose differs from others (..., k) in the coordinates `there`; angles up to full turns."""
+    off: Array = q[there] - then
+    turn = there == _THETA
+    off[..., turn] = np.remainder(off[..., turn] + np.pi, 2.0 * np.pi) - np.pi
+    return off
+
+
+def _worn(one: Scene, scene: Scene, worn: Array, moved: Array) -> Scene:
+    """Return a member's scene with worn pads; the wear accounts for `moved` (2,) of its clearances."""
+    assert scene.wear is not None
+    depths = tuple(worn.tolist())
+    horizontal, vertical = one.clearance.horizontal_m - moved[0], one.clearance.vertical_m - moved[1]
+    clearance = Clearance(max(float(horizontal), 0.0), max(float(vertical), 0.0))
+    return replace(one, clearance=clearance, wear=replace(scene.wear, initial_depth_m=depths))
+
+
+def widening(scene: Scene, worn: Array) -> Array:
+    """Return by how much pads that are worn by `worn` (..., 8) widen the clearances in m, shape (..., 2)."""
+    own = np.array([scene.clearance.horizontal_m, scene.clearance.vertical_m])
+    found: Array = clearances(scene, worn)[..., :2] - own
+    return found
+
+
+def middle_of(scene: Scene, known: Estimate) -> tuple[Scene, Array]:
+    """Return the scene and the gains of the load, shape (3,), with the middle values of an estimate."""
+    if known.horizontal_state is State.PRIOR:
+        return replace(scene, loads=(), wear=None), np.ones(3)
+
+    def point(value: Interval) -> Interval:
+        return Interval(value.mean, value.mean, value.mean)
+
+    middle = replace(
+        known,
+        apparent=None,
+        horizontal=point(known.horizontal),
+        vertical=point(known.vertical),
+        stiffness=point(known.stiffness),
+        damping=known.damping and point(known.damping),
+        gain_fx=known.gain_fx and point(known.gain_fx),
+        gain_fy=known.gain_fy and point(known.gain_fy),
+        gain_m=known.gain_m and point(known.gain_m),
+    )
+    scenes, gain = draw_scenes(scene, middle, 1, np.random.default_rng(0))
+    return scenes[0], gain[0]
