@@ -95,10 +95,12 @@ def test_the_files_that_come_first_exist() -> None:
 
 
 def test_ci_is_bounded_and_runs_every_check() -> None:
-    steps = re.findall(r'^step "([^"]+)" (\d+) make (.+)', (ROOT / ".ci" / "run").read_text(), re.MULTILINE)
+    program = (ROOT / ".ci" / "run").read_text()
+    steps = re.findall(r'^step "([^"]+)" (\d+) (?:env \S+ )?make (.+)', program, re.MULTILINE)
     assert sum(int(limit) for _, limit, _ in steps) <= 4200
     targets = {word for _, _, given in steps for word in given.split()}
-    assert targets >= {"test", "coverage", "lint", "docs", "demo", "lowest"}
+    # coverage has no required minimum: it is a figure, not a check
+    assert targets >= {"test", "lint", "docs", "demo", "lowest"}
     assert "test_stream_session.py" in dry_run("coverage") and "--cov" not in dry_run("test")
     lowest = dry_run("lowest")
     assert all(name in lowest for name in ("test_solve_reference.py", "test_record_file.py", "test_ros_lifecycle.py"))
