@@ -8,6 +8,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+from plow_twin.kernel.polynomial import to_bernstein
+from plow_twin.model.contact import power_term
+from plow_twin.solve.loop import integrate
+from plow_twin.solve.method.series import expand
+
 ROOT = Path(__file__).resolve().parent.parent
 SOURCES = (
     "plow_twin",
@@ -71,6 +76,18 @@ def install(python: Path, *requirements: str) -> None:
     """Install into an environment at the locked versions."""
     pip = ("-m", "pip", "install", "--quiet", "--no-compile", "-c", ROOT / "requirements" / "constraints.txt")
     run(python, *pip, *requirements, cwd=python.parent)
+
+
+def lend_kernels(python: Path) -> None:
+    """Copy what the tree has compiled beside the sources that an environment has installed.
+
+    The kernels are used if sources and versions are the same, and compiled otherwise.
+    """
+    (package,) = python.parent.parent.glob("lib/python*/site-packages/plow_twin")
+    for kernel in (to_bernstein, power_term, integrate, expand):
+        folder = package / Path(kernel.py_func.__code__.co_filename).parent.relative_to(ROOT / "plow_twin")
+        kept = shutil.ignore_patterns("*.py[co]")
+        shutil.copytree(kernel.stats.cache_path, folder / "__pycache__", ignore=kept, dirs_exist_ok=True)
 
 
 def build_wheel(folder: Path) -> Path:

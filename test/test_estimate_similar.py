@@ -9,7 +9,7 @@ import pytest
 from estimate_support import known
 from scenes import preset
 
-from plow_twin import Friction, Initial, simulate
+from plow_twin import Friction, Harmonic, Initial, simulate
 from plow_twin.estimate.estimate import estimate
 from plow_twin.estimate.forces import draw_scenes
 from plow_twin.estimate.similar import Units
@@ -37,9 +37,13 @@ def test_a_machine_of_another_size_is_estimated_as_one_of_the_paper_s_size() -> 
 @pytest.mark.parametrize("friction", [Friction(0.2, 0.02), Friction(0.3, stick_stiffness_n_m=5e7)])
 def test_a_scene_in_other_units_moves_alike(friction: Friction) -> None:
     thrown = Initial((1e-3, 0.0, 1e-3), (0.4, 0.3, 0.5))
-    scene = replace(preset("bench_kv"), friction=friction, initial=thrown, loads=())
-    units = Units(8.0, 1024.0, 4.0)
-    run, other = simulate(scene, 0.4, 0.01, 1e-9), simulate(units.scene(scene), 0.1, 0.0025, 1e-9)
+    units, scene = Units(8.0, 1024.0, 4.0), replace(preset("bench_kv"), friction=friction, initial=thrown)
+    # a load that moves nothing, and the balance, have the kernels of other tests used again
+    nothing, balance = (Harmonic("nothing to speak of", (1e-9, 0.0), 2.0),), friction.stick_stiffness_n_m is not None
+    run, other = (
+        simulate(replace(one, loads=nothing), span, span / 40.0, 1e-9, energy_balance=balance)
+        for one, span in ((scene, 0.4), (units.scene(scene), 0.1))
+    )
     assert np.ptp(run.q, axis=0).min() > 1e-3
     assert other.q * [8.0, 8.0, 1.0] == pytest.approx(run.q, rel=1e-6, abs=1e-9)
     assert other.force * units.force == pytest.approx(run.force, rel=1e-6, abs=1e-3)

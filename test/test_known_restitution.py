@@ -123,10 +123,12 @@ def test_the_page_shows_the_results_of_the_solver() -> None:
     tables = (restitution.page_table, restitution.laws_table, restitution.ratio_table, restitution.ramp_table)
     for line in (line for table in tables for line in table(rows)):
         assert f"{line}\n" in page, line
-    for law in ("zhiying_qishao", "kelvin_voigt", "hertz"):
+    # damped, as in the tests above: without damping the kernels are others, and each law returns 1
+    for law in ("zhiying_qishao", "kelvin_voigt"):
         stored = {row.asked: row.delivered for row in rows if row.law == law}
-        for again in restitution.measure(law, list(stored)[::10]):
+        for again in restitution.measure(law, list(stored)[5:-1:10]):
             assert stored[again.asked] == pytest.approx(again.delivered, abs=2e-9)
+    assert {row.delivered for row in rows if row.law == "hertz"} == {1.0}
     for row in [row for row in rows if row.law == "ramped_damping"][::9]:
         (again,) = restitution.measure(row.law, [row.asked], row.ramp)
         assert row.delivered == pytest.approx(again.delivered, abs=2e-9)

@@ -6,6 +6,7 @@ import ast
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -102,12 +103,19 @@ def _modules() -> list[Path]:
     return sorted(PACKAGE.rglob("*.py"))
 
 
+@cache
+def _statements(path: Path) -> list[ast.Import | ast.ImportFrom]:
+    """Return every import of a file, lazy imports included."""
+    nodes = ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+    return [node for node in nodes if isinstance(node, (ast.Import, ast.ImportFrom))]
+
+
 def _imports(path: Path) -> Iterator[str]:
-    """Yield the full name of every import, lazy imports included."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    """Yield the full name of every import."""
+    for node in _statements(path):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
+        else:
             assert node.level == 0, f"{path}: a relative import"
             if node.module == "plow_twin":
                 yield from (f"plow_twin.{alias.name}" for alias in node.names)
@@ -141,11 +149,10 @@ def _module_name(path: Path) -> str:
 def _module_imports(path: Path, modules: set[str]) -> set[str]:
     """Return the package's modules that one imports: lazily and for the type checker too."""
     found = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        names = []
+    for node in _statements(path):
         if isinstance(node, ast.Import):
             names = [[alias.name] for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
+        else:
             # `from folder import module` or `from module import name`
             names = [[f"{node.module}.{alias.name}", node.module or ""] for alias in node.names]
         found |= {
@@ -176,8 +183,8 @@ def test_the_cache_stamp_and_the_build_fingerprint_cover_every_kernel() -> None:
 
 
 def _imported_names(path: Path) -> set[str]:
-    nodes = ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-    return {f"{node.module}.{alias.name}" for node in nodes if isinstance(node, ast.ImportFrom) for alias in node.names}
+    nodes = (node for node in _statements(path) if isinstance(node, ast.ImportFrom))
+    return {f"{node.module}.{alias.name}" for node in nodes for alias in node.names}
 
 
 @pytest.mark.parametrize(

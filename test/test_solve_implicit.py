@@ -116,12 +116,15 @@ def test_the_tolerance_holds_however_loose_it_is(damping: float) -> None:
 
 
 def test_growth_while_dampers_hold_the_head_is_reported() -> None:
-    """A rest on two corners 1e-8 m deep amplifies rounding errors, for less time than the rest lasts."""
+    """A rest on two corners 1e-8 m deep amplifies rounding errors, for less time than the rest lasts.
+
+    The energy balance has the kernels of `test_implicit_and_explicit_steps_agree` used again.
+    """
     scene = replace(BENCH, contact=overdamped("kelvin_voigt", 1e11), friction=Friction(0.2, 0.02))
     with pytest.warns(ToleranceWarning, match=r"an error grows \S+ times"):
-        found = simulate(scene, 1.77, output_dt=0.01, sensitivity=True)
+        found = simulate(scene, 1.77, output_dt=0.01, sensitivity=True, energy_balance=True)
     assert found.sensitivity is not None and 1e4 < found.sensitivity.growth[-1] < 1e6
-    exact = simulate(scene, 1.77, output_dt=0.01, tol=1e-12)
+    exact = simulate(scene, 1.77, output_dt=0.01, tol=1e-12, energy_balance=True)
     assert 10.0 < pose_error(scene, found.q, exact.q) / 1e-9 < found.sensitivity.growth[-1]
 
 

@@ -22,6 +22,7 @@ from plow_twin.model.geometry import length_scale
 from plow_twin.model.loads import compile_loads
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.run.advance import Advance
+from plow_twin.solve.compiled_scene import compile_scene
 
 #: Steps that a request may take; a longer one ends with its status.
 BUDGET = 20_000
@@ -230,6 +231,12 @@ def check_energy(
         assert (abs(gain) <= slack).all(), (abs(gain).max() / scale, case.tol)
 
 
+def swings(case: Case) -> bool:
+    """Return whether the harmonics of a case, if there are any, are too large for a rest."""
+    terms = compile_scene(case.scene, case.tol).parts.terms
+    return terms.harmonics is None or terms.rest is None
+
+
 def search(structure: str, examples: int) -> None:
     """Check many scenes of one structure; most of them must really have been solved."""
     ended: Counter[Status] = Counter()
@@ -238,8 +245,11 @@ def search(structure: str, examples: int) -> None:
     shrinking = settings.get_current_profile_name() == "stress"
     phases = [Phase.generate, Phase.shrink] if shrinking else [Phase.generate]
 
+    # a harmonic so small that the head may rest compiles kernels of its own: left to the full count
+    drawn = cases(structure) if shrinking else cases(structure).filter(swings)
+
     @settings(max_examples=examples, phases=phases, suppress_health_check=list(HealthCheck))
-    @given(cases(structure))
+    @given(drawn)
     def every_scene_is_solved_or_named(case: Case) -> None:
         ended[check(case)] += 1
 
