@@ -92,8 +92,8 @@ def _load_facts(scene: Scene) -> Iterator[Fact]:
             yield _fact(f"{load.name}: last time", float(load.t[-1]), "s")
             continue
         (fx, fy), (x, y) = load.force_n, load.at_m
-        what = "amplitude of the moment" if isinstance(load, Harmonic) else "moment"
-        yield _fact(f"{load.name}: {what}", x * fy - y * fx + load.moment_n_m, "N m")
+        quantity = "amplitude of the moment" if isinstance(load, Harmonic) else "moment"
+        yield _fact(f"{load.name}: {quantity}", x * fy - y * fx + load.moment_n_m, "N m")
 
 
 def _fact(quantity: str, value: float, unit: str) -> Fact:

@@ -106,7 +106,7 @@ def listening(access: PageAccess) -> socket.socket:
     Raises
     ------
     DashboardError
-        It is taken, or not one of this machine.
+        The address is in use, or belongs to another machine.
     """
     try:
         family, kind, _, _, address = socket.getaddrinfo(access.host, access.port, type=socket.SOCK_STREAM)[0]

@@ -253,12 +253,12 @@ class Feed:
             self._loads = []
 
     def _do(self, asked: dict[str, Any]) -> None:
-        what, text = str(asked.get("do")), str(asked.get("text", ""))
-        if self._answer is None or what not in ("acknowledge", "mark"):
-            self.event(what, "not possible here", done=False)
+        action, text = str(asked.get("do")), str(asked.get("text", ""))
+        if self._answer is None or action not in ("acknowledge", "mark"):
+            self.event(action, "not possible here", done=False)
             return
-        done, said = self._answer(what, text)
-        self.event(what, f"{text}: {said}" if text else said, done=done)
+        done, said = self._answer(action, text)
+        self.event(action, f"{text}: {said}" if text else said, done=done)
 
 
 def _joined(rows: list[NDArray[np.void]], name: str) -> NDArray[Any]:
@@ -266,7 +266,7 @@ def _joined(rows: list[NDArray[np.void]], name: str) -> NDArray[Any]:
 
 
 def part_of(message: Message) -> Part:
-    """Return a status or named numbers as they are shown; of forces their peaks."""
+    """Return a status or named numbers in the form of the page; forces as their peaks."""
     if isinstance(message, DiagnosticStatus):
         return message.level, message.message, dict(message.values)
     if not isinstance(message, JointState):

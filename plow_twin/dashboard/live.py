@@ -19,8 +19,8 @@ def open_screen(front: BridgeFront, access: PageAccess, source: str) -> Screen:
     runtime = front.runtime
     services = Services(runtime, front.changed)
 
-    def answer(what: str, text: str) -> tuple[bool, str]:
-        return services.acknowledge_alarms() if what == "acknowledge" else services.mark(text)
+    def answer(action: str, text: str) -> tuple[bool, str]:
+        return services.acknowledge_alarms() if action == "acknowledge" else services.mark(text)
 
     facts = facts_of(runtime.scene, asdict(runtime.settings), source)
     load = (lambda: runtime.driver.session.twin.wrench) if facts["loads"] else None

@@ -45,7 +45,7 @@ _SHOWN: Final = (
 )  # fmt: skip
 #: How long a service may take to answer [s].
 _PATIENCE_S: Final = 5.0
-#: Depth of a topic of which only the newest message counts, and of one of which each counts.
+#: Queue depth of topics whose newest message alone counts, and of topics whose messages all count.
 _NEWEST, _ALL = 1, 1000
 
 
@@ -119,9 +119,9 @@ class NodeWatch:
             self.node.create_subscription(WrenchStamped, "excitation", self._load, sensor_input(_ALL), raw=True)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._diagnostics, DIAGNOSTICS)
 
-    def answer(self, what: str, text: str) -> tuple[bool, str]:
+    def answer(self, action: str, text: str) -> tuple[bool, str]:
         """Call the service that an operator asks for."""
-        service = "acknowledge_alarms" if what == "acknowledge" else "mark"
+        service = "acknowledge_alarms" if action == "acknowledge" else "mark"
         if service == "mark":
             value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=text)
             self._called(self._set, SetParameters.Request(parameters=[Parameter(name="mark", value=value)]))
@@ -188,8 +188,8 @@ class NodeWatch:
             name, _, part = status.name.partition(": ")
             if name == self.name:
                 values = {found.key: found.value for found in status.values}
-                told: Part = (int.from_bytes(status.level, "little"), status.message, values)
-                self.feed.part(part, told)
+                known: Part = (int.from_bytes(status.level, "little"), status.message, values)
+                self.feed.part(part, known)
 
 
 @contextmanager

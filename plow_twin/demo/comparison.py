@@ -56,8 +56,8 @@ def compare_forces(run: Path, wider_m: float) -> Comparison | None:
         Excess of the machine's clearances over the scene's in m.
     """
     reader = RunReader(run)
-    stamps, wrench, told, estimates = _read(reader)
-    if not len(stamps) or not told:
+    stamps, wrench, published, estimates = _read(reader)
+    if not len(stamps) or not published:
         return None
     scene = reader.header.scene(reader.path)
     clearance = replace(
@@ -71,8 +71,8 @@ def compare_forces(run: Path, wider_m: float) -> Comparison | None:
         for name, one in (("nominal", scene), ("true", replace(scene, clearance=clearance)))
     }
     late = times >= times[-1] - COMPARED_S
-    here = np.flatnonzero(late & np.isin(stamps, np.fromiter(told, np.int64)))
-    followed = np.array([told[stamp] for stamp in stamps[here].tolist()])
+    here = np.flatnonzero(late & np.isin(stamps, np.fromiter(published, np.int64)))
+    followed = np.array([published[stamp] for stamp in stamps[here].tolist()])
     true = motions["true"].force[here]
     peaks = {name: motion.peak[late].max(axis=0) for name, motion in motions.items()}
     size = float(np.sqrt((true**2).mean()))
@@ -91,7 +91,7 @@ def _motion(scene: Scene, times: Array, wrench: Array) -> AdvanceSeries:
 def _read(reader: RunReader) -> tuple[NDArray[np.int64], Array, dict[int, Array], list[int]]:
     """Return stamps [ns] and wrenches of the samples, the published forces by stamp, and when estimates came [ns]."""
     topic = reader.header.topic("contact_forces")
-    stamps, wrench, told, estimates = [], [], {}, []
+    stamps, wrench, published, estimates = [], [], {}, []
     for batch in reader.batches():
         there = np.flatnonzero(batch.entries.sample)
         stamps.append(batch.entries.stamp_ns[there])
@@ -105,5 +105,5 @@ def _read(reader: RunReader) -> tuple[NDArray[np.int64], Array, dict[int, Array]
                 if isinstance(record, OutputRecord) and record.topic == topic:
                     message = record.message()
                     if isinstance(message, JointState):
-                        told[message.stamp_ns] = message.effort
-    return np.concatenate(stamps), np.concatenate(wrench), told, estimates
+                        published[message.stamp_ns] = message.effort
+    return np.concatenate(stamps), np.concatenate(wrench), published, estimates

@@ -311,8 +311,8 @@ def with_estimate(scene: Scene, facts: Mapping[str, Any]) -> tuple[Scene, tuple[
     if not isinstance(facts, Mapping):
         raise LifeError(f"estimate: got {type(facts).__name__}, expected what `plow-twin estimate --json` prints")
     horizontal, vertical = (_estimated(name, facts.get(name)) for name in ("horizontal", "vertical"))
-    told = any(State(facts[name]["state"]).known for name in ("horizontal", "vertical"))
-    if told and "stiffness" in facts:
+    known = any(State(facts[name]["state"]).known for name in ("horizontal", "vertical"))
+    if known and "stiffness" in facts:
         damping = _mean("damping", facts["damping"]) if "damping" in facts else None
         scene = replace(scene, contact=contact_with(scene.contact, _mean("stiffness", facts["stiffness"]), damping))
     return with_clearances(scene, horizontal[0], vertical[0]), (horizontal[1], vertical[1])

@@ -341,9 +341,9 @@ def believed(stated: Deviation, q: Array, own: Array) -> tuple[Array, Deviation]
     return np.where(worse, np.nan, q), (x, y, theta)
 
 
-def _check_deviation(what: str, deviation: Deviation) -> None:
+def _check_deviation(name: str, deviation: Deviation) -> None:
     if len(deviation) != 3 or not all(0.0 <= value < math.inf for value in deviation):
-        raise EstimateError(f"{what}: got the deviations {deviation}, expected three finite ones >= 0")
+        raise EstimateError(f"{name}: got the deviations {deviation}, expected three finite ones >= 0")
 
 
 def _in_order(times: Array, usable: Any) -> NDArray[np.int64]:

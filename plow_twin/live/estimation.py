@@ -49,8 +49,8 @@ class Estimation:
         windows = Windows(*span, settings.head_pose_deviation, settings.excitation_deviation, settings.gaps_deviation)
         asked = asked_of(settings)
         self._worker = Worker(scene, windows, asked)
-        told = {ESTIMATE: True, WINDOW_FORCES: bool(asked.members), FORECAST: asked.plan is not None}
-        self._topics = [topic for topic, wanted in told.items() if wanted]
+        sent = {ESTIMATE: True, WINDOW_FORCES: bool(asked.members), FORECAST: asked.plan is not None}
+        self._topics = [topic for topic, wanted in sent.items() if wanted]
         #: when other pads were set, until an empty message has been sent [ns]
         self._set_ns: int | None = None
         #: where the clearances come from, and whether model and sensor can be trusted, as of the newest estimate
@@ -132,8 +132,8 @@ class Estimation:
         found = self._worker.poll()
         stamp_ns, self._set_ns = self._set_ns, None
         if found is None:
-            told = self._topics if stamp_ns is not None else ()
-            return {topic: plain.JointState(stamp_ns or 0, self._frame_id, ()) for topic in told}
+            topics = self._topics if stamp_ns is not None else ()
+            return {topic: plain.JointState(stamp_ns or 0, self._frame_id, ()) for topic in topics}
         self.count += 1
         self.skipped += found.skipped
         self.wall_s, self.end_ns = found.wall_s, found.end_ns
@@ -199,11 +199,11 @@ def forces_message(found: Found, frame_id: str) -> plain.JointState:
     names: list[str] = []
     peaks: list[float] = []
     impulses: list[float] = []
-    for pair, told in ((found.also["forces"] or {}).get("pairs", {})).items():
+    for pair, forces in ((found.also["forces"] or {}).get("pairs", {})).items():
         for suffix, point in (("", "p50"), ("/p05", "p05"), ("/p95", "p95")):
             names.append(f"{pair}{suffix}")
-            peaks.append(told["peak_n"][point])
-            impulses.append(told["impulse_n_s"][point])
+            peaks.append(forces["peak_n"][point])
+            impulses.append(forces["impulse_n_s"][point])
     numbers = {"velocity": np.array(impulses), "effort": np.array(peaks)}
     return plain.JointState(found.end_ns, frame_id, tuple(names), **numbers)
 
@@ -213,19 +213,19 @@ def forecast_message(found: Found, frame_id: str) -> plain.JointState:
 
     Limits that are not reached within the horizon are left out.
     """
-    told = found.also["forecast"] or {}
+    forecast = found.also["forecast"] or {}
     names: list[str] = []
     numbers: list[float] = []
     for point in ("p10", "p50", "p90"):
         for key, factor in (("hours", HOUR_S), ("km", 1e3), ("passes", 1.0), ("shifts", 1.0)):
-            value = told.get(point, {}).get(key)
+            value = forecast.get(point, {}).get(key)
             if value is not None:
                 names.append(f"{_SI.get(key, key)}/{point}")
                 numbers.append(factor * value)
     for key in ("not_reached_in_horizon", "probability_before_stop"):
-        if told.get(key) is not None:
+        if forecast.get(key) is not None:
             names.append(key)
-            numbers.append(told[key])
+            numbers.append(forecast[key])
     return plain.JointState(found.end_ns, frame_id, tuple(names), position=np.array(numbers))
 
 

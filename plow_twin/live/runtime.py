@@ -168,7 +168,7 @@ class Runtime:
 
     @property
     def without_clock(self) -> bool:
-        """Whether the time is to come from outside and has not come."""
+        """Whether the node uses `/clock` and no message on it has arrived."""
         return self._front.now_ns() == 0
 
     @property

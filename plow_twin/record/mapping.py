@@ -399,7 +399,7 @@ def _check_columns(path: Path, name: str, role: Role) -> None:
 
 
 def _check_stamp_unit(path: Path, name: str, role: Role) -> None:
-    """Raise a `MapError` for a unit in which no stamp is read."""
+    """Raise a `MapError` for a unit that stamps cannot have."""
     kind, why = role.message_type, ""
     if role.stamp == "log":
         why = "none beside stamp: log"

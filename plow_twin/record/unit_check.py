@@ -158,7 +158,7 @@ def check_poses(t: Array, q: Array, scene: Scene, source: object) -> None:
 
 
 def _stated(doubt: UnitDoubt, roles: Mapping[str, Role]) -> bool:
-    """Return whether the mapping states how each of the numbers is to be read."""
+    """Return whether the mapping states a unit for each of the numbers."""
     role = roles[doubt.role]
     return set(doubt.names) <= {*role.factor, *role.scale, *role.limits}
 

@@ -48,9 +48,9 @@ class InputCounts:
         """Return all counts that are not zero."""
         return {topic: {why: count for why, count in found.items() if count} for topic, found in self.counts.items()}
 
-    def _count(self, topic: str, what: str, count: int) -> None:
+    def _count(self, topic: str, reason: str, count: int) -> None:
         if count:
-            self.counts.setdefault(topic, Counter())[what] += count
+            self.counts.setdefault(topic, Counter())[reason] += count
 
 
 def unused_messages(path: Path) -> Iterator[dict[str, Any]]:

@@ -329,8 +329,9 @@ class TwinBatch:
             self._stop(begun)
             states[...] = before
             late = isinstance(stop, OutOfTimeError)
-            what = f"max_wall_s = {self._max_wall_s:g} reached" if late else "interrupted"
-            message = f"{what} in advances from t = {self.time:.9g} s to {float(times[-1]):.9g} s of {len(self)} twins"
+            reason = f"max_wall_s = {self._max_wall_s:g} reached" if late else "interrupted"
+            span = f"t = {self.time:.9g} s to {float(times[-1]):.9g} s"
+            message = f"{reason} in advances from {span} of {len(self)} twins"
             raise (LimitError if late else RunInterrupted)(message, None, self.time) from None
 
     def _stop(self, begun: Sequence[Future[None]]) -> None:

@@ -128,8 +128,8 @@ def simulate_many(
             run.stopped.set()
             pool.shutdown(cancel_futures=True)
             late = isinstance(stop, OutOfTimeError)
-            what = f"max_wall_s = {max_wall_s:g} reached" if late else "interrupted"
-            message = f"{what} after {run.done} of {len(scenes)} members"
+            reason = f"max_wall_s = {max_wall_s:g} reached" if late else "interrupted"
+            message = f"{reason} after {run.done} of {len(scenes)} members"
             raise (LimitError if late else RunInterrupted)(message, ensemble, 0.0) from None
     return ensemble
 

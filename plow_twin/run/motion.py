@@ -110,7 +110,7 @@ def run_fixed(
     budget: int,
     look: Callable[[Motion], None] | None,
 ) -> int:
-    """Bring a motion through `steps` fixed steps; return its `Status`."""
+    """Advance a motion by `steps` fixed steps; return its `Status`."""
     z = np.zeros(6 if compiled.parts.terms.support is None else 12)
     done, size = np.zeros(1, np.int64), _FIRST_SLICE
     while True:

@@ -21,7 +21,7 @@ _COVERED: Final = {"harmonics", "second", "viscous", "hysteretic", "integer", "f
 def fits_tangents(compiled: CompiledScene) -> bool:
     """Return whether the linearised equations have all terms of a scene: no exponent but integers and 1.5.
 
-    Overdamped contact is not followed, but the law of a restitution only seems to need it: at slow touches.
+    Implicit steps are not among them. A law with a restitution has them compiled for slow touches alone, so it fits.
     """
     terms, contact = compiled.parts.terms, compiled.scene.contact
     there = {name for name, term in zip(Terms._fields, terms, strict=True) if term is not None}

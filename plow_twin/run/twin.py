@@ -458,8 +458,8 @@ class Twin:
             self._wrench = samples[done - 1].copy()
         part = None if rows is None else AdvanceSeries(rows[:done])
         late = isinstance(stop, OutOfTimeError)
-        what = f"max_wall_s = {self._max_wall_s:g} reached" if late else "interrupted"
-        message = f"{what} at t = {self.time:.9g} s after {done} of {count} advances, {steps} steps in all"
+        reason = f"max_wall_s = {self._max_wall_s:g} reached" if late else "interrupted"
+        message = f"{reason} at t = {self.time:.9g} s after {done} of {count} advances, {steps} steps in all"
         raise (LimitError if late else RunInterrupted)(message, part, self.time) from None
 
     def _go_back(self) -> None:

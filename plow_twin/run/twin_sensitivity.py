@@ -127,7 +127,7 @@ class TwinSensitivity:
         SolverError
             When a shadow could not be followed.
         """
-        told = self._twin.advance(t, wrench)
+        advanced = self._twin.advance(t, wrench)
         rows = self._shadows.advance(t, self._twin.wrench)
         if (rows.status != Status.OK).any():
             raise SolverError(f"shadow at t = {t:.9g} s: {Status(int(rows.status.max())).text}")
@@ -139,7 +139,7 @@ class TwinSensitivity:
             clear = displacement_beside(depths, float(self._scale[0]), reads_speed=self._reads_speed) is not None
             if clear or t - self.t >= _LONGEST_S:
                 self._end(t, away[:size].T / DISPLACEMENT, away[size:])
-        return told
+        return advanced
 
     def _end(self, t: float, matrix: Array, changes: Array) -> None:
         """End a stretch: `matrix` is its fundamental matrix, `changes` the scaled effect of the parameters in it."""

@@ -156,7 +156,7 @@ class History:
             self._keep(np.array([stamp_ns]))
 
     def rewind(self, stamp_ns: int) -> tuple[bytes, list[Sample], list[Travel]]:
-        """Forget all from the newest snapshot before `stamp_ns` on; return it, and the samples and speeds after it."""
+        """Remove the newest snapshot before `stamp_ns` and everything after it; return snapshot, samples and speeds."""
         self._make_samples()
         while self._snapshots[-1][0] >= stamp_ns:
             self._snapshots.pop()

@@ -444,8 +444,8 @@ class Session:
             here = slice(begin, end)
             chosen = taken[(taken >= begin) & (taken < end)] - begin
             here_after = digest_after[(digest_after > begin) & (digest_after <= end)] - begin
-            told = None if rows is None else rows[here]
-            parts.append(self._advance(stamps[here], wrench[here], told, chosen, here_after, resumed=resumed))
+            out = None if rows is None else rows[here]
+            parts.append(self._advance(stamps[here], wrench[here], out, chosen, here_after, resumed=resumed))
             if resumed:
                 self._remember()
             begin, resumed = end, False

@@ -75,9 +75,9 @@ class Store:
         asked = self.sweep.arguments()
         differing = [key for key in asked if stored.get(key) != asked[key]]
         if differing or facts.get("format") != FORMAT:
-            what = "; ".join(_difference(key, stored.get(key), asked[key]) for key in differing) or "its format"
+            difference = "; ".join(_difference(key, stored.get(key), asked[key]) for key in differing) or "its format"
             raise StudyError(
-                f"{self.folder}: holds another sweep, which differs in {what}. Use another --out or --fresh"
+                f"{self.folder}: holds another sweep, which differs in {difference}. Use another --out or --fresh"
             )
 
     @property

@@ -20,8 +20,8 @@ def open_way(front: BridgeFront, way: WayOut, rate_hz: float, source: str) -> Ou
     runtime = front.runtime
     services = Services(runtime, front.changed)
 
-    def answer(what: str, text: str) -> tuple[bool, str]:
-        return services.call("acknowledge_alarms") if what == "acknowledge" else (False, "not possible here")
+    def answer(action: str, text: str) -> tuple[bool, str]:
+        return services.call("acknowledge_alarms") if action == "acknowledge" else (False, "not possible here")
 
     asked: Callable[[str, str], tuple[bool, str]] | None = answer if way.may_acknowledge else None
     outlet = Outlet(way, facts_of(runtime.scene, asdict(runtime.settings), source), asked, front.say_error)

@@ -43,8 +43,8 @@ def _report(way: Way) -> dict[str, Any]:
 
 async def serve(link: Link, way: Way, newest: Newest) -> None:
     """Pass on updates until the other end asks for the end, or has gone."""
-    told, ends = _report(way), False
-    link.send(told)
+    sent, ends = _report(way), False
+    link.send(sent)
     while not (ends or link.broken):
         await _readable(link)
         while not ends and (update := link.receive()) is not None:
@@ -53,8 +53,8 @@ async def serve(link: Link, way: Way, newest: Newest) -> None:
                 await way.send(newest.update(update), newest)
         await way.turn()
         report = _report(way)
-        if report != told and link.send(report):
-            told = report
+        if report != sent and link.send(report):
+            sent = report
     await way.close(0.0 if link.broken else _END_S)
     link.send(_report(way))
 
@@ -82,7 +82,7 @@ async def _run(link: Link, first: dict[str, Any]) -> None:
 
 
 def main() -> None:
-    """Run the way on the descriptor given."""
+    """Serve the way out whose link is the descriptor given as argument."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(_NICE)
     end = socket.socket(fileno=int(sys.argv[1]))

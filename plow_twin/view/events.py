@@ -45,8 +45,8 @@ class Events:
         match entry:
             case Hold() | Unload():
                 if not self.silent and excitation_source != "scene":
-                    what = "the last load is held" if isinstance(entry, Hold) else "the load falls to zero"
-                    self.add(stamp_ns, step, f"excitation silent: {what}", "WARN")
+                    subject = "the last load is held" if isinstance(entry, Hold) else "the load falls to zero"
+                    self.add(stamp_ns, step, f"excitation silent: {subject}", "WARN")
                     self.silent = True
             case Travel(_, speed):
                 if speed != self._speed_m_s:  # sensors repeat the same speed many times a second
@@ -92,8 +92,8 @@ class Events:
         """Write a status or the alarms when they have changed."""
         now = (message.level, message.message)
         if now != self._status.get(message.name):
-            what = "alarms" if message.name.endswith(f": {ALARMS}") else "status"
-            self.add(stamp_ns, step, f"{what}: {message.message}", _LEVELS[min(message.level, 3)])
+            subject = "alarms" if message.name.endswith(f": {ALARMS}") else "status"
+            self.add(stamp_ns, step, f"{subject}: {message.message}", _LEVELS[min(message.level, 3)])
         self._status[message.name] = now
 
     def flush(self) -> None:

@@ -216,7 +216,7 @@ class Feeder:
             return self._name, number, True
         elif self._goes_on(number):
             self._odd = None
-        else:  # counted as the next number until the next message decides
+        else:  # taken for the next number until the next message decides
             self._odd, number = number, self._number + 1
         again, self._number = number == self._number, number
         return self._name, number, again

@@ -109,7 +109,7 @@ class _Tail:
         try:
             found = self.path.stat()
         except FileNotFoundError:
-            return False  # until another file is there, the one that was moved away may grow
+            return False  # a file that was moved away may still grow until its successor exists
         ours = os.fstat(self._file.fileno())
         return (found.st_dev, found.st_ino) != (ours.st_dev, ours.st_ino) or self._is_anew()
 
