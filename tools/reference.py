@@ -30,8 +30,8 @@ def diagnostics() -> str:
 
 
 def verbs() -> str:
-    """Return the verbs of `plow-twin` with their options."""
-    lines = ["| verb | does | options |", "|---|---|---|"]
+    """Return the verbs of `plow-twin`."""
+    lines = ["| verb | does |", "|---|---|"]
     for name, command in sorted(commands.commands.items()):
         if isinstance(command, click.Group):
             lines += [_verb(f"{name} {inner}", verb) for inner, verb in command.commands.items()]
@@ -42,9 +42,7 @@ def verbs() -> str:
 
 def _verb(name: str, command: click.Command) -> str:
     arguments = " ".join(part for part in command.collect_usage_pieces(click.Context(command)) if part != "[OPTIONS]")
-    options = [f"`{max(one.opts, key=len)}`" for one in command.params if isinstance(one, click.Option)]
-    does = command.get_short_help_str(limit=200)
-    return f"| `{f'{name} {arguments}'.strip()}` | {does} | {', '.join(options)} |"
+    return f"| `{f'{name} {arguments}'.strip()}` | {command.get_short_help_str(limit=200)} |"
 
 
 def priors() -> str:
