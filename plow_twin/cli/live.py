@@ -188,7 +188,7 @@ def _also_metrics(say: Say, port: int | None, opened: ExitStack) -> Say:
     metrics = opened.enter_context(Metrics(port))
 
     def both(name: str, part: Part) -> None:
-        metrics.take(name, part)
+        metrics.update(name, part)
         say(name, part)
 
     return both

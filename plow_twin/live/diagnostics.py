@@ -280,7 +280,7 @@ class Health:
         """Return the part `input`: samples arrived, used and dropped."""
         counted = counters(runtime.driver)
         inputs, residual, age_s = runtime.inputs, runtime.residual(), runtime.newest_sample_age_s()
-        peak, wait_s = inputs.take_queue_peak()
+        peak, wait_s = inputs.pop_queue_peak()
         values = {key: str(counted[key]) for key in KEYS["input"] if key in counted} | {
             "source": runtime.source,
             "newest_sample_age_s": "" if age_s is None else f"{age_s:.3f}",

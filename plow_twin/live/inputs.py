@@ -112,7 +112,7 @@ class Inputs:
         if messages > most or longest_s > before_s:
             self._queue_peak = (max(most, messages), max(before_s, longest_s))
 
-    def take_queue_peak(self) -> tuple[int, float]:
+    def pop_queue_peak(self) -> tuple[int, float]:
         """Return the most messages that waited in the queue, and their longest wait [s], since the last call."""
         peak, self._queue_peak = self._queue_peak, (0, 0.0)
         return peak

@@ -57,7 +57,7 @@ class Metrics:
         self._server.server_close()
         self._thread.join()
 
-    def take(self, name: str, part: Part) -> None:
+    def update(self, name: str, part: Part) -> None:
         """Keep a part of the diagnostics; cheap, because the page is computed when it is read."""
         self._parts = {**self._parts, name: part}
 

@@ -507,7 +507,7 @@ class Runtime:
     def _journal_unused(self) -> None:
         """Journal the unused messages, once there is a journal."""
         if not self._start_due:
-            for entry in self.inputs.unused.taken(self._front.sender_name):
+            for entry in self.inputs.unused.pop_all(self._front.sender_name):
                 self.driver.session.emit(entry)
 
     def save_wear(self) -> None:

@@ -49,7 +49,7 @@ class UnusedMessages:
         if self._wanted and count:
             self._pending.setdefault((topic, sender, "lost"), _Pending()).count += count
 
-    def taken(self, name_of: Callable[[str, bytes], str]) -> list[Unused]:
+    def pop_all(self, name_of: Callable[[str, bytes], str]) -> list[Unused]:
         """Return the entries collected, and forget them; `name_of` names a sender of an input."""
         pending, self._pending = self._pending, {}
         return [

@@ -43,8 +43,8 @@ class KeptWear:
 class WearKeeper:
     """The wear of one head in one scene, in a folder.
 
-    Only a file that this keeper has read or written is replaced: another one, of a volume that was mounted meanwhile
-    or put there by hand, is wear that no twin has used yet.
+    Only a file that this keeper has read or written is replaced. Any other file, such as one put there by hand, holds
+    wear that no twin has used yet.
 
     Parameters
     ----------

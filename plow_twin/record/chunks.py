@@ -157,7 +157,7 @@ class ChunkReader:
                 if begin + length + behind > size:
                     if self.more is None:
                         break
-                    yield from self._scan(waiting.taken(), schemas)
+                    yield from self._scan(waiting.pop_all(), schemas)
                     yield Messages.none()
                     if not self.more(stream, size):
                         break
@@ -168,14 +168,14 @@ class ChunkReader:
                 if opcode == _MESSAGE:
                     waiting.add_message(os.pread(descriptor, _HEAD_SIZE + length, begin - _HEAD_SIZE))
                 if waiting.size > small:
-                    yield from self._scan(waiting.taken(), schemas)
+                    yield from self._scan(waiting.pop_all(), schemas)
                 if opcode == _CHUNK:
                     channels, place = heads.index()
                     if not self._is_wanted(channels):
                         continue
                     content = self._open(os.pread(descriptor, length, begin))
                     if content is None or len(content) > small:
-                        yield from self._scan(waiting.taken(), schemas)
+                        yield from self._scan(waiting.pop_all(), schemas)
                     if content is not None:
                         self._count_unpacked(len(content), size)
                         waiting.add(content)
@@ -185,13 +185,13 @@ class ChunkReader:
                     self._declare(opcode, os.pread(descriptor, length, begin), schemas)
                 elif opcode == _METADATA:
                     yield from self._scan(
-                        waiting.taken(), schemas
+                        waiting.pop_all(), schemas
                     )  # a note of damage has its place between the messages
                     self._metadata(os.pread(descriptor, length, begin))
                 elif opcode == _FOOTER:
                     self.finished = os.pread(descriptor, len(MAGIC), place) == MAGIC
                     break
-            yield from self._scan(waiting.taken(), schemas)
+            yield from self._scan(waiting.pop_all(), schemas)
 
     def _is_wanted(self, channels: int) -> bool:
         """Return whether a chunk is wanted, by the bits of its channels; without an index it is."""
@@ -330,7 +330,7 @@ class _Waiting:
         self._messages.append(record)
         self.size += len(record)
 
-    def taken(self) -> list[Bytes]:
+    def pop_all(self) -> list[Bytes]:
         """Return everything in the order of the file, and drop it."""
         self._join()
         contents, self._contents, self.size = self._contents, [], 0

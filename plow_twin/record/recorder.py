@@ -260,9 +260,9 @@ class Recorder:
             return False
 
     def publication(self, published: Published, sent: Mapping[str, bytes] = MappingProxyType({})) -> bool:
-        """Take all messages of a publication of one row that was sent; False when they were lost.
+        """Queue the messages of a publication of one row; False when they were lost.
 
-        `sent` has their bytes by base name of the topic; without them those that follow from the journal are made.
+        `sent` has their bytes by base name of the topic. Without it the messages that follow from the journal are made.
         """
         now = self._now_ns()
         topics = self._topics_of[len(published.slow) > 0, bool(sent) and bool(published.rows["marked"][0])]

@@ -280,8 +280,8 @@ class Driver:
     def travel(self, stamp_ns: int, speed_m_s: float) -> None:
         """Take over the speed along the face [m/s]; its sign is a direction, which wears alike.
 
-        One whose stamp is further ahead than `jump_forward_s`, or older than all that is remembered, is of another
-        clock: it acts from the time reached on, and is counted.
+        A speed whose stamp is further ahead than `jump_forward_s`, or older than every state that is kept, has the
+        stamp of another clock: it acts from the time reached on, and is counted.
         """
         reached_ns, oldest_ns = self.session.stamp_ns, self.session.history.oldest_ns
         if reached_ns is not None:

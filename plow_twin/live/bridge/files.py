@@ -241,7 +241,7 @@ class Files(SourceState):
         self._merged: Iterator[Arrived] | None = None
         #: the messages of a single topic
         self._tables: Iterator[Messages] | None = None
-        #: bytes of the files that are read once, and of them those read
+        #: bytes of the files that are read once, and how many of them have been read
         self._size = self._done = 0
 
     def topics(self) -> dict[str, TopicType]:
