@@ -444,7 +444,7 @@ def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: 
         value = Interval.normal(value.mean, math.hypot(deviation, bounced.unseen[index]))
         lowest = math.hypot(value.mean - value.p05, _HALF_NORMAL_P95 * bounced.rounded[index])
         value = replace(value, p05=value.mean - lowest)
-        observed = deviation < tuning.OBSERVED
+        observed = deviation < 2.0 * tuning.OBSERVED
         if not observed:
             value = _unobserved(unknowns, np.zeros(2), index, 0.0, bounced.noise)
         clearances.append(value.above(0.0))
