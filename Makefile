@@ -56,7 +56,7 @@ docs: $(INSTALLED)
 
 # core, record and node with the lowest versions that setup.py names
 lowest: $(LOWEST)/.installed
-	"$(LOWEST)/bin/python" -m pytest -m "not stress" $(PARALLEL) $(PYTEST_ARGS) $(LOWEST_TESTS)
+	"$(LOWEST)/bin/python" -m pytest -m "not stress" $(filter-out --no-loadscope-reorder,$(PARALLEL)) $(PYTEST_ARGS) $(LOWEST_TESTS)
 
 # the peers come on top; where they cannot all be installed, those that lack are named as not run
 bench: PIP := "$(VENV)/bin/python" -m pip install --quiet --disable-pip-version-check -c requirements/constraints.txt
@@ -73,7 +73,7 @@ $(INSTALLED): setup.py setup.cfg package.xml pyproject.toml requirements/constra
 $(LOWEST)/.installed: setup.py requirements/lowest.txt
 	test -x "$(LOWEST)/bin/python" || "$(PYTHON)" -m venv "$(LOWEST)"
 	"$(LOWEST)/bin/python" -m pip install --quiet --disable-pip-version-check -c requirements/lowest.txt \
-		-e ".[$(if $(AMENT_PREFIX_PATH),,ros,)record,test]"
+		-e ".[$(if $(AMENT_PREFIX_PATH),,ros,)record,mqtt,test]"
 	@touch "$@"
 
 clean:

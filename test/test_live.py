@@ -19,26 +19,19 @@ import tracemalloc
 from bisect import bisect_right
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
-from urllib.parse import urlsplit
 from urllib.request import urlopen
 
 import numpy as np
-import paho.mqtt.client as paho
 import pytest
-from paho.mqtt.enums import CallbackAPIVersion
-from pwdlib import PasswordHash
 from record_support import PAPER_AMPLITUDE, rewrite
 
 from plow_twin.cli.app import run as run_cli
 from plow_twin.cli.outlet import MOST_WAITING, Outlet
 from plow_twin.errors import RecordingError
 from plow_twin.live import parameters
-from plow_twin.live.bridge.access import Access
 from plow_twin.live.bridge.files import Files, StandardInput
-from plow_twin.live.bridge.mqtt import Mqtt
 from plow_twin.live.bridge.source import BridgeError
 from plow_twin.live.front import BridgeFront
 from plow_twin.live.inputs import Inputs
@@ -706,137 +699,10 @@ def test_nothing_lives_longer_than_the_time_remembered_but_the_index_of_the_reco
     assert int(figures["samples_used"]) == int(figures["samples_in"]) and int(figures["rolled_back"]) > 0
 
 
-@pytest.fixture
-def broker(tmp_path: Path) -> Iterator[Access]:
-    """A broker with TLS and one user, whose messages it keeps while he is away."""
-    certificate, key = tmp_path / "broker.pem", tmp_path / "broker.key"
-    subprocess.run(
-        ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-days", "2",
-         "-subj", "/CN=localhost", "-addext", "subjectAltName=DNS:localhost", "-keyout", str(key),
-         "-out", str(certificate)],
-        check=True, capture_output=True,
-    )  # fmt: skip
-    (tmp_path / "users").write_text(f"plough:{PasswordHash.recommended().hash('s3cret')}\n")
-    port = _free_port()
-    tls = {"ssl": True, "certfile": str(certificate), "keyfile": str(key)}
-    config = {
-        "listeners": {"default": {"type": "tcp", "bind": f"127.0.0.1:{port}", **tls}},
-        "plugins": {
-            "amqtt.plugins.authentication.FileAuthPlugin": {"password_file": str(tmp_path / "users")},
-            "amqtt.plugins.topic_checking.TopicTabooPlugin": {},
-        },
-    }
-    (tmp_path / "broker.yaml").write_text(json.dumps(config))
-    with (tmp_path / "broker.log").open("wb") as log:
-        process = subprocess.Popen(
-            [sys.executable, str(ROOT / "test" / "mqtt_broker.py"), str(tmp_path / "broker.yaml")],
-            stdout=subprocess.PIPE,
-            stderr=log,
-        )
-    try:
-        assert process.stdout is not None
-        assert process.stdout.readline() == b"ready\n", (tmp_path / "broker.log").read_text()
-        yield Access(f"mqtts://localhost:{port}", user="plough", password="s3cret", ca=certificate)
-    finally:
-        process.kill()
-        process.communicate()
-
-
 def _free_port() -> int:
     with socket.socket() as found:
         found.bind(("127.0.0.1", 0))
         return int(found.getsockname()[1])
-
-
-class Sender:
-    """A telemetry box: numbered samples to the broker."""
-
-    def __init__(self, access: Access) -> None:
-        self.client = paho.Client(CallbackAPIVersion.VERSION2)
-        self.client.username_pw_set(access.user, access.password)
-        self.client.tls_set(str(access.ca))
-        self.client.connect("localhost", urlsplit(access.url).port or 0)
-        self.client.loop_start()
-        self.number = 0
-
-    def send(self, count: int) -> None:
-        for _ in range(count):
-            t, fx, fy, m = _row(self.number)
-            self.number += 1
-            payload = {"t": t, "force": {"x": fx / 1e3, "y": fy / 1e3}, "moment": m, "n": self.number}
-            self.raw(json.dumps(payload).encode())
-
-    def raw(self, payload: bytes, *, retain: bool = False) -> None:
-        self.client.publish("plough/load", payload, qos=1, retain=retain).wait_for_publish(30.0)
-
-    def close(self) -> None:
-        self.client.disconnect()
-        self.client.loop_stop()
-
-
-MAP = """
-excitation: {topic: plough/load, fields: {fx: force.x, fy: force.y, m: moment}, unit: {fx: kN, fy: kN}, sequence: n}
-"""
-
-
-def test_a_broker_keeps_messages_for_an_absent_twin_and_garbage_is_counted(broker: Access, tmp_path: Path) -> None:
-    (tmp_path / "map.yaml").write_text(MAP)
-    (tmp_path / "password").write_text(broker.password + "\n")
-    arguments = (
-        *(broker.url, "--map", str(tmp_path / "map.yaml"), "--set", "excitation_timeout=3600"),
-        *("--user", broker.user, "--password-file", str(tmp_path / "password"), "--tls-ca", str(broker.ca)),
-    )
-    sender = Sender(broker)
-    old = {"t": 3.0, "force": {"x": 1.0, "y": 1.0}, "moment": 1.0, "n": 9000}
-    sender.raw(json.dumps(old).encode(), retain=True)  # from before the twin: neither a sample nor the first number
-    with _live(*arguments) as live:
-        live.until_count("dropped_inactive", 1)
-        sender.send(50)
-        for payload in (b"{nonsense", b"\xff\xfe", b"[" * 60000, b'{"n": 51}', b"x" * 100000):
-            sender.raw(payload)
-        values = live.until_count("samples_in", 56)
-        assert (values["samples_used"], values["dropped_malformed"], values["samples_lost"]) == ("50", "5", "0")
-        assert live.stop() == 3
-    sender.client.publish("plough/load", b"", qos=0, retain=True).wait_for_publish(30.0)
-    sender.send(50)
-    with _live(*arguments) as live:
-        values = live.until_count("samples_used", 50)
-        # the broker keeps the empty message too that takes back the retained one
-        assert (values["samples_lost"], values["dropped_malformed"]) == ("0", "1")
-        assert live.stop() == 3
-    sender.close()
-
-
-# paho leaves the socket of a failed handshake to the collector
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_a_misspelt_topic_of_a_broker_is_no_success(
-    broker: Access, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("PLOW_TWIN_MQTT_PASSWORD", broker.password)
-    mapping = tmp_path / "map.yaml"
-    mapping.write_text("excitation: {topic: plough/mistaken, fields: {fx: fx, fy: fy, m: m}}\n")
-    access = ["--user", broker.user, "--tls-ca", str(broker.ca)]
-    arguments = ["live", broker.url, "--map", str(mapping), "--scene", "paper", "--seconds", "1", "--quiet"]
-    assert run_cli([*arguments, *access]) == 3
-    assert "no sample came on plough/mistaken" in capsys.readouterr().err
-
-
-# paho drops the socket of a handshake that failed, and leaves closing it to the collector
-@pytest.mark.filterwarnings("ignore:unclosed <ssl.SSLSocket:ResourceWarning")
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_a_wrong_password_a_strange_certificate_and_a_broker_without_tls_are_refused(broker: Access) -> None:
-    for wrong, said in (
-        ({"password": "guess"}, "refused"),
-        ({"ca": None}, "certificate verify failed"),
-        ({"url": broker.url.replace("mqtts", "mqtt")}, "no answer"),
-    ):
-        bridge = Mqtt(replace(broker, **wrong), connect_s=2.0)
-        with pytest.raises(BridgeError, match=said):
-            bridge.start(["plough/load"])
-        assert not bridge.connected
-    for topic, said in (("prohibited", "refused: prohibited"), ("plough/+/load", r"topic: got 'plough/\+/load'")):
-        with pytest.raises(BridgeError, match=said):
-            Mqtt(replace(broker, client_id="other"), connect_s=5.0).start(["plough/load", topic])
 
 
 def test_a_refusal_by_the_system_is_a_warning_and_the_rest_is_done() -> None:
@@ -859,15 +725,6 @@ print(os.sched_getaffinity(0) == {one})
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     said = done.stdout.splitlines()
     assert [line.partition(" ")[0].rstrip(":") for line in said] == ["priority", "lock_memory", "cpu_affinity", "True"]
-
-
-@pytest.mark.parametrize(
-    "url", ["mqtt://plough.example:1883", "http://localhost", "mqtt://user:secret@localhost", "mqtt://localhost/topic"]
-)
-def test_another_machine_without_tls_and_passwords_in_the_address_are_refused(url: str) -> None:
-    with pytest.raises(BridgeError) as caught:
-        Mqtt(Access(url))
-    assert "secret" not in str(caught.value)
 
 
 @pytest.mark.parametrize(

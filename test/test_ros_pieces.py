@@ -106,4 +106,4 @@ def test_layouts_name_topics_and_numbers_that_exist() -> None:
     assert [display["Topic"]["Value"] for display in displays if "Topic" in display] == ["markers"]
     analyzers = yaml.safe_load((CONFIG / "diagnostic_analyzers.yaml").read_text())["analyzers"]["ros__parameters"]
     parts = [part for group in analyzers["twin"]["analyzers"].values() for part in group["startswith"]]
-    assert sorted(parts) == sorted(f"/plow_twin: {part}" for part in KEYS)
+    assert sorted(parts) == sorted(f"/plow_twin: {part}" for part in (*KEYS, "source"))

@@ -1,183 +1,29 @@
-"""Outputs to a plant: real brokers, servers and clients in other processes get the numbers of the recording."""
+"""Outputs to a plant besides MQTT: real servers and clients in other processes get the numbers of the recording."""
 
 from __future__ import annotations
 
 import asyncio
-import json
 import subprocess
-import sys
 import threading
 import time
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Callable, Coroutine
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
-import paho.mqtt.client as paho
 import pytest
 from asyncua import Client, ua
 from asyncua.crypto.security_policies import SecurityPolicyAes256Sha256RsaPss
 from asyncua.crypto.uacrypto import CertProperties
 from commands import plow_twin_here
-from paho.mqtt.enums import CallbackAPIVersion
-from test_live import ROOT, Live, _csv, _free_port, _live, broker
+from test_live import Live, _csv, _free_port, _live
+from test_mqtt import STALE, Subscriber, _entries, _open_broker
 
-from plow_twin.live.bridge.access import Access
-from plow_twin.record.entries import EntryRecord
-from plow_twin.record.reader import RunReader
-from plow_twin.stream.journal import Digest, Parameter
-from plow_twin.telemetry.mqtt import Broker, Message
+from plow_twin.stream.journal import Parameter
 from plow_twin.telemetry.opcua.model import NAMESPACE
 from plow_twin.telemetry.sparkplug import Payload
-
-__all__ = ["broker"]
-
-STALE = ("--set", "excitation_timeout=3600")
-
-
-class Subscriber:
-    """A client that hears all topics, in order of arrival."""
-
-    def __init__(self, port: int, access: Access | None = None, topics: str = "#") -> None:
-        self.messages: list[tuple[str, bytes, bool]] = []
-        self._subscribed = threading.Event()
-        self.client = paho.Client(CallbackAPIVersion.VERSION2)
-        if access is not None:
-            self.client.username_pw_set(access.user, access.password)
-            self.client.tls_set(str(access.ca))
-        self.client.on_connect = lambda client, *_: client.subscribe(topics, 1)
-        self.client.on_subscribe = lambda *_: self._subscribed.set()
-        self.client.on_message = lambda _, __, found: self.messages.append((found.topic, found.payload, found.retain))
-        self.client.connect("localhost" if access else "127.0.0.1", port)
-        self.client.loop_start()
-        assert self._subscribed.wait(30.0)
-
-    def until(self, reached: Callable[[], bool]) -> None:
-        _until(reached, self.messages)
-
-    def newest(self, topic: str) -> Any:
-        found = [payload for name, payload, _ in self.messages if name == topic]
-        return json.loads(found[-1]) if found else None
-
-    def all(self, topic: str) -> list[Any]:
-        return [json.loads(payload) for name, payload, _ in self.messages if name == topic]
-
-    def close(self) -> None:
-        self.client.disconnect()
-        self.client.loop_stop()
-
-
-def _until(reached: Callable[[], bool], seen: object = None) -> None:
-    give_up = time.monotonic() + 90.0
-    while not reached():
-        assert time.monotonic() < give_up, seen
-        time.sleep(0.02)
-
-
-@contextmanager
-def _open_broker(folder: Path, port: int) -> Iterator[None]:
-    """A broker without TLS that admits everybody."""
-    config = {
-        "listeners": {"default": {"type": "tcp", "bind": f"127.0.0.1:{port}"}},
-        "plugins": {"amqtt.plugins.authentication.AnonymousAuthPlugin": {"allow_anonymous": True}},
-    }
-    (folder / "open.yaml").write_text(json.dumps(config))
-    command = [sys.executable, str(ROOT / "test" / "mqtt_broker.py"), str(folder / "open.yaml")]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as process:
-        try:
-            assert process.stdout is not None and process.stdout.readline() == b"ready\n"
-            yield
-        finally:
-            process.kill()
-
-
-def test_a_broker_gets_all_groups_with_tls_and_says_when_the_twin_has_died(broker: Access, tmp_path: Path) -> None:
-    (tmp_path / "secret").write_text(broker.password + "\n")
-    (tmp_path / "out.yaml").write_text(f"mqtt: {{user: plough, password_file: secret, ca: '{broker.ca}'}}\n")
-    path, url = _csv(tmp_path / "load.csv", 1500), f"{broker.url}/face/plough"
-    port = urlsplit(broker.url).port or 0
-    arguments = (str(path), "--follow", "--mqtt-out", url, "--out-access", str(tmp_path / "out.yaml"), *STALE)
-    alarm = ("--set", "alarm_force=[20e3,1e9]", "--set", "alarm_duration=0.0")
-    early = Subscriber(port, broker)
-    with _live(*arguments, *alarm, "--out-rate", "5") as live:
-        live.until_count("samples_used", 1500)
-        live.until(lambda heard: heard.get("mqtt_out", {}).get("values", {}).get("sent", 0) > 8, "sent")
-        assert broker.password not in Path(f"/proc/{live.process.pid}/cmdline").read_text()
-        # a late subscriber gets the newest of everything but the peaks, which are over
-        late = Subscriber(port, broker)
-        late.until(lambda: late.newest("face/plough/alarms") is not None and len(late.messages) >= 7)
-        groups = {"clearance", "wear", "life", "flags", "status", "alarms", "online"}
-        assert {topic.removeprefix("face/plough/") for topic, _, _ in late.messages} == groups
-        clearance, alarms = late.newest("face/plough/clearance"), late.newest("face/plough/alarms")["values"]
-        assert clearance["unit"] == "m" and clearance["values"]["horizontal/p05"] == pytest.approx(0.025)
-        assert alarms["force_latched"] == "warn" and alarms["force_raised"] > alarms["force_threshold"] == 20e3
-        peaks = [json.loads(found) for topic, found, _ in early.messages if topic == "face/plough/peaks"]
-        largest = max(max(filter(None, found["values"].values()), default=0.0) for found in peaks[1:])
-        assert largest == pytest.approx(alarms["force_raised"], rel=1e-6) or largest > alarms["force_raised"]
-        assert late.newest("face/plough/online") is True
-        live.process.kill()
-        late.until(lambda: late.newest("face/plough/online") is False)
-    for subscriber in (early, late):
-        subscriber.close()
-
-
-def test_a_missing_broker_is_reported_and_costs_the_twin_nothing(tmp_path: Path) -> None:
-    path, runs = _csv(tmp_path / "load.csv", 2000), [tmp_path / "alone", tmp_path / "with"]
-    url = f"mqtt://127.0.0.1:{_free_port()}/plough"
-    done = [
-        plow_twin_here("live", path, "--record", run, "--json", *more)
-        for run, more in zip(runs, ((), ("--mqtt-out", url)), strict=True)
-    ]
-    assert [found.returncode for found in done] == [0, 0], done[1].stderr
-    part = json.loads(done[1].stdout)["mqtt_out"]
-    assert part["connected"] == "false" and part["sent"] == "0" and int(part["lost"]) > 0
-    assert "mqtt_out" not in json.loads(done[0].stdout)
-    digests = [[entry for entry in _entries(run) if isinstance(entry, Digest)] for run in runs]
-    assert digests[0] == digests[1] and digests[0]
-
-
-def _entries(run: Path) -> list[object]:
-    return [record.entry for record in RunReader(run) if isinstance(record, EntryRecord)]
-
-
-def test_messages_that_wait_for_a_broker_are_bounded_counted_and_come_in_order(tmp_path: Path) -> None:
-    port = _free_port()
-    there = Message("online", b"true", True)
-    way = Broker(
-        host="127.0.0.1", port=port, client_id="out", user="", password="", tls=None, will=lambda: there,
-        on_connected=lambda: [there], waiting=5,
-    )  # fmt: skip
-    way.open()
-    for number in range(8):
-        way.send(Message("n", str(number).encode(), False))
-    _until(lambda: way.state.trouble.startswith("no broker at 127.0.0.1"), way.state)
-    assert (way.state.sent, way.state.lost, way.state.connected) == (0, 3, False)
-    with _open_broker(tmp_path, port):
-        subscriber = Subscriber(port)
-        _until(lambda: way.state.sent == 6, way.state)
-        subscriber.until(lambda: len(subscriber.messages) == 6)
-        assert [payload for _, payload, _ in subscriber.messages] == [b"true", b"3", b"4", b"5", b"6", b"7"]
-        assert (way.state.lost, way.state.trouble) == (3, "")
-        subscriber.close()
-    _until(lambda: not way.state.connected)
-    asyncio.run(way.close(there, 0.0))
-
-
-@pytest.mark.parametrize(
-    ("url", "said"),
-    [
-        ("mqtt://plant.example/plough", "mqtts:// for another machine, or --plain"),
-        ("mqtt://user:secret@localhost/plough", "user and password in --out-access"),
-        ("mqtt://localhost", "expected mqtt[s]://HOST:PORT/PREFIX"),
-        ("mqtt://localhost/a/+/b", "the prefix without + and #"),
-    ],
-)
-def test_a_bad_address_is_refused_with_the_expectation(url: str, said: str, tmp_path: Path) -> None:
-    done = plow_twin_here("live", _csv(tmp_path / "load.csv", 3), "--mqtt-out", url, "--quiet")
-    assert done.returncode == 2 and said in " ".join(done.stderr.split()) and "secret" not in done.stderr
 
 
 class Heard:

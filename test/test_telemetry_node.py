@@ -12,7 +12,7 @@ pytest.importorskip("rclpy")
 
 from ros_processes import Process, bench
 from test_live import _free_port
-from test_telemetry import Subscriber, _open_broker
+from test_mqtt import Subscriber, _open_broker
 
 MS = 1_000_000
 RELIABLE_INPUT = {"qos_overrides.{ns}/excitation.subscription.reliability": "reliable"}

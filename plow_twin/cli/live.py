@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import replace
@@ -272,6 +271,8 @@ def _settings(options: dict[str, Any]) -> Settings:
         raise click.UsageError(str(error)) from error
     if not options["scene"] and "scene" not in values:
         say_error(f"plow-twin: no --scene: the preset {settings.scene} is used, which is not your machine")
+    if settings.opcua_server:
+        raise click.UsageError("opcua_server: a parameter of the node; expected the address as SOURCE")
     scene, record = options["scene"] or settings.scene, options["record"] or settings.record_path
     return replace(settings, scene=scene, record_path=str(record))
 
@@ -281,13 +282,13 @@ def _bridge(source: str, options: dict[str, Any], rate_hz: float) -> Bridge:
     from plow_twin.live.bridge.source import BridgeError
 
     if "://" in source:
-        from plow_twin.live.bridge.access import Access
+        from plow_twin.live.bridge.access import Access, password
 
         opcua = source.startswith("opc.tcp://")
         access = Access(
             source,
             user=options["user"],
-            password=_password(options["password_file"], "OPCUA" if opcua else "MQTT"),
+            password=password(options["password_file"], "OPCUA" if opcua else "MQTT"),
             ca=options["tls_ca"],
             certificate=options["tls_cert"],
             key=options["tls_key"],
@@ -331,9 +332,3 @@ def _opcua(access: Access, mapping: Path | None, rate_hz: float) -> Bridge:
             "mapping: got none, expected --map with the nodes: excitation: {fx: {node: 'ns=2;s=...'}, ...}"
         )
     return OpcUa(access, read_map(mapping, None), rate_hz)
-
-
-def _password(path: Path | None, source: str) -> str:
-    if path is None:
-        return os.environ.get(f"PLOW_TWIN_{source}_PASSWORD", "")
-    return path.read_text(encoding="utf-8").partition("\n")[0]

@@ -94,7 +94,7 @@ class BridgeFront:
         self.say_error = on_error
         self._said: Part | None = None
         model = read_load_model(mapping)
-        self.roles = _roles(bridge, mapping, settings.excitation_source, model is not None, units)
+        self.roles = roles_of(bridge, mapping, settings.excitation_source, model is not None, units)
         bridge.start([role.topic for role in self.roles.values()], stamps_by(self.roles.values()))
         self._first = deque(_first_messages(bridge) if bridge.ends else ())
         try:
@@ -287,10 +287,20 @@ def _first_messages(bridge: Bridge) -> Iterator[Messages]:
         yield found
 
 
-def _roles(
-    bridge: Bridge, mapping: Path | None, source: str, modelled: bool, units: Mapping[str, str]
+def roles_of(
+    bridge: Bridge,
+    mapping: Path | None,
+    source: str,
+    modelled: bool,
+    units: Mapping[str, str] = MappingProxyType({}),
 ) -> dict[str, Role]:
-    """Return the roles that the twin takes."""
+    """Return the roles that a twin takes from a bridge.
+
+    Raises
+    ------
+    BridgeError, RecordingError
+        The mapping cannot be used, or lacks the load although the excitation's `source` is this one.
+    """
     if source == "tool_forces":
         raise BridgeError("excitation_source: got 'tool_forces', expected 'excitation' or 'scene' without ROS")
     topics: Any = bridge.topics()

@@ -66,6 +66,13 @@ class Settings:
     services_off: str = _plain(
         "", Effect.START, "services that are refused, separated by commas, e.g. set_wear,acknowledge_alarms"
     )
+    opcua_server: str = _plain(
+        "", Effect.START, "OPC UA server, opc.tcp://HOST:PORT, in the place of the topics of some inputs; empty: none"
+    )
+    opcua_map: str = _plain("", Effect.START, "YAML file that gives the nodes of opcua_server for these inputs")
+    opcua_access: str = _plain(
+        "", Effect.START, "YAML file of the credentials at opcua_server; empty: none, on this machine"
+    )
     priority: int = _number(
         0,
         "SCHED_FIFO",
@@ -500,6 +507,8 @@ def settings(values: Mapping[str, Any]) -> Settings:
         raise ParameterError(found)
     made = Settings(**{name: coerce(name, value) for name, value in values.items() if name in SPECS})
     found = [*outside(made), *_unknown_services(made)]
+    if bool(made.opcua_server) != bool(made.opcua_map):
+        found.append(Problem("opcua_map", made.opcua_map, "a mapping to nodes, together with opcua_server"))
     if found:
         raise ParameterError(found)
     return made

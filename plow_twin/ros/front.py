@@ -6,10 +6,12 @@ import traceback
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 from rclpy.node import Node
 
 from plow_twin.live.parameters import ESTIMATES, Settings
+from plow_twin.live.part import Part
 from plow_twin.live.runtime import Runtime
 from plow_twin.live.services import Services
 from plow_twin.live.solver_start import Prepared
@@ -22,6 +24,9 @@ from plow_twin.ros.publishers import OutputPublishers
 from plow_twin.ros.subscriptions import Subscriptions
 from plow_twin.stream.alarms import Level
 from plow_twin.stream.topics import TOPICS
+
+if TYPE_CHECKING:
+    from plow_twin.ros.opcua_input import OpcUaInput
 
 
 class RosFront:
@@ -61,6 +66,7 @@ class RosFront:
         #: one thread at a time uses the twin
         self.turns = Turns()
         self._lost: list[str] = []
+        self._server: OpcUaInput | None = None
         with ExitStack() as made:
             self._make(settings, prepared, kept_wear, made)
             self._made = made.pop_all()
@@ -79,13 +85,21 @@ class RosFront:
         made.callback(self._publishers.close)
         self._loop = loop = InputLoop(self.turns, self._inputs_failed)
         made.callback(loop.close)
-        self.subscriptions = Subscriptions(node, runtime, self, loop, self.turns)
+        if settings.opcua_server:
+            from plow_twin.ros.opcua_input import OpcUaInput
+
+            self._server = OpcUaInput(runtime, self, node.get_logger().warning)
+            loop.add(self._server, self._server, "opcua")
+        elsewhere = frozenset() if self._server is None else self._server.names
+        self.subscriptions = Subscriptions(node, runtime, self, loop, self.turns, elsewhere)
         if settings.marker_rate:
             self._draw(settings, made)
         for rate_hz, do in runtime.periodic():
             loop.every(1.0 / rate_hz, do)
         self._services = Services(runtime, self.changed)
         runtime.start()
+        if self._server is not None:
+            self._server.start()
         loop.start()
 
     def _draw(self, settings: Settings, made: ExitStack) -> None:
@@ -144,8 +158,15 @@ class RosFront:
         return self._loop.error
 
     def look_for_others(self) -> None:
-        """Check whether another node publishes on this twin's topics."""
+        """Check whether another node publishes on this twin's topics, and the state of a server."""
+        if self._server is not None:
+            with self.turns:
+                self._server.look()
         self.runtime.others_publish = self._node.count_publishers(self.topics["contact_forces"]) > 1
+
+    def parts(self) -> dict[str, Part]:
+        """Return further parts of the diagnostics."""
+        return {} if self._server is None else {"source": self._server.part()}
 
     def activate(self) -> None:
         """Start taking samples."""

@@ -11,10 +11,9 @@ import select
 import threading
 import time
 from collections.abc import Callable
-from typing import Final, Protocol
+from typing import Any, Final, Protocol
 
 from plow_twin.live.timer import Timer
-from plow_twin.ros.input_queue import InputQueue, Taken
 
 #: Largest number of messages taken at once; timers and waiting threads get their turn in between.
 _MOST: Final = 200
@@ -44,10 +43,22 @@ class Turns:
             self._inside.release()
 
 
+class Queue(Protocol):
+    """Messages that wait; `fd` becomes readable when one has arrived."""
+
+    fd: int
+
+    def pop(self, most: int, *, all_there_are: bool = False) -> tuple[list[Any], bool]:
+        """As `InputQueue.pop`."""
+
+    def close(self) -> None:
+        """Release the queue."""
+
+
 class Receiver(Protocol):
     """Receives the messages of some topics."""
 
-    def receive(self, topic: str, batch: list[Taken]) -> None:
+    def receive(self, topic: str, batch: list[Any]) -> None:
         """Receive the messages that were in the queue of a topic."""
 
 
@@ -65,7 +76,7 @@ class InputLoop:
     def __init__(self, turns: Turns, on_error: Callable[[Exception], None]) -> None:
         self._turns, self._on_error = turns, on_error
         #: queue, receiver and topic by file descriptor
-        self._queues: dict[int, tuple[InputQueue, Receiver, str]] = {}
+        self._queues: dict[int, tuple[Queue, Receiver, str]] = {}
         #: the first one always runs
         self._timers = [Timer(_LOOK_S, self._look_at_all)]
         self._active = self._stopped = False
@@ -77,7 +88,7 @@ class InputLoop:
         #: the error that ended the thread; None while it runs and after `stop`
         self.error: Exception | None = None
 
-    def add(self, queue: InputQueue, receiver: Receiver, topic: str) -> None:
+    def add(self, queue: Queue, receiver: Receiver, topic: str) -> None:
         """Pass the messages in the queue of a topic to its receiver from now on, and close the queue at the end."""
         with self._turns:
             self._queues[queue.fd] = queue, receiver, topic

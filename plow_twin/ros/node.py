@@ -260,6 +260,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
             if runtime is not None:
                 runtime.look_at_clock()
             parts = self._health.parts(self.lifecycle, self.reason, self.runtime, time.monotonic_ns())
+            parts |= {} if self._front is None else self._front.parts()
         array = DiagnosticArray()
         array.header.stamp = self.get_clock().now().to_msg()
         name, head = self.get_fully_qualified_name(), self._table.settings.hardware_id

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from typing import Any, Final
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TwistStamped, WrenchStamped
@@ -47,9 +47,20 @@ class Subscriptions:
         Sends the messages that follow.
     loop, turns
         The thread that takes the messages, and the lock that keeps it apart from the executor's.
+    elsewhere
+        Inputs that are no topics: they come from a server.
     """
 
-    def __init__(self, node: Node, runtime: Runtime, front: Front, loop: InputLoop, turns: Turns) -> None:
+    def __init__(
+        self,
+        node: Node,
+        runtime: Runtime,
+        front: Front,
+        loop: InputLoop,
+        turns: Turns,
+        elsewhere: Collection[str] = (),
+    ) -> None:
+        self._elsewhere = elsewhere
         self._node, self._runtime, self._front, self._loop, self._turns = node, runtime, front, loop, turns
         self._inputs, self._intake = runtime.inputs, runtime.driver.intake
         self._connections = Connections(node)
@@ -89,6 +100,8 @@ class Subscriptions:
 
     def look_for_senders(self, topic: str) -> None:
         """Check whether the followed publisher of an input still exists."""
+        if topic in self._elsewhere:
+            return
         if topic == self._source:
             self._inputs.senders.alive(self._present(topic))
         elif topic in self._inputs.optional:
@@ -110,11 +123,15 @@ class Subscriptions:
 
     def name_of(self, topic: str, sender: bytes) -> str:
         """Return node and identity of a publisher; the identity alone if it vanished before it was looked up."""
+        if topic in self._elsewhere:
+            return sender.decode(errors="replace")
         if (topic, sender) not in self._names:
             self._present(topic)
         return self._names.get((topic, sender), sender.hex())
 
     def _subscribe(self, kind: type, topic: str, depth: int) -> None:
+        if topic in self._elsewhere:
+            return
         subscription = self._node.create_subscription(
             kind,
             topic,

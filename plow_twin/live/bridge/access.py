@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from ipaddress import ip_address
 from pathlib import Path
+from typing import Any, Final
 from urllib.parse import urlsplit
 
+from plow_twin.errors import InputError, Problem
 from plow_twin.live.bridge.source import BridgeError
+from plow_twin.scene_file.yaml_text import read_yaml
+
+#: Keys of a file of credentials that name files.
+_FILES: Final = ("ca", "certificate", "key", "user_certificate", "user_key", "password_file")
 
 
 @dataclass(frozen=True)
@@ -60,3 +67,38 @@ def is_loopback(host: str) -> bool:
         return ip_address(host).is_loopback
     except ValueError:
         return False
+
+
+def password(path: Path | None, source: str) -> str:
+    """Return the first line of a file, or the variable PLOW_TWIN_`source`_PASSWORD."""
+    if path is None:
+        return os.environ.get(f"PLOW_TWIN_{source}_PASSWORD", "")
+    return path.read_text(encoding="utf-8").partition("\n")[0]
+
+
+def read_access(url: str, path: Path | None) -> Access:
+    """Return the access to an OPC UA server with credentials from a YAML file, whose paths are relative to it.
+
+    Raises
+    ------
+    InputError
+        The file is no YAML within the bounds, or a key or value is not expected.
+    OSError
+        The file, or that of the password, cannot be read.
+    """
+    if path is None:
+        return Access(url, password=password(None, "OPCUA"))
+    keys = ("user", "plain", *_FILES)
+    expected = f"some of {', '.join(keys)}"
+    given, found = read_yaml(path, "credentials", expected)
+    if not found and not isinstance(given, dict):
+        found = [Problem("credentials", type(given).__name__, expected)]
+    for key, value in {} if found else given.items():
+        if key not in keys or not isinstance(value, bool if key == "plain" else str):
+            wanted = "true or false" if key == "plain" else f"a text under {expected}"
+            found = [*found, Problem(str(key), value, wanted)]
+    if found:
+        raise InputError(found, str(path))
+    files: dict[str, Any] = {key: path.parent / given[key] for key in _FILES if key in given}
+    secret = password(files.pop("password_file", None), "OPCUA")
+    return Access(url, given.get("user", ""), secret, plain=given.get("plain", False), **files)

@@ -32,8 +32,12 @@ def use_tls(client: Any, ca: Path | str | None, certificate: Path | str | None, 
     OSError, ValueError
         A file cannot be used.
     """
-    files = (None if path is None else str(path) for path in (ca, certificate, key))
-    client.tls_set(*files, cert_reqs=ssl.CERT_REQUIRED)
+    if key and not certificate:
+        raise ValueError("a key without its certificate")
+    context = ssl.create_default_context(cafile=ca)
+    if certificate:
+        context.load_cert_chain(certificate, key)
+    client.tls_set_context(context)
 
 
 def is_resumed(flags: Any) -> bool:

@@ -8,7 +8,7 @@ import random
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict
 from typing import Any, Final
@@ -56,6 +56,10 @@ class OpcUa(SourceState):
         Expected rate of the samples [Hz]; 0: not known, the server's fastest sampling is requested.
     connect_s
         Longest wait for the first connection [s].
+    waits
+        Whether `start` returns before the first connection, which is tried again like later ones.
+    on_arrival
+        Called, from another thread, when samples have arrived.
 
     Raises
     ------
@@ -64,10 +68,17 @@ class OpcUa(SourceState):
     """
 
     def __init__(
-        self, access: Access, roles: Mapping[str, Role], rate_hz: float = 0.0, connect_s: float = 20.0
+        self,
+        access: Access,
+        roles: Mapping[str, Role],
+        rate_hz: float = 0.0,
+        connect_s: float = 20.0,
+        *,
+        waits: bool = False,
+        on_arrival: Callable[[], None] | None = None,
     ) -> None:
         super().__init__()
-        self._access, self._connect_s = access, connect_s
+        self._access, self._connect_s, self._waits = access, connect_s, waits
         _, self.host, self.port = host_and_port(access, _PORTS, has_path=True)
         _check_encryption(access, self.host)
         self._sampling_ms = 1e3 / rate_hz if rate_hz else 0.0
@@ -87,6 +98,7 @@ class OpcUa(SourceState):
         self._revised: Revised | None = None
         self._queue: deque[Arrived] = deque()
         self._arrived = threading.Event()
+        self._on_arrival = on_arrival or self._arrived.set
         self._answer = threading.Event()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="opcua", daemon=True)
@@ -106,6 +118,8 @@ class OpcUa(SourceState):
     def start(self, topics: list[str], stamp_ns: StampOf[Arrived] | None = None) -> None:
         """Connect and subscribe."""
         self._thread.start()
+        if self._waits:
+            return
         if not self._answer.wait(self._connect_s):
             self.trouble = f"no answer within {self._connect_s:g} s"
         if not self.connected:
@@ -161,7 +175,7 @@ class OpcUa(SourceState):
                 wait_s = _FIRST_WAIT_S if self.connected else wait_s
                 self.connected, self._held_back = False, None
                 await link.close()
-            if not self._answer.is_set():  # the first attempt decides whether the twin starts
+            if not (self._waits or self._answer.is_set()):  # the first attempt decides whether the twin starts
                 self._answer.set()
                 return
             await asyncio.sleep(wait_s * random.uniform(0.5, 1.0))
@@ -309,7 +323,7 @@ class OpcUa(SourceState):
                 self._queue.append(Arrived(topic, log_ns, content))
             self.lost += samples.take_incomplete()
         if self._queue:
-            self._arrived.set()
+            self._on_arrival()
 
     def _words(self, error: BaseException) -> str:
         if isinstance(error, BridgeError):

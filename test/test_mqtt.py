@@ -1,0 +1,324 @@
+"""MQTT in and out: a real broker in another process, with paho 2 as with 1.6."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import subprocess
+import sys
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+from commands import plow_twin_here
+from test_live import ROOT, _csv, _free_port, _live, _row
+
+from plow_twin.cli.app import run as run_cli
+from plow_twin.live.bridge.access import Access
+from plow_twin.live.bridge.mqtt import Mqtt
+from plow_twin.live.bridge.paho_client import make_client, use_tls
+from plow_twin.live.bridge.source import BridgeError
+from plow_twin.record.entries import EntryRecord
+from plow_twin.record.reader import RunReader
+from plow_twin.stream.journal import Digest
+from plow_twin.telemetry.mqtt import Broker, Message
+
+STALE = ("--set", "excitation_timeout=3600")
+
+
+def _hash(password: str) -> str:
+    """Return a password as the broker's library keeps it."""
+    try:
+        from pwdlib import PasswordHash
+    except ModuleNotFoundError:  # before amqtt 0.12
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)
+            from passlib.apps import custom_app_context
+
+        return str(custom_app_context.hash(password))
+    return PasswordHash.recommended().hash(password)
+
+
+@pytest.fixture
+def broker(tmp_path: Path) -> Iterator[Access]:
+    """A broker with TLS and one user, whose messages it keeps while he is away."""
+    certificate, key = tmp_path / "broker.pem", tmp_path / "broker.key"
+    subprocess.run(
+        ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-days", "2",
+         "-subj", "/CN=localhost", "-addext", "subjectAltName=DNS:localhost", "-keyout", str(key),
+         "-out", str(certificate)],
+        check=True, capture_output=True,
+    )  # fmt: skip
+    (tmp_path / "users").write_text(f"plough:{_hash('s3cret')}\n")
+    port = _free_port()
+    tls = {"ssl": True, "certfile": str(certificate), "keyfile": str(key)}
+    config = {
+        "listeners": {"default": {"type": "tcp", "bind": f"127.0.0.1:{port}", **tls}},
+        "plugins": {
+            "amqtt.plugins.authentication.FileAuthPlugin": {"password_file": str(tmp_path / "users")},
+            "amqtt.plugins.topic_checking.TopicTabooPlugin": {},
+        },
+    }
+    (tmp_path / "broker.yaml").write_text(json.dumps(config))
+    with (tmp_path / "broker.log").open("wb") as log:
+        process = subprocess.Popen(
+            [sys.executable, str(ROOT / "test" / "mqtt_broker.py"), str(tmp_path / "broker.yaml")],
+            stdout=subprocess.PIPE,
+            stderr=log,
+        )
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"ready\n", (tmp_path / "broker.log").read_text()
+        yield Access(f"mqtts://localhost:{port}", user="plough", password="s3cret", ca=certificate)
+    finally:
+        process.kill()
+        process.communicate()
+
+
+class Subscriber:
+    """A client that hears all topics, in order of arrival."""
+
+    def __init__(self, port: int, access: Access | None = None, topics: str = "#") -> None:
+        self.messages: list[tuple[str, bytes, bool]] = []
+        self._subscribed = threading.Event()
+        self.client = make_client("", clean=True)
+        if access is not None:
+            self.client.username_pw_set(access.user, access.password)
+            use_tls(self.client, access.ca, None, None)
+        self.client.on_connect = lambda client, *_: client.subscribe(topics, 1)
+        self.client.on_subscribe = lambda *_: self._subscribed.set()
+        self.client.on_message = lambda _, __, found: self.messages.append((found.topic, found.payload, found.retain))
+        self.client.connect("localhost" if access else "127.0.0.1", port)
+        self.client.loop_start()
+        assert self._subscribed.wait(30.0)
+
+    def until(self, reached: Callable[[], bool]) -> None:
+        _until(reached, self.messages)
+
+    def newest(self, topic: str) -> Any:
+        found = [payload for name, payload, _ in self.messages if name == topic]
+        return json.loads(found[-1]) if found else None
+
+    def all(self, topic: str) -> list[Any]:
+        return [json.loads(payload) for name, payload, _ in self.messages if name == topic]
+
+    def close(self) -> None:
+        self.client.disconnect()
+        self.client.loop_stop()
+
+
+class Sender:
+    """A telemetry box: numbered samples to the broker."""
+
+    def __init__(self, access: Access) -> None:
+        self.client = make_client("", clean=True)
+        self.client.username_pw_set(access.user, access.password)
+        use_tls(self.client, access.ca, None, None)
+        self.client.connect("localhost", urlsplit(access.url).port or 0)
+        self.client.loop_start()
+        self.number = 0
+
+    def send(self, count: int) -> None:
+        for _ in range(count):
+            t, fx, fy, m = _row(self.number)
+            self.number += 1
+            payload = {"t": t, "force": {"x": fx / 1e3, "y": fy / 1e3}, "moment": m, "n": self.number}
+            self.raw(json.dumps(payload).encode())
+
+    def raw(self, payload: bytes, *, retain: bool = False) -> None:
+        self.client.publish("plough/load", payload, qos=1, retain=retain).wait_for_publish(30.0)
+
+    def close(self) -> None:
+        self.client.disconnect()
+        self.client.loop_stop()
+
+
+MAP = """
+excitation: {topic: plough/load, fields: {fx: force.x, fy: force.y, m: moment}, unit: {fx: kN, fy: kN}, sequence: n}
+"""
+
+
+def test_a_broker_keeps_messages_for_an_absent_twin_and_garbage_is_counted(broker: Access, tmp_path: Path) -> None:
+    (tmp_path / "map.yaml").write_text(MAP)
+    (tmp_path / "password").write_text(broker.password + "\n")
+    arguments = (
+        *(broker.url, "--map", str(tmp_path / "map.yaml"), "--set", "excitation_timeout=3600"),
+        *("--user", broker.user, "--password-file", str(tmp_path / "password"), "--tls-ca", str(broker.ca)),
+    )
+    sender = Sender(broker)
+    old = {"t": 3.0, "force": {"x": 1.0, "y": 1.0}, "moment": 1.0, "n": 9000}
+    sender.raw(json.dumps(old).encode(), retain=True)  # from before the twin: neither a sample nor the first number
+    with _live(*arguments) as live:
+        live.until_count("dropped_inactive", 1)
+        sender.send(50)
+        for payload in (b"{nonsense", b"\xff\xfe", b"[" * 60000, b'{"n": 51}', b"x" * 100000):
+            sender.raw(payload)
+        values = live.until_count("samples_in", 56)
+        assert (values["samples_used"], values["dropped_malformed"], values["samples_lost"]) == ("50", "5", "0")
+        assert live.stop() == 3
+    sender.client.publish("plough/load", b"", qos=0, retain=True).wait_for_publish(30.0)
+    sender.send(50)
+    with _live(*arguments) as live:
+        values = live.until_count("samples_used", 50)
+        # the broker keeps the empty message too that takes back the retained one
+        assert (values["samples_lost"], values["dropped_malformed"]) == ("0", "1")
+        assert live.stop() == 3
+    sender.close()
+
+
+# paho leaves the socket of a failed handshake to the collector
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_misspelt_topic_of_a_broker_is_no_success(
+    broker: Access, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("PLOW_TWIN_MQTT_PASSWORD", broker.password)
+    mapping = tmp_path / "map.yaml"
+    mapping.write_text("excitation: {topic: plough/mistaken, fields: {fx: fx, fy: fy, m: m}}\n")
+    access = ["--user", broker.user, "--tls-ca", str(broker.ca)]
+    arguments = ["live", broker.url, "--map", str(mapping), "--scene", "paper", "--seconds", "1", "--quiet"]
+    assert run_cli([*arguments, *access]) == 3
+    assert "no sample came on plough/mistaken" in capsys.readouterr().err
+
+
+# paho drops the socket of a handshake that failed, and leaves closing it to the collector
+@pytest.mark.filterwarnings("ignore:unclosed <ssl.SSLSocket:ResourceWarning")
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_wrong_password_a_strange_certificate_and_a_broker_without_tls_are_refused(broker: Access) -> None:
+    for wrong, said in (
+        ({"password": "guess"}, "refused"),
+        ({"ca": None}, "certificate verify failed"),
+        ({"url": broker.url.replace("mqtts", "mqtt")}, "no answer"),
+    ):
+        bridge = Mqtt(replace(broker, **wrong), connect_s=2.0)
+        with pytest.raises(BridgeError, match=said):
+            bridge.start(["plough/load"])
+        assert not bridge.connected
+    for topic, said in (("prohibited", "refused: prohibited"), ("plough/+/load", r"topic: got 'plough/\+/load'")):
+        with pytest.raises(BridgeError, match=said):
+            Mqtt(replace(broker, client_id="other"), connect_s=5.0).start(["plough/load", topic])
+
+
+@pytest.mark.parametrize(
+    "url", ["mqtt://plough.example:1883", "http://localhost", "mqtt://user:secret@localhost", "mqtt://localhost/topic"]
+)
+def test_another_machine_without_tls_and_passwords_in_the_address_are_refused(url: str) -> None:
+    with pytest.raises(BridgeError) as caught:
+        Mqtt(Access(url))
+    assert "secret" not in str(caught.value)
+
+
+def _until(reached: Callable[[], bool], seen: object = None) -> None:
+    give_up = time.monotonic() + 90.0
+    while not reached():
+        assert time.monotonic() < give_up, seen
+        time.sleep(0.02)
+
+
+@contextmanager
+def _open_broker(folder: Path, port: int) -> Iterator[None]:
+    """A broker without TLS that admits everybody."""
+    config = {
+        "listeners": {"default": {"type": "tcp", "bind": f"127.0.0.1:{port}"}},
+        "plugins": {"amqtt.plugins.authentication.AnonymousAuthPlugin": {"allow_anonymous": True}},
+    }
+    (folder / "open.yaml").write_text(json.dumps(config))
+    command = [sys.executable, str(ROOT / "test" / "mqtt_broker.py"), str(folder / "open.yaml")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as process:
+        try:
+            assert process.stdout is not None and process.stdout.readline() == b"ready\n"
+            yield
+        finally:
+            process.kill()
+
+
+def test_a_broker_gets_all_groups_with_tls_and_says_when_the_twin_has_died(broker: Access, tmp_path: Path) -> None:
+    (tmp_path / "secret").write_text(broker.password + "\n")
+    (tmp_path / "out.yaml").write_text(f"mqtt: {{user: plough, password_file: secret, ca: '{broker.ca}'}}\n")
+    path, url = _csv(tmp_path / "load.csv", 1500), f"{broker.url}/face/plough"
+    port = urlsplit(broker.url).port or 0
+    arguments = (str(path), "--follow", "--mqtt-out", url, "--out-access", str(tmp_path / "out.yaml"), *STALE)
+    alarm = ("--set", "alarm_force=[20e3,1e9]", "--set", "alarm_duration=0.0")
+    early = Subscriber(port, broker)
+    with _live(*arguments, *alarm, "--out-rate", "5") as live:
+        live.until_count("samples_used", 1500)
+        live.until(lambda heard: heard.get("mqtt_out", {}).get("values", {}).get("sent", 0) > 8, "sent")
+        assert broker.password not in Path(f"/proc/{live.process.pid}/cmdline").read_text()
+        # a late subscriber gets the newest of everything but the peaks, which are over
+        late = Subscriber(port, broker)
+        late.until(lambda: late.newest("face/plough/alarms") is not None and len(late.messages) >= 7)
+        groups = {"clearance", "wear", "life", "flags", "status", "alarms", "online"}
+        assert {topic.removeprefix("face/plough/") for topic, _, _ in late.messages} == groups
+        clearance, alarms = late.newest("face/plough/clearance"), late.newest("face/plough/alarms")["values"]
+        assert clearance["unit"] == "m" and clearance["values"]["horizontal/p05"] == pytest.approx(0.025)
+        assert alarms["force_latched"] == "warn" and alarms["force_raised"] > alarms["force_threshold"] == 20e3
+        peaks = [json.loads(found) for topic, found, _ in early.messages if topic == "face/plough/peaks"]
+        largest = max(max(filter(None, found["values"].values()), default=0.0) for found in peaks[1:])
+        assert largest == pytest.approx(alarms["force_raised"], rel=1e-6) or largest > alarms["force_raised"]
+        assert late.newest("face/plough/online") is True
+        live.process.kill()
+        late.until(lambda: late.newest("face/plough/online") is False)
+    for subscriber in (early, late):
+        subscriber.close()
+
+
+def test_a_missing_broker_is_reported_and_costs_the_twin_nothing(tmp_path: Path) -> None:
+    path, runs = _csv(tmp_path / "load.csv", 2000), [tmp_path / "alone", tmp_path / "with"]
+    url = f"mqtt://127.0.0.1:{_free_port()}/plough"
+    done = [
+        plow_twin_here("live", path, "--record", run, "--json", *more)
+        for run, more in zip(runs, ((), ("--mqtt-out", url)), strict=True)
+    ]
+    assert [found.returncode for found in done] == [0, 0], done[1].stderr
+    part = json.loads(done[1].stdout)["mqtt_out"]
+    assert part["connected"] == "false" and part["sent"] == "0" and int(part["lost"]) > 0
+    assert "mqtt_out" not in json.loads(done[0].stdout)
+    digests = [[entry for entry in _entries(run) if isinstance(entry, Digest)] for run in runs]
+    assert digests[0] == digests[1] and digests[0]
+
+
+def _entries(run: Path) -> list[object]:
+    return [record.entry for record in RunReader(run) if isinstance(record, EntryRecord)]
+
+
+def test_messages_that_wait_for_a_broker_are_bounded_counted_and_come_in_order(tmp_path: Path) -> None:
+    port = _free_port()
+    there = Message("online", b"true", True)
+    way = Broker(
+        host="127.0.0.1", port=port, client_id="out", user="", password="", tls=None, will=lambda: there,
+        on_connected=lambda: [there], waiting=5,
+    )  # fmt: skip
+    way.open()
+    for number in range(8):
+        way.send(Message("n", str(number).encode(), False))
+    _until(lambda: way.state.trouble.startswith("no broker at 127.0.0.1"), way.state)
+    assert (way.state.sent, way.state.lost, way.state.connected) == (0, 3, False)
+    with _open_broker(tmp_path, port):
+        subscriber = Subscriber(port)
+        _until(lambda: way.state.sent == 6, way.state)
+        subscriber.until(lambda: len(subscriber.messages) == 6)
+        assert [payload for _, payload, _ in subscriber.messages] == [b"true", b"3", b"4", b"5", b"6", b"7"]
+        assert (way.state.lost, way.state.trouble) == (3, "")
+        subscriber.close()
+    _until(lambda: not way.state.connected)
+    asyncio.run(way.close(there, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("url", "said"),
+    [
+        ("mqtt://plant.example/plough", "mqtts:// for another machine, or --plain"),
+        ("mqtt://user:secret@localhost/plough", "user and password in --out-access"),
+        ("mqtt://localhost", "expected mqtt[s]://HOST:PORT/PREFIX"),
+        ("mqtt://localhost/a/+/b", "the prefix without + and #"),
+    ],
+)
+def test_a_bad_address_is_refused_with_the_expectation(url: str, said: str, tmp_path: Path) -> None:
+    done = plow_twin_here("live", _csv(tmp_path / "load.csv", 3), "--mqtt-out", url, "--quiet")
+    assert done.returncode == 2 and said in " ".join(done.stderr.split()) and "secret" not in done.stderr
