@@ -1,10 +1,14 @@
-"""A real OPC UA server: `opcua_server.py PORT [CERTIFICATE KEY [USER]]`; commands on its input."""
+"""A real OPC UA server: `opcua_server.py PORT [CERTIFICATE KEY [USER]]`; commands on its input.
+
+With `MORE_NAMESPACES` in the environment, its nodes have another namespace number.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import json
 import logging
+import os
 import sys
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -55,10 +59,36 @@ class Plant:
             await self.write(stamp_ns, values, **how)
             await asyncio.sleep(pause_s)
 
-    async def lose(self) -> None:
-        """Let each subscription skip a number, as if a message had been lost."""
+    async def number(self, more: int) -> None:
+        """Let each subscription skip numbers, as if messages had been lost, or use one again."""
         for found in self._server.iserver.subscription_service.subscriptions.values():
-            found._notification_seq += 1
+            found._notification_seq += more
+
+    async def lie(self, kind: str) -> None:
+        """Give a history from the far future, or one that never ends."""
+
+        def answer(*asked: Any) -> Any:
+            years = {"future": (2090, 9999), "endless": (2026,), "nothing": ()}[kind]
+            times = [datetime(year, 1, 1, tzinfo=UTC) for year in years]
+            values = [ua.DataValue(ua.Variant(1e9), ua.StatusCode(ua.StatusCodes.Good), time) for time in times]
+            return values, None if kind == "future" else EPOCH
+
+        async def read(*asked: Any) -> Any:
+            return answer(*asked)
+
+        self._server.iserver.history_manager.storage.read_node_history = read
+
+    async def refuse(self, refused: bool) -> None:
+        """Refuse subscriptions, or admit them again."""
+        service = self._server.iserver.subscription_service
+        if refused:
+
+            async def create(*asked: Any, **more: Any) -> Any:
+                raise ua.UaStatusCodeError(ua.StatusCodes.BadTooManySubscriptions)
+
+            service.create_subscription = create
+        else:
+            del service.create_subscription
 
 
 async def serve() -> None:
@@ -72,6 +102,8 @@ async def serve() -> None:
         server.set_security_policy([ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt])
         await server.load_certificate(certificate)
         await server.load_private_key(key)
+    if "MORE_NAMESPACES" in os.environ:
+        await server.register_namespace("urn:other")
     index = await server.register_namespace("urn:plow-twin:test")
     nodes = [
         await server.nodes.objects.add_variable(ua.NodeId(name, index), name, 0.0, ua.VariantType.Double)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import resource
 import socket
 import subprocess
 import sys
@@ -41,12 +43,13 @@ MS = 1_000_000
 class Plant:
     """The server, and a line to it that can be cut."""
 
-    def __init__(self, *security: str) -> None:
+    def __init__(self, *security: str, **environment: str) -> None:
         self.port, server_port = _free_port(), _free_port()
         self._process = subprocess.Popen(
             [sys.executable, str(ROOT / "test" / "opcua_server.py"), str(server_port), *security],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
+            env=os.environ | environment,
             text=True,
         )
         assert self._process.stdout is not None and self._process.stdout.readline() == "ready\n"
@@ -65,6 +68,12 @@ class Plant:
         """Let clients connect."""
         self._door = socket.create_server(("127.0.0.1", self.port))
         threading.Thread(target=self._let_in, args=(self._door,), daemon=True).start()
+
+    def restart_as(self, other: Plant) -> None:
+        """Break all connections, and lead new ones to another server."""
+        self.cut()
+        self._server = other._server
+        self.mend()
 
     def cut(self) -> None:
         """Break all connections and refuse new ones."""
@@ -218,7 +227,7 @@ def test_a_lost_message_is_seen_by_its_number_and_filled_from_the_history(server
     with _bridge(server, roles) as bridge:
         server.do("rows", _rows(start_ns, 0, 5))
         _until(bridge, lambda found: start_ns + 4 * MS in _stamps(found))
-        server.do("lose")
+        server.do("number", 1)
         server.do("rows", _rows(start_ns, 6, 8))
         found = _until(bridge, lambda found: start_ns + 7 * MS in _stamps(found))
         assert bridge.part()[2]["notifications_lost"] == "1" and bridge.lost == 0
@@ -283,6 +292,77 @@ def test_a_break_without_history_is_a_loss(server: Plant, roles: Any) -> None:
         facts = bridge.part()[2]
         assert (facts["breaks"], facts["breaks_filled"], facts["unfilled_s"], bridge.lost) == ("1", "0", "0.01", 1)
         assert facts["no_history"] == "the server's history is empty"
+
+
+@pytest.mark.parametrize("kind", ["future", "endless", "nothing"])
+def test_a_history_that_lies_is_not_believed(kind: str, roles: Any) -> None:
+    plant = Plant()
+    start_ns = time.time_ns() // MS * MS
+    try:
+        with _bridge(plant, roles) as bridge:
+            plant.do("rows", _rows(start_ns, 0, 5))
+            _until(bridge, lambda found: start_ns + 4 * MS in _stamps(found))
+            plant.do("lie", kind)
+            plant.do("number", -1)  # a number twice loses nothing
+            plant.do("rows", _rows(start_ns, 5, 6))
+            _until(bridge, lambda found: start_ns + 5 * MS in _stamps(found))
+            assert bridge.part()[2]["notifications_lost"] == "0"
+            plant.do("number", 1)
+            plant.do("rows", _rows(start_ns, 9, 12))
+            found = _until(bridge, lambda found: start_ns + 11 * MS in _stamps(found))
+            assert _stamps(found) == [start_ns + index * MS for index in (9, 10, 11)]
+            facts = bridge.part()[2]
+            assert ((facts["history_strays"] != "0") is (kind == "future")) and bridge.lost == 1
+            assert kind == "future" or "history" in facts["no_history"]
+            # its clock is put back by an hour
+            plant.do("rows", _rows(start_ns - 3_600_000 * MS, 0, 5))
+            found = _until(bridge, lambda found: len(found) >= 5)
+            assert _stamps(found) == [start_ns - 3_600_000 * MS + index * MS for index in range(5)]
+    finally:
+        plant.close()
+
+
+def test_a_server_that_restarts_with_other_namespace_numbers_or_refuses_for_a_while_is_followed(roles: Any) -> None:
+    first, second = Plant(), Plant(MORE_NAMESPACES="1")
+    start_ns = time.time_ns() // MS * MS
+    try:
+        second.do("refuse", True)
+        with _bridge(first, roles) as bridge:
+            first.do("rows", _rows(start_ns, 0, 5))
+            _until(bridge, lambda found: len(found) >= 5)
+            first.restart_as(second)
+            _until(bridge, lambda _: "BadTooManySubscriptions" in bridge.trouble)
+            second.do("refuse", False)
+            _until(bridge, lambda _: bridge.connected)
+            second.do("rows", _rows(start_ns, 10, 15))
+            found = _until(bridge, lambda found: start_ns + 14 * MS in _stamps(found))
+            assert _stamps(found)[-5:] == [start_ns + index * MS for index in range(10, 15)]
+    finally:
+        first.close()
+        second.close()
+
+
+@pytest.mark.parametrize(
+    "answer", [b"", b"ACKF\x1c", b"\0" * 100, b"MSGF\xff\xff\xff\xff" + bytes(3 << 20), b"MSGC\x08\0\0\0" * 1000]
+)
+def test_a_server_that_sends_nonsense_or_a_part_of_a_message_is_refused_in_bounded_memory(
+    answer: bytes, roles: Any
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as door:
+
+        def serve() -> None:
+            with suppress(OSError):
+                client, _ = door.accept()
+                with client:
+                    client.recv(1 << 16)
+                    client.sendall(answer)
+
+        threading.Thread(target=serve, daemon=True).start()
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        bridge = OpcUa(Access(f"opc.tcp://127.0.0.1:{door.getsockname()[1]}"), roles, connect_s=20.0)
+        with pytest.raises(BridgeError, match=r"no server at|refused|no answer"):
+            bridge.start([])
+        assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50_000
 
 
 @pytest.fixture(scope="module")

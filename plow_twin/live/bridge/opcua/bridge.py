@@ -94,6 +94,8 @@ class OpcUa(SourceState):
         self._topics_of = [
             [topic for topic, role in self._roles.items() if node in role.fields.values()] for node in self._nodes
         ]
+        #: namespaces of the server at the first connection
+        self._uris: list[str] = []
         self._counts = Counts()
         self._revised: Revised | None = None
         self._queue: deque[Arrived] = deque()
@@ -166,7 +168,7 @@ class OpcUa(SourceState):
         self._loop, self._task = asyncio.get_running_loop(), asyncio.current_task()
         wait_s = _FIRST_WAIT_S
         while not self._stop.is_set():
-            link = Link(self._access, self.host, self._ids, self._sampling_ms, self._take, self._counts)
+            link = Link(self._access, self.host, self._ids, self._uris, self._sampling_ms, self._take, self._counts)
             try:
                 await self._follow(link)
             except Exception as error:  # a malformed answer ends in any error of the library
@@ -186,6 +188,7 @@ class OpcUa(SourceState):
         again = self._answer.is_set()
         self._held_back, self._no_history, self._link = [], "", link
         self._revised = await link.open()
+        self._uris = self._uris or link.uris
         self.connected, self.trouble = True, ""
         self._answer.set()
         if again:
@@ -210,7 +213,7 @@ class OpcUa(SourceState):
         while self._held_back:
             waiting, self._held_back = self._held_back, []
             for values, lost in waiting:
-                await self._take_now([item for item in values if self._is_new(*item)], lost)
+                await self._take_now([item for item in values if not self._is_known(*item)], lost)
         self._held_back = None
 
     async def _take(self, values: list[tuple[int, Any]], lost: bool) -> None:
@@ -229,7 +232,7 @@ class OpcUa(SourceState):
         self._counts.overflows += overflows
         if (lost or overflows) and any(min(samples.newest_ns.values()) for samples in self._samples.values()):
             await self._fill(values)
-            values = [item for item in values if self._is_new(*item)]
+            values = [item for item in values if not self._is_known(*item)]
         now_s = time.monotonic()
         for number, value in values:
             self._add(number, value, now_s)
@@ -239,6 +242,15 @@ class OpcUa(SourceState):
         """Return whether a value is newer than all of its node."""
         found = reading(value, self._by_server(number), Counts())
         return found is not None and found[0] > self._newest_ns(number)
+
+    def _is_before(self, number: int, value: Any, end_ns: int) -> bool:
+        found = reading(value, self._by_server(number), Counts())
+        return found is not None and found[0] <= end_ns
+
+    def _is_known(self, number: int, value: Any) -> bool:
+        """Return whether the history has had a value; one from long before is new: the server's clock was put back."""
+        found = reading(value, self._by_server(number), Counts())
+        return found is not None and 0 <= self._newest_ns(number) - found[0] < _PIECE_NS
 
     def _by_server(self, number: int) -> bool:
         return self._roles[self._topics_of[number][0]].stamp == SERVER_STAMP
@@ -302,6 +314,9 @@ class OpcUa(SourceState):
         assert self._link is not None
         values = await self._link.history(begin_ns, end_ns)
         new = [item for item in values if self._is_new(*item)]
+        asked = [item for item in new if self._is_before(*item, end_ns + _OVERLAP_NS)]
+        self._counts.history_strays += len(new) - len(asked)
+        new = asked
         self._counts.values_filled += len(new)
         now_s = time.monotonic()
         for number, value in new:

@@ -33,6 +33,11 @@ _MOST_AGAIN: Final = 100
 _ANSWER_S: Final = 10.0
 #: Longest wait for the end of a session [s].
 _CLOSE_S: Final = 2.0
+#: Most bytes of a message that a server may send, and of its parts (the standard's least limit is 8 KiB) [B].
+_LARGEST_MESSAGE: Final = 64 << 20
+_LARGEST_PART: Final = 1 << 20
+#: Most values of the history that are read at once: 10 s of ten nodes at 10 kHz.
+_MOST_HISTORY: Final = 1_000_000
 #: Sequence numbers begin again at 1 behind this.
 _LAST_NUMBER: Final = 2**32 - 1
 
@@ -66,6 +71,8 @@ class Link:
         The server.
     nodes
         Identifiers of the nodes.
+    uris
+        Namespaces of the server when the numbers in these identifiers held; empty: they hold now.
     sampling_ms
         Requested sampling interval [ms]; 0: the server's fastest.
     take
@@ -75,12 +82,22 @@ class Link:
     """
 
     def __init__(
-        self, access: Access, host: str, nodes: Sequence[ua.NodeId], sampling_ms: float, take: Take, counts: Counts
+        self,
+        access: Access,
+        host: str,
+        nodes: Sequence[ua.NodeId],
+        uris: Sequence[str],
+        sampling_ms: float,
+        take: Take,
+        counts: Counts,
     ) -> None:
         self._access, self._host, self._nodes = access, host, list(nodes)
+        #: namespaces of the server, by number
+        self.uris = list(uris)
         self._sampling_ms, self._take, self._counts = sampling_ms, take, counts
         # a server that answers late is not gone
         self._client = Client(access.url, timeout=_ANSWER_S, watchdog_intervall=3.0 * _KEEPALIVE_S)
+        _bound(self._client)
         if access.user:
             self._client.set_user(access.user)
             self._client.set_password(access.password)
@@ -106,6 +123,8 @@ class Link:
         if self._access.user_certificate is not None:
             await identify(self._client, self._access)
         await self._client.connect()
+        before, self.uris = self.uris, await self._client.get_namespace_array()
+        self._nodes = [self._placed(node, before or self.uris) for node in self._nodes]
         return await self._subscribe()
 
     async def close(self) -> None:
@@ -114,6 +133,17 @@ class Link:
             await asyncio.wait_for(self._client.disconnect(), _CLOSE_S)
         except Exception:  # whatever the state of the connection was
             self._client.disconnect_socket()
+
+    def _placed(self, node: ua.NodeId, uris: Sequence[str]) -> ua.NodeId:
+        """Return a node's identifier with the present number of its namespace, which may change with a restart."""
+        uri = getattr(node, "NamespaceUri", None)
+        if uri is None:
+            uri = uris[node.NamespaceIndex] if node.NamespaceIndex < len(uris) else None
+        if uri is None:
+            return node  # the server says that it does not know it
+        if uri not in self.uris:
+            raise BridgeError(f"node: got namespace {uri}, expected one of the server: {', '.join(self.uris)}")
+        return ua.NodeId(node.Identifier, ua.Int16(self.uris.index(uri)), node.NodeIdType)
 
     @property
     def trouble(self) -> str:
@@ -131,7 +161,7 @@ class Link:
         Raises
         ------
         UaError
-            The server keeps no history of some node.
+            The server keeps no history of some node, or its answers have no end.
         """
         details = ua.ReadRawModifiedDetails(
             IsReadModified=False,
@@ -141,6 +171,7 @@ class Link:
             ReturnBounds=False,
         )
         found: list[tuple[int, Any]] = []
+        reached = [details.StartTime] * len(self._nodes)
         wanted = [(number, ua.HistoryReadValueId(NodeId=node)) for number, node in enumerate(self._nodes)]
         while wanted:
             asked = ua.HistoryReadParameters(details, ua.TimestampsToReturn.Both, False, [read for _, read in wanted])
@@ -148,8 +179,13 @@ class Link:
             more = []
             for (number, read), result in zip(wanted, results, strict=True):
                 result.StatusCode.check()
-                found += [(number, value) for value in getattr(result.HistoryData, "DataValues", None) or ()]
+                values = getattr(result.HistoryData, "DataValues", None) or []
+                found += [(number, value) for value in values]
                 if result.ContinuationPoint:
+                    newest = values[-1].SourceTimestamp or values[-1].ServerTimestamp if values else None
+                    if newest is None or newest <= reached[number] or len(found) > _MOST_HISTORY:
+                        raise UaError("history: got an answer that leads to no end")
+                    reached[number] = newest
                     more.append(
                         (number, ua.HistoryReadValueId(read.NodeId, ContinuationPoint=result.ContinuationPoint))
                     )
@@ -226,7 +262,10 @@ class Link:
 
     def _missing(self, number: int) -> range:
         """Return the sequence numbers that should have come before this one."""
-        expected, self._next_number = self._next_number, number % _LAST_NUMBER + 1
+        expected = self._next_number
+        if expected is not None and number == expected - 1:  # the newest one again
+            return range(0)
+        self._next_number = number % _LAST_NUMBER + 1
         return range(0) if expected is None or number < expected else range(expected, number)
 
     async def _again(self, number: int) -> ua.NotificationMessage | None:
@@ -245,3 +284,25 @@ class Link:
             elif isinstance(part, ua.StatusChangeNotification):
                 self._ended = f"the subscription has ended: {part.Status.name}"
         await self._take(values, lost)
+
+
+def _bound(client: Client) -> None:
+    """Have a client disconnect from a server that sends messages without end: asyncua keeps any size."""
+    connection = client.uaclient
+    make = connection._make_protocol
+
+    def bounded() -> Any:
+        protocol = make()
+        receive = protocol.data_received
+
+        def data_received(data: bytes) -> None:
+            begun = len(protocol.receive_buffer or b"")
+            if begun > _LARGEST_PART or protocol._connection._incoming_size > _LARGEST_MESSAGE:
+                protocol.disconnect_socket()
+            else:
+                receive(data)
+
+        setattr(protocol, "data_received", data_received)  # noqa: B010
+        return protocol
+
+    setattr(connection, "_make_protocol", bounded)  # noqa: B010

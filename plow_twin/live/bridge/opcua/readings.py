@@ -9,6 +9,8 @@ from typing import Any, Final
 from plow_twin.live.bridge.opcua.samples import NOT_MEASURED, Value
 
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
+#: Times beyond this stand for none [ns].
+_FARTHEST_NS: Final = 4_000_000_000_000_000_000
 _MICROSECOND: Final = timedelta(microseconds=1)
 _SEVERITY: Final = 0xC0000000
 _UNCERTAIN: Final = 0x40000000
@@ -32,6 +34,8 @@ class Counts:
     breaks: int = 0
     breaks_filled: int = 0
     values_filled: int = 0
+    #: values of the history from times that it was not asked for
+    history_strays: int = 0
     #: time that neither a message nor the history covers
     unfilled_s: float = 0.0
 
@@ -72,7 +76,7 @@ def _stamp_ns(time: datetime | None, picoseconds: int | None) -> int | None:
         return None
     time = time if time.tzinfo else time.replace(tzinfo=UTC)
     stamp_ns = (time - _EPOCH) // _MICROSECOND * 1000 + (picoseconds or 0) // 100
-    return stamp_ns if stamp_ns > 0 else None  # 1601 stands for no time
+    return stamp_ns if 0 < stamp_ns < _FARTHEST_NS else None  # 1601 and 9999 stand for no time
 
 
 def date_of(stamp_ns: int) -> datetime:
