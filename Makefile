@@ -25,9 +25,9 @@ BENCH_ARGS ?=
 SITE ?= out/site
 COVERED ?= $(wildcard test/test_model_*.py test/test_scene_*.py test/test_stream_*.py test/test_record_file.py)
 LOWEST ?= .venv-lowest
-# core, record and node, without random searches; rerun wants a newer numpy than ROS 2 Jazzy has
+# core, record, node and MQTT, without random searches; rerun wants a newer numpy than ROS 2 Jazzy has
 LOWEST_TESTS ?= -k "not rerun" $(wildcard test/test_model_*.py test/test_scene_*.py test/test_run_twin.py test/test_stream_session.py) \
-	$(addprefix test/, test_solve_reference.py test_record_file.py test_ros_lifecycle.py)
+	$(addprefix test/, test_solve_reference.py test_record_file.py test_ros_lifecycle.py test_mqtt.py)
 
 demo: $(INSTALLED)
 	"$(VENV)/bin/plow-twin" demo --speed $(SPEED) --out "$(OUT)"
@@ -54,7 +54,7 @@ coverage: $(INSTALLED)
 docs: $(INSTALLED)
 	"$(VENV)/bin/mkdocs" build --strict --site-dir "$(abspath $(SITE))"
 
-# core, record and node with the lowest versions that setup.py names
+# core, record, node and MQTT with the lowest versions that setup.py names
 lowest: $(LOWEST)/.installed
 	"$(LOWEST)/bin/python" -m pytest -m "not stress" $(filter-out --no-loadscope-reorder,$(PARALLEL)) $(PYTEST_ARGS) $(LOWEST_TESTS)
 

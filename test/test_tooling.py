@@ -52,7 +52,9 @@ def test_every_file_of_the_package_is_installed(metadata: dict[str, Any]) -> Non
 
 def test_the_lowest_versions_are_those_that_setup_names(metadata: dict[str, Any]) -> None:
     stated: dict[str, str] = {}
-    for line in (*metadata["install_requires"], *metadata["extras_require"]["record"]):
+    extras = metadata["extras_require"]
+    of_tests = [line for line in extras["test"] if re.match("pytest(-xdist)?>", line)]
+    for line in (*metadata["install_requires"], *extras["record"], *extras["mqtt"], *of_tests):
         match = VERSION.fullmatch(line)
         assert match is not None, line
         stated[match[1]] = match[2]
@@ -103,7 +105,10 @@ def test_ci_is_bounded_and_runs_every_check() -> None:
     assert targets >= {"test", "lint", "docs", "demo", "lowest"}
     assert "test_stream_session.py" in dry_run("coverage") and "--cov" not in dry_run("test")
     lowest = dry_run("lowest")
-    assert all(name in lowest for name in ("test_solve_reference.py", "test_record_file.py", "test_ros_lifecycle.py"))
+    assert all(
+        name in lowest
+        for name in ("test_solve_reference.py", "test_record_file.py", "test_ros_lifecycle.py", "test_mqtt.py")
+    )
 
 
 def test_a_screenshot_leaves_the_settings_of_the_user_s_viewer_alone(
