@@ -462,34 +462,43 @@ def plot(results: dict[str, Any], drops: Drops) -> None:
     axis.barh(names, [results["ellipse"][name]["rms"] for name in names], color="tab:blue", label="RMS")
     axis.plot([results["ellipse"][name]["median"] for name in names], names, "k|", label="median")
     axis.set_xlabel("error of the velocity after the impact, held out [m/s]")
-    axis.legend()
+    axis.set_title("Measured impacts of an ellipse, by contact law")
+    axis.margins(y=0.01)
+    axis.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0))
     figure.savefig(IMAGES / "measured_laws.png", dpi=110, bbox_inches="tight")
     index = next(i for i in drops.usable() if len(drops.bounces[i]) > 2)
     pose, given = drops.pose[index], int(drops.flight_rows[index])
     rows = drops.until(index, 2) + 1
     points = np.quantile(ensemble(pose[:given], rows), [0.05, 0.5, 0.95], axis=0)
-    figure, axes = plt.subplots(3, 1, figsize=(8, 7), sharex=True)
+    figure, axes = plt.subplots(3, 1, figsize=(9, 7), sharex=True)
     t = np.arange(rows) / 250.0
-    for j, (axis, name) in enumerate(zip(axes, ("x [m]", "z [m]", "theta [rad]"), strict=True)):
-        axis.fill_between(t, points[0, :, j], points[2, :, j], color="tab:blue", alpha=0.3, label="90 % band")
-        axis.plot(t, points[1, :, j], color="tab:blue", label="median")
-        axis.plot(t, pose[:rows, j], "k.", markersize=3, label="measured")
-        axis.axvline((given - 1) / 250.0, color="0.6")
+    units = (("x [mm]", 1e3), ("z [mm]", 1e3), ("angle [degrees]", float(np.degrees(1.0))))
+    for j, (axis, (name, unit)) in enumerate(zip(axes, units, strict=True)):
+        axis.fill_between(
+            t, unit * points[0, :, j], unit * points[2, :, j], color="tab:blue", alpha=0.3, label="90 % band"
+        )
+        axis.plot(t, unit * points[1, :, j], color="tab:blue", label="median")
+        axis.plot(t, unit * pose[:rows, j], "k.", markersize=3, label="measured")
+        axis.axvline((given - 1) / 250.0, color="0.6", label="end of the first flight")
         axis.set_ylabel(name)
-    axes[0].legend()
-    axes[2].set_xlabel("t [s]")
+    axes[0].set_title(f"Measured drop {index} of a square, predicted from its first flight")
+    axes[0].legend(loc="upper left", bbox_to_anchor=(1.01, 1.0))
+    axes[2].set_xlabel("time [s]")
     figure.savefig(IMAGES / "measured_drop.png", dpi=110, bbox_inches="tight")
-    figure, axis = plt.subplots(figsize=(6, 3))
+    figure, axis = plt.subplots(figsize=(6, 3.4))
     for name, one in results["square"].items():
-        for j, (what, style) in enumerate((("x", "-"), ("z", "--"), ("theta", ":"))):
-            color = "tab:blue" if name.startswith("rounded") else "tab:orange"
-            cover = [row[j] for row in one["coverage"]]
-            axis.plot(range(1, len(cover) + 1), cover, style, marker="o", color=color, label=f"{what}, {name}")
-    axis.axhspan(0.85, 0.95, color="0.9")
+        rounded = name.startswith("rounded")
+        block = "rounded corners, e falls" if rounded else "sharp corners, e constant"
+        for j, (component, style) in enumerate((("x", "-"), ("z", "--"), ("angle", ":"))):
+            color = "tab:blue" if rounded else "tab:orange"
+            cover = [100.0 * row[j] for row in one["coverage"]]
+            axis.plot(range(1, len(cover) + 1), cover, style, marker="o", color=color, label=f"{component}, {block}")
+    axis.axhspan(85.0, 95.0, color="0.9", label="aim")
     axis.set_xticks([1, 2])
     axis.set_xlabel("after bounce")
-    axis.set_ylabel("share of rows inside")
-    axis.legend(fontsize=7)
+    axis.set_ylabel("rows inside the 90 % band [%]")
+    axis.set_title("Measured drops of a square")
+    axis.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), fontsize=8)
     figure.savefig(IMAGES / "measured_coverage.png", dpi=110, bbox_inches="tight")
 
 

@@ -67,7 +67,9 @@ def test_numpy_pandas_and_arrow_are_the_same_numbers(run: Run) -> None:
 
 
 @pytest.mark.parametrize("kind", ["csv", "parquet", "npz"])
-def test_an_export_is_the_recording(kind: str, run: Run, tmp_path: Path) -> None:
+def test_an_export_is_the_recording_and_overwrites_nothing(
+    kind: str, run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / ("run.npz" if kind == "npz" else "tables")
     assert cli(["export", str(run.folder), "--to", kind, "--out", str(out), "--quiet"]) == 0
     recording = plow_twin.read_recording(run.folder)
@@ -85,6 +87,8 @@ def test_an_export_is_the_recording(kind: str, run: Run, tmp_path: Path) -> None
         read = np.stack([column.to_numpy().astype(float) for column in table.columns[1:]], axis=1)
         np.testing.assert_array_equal(read, values)
         np.testing.assert_array_equal(table["stamp"].to_numpy().astype("datetime64[ns]").astype(np.int64), stamps)
+    assert cli(["export", str(run.folder), "--to", kind, "--out", str(out), "--quiet"]) == 2
+    assert "is there already" in capsys.readouterr().err
 
 
 def test_an_export_of_a_cut_recording_says_so_and_of_a_place_that_takes_nothing_too(

@@ -23,6 +23,9 @@ def export(recording: Path, kind: str, out: Path, quiet: bool) -> int:
     from plow_twin.record.recording import read_recording
 
     opened = read_recording(recording)
+    there = [path for path in ([out] if kind == "npz" else _tables(out, kind)) if path.is_file()]
+    if there:
+        raise click.UsageError(f"{there[0]}: is there already, expected another place: --out")
     with busy("exporting", quiet):
         rows = write(opened, kind, out)
     if not quiet:
@@ -34,3 +37,10 @@ def export(recording: Path, kind: str, out: Path, quiet: bool) -> int:
     if lost:
         say_error(f"plow-twin: {recording}: lost {counts(lost)}")
     return DONE_WITH_LOSS if lost else DONE
+
+
+def _tables(out: Path, kind: str) -> list[Path]:
+    """Return the files of all tables that an export may write into the folder."""
+    from plow_twin.record.recording import COLUMNS
+
+    return [out / f"{name}.{kind}" for name in COLUMNS]
