@@ -742,7 +742,7 @@ def _groups(
 
     `added` is the covariance beyond the fit's; `shared` are unknowns and differences from the model.
     """
-    out = {}
+    out: dict[str, tuple[Interval, State]] = {}
     for name, (value, deviation) in by_group(problem, fit, widened).items():
         axis = GX if name.startswith("horizontal") else GY
         state = states[axis]
