@@ -308,7 +308,7 @@ def test_a_bag_of_another_program_is_drawn_by_its_mapping(tmp_path: Path, monkey
     arguments = ["view", str(tmp_path / "bag"), "--map", str(tmp_path / "map.yaml"), "--scene", "paper", "--quiet"]
     assert run_cli([*arguments, "--png", str(tmp_path / "bag.png")]) == 0
     force, load = figures[0].axes[2:4]
-    assert figures[0].get_suptitle().startswith("bag/run, ")
+    assert figures[0].get_suptitle().startswith("bag/run, scene paper, ")
     largest = max(float(np.nanmax(line.get_ydata())) for line in force.lines[:8])
     assert largest == pytest.approx(analyse_force(tmp_path) / 1e3, rel=1e-6)
     np.testing.assert_allclose(load.lines[0].get_ydata(), motion()[1][:400, 0] / 1e3)

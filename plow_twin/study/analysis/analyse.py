@@ -431,7 +431,7 @@ def _walk_other(
             f"{path}: excitation: got {found}, expected a topic with the load, or a mapping that names it"
         )
     check_units(messages_of(open_source(path), roles), roles, predictions[0].scene, path)
-    writer = _writer(out, predictions[0].scene, roles) if out is not None else None
+    writer = _writer(out, predictions[0], roles) if out is not None else None
     walkers = [
         Walker(_session(prediction.scene, _TOLERANCE), prediction.walked, writer if number == 0 else None)
         for number, prediction in enumerate(predictions)
@@ -463,12 +463,12 @@ def _walk_other(
     return Analysis(path, "other", predictions, measured, counted, losses, dict(source.losses.unknown_types))
 
 
-def _writer(out: Path, scene: Scene, roles: Mapping[str, Role]) -> Any:
+def _writer(out: Path, prediction: Prediction, roles: Mapping[str, Role]) -> Any:
     from plow_twin.record.header import RunHeader
     from plow_twin.record.writer import RunWriter
 
-    parameters = {f"{_MAP}{name}": role.topic for name, role in roles.items()}
-    header = RunHeader(dump_scene(scene), tol=_TOLERANCE, parameters=parameters)
+    parameters = {"scene": prediction.name} | {f"{_MAP}{name}": role.topic for name, role in roles.items()}
+    header = RunHeader(dump_scene(prediction.scene), tol=_TOLERANCE, parameters=parameters)
     return RunWriter(out / "run", header, chunk_size=2**20, min_free_bytes=64 * 1024 * 1024)
 
 
