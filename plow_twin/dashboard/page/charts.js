@@ -129,9 +129,11 @@ export class Charts {
       ctx.fillStyle = "#b04a8c";
       ctx.textAlign = "right";
       const text = event.kind === "mark" ? event.text.split(": ")[0].slice(0, 24) : event.kind;
-      row = x - 4 - ctx.measureText(text).width < before ? (row + 1) % 5 : 0;
-      before = x;
-      ctx.fillText(text, x - 4, bbox.top + 12 + 12 * row);
+      const width = ctx.measureText(text).width;
+      const end = Math.max(x - 4, bbox.left + 4 + width);
+      row = end - width < before ? (row + 1) % 5 : 0;
+      before = Math.max(x, end);
+      ctx.fillText(text, end, bbox.top + 12 + 12 * row);
     }
     ctx.restore();
   }
