@@ -82,7 +82,7 @@ def right_models() -> str:
 def right_sum() -> str:
     """Return the groups whose error was asked for, without widths, bounds and cost, and how many are flagged."""
     keep = (0, 1, 2, 3, 5, 6)
-    lines = []
+    lines: list[str] = []
     for line in right_models().splitlines():
         cells = [cell.strip() for cell in line.strip("|").split("|")]
         if len(cells) > 1 and (not lines or "---" in line or cells[3]):
