@@ -598,10 +598,8 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
         # a moment that cannot be predicted contradicts no clearance; a bouncing head cannot be predicted for long
         tested = share[index] > tuning.PREDICTED or unknowns.penetration_of(float(shared[SOFTNESS])) < tuning.HARD
         if not tested and finished and not suspect:
-            clearance = "horizontal" if index == GX else "vertical"
             reasons.append(
-                f"{clearance} clearance not observable: {share[index]:.0%} of {COMPONENTS[index]} is predicted, "
-                f"expected {tuning.PREDICTED:.0%}"
+                f"{COMPONENTS[index]}: {share[index]:.0%} of it is predicted, expected {tuning.PREDICTED:.0%}"
             )
         touched = min(float(fit.point.contact[:, _SIDES[side]].sum()) for side in sides)
         observed = tested and touched > tuning.TOUCHED
@@ -625,9 +623,7 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
         sensor="suspect" if verdict.sensor else "ok",
         reasons=tuple(reasons),
         lost=lost,
-        groups=_groups(
-            problem, fit, float(np.sqrt(alone[GX, GX] / plain[GX, GX])), clearances, states, shared, covariance - alone
-        ),
+        groups=_groups(problem, fit, float(np.sqrt(alone[GX, GX] / plain[GX, GX])), states, shared, covariance - alone),
         differs={} if beside is None else beside.differs,
         correlation=_correlation(covariance),
         figures={
@@ -730,25 +726,16 @@ def _scatter(problem: Problem, fit: Fit, variance: Array) -> float:
 
 
 def _groups(
-    problem: Problem,
-    fit: Fit,
-    widened: float,
-    clearances: list[Interval],
-    states: list[State],
-    shared: Array,
-    added: Array,
+    problem: Problem, fit: Fit, widened: float, states: list[State], shared: Array, added: Array
 ) -> dict[str, tuple[Interval, State]]:
-    """Return the clearance of each group of pads; the whole clearance's prior where the motion does not determine it.
+    """Return the clearance of each group of pads; not observable where the motion does not determine it.
 
     `added` is the covariance beyond the fit's; `shared` are unknowns and differences from the model.
     """
-    out: dict[str, tuple[Interval, State]] = {}
+    out = {}
     for name, (value, deviation) in by_group(problem, fit, widened).items():
         axis = GX if name.startswith("horizontal") else GY
         state = states[axis]
-        if state is State.NOT_OBSERVABLE:
-            out[name] = clearances[axis], state
-            continue
         whole = math.sqrt(deviation**2 + max(float(added[axis, axis]), 0.0))
         if state.known and whole > 0.5 * tuning.OBSERVED:
             state = State.NOT_OBSERVABLE
