@@ -110,21 +110,19 @@ TOPICS: Final = (
     Topic(
         "contact_peaks", JOINT_STATE, Cadence.EACH,
         "position = touches since configure, velocity = impulse [N s] and effort = largest force [N] since the last "
-        "message; after late samples since the time that the model went back to",
+        "message, or, after late samples, since the time that the model went back to",
         names=PAIR_NAMES,
         columns={"position": (("makes", 8),), "velocity": (("impulse", 8),), "effort": (("peak", 8),)},
         cumulative=True,
     ),
     Topic(
         "force_intervals", JOINT_STATE, Cadence.FOLLOWED,
-        "effort = force [N] of `contact_forces` under `<pair>`, its 5 % and 95 % points under `<pair>/p05`, "
-        "`<pair>/p95`, with the same stamp",
+        "effort = force [N] of `contact_forces` as `<pair>`, its 5 % and 95 % points as `<pair>/p05`, `<pair>/p95`",
         names=_INTERVALS, columns={"effort": (("force", 8), ("force_low", 8), ("force_high", 8))},
     ),
     Topic(
         "peak_intervals", JOINT_STATE, Cadence.FOLLOWED,
-        "velocity = impulse [N s] and effort = largest force [N] of `contact_peaks`, and their points, under the same "
-        "names, with the same stamp and over the same span",
+        "velocity = impulse [N s] and effort = largest force [N] of `contact_peaks`, with the same points",
         names=_INTERVALS,
         columns={
             "velocity": (("impulse", 8), ("impulse_low", 8), ("impulse_high", 8)),
@@ -140,49 +138,45 @@ TOPICS: Final = (
     Topic(
         "clearance", JOINT_STATE, Cadence.SLOW,
         "position [m] of `horizontal`, `vertical`, then `pad_<pair>` (wear depth), then `<name>/p05`, `<name>/p95` of "
-        "each; first message in each 0.1 s of stamps",
+        "each",
         names=CLEARANCE_NAMES, columns={"position": (("clearance", len(CLEARANCE_NAMES)),)}, cumulative=True,
     ),
     Topic(
         "wear_rate", JOINT_STATE, Cadence.SLOW,
-        "velocity = growth of each pad's wear since the last such message [m/s]; with `clearance`",
+        "velocity = growth of each pad's wear since the message before [m/s]",
         names=PAD_NAMES, columns={"velocity": (("wear_rate", 8),)}, cumulative=True,
     ),
     Topic(
         "quality", JOINT_STATE, Cadence.MARKED,
         "position of `held` (the state at the stamp was computed without a sample) and `corrected` (late samples have "
-        "been worked in), 1 or 0, with the stamp of the forces they speak of; sent with each such message and with the "
-        "first one after",
+        "been worked in), 1 or 0; also sent once after the last mark",
         names=("held", "corrected"), columns={"position": (("held", 1), ("corrected", 1))}, latched=True,
     ),
     Topic(
         "estimate", JOINT_STATE, Cadence.ESTIMATE,
-        "only with the parameter `estimate`: position of `horizontal`, `vertical` [m], `stiffness`, `damping`, "
-        "`gain_fx`, `gain_fy`, `gain_m` [1], `bias_x`, `bias_y` [m], `bias_theta` [rad], `delay` [s], each followed by "
-        "its `<name>/p05`, `<name>/p95`; the stamp is the end of the window; without names where the estimate is "
-        "withdrawn",
+        "with `estimate: true`: position of `horizontal`, `vertical` [m], `stiffness`, `damping`, `gain_fx`, "
+        "`gain_fy`, `gain_m` [1], `bias_x`, `bias_y` [m], `bias_theta` [rad], `delay` [s], each followed by its "
+        "`<name>/p05`, `<name>/p95`",
         latched=True, depth=1,
     ),
     Topic(
         "window_forces", JOINT_STATE, Cadence.ESTIMATE,
-        "only with `estimate` and `estimate_forces`: `<pair>`, `<pair>/p05`, `<pair>/p95` (median, 5 % and 95 % points "
-        "over twins drawn from the estimate), velocity = impulse [N s] and effort = largest force [N] in the last "
-        "`estimate_interval` before the stamp, which is the end of the window; without names where there are none",
+        "with `estimate_forces`: velocity = impulse [N s] and effort = largest force [N] in the last "
+        "`estimate_interval`, over twins drawn from the estimate: median `<pair>`, points `<pair>/p05`, `<pair>/p95`",
         latched=True, depth=1,
     ),
     Topic(
         "forecast", JOINT_STATE, Cadence.ESTIMATE,
-        "only with `estimate` and `forecast_limits`: position of `seconds`, `metres`, `passes`, `shifts`, each as "
-        "`/p10`, `/p50`, `/p90`, of operation until a clearance reaches its limit (left out where that is beyond the "
-        "horizon), then `not_reached_in_horizon` and, with `forecast_stop`, `probability_before_stop` [1]; without "
-        "names where the estimate is withdrawn",
+        "with `forecast_limits`: position of `seconds`, `metres`, `passes`, `shifts` of operation until a clearance "
+        "reaches its limit, each as `/p10`, `/p50`, `/p90` (left out beyond the horizon), then "
+        "`not_reached_in_horizon` and, with `forecast_stop`, `probability_before_stop` [1]",
         latched=True, depth=1,
     ),
     Topic(
         "alarms", STATUS, Cadence.CHANGE,
-        "the alarms: value, `<name>_level` and `<name>_latched` of `force` [N], `clearance` [m], `clearance_rate`, "
-        "`wear_rate` [m/s], and `residual` [m] where it has a threshold; of a latched alarm `<name>_raised` (value), "
-        "`<name>_threshold`, `<name>_place` (pad or axis) and `<name>_stamp_ns`; message = the same in words",
+        "value, `<name>_level` and `<name>_latched` of `force` [N], `clearance` [m], `clearance_rate`, `wear_rate` "
+        "[m/s] and, with a threshold, `residual` [m]; of a latched alarm `<name>_raised` (value), `<name>_threshold`, "
+        "`<name>_place` (pad or axis), `<name>_stamp_ns`; message = the same in words",
         latched=True, depth=1,
     ),
     Topic("status", STATUS, Cadence.CHANGE, "what the node is doing", latched=True, depth=1),
