@@ -594,12 +594,14 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
     least = range_of_motion(unknowns.scene, poses)[0] - given
     share = predicted(fit).sum(axis=0) / np.maximum(np.isfinite(fit.point.residual).sum(axis=0), 1)
     clearances, states = [], []
+    untested: dict[int, Interval] = {}
     for index, sides in ((GX, ("left", "right")), (GY, ("top", "bottom"))):
         # a moment that cannot be predicted contradicts no clearance; a bouncing head cannot be predicted for long
         tested = share[index] > tuning.PREDICTED or unknowns.penetration_of(float(shared[SOFTNESS])) < tuning.HARD
         if not tested and finished and not suspect:
             reasons.append(
-                f"{COMPONENTS[index]}: {share[index]:.0%} of it is predicted, expected {tuning.PREDICTED:.0%}"
+                f"{'horizontal' if index == GX else 'vertical'} clearance not observable: {share[index]:.0%} of "
+                f"{COMPONENTS[index]} is predicted, expected {tuning.PREDICTED:.0%}"
             )
         touched = min(float(fit.point.contact[:, _SIDES[side]].sum()) for side in sides)
         observed = tested and touched > tuning.TOUCHED
@@ -609,6 +611,8 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
             value = _unobserved(unknowns, deviation, index, least[index], fit.noise)
         clearances.append(value.above(0.0))
         states.append(_state(suspect and not rough, observed, rough))
+        if not tested:
+            untested[index] = clearances[-1]
     normal = [Interval.normal(value, spread) for value, spread in zip(shared, deviation, strict=True)]
     result = Estimate(
         t_start=float(poses.t[0]),
@@ -623,7 +627,9 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
         sensor="suspect" if verdict.sensor else "ok",
         reasons=tuple(reasons),
         lost=lost,
-        groups=_groups(problem, fit, float(np.sqrt(alone[GX, GX] / plain[GX, GX])), states, shared, covariance - alone),
+        groups=_groups(
+            problem, fit, float(np.sqrt(alone[GX, GX] / plain[GX, GX])), states, untested, shared, covariance - alone
+        ),
         differs={} if beside is None else beside.differs,
         correlation=_correlation(covariance),
         figures={
@@ -726,11 +732,18 @@ def _scatter(problem: Problem, fit: Fit, variance: Array) -> float:
 
 
 def _groups(
-    problem: Problem, fit: Fit, widened: float, states: list[State], shared: Array, added: Array
+    problem: Problem,
+    fit: Fit,
+    widened: float,
+    states: list[State],
+    untested: dict[int, Interval],
+    shared: Array,
+    added: Array,
 ) -> dict[str, tuple[Interval, State]]:
     """Return the clearance of each group of pads; not observable where the motion does not determine it.
 
-    `added` is the covariance beyond the fit's; `shared` are unknowns and differences from the model.
+    `untested` has the clearances that no predicted motion tests, by axis: no group of them is known better. `added` is
+    the covariance beyond the fit's; `shared` are unknowns and differences from the model.
     """
     out = {}
     for name, (value, deviation) in by_group(problem, fit, widened).items():
@@ -739,7 +752,8 @@ def _groups(
         whole = math.sqrt(deviation**2 + max(float(added[axis, axis]), 0.0))
         if state.known and whole > 0.5 * tuning.OBSERVED:
             state = State.NOT_OBSERVABLE
-        out[name] = Interval.normal(value.mean + float(shared[axis] - fit.shared[axis]), whole).above(0.0), state
+        found = Interval.normal(value.mean + float(shared[axis] - fit.shared[axis]), whole).above(0.0)
+        out[name] = untested.get(axis, found), state
     return out
 
 
