@@ -79,15 +79,19 @@ def right_models() -> str:
     return "\n".join(lines)
 
 
+def narrowed(text: str, keep: Sequence[int]) -> list[list[str]]:
+    """Return the cells of some columns of a table of Markdown, without bounds in brackets; the head comes first."""
+    lines = [line for line in text.splitlines() if line.startswith("| ")]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    return [[row[column].partition(" (")[0] for column in keep] for row in rows]
+
+
 def right_sum() -> str:
     """Return the groups whose error was asked for, without widths, bounds and cost, and how many are flagged."""
-    keep = (0, 1, 2, 3, 5, 6)
-    lines: list[str] = []
-    for line in right_models().splitlines():
-        cells = [cell.strip() for cell in line.strip("|").split("|")]
-        if len(cells) > 1 and (not lines or "---" in line or cells[3]):
-            lines.append("| " + " | ".join(cells[column].partition(" (")[0] for column in keep) + " |")
-    return "\n".join([lines[0], "|---" * len(keep) + "|", *lines[2:], "", right_models().splitlines()[-1]])
+    text = right_models()
+    head, *rows = narrowed(text, (0, 1, 2, 3, 5, 6))
+    lines = ["| " + " | ".join(row) + " |" for row in (head, *(row for row in rows if row[3]))]
+    return "\n".join([lines[0], "|" + "---|" * len(head), *lines[1:], "", text.splitlines()[-1]])
 
 
 def wrong_models() -> str:

@@ -156,6 +156,12 @@ def follow_table() -> str:
     return follow.as_markdown(_lines("follow.jsonl"))
 
 
+def follow_sum() -> str:
+    """Return the same without the clearances and the cost."""
+    _, *rows = estimate_pages.narrowed(follow_table(), range(6))
+    return table(["group", "truths", "forces, RMS", "largest force", "impulse", "coverage of the three"], rows)
+
+
 def siconos() -> str:
     """Return the slider of the literature beside this solver: two references of Siconos."""
     with (RESULTS / "siconos.csv").open(newline="", encoding="utf-8") as file:
@@ -184,7 +190,8 @@ def _in_unit(row: dict[str, str], key: str) -> str:
 FIGURES: dict[str, Callable[[], str]] = {
     "speed": speed, "located": located, "work": work, "missed": missed,
     "random_scenes": random_scenes, "siconos": siconos, "lives": life_table, "lives_sum": life_sum,
-    "month": month_table, "follow": follow_table, **estimate_pages.FIGURES, **measured_pages.FIGURES,
+    "month": month_table, "follow": follow_table, "follow_sum": follow_sum,
+    **estimate_pages.FIGURES, **measured_pages.FIGURES,
     "tuning": tuning_sensitivity.table,
     **{
         name: stored(name)
