@@ -15,11 +15,11 @@ from plow_twin.stream.topics import TOPICS
 
 def topics() -> str:
     """Return the topics that a twin sends."""
-    lines = ["| topic | type | sent | latched | content |", "|---|---|---|---|---|"]
+    lines = ["| topic | type | sent | content |", "|---|---|---|---|"]
     for topic in TOPICS:
         kind = topic.type.replace("/msg/", "/")
-        latched = "yes" if topic.latched else ""
-        lines.append(f"| `{topic.name}` | {kind} | {topic.cadence.value} | {latched} | {topic.content} |")
+        sent = f"{topic.cadence.value}{', latched' * topic.latched}"
+        lines.append(f"| `{topic.name}` | {kind} | {sent} | {topic.content} |")
     return "\n".join(lines)
 
 
