@@ -81,7 +81,7 @@ def right_models() -> str:
 
 def narrowed(text: str, keep: Sequence[int]) -> list[list[str]]:
     """Return the cells of some columns of a table of Markdown, without bounds in brackets; the head comes first."""
-    lines = [line for line in text.splitlines() if line.startswith("| ")]
+    lines = [line for line in text.splitlines() if line.startswith("| ") and "---" not in line]
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
     return [[row[column].partition(" (")[0] for column in keep] for row in rows]
 
