@@ -261,7 +261,7 @@ def test_a_broker_gets_all_groups_with_tls_and_says_when_the_twin_has_died(broke
         assert clearance["unit"] == "m" and clearance["values"]["horizontal/p05"] == pytest.approx(0.025)
         assert alarms["force_latched"] == "warn" and alarms["force_raised"] > alarms["force_threshold"] == 20e3
         peaks = [json.loads(found) for topic, found, _ in early.messages if topic == "face/plough/peaks"]
-        largest = max(max(filter(None, found["values"].values()), default=0.0) for found in peaks[1:])
+        largest = max(max(filter(None, found["values"].values()), default=0.0) for found in peaks)
         assert largest == pytest.approx(alarms["force_raised"], rel=1e-6) or largest > alarms["force_raised"]
         assert late.newest("face/plough/online") is True
         live.process.kill()

@@ -56,6 +56,10 @@ def test_an_alarm_comes_after_its_duration_goes_below_its_hysteresis_and_stays_l
         _changes(alarms, _publication(stamp, 300.0))
     assert _levels(alarms) == (Level.ERROR, Level.ERROR)
     assert alarms.acknowledge() == ["force"] and alarms.worst is Level.ERROR
+    _changes(alarms, _publication(30, 150.0))
+    assert alarms.acknowledge() == ["force"] and _levels(alarms) == (Level.WARN, Level.WARN)
+    raised = alarms.alarms["force"].raised
+    assert raised is not None and (raised.value, raised.threshold) == (300.0, 100.0)  # that of the level that is left
 
 
 def test_a_threshold_of_zero_is_no_alarm() -> None:

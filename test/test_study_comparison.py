@@ -14,6 +14,7 @@ import pyarrow.parquet
 import pytest
 from record_support import BASE_NS, STEP_NS, Run, paper_sample, record_run
 
+from plow_twin import load_scene
 from plow_twin.cli.app import run as cli
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record.messages import JointState
@@ -58,6 +59,12 @@ def test_windows_hold_the_recorded_numbers(runs: tuple[Run, Run]) -> None:
     np.testing.assert_allclose(windows.pairs["dissipation"].sum(axis=0), work, rtol=1e-9)
     load = np.array([paper_sample(index).wrench for index in range(1000)])
     np.testing.assert_allclose(windows.load[0], np.sqrt([(load[:, :2] ** 2).sum() / 1e3, (load[:, 2] ** 2).mean()]))
+
+
+def test_a_window_without_a_message_of_the_clearance_has_that_of_its_neighbours(runs: tuple[Run, Run]) -> None:
+    windows = windows_of(read_recording(runs[0].folder), 0.05)
+    scene = load_scene("paper").clearance
+    np.testing.assert_allclose(windows.clearance, [[scene.horizontal_m, scene.vertical_m]] * len(windows.start_ns))
 
 
 def test_the_window_is_the_period_of_the_load(runs: tuple[Run, Run]) -> None:
@@ -111,6 +118,10 @@ def test_a_lasting_change_of_a_load_that_windows_cut_through_is_the_load_s() -> 
     np.testing.assert_array_equal(
         with_neighbours(np.array([1.0, 2.0, 3.0]), np.array([0, 10, 90])), [[1, 1, 2], [2, 1, 2], [3, 3, 3]]
     )
+    # no slope holds far beyond the loads that it comes from
+    load = random.normal(1.0, 0.02, 40)
+    apart = change((1e5 * load**2, load), (1.4e5 * load**2, 1.4 * load), random, draws=100)
+    assert apart is not None and apart.verdict == "load or machine"
     equal = np.full(93, 0.025)  # its mean is rounded
     constant = change((equal[:62], np.ones(62)), (equal, np.ones(93)), random, draws=100)
     assert constant is not None and constant.verdict == "chance"
@@ -183,6 +194,8 @@ def test_one_group_and_a_run_without_outputs_are_refused(
 ) -> None:
     assert cli(["compare", str(runs[0].folder), "--workers", "1"]) == 1
     assert "got 1 group of windows (monday), expected two or more" in capsys.readouterr().err
+    assert cli(["compare", *[str(runs[0].folder)] * 2, "--workers", "1"]) == 1
+    assert "monday: given 2 times, used once" in capsys.readouterr().err
     bare = record_run(tmp_path / "bare", [Parameter("hold", "hold"), *map(paper_sample, range(99))], frame_every=10**9)
     assert cli(["compare", str(runs[0].folder), str(bare.folder), "--workers", "1"]) == 1
     assert "bare: got no contact_peaks" in capsys.readouterr().err

@@ -21,6 +21,8 @@ def call(socket: Path, service: str, text: str) -> int:
     """Ask the twin of `plow-twin live --control SOCKET` for a SERVICE of the node; TEXT is that of a mark."""
     from plow_twin.live.control import call as ask
 
+    if text and service != "mark":
+        raise click.UsageError(f"{service}: got the text {text!r}, expected none: it concerns all alarms, or the twin")
     done, answer = ask(socket, service, text)
     if not done:
         say_error(f"plow-twin: {service}: {answer}")

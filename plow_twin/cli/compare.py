@@ -57,11 +57,16 @@ def compare(
     from plow_twin.study.analysis.analyse import expand
     from plow_twin.study.analysis.many import run_many
     from plow_twin.study.analysis.task import names_apart
+    from plow_twin.study.comparison.change import FEWEST
     from plow_twin.study.comparison.compare import WindowsTask
     from plow_twin.study.comparison.compare import compare as compared
 
     label = _label(by, shifts, zone)
-    found = list(dict.fromkeys(expand(recordings)))
+    given = expand(recordings)
+    found = list(dict.fromkeys(given))
+    for path in found:
+        if given.count(path) > 1:
+            say_error(f"plow-twin: {path}: given {given.count(path)} times, used once")
     tasks = [WindowsTask(path, window) for path in found]
     with progress("reading", quiet or as_json) as on_progress:
         results = run_many(tasks, workers=workers or os.cpu_count() or 1, dask=dask, on_progress=on_progress)
@@ -75,6 +80,12 @@ def compare(
         say_error(f"plow-twin: {run}: lost {counts}")
     scenes = [result["scene"] for result in results if result.get("scene")]
     comparison = compared(runs, label, scenes=scenes)
+    for name, windows in comparison.groups.items():
+        if len(windows.start_ns) < FEWEST:
+            say_error(
+                f"plow-twin: {name}: got {len(windows.start_ns)} windows, expected at least {FEWEST}: too few to "
+                "separate a change from chance; a shorter --window gives more"
+            )
     if out is not None:
         from plow_twin.study.comparison.report import write_comparison
 

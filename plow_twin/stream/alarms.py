@@ -103,9 +103,19 @@ class Alarm:
         self.level, self._since_ns = level, None
         if level > self.latched:
             self.latched = level
-            threshold = self.thresholds.error if level is Level.ERROR else self.thresholds.warn
-            self.raised = Raised(value, threshold, stamp_ns)
+            self.raised = Raised(value, self._threshold(), stamp_ns)
         return True
+
+    def _threshold(self) -> float:
+        return self.thresholds.error if self.latched is Level.ERROR else self.thresholds.warn
+
+    def acknowledge(self) -> None:
+        """Release the alarm; it stays at the level that is still present."""
+        self.latched = self.level
+        if not self.level:
+            self.raised = None
+        elif self.raised is not None:
+            self.raised = replace(self.raised, threshold=self._threshold())
 
     def stays(self, values: NDArray[np.float64]) -> bool:
         """Return whether these values can change no level."""
@@ -290,7 +300,5 @@ class Alarms:
     def acknowledge(self) -> list[str]:
         """Release latched alarms; return the names of those still present."""
         for alarm in self.alarms.values():
-            alarm.latched = alarm.level
-            if not alarm.level:
-                alarm.raised = None
+            alarm.acknowledge()
         return [name for name, alarm in self.alarms.items() if alarm.level]

@@ -18,6 +18,8 @@ FEWEST: Final = 8
 _LEAST_VARIATION: Final = 0.01
 #: Loads of two groups that differ by less than this share count as equal.
 _EQUAL_LOAD: Final = 0.01
+#: Points of the loads of two groups that must overlap: no slope holds far beyond the loads that it comes from [%].
+_USUAL: Final = (5.0, 95.0)
 #: Means of equal numbers differ by rounding, less than by this share.
 _ROUNDING: Final = 1e-12
 #: A window whose start follows within this many lengths is the next one.
@@ -33,7 +35,8 @@ class Change:
     share, low, high : float
         The change and its 95 % interval.
     machine, machine_low, machine_high : float or None
-        The same at equal load; None where the load varies too little to show how the quantity follows it.
+        The same at equal load; None where the load varies too little to show how the quantity follows it, or where the
+        loads of the groups do not overlap.
     """
 
     share: float
@@ -120,6 +123,9 @@ def _at_equal_load(before: tuple[Array, Array], after: tuple[Array, Array]) -> f
     difference = load_after.mean(axis=0) - load_before.mean(axis=0)
     if abs(difference[0]) < _EQUAL_LOAD * usual:
         return float(second.mean()) / mean - 1.0
+    (low, high), (other_low, other_high) = (np.percentile(load[:, 0], _USUAL) for load in (load_before, load_after))
+    if low > other_high or other_low > high:
+        return None
     centred_load = np.concatenate((load_before - load_before.mean(axis=0), load_after - load_after.mean(axis=0)))
     centred = np.concatenate((first - first.mean(), second - second.mean()))
     if float(np.sqrt((centred_load[:, 0] ** 2).mean())) < _LEAST_VARIATION * usual:

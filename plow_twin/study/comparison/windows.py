@@ -97,7 +97,7 @@ def windows_of(recording: Recording, window_s: float | None = None) -> Windows:
     """
     window_ns = round(1e9 * (window_s or _load_period(recording)))
     peak, moved, contact, load = _Sums(PAIR_COUNT), _Sums(2 * PAIR_COUNT), _Sums(2 * PAIR_COUNT + 1), _Sums(3)
-    slow, slow_count = _Sums(2 + PAIR_COUNT), _Sums(1)
+    slow, slow_count = _Sums(2), _Sums(1)
     messages = _Sums(1)
     touches: Array | None = None
     newest: tuple[Indexes, Array] | None = None
@@ -128,15 +128,16 @@ def windows_of(recording: Recording, window_s: float | None = None) -> Windows:
                 ends = window[len(window) - count :]
                 contact.add(ends, np.hstack((work, in_contact[len(in_contact) - count :], np.ones((count, 1)))))
             else:
-                slow.add(window, part.values[:, [*_TOTALS, *_PADS]])
+                slow.add(window, part.values[:, _TOTALS])
                 slow_count.add(window, np.ones((len(window), 1)))
                 for number in np.unique(window).tolist():
                     rows = part.values[window == number][:, _PADS]
                     pads[number] = (pads[number][0] if number in pads else rows[0], rows[-1])
-    if not messages.rows:
-        raise RecordingError(
-            f"{recording.path}: got no contact_peaks, expected a run with outputs: plow-twin replay --write"
-        )
+    for name, found_of in (("contact_peaks", messages), ("clearance", slow)):
+        if not found_of.rows:
+            raise RecordingError(
+                f"{recording.path}: got no {name}, expected a run with outputs: plow-twin replay --write"
+            )
     full = _FULL * float(np.median([row[0] for row in messages.rows.values()]))
     numbers = sorted(number for number, row in messages.rows.items() if row[0] >= full)
     seconds = window_ns * 1e-9
@@ -154,8 +155,15 @@ def windows_of(recording: Recording, window_s: float | None = None) -> Windows:
             "wear": grown.reshape(-1, PAIR_COUNT) * 3600.0 / seconds,
         },
         np.sqrt(squares[:, :2] / np.maximum(squares[:, 2:], 1.0)),
-        (slow.of(numbers) / np.maximum(slow_count.of(numbers), 1.0))[:, :2],
+        _between(slow, slow_count, numbers),
     )
+
+
+def _between(sums: _Sums, count: _Sums, numbers: list[int]) -> Array:
+    """Return the means of some windows; a window without a message has those between its neighbours'."""
+    known = sorted(sums.rows)
+    means = sums.of(known) / count.of(known)
+    return np.column_stack([np.interp(numbers, known, column) for column in means.T])
 
 
 def _risen(part: Batched, window: Indexes) -> tuple[Batched, Indexes]:
