@@ -103,7 +103,7 @@ def change(
             machine.append(_at_equal_load(first, second))
     low, high = np.percentile(shares[1:], (2.5, 97.5)).tolist()
     known = np.array([share for share in machine[1:] if share is not None])
-    if machine[0] is None or len(known) < 0.9 * draws:
+    if machine[0] is None or _apart(before[1], after[1]) or len(known) < 0.9 * draws:
         return Change(shares[0], low, high, None, None, None)
     machine_low, machine_high = np.percentile(known, (2.5, 97.5)).tolist()
     return Change(shares[0], low, high, machine[0], machine_low, machine_high)
@@ -112,6 +112,14 @@ def change(
 def _drawn(group: tuple[Array, Array], random: np.random.Generator) -> tuple[Array, Array]:
     chosen = random.integers(0, len(group[0]), len(group[0]))
     return group[0][chosen], group[1][chosen]
+
+
+def _apart(before: Array, after: Array) -> bool:
+    """Return whether the loads of two groups differ and do not overlap."""
+    first, second = (load.reshape(len(load), -1)[:, 0] for load in (before, after))
+    (low, high), (other_low, other_high) = (np.percentile(load, _USUAL) for load in (first, second))
+    differ = abs(second.mean() - first.mean()) >= _EQUAL_LOAD * first.mean()
+    return bool(differ and (low > other_high or other_low > high))
 
 
 def _at_equal_load(before: tuple[Array, Array], after: tuple[Array, Array]) -> float | None:
@@ -123,9 +131,6 @@ def _at_equal_load(before: tuple[Array, Array], after: tuple[Array, Array]) -> f
     difference = load_after.mean(axis=0) - load_before.mean(axis=0)
     if abs(difference[0]) < _EQUAL_LOAD * usual:
         return float(second.mean()) / mean - 1.0
-    (low, high), (other_low, other_high) = (np.percentile(load[:, 0], _USUAL) for load in (load_before, load_after))
-    if low > other_high or other_low > high:
-        return None
     centred_load = np.concatenate((load_before - load_before.mean(axis=0), load_after - load_after.mean(axis=0)))
     centred = np.concatenate((first - first.mean(), second - second.mean()))
     if float(np.sqrt((centred_load[:, 0] ** 2).mean())) < _LEAST_VARIATION * usual:
