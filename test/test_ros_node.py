@@ -790,10 +790,11 @@ def test_two_twins_in_two_namespaces_do_not_meet(tmp_path: Path) -> None:
 
 
 def test_the_documentation_names_every_topic_parameter_and_key() -> None:
-    from plow_twin.live.diagnostics import markdown_tables
+    from plow_twin.live.diagnostics import keys_text
     from plow_twin.live.parameters import yaml_text
 
     text = (ROOT / "docs" / "node.md").read_text(encoding="utf-8")
-    for table in markdown_tables().values():
-        assert table in text
-    assert (ROOT / "config" / "twin.yaml").read_text(encoding="utf-8") == yaml_text()
+    for file, made in (("twin.yaml", yaml_text()), ("diagnostics.yaml", keys_text())):
+        assert f"<!-- file: config/{file} -->" in text
+        assert (ROOT / "config" / file).read_text(encoding="utf-8") == made
+    assert yaml.safe_load(keys_text()) == {"status": STATUS_KEYS, **KEYS}

@@ -1,4 +1,4 @@
-"""Write the tables of the pages that come from results or code, and `config/twin.yaml`: `python tools/pages.py`.
+"""Write what comes from results or code, the tables of the pages and two files of `config`: `python tools/pages.py`.
 
 A page marks the place of a table by `<!-- made: NAME -->` and `<!-- end -->`; the text between is replaced by what
 `TABLES[NAME]` returns.
@@ -17,6 +17,7 @@ sys.path.append(str(ROOT / "benchmark"))
 import figures  # noqa: E402
 import reference  # noqa: E402
 
+from plow_twin.live.diagnostics import keys_text  # noqa: E402
 from plow_twin.live.parameters import yaml_text  # noqa: E402
 
 PAGES = (
@@ -34,10 +35,11 @@ def renewed(text: str) -> str:
 
 
 def main() -> None:
-    """Rewrite the pages and the parameter file."""
+    """Rewrite the pages, the file of parameters and that of the keys of diagnostics."""
     for page in PAGES:
         page.write_text(renewed(page.read_text(encoding="utf-8")), encoding="utf-8")
     (ROOT / "config" / "twin.yaml").write_text(yaml_text(), encoding="utf-8")
+    (ROOT / "config" / "diagnostics.yaml").write_text(keys_text(), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Tables of the reference pages, made from the code: topics, keys of diagnostics, verbs of the command, priors."""
+"""Tables of the reference pages, made from the code: topics, verbs of the command, priors."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import click
 
 from plow_twin.cli.app import commands
 from plow_twin.estimate.priors import DEFAULTS
-from plow_twin.live.diagnostics import markdown_tables
 from plow_twin.model.scene import Mark
 from plow_twin.stream.topics import TOPICS
 
@@ -21,12 +20,6 @@ def topics() -> str:
         sent = f"{topic.cadence.value}{', latched' * topic.latched}"
         lines.append(f"| `{topic.name}` | {kind} | {sent} | {topic.content} |")
     return "\n".join(lines)
-
-
-def diagnostics() -> str:
-    """Return the keys of each part of `/diagnostics`."""
-    parts = {name: text for name, text in markdown_tables().items() if name != "status"}
-    return "\n\n".join(f"### {name}\n\n{text}" for name, text in parts.items())
 
 
 def verbs() -> str:
@@ -54,7 +47,4 @@ def priors() -> str:
     return "\n".join(lines)
 
 
-TABLES: dict[str, Callable[[], str]] = {
-    "topics": topics, "status_keys": lambda: markdown_tables()["status"], "diagnostics": diagnostics,
-    "verbs": verbs, "priors": priors,
-}  # fmt: skip
+TABLES: dict[str, Callable[[], str]] = {"topics": topics, "verbs": verbs, "priors": priors}

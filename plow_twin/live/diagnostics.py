@@ -142,16 +142,12 @@ STATUS_KEYS: Final[dict[str, str]] = {
 }
 
 
-def markdown_tables() -> dict[str, str]:
-    """Return the tables of the keys of `status` and of each part of `/diagnostics`; keys of one meaning share a row."""
-    tables = {}
+def keys_text() -> str:
+    """Return the meaning of every key of `status` and of each part of `/diagnostics`, as YAML."""
+    lines = ["# Keys of `status` and of the parts of /diagnostics."]
     for part, keys in {"status": STATUS_KEYS, **KEYS}.items():
-        of_meaning: dict[str, list[str]] = {}
-        for key, text in keys.items():
-            of_meaning.setdefault(text, []).append(f"`{key}`")
-        rows = (f"| {', '.join(names)} | {text} |" for text, names in of_meaning.items())
-        tables[part] = "\n".join(["| key | meaning |", "|---|---|", *rows])
-    return tables
+        lines += [f"{part}:", *(f'  {key}: "{text}"' for key, text in keys.items())]
+    return "\n".join(lines) + "\n"
 
 
 _LEVELS: Final = {
