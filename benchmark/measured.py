@@ -28,7 +28,7 @@ from plow_twin.model.contact_laws import LAWS
 from plow_twin.scene_file import load_scene
 from plow_twin.solve.rounded_block import toss_blocks
 from plow_twin.study.measured.drops import Drops
-from plow_twin.study.measured.ellipse import ELLIPSE, GYRATION, EllipseContact, contact_arms, impact
+from plow_twin.study.measured.ellipse import ELLIPSE, GYRATION, EllipseContact, contact_arms, impact, simulated_impact
 from plow_twin.study.measured.square import (
     MARKER,
     RATE_HZ,
@@ -240,6 +240,10 @@ def by_law(impacts: Impacts) -> dict[str, Any]:
         contact = replace(ELLIPSE, **numbers)
         found[name] = impacts.held_out(contact, ("restitution", "friction", *names, *FALLING))
         print(name, found[name], flush=True)
+    every = np.arange(len(impacts.before))
+    found["preset `measured_ellipse`, fitted to all, computed whole"] = errors(
+        impacts.missed(simulated_impact(impacts.before), every)
+    )
     return found
 
 

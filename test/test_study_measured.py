@@ -12,7 +12,7 @@ from plow_twin import Clearance, Contact, Frame, Friction, Gravity, Head, Initia
 from plow_twin.errors import ArgumentError
 from plow_twin.study.measured import bands, impact
 from plow_twin.study.measured.drops import Drops
-from plow_twin.study.measured.ellipse import ELLIPSE, GYRATION, SEMI_AXES, contact_arms
+from plow_twin.study.measured.ellipse import ELLIPSE, GYRATION, SEMI_AXES, contact_arms, simulated_impact
 from plow_twin.study.measured.square import MARKER, SQUARE, ensemble, fit_flight, toss
 
 DATA = Path(__file__).resolve().parent.parent / "benchmark" / "data" / "measured"
@@ -48,6 +48,16 @@ def test_measured_impacts_are_met_better_than_by_a_rigid_impact(impacts) -> None
     # without the fall of restitution and without the spring's damper it is no better than the rigid one
     plain = replace(ELLIPSE, fall=0.0, fall_along=0.0, restitution=0.54, tilt=0.0, stick_damping=0.0)
     assert np.sqrt((misses(impact(before, plain), after) ** 2).mean()) > 0.27
+
+
+def test_preset_computes_measured_impacts_whole_as_the_function_does(impacts) -> None:
+    before, after = impacts
+    found = simulated_impact(before)
+    # the ellipse turns a little during an impact of finite time
+    assert misses(found, impact(before)).max() < 0.015
+    missed = misses(found, after)
+    assert np.sqrt((missed**2).mean()) < 0.245
+    assert np.median(missed) < 0.15
 
 
 def test_impact_is_an_impulse_at_the_lowest_point_that_gains_no_energy(impacts) -> None:
@@ -133,6 +143,11 @@ def test_bad_rows_of_a_flight_are_named(wrong: np.ndarray) -> None:
 def test_bad_numbers_of_an_impact_are_named() -> None:
     with pytest.raises(ArgumentError, match=r"before.*\(n, 6\)"):
         impact(np.zeros((2, 5)))
+    with pytest.raises(ArgumentError, match=r"before.*\(n, 6\)"):
+        impact([[1.0, 2.0], [3.0]])  # type: ignore[list-item]
+    with pytest.raises(ArgumentError, match=r"before\[1\].*nan"):
+        impact(np.array([[0.0] * 6, [0.0] * 5 + [np.nan]]))
+    assert impact(np.zeros((0, 6))).shape == (0, 6)
     with pytest.raises(ArgumentError, match="n_rows"):
         bands(np.zeros((8, 3)), 0)
 

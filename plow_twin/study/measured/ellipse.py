@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
 from typing import Final
 
 import numpy as np
@@ -10,6 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from plow_twin.errors import ArgumentError
 from plow_twin.model.contact_laws import LAWS
+from plow_twin.model.scene import Initial, Scene
+from plow_twin.run.simulate import simulate
+from plow_twin.scene_file import load_scene
 from plow_twin.solve.point_impact import POINT, strike_points
 
 Array = NDArray[np.float64]
@@ -22,6 +26,8 @@ _STIFFNESS: Final = 1e9
 #: Speed in m/s of approach at which restitutions are given: the middle of the measured speeds.
 USUAL_SPEED: Final = 2.5
 _LEAST, _LARGEST = 0.05, 0.98
+#: Gap in m at which a whole impact starts, and time in s in which it is over: 13 half periods of the contact.
+_GAP, _WHOLE = 1e-9, 40.0 / _STIFFNESS**0.5
 
 
 @dataclass(frozen=True)
@@ -105,14 +111,10 @@ def impact(before: ArrayLike, contact: EllipseContact = ELLIPSE) -> Array:
     ArgumentError
         For another shape, numbers that are not finite, or a law that is not known.
     """
-    states = np.array(before, dtype=np.float64)
-    if states.ndim != 2 or states.shape[1] != 6 or not np.isfinite(states).all():
-        raise ArgumentError(f"before: got shape {states.shape}, expected finite numbers of shape (n, 6)")
+    states = _states(before)
     if contact.law not in LAWS:
         raise ArgumentError(f"contact.law: got {contact.law!r}, expected one of {', '.join(LAWS)}")
-    c, s = np.cos(contact.tilt), np.sin(contact.tilt)
-    # the data's x runs against the sense in which theta is counter-clockwise
-    along, up = -c * states[:, 3] + s * states[:, 4], s * states[:, 3] + c * states[:, 4]
+    along, up = _to_surface(states[:, 3], states[:, 4], contact.tilt)
     normal_arm, tangential_arm = contact_arms(states[:, 2] - contact.tilt)
     slip, speed = along - states[:, 5] * tangential_arm, -(up + states[:, 5] * normal_arm)
     hits = speed > 0.0
@@ -121,9 +123,85 @@ def impact(before: ArrayLike, contact: EllipseContact = ELLIPSE) -> Array:
     struck = np.zeros((int(hits.sum()), 2))
     strike_points(point, damping, normal_arm[hits], tangential_arm[hits], GYRATION**2, speed[hits], slip[hits], struck)
     impulse[hits] = struck
-    states[:, 3] -= c * impulse[:, 0] - s * impulse[:, 1]
-    states[:, 4] += s * impulse[:, 0] + c * impulse[:, 1]
+    vx, vy = _to_surface(impulse[:, 0], impulse[:, 1], contact.tilt)
+    states[:, 3] += vx
+    states[:, 4] += vy
     states[:, 5] += (normal_arm * impulse[:, 1] - tangential_arm * impulse[:, 0]) / GYRATION**2
+    return states
+
+
+def _states(before: ArrayLike) -> Array:
+    try:
+        states = np.array(before, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ArgumentError(f"before: {error}, expected finite numbers of shape (n, 6)") from None
+    if states.ndim != 2 or states.shape[1] != 6:
+        raise ArgumentError(f"before: got shape {states.shape}, expected finite numbers of shape (n, 6)")
+    if not np.isfinite(states).all():
+        row = int(np.flatnonzero(~np.isfinite(states).all(axis=1))[0])
+        raise ArgumentError(f"before[{row}]: got {states[row].tolist()}, expected finite numbers")
+    return states
+
+
+def _to_surface(x: Array, y: Array, tilt: float) -> tuple[Array, Array]:
+    """Resolve vectors in axes of the data along the surface and away from it; also the way back.
+
+    The data's x runs against the sense in which theta is counter-clockwise.
+    """
+    c, s = np.cos(tilt), np.sin(tilt)
+    return s * y - c * x, s * x + c * y
+
+
+@cache
+def _preset() -> Scene:
+    return load_scene("measured_ellipse")
+
+
+def impact_scene(before: ArrayLike) -> Scene:
+    """Return the preset `measured_ellipse` a nanometre before an impact.
+
+    Parameters
+    ----------
+    before : array_like, shape (6,)
+        As a row of `impact`.
+
+    Raises
+    ------
+    ArgumentError
+        As `impact`.
+    """
+    state = _states(np.asarray(before)[None])[0]
+    along, up = (float(rate[0]) for rate in _to_surface(state[3:4], state[4:5], ELLIPSE.tilt))
+    beside, below = (float(arm[0]) for arm in contact_arms(state[2:3] - ELLIPSE.tilt))
+    scene = _preset()
+    x, y = -0.5 * scene.frame.width_m - beside, 0.5 * (scene.frame.height_m + scene.clearance.vertical_m) - below
+    omega = float(state[5])
+    start = Initial((0.0, _GAP - 0.5 * scene.clearance.vertical_m, 0.0), (along + omega * y, up - omega * x, omega))
+    return replace(scene, head=replace(scene.head, com_offset_m=(x, y)), initial=start)
+
+
+def simulated_impact(before: ArrayLike) -> Array:
+    """Return the states after impacts as `impact` does, each one computed whole by the preset `measured_ellipse`.
+
+    Parameters
+    ----------
+    before : array_like, shape (n, 6)
+
+    Raises
+    ------
+    ArgumentError
+        As `impact`.
+    """
+    states = _states(before)
+    for state in states:
+        scene = impact_scene(state)
+        motion = simulate(scene, t_end=_WHOLE, output_dt=_WHOLE)
+        (vx, vy, omega), theta = motion.v[-1], motion.q[-1, 2]
+        # the offset of the centre of mass is half a metre and has turned during the impact
+        x, y = scene.head.com_offset_m
+        c, s = np.cos(theta), np.sin(theta)
+        state[3:5] = _to_surface(vx - omega * (s * x + c * y), vy + omega * (c * x - s * y), ELLIPSE.tilt)
+        state[5] = omega
     return states
 
 
