@@ -1,12 +1,9 @@
-"""Tables of the reference pages, made from the code: topics, verbs of the command, priors."""
+"""Tables of the reference pages, made from the code: topics and priors."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-import click
-
-from plow_twin.cli.app import commands
 from plow_twin.estimate.priors import DEFAULTS
 from plow_twin.model.scene import Mark
 from plow_twin.stream.topics import TOPICS
@@ -22,22 +19,6 @@ def topics() -> str:
     return "\n".join(lines)
 
 
-def verbs() -> str:
-    """Return the verbs of `plow-twin`."""
-    lines = ["| verb | does |", "|---|---|"]
-    for name, command in sorted(commands.commands.items()):
-        if isinstance(command, click.Group):
-            lines += [_verb(f"{name} {inner}", verb) for inner, verb in command.commands.items()]
-        else:
-            lines.append(_verb(name, command))
-    return "\n".join(lines)
-
-
-def _verb(name: str, command: click.Command) -> str:
-    arguments = " ".join(part for part in command.collect_usage_pieces(click.Context(command)) if part != "[OPTIONS]")
-    return f"| `{f'{name} {arguments}'.strip()}` | {command.get_short_help_str(limit=200)} |"
-
-
 def priors() -> str:
     """Return the prior's standard deviations of a scene's numbers, by mark."""
     marks = (Mark.MEASURED, Mark.GIVEN, Mark.RECONSTRUCTED, Mark.ASSUMED)
@@ -47,4 +28,4 @@ def priors() -> str:
     return "\n".join(lines)
 
 
-TABLES: dict[str, Callable[[], str]] = {"topics": topics, "verbs": verbs, "priors": priors}
+TABLES: dict[str, Callable[[], str]] = {"topics": topics, "priors": priors}
