@@ -1,4 +1,4 @@
-"""Faults of a figure: legends over the data, texts over each other, axes without words."""
+"""Faults of a figure: legends over the data, texts over each other or beyond the figure, axes without words."""
 
 from __future__ import annotations
 
@@ -34,9 +34,23 @@ def check_figure(figure: Figure) -> None:
             its = legend.get_window_extent()
             assert its.x0 >= place.x1 - 1.0 or its.y1 <= place.y0 + 1.0, axis.get_ylabel()
         _check_ticks(axis)
+    _check_words(figure)
     for text in _texts(figure):
         assert "um" not in text.split() and "[um]" not in text
         assert not (text[:1] == "-" and text[1:2].isdigit()), f"{text}: a hyphen for a minus sign"
+
+
+def _check_words(figure: Figure) -> None:
+    """Raise where titles and labels of axes overlap each other or leave the figure."""
+    words = [word for axis in figure.axes for word in (axis.title, axis.xaxis.label, axis.yaxis.label)]
+    words += [text for text in figure.texts if text.get_text()]
+    boxes = [(word.get_text(), word.get_window_extent()) for word in words if word.get_text() and word.get_visible()]
+    whole = figure.bbox.padded(1.0)
+    for number, (text, box) in enumerate(boxes):
+        assert whole.x0 <= box.x0 and box.x1 <= whole.x1 and whole.y0 <= box.y0 and box.y1 <= whole.y1, text
+        for other, its in boxes[number + 1 :]:
+            apart = max(box.x0 - its.x1, its.x0 - box.x1, box.y0 - its.y1, its.y0 - box.y1)
+            assert apart > 0.0, (text, other)
 
 
 def _check_ticks(axis: Axes) -> None:

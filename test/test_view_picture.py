@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +17,12 @@ from matplotlib.text import Annotation
 from record_support import BASE_NS, STEP_NS, paper_sample, record_run
 
 from plow_twin.model.pairs import PAIR_COUNT
+from plow_twin.record.messages import JointState
+from plow_twin.record.reader import RunReader
 from plow_twin.stream.journal import Entry, Estimated, Hold, SetModel
 from plow_twin.view.envelope import Envelope
-from plow_twin.view.picture import to_png
+from plow_twin.view.picture import run_figure, to_png
+from plow_twin.view.run_curves import RunCurves
 
 
 @pytest.fixture
@@ -112,14 +116,23 @@ def test_a_stretch_without_samples_is_shaded_and_crossed_by_no_line(tmp_path: Pa
 def test_every_force_of_the_instant_shown_has_its_arrow_and_its_value_inside_the_axes(
     tmp_path: Path, figures: list[Figure]
 ) -> None:
-    run = record_run(tmp_path / "run", map(paper_sample, range(3000)))
+    load = map(paper_sample, range(0, 3000, 50))  # the peaks lie between the stamps
+    run = record_run(tmp_path / "run", load)
     to_png(run.folder, tmp_path / "run.png")
     check_figure(figures[0])
+    reader = RunReader(run.folder)
+    curves = RunCurves.of(reader)
+    curves.held_s, curves.failed_s = [(0.1, 0.2)], [(0.3, 0.4)]
+    curves.changes = [(0.5, "first estimate"), (0.501, "parameters set")]
+    check_figure(whole := run_figure(reader, curves))
+    assert [text.get_text() for text in whole.axes[4].texts] == ["first estimate, parameters set"]
     section = figures[0].axes[0]
     assert "to scale" in section.get_xlabel() and "head turned by" in section.get_title()
     values = [text for text in section.texts if text.get_text().endswith("kN")]
-    largest = float(section.get_title().split()[-2])
-    assert max(float(text.get_text().split()[0]) for text in values) == pytest.approx(largest, abs=0.51)
+    of_run, at_stamp = (float(number) for number in re.findall(r"([\d.]+) kN", section.get_title()))
+    assert max(float(text.get_text().split()[0]) for text in values) == pytest.approx(at_stamp, abs=0.51)
+    peaks = max(max(m.effort) for topic, m in run.outputs if topic == "/contact_peaks" and isinstance(m, JointState))
+    assert of_run == pytest.approx(peaks / 1e3, abs=0.051) and of_run > at_stamp  # as the other views say
     assert 1 <= len(values) <= PAIR_COUNT
     x, y = sorted(section.get_xlim()), sorted(section.get_ylim())
     for text in values:

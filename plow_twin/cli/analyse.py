@@ -103,7 +103,7 @@ def analyse(
 
 def _found(recordings: Sequence[Path], out: Path | None) -> tuple[list[Path], tuple[Path, ...]]:
     """Return the recordings at paths and in folders; name the items of folders that are no recordings."""
-    from plow_twin.study.analysis.analyse import expand, left_out
+    from plow_twin.study.analysis.analyse import counted_once, expand, left_out
 
     for path in recordings:
         if not path.exists():
@@ -113,7 +113,10 @@ def _found(recordings: Sequence[Path], out: Path | None) -> tuple[list[Path], tu
     left = {item: path for path in recordings for item in left_out(path) if item.resolve() not in results_before}
     for item, path in left.items():
         say_error(f"plow-twin: {item}: left out: no recording of {path}")
-    return list(dict.fromkeys(expand(recordings))), tuple(left)
+    found, repeated = counted_once(expand(recordings))
+    for sentence in repeated:
+        say_error(f"plow-twin: {sentence}")
+    return found, tuple(left)
 
 
 def _watched(task: Any, every: float, as_json: bool, quiet: bool) -> int:

@@ -53,8 +53,8 @@ def compare(
     as_json: bool,
     quiet: bool,
 ) -> int:
-    """Compare runs, or folders of runs, with the first: peaks, impacts, duty, impulse, dissipation, wear by pad."""
-    from plow_twin.study.analysis.analyse import expand
+    """Compare runs, or folders of runs, with the first: peaks, impacts, contact, impulse, dissipation, wear."""
+    from plow_twin.study.analysis.analyse import counted_once, expand
     from plow_twin.study.analysis.many import run_many
     from plow_twin.study.analysis.task import names_apart
     from plow_twin.study.comparison.change import FEWEST
@@ -62,11 +62,9 @@ def compare(
     from plow_twin.study.comparison.compare import compare as compared
 
     label = _label(by, shifts, zone)
-    given = expand(recordings)
-    found = list(dict.fromkeys(given))
-    for path in found:
-        if given.count(path) > 1:
-            say_error(f"plow-twin: {path}: given {given.count(path)} times, used once")
+    found, repeated = counted_once(expand(recordings))
+    for sentence in repeated:
+        say_error(f"plow-twin: {sentence}")
     tasks = [WindowsTask(path, window) for path in found]
     with progress("reading", quiet or as_json) as on_progress:
         results = run_many(tasks, workers=workers or os.cpu_count() or 1, dask=dask, on_progress=on_progress)
@@ -78,8 +76,10 @@ def compare(
     lost = {result["run"]: result["lost"] for result in results if result.get("lost")}
     for run, counts in lost.items():
         say_error(f"plow-twin: {run}: lost {counts}")
-    scenes = [result["scene"] for result in results if result.get("scene")]
+    scenes = {name: result["scene"] for name, result in zip(names, results, strict=True) if "error" not in result}
     comparison = compared(runs, label, scenes=scenes)
+    for note in comparison.notes:
+        say_error(f"plow-twin: {note}")
     for name, windows in comparison.groups.items():
         if len(windows.start_ns) < FEWEST:
             say_error(
@@ -128,8 +128,9 @@ def _show(found: Comparison) -> None:
     console.print(groups)
     first = next(iter(found.groups))
     for name, by_pair in found.changes.items():
-        quantities = ["energy" if name == "dissipation" else name for name in next(iter(by_pair.values()))]
-        view = table(f"{name} beside {first}: change of the means [%] {_KEY}", "pad", *quantities)
+        names = {"dissipation": "energy", "in_contact": "in contact"}
+        quantities = [names.get(quantity, quantity) for quantity in next(iter(by_pair.values()))]
+        view = table(f"{name} beside {first}: change of the means [%]", "pad", *quantities)
         for pair, by_quantity in by_pair.items():
             view.add_row(
                 pair,
@@ -138,11 +139,15 @@ def _show(found: Comparison) -> None:
         console.print(view)
         changes = (f"{axis} {_text(change)}" for axis, change in found.clearance_changes[name].items())
         console.print(f"clearance [%]: {', '.join(changes)}", highlight=False)
+    console.print(_KEY, highlight=False)
 
 
 #: Signs of the causes of a change, and their meanings.
 _SIGNS: Final = {"chance": "", "machine": "M", "load": "L", "load or machine": "?"}
-_KEY: Final = "(M: the machine, L: the load, ?: either; no letter: may be chance)"
+_KEY: Final = (
+    "M: the machine changed, L: the load did, ?: either; no letter: may be chance. All numbers of a table are judged "
+    "together: of its letters, one in twenty is there by chance. Contact: share of samples with force."
+)
 
 
 def _text(change: Change | None) -> str:

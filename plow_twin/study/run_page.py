@@ -108,7 +108,7 @@ class _Log:
             case Estimated(end_ns=end_ns, result=result):
                 self.estimates.append(_estimate_row(end_ns, json.loads(result)))
             case Mark(stamp_ns, text):
-                self.events.append((time_text(stamp_ns), f"mark: {text}"))
+                self.events.append((time_text(stamp_ns), text if text.startswith("alarm: ") else f"mark: {text}"))
             case Reset(stamp_ns, reason):
                 self.events.append((time_text(stamp_ns), f"reset: {reason}"))
             case Failed(stamp_ns, _, advances, reason):
@@ -175,7 +175,7 @@ def _by_pad(recording: Recording) -> list[dict[str, str]]:
             "largest force [kN]": f"{largest[pair] / 1e3:.1f}",
             "touches": f"{touches[pair]:.0f}",
             "impulse [kN s]": f"{impulse[pair] / 1e3:.2f}",
-            "share of time in contact [%]": f"{100.0 * in_contact[pair] / rows:.1f}" if rows else "",
+            "samples in contact [%]": f"{100.0 * in_contact[pair] / rows:.1f}" if rows else "",
             "wear at the end [µm]": "" if wear is None else f"{1e6 * wear[pair]:.2f}",
         }
         for pair, name in enumerate(PAIR_NAMES)

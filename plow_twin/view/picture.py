@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 #: Room about the end of an arrow for its label [mm].
 _LABEL_ROOM_MM: Final = 50.0
+#: Width of an upright label, as a share of the axes that it stands in.
+_LABEL_WIDTH: Final = 0.015
 _LOAD_NAMES: Final = ("Fx [kN]", "Fy [kN]", "M [kN m]")
 #: Where a clearance comes from, by its state, in the words of the screen.
 _STATES: Final = {
@@ -89,7 +91,7 @@ def run_figure(reader: RunReader, curves: RunCurves) -> Figure:
             axis.axvspan(begin, end, color="tab:red", alpha=0.25, zorder=0)
         if axis.get_legend_handles_labels()[0]:
             legend_beside(axis)
-    clearance.set_xlabel("; ".join(("time since the first stamp [s]", *_meanings(curves))))
+    clearance.set_xlabel("\n".join(("time since the first stamp [s]", "; ".join(_meanings(curves)))).rstrip())
     figure.suptitle(_title(reader, curves, {**reader.lost, **reader.lost_parts}))
     return figure
 
@@ -123,7 +125,7 @@ def _draw_instant(upper: Any, lower: Any, section: Section, curves: RunCurves) -
             _note_absence(place, f"no {name} in the recording")
             place.set(xticks=[])
         return
-    _draw_section(upper, section, instant, curves.instant_s)
+    _draw_section(upper, section, instant, curves)
     _draw_gaps(lower, instant.penetration)
 
 
@@ -133,7 +135,7 @@ def _note_absence(axis: Any, text: str) -> None:
     axis.set(yticks=[])
 
 
-def _draw_section(axis: Any, section: Section, instant: Instant, time_s: float) -> None:
+def _draw_section(axis: Any, section: Section, instant: Instant, curves: RunCurves) -> None:
     pose, force, largest = instant.pose, instant.force, float(instant.force.max())
     axis.plot(*section.frame_strip().T, color="0.5", label=section.frame_name)
     for number, strip in enumerate(section.head_strips(pose)):
@@ -152,11 +154,12 @@ def _draw_section(axis: Any, section: Section, instant: Instant, time_s: float) 
             np.concatenate([origins + 1.1 * vectors + side for side in (-_LABEL_ROOM_MM, _LABEL_ROOM_MM)])
         )
         axis.autoscale_view()
-    turned, force_kn = signed(math.degrees(pose[2]), ".1f"), f"{largest / 1e3:.1f} kN"
+    turned, of_stamp = signed(math.degrees(pose[2]), ".1f"), f"at this stamp: {largest / 1e3:.1f} kN"
+    of_run = f"of the run: {curves.peak:.1f} kN; " if curves.peak else ""
     axis.set(aspect="equal")
     axis.set_title(
-        f"Cross-section [mm] at {time_s:.2f} s, head turned by {turned}°\nlargest force of a stamp: {force_kn}",
-        fontsize=11,
+        f"Cross-section [mm] at {curves.instant_s:.2f} s, head turned by {turned}°\nlargest force {of_run}{of_stamp}",
+        fontsize=9,
     )
     axis.margins(0.1)
     axis.set_xlabel("to scale; where a wall lies inside a corner, the contact gives way", fontsize=8)
@@ -180,7 +183,7 @@ def _draw_gaps(axis: Any, penetration: NDArray[np.float64]) -> None:
     axis.margins(x=0.15)
     axis.set_yticks(places, PAIR_NAMES, fontsize=7)
     axis.invert_yaxis()
-    axis.set_xlabel("at that stamp [mm]: gap (negative), penetration (positive)")
+    axis.set_xlabel("at that stamp [mm]: gap (negative), penetration (positive)", fontsize=9)
 
 
 def _curves(
@@ -238,8 +241,15 @@ def _clearance(axis: Any, curves: RunCurves) -> None:
         label = f"{name}, at the end\n{end},\n{_STATES[curves.states[name]]}"
         line = axis.plot(times, value, label=label)[0]
         axis.fill_between(times, low, high, alpha=0.25, color=line.get_color(), lw=0)
+    left, right = axis.get_xlim()
+    labels: list[tuple[float, str]] = []
     for time_s, reason in curves.changes:
         axis.axvline(time_s, color="0.4", ls=":", lw=1.0)
+        if labels and time_s - labels[-1][0] < _LABEL_WIDTH * (right - left):
+            labels[-1] = (labels[-1][0], f"{labels[-1][1]}, {reason}")
+        else:
+            labels.append((time_s, reason))
+    for time_s, reason in labels:
         axis.annotate(reason, (time_s, 0.97), xycoords=axis.get_xaxis_transform(), fontsize=7, rotation=90,
                       xytext=(-2.0, 0.0), textcoords="offset points", ha="right", va="top", color="0.2")  # fmt: skip
 

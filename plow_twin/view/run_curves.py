@@ -56,6 +56,8 @@ class RunCurves:
     load: Envelope = field(default_factory=lambda: Envelope(3))
     clearance: Envelope = field(default_factory=lambda: Envelope(len(_CLEARANCE_COLUMNS)))
     instant: Instant | None = None
+    #: largest peak of all pairs, between the stamps too [kN]; 0 without peaks
+    peak: float = 0.0
     held_s: list[tuple[float, float]] = field(default_factory=list)
     failed_s: list[tuple[float, float]] = field(default_factory=list)
     failed: int = 0
@@ -180,7 +182,9 @@ class RunCurves:
     def _messages(self, found: dict[str, Rows]) -> None:
         if "contact_peaks" in found:
             rows = found["contact_peaks"]
-            self.force.add(self._seconds(rows.stamp_ns), rows.numbers[:, 2 * PAIR_COUNT :] / 1e3)
+            peaks = rows.numbers[:, 2 * PAIR_COUNT :] / 1e3
+            self.force.add(self._seconds(rows.stamp_ns), peaks)
+            self.peak = max(self.peak, float(peaks.max()))
         if "clearance" in found:
             rows = found["clearance"]
             values = 1e3 * rows.numbers[:, _CLEARANCE_COLUMNS]

@@ -21,7 +21,7 @@ from plow_twin.record.bag import beside_folders, readable_beside
 from plow_twin.record.follow import Tail
 from plow_twin.record.importing import Feed
 from plow_twin.record.mapping import UNFIT, Role, messages_of, read_map, readings, roles_by_source, with_units
-from plow_twin.record.reader import FileStatus, RunReader, own_run
+from plow_twin.record.reader import FileStatus, RunReader, mcap_path, own_run, read_header
 from plow_twin.record.replay import following_twin
 from plow_twin.record.sources import open_source, packed
 from plow_twin.record.unit_check import check_units
@@ -512,3 +512,31 @@ def expand(paths: Sequence[Path]) -> list[Path]:
             raise RecordingError(f"{path}: got a folder without recordings, expected some{packed(path)}")
         found += inside
     return found
+
+
+def counted_once(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
+    """Return the recordings without repetitions, and a sentence for each recording that is left out.
+
+    A recording is repeated where its path comes again, or the same run under another path: its random id says so.
+    """
+    kept: dict[object, Path] = {}
+    left: list[str] = []
+    for path in paths:
+        keys = path.resolve(), _identity(path)
+        known = next((kept[key] for key in keys if key in kept), None)
+        if known is None:
+            kept |= dict.fromkeys(keys, path)
+        elif known == path:
+            left.append(f"{path}: given twice, used once")
+        else:
+            left.append(f"{path}: left out: the same run as {known}")
+    return list(dict.fromkeys(kept.values())), left
+
+
+def _identity(path: Path) -> object:
+    """Return a run's random id with the number of its first part; the path of any other recording."""
+    try:
+        header = read_header(mcap_path(path))
+    except (RecordingError, OSError):  # named where it is used
+        header = None
+    return path if header is None or not header.run_id else (header.run_id, header.part)

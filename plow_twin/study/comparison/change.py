@@ -7,6 +7,8 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import false_discovery_control
+from scipy.stats import t as student
 
 Array = NDArray[np.float64]
 
@@ -20,6 +22,10 @@ _LEAST_VARIATION: Final = 0.01
 _EQUAL_LOAD: Final = 0.01
 #: Points of the loads of two groups that must overlap: no slope holds far beyond the loads that it comes from [%].
 _USUAL: Final = (5.0, 95.0)
+#: Probability below which a change is more than chance.
+_LEVEL: Final = 0.05
+#: Windows drawn at once [windows]: bounds the memory.
+_AT_ONCE: Final = 2**21
 #: Means of equal numbers differ by rounding, less than by this share.
 _ROUNDING: Final = 1e-12
 #: A window whose start follows within this many lengths is the next one.
@@ -34,7 +40,10 @@ class Change:
     ----------
     share, low, high : float
         The change and its 95 % interval.
-    machine, machine_low, machine_high : float or None
+    chance : float
+        Probability of such a change by chance, adjusted for the number of cells judged together (Benjamini and
+        Hochberg): of the cells below 0.05, one in twenty is there by chance.
+    machine, machine_low, machine_high, machine_chance : float or None
         The same at equal load; None where the load varies too little to show how the quantity follows it, or where the
         loads of the groups do not overlap.
     """
@@ -42,18 +51,20 @@ class Change:
     share: float
     low: float
     high: float
-    machine: float | None
-    machine_low: float | None
-    machine_high: float | None
+    chance: float
+    machine: float | None = None
+    machine_low: float | None = None
+    machine_high: float | None = None
+    machine_chance: float | None = None
 
     @property
     def verdict(self) -> str:
         """`chance`, or the cause of a change that is more: `machine`, `load`, or `load or machine`."""
-        if self.low <= _ROUNDING and self.high >= -_ROUNDING:
+        if self.chance > _LEVEL:
             return "chance"
-        if self.machine_low is None or self.machine_high is None:
+        if self.machine_chance is None:
             return "load or machine"
-        return "load" if self.machine_low <= 0.0 <= self.machine_high else "machine"
+        return "load" if self.machine_chance > _LEVEL else "machine"
 
 
 def points(values: Array) -> dict[str, float]:
@@ -76,10 +87,10 @@ def with_neighbours(load: Array, start_ns: NDArray[np.int64]) -> Array:
     return np.column_stack((load, np.append(load[:1], before), np.append(after, load[-1:])))
 
 
-def change(
+def changes(
     before: tuple[Array, Array], after: tuple[Array, Array], random: np.random.Generator, draws: int = _DRAWS
-) -> Change | None:
-    """Return the change between two groups of windows, None where there are too few.
+) -> list[Change | None]:
+    """Return the changes of some quantities between two groups of windows, None where there are too few.
 
     Means are compared by a bootstrap over windows. At equal load: less the part that follows the load, by the slopes
     over the load's variation within the groups (analysis of covariance).
@@ -87,31 +98,85 @@ def change(
     Parameters
     ----------
     before, after
-        Values of a quantity, shape (n,), and load of the windows of each group, shape (n,), or as of
+        Values of the quantities, shape (n, k), and load of the windows of each group, shape (n,), or as of
         `with_neighbours`, shape (n, 3).
     random
         Source of the draws.
+
+    References
+    ----------
+    Benjamini, Hochberg (1995), Controlling the false discovery rate, J. R. Stat. Soc. B 57.
     """
-    if min(len(before[0]), len(after[0])) < FEWEST or not before[0].mean() > 0.0:
-        return None
-    shares, machine = [], []
-    for draw in range(draws + 1):
-        first, second = (_drawn(group, random) if draw else group for group in (before, after))
-        mean = float(first[0].mean())
-        if mean > 0.0:
-            shares.append(float(second[0].mean()) / mean - 1.0)
-            machine.append(_at_equal_load(first, second))
-    low, high = np.percentile(shares[1:], (2.5, 97.5)).tolist()
-    known = np.array([share for share in machine[1:] if share is not None])
-    if machine[0] is None or _apart(before[1], after[1]) or len(known) < 0.9 * draws:
-        return Change(shares[0], low, high, None, None, None)
-    machine_low, machine_high = np.percentile(known, (2.5, 97.5)).tolist()
-    return Change(shares[0], low, high, machine[0], machine_low, machine_high)
+    width, fewest = before[0].shape[1], min(len(before[0]), len(after[0]))
+    if fewest < FEWEST:
+        return [None] * width
+    known = np.flatnonzero(before[0].mean(axis=0) > 0.0)
+    first, second = (
+        _Drawn(values[:, known], load.reshape(len(load), -1), random, draws) for values, load in (before, after)
+    )
+    found = _tested(second.mean - first.mean, first.mean, fewest)
+    at_equal_load = None
+    if not _apart(before[1], after[1]):
+        rest = _at_equal_load(first, second)
+        left = np.isfinite(rest[:, 0])
+        if left[0] and left[1:].mean() >= 0.9:
+            at_equal_load = _tested(rest[left], first.mean[left], fewest)
+    result: list[Change | None] = [None] * width
+    for place, cell in enumerate(known.tolist()):
+        machine = (None,) * 4 if at_equal_load is None else (part[place].item() for part in at_equal_load)
+        result[cell] = Change(*(part[place].item() for part in found), *machine)
+    return result
 
 
-def _drawn(group: tuple[Array, Array], random: np.random.Generator) -> tuple[Array, Array]:
-    chosen = random.integers(0, len(group[0]), len(group[0]))
-    return group[0][chosen], group[1][chosen]
+class _Drawn:
+    """Moments of a group: of its windows, then of each draw from them.
+
+    Attributes
+    ----------
+    size : int
+        Windows of a draw.
+    mean : ndarray, shape (draws + 1, k)
+        Means of the quantities.
+    load : ndarray, shape (draws + 1, m)
+        Means of the loads.
+    within : ndarray, shape (draws + 1, m, m + k)
+        Covariance of the loads with each other and with the quantities.
+    """
+
+    def __init__(self, values: Array, load: Array, random: np.random.Generator, draws: int) -> None:
+        self.size, width = load.shape
+        whole = np.hstack((load, values))
+        usual = whole.mean(axis=0)
+        centred = whole - usual
+        means, products = [np.zeros((1, whole.shape[1]))], [centred[:, :width].T @ centred / self.size]
+        done = 0
+        while done < draws:  # as many at a time as fit into the memory
+            count = min(draws - done, max(1, _AT_ONCE // self.size))
+            done += count
+            times = np.stack(
+                [np.bincount(random.integers(0, self.size, self.size), minlength=self.size) for _ in range(count)]
+            )
+            weights = times / self.size
+            means.append(weights @ centred)
+            products.append(np.stack([weights @ (centred[:, [one]] * centred) for one in range(width)], axis=1))
+        offset = np.concatenate(means)
+        self.mean, self.load = (usual + offset)[:, width:], (usual + offset)[:, :width]
+        second = np.concatenate([part.reshape(-1, width, whole.shape[1]) for part in products])
+        self.within = second - offset[:, :width, None] * offset[:, None, :]
+
+
+def _tested(differences: Array, mean: Array, fewest: int) -> tuple[Array, Array, Array, Array]:
+    """Return share, low, high and adjusted chance of each difference; the first row is the value, the others draws.
+
+    Student's t with the degrees of freedom of the smaller group errs on the side of chance.
+    """
+    drawn = np.divide(differences, mean, out=np.full_like(mean, np.nan), where=mean > 0.0)
+    low, high = np.nanpercentile(drawn[1:], (2.5, 97.5), axis=0)
+    share, spread = drawn[0], differences[1:].std(axis=0, ddof=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        chance = 2.0 * student.sf(np.abs(differences[0] / spread), fewest - 1)
+    chance[np.abs(share) <= _ROUNDING] = 1.0
+    return share, low, high, false_discovery_control(chance) if len(chance) else chance
 
 
 def _apart(before: Array, after: Array) -> bool:
@@ -122,18 +187,15 @@ def _apart(before: Array, after: Array) -> bool:
     return bool(differ and (low > other_high or other_low > high))
 
 
-def _at_equal_load(before: tuple[Array, Array], after: tuple[Array, Array]) -> float | None:
-    """Return the change of the mean at the first group's load, as a share of the first mean."""
-    (first, load_before), (second, load_after) = (
-        (values, load.reshape(len(load), -1)) for values, load in (before, after)
-    )
-    mean, usual = float(first.mean()), float(load_before.mean())
-    difference = load_after.mean(axis=0) - load_before.mean(axis=0)
-    if abs(difference[0]) < _EQUAL_LOAD * usual:
-        return float(second.mean()) / mean - 1.0
-    centred_load = np.concatenate((load_before - load_before.mean(axis=0), load_after - load_after.mean(axis=0)))
-    centred = np.concatenate((first - first.mean(), second - second.mean()))
-    if float(np.sqrt((centred_load[:, 0] ** 2).mean())) < _LEAST_VARIATION * usual:
-        return None
-    slopes = np.linalg.lstsq(centred_load, centred)[0]
-    return (float(second.mean()) - float(slopes @ difference)) / mean - 1.0
+def _at_equal_load(before: _Drawn, after: _Drawn) -> Array:
+    """Return the differences of the means at the first group's load, NaN where the load hardly varies."""
+    usual, difference = before.load[:, 0], after.load - before.load
+    changed = np.abs(difference[:, 0]) >= _EQUAL_LOAD * usual
+    width, size = difference.shape[1], before.size + after.size
+    within = (before.size * before.within + after.size * after.within) / size
+    slopes = np.linalg.pinv(within[:, :, :width], hermitian=True) @ within[:, :, width:]
+    followed = np.einsum("dm,dmk->dk", np.where(changed[:, None], difference, 0.0), slopes)
+    rest = after.mean - before.mean - followed
+    still = np.sqrt(np.maximum(within[:, 0, 0], 0.0)) < _LEAST_VARIATION * usual
+    rest[changed & still] = np.nan
+    return np.asarray(rest)

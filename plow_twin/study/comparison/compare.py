@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, time, timedelta, tzinfo
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
@@ -13,11 +14,13 @@ import numpy as np
 from plow_twin.errors import RecordingError
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record.recording import read_recording
-from plow_twin.study.comparison.change import Change, change, points, with_neighbours
-from plow_twin.study.comparison.windows import QUANTITIES, Windows, windows_of
+from plow_twin.study.comparison.change import Change, changes, points, with_neighbours
+from plow_twin.study.comparison.windows import FULL, QUANTITIES, Windows, windows_of
 
 #: Stamps before this [ns] are no dates: 1e18 ns is in the year 2001.
 _DATES_NS: Final = 10**18
+#: Share of a window that may be without messages: rates that differ by less count as equal.
+_MISSING: Final = 1.0 - FULL
 #: Default begins of the shifts.
 SHIFTS: Final = (time(6), time(14), time(22))
 
@@ -41,6 +44,8 @@ class Comparison:
         By group (but the first), horizontal and vertical: the same.
     scenes : list of str
         Names of the scenes of all runs.
+    notes : list of str
+        Doubts about the runs: times that several runs have, sample rates that differ.
     """
 
     groups: dict[str, Windows]
@@ -48,6 +53,7 @@ class Comparison:
     changes: dict[str, dict[str, dict[str, Change | None]]] = field(default_factory=dict)
     clearance_changes: dict[str, dict[str, Change | None]] = field(default_factory=dict)
     scenes: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
     def facts(self) -> dict[str, Any]:
         """Return plain values for JSON."""
@@ -73,6 +79,7 @@ class Comparison:
             },
             "units": dict(QUANTITIES),
             "scenes": self.scenes,
+            "notes": self.notes,
             "changes": {
                 name: {pair: _facts(by_quantity) for pair, by_quantity in by_pair.items()}
                 for name, by_pair in self.changes.items()
@@ -127,7 +134,10 @@ def by_time(kind: str, shifts: Sequence[time] = SHIFTS, zone: tzinfo = UTC) -> L
 
 
 def compare(
-    runs: Iterable[tuple[str, Windows]], label: Label = by_run, seed: int = 0, scenes: Iterable[str] = ()
+    runs: Iterable[tuple[str, Windows]],
+    label: Label = by_run,
+    seed: int = 0,
+    scenes: Mapping[str, tuple[str, str]] = MappingProxyType({}),
 ) -> Comparison:
     """Return the groups of some runs, and the changes from the first group to each other.
 
@@ -140,57 +150,82 @@ def compare(
     seed
         Of the draws of the bootstrap.
     scenes
-        Names of the runs' scenes.
+        Name and contents of each run's scene.
 
     Raises
     ------
     RecordingError
         There are fewer than two groups.
     """
-    parts: dict[str, list[tuple[Windows, np.ndarray[Any, Any]]]] = {}
+    parts: dict[str, list[Windows]] = {}
     names: dict[str, list[str]] = {}
+    notes: list[str] = []
+    runs = list(runs)
     for name, windows in runs:
         labels = np.array([label(name, stamp) for stamp in windows.start_ns.tolist()])
         for group in dict.fromkeys(labels.tolist()):
-            parts.setdefault(group, []).append((windows, labels == group))
+            chosen = windows.chosen(labels == group)
+            for other, there in zip(names.get(group, ()), parts.get(group, ()), strict=True):
+                twice = _overlapping(chosen, there)
+                if twice.any():
+                    notes.append(
+                        f"{name}: {twice.sum()} of {len(twice)} windows in {group} left out: {other} covers their time"
+                    )
+                    chosen = chosen.chosen(~twice)
+            parts.setdefault(group, []).append(chosen)
             names.setdefault(group, []).append(name)
     if len(parts) < 2:
         raise RecordingError(f"got {len(parts)} group of windows ({', '.join(parts)}), expected two or more")
-    found = Comparison({group: _joined(chosen) for group, chosen in parts.items()}, names)
-    found.scenes = sorted(set(scenes))
+    found = Comparison({group: Windows.joined(chosen) for group, chosen in parts.items()}, names)
+    found.scenes = sorted({name for name, _ in scenes.values() if name})
+    found.notes = notes + _rates_apart(runs) + _scenes_apart(scenes)
     (reference, first), *others = found.groups.items()
     loads = {group: with_neighbours(windows.load[:, 0], windows.start_ns) for group, windows in found.groups.items()}
     random = np.random.default_rng(seed)
+    before = _cells(first)
     for group, windows in others:
-        found.changes[group] = {
-            pair: {
-                quantity: change(
-                    (first.pairs[quantity][:, place], loads[reference]),
-                    (windows.pairs[quantity][:, place], loads[group]),
-                    random,
-                )
-                for quantity in QUANTITIES
-            }
-            for place, pair in enumerate(PAIR_NAMES)
-        }
-        found.clearance_changes[group] = {
-            axis: change(
-                (first.clearance[:, place], loads[reference]),
-                (windows.clearance[:, place], loads[group]),
-                random,
-            )
-            for place, axis in enumerate(("horizontal", "vertical"))
-        }
+        cells = iter(changes((before, loads[reference]), (_cells(windows), loads[group]), random))
+        found.changes[group] = {pair: {quantity: next(cells) for quantity in QUANTITIES} for pair in PAIR_NAMES}
+        found.clearance_changes[group] = {axis: next(cells) for axis in ("horizontal", "vertical")}
     return found
 
 
-def _joined(parts: Sequence[tuple[Windows, np.ndarray[Any, Any]]]) -> Windows:
-    return Windows(
-        np.concatenate([windows.start_ns[chosen] for windows, chosen in parts]),
-        {name: np.concatenate([windows.pairs[name][chosen] for windows, chosen in parts]) for name in QUANTITIES},
-        np.concatenate([windows.load[chosen] for windows, chosen in parts]),
-        np.concatenate([windows.clearance[chosen] for windows, chosen in parts]),
+def _cells(windows: Windows) -> np.ndarray[Any, Any]:
+    """Return the quantities of each pair, then the clearances, shape (n, cells)."""
+    by_pair = np.stack([windows.pairs[name] for name in QUANTITIES], axis=2)
+    return np.hstack((by_pair.reshape(len(by_pair), -1), windows.clearance))
+
+
+def _overlapping(windows: Windows, others: Windows) -> np.ndarray[Any, Any]:
+    """Return which windows share time with one of the others."""
+    if not len(others.start_ns):
+        return np.zeros(len(windows.start_ns), bool)
+    order = np.argsort(others.start_ns)
+    (begins, ends), (starts, stops) = (
+        # what surely has messages of a window
+        ((part.start_ns + _MISSING * part.length_ns), (part.start_ns + FULL * part.length_ns))
+        for part in (windows, others)
     )
+    starts, stops = starts[order], stops[order]
+    before = np.searchsorted(starts, ends) - 1  # the newest of the others that begins before a window's end
+    return np.asarray((before >= 0) & (stops[before] > begins))
+
+
+def _rates_apart(runs: Sequence[tuple[str, Windows]]) -> list[str]:
+    """Name the sample rates of the runs where they differ."""
+    rates = {name: float(windows.rate_hz.mean()) for name, windows in runs if len(windows.rate_hz)}
+    if not rates or min(rates.values()) >= FULL * max(rates.values()):
+        return []
+    found = ", ".join(f"{name} {rate:.4g} Hz" for name, rate in rates.items())
+    return [f"the sample rates differ, and peaks, impacts and contact depend on them: {found}"]
+
+
+def _scenes_apart(scenes: Mapping[str, tuple[str, str]]) -> list[str]:
+    """Name the scenes of the runs where their contents differ."""
+    if len({contents for _, contents in scenes.values()}) < 2:
+        return []
+    found = ", ".join(f"{run} {name or 'without a name'}" for run, (name, _) in scenes.items())
+    return [f"the runs have different scenes, so a change of the machine may be that of its description: {found}"]
 
 
 @dataclass(frozen=True)
@@ -205,7 +240,7 @@ class WindowsTask:
         return None
 
     def run(self) -> dict[str, Any]:
-        """Return the windows under the key `windows`, the run's losses under `lost`, its scene's name under `scene`.
+        """Return the windows (`windows`), the run's losses (`lost`), name and contents of its scene (`scene`).
 
         Raises
         ------
@@ -215,4 +250,5 @@ class WindowsTask:
         recording = read_recording(self.path)
         windows = windows_of(recording, self.window_s)
         scene = Path(str(recording.header.parameters.get("scene", ""))).name
-        return {"run": str(self.path), "windows": windows, "lost": recording.losses(), "scene": scene}
+        contents = recording.header.scene_yaml
+        return {"run": str(self.path), "windows": windows, "lost": recording.losses(), "scene": (scene, contents)}

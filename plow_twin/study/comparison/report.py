@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -65,27 +66,27 @@ def _title(found: Comparison) -> str:
 
 
 def _write_windows(found: Comparison, path: Path) -> None:
+    """Write a row group for each group, so that only one is in memory twice."""
     import pyarrow as pa
     import pyarrow.parquet
 
-    columns: dict[str, list[Any]] = {"group": [], "start": []}
-    for name, windows in found.groups.items():
-        columns["group"] += [name] * len(windows.start_ns)
-        columns["start"] += windows.start_ns.view("datetime64[ns]").tolist()
-        numbers = {
-            "load/force_rms": windows.load[:, 0],
-            "load/moment_rms": windows.load[:, 1],
-            "clearance/horizontal": windows.clearance[:, 0],
-            "clearance/vertical": windows.clearance[:, 1],
-            **{
-                f"{pair}/{quantity}": values[:, place]
-                for place, pair in enumerate(PAIR_NAMES)
-                for quantity, values in windows.pairs.items()
-            },
-        }
-        for key, values in numbers.items():
-            columns.setdefault(key, []).extend(values.tolist())
-    stamps = pa.array(columns.pop("start"), pa.timestamp("ns", "UTC"))
-    table = pa.table({"group": columns.pop("group"), "start": stamps, **columns})
-    with whole_file(path) as stream:
-        pyarrow.parquet.write_table(table, stream)
+    writer = None
+    with whole_file(path) as stream, ExitStack() as opened:
+        for name, windows in found.groups.items():
+            columns: dict[str, Any] = {
+                "group": [name] * len(windows.start_ns),
+                "start": pa.array(windows.start_ns.view("datetime64[ns]"), pa.timestamp("ns", "UTC")),
+                "length": windows.length_ns * 1e-9,
+                "samples_a_second": windows.rate_hz,
+                "load/force_rms": windows.load[:, 0],
+                "load/moment_rms": windows.load[:, 1],
+                "clearance/horizontal": windows.clearance[:, 0],
+                "clearance/vertical": windows.clearance[:, 1],
+            }
+            for place, pair in enumerate(PAIR_NAMES):
+                for quantity, values in windows.pairs.items():
+                    columns[f"{pair}/{quantity}"] = values[:, place]
+            table = pa.table({key: pa.array(values) for key, values in columns.items()})
+            if writer is None:
+                writer = opened.enter_context(pyarrow.parquet.ParquetWriter(stream, table.schema))
+            writer.write_table(table)

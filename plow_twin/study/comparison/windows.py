@@ -1,8 +1,8 @@
-"""A run as windows of about a load period: peaks, impacts, duty, impulse and dissipation of each pair, and the load."""
+"""A run as windows of about a load period: the load, and quantities of each pair."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -22,7 +22,7 @@ Indexes = NDArray[np.int64]
 QUANTITIES: Final[Mapping[str, str]] = {
     "peak": "N",
     "impacts": "1/min",
-    "duty": "1",
+    "in_contact": "share of samples",
     "impulse": "N",
     "dissipation": "W",
     "wear": "m/h",
@@ -32,7 +32,7 @@ _PERIOD_SPAN_S: Final = 60.0
 #: Length of a window where the load has no period [s].
 _NO_PERIOD_S: Final = 10.0
 #: A window with fewer of the messages of a full one is left out: it is cut by an end or a gap.
-_FULL: Final = 0.9
+FULL: Final = 0.9
 _PADS: Final = np.array([CLEARANCE_NAMES.index(name) for name in PAD_NAMES])
 _TOTALS: Final = np.array([CLEARANCE_NAMES.index(name) for name in ("horizontal", "vertical")])
 
@@ -46,18 +46,47 @@ class Windows:
     start_ns : ndarray, shape (n,)
         Their first stamps [ns].
     pairs : dict of str to ndarray, shape (n, 8)
-        `QUANTITIES`: largest force, impacts a minute, share of time in contact, impulse and dissipated energy a second,
-        wear an hour.
+        `QUANTITIES`: largest force, impacts a minute, share of samples in contact, impulse and dissipated energy a
+        second, wear an hour.
     load : ndarray, shape (n, 2)
         Root mean square of the force [N] and of the moment [N m] of the load.
     clearance : ndarray, shape (n, 2)
         Horizontal and vertical clearance [m].
+    length_ns : ndarray, shape (n,)
+        Their lengths [ns].
+    rate_hz : ndarray, shape (n,)
+        Samples of the load a second.
     """
 
     start_ns: Indexes
     pairs: dict[str, Array]
     load: Array
     clearance: Array
+    length_ns: Indexes
+    rate_hz: Array
+
+    def chosen(self, which: NDArray[np.bool_]) -> Windows:
+        """Return some of the windows, by a mask (n,)."""
+        return Windows(
+            self.start_ns[which],
+            {name: values[which] for name, values in self.pairs.items()},
+            self.load[which],
+            self.clearance[which],
+            self.length_ns[which],
+            self.rate_hz[which],
+        )
+
+    @classmethod
+    def joined(cls, parts: Sequence[Windows]) -> Windows:
+        """Return the windows of several runs as one."""
+        return cls(
+            np.concatenate([part.start_ns for part in parts]),
+            {name: np.concatenate([part.pairs[name] for part in parts]) for name in QUANTITIES},
+            np.concatenate([part.load for part in parts]),
+            np.concatenate([part.clearance for part in parts]),
+            np.concatenate([part.length_ns for part in parts]),
+            np.concatenate([part.rate_hz for part in parts]),
+        )
 
 
 @dataclass
@@ -138,7 +167,7 @@ def windows_of(recording: Recording, window_s: float | None = None) -> Windows:
             raise RecordingError(
                 f"{recording.path}: got no {name}, expected a run with outputs: plow-twin replay --write"
             )
-    full = _FULL * float(np.median([row[0] for row in messages.rows.values()]))
+    full = FULL * float(np.median([row[0] for row in messages.rows.values()]))
     numbers = sorted(number for number, row in messages.rows.items() if row[0] >= full)
     seconds = window_ns * 1e-9
     sums, touched = moved.of(numbers), contact.of(numbers)
@@ -149,13 +178,15 @@ def windows_of(recording: Recording, window_s: float | None = None) -> Windows:
         {
             "peak": peak.of(numbers),
             "impacts": sums[:, :PAIR_COUNT] * 60.0 / seconds,
-            "duty": touched[:, PAIR_COUNT : 2 * PAIR_COUNT] / np.maximum(touched[:, -1:], 1.0),
+            "in_contact": touched[:, PAIR_COUNT : 2 * PAIR_COUNT] / np.maximum(touched[:, -1:], 1.0),
             "impulse": sums[:, PAIR_COUNT:] / seconds,
             "dissipation": touched[:, :PAIR_COUNT] / seconds,
             "wear": grown.reshape(-1, PAIR_COUNT) * 3600.0 / seconds,
         },
         np.sqrt(squares[:, :2] / np.maximum(squares[:, 2:], 1.0)),
         _between(slow, slow_count, numbers),
+        np.full(len(numbers), window_ns, np.int64),
+        squares[:, 2] / seconds,
     )
 
 
