@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Callable
 
 from plow_twin.estimate.priors import DEFAULTS
 from plow_twin.model.scene import Mark
-from plow_twin.stream.topics import TOPICS
+from plow_twin.stream.topics import JOINT_STATE, TOPICS
 
 
 def topics() -> str:
-    """Return the topics that a twin sends."""
-    lines = ["| topic | type | sent | content |", "|---|---|---|---|"]
+    """Return the topics that a twin sends: name, type unless it is a JointState, when they are sent, and content."""
+    lines = []
     for topic in TOPICS:
-        kind = topic.type.replace("/msg/", "/")
-        sent = f"{topic.cadence.value}{', latched' * topic.latched}"
-        lines.append(f"| `{topic.name}` | {kind} | {sent} | {topic.content} |")
+        kind = "" if topic.type == JOINT_STATE else f"{topic.type.replace('/msg/', '/')}, "
+        sent = f"{kind}{topic.cadence.value}{', latched' * topic.latched}"
+        line = f"- `{topic.name}` ({sent}): {topic.content}"
+        lines += textwrap.wrap(line, 140, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
     return "\n".join(lines)
 
 
