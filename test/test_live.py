@@ -33,10 +33,12 @@ from plow_twin.errors import RecordingError
 from plow_twin.live import parameters
 from plow_twin.live.bridge.files import Files, StandardInput
 from plow_twin.live.bridge.source import BridgeError
+from plow_twin.live.control import call
 from plow_twin.live.front import BridgeFront
 from plow_twin.live.inputs import Inputs
 from plow_twin.live.load_model import read_load_model
 from plow_twin.live.part import Part
+from plow_twin.live.service_names import mark_problem
 from plow_twin.live.services import Services
 from plow_twin.live.solver_start import Preparation
 from plow_twin.model.pairs import PAIR_NAMES
@@ -524,6 +526,19 @@ def test_an_alarm_is_reported_once_with_value_pad_threshold_and_time_and_acknowl
         assert again > 4
         mark, acknowledge = ["call", str(control), "mark", "new pads"], ["call", str(control), "acknowledge_alarms"]
         assert [run_cli(mark), run_cli(acknowledge)] == [0, 0]
+        answer = capsys.readouterr().out
+        assert "still there: force" in answer and f"kN at {values['force_place']}, warning threshold 20 kN" in answer
+        assert re.search(r", now [\d.]+ kN$", answer.strip())
+        for text, got in (
+            (" ", "got 0 characters"),
+            ("x" * 201, "got 201 characters"),
+            ("a\x1b[2Jb", "got 'a\\x1b[2Jb'"),
+        ):
+            assert run_cli(["call", str(control), "mark", text]) == 2 and got in capsys.readouterr().err
+            assert call(control, "mark", text) == (False, mark_problem(text))  # by any other program too
+        for place, kind in ((path, "a file"), (tmp_path, "a folder"), (tmp_path / "none", "nothing there")):
+            assert run_cli(["call", str(place), "mark", "x"]) == 1
+            assert f"got {kind}, expected the socket that plow-twin live --control" in capsys.readouterr().err
         assert run_cli(["call", str(control), "restore"]) == 1 and "no snapshot" in capsys.readouterr().err
         assert live.stop() == 0
     assert not control.exists() and run_cli(acknowledge) == 1

@@ -410,6 +410,33 @@ def test_an_open_recorder_is_closed_at_exit(tmp_path: Path) -> None:
     assert (tmp_path / "run" / "metadata.yaml").exists()
 
 
+def test_closing_waits_while_items_are_written_and_then_says_what_is_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write, stuck = RunWriter.write_samples, threading.Event()
+
+    def slowly(writer: RunWriter, *given: Any) -> None:
+        if len(given[0]) == 1:  # the last sample, after the others
+            stuck.wait(60.0)
+        time.sleep(0.3)
+        write(writer, *given)
+
+    monkeypatch.setattr("plow_twin.record.recorder._BURST", 10)
+    monkeypatch.setattr(RunWriter, "write_samples", slowly)
+    for count in (50, 51):
+        recorder = Recorder(tmp_path / f"run{count}", HEADER)
+        for index in range(count):
+            assert recorder.journal(paper_sample(index))
+        report = recorder.close(timeout_s=0.6)  # shorter than all, longer than one burst
+        assert report.complete == (count == 50)
+    sentence = report.sentence(tmp_path / "run51")
+    stuck.set()
+    assert (
+        "is incomplete: the disk took nothing for 0.6 s, " in sentence and "are unwritten; its end is not" in sentence
+    )
+    assert sentence.endswith(f"plow-twin doctor --repair {tmp_path / 'run51'} completes its files")
+
+
 def test_an_earlier_recording_is_never_written_over(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     Recorder(folder, HEADER).close()

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from plow_twin.cli.console import DONE, FAILED, say_error
-from plow_twin.live.service_names import SERVICES
+from plow_twin.live.service_names import SERVICES, mark_problem
 
 
 @click.command(
@@ -16,13 +16,15 @@ from plow_twin.live.service_names import SERVICES
 )
 @click.argument("socket", type=click.Path(path_type=Path))
 @click.argument("service", type=click.Choice(SERVICES))
-@click.argument("text", default="")
-def call(socket: Path, service: str, text: str) -> int:
+@click.argument("text", required=False)
+def call(socket: Path, service: str, text: str | None) -> int:
     """Ask the twin of `plow-twin live --control SOCKET` for a SERVICE of the node; TEXT is that of a mark."""
     from plow_twin.live.control import call as ask
 
-    if text and service != "mark":
+    if text is not None and service != "mark":
         raise click.UsageError(f"{service}: got the text {text!r}, expected none: it concerns all alarms, or the twin")
+    if text is not None and (problem := mark_problem(text)) is not None:
+        raise click.UsageError(problem)
     done, answer = ask(socket, service, text)
     if not done:
         say_error(f"plow-twin: {service}: {answer}")

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     short_help="Compare runs: do the contacts change, and is it the load or the machine?",
     epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, 3 done, and a run was left out.",
 )
-@click.argument("recordings", metavar="RUN...", type=click.Path(path_type=Path, exists=True), nargs=-1, required=True)
+@click.argument("recordings", metavar="RUN...", type=click.Path(path_type=Path), nargs=-1, required=True)
 @click.option("--by", type=click.Choice(["run", "day", "shift"]), default="run", show_default=True, help="Groups.")
 @click.option("--shifts", default="06:00,14:00,22:00", show_default=True, help="Begins of the shifts.")
 @click.option("--zone", default="UTC", show_default=True, help="Time zone of days and shifts, e.g. Europe/Berlin.")
@@ -61,6 +61,9 @@ def compare(
     from plow_twin.study.comparison.compare import WindowsTask
     from plow_twin.study.comparison.compare import compare as compared
 
+    for path in recordings:
+        if not path.exists():
+            raise click.BadParameter(f"{path}: does not exist", param_hint="RUN...")
     label = _label(by, shifts, zone)
     found, repeated = counted_once(expand(recordings))
     for sentence in repeated:

@@ -258,7 +258,7 @@ class Feed:
             self.event(action, "not possible here", done=False)
             return
         done, said = self._answer(action, text)
-        self.event(action, f"{text}: {said}" if text else said, done=done)
+        self.event(action, f"{text}: {said}" if text and done else said, done=done)
 
 
 def _joined(rows: list[NDArray[np.void]], name: str) -> NDArray[Any]:

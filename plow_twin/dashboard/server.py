@@ -36,9 +36,8 @@ MOST_PAGES: Final = 50
 _PATIENCE_S: Final = 20.0
 #: Longest time without a word to a page, and shortest between two wishes of one [s].
 _WORD_S, _WISH_S = 1.0, 0.2
-#: Longest wish of a page [B], and longest text of a mark.
+#: Longest wish of a page [B].
 _WISH: Final = 4096
-_MARK: Final = 200
 #: How much the server gives way to the twin (`nice`).
 _NICE: Final = 10
 #: Why a page is let go, in numbers of the protocol of WebSockets.
@@ -151,7 +150,7 @@ class Pages:
         while True:
             wish = await _wish(socket)
             if wish.get("do") in ("acknowledge", "mark"):
-                self._link.send({"do": wish["do"], "text": str(wish.get("text", "")).strip()[:_MARK]})
+                self._link.send({"do": wish["do"], "text": str(wish.get("text", "")).strip()})
                 await asyncio.sleep(_WISH_S)
 
 

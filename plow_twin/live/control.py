@@ -98,17 +98,20 @@ class Control:
         text = asked.get("text") if isinstance(asked, dict) else None
         if name not in SERVICES or self.services is None:
             return False, f"service: got {name!r}, expected one of {', '.join(SERVICES)}"
-        return self.services.call(name, text if isinstance(text, str) else "")
+        return self.services.call(name, text if isinstance(text, str) else None)
 
 
-def call(path: Path, service: str, text: str = "") -> tuple[bool, str]:
+def call(path: Path, service: str, text: str | None = None) -> tuple[bool, str]:
     """Ask the twin behind a socket for a service; return whether it was done, and its answer.
 
     Raises
     ------
     ControlError
-        Nobody answers.
+        There is no socket, or nobody answers.
     """
+    if not path.is_socket():
+        kind = "a folder" if path.is_dir() else "a file" if path.exists() else "nothing there"
+        raise ControlError(f"{path}: got {kind}, expected the socket that plow-twin live --control has opened")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as client:
         client.bind("")  # a name of its own, outside of the file system
         client.settimeout(_PATIENCE_S)
@@ -117,7 +120,8 @@ def call(path: Path, service: str, text: str = "") -> tuple[bool, str]:
             client.send(json.dumps({"service": service, "text": text}).encode())
             answer = json.loads(client.recv(_LARGEST))
         except OSError as error:
-            reason = "no answer" if isinstance(error, TimeoutError) else error.strerror or error
+            gone = isinstance(error, ConnectionRefusedError)
+            reason = "the twin that opened it has ended" if gone else error.strerror or f"nothing for {_PATIENCE_S:g} s"
             raise ControlError(f"{path}: no twin answers: {reason}") from error
     return bool(answer["success"]), str(answer["message"])
 

@@ -22,6 +22,7 @@ from plow_twin.live.file_root import outside
 from plow_twin.live.inputs import Inputs
 from plow_twin.live.parameters import MODEL, ParameterError, Settings, model_changes
 from plow_twin.live.publishing import Front, Outgoing, Publishing
+from plow_twin.live.service_names import mark_problem
 from plow_twin.live.solver_start import Prepared
 from plow_twin.live.wear_keeper import KeptWear, WearKeeper
 from plow_twin.model.scene import Scene, fastest_travel
@@ -258,6 +259,8 @@ class Runtime:
 
     def mark(self, text: str) -> tuple[bool, str]:
         """Put a text into the journal and have the ring written, if there is one."""
+        if (problem := mark_problem(text)) is not None:
+            return False, problem
         self.driver.mark(self.stamp_ns, text)
         if self.recording is None:
             return False, "nothing is recorded"
@@ -296,9 +299,8 @@ class Runtime:
             self.wear_keeper.close(self.driver.session.wear_depth)
             lost += [self.wear_keeper.error] if self.wear_keeper.error else []
         self.driver.close()
-        report = self.recording.close() if self.recording else None
-        if report is not None and not report.complete:
-            lost.append(f"recording incomplete: lost {dict(report.lost)}, closed {report.closed}, error {report.error}")
+        if self.recording is not None and not (report := self.recording.close()).complete:
+            lost.append(report.sentence(self.recording.path.parent))
         return lost
 
     def periodic(self) -> list[tuple[float, Callable[[], float | None]]]:

@@ -1,4 +1,4 @@
-"""Names of the services of a live twin, each a method of `Services`."""
+"""Names of the services of a live twin, each a method of `Services`, and the texts that a mark may have."""
 
 from __future__ import annotations
 
@@ -14,3 +14,15 @@ SERVICES: Final = (
     "mark",
     "forecast",
 )
+
+#: Longest text of a mark [characters].
+MOST_MARK: Final = 200
+
+
+def mark_problem(text: str) -> str | None:
+    """Return what is wrong with the text of a mark; None where nothing is."""
+    if not text.strip() or len(text) > MOST_MARK:
+        return f"text of a mark: got {len(text.strip())} characters, expected 1 to {MOST_MARK}"
+    if not text.isprintable():
+        return f"text of a mark: got {text[:60]!r}, expected printable characters in one line"
+    return None

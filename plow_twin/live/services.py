@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from plow_twin.live.parameters import services_off
 from plow_twin.live.runtime import Runtime
-from plow_twin.record.alarms import ACKNOWLEDGED
+from plow_twin.record.alarms import ACKNOWLEDGED, alarm_texts, alarms_message
 from plow_twin.record.wear_state import check_depth
 from plow_twin.stream.journal import Snapshot
 
@@ -27,7 +27,7 @@ class Services:
         self._runtime, self._changed = runtime, changed
         self._kept: Snapshot | None = None
 
-    def call(self, name: str, text: str = "") -> tuple[bool, str]:
+    def call(self, name: str, text: str | None = None) -> tuple[bool, str]:
         """Carry out the service `name`, unless the parameter `services_off` names it; `text` belongs to a mark."""
         if name in services_off(self._runtime.settings):
             return False, f"{name}: switched off by the parameter services_off"
@@ -36,9 +36,9 @@ class Services:
         done: tuple[bool, str] = getattr(self, name)()
         return done
 
-    def mark(self, text: str = "") -> tuple[bool, str]:
+    def mark(self, text: str | None = None) -> tuple[bool, str]:
         """Put a text, by default the parameter `mark`, into the journal, and write the ring if there is one."""
-        return self._runtime.mark(text or self._runtime.settings.mark or "service")
+        return self._runtime.mark((self._runtime.settings.mark or "service") if text is None else text)
 
     def reset(self) -> tuple[bool, str]:
         """Put the motion back to its initial state; return whether that was done, and a text for who asked."""
@@ -61,10 +61,12 @@ class Services:
 
     def acknowledge_alarms(self) -> tuple[bool, str]:
         """Let go the alarms that are latched."""
-        left = self._runtime.alarms.acknowledge()
+        alarms = self._runtime.alarms
+        left = alarms.acknowledge()
         self._runtime.driver.parameter(ACKNOWLEDGED, self._runtime.stamp_ns)
         self._runtime.send_alarms()
-        return True, f"still there: {', '.join(left)}" if left else "no alarm is left"
+        values = dict(alarms_message(alarms, "", "").values)
+        return True, f"still there: {'; '.join(alarm_texts(values, newest=True))}" if left else "no alarm is left"
 
     def forecast(self) -> tuple[bool, str]:
         """Return the newest forecast as JSON."""

@@ -64,8 +64,8 @@ def alarms_message(alarms: Alarms, node: str, hardware_id: str) -> DiagnosticSta
     return DiagnosticStatus(int(alarms.worst), f"{node}: {ALARMS}", text, hardware_id, tuple(values.items()))
 
 
-def alarm_texts(values: Mapping[str, str], *, own_start: bool = False) -> list[str]:
-    """Return a sentence for each latched alarm: level, value, pad, threshold and time.
+def alarm_texts(values: Mapping[str, str], *, own_start: bool = False, newest: bool = False) -> list[str]:
+    """Return a sentence for each latched alarm: level, value, pad, threshold and time, with `newest` the value now too.
 
     `values` are those of `alarms_message`; `own_start` as of `time_text`.
     """
@@ -80,7 +80,8 @@ def alarm_texts(values: Mapping[str, str], *, own_start: bool = False) -> list[s
         title = "error" if level == "error" else "warning"
         time = time_text(int(stamp), own_start=own_start)
         limit = f"{title} threshold {threshold:.4g} {unit}"
-        found.append(f"{name.replace('_', ' ')} {raised:.4g} {unit}{place}, {limit}, at {time}")
+        now = f", now {float(values[name]) * factor:.4g} {unit}" if newest else ""
+        found.append(f"{name.replace('_', ' ')} {raised:.4g} {unit}{place}, {limit}, at {time}{now}")
     return found
 
 

@@ -77,6 +77,17 @@ class LossReport:
         """Whether the file is without loss and has its index."""
         return self.closed and not self.lost and self.error is None
 
+    def sentence(self, folder: Path) -> str:
+        """Say what the recording in `folder` lacks, and which commands show and complete it."""
+        lacks = [f"{count} lost of {topic}" for topic, count in self.lost.items()]
+        if self.error is not None:
+            lacks.append(self.error)
+        remedy = f"plow-twin info {folder} shows its content"
+        if not self.closed:
+            lacks.append("its end is not written")
+            remedy += f", plow-twin doctor --repair {folder} completes its files"
+        return f"the recording {folder} is incomplete: {'; '.join(lacks)}. {remedy}"
+
 
 class Recorder:
     """Record a run to the folder `path`.
@@ -340,9 +351,9 @@ class Recorder:
         self._output_gaps.clear()
 
     def close(self, timeout_s: float = 5.0) -> LossReport:
-        """Write the queued items, close the file and return the losses; waits at most `timeout_s` [s].
+        """Write the queued items, close the file and return the losses.
 
-        A second call only returns the report.
+        Waits while items are written, and at most `timeout_s` [s] without one. A second call only returns the report.
         """
         atexit.unregister(self.close)
         with self._lock:
@@ -353,11 +364,13 @@ class Recorder:
                 if self._journal_gap:
                     self._push_entry(now, Loss(self._journal_gap))
         self._stopping.set()
-        self._thread.join(timeout_s)
+        before = None
+        while self._thread.is_alive() and before != (before := (self._written, self._queued)):
+            self._thread.join(timeout_s)
         with self._lock:
             error = self._error or self._mark_error
             if error is None and not self._closed:
-                error = f"{self.path}: not closed within {timeout_s:g} s, {self._queued} item(s) unwritten"
+                error = f"the disk took nothing for {timeout_s:g} s, {self._queued} messages and entries are unwritten"
             return LossReport(dict(self._lost), self._closed, error)
 
     def __enter__(self) -> Self:
