@@ -9,6 +9,8 @@ import pytest
 from scenes import preset
 
 from plow_twin import Clearance, Gravity, Harmonic, Scene, Status, Table, simulate, simulate_many
+from plow_twin.model.loads import compile_loads
+from plow_twin.solve import compiled_scene
 
 
 def members() -> list[Scene]:
@@ -46,8 +48,39 @@ def test_members_with_other_terms_leave_nothing_behind() -> None:
     swinging = dataclasses.replace(scene, gravity=Gravity(0.0), loads=(swing,))
     scenes = [dataclasses.replace(scene, loads=(table,)), swinging, dataclasses.replace(scene, loads=()), swinging]
     together = simulate_many(scenes, 0.9, 0.1, workers=1)
-    for index, one in enumerate(scenes):
-        assert np.array_equal(together.q[index], simulate(one, 0.9, 0.1).q)
+    alone = [simulate(one, 0.9, 0.1).q for one in reversed(scenes)]
+    assert all(np.array_equal(one, q) for one, q in zip(together.q, reversed(alone), strict=True))
+
+
+def test_a_run_within_the_progress_of_another_changes_no_bit() -> None:
+    scene, within = preset("bench_hc"), []
+    expected = simulate(scene, 20.0, 0.1, 1e-11)
+    inner = dataclasses.replace(scene, loads=())
+
+    def run_another(share: float) -> None:
+        within.append(simulate(inner, 0.9, 0.1).q)
+
+    found = simulate(scene, 20.0, 0.1, 1e-11, on_progress=run_another)
+    assert within and np.array_equal(found.q, expected.q) and np.array_equal(found.v, expected.v)
+    assert all(np.array_equal(q, within[0]) for q in within)
+
+
+def test_scenes_one_after_the_other_share_what_their_equal_parts_need(monkeypatch: pytest.MonkeyPatch) -> None:
+    summed: list[object] = []
+
+    def counted(loads: object) -> object:
+        summed.append(loads)
+        return compile_loads(loads)
+
+    monkeypatch.setattr(compiled_scene, "compile_loads", counted)
+    scene = preset("bench_hc")
+    table = Table("ramp", np.array([0.0, 1.0]), np.array([[0.0, 0.0, 0.0], [4e4, -1e4, 2e3]]))
+    for gap in (0.020, 0.025, 0.030):
+        simulate(dataclasses.replace(scene, clearance=Clearance(gap, gap)), 1e-3)
+    assert len(summed) == 1
+    for _ in range(2):  # a table is not kept
+        simulate(dataclasses.replace(scene, loads=(table,)), 1e-3)
+    assert len(summed) == 3
 
 
 def test_a_member_that_fails_does_not_stop_the_others() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time as _time
 import warnings
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
@@ -21,9 +22,9 @@ from plow_twin.run.energy_balance import EnergyBalance, energy_balance_of
 from plow_twin.run.motion import BUDGET, Motion, run_events, run_fixed
 from plow_twin.run.pace import MOST_SECONDS, check_limits
 from plow_twin.run.sensitivity import Sensitivity, sensitivity_of
-from plow_twin.solve.compiled_scene import CompiledScene, compile_scene
+from plow_twin.solve.compiled_scene import CompiledScene, compile_scene, options
 from plow_twin.solve.energy_balance import new_balance
-from plow_twin.solve.state import EVENT, OFF, Status, Totals, new_work
+from plow_twin.solve.state import EVENT, OFF, Status, Totals, Work, new_work
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -284,6 +285,8 @@ def output_times(t_end: float, output_dt: float | None) -> Array:
     return times if t_end - times[-1] <= 1e-9 * output_dt else np.append(times, t_end)
 
 
+#: Scratch space of the last run; a run beside it, in another thread or from `on_progress`, takes its own.
+_spare: Final[deque[Work]] = deque(maxlen=1)
 #: Kinds of run whose kernels this process has compiled or loaded.
 _ready: set[tuple[object, ...]] = set()
 
@@ -292,7 +295,7 @@ def _make_ready(compiled: CompiledScene, energy_balance: bool, method: Method, d
     """Compile or load the kernels of a kind of run, by a run of no length; return the seconds, 0 the next time."""
     parts = compiled.parts
     loads = parts.harmonics is None, parts.segments is None, None if parts.implicit is None else parts.implicit.dtype
-    kind = parts.terms, *loads, compiled.params.dtype, method == "events", energy_balance
+    kind = parts.terms, *loads, options(compiled.scene), method == "events", energy_balance
     if kind in _ready:
         return 0.0
     begin = _time.perf_counter()
@@ -319,7 +322,9 @@ def _run(
     budget = BUDGET if watch is None else watch.max_steps
     look = None if watch is None else watch.look
     if dt is None:
-        code, _ = run_events(compiled, motion, times, t_end, new_work(), budget, look)
+        work = _spare_work()
+        code, _ = run_events(compiled, motion, times, t_end, work, budget, look)
+        _spare.append(work)
     else:
         stride = round(float(times[1]) / dt) if len(times) > 1 else 1
         code = run_fixed(compiled, motion, round(t_end / dt), stride, dt, method == "euler", budget, look)
@@ -327,6 +332,13 @@ def _run(
         watch.look(motion)
     if code != Status.OK:
         raise SolverError(f"at t = {motion.time:.9g} s: {Status(code).text}")
+
+
+def _spare_work() -> Work:
+    try:
+        return _spare.pop()
+    except IndexError:
+        return new_work()
 
 
 def _result(

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from numbers import Real
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from plow_twin.model import geometry
 from plow_twin.model.contact_laws import LAWS
 from plow_twin.model.loads import LoadSet, Pieces, compile_loads
 from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
-from plow_twin.model.scene import DOF_NAMES, Contact, Head, Scene, Wear
+from plow_twin.model.scene import DOF_NAMES, Contact, Head, Scene, Table, Wear
 from plow_twin.solve.method.implicit import OVERDAMPED_RATIO, new_implicit
 from plow_twin.solve.modes import settle_modes
 from plow_twin.solve.state import (
@@ -108,7 +108,9 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
         For a tolerance out of range.
     """
     _check_tolerance(tol)
-    return _describe(scene, tol, sampled, _Shared()).compiled()
+    # a table of loads may be large: nothing keeps it when its scene has gone
+    tables = any(isinstance(load, Table) for load in scene.loads)
+    return _describe(scene, tol, sampled, _Shared() if tables else _LATELY).compiled()
 
 
 def compile_scenes(scenes: Sequence[Scene], tol: float) -> tuple[NDArray[np.void], list[CompiledScene]]:
@@ -149,18 +151,29 @@ def _check_tolerance(tol: float) -> None:
 
 
 class _Shared:
-    """Results that scenes share, computed once for each set of objects that they depend on."""
+    """Results that scenes share, computed once for each set of objects that they depend on.
 
-    def __init__(self) -> None:
+    With `most` only the newest so many are kept.
+    """
+
+    def __init__(self, most: float = math.inf) -> None:
+        self._most = most
         self._known: dict[tuple[Any, ...], tuple[Any, Any]] = {}
 
     def of(self, compute: Callable[..., _Found], *sources: object) -> _Found:
         """Return `compute` of the sources; computed only once for the same objects."""
         key = (compute, *map(id, sources))
-        if key not in self._known:
-            self._known[key] = sources, compute(*sources)  # the sources stay, and keep their identity
-        found: _Found = self._known[key][1]
+        known = self._known.get(key)
+        if known is None:
+            known = self._known[key] = sources, compute(*sources)  # the sources stay, and keep their identity
+            if len(self._known) > self._most:
+                self._known.pop(next(iter(self._known)), None)
+        found: _Found = known[1]
         return found
+
+
+#: Of the scenes compiled last: studies vary some parts of a scene and keep the others.
+_LATELY: Final = _Shared(64)
 
 
 @dataclass(frozen=True)
@@ -212,7 +225,7 @@ def _describe(scene: Scene, tol: float, sampled: bool, shared: _Shared) -> _Desc
         direction=direction,
         order=order,
         lacuna=_lacuna(scene.contact.exponent),
-        threshold=speed * shared.of(_thresholds, admissible, order),
+        threshold=speed * _thresholds(admissible, order),
         velocity_tolerance=tol * speed,
         position_tolerance=tol * length,
         weight=radius * speed / length,
@@ -325,6 +338,7 @@ def _initial_depth(scene: Scene) -> float:
     return max(float((np.array([y[COS], y[SIN], y[X], y[Y], 1.0]) @ rows).max()), 0.0)
 
 
+@lru_cache(64)
 def _thresholds(admissible: float, order: int) -> Array:
     """Return the admissible size of each term over that of the first."""
     sizes: Array = admissible ** (np.arange(MAX_ORDER + 1) / order)

@@ -439,16 +439,27 @@ def new_record(dtype: np.dtype[np.void]) -> np.record:
 
 def first_of(records: NDArray[np.void]) -> np.record:
     """Return the first of some records, in place."""
-    record: np.record = records.view(np.recarray)[0]
+    record: np.record = records.view(_with_attributes(records.dtype))[0]
     return record
+
+
+@cache
+def _with_attributes(dtype: np.dtype[np.void]) -> np.dtype[np.void]:
+    """Return the record type whose fields are attributes."""
+    return np.dtype((np.record, dtype))
 
 
 def new_records(dtype: np.dtype[np.void], count: int) -> NDArray[np.void]:
     """Return records of zeros that start at a cache line: rows of eight numbers then lie in one line each."""
     memory = np.zeros(count * dtype.itemsize + _LINE, np.uint8)
     start = -memory.ctypes.data % _LINE
-    records: NDArray[np.void] = memory[start : start + count * dtype.itemsize].view(dtype)
-    return records
+    return np.ndarray(count, dtype, memory.data, start)
+
+
+@cache
+def _inverses() -> Array:
+    """Return 0 and 1 / k, shape (orders + 2,)."""
+    return np.append(0.0, 1.0 / np.arange(1, _ROWS + 2))
 
 
 @cache
@@ -463,6 +474,6 @@ def _inverse_binomials() -> Array:
 def new_work() -> Work:
     """Return scratch space for series up to `MAX_ORDER`."""
     work = new_record(WORK)
-    work.inverse[1:] = 1.0 / np.arange(1, _ROWS + 2)
+    work.inverse[:] = _inverses()
     work.binomial[:] = _inverse_binomials()
     return work
