@@ -279,7 +279,7 @@ def test_a_file_that_another_program_rewrote_is_a_run(run: Run, tmp_path: Path) 
 @pytest.mark.parametrize(
     ("content", "expected"),
     [
-        (b"", "not an MCAP file"),
+        (b"", "empty: its recorder was killed"),
         (b"something else entirely", "not an MCAP file"),
         (b"\x89MCAP0\r\n", "is missing"),
         (None, "no such recording"),

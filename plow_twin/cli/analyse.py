@@ -17,12 +17,12 @@ from plow_twin.cli.console import (
     DONE_WITH_LOSS,
     FAILED,
     POSITIVE,
-    counts,
     json_option,
     output_console,
     progress,
     quiet_option,
     say_error,
+    say_lost,
     table,
     unit_option,
 )
@@ -216,7 +216,7 @@ def _show(results: list[dict[str, Any]], many: bool, as_json: bool, quiet: bool,
         if "error" in facts:
             say_error(f"plow-twin: {facts['error']}")
         elif facts["lost"]:
-            say_error(f"plow-twin: {facts['run']}: lost {counts(facts['lost'])}")
+            say_lost(facts["run"], facts["lost"])
     if as_json:
         facts = {"runs": results, "left_out": left_out} if many else results[0]
         click.echo(json.dumps(facts, indent=2, allow_nan=False))

@@ -19,6 +19,7 @@ from plow_twin.cli.console import (
     progress,
     quiet_option,
     say_error,
+    say_lost,
     table,
 )
 
@@ -78,7 +79,7 @@ def compare(
     runs = [(name, result["windows"]) for name, result in zip(names, results, strict=True) if "error" not in result]
     lost = {result["run"]: result["lost"] for result in results if result.get("lost")}
     for run, counts in lost.items():
-        say_error(f"plow-twin: {run}: lost {counts}")
+        say_lost(run, counts)
     scenes = {name: result["scene"] for name, result in zip(names, results, strict=True) if "error" not in result}
     comparison = compared(runs, label, scenes=scenes)
     for note in comparison.notes:

@@ -189,6 +189,27 @@ def counts(found: Mapping[str, int]) -> str:
     return ", ".join(f"{name}: {count}" for name, count in found.items())
 
 
+def say_end(recording: object, status: str) -> None:
+    """Print on standard error how a recording ended, if not as it should, and the verb that completes it."""
+    from plow_twin.record.reader import FileStatus
+
+    if status not in (FileStatus.COMPLETE.value, FileStatus.UNREAD.value):
+        cut = status == FileStatus.TRUNCATED.value
+        remedy = f"; plow-twin doctor --repair {recording} completes it after the run's end" if cut else ""
+        say_error(f"plow-twin: {recording}: {status}{remedy}")
+
+
+def say_lost(recording: object, lost: Mapping[str, int]) -> None:
+    """Print the losses of a recording on standard error; how it ended may be one of them."""
+    from plow_twin.record.reader import FileStatus
+
+    ends = {status.value for status in FileStatus}
+    for status in ends.intersection(lost):
+        say_end(recording, status)
+    if left := {name: count for name, count in lost.items() if name not in ends}:
+        say_error(f"plow-twin: {recording}: lost {counts(left)}")
+
+
 def kilonewton(force_n: float) -> str:
     """Return a force in N as text in kN."""
     return f"{force_n / 1e3:.2f}"

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from plow_twin.cli.console import DONE, DONE_WITH_LOSS, busy, counts, output_console, quiet_option, say_error, table
+from plow_twin.cli.console import DONE, DONE_WITH_LOSS, busy, output_console, quiet_option, say_lost, table
 
 
 @click.command(
@@ -34,8 +34,7 @@ def export(recording: Path, kind: str, out: Path, quiet: bool) -> int:
             shown.add_row(name, str(count), str(len(opened[name].columns)))
         output_console().print(shown)
     lost = opened.losses()
-    if lost:
-        say_error(f"plow-twin: {recording}: lost {counts(lost)}")
+    say_lost(recording, lost)
     return DONE_WITH_LOSS if lost else DONE
 
 

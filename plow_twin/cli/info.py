@@ -15,7 +15,16 @@ from rich.console import Console
 from rich.padding import Padding
 from rich.text import Text
 
-from plow_twin.cli.console import DONE, DONE_WITH_LOSS, json_option, output_console, show_facts, table, unit_option
+from plow_twin.cli.console import (
+    DONE,
+    DONE_WITH_LOSS,
+    json_option,
+    output_console,
+    say_end,
+    show_facts,
+    table,
+    unit_option,
+)
 from plow_twin.errors import RecordingError
 from plow_twin.scene_file.presets import PRESETS
 
@@ -132,6 +141,7 @@ def _recording(path: Path, as_json: bool) -> int:
 
     facts, lossy = read_recording(path)
     _show(facts, as_json)
+    say_end(path, facts["status"])
     return DONE_WITH_LOSS if lossy else DONE
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from plow_twin.cli.console import json_option, output_console, progress, quiet_option, say_error, show_facts
+from plow_twin.cli.console import json_option, output_console, progress, quiet_option, say_end, say_error, show_facts
 
 if TYPE_CHECKING:
     from plow_twin.record.replay_report import ReplayReport
@@ -40,6 +40,7 @@ def replay(recording: Path, digests_only: bool, write: Path | None, as_json: boo
         click.echo(json.dumps(facts, indent=2, allow_nan=False))
     elif not quiet:
         show_facts(output_console(), facts)
+    say_end(recording, report.status.value)
     if report.build_differences:
         other = ", ".join(f"{key} {there} (here {here})" for key, (there, here) in report.build_differences.items())
         say_error(f"plow-twin: warning: recorded by another build, which may round differently: {other}")

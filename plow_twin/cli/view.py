@@ -18,10 +18,11 @@ from plow_twin.cli.console import (
     DONE_WITH_LOSS,
     POSITIVE,
     busy,
-    counts,
     progress,
     quiet_option,
+    say_end,
     say_error,
+    say_lost,
     unit_option,
 )
 
@@ -180,7 +181,7 @@ def _made_run(
         if found.kind != "other":
             raise click.UsageError("--scene, --map, --unit: got a run of ours, expected another recording")
         if found.lost:
-            say_error(f"plow-twin: {recording}: lost {counts(found.lost)}")
+            say_lost(recording, found.lost)
         yield place / "run", found.lossy
 
 
@@ -210,10 +211,8 @@ def _print_losses(recording: Path, status: FileStatus, lost: Mapping[str, int], 
     from plow_twin.record.reader import FileStatus
 
     whole = status in (FileStatus.COMPLETE, FileStatus.UNREAD)
-    if not whole:
-        say_error(f"plow-twin: {recording}: {status.value}")
-    if lost:
-        say_error(f"plow-twin: {recording}: lost {counts(lost)}")
+    say_end(recording, status.value)
+    say_lost(recording, lost)
     if failed:
         say_error(f"plow-twin: {recording}: {failed} advances failed: they have no forces")
     return not whole or bool(lost or failed)

@@ -498,6 +498,8 @@ def open_mcap(path: Path) -> IO[bytes]:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
     if stream.read(len(MAGIC)) != MAGIC:
         stream.close()
+        if path.stat().st_size == 0:
+            raise ForeignRecordingError(f"{path}: empty: its recorder was killed before it wrote anything")
         table = path.suffix.lower() in _TABLES
         more = "; of a table plow-twin live makes a recording, and --map opens it where a verb has it" if table else ""
         raise ForeignRecordingError(f"{path}: not an MCAP file (its first bytes are not {MAGIC!r}){more}")
