@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import json
+import re
 import shutil
 from contextlib import ExitStack
 from dataclasses import replace
@@ -17,14 +19,16 @@ import pytest
 from record_support import BASE_NS, STEP_NS, Run, paper_sample, record_run
 
 from plow_twin import load_scene
+from plow_twin.cli import compare as compare_verb
 from plow_twin.cli.app import run as cli
+from plow_twin.cli.console import PlainConsole
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record.messages import JointState
 from plow_twin.record.recording import read_recording
 from plow_twin.stream.journal import Parameter, Sample
 from plow_twin.study.comparison.change import Change, changes, with_neighbours
-from plow_twin.study.comparison.compare import by_time, compare
-from plow_twin.study.comparison.windows import windows_of
+from plow_twin.study.comparison.compare import Comparison, by_time, compare
+from plow_twin.study.comparison.windows import QUANTITIES, windows_of
 
 SECONDS = 8
 
@@ -237,3 +241,14 @@ def test_overlapping_runs_other_rates_and_other_scenes_are_named(runs: tuple[Run
     twice, rates, scenes = found.notes
     assert twice == "b: 16 of 16 windows in 2027-01-15 left out: a covers their time"
     assert rates.endswith("them: a 1000 Hz, b 1000 Hz, c 500 Hz") and scenes.endswith("its description: a a, b b, c c")
+
+
+def test_names_of_pads_are_whole_in_eighty_columns(runs: tuple[Run, Run], monkeypatch: pytest.MonkeyPatch) -> None:
+    windows, text = windows_of(read_recording(runs[0].folder), 1.0), io.StringIO()
+    monkeypatch.setattr(compare_verb, "output_console", lambda: PlainConsole(file=text, width=80))
+    shares = dict(zip(QUANTITIES, (-0.999, 0.9994, 1.0, 12.34, -1.0, -1e-17), strict=True))
+    cells = {name: Change(share, -1.0, 1.0, 0.0, share, -1.0, 1.0, 0.0) for name, share in shares.items()}
+    found = Comparison({"a": windows, "b": windows}, {}, {"b": dict.fromkeys(PAIR_NAMES, cells)}, {"b": {}})
+    compare_verb._show(found)
+    row = r"│ bottom_right_bottom │ +-99.9M │ +\+99.9M │ +\+100M │ +\+1234M │ +-100M │ +\+0.0M │"
+    assert re.search(row, text.getvalue()) and "…" not in text.getvalue()

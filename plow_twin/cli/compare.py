@@ -155,5 +155,9 @@ _KEY: Final = (
 
 
 def _text(change: Change | None) -> str:
-    """Return a change in percent and the sign of its cause."""
-    return "-" if change is None else f"{100.0 * change.share:+.1f}{_SIGNS[change.verdict]}"
+    """Return a change in percent and the sign of its cause, so short that a table has room in 80 columns."""
+    if change is None:
+        return "-"
+    percent = round(100.0 * change.share, 1) + 0.0
+    number = f"{percent:+.1f}" if abs(percent) < 100.0 else f"{min(percent, 99999.0):+.0f}"
+    return f"{number}{_SIGNS[change.verdict]}"
