@@ -52,8 +52,8 @@ if _TYPE_CHECKING:
     from plow_twin.scene_file import dump_scene as dump_scene
     from plow_twin.scene_file import load_scene as load_scene
 
-#: Where each name is defined. It is imported when it is first used: a command can be stopped from its first moment on,
-#: and who builds scenes in Python needs nothing that reads YAML.
+#: Where each name is defined. It is imported at its first use, so that a command can be stopped from its first moment
+#: on, and scenes built in Python do not need the YAML reader.
 _NAMES = {
     "plow_twin.errors": (
         "ArgumentError",

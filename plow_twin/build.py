@@ -10,7 +10,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Final
 
-#: Rooms whose code decides the bits of a run.
+#: Subpackages whose code decides the bits of a run.
 NUMERIC_SUBPACKAGES: Final = ("kernel", "model", "solve", "run", "stream", "record")
 
 

@@ -21,7 +21,7 @@ _ACTING: Final = frozenset({"Cc", "Cf", "Cs", "Zl", "Zp"})
 
 
 def printable(text: str) -> str:
-    """Return a text, as of a file, that does nothing to a terminal: control characters are escaped, line ends stay."""
+    """Return a text that is safe for a terminal: control characters are escaped, line ends stay."""
     if text.isprintable():
         return text
     return "".join(
@@ -41,7 +41,7 @@ class Problem:
     got : object
         What stood there.
     expected : str
-        What could have stood there, in words.
+        The expected value, in words.
     """
 
     key: str
@@ -58,7 +58,7 @@ class InputError(PlowTwinError, ValueError):
     Attributes
     ----------
     problems : tuple of Problem
-        All that is wrong.
+        All problems.
     source : str
         Name of the file or other input.
     """
@@ -89,7 +89,7 @@ class SolverError(PlowTwinError, RuntimeError):
 
 
 class _StoppedError(PlowTwinError):
-    """A run was stopped on its way."""
+    """A run was stopped before its end."""
 
     def __init__(self, message: str, result: Any, time_s: float) -> None:
         super().__init__(message)
@@ -142,4 +142,4 @@ class TakenError(RecordingError):
 
 
 class ForeignRecordingError(RecordingError):
-    """A recording is no run of plow_twin; it may be a recording of another kind."""
+    """A recording is not a run of plow_twin, but perhaps of another program."""

@@ -764,7 +764,7 @@ def test_the_scenes_own_loads_run_by_the_nodes_clock(tmp_path: Path) -> None:
         for step in range(5):
             message = Clock()
             message.clock.sec, message.clock.nanosec = divmod(T0 + step * 300 * MS, 1_000_000_000)
-            # again and again: the twin's side of the connection may lag behind this one's
+            # again and again: the twin may see the connection later than this process
             probe.until(lambda: clock.publish(message) or _at(heads, T0 + step * 300 * MS), "its answer")  # noqa: B023
     twin = Twin(PAPER)
     for index, head in enumerate(heads):

@@ -21,11 +21,11 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     if os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
         sys.exit("plow-twin: NUMBA_DISABLE_JIT is set, expected it unset: the solver is compiled code")
     with _ending_at_once():
-        # the imports of the verbs: an interrupted import may end in another error
+        # an interrupted import may end in another error
         try:
             import plow_twin.run.twin  # noqa: F401
             from plow_twin.cli.app import main as run
-        except (ImportError, OSError, MemoryError) as error:  # memory for libraries is short, or one is missing
+        except (ImportError, OSError, MemoryError) as error:  # memory is short, or a library is missing
             newer = (
                 "" if sys.version_info < (3, 13) else f"; this is Python 3.{sys.version_info[1]}, expected 3.11 or 3.12"
             )

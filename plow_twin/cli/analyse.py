@@ -102,7 +102,7 @@ def analyse(
 
 
 def _found(recordings: Sequence[Path], out: Path | None) -> tuple[list[Path], tuple[Path, ...]]:
-    """Return the recordings at paths and in folders; name the items of folders that are no recordings."""
+    """Return the recordings at paths and in folders; name the items in folders that are not recordings."""
     from plow_twin.study.analysis.analyse import counted_once, expand, left_out
 
     for path in recordings:

@@ -18,7 +18,7 @@ from plow_twin.live.service_names import SERVICES, mark_problem
 @click.argument("service", type=click.Choice(SERVICES))
 @click.argument("text", required=False)
 def call(socket: Path, service: str, text: str | None) -> int:
-    """Ask the twin of `plow-twin live --control SOCKET` for a SERVICE of the node; TEXT is that of a mark."""
+    """Ask the twin of `plow-twin live --control SOCKET` for a SERVICE of the node; TEXT is the text of a mark."""
     from plow_twin.live.control import call as ask
 
     if text is not None and service != "mark":

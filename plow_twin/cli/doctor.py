@@ -37,7 +37,7 @@ def doctor(recording: Path, repair: bool, as_json: bool) -> int:
 
 
 def _shown(facts: dict[str, Any]) -> dict[str, Any]:
-    """Return the facts for the terminal: parts by name, each problem on a line."""
+    """Return the facts for the terminal, parts by name and each problem on its own line."""
     parts = {part["file"]: {key: value for key, value in part.items() if key != "file"} for part in facts["parts"]}
     problems: dict[str, Any] = {
         key: dict(enumerate(facts[key], 1)) if facts[key] else None

@@ -105,12 +105,12 @@ def estimate(
     INPUT is a folder with scene.yaml (the nominal scene), load.csv (t, fx, fy, m: the load believed), pose.csv (t, x,
     y, theta: the measured pose, a cell left empty was not measured) and, beside or instead of that, gaps.csv (t and
     columns named after pairs: measured gaps) and contact_forces.csv (the same: measured forces); each of them may be
-    .parquet. Or it is a run of ours, or another recording (MCAP, rosbag2's sqlite3, CSV, Parquet). Where the node of a
-    run estimated, its newest estimate is made again from the journal and compared, bit for bit; else the measured pose
-    is one recorded beside the run.
+    .parquet. Or it is a run of ours, or another recording (MCAP, rosbag2's sqlite3, CSV, Parquet). If the node of a run
+    made estimates, the newest is computed again from the journal and compared, bit for bit; otherwise the measured pose
+    is recorded beside the run.
 
-    With --follow each row of followed.csv tells forces and clearances, with 90 % intervals, from what was measured up
-    to its time.
+    With --follow each row of followed.csv has forces and clearances, with 90 % intervals, from the measurements up to
+    its time.
     """
     import numpy as np
 
@@ -170,7 +170,7 @@ def estimate(
 
 @dataclass(frozen=True)
 class _Task:
-    """An estimate to make: `run` returns the estimate and further facts. Its times count from `first_ns`, if known."""
+    """An estimate to compute: `run` returns it and further facts. Its times count from `first_ns`, if known."""
 
     scene: Scene
     load: Load
@@ -206,7 +206,7 @@ def _measured(source: Path, scene: Path | None, mapping: Path | None, folder: bo
 
 
 def _given(source: Path, scene: Path | None, mapping: Path | None, folder: bool) -> _Task:
-    """Return the task of an estimate from all measurements."""
+    """Return the computation of an estimate from all measurements."""
     from plow_twin.estimate.estimate import estimate as run
 
     given = _measured(source, scene, mapping, folder)
@@ -232,12 +232,12 @@ def _followed(given: _Given, members: int, dt: float | None) -> tuple[list[str],
     return offline.table(stretch.rows)
 
 
-#: What to do about numbers in another unit.
+#: Advice about numbers in another unit.
 _REMEDY: Final = "convert the file, or state the unit in a mapping (--map)"
 
 
 def _check_units(source: Path, measured: Measured) -> None:
-    """Refuse poses that no head can have, and warn of a load that looks as if it were in another unit."""
+    """Refuse impossible poses, and warn of a load that seems to be in another unit."""
     from plow_twin.record.unit_check import unit_doubts
 
     values = {("excitation", name): measured.load[:, 1 + place] for place, name in enumerate(("fx", "fy", "m"))}
@@ -249,7 +249,7 @@ def _check_units(source: Path, measured: Measured) -> None:
 
 
 def _repeated(source: Path) -> _Task | None:
-    """Return the task of computing the newest estimate of a live node again, or None without one."""
+    """Return the computation that repeats the newest estimate of a live node, or None without an estimate."""
     from plow_twin.estimate.answer import answer
     from plow_twin.live.estimation import asked_of
     from plow_twin.live.parameters import settings
@@ -330,7 +330,7 @@ def _show_forces(forces: Forces) -> None:
 
 
 def _show_live(live: dict[str, Any]) -> None:
-    """Print which estimate this is; its times count from the first sample of the window."""
+    """Print the window of the estimate, in times from its first sample."""
     same = "the same bit for bit" if live["repeated"] else "not the same"
     window = f"{1e-9 * live['start_ns']:.3f} s to {1e-9 * live['end_ns']:.3f} s"
     text = (

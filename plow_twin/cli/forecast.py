@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from plow_twin.model.scene import Scene
 
 
-#: A limit below this share of the clearance is no limit in mm; in m it would be the thousandth of one.
+#: A limit below this share of the clearance was not given in mm; a limit in m is a thousandth of the number in mm.
 _METRES: Final = 1e-2
 
 
@@ -86,8 +86,8 @@ def forecast(
 ) -> int:
     """Forecast when a clearance of SCENE, which has a section `wear`, reaches its limit.
 
-    SCENE is a scene file, a preset, or a run of ours: of that the scene with the pads as worn as the run left them, and
-    the newest estimate of its node since these pads were set.
+    SCENE is a scene file, a preset, or a run of ours: then its scene with the pads as worn at its end, and the newest
+    estimate of its node since these pads were set.
     """
     from plow_twin.estimate.coefficient import coefficient
     from plow_twin.estimate.forecast import Plan, Scenario, with_clearances
@@ -156,7 +156,7 @@ def _check_limits(limits_m: tuple[float, float], scene: Scene) -> None:
 
 
 def _scene(name: str) -> tuple[Scene, dict[str, Any] | None, dict[str, int]]:
-    """Return the scene (of a run that at its end), the newest estimate of its pads, and the losses of the journal."""
+    """Return the scene (of a run as at its end), the newest estimate of its pads, and the losses of the journal."""
     from plow_twin.record.estimated import left_by
     from plow_twin.record.reader import RunReader, own_run
     from plow_twin.scene_file import load_scene

@@ -17,7 +17,7 @@ PATIENCE_S: Final = 3.0
 
 @contextmanager
 def interruptible(on_overdue: Callable[[], object] = lambda: None) -> Iterator[Callable[[], bool]]:
-    """Give a function that returns whether the process was asked to end.
+    """Yield a function that returns whether the process was asked to end.
 
     If the block lasts longer than `PATIENCE_S` after that, `on_overdue` is called and the process ends with exit code
     1: a library that waits for a viewer cannot be interrupted otherwise.

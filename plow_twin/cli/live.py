@@ -170,7 +170,7 @@ def _say_what_differs(front: BridgeFront, settings: Settings) -> None:
 
 
 def _say_pace(settings: Settings, quiet: bool) -> None:
-    """Say before a file that ends is read why that takes long, and what is faster."""
+    """Say, before a file is read, why that takes long and which setting is faster."""
     if settings.follows == "full" and not quiet:
         say_error(
             f"plow-twin: {settings.follow_members} twins follow the machine, which takes about as long as the file's "
@@ -213,14 +213,14 @@ def _screen(front: BridgeFront, access: PageAccess, source: str) -> Screen:
 
 
 def _open_way(front: BridgeFront, way: WayOut, rate_hz: float, source: str) -> AbstractContextManager[object]:
-    """Open a way out of a twin."""
+    """Open an output of a twin."""
     from plow_twin.telemetry.live import open_way
 
     return open_way(front, way, rate_hz, source)
 
 
 def _show_progress(front: BridgeFront, bridge: Bridge, update: OnProgress) -> None:
-    """Show how much of a source that ends has been read."""
+    """Show how much of a finite source has been read."""
     from plow_twin.live.bridge.files import Files
     from plow_twin.live.timer import Timer
 
@@ -253,7 +253,7 @@ def _shown(values: dict[str, str]) -> list[str]:
 
 
 def _settings(options: dict[str, Any]) -> Settings:
-    """Return the parameters: from the file, then from --set, then from options of their own."""
+    """Return the parameters: from the file, replaced by those of --set, then by those of their own options."""
     from plow_twin.live import parameters
 
     values = parameters.read_parameters(options["params"]) if options["params"] else {}
@@ -315,7 +315,7 @@ def _bridge(source: str, options: dict[str, Any], rate_hz: float) -> Bridge:
 
 
 def _tables(folder: Path, *, growing: bool) -> list[Path]:
-    """Return the files of a folder; of those that are read while they grow, Parquet is none."""
+    """Return the files of a folder, without Parquet where files are read while they grow."""
     from plow_twin.scene_file.csv_rows import tables
     from plow_twin.scene_file.parquet_lines import is_parquet
 

@@ -23,7 +23,7 @@ class Report:
     """Says status and alarms when they change, and with `lines` all parts as JSON lines.
 
     An alarm is reported when it is raised and when it is acknowledged, not each time its quantity passes a threshold.
-    A reader that hangs holds nobody up: lines give way and are counted.
+    A hanging reader does not delay the twin: lines are dropped and counted.
 
     Parameters
     ----------
@@ -43,14 +43,14 @@ class Report:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is not None:  # else there is more to say
+        if kind is not None:  # otherwise there is more to say
             with suppress(BrokenPipeError):
                 self.close_lines()
             self.close()
 
     @property
     def lost(self) -> int:
-        """Lines that standard output did not take."""
+        """Lines that standard output has refused."""
         return self._out.lost
 
     def error(self, text: str) -> None:
@@ -58,11 +58,11 @@ class Report:
         self._errors.put(f"plow-twin: {text}")
 
     def close_lines(self) -> bool:
-        """End the JSON lines; return False if their reader hangs."""
+        """Write the last JSON lines; return False if their reader hangs."""
         return self._out.close()
 
     def close(self) -> bool:
-        """End what is said to a person; return False if the terminal, or who reads it, hangs."""
+        """End the lines for a person; return False if the terminal or its reader hangs."""
         return self._errors.close()
 
     def say(self, name: str, part: Part) -> None:

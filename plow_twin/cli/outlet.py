@@ -1,4 +1,4 @@
-"""Lines for a reader that may be slow, or hang: who writes them never waits for it."""
+"""Lines for a reader that may be slow or hang; the writer never waits for it."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from collections import deque
 from collections.abc import Callable
 from typing import Final
 
-#: Bound: lines that wait for the reader; the oldest give way.
+#: Bound: lines that wait for the reader; the oldest are dropped first.
 MOST_WAITING: Final = 1000
-#: Bound: time at the end for which the reader may take nothing [s].
+#: Bound: time at the end for which the reader may read nothing [s].
 _PATIENCE_S: Final = 2.0
 
 
@@ -21,7 +21,7 @@ class Outlet:
     write
         Writes a line; returns whether it was taken.
     on_loss
-        Called once, when the first line gives way.
+        Called once, when the first line is dropped.
     """
 
     def __init__(self, write: Callable[[str], bool], on_loss: Callable[[], object] = lambda: None) -> None:
@@ -30,7 +30,7 @@ class Outlet:
         self._news = threading.Condition()
         self._thread: threading.Thread | None = None
         self._closed = self._broken = False
-        #: lines that were not taken, and those that gave way
+        #: lines that were not taken, and lines that were dropped
         self.lost = 0
 
     def put(self, line: str) -> None:
@@ -51,7 +51,7 @@ class Outlet:
             self._thread.start()
 
     def close(self) -> bool:
-        """Wait for the reader as long as it takes anything; return False if it hangs; raises as `put`."""
+        """Wait for the reader as long as it reads; return False if it hangs; raises as `put`."""
         with self._news:
             self._closed = True
             self._news.notify()
@@ -59,7 +59,7 @@ class Outlet:
             left = len(self._waiting)
             self._thread.join(_PATIENCE_S)
             if self._thread.is_alive() and len(self._waiting) == left:
-                self.lost += left + 1  # with the line that is being written
+                self.lost += left + 1  # including the line that is being written
                 return False
         if self._broken:
             raise BrokenPipeError

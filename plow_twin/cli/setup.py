@@ -1,4 +1,4 @@
-"""`plow-twin setup`: a mapping and a stub of a scene for a CSV or Parquet file of one's own."""
+"""`plow-twin setup`: a mapping and a stub of a scene for a user's CSV or Parquet file."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path(), help="Folder for the files.")
 @quiet_option
 def setup(file: Path, scene: str | None, given: tuple[str, ...], units: dict[str, str], out: Path, quiet: bool) -> int:
-    """Guess separator, time, columns and units of FILE; ask in a terminal about the others; write map and scene."""
+    """Guess separator, time, columns and units of FILE; ask in a terminal about the rest; write map and scene."""
     from plow_twin.record.column_guess import guess_columns
     from plow_twin.record.sources import Columns
     from plow_twin.scene_file import load_scene

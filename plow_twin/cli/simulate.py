@@ -72,7 +72,7 @@ def simulate(
 ) -> int:
     """Simulate SCENE, a file or one of the presets paper, bench_kv, bench_hc.
 
-    Ctrl-C and the limits end it with the results so far: files and JSON are written up to there, exit code 1.
+    At Ctrl-C or a limit, files and JSON hold the results so far, and the exit code is 1.
     """
     _check_usage(out, method, dt)
     _check_rows(t_end, output_dt)

@@ -100,7 +100,7 @@ def calibrate(
 def _merged(proposed: Sequence[str], given: Sequence[str]) -> tuple[str, ...]:
     """Return the unknowns of the target file; given ones replace those of the same parameter.
 
-    `contact.damping` and `contact.restitution` exclude each other, and so does a range that is `PATH=fixed`.
+    A given `contact.damping` also replaces `contact.restitution`, and the reverse; `PATH=fixed` removes an unknown.
     """
     paths = {text.partition("=")[0] for text in given}
     if paths & {"contact.damping", "contact.restitution"}:

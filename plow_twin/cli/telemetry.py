@@ -1,4 +1,4 @@
-"""Options of the ways out, and `plow-twin telemetry`: the ways out of a node."""
+"""Options of the outputs, and `plow-twin telemetry`, the outputs of a node."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def telemetry_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add `--mqtt-out`, `--sparkplug`, `--influx`, `--opcua`, and the options that concern all ways out."""
+    """Add `--mqtt-out`, `--sparkplug`, `--influx`, `--opcua`, and the options of all outputs."""
     for option in (
         click.option(
             "--out-access",

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from plow_twin.view.rrd import ViewSummary
 
 
-#: Largest factor of the drawn clearance; beyond it the cavity is far from the frame.
+#: Largest factor of the drawn clearance; a larger one draws the cavity far from the frame.
 _MOST_EXAGGERATED = 1e4
 
 
@@ -142,7 +142,7 @@ def view(
 
 
 def _check_still(option: str, *, moving: bool, exaggerate: float | None, others: tuple[str, ...]) -> None:
-    """Refuse options that a picture of a whole run does not have."""
+    """Refuse options that a picture of a whole run lacks."""
     if moving:
         raise click.UsageError(
             f"{option} cannot be combined with --out, --web or --follow: it is a picture of a whole run"
@@ -154,7 +154,7 @@ def _check_still(option: str, *, moving: bool, exaggerate: float | None, others:
 
 
 def _still(run: Path, png: Path | None, html: Path | None) -> tuple[FileStatus, dict[str, int], int]:
-    """Write the picture or the page of a run; return how it ended, its losses, and its failed advances."""
+    """Write the picture or the page of a run; return its end, its losses, and its failed advances."""
     if png is not None:
         from plow_twin.view.picture import to_png
 
@@ -169,7 +169,7 @@ def _still(run: Path, png: Path | None, html: Path | None) -> tuple[FileStatus, 
 def _made_run(
     recording: Path, scene: str | None, mapping: Path | None, units: dict[str, str], quiet: bool
 ) -> Iterator[tuple[Path, bool]]:
-    """Give the run that the model makes of another recording, and whether something of it could not be used."""
+    """Yield the run that the model makes of another recording, and whether some of the recording could not be used."""
     from tempfile import TemporaryDirectory
 
     from plow_twin.study.analysis.analyse import analyse
@@ -227,8 +227,8 @@ def _serve(file: Path, port: int) -> int:
     command = [program, str(file), "--serve-web", "--bind", LOOPBACK, "--port", str(data_port)]
     click.echo(f"serving until interrupted: {page_address(port, data_port)}")
     sys.stdout.flush()
-    # in place of this process: a signal to it reaches the server
-    # without the program's own lines: its address opens the light theme, on which labels cannot be read
+    # replaces this process, so that a signal to it reaches the server without the program's own lines: its address
+    # opens the light theme, on which labels cannot be read
     os.execve(program, [*command, "--web-viewer-port", str(port)], {"RUST_LOG": "error", **os.environ})
 
 

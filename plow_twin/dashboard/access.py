@@ -1,4 +1,4 @@
-"""Access to the screen: its address, the token, and the host names that it answers to."""
+"""Access to the screen: its address, its token, and the host names that it answers to."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ class PageAccess:
 
     @classmethod
     def of(cls, listen: str, token_file: Path | None) -> PageAccess:
-        """Return the access for HOST:PORT; the token is the first line of a file, or in the environment.
+        """Return the access for HOST:PORT, with the token in the first line of a file or in the environment.
 
         Raises
         ------
         DashboardError
-            The address cannot be read, or is of another machine's network and there is no token.
+            The address cannot be read, or other machines reach it and there is no token.
         OSError
             The file cannot be read.
         """
@@ -65,14 +65,14 @@ class PageAccess:
         return cls(host, port, token)
 
     def admits(self, token: object) -> bool:
-        """Return whether a token is the right one, in a time that does not depend on how much of it is right."""
+        """Return whether a token is right, in a time that does not depend on how much of it is."""
         given = token if isinstance(token, str) else ""
         return hmac.compare_digest(given.encode("utf-8", "replace"), self.token.encode())
 
     def answers_to(self, host: str) -> bool:
-        """Return whether the page answers to a name, as in `Host`; it does not to names that others may own.
+        """Return whether the page answers to a name, as in `Host`: not to names that others may own.
 
-        Else a page of theirs could have its name lead here and read the screen (DNS rebinding).
+        Otherwise their page could point its name to this address and read the screen (DNS rebinding).
         """
         try:
             name = urlsplit(f"//{host}").hostname or ""

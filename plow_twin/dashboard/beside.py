@@ -1,4 +1,4 @@
-"""A process beside a twin, at the other end of a link: whatever happens to it, the twin does not notice."""
+"""A process beside a twin, at the other end of a link; no trouble of the process affects the twin."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ class Beside:
     module
         Module that is run; its arguments are the descriptor of the link, then `descriptors`.
     first
-        First message; secrets go this way, for others can read a command line.
+        First message; it carries secrets, because others can read a command line.
     descriptors
-        Further descriptors that it gets.
+        Further descriptors for the process.
     """
 
     def __init__(self, module: str, first: dict[str, Any], descriptors: Sequence[int] = ()) -> None:
         self.link, theirs = pair()
         with theirs:
             numbers = (theirs.fileno(), *descriptors)
-            # a session of its own: Ctrl-C is for the twin, whose end is the process's too
+            # a session of its own: Ctrl-C is for the twin, whose end also ends the process
             self.process = subprocess.Popen(
                 [sys.executable, "-m", module, *map(str, numbers)],
                 stdin=subprocess.DEVNULL,

@@ -14,7 +14,7 @@ _EVENTS: Final = 200
 
 
 class Board:
-    """The newest of everything, each with the number of the update that brought it."""
+    """The newest values, each with the number of the update that brought it."""
 
     def __init__(self) -> None:
         self.version = 0
@@ -52,7 +52,7 @@ class Board:
         news.set()
 
     def since(self, version: int) -> dict[str, Any]:
-        """Return the updates after the given number, the last that a page has received; 0: all."""
+        """Return the updates after `number`, the last that a page has received; 0: all."""
         found: dict[str, Any] = {
             "version": self.version,
             "age": round(time.monotonic() - self._updated_s, 2),

@@ -1,6 +1,6 @@
-"""The feed of a process beside a twin: it sums up publications and hands the sums over at a rate, where there is room.
+"""The feed of a process beside a twin: it sums up publications and sends the sums at a fixed rate, if there is room.
 
-An update that is not taken is not queued: its peaks, and the newest of everything else, stay for the next one.
+An update that is not taken is not queued: its peaks and all newest values stay for the next update.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ _MOST: Final = 256
 _EVENTS: Final = 20
 #: Longest text that is passed on.
 _LONGEST: Final = 1000
-#: Most wishes of operators that are heard at once.
+#: Most requests of operators that are handled at once.
 _MOST_ASKED: Final = 8
 _NO_LOAD: Final = np.full(3, np.nan)
-#: States of a clearance that the measurements determine; the estimate itself is not loaded here.
+#: States of a clearance that the measurements determine, repeated here so that the estimate is not imported.
 _KNOWN_STATES: Final = ("estimated", "rough")
 
 
@@ -108,7 +108,7 @@ class Motion:
         return found
 
     def update(self) -> dict[str, Any]:
-        """Return all of it for the page."""
+        """Return the values for the page."""
         found = {
             "t": self.stamp_ns * 1e-9,
             "pose": numbers(self.pose),
@@ -165,7 +165,7 @@ class Feed:
         self._link, self._answer, self._load, self._on_error = link, answer, load, on_error
         self._by_second = by_second
         self._end = f"{process} has ended: {consequence}, the twin goes on"
-        #: newest report of the process on itself
+        #: newest report of the process about itself
         self.report: dict[str, Any] = {}
         self._ended = False
         self._news: dict[str, Any] = {"facts": {**facts, "can_ask": answer is not None}}
@@ -176,7 +176,7 @@ class Feed:
         self.motion = Motion()
         #: second of stamps of the newest publication
         self._second = 0
-        #: updates that the server took, and those that it had no room for
+        #: updates that the server took, and updates that it had no room for
         self.taken = self.not_taken = 0
 
     def publication(self, published: Published) -> None:
@@ -194,7 +194,7 @@ class Feed:
     def part(self, name: str, part: Part) -> None:
         """Take in a status: the newest of each name counts."""
         level, message, values = part
-        if name == "estimate" and "estimates" not in values:  # no part of the diagnostics, which has that name too
+        if name == "estimate" and "estimates" not in values:  # not the part of the diagnostics of the same name
             self._sum_up()  # the publications before it
             self.motion.estimate = values
         elif name == "status":
@@ -227,7 +227,7 @@ class Feed:
                 self._do(asked)
 
     def send(self) -> bool:
-        """Send an update; False, and counted, where there was no room."""
+        """Send an update; Without room it is counted, and the result is False."""
         self._sum_up()
         update: dict[str, Any] = {**self._news, "not_taken": self.not_taken}
         if self._parts:

@@ -8,7 +8,7 @@ import socket
 from contextlib import suppress
 from typing import Any, Final
 
-#: Most bytes of one message, and room for those that the other side has not taken yet [B].
+#: Most bytes of a message, and room for messages that the other side has not yet received [B].
 LONGEST: Final = 1 << 16
 _ROOM: Final = 1 << 18
 
@@ -34,7 +34,7 @@ class Link:
         return self._end.fileno()
 
     def send(self, message: dict[str, Any]) -> bool:
-        """Send a message; False where it is not taken: no room, too long, or no receiver."""
+        """Send a message; False where the message is not taken: no room, too long, or no receiver."""
         data = json.dumps(message, separators=(",", ":")).encode()
         if self.broken or len(data) > LONGEST:
             return False

@@ -1,4 +1,4 @@
-"""The screen of a node: from its topics, by a process beside it; wishes go to its services."""
+"""The screen of a node: a process beside it reads its topics and passes requests to its services."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class NodeWatch:
     wait_s
         How long to wait for the node [s].
     stopped
-        Whether to wait no longer.
+        Returns whether to stop waiting.
 
     Raises
     ------
@@ -139,7 +139,7 @@ class NodeWatch:
         return future.result() if future.done() else None
 
     def _subscribe(self, kind: type, topic: str, quality: QoSProfile, take: Callable[[Any], None]) -> None:
-        """Subscribe to an output; the messages come as the plain ones of a recording."""
+        """Subscribe to an output; its messages are converted to those of a recording."""
         message_type = plain.JointState.TYPE if kind is JointState else plain.DiagnosticStatus.TYPE
         message_type = plain.Odometry.TYPE if kind is Odometry else message_type
         self.node.create_subscription(kind, topic, lambda data: take(decode(data, message_type)), quality, raw=True)
@@ -211,7 +211,7 @@ def show_node(
     stopped: Callable[[], bool],
     on_open: Callable[[Screen], object],
 ) -> None:
-    """Show a node until `stopped`; `scene`: its scene where that cannot be read here under the name it has there.
+    """Show a node until `stopped`; `scene` replaces the node's scene where its name cannot be read on this machine.
 
     Raises
     ------

@@ -28,7 +28,7 @@ from plow_twin.stream.topics import Cadence, names_of
 
 #: The topics whose messages are decoded one by one.
 _SLOW: Final = names_of(Cadence.ESTIMATE, Cadence.CHANGE)
-#: How long the feed waits for room [s]: a file is no live run that it could hold up.
+#: How long the feed waits for room [s]; a file, unlike a live run, is not delayed by that.
 _WAIT_S: Final = 2e-3
 
 
@@ -42,7 +42,7 @@ class RunFeed:
     header
         Of the recording.
     stopped
-        Whether to hand over no more.
+        Returns whether to stop.
     """
 
     def __init__(self, feed: Feed, header: RunHeader, stopped: Callable[[], bool]) -> None:
@@ -127,7 +127,7 @@ def show_run(path: Path, access: PageAccess, stopped: Callable[[], bool], on_ope
     access
         Address and token.
     stopped
-        Asked again and again.
+        Returns whether to stop.
     on_open
         Called with the screen.
 

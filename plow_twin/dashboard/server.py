@@ -1,7 +1,7 @@
 """The server of the screen, a process of its own: `python -m plow_twin.dashboard.server LINK SOCKET`.
 
-Each page gets the newer values once it has taken the update before: a slow page gets fewer updates, a frozen one
-no update, and no other page waits for either.
+Each page gets newer values once it has taken the update before: a slow page gets fewer updates, a frozen page none, and
+no page waits for another.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ from plow_twin.dashboard.link import Link
 PAGE: Final = Path(__file__).with_name("page")
 #: Most pages at once; a further one is refused.
 MOST_PAGES: Final = 50
-#: How long a page may take for an update, or to name its token, until it is let go [s].
+#: How long a page may take for an update, or to send its token, before it is closed [s].
 _PATIENCE_S: Final = 20.0
-#: Longest time without a word to a page, and shortest between two wishes of one [s].
+#: Longest time without a message to a page, and shortest time between two requests of a page [s].
 _WORD_S, _WISH_S = 1.0, 0.2
-#: Longest wish of a page [B].
+#: Longest request of a page [B].
 _WISH: Final = 4096
-#: How much the server gives way to the twin (`nice`).
+#: Lower priority of the server than the twin (`nice`).
 _NICE: Final = 10
-#: Why a page is let go, in numbers of the protocol of WebSockets.
+#: Reasons to close a page, as codes of the WebSocket protocol.
 TOO_MANY, NO_TOKEN, ENDED = 1013, 4401, 1001
 _HEADERS: Final = {
     "Content-Security-Policy": "default-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
@@ -80,14 +80,14 @@ class Guard:
 
 
 class Pages:
-    """The pages that look at a board.
+    """The pages that show a board.
 
     Parameters
     ----------
     board
-        What they look at.
+        Source of their values.
     link
-        Where their wishes go.
+        Receiver of their requests.
     access
         Who may look.
     """
@@ -96,7 +96,7 @@ class Pages:
         self._board, self._link, self._access = board, link, access
 
     async def page(self, socket: WebSocket) -> None:
-        """Serve one page until it goes."""
+        """Serve one page until it is closed."""
         await socket.accept()
         if self._board.pages >= MOST_PAGES:
             await socket.close(TOO_MANY, f"{MOST_PAGES} pages are open")
@@ -108,7 +108,7 @@ class Pages:
                 return
             await self._serve(socket)
         except (WebSocketDisconnect, TimeoutError, RuntimeError):
-            return  # it has gone, or does not read
+            return  # the page has gone, or does not read
         finally:
             self._board.pages -= 1
 
@@ -132,7 +132,7 @@ class Pages:
             await asyncio.gather(*tasks, return_exceptions=True)
 
     async def _send_updates(self, socket: WebSocket) -> None:
-        """Send newer values to the page in a loop; count updates that it was too slow for."""
+        """Send newer values to the page in a loop; count the updates that a slow page misses."""
         board, version, skipped = self._board, 0, 0
         while not self._link.broken:
             news = board.news

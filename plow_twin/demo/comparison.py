@@ -46,7 +46,7 @@ class Comparison:
 
 
 def compare_forces(run: Path, wider_m: float) -> Comparison | None:
-    """Return the forces of a run beside the forces of a machine with larger clearances; None without forces.
+    """Compare the forces of a run with those of a machine with larger clearances; None without forces.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def _motion(scene: Scene, times: Array, wrench: Array) -> AdvanceSeries:
 
 
 def _read(reader: RunReader) -> tuple[NDArray[np.int64], Array, dict[int, Array], list[int]]:
-    """Return stamps [ns] and wrenches of the samples, the published forces by stamp, and when estimates came [ns]."""
+    """Return stamps [ns] and wrenches of the samples, published forces by stamp, and times of the estimates [ns]."""
     topic = reader.header.topic("contact_forces")
     stamps, wrench, published, estimates = [], [], {}, []
     for batch in reader.batches():

@@ -1,4 +1,4 @@
-"""A live run: publisher and node with its recorder as processes, watched, then summarised."""
+"""A live run: publisher and node with its recorder as processes, with a summary at the end."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ _STOP_TIMEOUT_S: Final = 10.0
 _RATE_HZ: Final = 1000.0
 #: Clearance of the head with the synthetic sensor beyond that of the scene [mm].
 _SENSOR_MM: Final = 1.5
-#: Shortest demo that has an estimate [s], its window and its interval [s].
+#: Shortest demo with an estimate, and the estimate's window and interval [s].
 _ESTIMATED_S, _WINDOW_S, _INTERVAL_S = 15.0, 14.0, 3.0
-#: Without progress for so long, the run has failed [s].
+#: The run has failed after so long without progress [s].
 _STUCK_S: Final = 30.0
 
 
@@ -74,7 +74,7 @@ def run_demo(speed: str, seconds: float, out: Path, quiet: bool, screen: list[st
     Parameters
     ----------
     speed
-        `real`: by the clock of the machine; `fast`: under /clock, as fast as the machine goes.
+        `real`: at the machine's clock; `fast`: under /clock, as fast as the machine goes.
     seconds
         Machine time to run [s].
     out
@@ -211,7 +211,7 @@ class Child:
         self._stream: IO[bytes] = log.open("wb")
         command = [sys.executable, "-m", *arguments]
         bound = shutil.which("setpriv")
-        if bound is not None:  # stopped with this process, however it ends
+        if bound is not None:  # ends with this process, in any case
             command = [bound, "--pdeathsig", "TERM", *command]
         self._process = subprocess.Popen(
             command, stdout=self._stream, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL
@@ -393,7 +393,7 @@ def _force_table(summary: RunSummary) -> Table:
 
 
 def program(name: str, module: str) -> str:
-    """Return how a shell in the present folder starts a program of this environment, on PATH or not."""
+    """Return the command that starts a program of this environment from the present folder, on PATH or not."""
     beside = Path(sys.executable).with_name(name)
     path, arguments = (beside, []) if beside.exists() else (Path(sys.executable), ["-m", module])
     relative = os.path.relpath(path)

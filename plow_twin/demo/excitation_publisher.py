@@ -5,8 +5,8 @@ measurement of known truth.
 
 With `--cutting` it adds a stochastic cutting load and publishes the speed along the face on `travel`.
 
-`real` keeps a grid on the steady clock: each sample leaves at its time, a late sample at once, and no sample is left
-out. `fast` publishes `/clock`, and runs ahead of the twin's `contact_peaks` by a bounded number of samples.
+`real` sends each sample at its time on a grid of the steady clock, a late one at once, without leaving any out. `fast`
+publishes `/clock`, and runs ahead of the twin's `contact_peaks` by a bounded number of samples.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ _TRAVEL_S: Final = 0.1
 #: Rate of the synthetic sensor, and its noise [m, m, rad].
 _POSE_HZ: Final = 100.0
 _POSE_NOISE: Final = np.array([5e-4, 5e-4, 2e-3])
-#: Without an answer for so long, the samples under way count as lost [s].
+#: Time without an answer after which the samples under way count as lost [s].
 _STALL_S: Final = 2.0
 #: CDR of a message that begins with a stamp: 4 bytes of encapsulation, then sec and nanosec.
 _STAMP: Final = struct.Struct("<4xiI")
@@ -99,7 +99,7 @@ class ExcitationPublisher(WithoutEvents):
         self.sent = 0
         #: longest delay of a sample behind its time on the grid [s]
         self.latest_s = 0.0
-        #: times that the twin did not answer within the time allowed
+        #: how often the twin did not answer within the time allowed
         self.stalls = 0
         self.create_subscription(DiagnosticStatus, "status", self._on_status, OUTPUTS["status"])
         self._answers = (
@@ -182,7 +182,7 @@ class ExcitationPublisher(WithoutEvents):
 
     def _on_status(self, message: DiagnosticStatus) -> None:
         values = {value.key: value.value for value in message.values}
-        # the twin's side of the connection may lag behind this one's
+        # the twin may see the connection later than this process
         self._twin_reads = values.get("lifecycle") == "active" and values.get("publishers_excitation", "0") != "0"
 
     def _on_answer(self, data: bytes) -> None:
@@ -195,7 +195,7 @@ def plan(
 ) -> Plan:
     """Sample the loads of a scene, gravity not included, with a cutting load on top.
 
-    With `sensor_mm` the plan has the noisy pose of a head whose clearances exceed the scene's by as much.
+    With `sensor_mm` the plan has the noisy pose of a head whose clearances are larger by `sensor_mm`.
 
     Raises
     ------

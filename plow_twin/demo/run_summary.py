@@ -30,7 +30,7 @@ class RunSummary:
     Attributes
     ----------
     largest, mean_in_contact : ndarray, shape (8,)
-        Largest force, and impulse over the time in contact (known to one sample interval a touch) [N].
+        Largest force, and impulse over the time in contact, which each touch makes uncertain by a sample interval [N].
     makes : ndarray, shape (8,)
         Number of makes.
     contact_sets : dict

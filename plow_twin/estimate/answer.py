@@ -16,9 +16,9 @@ from plow_twin.estimate.result import Estimate, State
 from plow_twin.estimate.window import Window
 from plow_twin.model.scene import Scene, Table
 
-#: Derived: load periods in which members forget their starts; a compared motion counts after as many.
+#: Derived: load periods in which members forget their starts, and after which a compared motion counts.
 _SETTLE_PERIODS: Final = 1.0
-#: Derived: `tuning.LOAD_KNOT` is half of a knot at 400 in the paper's period; shorter periods have as many knots.
+#: Derived: `tuning.LOAD_KNOT` is half the distance of 400 knots in the paper's period; shorter periods also have 400.
 _KNOT_SHARE: Final = 1.0 / 400.0
 
 
@@ -54,7 +54,7 @@ class Answer:
 
 
 def answer(scene: Scene, window: Window, guess: Guess, asked: Asked) -> Answer:
-    """Estimate from a window, beginning at `guess`, and give the other requested answers."""
+    """Estimate from a window, starting at `guess`, and compute the other requested answers."""
     result, following = estimate_window(scene, window.load, window.pose, window.lost, guess, window.gaps)
     also: dict[str, Any] = {}
     if asked.members:
@@ -80,7 +80,7 @@ def _forces(scene: Scene, result: Estimate, load: Load, asked: Asked) -> dict[st
 
 
 def followed(load: Load, period: float) -> Load:
-    """Return the load thinned to the fewest samples that the members of the forces can follow."""
+    """Return the load thinned to the samples that the members need."""
     knots = int((load.t[-1] - load.t[0]) / min(tuning.LOAD_KNOT, _KNOT_SHARE * period))
     thin = load.thinned(2.0 * tuning.TOLERANCE)
     return load.averaged(knots) if len(thin.t) > knots else thin

@@ -1,7 +1,7 @@
 """Normal equations of swings: block tridiagonal with a border of the shared unknowns, solved in linear time.
 
-Each swing has six unknowns and is linked at most to its neighbours, so the rest is factorised as a band
-matrix (Cholesky) and the border by its Schur complement.
+Each swing has six unknowns and is linked to its neighbours at most, so the swings' part is factorised as a band matrix
+(Cholesky) and the border by its Schur complement.
 
 Reference: Golub and Van Loan, Matrix Computations, ch. 4.3 and 3.2.6.
 """
@@ -76,7 +76,7 @@ class Arrow:
 
 @dataclass(frozen=True, eq=False)
 class Factor:
-    """Cholesky factors of the rest and of the border's Schur complement; `eliminated` (6 s, k) is rest^-1 coupling."""
+    """Cholesky factors of the swings' part and of the Schur complement; `eliminated` (6 s, k): swings^-1 coupling."""
 
     band: Array
     eliminated: Array

@@ -1,10 +1,11 @@
 """Clearances around a block (`carries: corners`) from its impacts: where two flights meet, a corner meets its wall.
 
 Between impacts the block flies: under load and gravity alone, up to drag and errors of the load. The flights before and
-after an impact are extrapolated to the time at which they are nearest to each other. The corner that is deepest then,
-toward the wall that pushed, is at the wall, deeper by its penetration. The places of all impacts are linear in the
-clearances, in the sensor's bias and lever arm, and in how deep the contact gives way. These are estimated together. The
-errors of the impacts have a Student-t distribution of unknown scale, so the intervals follow from the impacts' scatter.
+after an impact are extrapolated to the time at which they are nearest to each other. The corner that is deepest at that
+time, toward the wall that pushed, is at the wall, beyond it by its penetration. The places of all impacts are linear in
+the clearances, in the sensor's bias and lever arm, and in how deep the contact gives way. These are estimated together.
+The errors of the impacts have a Student-t distribution of unknown scale, so the intervals follow from the impacts'
+scatter.
 
 Reference: Lange, Little and Taylor, J. Am. Stat. Assoc. 84 (1989) 881 (Student-t errors by reweighting).
 """
@@ -61,9 +62,9 @@ class Impact:
     wall : str
         A name of `WALLS`.
     distance : float
-        Distance in m of the wall from the middle of the guide, were it hard.
+        Distance in m of the wall from the middle of the guide, taken as hard.
     deeper : float
-        How much of it is penetration with the scene's stiffness, in m.
+        The part of it that is penetration with the scene's stiffness, in m.
     restitution : float
         Normal speed of the corner after the impact over that before.
     gained : float
@@ -87,8 +88,8 @@ class Impact:
 def estimate_block(scene: Scene, load: Load, poses: Poses, known: Estimate) -> Estimate:
     """Estimate the clearances around a block from the places of its impacts.
 
-    Where an axis has impacts on one wall only, the poses are taken to be measured from its middle. A clearance that is
-    not known better than half the prior's deviation is not observable.
+    Where an axis has impacts on one wall only, the poses count as measured from the middle of the axis. A clearance
+    whose deviation exceeds half of the prior's is not observable.
 
     Parameters
     ----------
@@ -158,7 +159,7 @@ def _unfit(found: list[Impact], contacts: int) -> str:
 
 
 def _on_walls(scene: Scene, every: list[Impact], known: Estimate) -> tuple[list[Impact], list[str]]:
-    """Return the impacts that are where a wall can be, and a reason for each wall that lacks some."""
+    """Return the impacts at possible places of the walls, and a reason for each wall without enough impacts."""
     met: list[Impact] = []
     reasons = []
     for wall, (axis, _) in WALLS.items():
@@ -184,9 +185,9 @@ def _solve(scene: Scene, met: list[Impact], known: Estimate, level: Array) -> tu
     prior = np.zeros(_SIZE)
     prior[_CLEARANCES] = known.horizontal.deviation, known.vertical.deviation
     prior[_BIAS] = np.array([quantity.deviation for quantity in QUANTITIES])[BIAS]
-    # stated for a machine of the paper's size
+    # as for a machine of the paper's size
     prior[_LEVER] = UNSTATED["lever_x"] * geometry.half_diagonal(scene) / PAPER_LENGTH
-    # penetration is a power of the stiffness, whose logarithm has the prior: the 95 % points agree
+    # the prior is on the logarithm of the stiffness, of which the penetration is a power: the 95 % points agree
     spread = deviation_of(scene, "contact.stiffness") / (scene.contact.exponent + 1.0)
     prior[_DEPTH] = math.expm1(NORMAL_P95 * spread) / NORMAL_P95
     for axis in (GX, GY):
@@ -205,7 +206,7 @@ def _solve(scene: Scene, met: list[Impact], known: Estimate, level: Array) -> tu
         design[row, _LEVER] = one.turned
     # a number held at zero takes no part
     free = prior > 0.0
-    # corners are not points: each impact is off by how well the frame is known, at least
+    # corners are not points: each impact is off by at least the uncertainty of the frame
     least = max(float(level[:2].max()), *(deviation_of(scene, f"frame.{side}") for side in ("width_m", "height_m")))
     scales = np.geomspace(least, max(float(prior[_CLEARANCES].max()), 2.0 * least), _SCALES)
     step, deviation = np.zeros(_SIZE), np.zeros(_SIZE)
@@ -340,7 +341,7 @@ def _meeting(scene: Scene, inertia: Array, flights: list[Array], room: float) ->
         return None
     mass = 1.0 / (1.0 / inertia[0] + arm**2 / inertia[2])
     energy = (inertia * v**2).sum(axis=1)
-    # that of a rounded corner is the centre of its arc
+    # of a rounded corner, the centre of its arc
     distance = float(normal @ (q[:2] + corner)) + geometry.corner_radius(scene)
     turned = np.array([c * normal[0] + s * normal[1], -s * normal[0] + c * normal[1]])
     deeper = _deeper(scene, mass, before, after)
@@ -355,7 +356,7 @@ def _corners(scene: Scene) -> Array:
 
 
 def _deeper(scene: Scene, mass: float, before: float, after: float) -> float:
-    """Return how much deeper than the wall two flights meet that a compliant contact joins, in m.
+    """Return how far behind the wall two flights meet that a compliant contact joins, in m.
 
     Straight lines with the normal speeds v and e v before and after meet at v e T / (1 + e). The contact lasts
     T = pi u / v with the largest penetration u (exact for a spring).

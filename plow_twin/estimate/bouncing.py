@@ -1,8 +1,8 @@
 """Clearances of a hard guide: features of the whole motion are compared, not the pose at each moment.
 
 Behind a hard contact the head bounces many times before it rests, so its pose at a moment cannot be predicted. The
-reach of the corners and the scatter of the pose at each phase of the load can. Motions with drawn stiffness, damping
-and load gains are simulated and observed through the sensor's noise and gaps. A regression among those near the
+reach of the corners, and the scatter of the pose at each phase of the load, can be. Motions with drawn stiffness,
+damping and load gains are simulated and observed through the sensor's noise and gaps. A regression among those near the
 measured motion gives the difference between clearance and reach (approximate Bayesian computation with local-linear
 adjustment); its residuals give the interval.
 
@@ -32,21 +32,22 @@ from plow_twin.model import geometry
 
 Array = NDArray[np.float64]
 
-#: Derived: tried biases of theta in rad, eight deviations of the prior to both sides, and the reach of the parabola
-#: about the best one, three quarters of their distance.
+#: Derived: tried biases of theta in rad, eight deviations of the prior to both sides, and the range of the parabola
+#: about the best bias, three quarters of their distance.
 _TURNS: Final = np.linspace(-0.16, 0.16, 81)
 _FINEST_TURN: Final = 3e-3
 _NEAR_TURNS: Final = np.linspace(-_FINEST_TURN, _FINEST_TURN, 5)
-#: Bound: rows in which a bias is looked for, and its last part.
+#: Bound: rows in which a bias is searched, and in the last part of the search.
 _MOST_ROWS, _MOST_NEAR_ROWS = 2000, 1200
 #: Derived: the mean of nine values has a third of their scatter.
 _FEWEST_OF_PHASE = 9
-#: Derived: delays in s of the measured path, two deviations of the prior to both sides, and of the drawn paths, a
-#: tenth as far; the place of no delay among the latter.
+#: Derived: delays in s of the measured path (two deviations of the prior to both sides) and of the drawn paths (a tenth
+#: as far), and the index of zero delay among the latter.
 _LAGS_S: Final = np.linspace(-0.1, 0.1, 81)
 _OF_DRAWN_S: Final = np.linspace(-0.01, 0.01, 9)
 _NO_LAG = len(_OF_DRAWN_S) // 2
-#: Derived: powers of two, distances in rows over which pose and reaches change; the second for each phase of the load.
+#: Derived: powers of two, the distances in rows over which changes of pose and reaches are taken; the second also for
+#: each phase of the load.
 _CHANGES: Final = (1, 2, 4, 8, 16, 32)
 _CHANGES_BY_PHASE: Final = (1, 4)
 #: Definition: the sides of the frame in a scene.
@@ -71,13 +72,14 @@ class Bounced:
     bias : (3,) of x, y in m and theta in rad with its deviation
     ln_penetration, ln_damping : mean and standard deviation (of m under the reference force; the latter as `Unknowns`)
     noise : (3,) standard deviation of the measurements
-    distance : of the measured motion from nearby drawn ones, over the distance of drawn ones from each other
+    distance : of the measured motion from nearby drawn motions, over the distance of drawn motions from each other
     path : distance of mean and scatter of the pose over the load's period from the prediction by the drawn motions, as
-        a normal deviate among the distances of the drawn ones
+        as a normal deviate among the distances of the drawn motions
     law : likeness of the motion to motions of another contact law, as a normal deviate among motions of the law
-        believed; 0 if no other law is known
+        believed law; 0 if no other law is known
     odds : log odds of the other law; minus infinity if no other law is known
-    unseen : (2,) deviation of the clearances in m by sides of the frame and theta's scale, which the motion hides
+    unseen : (2,) deviation of the clearances in m due to sides of the frame and theta's scale, which the motion does
+    not show
     rounded : (2,) by how much corners rounded by `priors.ROUNDING` make them too large, in m
     """
 
@@ -97,7 +99,7 @@ class Bounced:
 
 
 def bounces(unknowns: Unknowns, poses: Poses) -> bool:
-    """Return whether the contact is seen to be so hard that this way is the right one."""
+    """Return whether the contact is visibly so hard that the comparison is the right method."""
     return _reach_noise(unknowns, _whole(poses)) < tuning.POSSIBLE and _is_narrow(unknowns, poses)
 
 
@@ -109,7 +111,7 @@ def _is_narrow(unknowns: Unknowns, poses: Poses) -> bool:
 
 
 def _whole(poses: Poses) -> Array:
-    """Return the poses of which every component was measured, or all where these are few, bridged by straight lines."""
+    """Return the poses with all components measured; where these are few, all poses, bridged by straight lines."""
     whole = np.isfinite(poses.q).all(axis=1)
     return poses.q[whole] if whole.sum() > _FEWEST_WHOLE else filled(poses)
 
@@ -136,7 +138,7 @@ def bias_of_hard(unknowns: Unknowns, poses: Poses) -> Array:
 
 
 def _near_bias(unknowns: Unknowns, q: Array) -> Array:
-    """Return a small bias, shape (3,); it is found for drawn motions too, so that its error is known."""
+    """Return a small bias, shape (3,), that is also estimated for drawn motions, so that its error is known."""
     q = _few(q, _MOST_NEAR_ROWS)
     bias = np.zeros(3)
     for _ in range(2):
@@ -222,7 +224,7 @@ def compare(
             if len(rounds) == 3 and count == tuning.DRAWS[2] and not followed:
                 rounds.append((tuning.DRAWS[3], tuning.DRAWN_CLEARANCE[3]))
     assert found is not None
-    # where it has gone astray the last corrections say by how much
+    # where it has not converged, the last corrections show by how much
     deviation = np.where(np.abs(moved) > tuning.ASTRAY, np.hypot(deviation, tuning.UNEXPLAINED_HARD), deviation)
     law, odds = 0.0, -math.inf
     if found.value[5] < math.log(tuning.FITTED):
@@ -238,7 +240,7 @@ def compare(
         found.distance,
         path_deviate(eye.paths(eye.q, _LAGS_S), features[:, 5:], paths, measured[5:]),
         law,
-        odds if near is None else -math.inf,  # its limit was set with draws of hard contacts
+        odds if near is None else -math.inf,  # the limit was set with draws of hard contacts
         *hidden_by_geometry(unknowns, poses, period, measured[:2]),
     )
 
@@ -282,19 +284,19 @@ class _Spread:
 
     @staticmethod
     def near(unknowns: Unknowns, vector: Array) -> _Spread:
-        """Return that about the softness and damping of a vector."""
+        """Return the distribution about the softness and damping of a vector."""
         mean = np.array([math.log(unknowns.penetration_of(float(vector[SOFTNESS]))), vector[DAMPING]])
         return _Spread(mean, tuning.FIRM_SPREAD[0] * np.array([1.0, float(unknowns.damped)]), _FIRM_BOUNDS)
 
     def narrowed(self, found: _Regressed) -> _Spread:
-        """Return the spread about a result."""
+        """Return the distribution about a result."""
         _, over, least = tuning.FIRM_SPREAD
         deviation = np.minimum(np.maximum(over * found.deviation[5:7], least), self.deviation)
         return _Spread(found.value[5:7], deviation, _FIRM_BOUNDS)
 
 
 class _Drawn:
-    """Draws of one law: features, targets, changes and, until cleared, the observed motions."""
+    """Draws of one law: features, targets, changes and the observed motions, until these are cleared."""
 
     def __init__(
         self, forward: Forward, unknowns: Unknowns, eye: MotionFeatures, spread: _Spread, rng: np.random.Generator
@@ -335,7 +337,7 @@ class _Drawn:
         return numbers
 
     def of_other_law(self) -> _Drawn | None:
-        """Return an empty set of draws of the law that the contact may have instead; None without such a law."""
+        """Return an empty set of draws of the other possible law; None without such a law."""
         other = with_other_law(self.unknowns)
         return None if other is None else _Drawn(self.forward.of(other.scene), other, self.eye, self.spread, self.rng)
 
@@ -344,13 +346,13 @@ class _Drawn:
         return np.concatenate([np.array(self.features)[:, 5:], np.array(self.changes)], axis=1)
 
     def draws(self) -> Draws:
-        """Return the features of the motions, by phase of the load too, and the unknowns that they were drawn with."""
+        """Return the features of the motions, also by phase of the load, and the unknowns that they were drawn with."""
         of_draw = np.array(self.targets)[:, [5, 6, 7, 8, 9, 0, 1]]
         return Draws(np.concatenate([self.like(), np.array(self.by_phase)], axis=1), of_draw)
 
 
 def _likeliest(features: Array, targets: Array, paths: Array, measured: Array, seen: Array) -> Array:
-    """Return the likeliest clearances less the reach, of each drawn motion and of the measured one, (n + 1, 2), in m.
+    """Return the likeliest clearances minus the reach, of each drawn motion and the measured one, (n + 1, 2), in m.
 
     Only the mean poses in `seen`, (lags, k), and `paths`, (n, lags, k), are used.
     """
@@ -382,15 +384,15 @@ def path_delay(eye: MotionFeatures, features: Array, drawn: list[Array], measure
         return 0.0
     value, left = _Near.to(features, measured).left_over(paths[:, there])
     off = ((seen[:, there] - value) ** 2 / ((left**2).mean(axis=0) + _NO_SCATTER)).sum(axis=1)
-    # no pose is measured before it is there
+    # a pose cannot be known before it is measured
     return max(float(_LAGS_S[int(np.argmin(off))]), 0.0)
 
 
 def _of_other_law(drawn: _Drawn, centre: Array, delay: float, most_work: int) -> tuple[float, float]:
     """Return the likeness of the measured motion to another law, and the log odds of that law.
 
-    Goodness of fit does not separate laws with similar motions. A classifier of draws of both laws does (Pudlo et al.,
-    Bioinformatics 32 (2016) 859), and so does the likelihood under each; each finds cases that the other misses.
+    Goodness of fit does not separate laws with similar motions. A classifier of draws of both laws (Pudlo et al.,
+    Bioinformatics 32 (2016) 859) and the likelihood under each law do, and each finds cases that the other misses.
     """
     other, nothing = drawn.of_other_law(), (0.0, -math.inf)
     if other is None:
@@ -552,7 +554,7 @@ class MotionFeatures:
         self.q = filled(poses)
         self.noise = noise_level(self.q)
         self._period, self._parts = period, tuning.PATH_PHASES // 2
-        #: until then a motion forgets where it began, which a delay makes another place
+        #: by then a motion has forgotten its start, which a delay changes
         self._settled = poses.t - poses.t[0] >= period
         self._whole = self._there.all(axis=1)
         if self._whole.sum() <= _FEWEST_WHOLE:
@@ -570,7 +572,7 @@ class MotionFeatures:
         vector[[GX, GY]], vector[DAMPING] = clearance, numbers[1]
         vector[GAIN] = np.clip(numbers[2:5], 0.7, 1.3)
         scene = unknowns.scene_of(vector)
-        # harder than a fit simulates: how soon the bounces die out depends on it
+        # harder than a fit simulates; the decay of the bounces depends on it
         contact = replace(scene.contact, stiffness=unknowns.force / math.exp(numbers[0]) ** scene.contact.exponent)
         start = np.concatenate([self.q[0], np.zeros(3)])
         start += np.array([1e-3, 1e-3, 4e-3, 0.05, 0.05, 0.2]) * rng.standard_normal(6)
@@ -606,9 +608,9 @@ class MotionFeatures:
         return out.ravel()
 
     def _seen(self, q: Array, white: Array) -> Array:
-        """Return a motion with as much noise as makes its quick changes as large as those measured.
+        """Return a motion with the noise that makes its quick changes as large as the measured ones.
 
-        Bounces change the pose quickly too, so those changes overrate the noise, and the reach with it.
+        Bounces also change the pose quickly, so these changes overestimate the noise, and with it the reach.
         """
         noise = self.noise
         for _ in range(_NOISE_ROUNDS):
@@ -616,11 +618,11 @@ class MotionFeatures:
         return self._bridged(q + noise * white)
 
     def _bridged(self, q: Array) -> Array:
-        """Return a motion as it is seen where components are missing, bridged as those measured are."""
+        """Return a motion without the components that are missing in the measurement, bridged like the measurement."""
         return q if self._there.all() else filled(Poses(self._t, np.where(self._there, q, np.nan)))
 
     def features(self, q: Array) -> Array:
-        """Return reach of the clearances, the bias found, then the other features of the motion."""
+        """Return reach, bias and the other features of the motion, in this order."""
         whole = q[self._whole]
         bias = _near_bias(self._unknowns, whole)
         whole = whole - bias
@@ -643,7 +645,7 @@ class MotionFeatures:
         return np.concatenate([sums, bias, *like])
 
     def changes(self, q: Array) -> Array:
-        """Return logarithms of how much pose and reaches change within some distances: how the bounces die out."""
+        """Return logarithms of the change of pose and reaches over some distances: the decay of the bounces."""
         rows = np.concatenate([q, reaches(self._unknowns.scene, q)], axis=1)
         parts = []
         for apart in _CHANGES:
@@ -653,7 +655,7 @@ class MotionFeatures:
         return np.log(np.concatenate(parts) + 1e-12)
 
     def changes_by_phase(self, q: Array, lag_s: float = 0.0) -> Array:
-        """Return such logarithms of the pose at each phase of the load, of a motion that is `lag_s` late."""
+        """Return these logarithms of the pose at each phase of the load, for a motion that is `lag_s` late."""
         phase = ((self._t - self._t[0] - lag_s) / self._period % 1.0 * self._parts).astype(int) % self._parts
         count = np.maximum(np.bincount(phase, minlength=self._parts), 1)
         parts = []
@@ -670,7 +672,7 @@ class MotionFeatures:
         return _reach(self._unknowns, q)
 
     def _by_phase(self, q: Array) -> Array:
-        """Return mean reaches in the phases of the load in which they are farthest, shape (3, 4): where it rests."""
+        """Return mean reaches in the phases of the load in which they are farthest and the head rests, shape (3, 4)."""
         reach, phase = reaches(self._unknowns.scene, q), self._reach_phase
         count = np.bincount(phase, minlength=tuning.PATH_PHASES + 1)
         known = count > 0

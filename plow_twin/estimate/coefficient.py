@@ -1,8 +1,8 @@
 """The wear coefficient from clearances that were estimated over weeks.
 
-The clearance grows along one path h(E) of the exposure E = k_s s / A (s the travel), whatever the coefficient k_s is.
-So a history of clearances against travel gives k_s: its posterior is computed on a grid of ln k_s, the clearance at the
-beginning integrated out, from the log-normal prior of the scene's wear.
+The clearance grows along one path h(E) of the exposure E = k_s s / A (s the travel) for any coefficient k_s.
+So a history of clearances against travel gives k_s: its posterior follows on a grid of ln k_s from the log-normal prior
+of the scene's wear, with the clearance at the beginning integrated out.
 """
 
 from __future__ import annotations
@@ -22,9 +22,10 @@ from plow_twin.model.scene import Clearance, Scene
 
 Array = NDArray[np.float64]
 
-#: Bound: points of the grid. Derived: it reaches four deviations of the prior to both sides, all but 6e-5 of it.
+#: Bound: points of the grid. Derived: range of the grid, four deviations of the prior to both sides: all but 6e-5 of
+#: its probability.
 _POINTS, _REACH = 801, 4.0
-#: Bound: the path is followed beyond the history by as many times the clearance's growth, and by a depth in m.
+#: Bound: how far the path is followed beyond the history, in multiples of the clearance's growth, plus a depth in m.
 _FURTHER, _FURTHER_M = 2.0, 5e-4
 
 
@@ -91,7 +92,7 @@ def coefficient(scene: Scene, history: History) -> Coefficient:
     Parameters
     ----------
     scene : Scene
-        With wear, whose `prior_m2_n` is the prior; its clearances are replaced by those the history begins with.
+        With wear, whose `prior_m2_n` is the prior; its clearances are replaced by the first of the history.
     history : History
 
     Raises
@@ -136,7 +137,7 @@ def coefficient(scene: Scene, history: History) -> Coefficient:
 
 
 def _check_fit(history: History, grown: Array) -> None:
-    """Raise LifeError where clearances are farther from a growth, shape (n, 2), than their deviations allow.
+    """Raise LifeError where clearances deviate more from a growth, shape (n, 2), than their deviations allow.
 
     The growth itself is known to within `tuning.PATH_DEVIATION`.
     """

@@ -1,8 +1,8 @@
-"""Contact forces measured by load cells at the guides, which add to the motion in stiffness, damping and clearances.
+"""Contact forces measured by load cells at the guides, which sharpen stiffness, damping and clearances.
 
-After the fit the motion is known at every moment, and the law gives each pair's force from it. A cell that
-contradicts its pair's force is named, and so is the law if all cells do; the forces are not used then. Otherwise poses
-and forces are fitted together (`force_fit`).
+After the fit the motion is known at every moment, and the law gives each pair's force from it. If a cell contradicts
+its pair's force, the cell is named (if all do, the law), and the forces are not used. Otherwise poses and forces are
+fitted together (`force_fit`).
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class ContactForces:
 
     @staticmethod
     def of(t: ArrayLike, force: ArrayLike) -> tuple[ContactForces, int]:
-        """Put rows in order of time; return them and how many had to be left out.
+        """Return rows in order of time, and the number of rows left out.
 
         Left out are rows without a finite stamp or any force, with a force beyond 1e12 N, or with a repeated stamp.
 
@@ -90,7 +90,7 @@ class Cells:
     pairs : (k,) numbers of their pairs
     force : (n, 8) measured forces [N] less `offset`, (8,), the reading in flight
     noise : (8,) standard deviation in N
-    delay : by which their stamps are later than the motion, in s
+    delay : of their stamps behind the motion, in s
     """
 
     pairs: NDArray[np.int64]
@@ -127,8 +127,8 @@ class Feeling:
 def forces_at(scene: Scene, q: Array, v: Array, depth: Array | None = None) -> tuple[Array, Array]:
     """Return penetrations in m and forces in N of the pairs, (n, 8) each, from poses and rates, (n, 3) each.
 
-    `depth`, shape (8,), is the outward displacement of each pad in m. The law's damping must be the scene's own, not
-    one that a restitution and the speed of the touch give.
+    `depth`, shape (8,), is the outward displacement of each pad in m. The law's damping must be a number of the scene;
+    a restitution would make it depend on the speed of the touch.
     """
     x, y, vx, vy, omega, c, s, _ = body_states(np.hstack((q, v)), scene.head.com_offset_m).T
     rows = penetration_rows(scene)
@@ -164,7 +164,7 @@ def cells_of(feeling: Feeling, found: Fit, forces: ContactForces) -> tuple[Cells
     measured = forces.force - offset
     found_out, pairs = [], []
     largest = float(np.nanmax(felt.force))
-    # digits of a cell that shows 0 in flight
+    # resolution of a cell that shows 0 in flight
     noise = np.maximum(noise, 1e-4 * largest)
     for i, name in enumerate(PAIR_NAMES):
         there = np.isfinite(measured[:, i]) & (felt.swing >= 0)

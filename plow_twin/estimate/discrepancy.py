@@ -36,7 +36,7 @@ from plow_twin.model.scene import Friction, Scene
 Array = NDArray[np.float64]
 
 #: Prior: deviations of quantities that no scene states. Walls by `WALLS`: stiffness over the contact's, turn in m. Of
-#: the sensor: scales, lever arm in m, square of the time constant of a filter in s2 (its delay is estimated already),
+#: the sensor: scales, lever arm in m, square of a filter's time constant in s2 (the delay is an unknown of the fit),
 #: drift of its clock.
 UNSTATED: Final = {
     **{f"stiffness_{wall}": 0.1 for wall in ("left", "right", "top", "bottom")},
@@ -46,8 +46,7 @@ UNSTATED: Final = {
     "filter": 1e-4,
     "clock": 1e-4,
 }
-#: Step: of the difference quotients by quantities that a scene states, by their path there; a fifth to a half of the
-#: deviation of a prior.
+#: Step: of the difference quotients by quantities of a scene, by path; a fifth to a half of the prior's deviation.
 STATED: Final = {
     "head.mass_kg": 0.02,
     "head.inertia_kg_m2": 0.02,
@@ -103,7 +102,7 @@ def graded(problem: Problem, found: Fit, doubtful: bool = False, seed: int = 0) 
     problem, found : Problem, Fit
         The fit; it need not have come to its end.
     doubtful : bool
-        Whether the fit shows that the machine differs, whatever the selection finds.
+        Whether the fit itself shows that the machine differs.
     seed : int
         Draws which quantities differ.
 
@@ -121,7 +120,7 @@ def graded(problem: Problem, found: Fit, doubtful: bool = False, seed: int = 0) 
     mean, covariance, often, exact = linear.averaged(np.random.default_rng(seed))
     surprise, named = linear.surprise(mean, often), linear.named(mean, often)
     if doubtful or not exact:
-        # of a machine that differs no quantity is exact
+        # if the machine differs, no quantity is exact
         mean, covariance = linear.free()
         surprise = max(surprise, linear.surprise(mean, np.ones(len(often))))
     step = mean[:SIZE]
@@ -192,13 +191,13 @@ def _of_sensor(problem: Problem, q: Array, v: Array) -> Iterator[tuple[str, Arra
     c, s, zero = np.cos(q[:, 2]), np.sin(q[:, 2]), np.zeros(len(q))
     yield "lever_x", np.stack([c - 1.0, s, zero], axis=1)
     yield "lever_y", np.stack([-s, c - 1.0, zero], axis=1)
-    # a low pass 1 / (1 + tau s) beyond its delay: tau^2 s^2 / 2
+    # a low pass 1 / (1 + tau s) without its delay: tau^2 s^2 / 2
     yield "filter", 0.5 * np.gradient(v, t, axis=0)
     yield "clock", -v * (t - t.mean())[:, None]
 
 
 def variants(scene: Scene) -> tuple[Scene, ...]:
-    """Return the scene with the changes whose motions need other compiled terms: another exponent, friction."""
+    """Return the scene with the changes that need other compiled terms: another exponent, friction."""
     return tuple(_moved(scene, path, STATED[path], 1.0) for path in ("contact.exponent", "friction.coefficient"))
 
 
@@ -311,9 +310,9 @@ class _Linearised:
         return covariance @ self._score, covariance
 
     def averaged(self, rng: np.random.Generator) -> tuple[Array, Array, Array, bool]:
-        """Return mean and covariance of the border over which quantities differ, how often each does, and if none may.
+        """Return mean, covariance and share of differences of the border over the draws, and if the scene may be exact.
 
-        The scene may be exact if that is drawn at all.
+        The scene may be exact if any draw leaves it so.
         """
         count, size = len(self.names), len(self._precision)
         differs, log_precision = np.zeros(count, np.bool_), np.log(self._precision)
@@ -359,7 +358,7 @@ class _Linearised:
         return freed(count, len(moving)) * float(ratio[moving].mean())
 
     def surprise(self, mean: Array, often: Array) -> float:
-        """Return the mean square of the differences in deviations of their prior, at least 1; above, not linear."""
+        """Return the mean square of the differences in deviations of their prior, at least 1; above 1: not linear."""
         z = mean[SIZE:] * np.sqrt(self._precision[SIZE:])
         # mean over the draws in which it differs
         return max(1.0, float((z**2 / np.maximum(often, 0.1)).sum() / max(often.sum(), 1.0)))

@@ -1,4 +1,4 @@
-"""Walls and stiffness from the equations of motion in weak form; no motion is integrated, so no load error adds up.
+"""Walls and stiffness from the equations of motion in weak form, without integrating a motion or errors of the load.
 
 The equations are multiplied by short smooth functions psi and integrated by parts, which needs no derivative of a
 measured pose:
@@ -6,7 +6,7 @@ measured pose:
     integral psi'' q  =  integral psi (load + contact) / M,
     contact = K sum n p (1 + d p'),   integral psi p p' = -1/2 integral psi' p^2,
 
-with the penetrations p behind four walls. Gauss-Newton steps find the walls, K and K d; what the load leaves over
+with the penetrations p behind four walls. Gauss-Newton steps find the walls, K and K d; the remaining acceleration
 counts as noise. The result is biased where a contact lasts a few samples; `uncertain_load` corrects it.
 
 References: Shinbrot, Trans. ASME 79 (1957) 67 (modulating functions); Messenger and Bortz, J. Comput. Phys. 443 (2021)
@@ -44,7 +44,7 @@ _UNIT = 1e7
 _HUBER, _MAD = 2.0, 1.4826
 #: Bound: starts of a search, as shares of the range of motion and as penetrations in m.
 _SHARES, _DEPTHS = (0.25, 0.5, 0.75, 0.95), (3e-3, 6e-3, 12e-3, 20e-3)
-#: Guard: penetrations in m of the hardest and of the softest contact that is looked for.
+#: Guard: penetrations in m of the hardest and of the softest contact that is tried.
 DEPTHS: Final = (2e-4, 3e-2)
 #: Guard: columns without information.
 _SINGULAR = 1e-9
@@ -57,7 +57,7 @@ class Walls:
     reach : (4,) distance in m by which the corners move toward the right, left, top and bottom before they touch
     ln_depth : logarithm of the penetration in m under the reference force
     damping : of Hunt and Crossley in s/m
-    left_over : (3,) logarithm of the scatter that is left over, over that of the acceleration
+    left_over : (3,) logarithm of the remaining scatter over the scatter of the acceleration
     loss : sum of the logarithms of the scatters
     """
 
@@ -167,7 +167,7 @@ class EquationError:
 
     @staticmethod
     def _solve(columns: Array, target: Array, weight: Array) -> tuple[Array, Array]:
-        """Return the weighted least-squares solution (9,) and what it leaves over, shape (m, 3)."""
+        """Return the weighted least-squares solution (9,) and its residuals, shape (m, 3)."""
         rows = (columns * weight[:, :, None]).reshape(-1, columns.shape[2])
         normal = rows.T @ rows
         held = np.zeros(len(normal))

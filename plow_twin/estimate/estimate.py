@@ -48,13 +48,13 @@ Array = NDArray[np.float64]
 #: Shared unknowns, noise and turns of the walls of the window before, 18 numbers; empty: no guess.
 Guess = tuple[float, ...]
 
-#: Bound: load periods and seconds of a window, whichever is longer, and the longest window of a node in s; of more the
-#: newest are taken, since the work is bounded.
+#: Bound: load periods and seconds of a window, whichever is longer, and the longest window of a node in s; of longer
+#: data the newest part is used, to bound the work.
 MOST_PERIODS, MOST_SPAN_S = 20.0, 60.0
 _LONGEST_S = 600.0
 #: Derived: normal deviate that a right model exceeds in one of a hundred cases, to two digits.
 MOST_OTHER_LAW = round(float(ndtri(0.99)), 2)
-#: Derived: 95 % point of half a normal distribution, in its deviations.
+#: Derived: 95 % point of a half-normal distribution, in its deviations.
 _HALF_NORMAL_P95 = float(ndtri(0.975))
 #: Guard: logarithms of the penetrations in m that a contact can have.
 _LN_PENETRATIONS = (math.log(1e-9), math.log(0.12))
@@ -81,11 +81,11 @@ def estimate(
     poses : Poses
         The measured poses.
     lost : int
-        Rows that were left out before.
+        Number of rows that were left out before.
     gaps : Gaps, optional
         Measured gaps: they give the clearances directly, and the pose where it is not measured.
     forces : ContactForces, optional
-        Measured contact forces: they say more of the contact than the motion alone.
+        Measured contact forces: they determine the contact better than the motion alone.
     """
     return estimate_window(scene, load, poses, lost, gaps=gaps, forces=forces)[0]
 
@@ -114,7 +114,7 @@ def estimate_window(
     found, following = _estimate(units.scene(scene), *its, lost, guess, units.gaps(gaps), units.forces(forces))
     found = units.in_si(found, scene)
     if units.only_time and found.sensor == "ok":
-        # a machine of the paper's size under a quick or slow load: its impacts last as long as there
+        # of the paper's size under a quicker or slower load: impacts last as long as in the paper
         period = min(load.period(), float(poses.t[-1] - poses.t[0]))
         unknowns = Unknowns.stated(scene, load, poses)
         found = under_uncertain_load(found, unknowns, thinned(load, period)[0], poses, period)
@@ -130,7 +130,7 @@ def _estimate(
     gaps: Gaps | None,
     forces: ContactForces | None,
 ) -> tuple[Estimate, Guess]:
-    """Estimate in the units that all is given in."""
+    """Estimate in the units of the arguments."""
     known, measured = len(load.t), len(poses.t)
     load = load.longest_stretch()
     lost += known - len(load.t)
@@ -275,10 +275,11 @@ def under_uncertain_load(
     period: float,
     fitted: tuple[Problem, Fit] | None = None,
 ) -> Estimate:
-    """Return an estimate whose withdrawn clearances allow for a load, or an angle, that is not known.
+    """Return an estimate whose withdrawn clearances are replaced: they allow for an unknown load or angle.
 
-    `result` comes from the load believed; it stays where it knows a clearance, or nothing is found. Where the
-    comparison agrees with what `fitted` says of a machine that differs, that was no false optimum: both are combined.
+    `result` comes from the load believed; it stays where it has a clearance, or where the comparison finds none. Where
+    the comparison agrees with `fitted`, the result for a machine that differs, the fit was in no false optimum, and
+    both are combined.
     """
     if _known(result) or felt.interval() > tuning.COARSEST:
         return result
@@ -345,7 +346,7 @@ def with_bounced(result: Estimate, bounced: Bounced, spent: int) -> Estimate:
 
 
 def _with_turns(found: tuple[Problem, Fit], verdict: Verdict, period: float) -> tuple[tuple[Problem, Fit], Verdict]:
-    """Let the walls turn where the fit does not hold, or shows that they are: pads worn askew.
+    """Let the walls turn where the fit fails with straight walls, or shows turned ones: pads worn askew.
 
     Walls taken for straight make the clearance too small, by 0.2 mm where pads differ by 1.2 mm.
     """
@@ -364,7 +365,7 @@ def _with_turns(found: tuple[Problem, Fit], verdict: Verdict, period: float) -> 
 
 
 def _moved_back(result: Estimate, bias: Array) -> Estimate:
-    """Return an estimate from poses that a bias was taken out of."""
+    """Return an estimate from poses with a bias removed."""
     x, y, theta = (
         None if known is None else Interval(known.mean + by, known.p05 + by, known.p95 + by)
         for known, by in zip((result.bias_x, result.bias_y, result.bias_theta), bias.tolist(), strict=True)
@@ -374,7 +375,7 @@ def _moved_back(result: Estimate, bias: Array) -> Estimate:
 
 
 def with_gaps(result: Estimate, by_gaps: GapsFit) -> Estimate:
-    """Combine the estimate from the motion with that from gap sensors; no state is kept where they contradict."""
+    """Combine the estimates from motion and gap sensors; where they contradict each other, withdraw the values."""
     found = []
     if by_gaps.contradiction > tuning.OUTLYING:
         found.append(
@@ -451,7 +452,7 @@ def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: 
         states.append(_state(bool(sensor), observed, rough))
     exponent = unknowns.scene.contact.exponent
     log = Interval.normal(*bounced.ln_penetration)
-    # a regression that extrapolates gives no bound
+    # an extrapolating regression gives no bound
     log = Interval(*np.clip([log.mean, log.p05, log.p95], *_LN_PENETRATIONS).tolist())
     mean, soft, hard = (unknowns.force / np.exp(value) ** exponent for value in (log.mean, log.p95, log.p05))
     bias = [Interval.normal(*pair) for pair in zip(bounced.bias, bounced.bias_deviation, strict=True)]
@@ -463,7 +464,7 @@ def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: 
         horizontal_state=states[0],
         vertical_state=states[1],
         apparent=(apparent[0], apparent[1]) if all(state.known for state in states) else None,
-        # it follows from the bounces alone: the hard side stays open
+        # only the bounces determine it: the hard side stays open
         stiffness=Interval(float(mean), float(soft), max(float(hard), unknowns.hardest_believed)),
         damping=_damping(unknowns, Interval.normal(*bounced.ln_damping)),
         bias_x=bias[0],
@@ -513,7 +514,7 @@ def _figures(beside: Graded | None) -> dict[str, float]:
 def _graded(problem: Problem, fit: Fit, verdict: Verdict) -> Graded | None:
     """Return the result of the fit where the machine may differ from the model; None where data contradict themselves.
 
-    None too for linked swings and turned walls while no check fails. A fit that has not converged may be in another
+    None too for linked swings and turned walls while no check fails. A fit that has not converged may be in a false
     optimum: None if its swings are linked, or if its residuals far exceed the noise.
     """
     if verdict.broken:
@@ -550,7 +551,7 @@ def thinned(load: Load, period: float) -> tuple[Load, bool]:
         if len(thin.t) <= most:
             break
     broad = len(thin.t) > most
-    # the means of a broad-band load move the head
+    # the mean values of a broad-band load move the head
     return load.averaged(tuning.KNOTS[1] * int(most)) if len(thin.t) > tuning.KNOTS[1] * most else thin, broad
 
 
@@ -589,7 +590,7 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
     if not finished and not suspect:
         gain = f"{fit.gain_left:.0f} are left to gain, expected at most {tuning.OUTLYING**2:g}"
         reasons = [f"the fit has not come to its end: {gain}"]
-    # walls give way: largest distance of the head beyond them
+    # compliant walls: largest distance of the head beyond them
     given = tuning.GIVEN * float(np.exp(shared[SOFTNESS] + NORMAL_P95 * min(deviation[SOFTNESS], 1.0)))
     least = range_of_motion(unknowns.scene, poses)[0] - given
     share = predicted(fit).sum(axis=0) / np.maximum(np.isfinite(fit.point.residual).sum(axis=0), 1)
@@ -647,7 +648,7 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
 
 
 def _with_forces(result: Estimate, problem: Problem, fit: Fit, forces: ContactForces, widened: float) -> Estimate:
-    """Combine a fit with measured contact forces; no state is kept where they contradict it."""
+    """Combine a fit with measured contact forces; where they contradict it, withdraw the values."""
     from plow_twin.estimate.force_fit import fit_jointly
 
     if "suspect" in (result.model, result.sensor) or not fit.finished:
@@ -680,7 +681,7 @@ def _with_forces(result: Estimate, problem: Problem, fit: Fit, forces: ContactFo
 
 
 def _numbers(unknowns: Unknowns, normal: list[Interval]) -> dict[str, Any]:
-    """Return the estimate of all but the clearances, by name, from the intervals of the shared unknowns."""
+    """Return the estimates of all quantities but the clearances, by name, from the intervals of the shared unknowns."""
     values = {quantity.name: value for quantity, value in zip(QUANTITIES, normal, strict=True)}
     del values["horizontal"], values["vertical"]
     contact = {
@@ -691,15 +692,15 @@ def _numbers(unknowns: Unknowns, normal: list[Interval]) -> dict[str, Any]:
 
 
 def _plain(problem: Problem, fit: Fit) -> Array:
-    """Return the covariance that the noise gives; walls that were found turned may be turned otherwise too."""
+    """Return the covariance due to noise, and, if walls were found turned, to the uncertainty of their turns."""
     return fit.covariance + of_turns(problem, fit) if problem.turns.any() else fit.covariance
 
 
 def _covariance(problem: Problem, fit: Fit, verdict: Verdict, plain: Array) -> Array:
     """Return the covariance of the shared unknowns: `plain` of the noise, or from the scatter of the swings if larger.
 
-    One cause scatters all unknowns that move the head, so one ratio, the mean of theirs, widens all of them; a single
-    ratio from some tens of swings would be chance. The links of linked swings hold it already. The scatter is
+    One cause scatters all unknowns that move the head, so the mean of their ratios widens all of them; the ratio of one
+    unknown, from some tens of swings, would be chance. Linked swings contain it already. The scatter is
     corrected for the unknowns fitted to it. Residuals beyond the noise are correlated for long, so deviations grow with
     their size, not with its root. The step that the fit would still take is unknown.
     """
@@ -710,7 +711,7 @@ def _covariance(problem: Problem, fit: Fit, verdict: Verdict, plain: Array) -> A
 
 
 def _widened(problem: Problem, fit: Fit, verdict: Verdict) -> float:
-    """Return the variance over that of the noise, by the scatter of the swings and by the residuals' colour."""
+    """Return the variance over that of the noise, by the scatter of the swings and the colour of the residuals."""
     ratio = 1.0 if len(problem.link) else max(1.0, _scatter(problem, fit, np.diag(fit.covariance)))
     colour = max(verdict.figures.get(f"colour_{name}", 1.0) for name in COMPONENTS)
     widened = max(1.0, colour) * (1.0 if fit.converged else tuning.UNFINISHED)
@@ -742,8 +743,8 @@ def _groups(
 ) -> dict[str, tuple[Interval, State]]:
     """Return the clearance of each group of pads; not observable where the motion does not determine it.
 
-    `untested` has the clearances that no predicted motion tests, by axis: no group of them is known better. `added` is
-    the covariance beyond the fit's; `shared` are unknowns and differences from the model.
+    `untested` flags, by axis, clearances that no predicted motion tests: their groups are not known better than they.
+    `added` is the covariance beyond the fit's; `shared` are unknowns and differences from the model.
     """
     out = {}
     for name, (value, deviation) in by_group(problem, fit, widened).items():
@@ -847,7 +848,7 @@ def _is_idle(scene: Scene, load: Load, poses: Poses) -> bool:
 
 
 def _rests(poses: Poses) -> bool:
-    """Return whether all but the first of the pose is noise."""
+    """Return whether the pose, after its first value, is all noise."""
     q = filled(poses)[len(poses.t) // 4 :]
     return bool((q.std(axis=0) < tuning.RESTS * noise_level(q)).all())
 

@@ -1,11 +1,11 @@
 """Least squares of the measured motion over the unknowns and the state at the start of each swing.
 
-The window is cut into swings, each begun in flight between the walls, where the state is best known and a small error
-of it does no harm. Each is simulated from its own starting state (multiple shooting), so neither the last bounces of a
-hard contact nor an error of the load can grow from swing to swing. Levenberg-Marquardt minimises Huber's function of
-the residuals and the prior. Under a load that is unknown between its samples the swings are short, and
-each is linked to the next by the covariance of that unknown part (weak constraints). Runs from displaced starting
-states give the variance of the prediction at each moment, which is added to the measurement's.
+The window is cut into swings, each begun in flight between the walls, where the state is known best and its errors
+matter least. Each is simulated from its own starting state (multiple shooting), so that errors of the load and of the
+last bounces of a hard contact do not grow from swing to swing. Levenberg-Marquardt minimises Huber's function of the
+residuals and the prior. Under a load that is unknown between its samples the swings are short, and each is linked to
+the next by the covariance of the unknown part of the load (weak constraints). Runs from displaced starting states give
+the variance of the prediction at each moment, which is added to the measurement's.
 
 References: Bock, Recent advances in parameter identification techniques for ODE (1983); Nocedal and Wright, Numerical
 Optimization, ch. 10; Huber, Robust Statistics, ch. 7; Tremolet, Q. J. R. Meteorol. Soc. 132 (2006) 2483.
@@ -39,7 +39,7 @@ _DISPLACED = np.array([2e-4, 2e-4, 1e-3, 5e-3, 5e-3, 3e-2])
 _LEAST_DRIFT = 1e-8
 #: Definition: walls by their two pads: left, right (top pad first), top, bottom (left pad first).
 WALLS: Final = ((1, 7), (3, 5), (0, 2), (6, 4))
-#: Derived: three numbers a row against the six of a swing's start; fewer rows determine the start alone.
+#: Derived: a row has three numbers, the start of a swing six; fewer rows determine the start alone.
 FEWEST_OF_SWING = 4
 
 
@@ -107,7 +107,7 @@ class Linear:
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """A part of the normal equations: the shared unknowns and the unknowns of consecutive swings from `swing` on.
+    """A part of the normal equations, for the shared unknowns and those of consecutive swings from `swing` on.
 
     rows, weighted : (m, 17) or (m, 23)
     residual : (m,)
@@ -135,7 +135,7 @@ class Fit:
     variance : (n, 3) variance of each measurement as weighted
     jitter : (n, 3) variance that cannot be predicted
     linear : its Jacobians
-    left : (11 + 6 s,) the step still to be taken, linearised; zero at an optimum
+    left : (11 + 6 s,) the remaining step, linearised; zero at an optimum
     gain_left : reduction of the cost by that step
     """
 
@@ -235,7 +235,7 @@ class Problem:
         self, point: Point, turns: Array | None = None, push: Array | None = None, share: Array | None = None,
         change: Callable[[Scene], Scene] | None = None,
     ) -> tuple[Array, Array] | None:  # fmt: skip
-        """Return poses and rates, (n, 3), at a point with something changed; NaN outside the swings.
+        """Return poses and rates, (n, 3), at a changed point; NaN outside the swings.
 
         Parameters
         ----------
@@ -267,7 +267,7 @@ class Problem:
     def cost(self, point: Point, variance: Array) -> float:
         """Return twice the negative logarithm of the posterior: Huber's function of the residuals and the prior.
 
-        A measurement that a point does not reach costs as much as one that fits.
+        A measurement outside the swings costs nothing beyond a perfect fit.
         """
         z = np.abs(point.residual) / np.sqrt(variance)
         loss = huber_loss(z)
@@ -330,8 +330,8 @@ def fit(
 ) -> Fit | None:
     """Fit from a starting point; None where the model cannot be run there.
 
-    `noise`, shape (3,), is a first guess; a step that gains less than `enough` of the cost is the last one; `seed`
-    draws the displacements that probe the predictability.
+    `noise`, shape (3,), is a first guess; a step that reduces the cost by less than the share `enough` is the last;
+    `seed` draws the displacements that probe the predictability.
     """
     point = problem.evaluate(problem.unknowns.within(shared), states)
     if point is None:
@@ -367,7 +367,7 @@ def fit(
 
 
 def pieces(problem: Problem, point: Point, linear: Linear, variance: Array) -> Iterator[list[Piece]]:
-    """Yield for each swing the terms of its measurements and of its link to the next swing in the normal equations."""
+    """Yield for each swing the terms of the normal equations from its measurements and its link to the next."""
     z = np.abs(point.residual) / np.sqrt(variance)
     weight = np.nan_to_num(huber_weight(z) / variance) * np.isfinite(point.residual)
     weighted, residual = linear.rows * weight[:, :, None], np.nan_to_num(point.residual)
@@ -401,7 +401,7 @@ def normal_equations(problem: Problem, point: Point, linear: Linear, variance: A
 
 
 def freed(swings: int, unknowns: int) -> float:
-    """Return the factor by which unknowns fitted to few swings lessen their scatter, at most `tuning.MOST_FREED`."""
+    """Return the factor by which a fit reduces the scatter of few swings, at most `tuning.MOST_FREED`."""
     return swings / max(swings - unknowns, swings / tuning.MOST_FREED)
 
 
@@ -481,7 +481,7 @@ def unpredicted(problem: Problem, point: Point, jacobian: Array, seed: int, prob
 
 
 def _spread(variance: Array, reach: int = 2) -> Array:
-    """Return running means of the variance: a few probes give it only roughly."""
+    """Return running means of the variance, because a few probes give it only roughly."""
     padded = np.pad(variance, ((reach, reach), (0, 0)), mode="edge")
     total = np.zeros_like(variance)
     for shift in range(2 * reach + 1):

@@ -1,12 +1,12 @@
 """The twin that follows its machine: members drawn from the prior or an estimate, moved by the measured poses.
 
-The members differ in clearances, contact and load gains. They are drawn from the prior at first and again from each
-estimate that stands; new members begin at their places. `members` holds them and their Kalman filter.
+The members differ in clearances, contact and load gains. They are drawn from the prior at first, then from each valid
+estimate; new members begin at the places of the old. `members` holds them and their Kalman filter.
 
 The first member has the middle value of each number and no drawn noise. It is the median twin: a real motion. Before
-the first estimate it is the nominal twin, which no pose moves: moved to the place of a machine with other clearances,
-it would press its own walls, and its forces would be less accurate than without following. The second member is then a
-copy of it that the poses do move: the first estimate begins at its place.
+the first estimate it is the nominal twin, which no pose moves: at the place of a machine with larger clearances it
+would press its own walls, with less accurate forces than without following. Until then the second member is a copy of
+it that the poses move: the first estimate begins at its place.
 """
 
 from __future__ import annotations
@@ -57,12 +57,12 @@ _CALL: Final = 20
 _KNOWN_HZ: Final = 10.0
 #: Bound: poses that wait for the model to reach their stamps; as many as a session keeps to use again.
 _MOST_DUE: Final = MOST_MEASURED
-#: Definition: one row, which is wanted or not; no digest; clearances that do not move.
+#: Definition: arrays for one row with and without intervals, for no digest, and for constant clearances.
 _YES: Final = np.ones(1, bool)
 _NO: Final = np.zeros(1, bool)
 _NO_DIGESTS: Final = np.zeros(0, np.int64)
 _UNMOVED: Final = np.zeros(6)
-#: Definition: no load and no poses.
+#: Definition: an empty load and empty poses.
 _NO_LOAD: Final = Load(np.array([0.0, 1.0]), np.zeros((2, 3)))
 _NO_POSES: Final = Poses(np.zeros(0), np.zeros((0, 3)))
 _LENGTH: Final = struct.Struct("<q")
@@ -87,9 +87,9 @@ class Span:
 
 
 class _Behind(NamedTuple):
-    """Samples that only the first member has taken yet: times, loads, its rows.
+    """Samples that only the first member has used so far: times, loads, its rows.
 
-    `wanted` are the rows that get intervals, `ends` those that end a span of peaks and impulses; with `begins` a span
+    `wanted` are the rows with intervals, `ends` the rows that end a span of peaks and impulses; with `begins` a span
     begins with the first row.
     """
 
@@ -140,11 +140,11 @@ class Follower:
         self._members, self._seed = members, seed
         self._prior = prior(scene)
         self._speed = scene.wear.travel_speed_m_s if scene.wear is not None else 0.0
-        #: poses and estimates so far, whether they were used or not
+        #: number of poses and estimates so far, used or not
         self.added = 0
-        #: whether the intervals of the forces are wanted at each row, beside those published
+        #: whether each row gets intervals of the forces, not only published rows
         self.every_row = False
-        #: whether a row that is published by itself does not wait for the other members, which `catch_up` advances
+        #: whether a single published row goes out before the other members, which `catch_up` advances
         self.defers = False
         self._behind: _Behind | None = None
         #: smallest and largest load so far, shape (2, 3)
@@ -187,7 +187,7 @@ class Follower:
 
     @property
     def signature(self) -> tuple[bool, ...]:
-        """Which terms the equations have, as of `Twin`."""
+        """Terms of the equations, as in `Twin`."""
         others = self._ensemble.others
         return self._ensemble.first.signature + (() if others is None else others.signature)
 
@@ -229,7 +229,7 @@ class Follower:
         return found
 
     def failure(self, status: int) -> str:
-        """Say why the newest advance that failed did so."""
+        """Return the reason why the newest failed advance failed."""
         return self._ensemble.first.failure(status)
 
     def like(self, scene: Scene) -> Follower:
@@ -261,7 +261,7 @@ class Follower:
         Parameters
         ----------
         ends : ndarray of int64, shape (m,)
-            Rising numbers of the rows that are published: a span of peaks and impulses ends there.
+            Rising numbers of the published rows, each of which ends a span of peaks and impulses.
         begins : bool
             Whether a span begins with the first row.
         """
@@ -271,7 +271,7 @@ class Follower:
     def advance_rows(
         self, t: Array, wrench: Array, rows: Rows | None, digest_after: NDArray[np.int64] = _NO_DIGESTS
     ) -> Advanced:
-        """Advance to some times, as `Twin.advance_rows`; a row allows for all measurements before it.
+        """Advance to given times, as `Twin.advance_rows`; a row uses all measurements before it.
 
         With `defers`, the other members are left to `catch_up` after a row that is published by itself.
         """
@@ -317,7 +317,7 @@ class Follower:
         return failed
 
     def catch_up(self) -> None:
-        """Advance all members to the time of the first: its rows get their intervals, measurements that are due act."""
+        """Advance all members to the time of the first: its rows get their intervals, and due measurements act."""
         behind, self._behind = self._behind, None
         if behind is None:
             return
@@ -348,7 +348,7 @@ class Follower:
         return np.repeat(widening(self.scene, worn), 3, axis=-1)
 
     def _note_clearance(self) -> None:
-        """Keep the clearances of unworn pads as the prior, the estimate or the members give them now."""
+        """Store the present clearances of unworn pads, by the prior, the estimate or the members."""
         self._cell = math.floor(self.time * _KNOWN_HZ)
         known = self._known
         if self.estimate is None and self._ensemble.moved:
@@ -436,15 +436,15 @@ class Follower:
     def add_pose(self, t: float, q: ArrayLike, known: float = -math.inf) -> None:
         """Add a pose measured at `t` in s, shape (3,), NaN where not measured; it acts when the model reaches `t`.
 
-        It acts at `known` in s where that is later. A pose of the last `LATEST_S` acts at once.
+        It acts at `known` in s if that is later. A pose of the last `LATEST_S` acts at once.
         """
         self._add(max(t, known), [t, *np.asarray(q, dtype=np.float64).tolist()])
 
     def add_estimate(self, text: str, t: float) -> None:
         """Add an estimate, JSON as of `Estimate.as_dict`, that is known from `t` in s on.
 
-        It is followed if it knows both clearances, or one while no estimate is followed. After a withdrawn estimate the
-        prior holds again.
+        It is followed if it has both clearances, or at least one while no estimate is followed. After a withdrawn
+        estimate the prior holds again.
         """
         self._add(t, text)
 
@@ -476,13 +476,13 @@ class Follower:
         return self._text
 
     def follow_estimate(self, known: str) -> None:
-        """Follow the estimate that another follower's `known` has."""
+        """Follow the estimate in another follower's `known`."""
         if known != self._text:
             self.catch_up()
             self._begin_anew(known)
 
     def _begin_anew(self, text: str) -> None:
-        """Draw members from an estimate, JSON, or the prior; they begin at the places of those before them."""
+        """Draw members from an estimate (JSON) or the prior; they begin at the places of the members before."""
         before = self._ensemble
         self.drawn += 1
         self._draw(text, self.time, self.wear_depth)
@@ -542,7 +542,7 @@ class Follower:
         return found
 
     def span(self) -> Span:
-        """Return peaks and impulses since the call before, where no publication has ended a span."""
+        """Return peaks and impulses since the previous call, if no publication has ended a span."""
         self.catch_up()
         start, self._span_start = self._span_start, self.time
         found = Span(start, self.time, *self._ensemble.span())
@@ -564,7 +564,7 @@ def follower(scene: Scene, follow: str, members: int, tol: float) -> Follower:
 
 
 def _load_share(text: str) -> Array:
-    """Return the load's error in shares of half its range, (3,), of an estimate, JSON; zero unless it is rough."""
+    """Return the load's error in an estimate (JSON), in shares of half its range, (3,); zero unless it is rough."""
     found = json.loads(text) if text else {}
     rough = State.ROUGH.value in [found.get(axis, {}).get("state") for axis in ("horizontal", "vertical")]
     figures = found.get("figures", {}) if rough else {}

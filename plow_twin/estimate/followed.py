@@ -61,7 +61,7 @@ class Followed:
 
 @dataclass(frozen=True)
 class TakenOver:
-    """An estimate, and the time in s from which on the twins are drawn from it, if `taken`."""
+    """An estimate, and the time in s from which the twins are drawn from it, if `taken`."""
 
     t: float
     estimate: Estimate
@@ -70,7 +70,7 @@ class TakenOver:
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """Rows, the estimates on the way, and peaks and impulses of each span."""
+    """Rows, the estimates in between, and peaks and impulses of each span."""
 
     rows: Followed
     taken_over: list[TakenOver]
@@ -103,7 +103,7 @@ def follow(
     span : float, optional
         Seconds of a span of peaks and impulses; no spans by default.
     seed : int
-        Of all that is drawn.
+        Seed of all draws.
     """
     steps = _Steps(scene, load, poses, gaps, members, seed, span)
     parts = list(steps.rows(dt))
@@ -112,7 +112,7 @@ def follow(
 
 
 class _Steps:
-    """The loop over the load: a session, as of a live twin, gets all measurements in the order of their stamps."""
+    """The loop over the load: a session, as of a live twin, gets all measurements in order of their stamps."""
 
     def __init__(
         self, scene: Scene, load: Load, poses: Poses, gaps: Gaps | None, members: int, seed: int, span: float | None
@@ -150,7 +150,7 @@ class _Steps:
                     self._estimate(window)
 
     def _add_poses(self, until_ns: int) -> None:
-        """Add the poses up to a stamp; the model uses each once it comes to its time."""
+        """Add the poses up to a stamp; the model uses each when it reaches its time."""
         last = int(np.searchsorted(self._pose_stamps, until_ns, side="right"))
         for index in range(self._poses_added, last):
             stamp, q = int(self._pose_stamps[index]), tuple(self._poses.q[index].tolist())

@@ -1,8 +1,8 @@
 """Poses and contact forces fitted together: Gauss-Newton steps from the fit of the poses.
 
 Beside the shared unknowns are the delay of the forces and the logarithm of each cell's gain; the state at the start of
-each swing is eliminated. Moments that are hard to predict count less, Huber's function
-bounds the influence of a moment, and the scatter of the swings' scores widens the intervals (White 1982).
+each swing is eliminated. Moments that are hard to predict have less weight, Huber's function bounds the influence of a
+moment, and the scatter of the swings' scores widens the intervals (White 1982).
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ Array = NDArray[np.float64]
 
 #: Bound: rows, some 200 a second of a window of ten load periods.
 _MOST_ROWS = 6000
-#: Bound: steps, the first of them with draws that probe predictability, number of these draws; gain of the cost that
-#: ends them, that of noise.
+#: Bound: steps; first steps with draws that probe predictability, and number of draws; gain of the cost, that of noise,
+#: below which the steps end.
 _ROUNDS, _DRAWN_ROUNDS, _PROBES, _ENOUGH = 8, 3, 3, 0.5
-#: Step: of the difference quotients to both sides, of the delay in s and of a starting state. With the longer steps of
-#: the poses, to one side, clearances were off by 4 of their deviations.
+#: Step: of the difference quotients to both sides, of the delay in s and of a starting state. The longer one-sided
+#: steps of the poses gave clearances that were off by 4 of their deviations.
 _DELAY_STEP = 2e-5
 _STATE_STEPS = np.array([1e-5, 1e-5, 5e-5, 2e-4, 2e-4, 1.4e-3])
 
@@ -69,9 +69,10 @@ class _At:
 
 @dataclass(frozen=True, eq=False)
 class _Block:
-    """Normal equations of one swing, its starting state eliminated: normal (b, b), score (b,) of the others.
+    """Normal equations of a swing, its starting state eliminated: normal (b, b), score (b,) of the other unknowns.
 
-    `state`, `answer` : (6,), (6, b) step of the state alone, and its derivative by the others' steps; `root` draws it
+    `state`, `answer` : (6,), (6, b) step of the state alone, and its derivative by the steps of the other unknowns;
+    `root` draws it
     """
 
     normal: Array
@@ -136,7 +137,7 @@ class _Joint:
         """Return the joint fit, starting from the fit of the poses."""
         found, cells = self._found, self._cells
         felt = self._feeling.at(found.shared, found.point.states, cells.delay)
-        assert felt is not None  # the cells were looked at there
+        assert felt is not None  # the cells were checked there
         near = np.isfinite(cells.force) & (felt.penetration > -2.0 * tuning.HEAD_ROOM)
         near[:, np.setdiff1d(np.arange(near.shape[1]), cells.pairs)] = False
         self._row, self._pair = np.nonzero(near)
@@ -148,7 +149,7 @@ class _Joint:
             return not_used("the model cannot be run")
         linear, jacobian = self._linearised(at)
         for index in range(_ROUNDS):
-            if index < _DRAWN_ROUNDS:  # at first only the poses limit the draws
+            if index < _DRAWN_ROUNDS:  # at first only the poses bound the draws
                 self._weigh(at.force)
                 known = self._blocks(at, linear, jacobian if index else 0.0 * jacobian)
                 self._jitter = self._unpredicted(at, jacobian, known)
@@ -167,7 +168,7 @@ class _Joint:
         return self._summary(at, covariance)
 
     def _weigh(self, force: Array) -> None:
-        """Set the variance of each entry, from about the force that the motion gives."""
+        """Set the variance of each entry from the force of the motion."""
         noise = self._cells.noise[self._pair]
         self._spread = (
             noise**2 + (tuning.LAW_ERROR * np.nan_to_num(force)) ** 2 + tuning.JITTER_WEIGHT[2] * self._jitter
@@ -215,7 +216,7 @@ class _Joint:
         return self._problem.linearise(at.point), out
 
     def _quotient(self, below: _Place, above: _Place, step: float) -> Array:
-        """Return the derivative of the forces between two places, each a step away; 0 where one cannot be run."""
+        """Return the derivative of the forces between two places, each a step away; 0 where a place cannot be run."""
         one, other = self._force(below), self._force(above)
         if one is None or other is None:
             return np.zeros(len(self._row))
@@ -322,7 +323,7 @@ class _Joint:
         return JointFit(used, place.shared, covariance[:SIZE, :SIZE])
 
     def _unfitted(self, at: _At) -> int:
-        """Return the number of swings whose forces are not those measured: their states are in another optimum."""
+        """Return the number of swings whose forces are not the measured ones: their states are in a false optimum."""
         z = (self._measured - at.force) ** 2 / self._spread
         z, swing = z[np.isfinite(z)], self._swing[np.isfinite(z)]
         count, total = np.bincount(swing), np.bincount(swing, z)

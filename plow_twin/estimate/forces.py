@@ -116,7 +116,7 @@ class ForceEnsemble:
     def advance(self, t: Array, wrench: Array, *, over_time: bool = True) -> Forces:
         """Advance all members through samples of the load believed; `t` (n,) in s, `wrench` (n, 3).
 
-        Without `over_time` the forces at each sample are left at 0: they cost as much as the rest.
+        Without `over_time` the forces at each sample stay 0: they would double the cost.
 
         Raises
         ------
@@ -145,7 +145,7 @@ def quantiles(values: Array) -> Array:
     """Return the nearest-rank quantiles over the first axis, in the order of `POINTS`; no value is below zero."""
     places = [min(int(share * len(values)), len(values) - 1) for share in POINTS]
     out = np.zeros((len(POINTS), *values.shape[1:]))
-    # most pairs are apart in all members: no order to find
+    # most pairs are apart in all members: nothing to sort
     there = values.any(axis=0)
     out[:, there] = np.partition(np.ascontiguousarray(values[:, there].T), places, axis=1)[:, places].T
     return out

@@ -1,4 +1,4 @@
-"""Remaining life: when a clearance reaches its limit, as a distribution over coefficient, clearance now and load.
+"""Remaining life: the time until a clearance reaches its limit, over coefficient, present clearance and load.
 
 Scenarios repeat it with another load or wear coefficient, from the same draws.
 """
@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 
 #: Definition: seconds of an hour.
 HOUR_S = 3600.0
-#: Guard: share of a clearance by which a drawn one may be smaller.
+#: Guard: largest share of a clearance by which a drawn one is smaller.
 _LEAST_SHARE = 0.9
 
 
@@ -78,7 +78,7 @@ class Plan:
     scenarios: tuple[Scenario, ...] = ()
 
     def __post_init__(self) -> None:
-        """Raise LifeError for numbers that no plan can have."""
+        """Raise LifeError for an impossible plan."""
         numbers = {
             "limit_horizontal_m": self.limit_horizontal_m,
             "limit_vertical_m": self.limit_vertical_m,
@@ -140,7 +140,7 @@ class Forecast:
         return np.quantile(np.stack(each, axis=2), (0.1, 0.5, 0.9), axis=0, method="lower")
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it for JSON; null: not reached within the horizon."""
+        """Return the forecast for JSON; null: not reached within the horizon."""
         plan = self.plan
         return {
             **self._times(),
@@ -183,14 +183,14 @@ def forecast(
     Parameters
     ----------
     scene : Scene
-        With wear; its clearances are those now, its loads those expected. `wear.prior_m2_n` gives the 5 % and 95 %
-        points of the coefficient, which is taken as log-normal.
+        With wear; its clearances are the present ones, its loads the expected ones. `wear.prior_m2_n` gives the 5 % and
+        95 % points of the coefficient, which is taken as log-normal.
     plan : Plan
     deviation_m : tuple of float
         Standard deviations of the clearances now, in m.
     known : Coefficient or None
-        Posterior of the wear coefficient from a history of clearances. It includes the size of the load, of which only
-        `tuning.PATH_DEVIATION` is drawn then. None: the prior.
+        Posterior of the wear coefficient from a history of clearances. It includes the uncertainty of the load, so that
+        only `tuning.PATH_DEVIATION` is drawn in addition. None: the prior.
 
     Raises
     ------
@@ -224,7 +224,7 @@ def _forecast(
         coefficient, load = known.draw(plan.draws, rng), 1.0 + tuning.PATH_DEVIATION * rng.standard_normal(plan.draws)
     coefficient = coefficient * multiple
     size = np.array([scene.clearance.horizontal_m, scene.clearance.vertical_m])
-    # a clearance that is hardly known is not negative
+    # also a clearance that is hardly known is not negative
     now = np.maximum(rng.normal(0.0, 1.0, (plan.draws, 2)) * deviation_m, -_LEAST_SHARE * size)
     most = float(coefficient.max() * load.max()) * travel / wear.pad_area_m2
     # a clearance that is smaller now is further from its limit: the path must be as long
@@ -245,7 +245,7 @@ def _forecast(
 
 
 def check_prior(wear: Wear) -> None:
-    """Raise LifeError for a coefficient that contradicts its prior, of which a forecast without a history is made."""
+    """Raise LifeError for a coefficient that contradicts its prior, which a forecast without a history uses."""
     low, high = wear.prior_m2_n
     if not low <= wear.coefficient_m2_n <= high:
         raise LifeError(
@@ -282,7 +282,7 @@ def with_clearances(scene: Scene, horizontal_m: float, vertical_m: float, depth:
     """Return the scene with the estimated clearances, which include all wear so far.
 
     `depth`, shape (8,) in m, is the wear of the pads if known; the clearances before it follow.
-    With running-in they are worn by the growth of the clearances, because they no longer wear like new pads.
+    With running-in the pads are worn by the growth of the clearances, because they no longer wear like new pads.
     """
     wear, new = scene.wear, scene.clearance
     if wear is None:
@@ -290,7 +290,7 @@ def with_clearances(scene: Scene, horizontal_m: float, vertical_m: float, depth:
     if depth is None:
         depth = np.zeros(PAIR_COUNT)
         if wear.running_in_ratio > 1.0:
-            # half of the growth at either of two walls
+            # half of the growth at each of two walls
             depth += 0.5 * max(horizontal_m - new.horizontal_m, 0.0) * np.abs(NORMAL_X)
             depth += 0.5 * max(vertical_m - new.vertical_m, 0.0) * np.abs(NORMAL_Y)
     grown = 0.5 * depth @ np.abs(NORMAL_X), 0.5 * depth @ np.abs(NORMAL_Y)
@@ -301,7 +301,7 @@ def with_clearances(scene: Scene, horizontal_m: float, vertical_m: float, depth:
 def with_estimate(scene: Scene, facts: Mapping[str, Any]) -> tuple[Scene, tuple[float, float]]:
     """Return the scene with the values of an estimate's JSON, and the standard deviations of the clearances in m.
 
-    The contact is the estimated one where a clearance was estimated with it: a softer one bears on other pads.
+    The contact is the estimated one where a clearance was estimated with it: a softer contact loads other pads.
 
     Raises
     ------

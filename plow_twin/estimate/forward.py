@@ -37,7 +37,7 @@ class Motions:
 
 
 class Forward:
-    """Runs one scene with varied numbers; one compiled kernel serves them, since the terms stay.
+    """Runs one scene with varied numbers; all use one compiled kernel, since the terms stay.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ class Forward:
     Raises
     ------
     EstimateError
-        For a scene whose frame gives way.
+        For a scene with a `support`.
     """
 
     def __init__(self, scene: Scene, load: Load) -> None:
@@ -94,7 +94,7 @@ class Forward:
         times : ndarray, shape (n,)
             Times of the rows in s, rising within each run and not before its start.
         depth : ndarray, shape (8,), optional
-            By how much each pad lies further out than the clearances say, in m.
+            Distance in m by which each pad lies further out than by the clearances.
         push : ndarray, shape (3,), optional
             A constant load added to the believed load, in N, N, N m.
         share : ndarray, shape (8,), optional

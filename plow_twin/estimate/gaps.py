@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 _LARGEST = 1e3
 #: Bound: rounds of reweighting.
 _ROUNDS = 4
-#: Guard: singular value of the equations below which an unknown does not follow from the sensors.
+#: Guard: singular value of the equations below which the sensors do not determine an unknown.
 _SINGULAR = 1e-6
 #: Definition: clearances between the pads that face each other, by the two pairs.
 GROUPS: Final = {
@@ -55,7 +55,7 @@ class Gaps:
 
     @staticmethod
     def of(t: ArrayLike, gap: ArrayLike, deviation: float = 0.0) -> tuple[Gaps, int]:
-        """Put rows in order of time; return them and how many had to be left out.
+        """Return rows in order of time, and the number of rows left out.
 
         Left out are rows without a finite stamp or any gap, with a gap beyond 1e3 m, or with a repeated stamp.
 
@@ -75,10 +75,10 @@ class Gaps:
 
 @dataclass(frozen=True, eq=False)
 class GapsFit:
-    """Clearances and poses that follow from measured gaps.
+    """Clearances and poses computed from measured gaps.
 
     poses : the poses where pose and clearances follow from each message
-    clearance, deviation : (2,) horizontal and vertical in m; infinite deviation where it does not follow
+    clearance, deviation : (2,) horizontal and vertical in m; infinite deviation where not determined
     groups : the clearance between facing pads, where both have sensors
     used : number of messages
     contradiction : largest mean residual of a sensor, in constant errors; 0 where no sensor is redundant
@@ -150,7 +150,7 @@ def _fit_one_set(
         unknown[:, : equations.shape[1]] += left @ inverse.T
     x, y = _displacement(unknown, scene)
     clearance = np.median(unknown[:, 2:4], axis=0)
-    # errors of the sensors stay, noise averages out
+    # the errors of the sensors are constant, noise averages out
     spread = error * np.sqrt((inverse[2:4] ** 2).sum(axis=1))
     noise = unknown[:, 2:4].std(axis=0) / np.sqrt(len(t))
     q = np.stack([x, y, unknown[:, 4]], axis=1)
@@ -174,7 +174,7 @@ def _displacement(unknown: Array, scene: Scene) -> tuple[Array, Array]:
 
 
 def _between(rows: Array, t: Array, gap: Array, pairs: NDArray[np.int64], pair: tuple[int, int], theta: Array) -> Array:
-    """Return the clearance between two pads that face each other, shape (n,): where the head is does not matter."""
+    """Return the clearance between two pads that face each other, shape (n,), at any place of the head."""
     first, second = (gap[:, int(np.flatnonzero(pairs == one)[0])] for one in pair)
     both = rows[:, list(pair)].sum(axis=1)
     clearance: Array = first + second + np.cos(theta) * both[0] + np.sin(theta) * both[1] + both[4]

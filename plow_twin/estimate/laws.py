@@ -1,8 +1,8 @@
 """The odds of two laws of a hard contact, by the likelihood of the motion under each.
 
-The features of drawn motions of a law are a smooth function of their unknowns, a polynomial of few terms, and
-normal noise; of a measured motion the likelihood under each law follows, and from it the odds of the two (synthetic
-likelihood: Wood, Nature 466 (2010) 1102; the integral over the parameters after Laplace).
+The features of drawn motions of a law are a smooth function of their unknowns, a polynomial of few terms, plus normal
+noise. This gives the likelihood of a measured motion under each law, and the odds of the two (synthetic likelihood:
+Wood, Nature 466 (2010) 1102; the integral over the parameters after Laplace).
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ Array = NDArray[np.float64]
 
 #: Guard: least variance of a feature.
 _LEAST = 1e-9
-#: Definition: parameters that act to the third power (penetration, damping), and those whose effect changes with them
-#: (clearances).
+#: Definition: parameters that enter to the third power (penetration, damping), and parameters whose effect depends on
+#: them (clearances).
 _CURVED, _CHANGING = (0, 1), (5, 6)
-#: Bound: steps to the likeliest parameters (Levenberg, Marquardt), damping of the first, gain that ends them. Step: of
-#: their difference quotients.
+#: Bound: steps to the likeliest parameters (Levenberg-Marquardt), damping of the first step, gain that ends them. Step:
+#: of their difference quotients.
 _STEPS, _DAMPED, _ENOUGH, _SMALL = 30, 1e-2, 1e-2, 1e-4
 
 

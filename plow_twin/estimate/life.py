@@ -1,4 +1,4 @@
-"""Wear over months in seconds: a few load periods give the mean force on each pad, then many periods are jumped.
+"""Wear over months in seconds: a few load periods give the mean force on each pad, then many periods are skipped.
 
 The wear rate of a pad is k_s <F> v / A (Archard), so depths depend on time, travel speed and coefficient only through
 the exposure E = k_s s / A in 1/N, s the travel in m:  dh/dE = <F>(h).  One path h(E) serves every coefficient. It is
@@ -26,9 +26,9 @@ from plow_twin.run.simulate import simulate
 
 Array = NDArray[np.float64]
 
-#: Guard: wear in m by which the travel of sliding pads is found; too small to matter.
+#: Guard: wear in m that measures the travel of sliding pads; too small to matter.
 _TRACE_M = 1e-12
-#: Bound: rows for one of a path with running-in.
+#: Bound: rows inserted for each row of a path with running-in.
 _FINER = 16
 #: Bound: steps of a path.
 _MOST_STEPS = 400
@@ -72,7 +72,7 @@ def period_of(scene: Scene) -> float:
     Raises
     ------
     LifeError
-        Without either, or where the table is too short to take the means of.
+        Without a load of either kind, or where the table is too short for means.
     """
     omegas = [load.omega_rad_s for load in scene.loads if isinstance(load, Harmonic)]
     if omegas:
@@ -115,7 +115,7 @@ def mean_forces(scene: Scene, depth: Array, tol: float = 1e-6) -> tuple[Array, A
                 f"which the model runs: {error}"
             ) from error
         if trace:
-            # the wear by force and sliding, as the impulse that would wear as much by travel alone
+            # the wear by force and sliding, as an impulse that would cause the same wear by travel alone
             impulses.append((result.wear_depth - depth) * (wear.pad_area_m2 / (trace * wear.travel_speed_m_s)))
         else:
             impulses.append(np.array([values["impulse"] for values in result.statistics.values()]))
@@ -124,7 +124,7 @@ def mean_forces(scene: Scene, depth: Array, tol: float = 1e-6) -> tuple[Array, A
 
 
 def _trace(scene: Scene, period: float) -> float:
-    """Return a wear coefficient in m^2/N that leaves the walls where they are: `_TRACE_M` deep under the weight."""
+    """Return a wear coefficient in m^2/N that hardly moves the walls: `_TRACE_M` deep under the weight."""
     wear = scene.wear
     if wear is None or wear.travel_speed_m_s <= 0.0:
         raise LifeError("wear: got none, or no travel speed, expected a section `wear` with travel_speed_m_s above 0")
@@ -138,7 +138,7 @@ def wear_path(scene: Scene, limit: tuple[float, float], most_exposure: float) ->
     Raises
     ------
     LifeError
-        Where the scene has no wear or no period, or the path does not come to its end.
+        Where the scene has no wear or no period, or the path does not end.
     """
     if scene.wear is None:
         raise LifeError("wear: got none, expected its parameters")
@@ -155,7 +155,7 @@ def wear_path(scene: Scene, limit: tuple[float, float], most_exposure: float) ->
         euler = steady + step * force
         ahead, ahead_deviation = mean_forces(scene, with_running_in(scene.wear, euler))
         change = 0.5 * step * (ahead - force)
-        # noise of the means is no error of the step
+        # noise of the means does not count as an error of the step
         noise = 0.5 * step * np.hypot(deviation, ahead_deviation)
         off = float(np.maximum(np.abs(change) - 2.0 * noise, 0.0).max()) / smallest
         if off > tuning.JUMP[1] and step * float(force.max()) > 1e-3 * smallest:
@@ -177,7 +177,7 @@ def wear_path(scene: Scene, limit: tuple[float, float], most_exposure: float) ->
 
 
 def _finer(columns: list[Array]) -> list[Array]:
-    """Return columns with rows between each two, on straight lines: running-in between rows is neglected."""
+    """Return columns with further rows on straight lines between each two; running-in between rows is neglected."""
     at = np.arange(len(columns[0]), dtype=np.float64)
     more = np.linspace(0.0, at[-1], _FINER * (len(at) - 1) + 1)
     before = np.minimum(more.astype(int), max(len(at) - 2, 0))

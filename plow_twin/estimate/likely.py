@@ -2,9 +2,9 @@
 
 The features of drawn motions, with their mean path over the period, are a quadratic function of their parameters plus
 normal noise (synthetic likelihood: Wood, Nature 466 (2010) 1102). The clearances of largest likelihood are then
-features of a regression, which learns their worth from the drawn motions (semi-automatic approximate Bayesian
-computation: Fearnhead and Prangle, J. R. Stat. Soc. B 74 (2012) 419). A direct regression on the path is not possible:
-it has more parts than there are draws.
+features of a regression, which weighs them by the drawn motions (semi-automatic approximate Bayesian computation:
+Fearnhead and Prangle, J. R. Stat. Soc. B 74 (2012) 419). A direct regression on the path is not possible: it has more
+parts than there are draws.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 #: Guard: least variance of a feature, and least deviation of a drawn parameter.
 _LEAST, _SAME = 1e-14, 1e-12
-#: Definition: parameters whose effect changes with each other: clearances, softness and damping.
+#: Definition: parameters that interact: clearances, softness and damping.
 _CURVED = tuple(combinations_with_replacement(range(4), 2))
 #: Definition: folds of the cross-validation.
 _PARTS = 10

@@ -20,10 +20,10 @@ Array = NDArray[np.float64]
 Deviation = tuple[float, ...]
 #: Definition: no deviation is stated.
 UNSTATED: Deviation = (0.0, 0.0, 0.0)
-#: Derived: a standard deviation from n values is known to 1 / sqrt(2 n): 22 % of a cell in contact, 16 % of poses and
-#: gaps, 10 % of a scatter in a comparison.
+#: Derived: a standard deviation from n values is known to 1 / sqrt(2 n), which is 22 % for a cell in contact, 16 % for
+#: poses and gaps, 10 % for a scatter in a comparison.
 FEWEST_IN_CONTACT, FEWEST_POSES, FEWEST_FOR_SCATTER = 10, 20, 50
-#: Bound: least number of points between two knots at which a load is averaged.
+#: Bound: smallest number of points between two knots over which a load is averaged.
 _FINER = 8
 #: Guard: largest number that can be a head's pose, in m or rad, and a load, in N or N m.
 _LARGEST_POSE, _LARGEST_LOAD = 1e6, 1e15
@@ -53,10 +53,10 @@ class Poses:
 
     @staticmethod
     def of(t: ArrayLike, q: ArrayLike, deviation: Deviation = UNSTATED) -> tuple[Poses, int]:
-        """Put rows in order of time; return them and how many had to be left out.
+        """Return rows in order of time, and the number of rows left out.
 
-        Rows without a finite stamp, without any finite component, with one beyond 1e6, or with a stamp that is there
-        already are left out.
+        Left out are rows without a finite stamp or any finite component, with a component beyond 1e6, or with a
+        repeated stamp.
 
         Raises
         ------
@@ -73,7 +73,7 @@ class Poses:
         return Poses(times[index], rows[index], deviation), len(times) - len(index)
 
     def interval(self) -> float:
-        """Return the distance in s of whole poses, partial poses counted as merged."""
+        """Return the distance in s between whole poses, with partial poses merged."""
         measured = int(np.isfinite(self.q).sum())
         return float(np.median(np.diff(self.t))) * self.q.size / max(measured, 1)
 
@@ -87,9 +87,9 @@ class Poses:
         return Poses(self.t, self.q + by, self.deviation)
 
     def without_spikes(self, level: Array) -> tuple[Poses, int]:
-        """Leave out values far from all four about them; return how many. `level`, shape (3,): noise from row to row.
+        """Leave out values far from all four neighbours; return how many. `level`, shape (3,): noise from row to row.
 
-        Where many are, the sensor is bad, and no row is left out.
+        If there are many, the sensor is bad, and no row is left out.
         """
         if len(self.t) < FEWEST_FOR_SCATTER:
             return self, 0
@@ -105,9 +105,9 @@ class Poses:
         return Poses(self.t, np.where(spikes, np.nan, self.q), self.deviation), count
 
     def fresh(self) -> Poses:
-        """Leave out repetitions of a sensor that is slower than its sender: they are late and share their noise.
+        """Leave out repeated values of a sensor that is slower than its sender: they are late and share their noise.
 
-        A value that stays longer comes from a stopped sensor and is kept.
+        A value repeated for longer comes from a stopped sensor and is kept.
         """
         one, next_one = self.q[:-1], self.q[1:]
         again = ((one == next_one) | (np.isnan(one) & np.isnan(next_one))).all(axis=1)
@@ -159,7 +159,7 @@ class Load:
         return Load(times[index], rows[index], deviation), len(times) - len(index)
 
     def between(self, start: float, end: float) -> Load:
-        """Return the samples that matter in [start, end]."""
+        """Return the samples that determine the load in [start, end]."""
         first = max(int(np.searchsorted(self.t, start, side="right")) - 1, 0)
         last = min(int(np.searchsorted(self.t, end, side="left")) + 1, len(self.t))
         return Load(self.t[first:last], self.wrench[first:last])
@@ -222,7 +222,7 @@ class Load:
     def smooth(self, step: float) -> Load:
         """Return a cubic spline through the samples, each `step` s, with `tuning.COARSE_GAIN` as stated deviation.
 
-        A sample taken so rarely may be an average, which lessens the amplitude and keeps the shape.
+        A sample taken so rarely may be an average, which reduces the amplitude and keeps the shape.
         """
         t = np.linspace(self.t[0], self.t[-1], math.ceil((self.t[-1] - self.t[0]) / step) + 1)
         size = tuning.COARSE_GAIN * np.sqrt((self.wrench**2).mean(axis=0))
@@ -230,7 +230,7 @@ class Load:
         return Load(t, np.asarray(CubicSpline(self.t, self.wrench)(t), np.float64), (fx, fy, moment))
 
     def thinned(self, share: float = 1e-3) -> Load:
-        """Leave out samples that straight lines give within `share` of the range (Ramer, Douglas and Peucker)."""
+        """Leave out samples that straight lines reproduce within `share` of the range (Ramer, Douglas and Peucker)."""
         return self.kept(self.significance(share) > share)
 
     def kept(self, keep: NDArray[np.bool_]) -> Load:
@@ -238,7 +238,7 @@ class Load:
         return Load(self.t[keep], self.wrench[keep])
 
     def significance(self, share: float) -> Array:
-        """Return for each sample the share of the range from which on `thinned` leaves it out, shape (n,).
+        """Return for each sample the smallest `share` at which `thinned` leaves it out, shape (n,).
 
         Infinite for the ends; 0 for samples that `share` leaves out too.
         """
@@ -246,7 +246,7 @@ class Load:
         rows = self.wrench / np.where(scale > 0.0, scale, 1.0)
         out = np.zeros(len(rows))
         out[[0, -1]] = np.inf
-        # all lines of a generation at once; lines within a line that is left out are left out
+        # all lines of a level at once; a line that is left out has no lower levels
         left, right, least = np.array([0]), np.array([len(rows) - 1]), np.array([np.inf])
         while len(left):
             inner = right - left > 1
@@ -275,7 +275,7 @@ class Load:
     def left_open(self) -> Array:
         """Return the spectral density of the impulse missed by lines between the samples, in N2 s and (N m)2 s.
 
-        A load that is as rough between its samples as from sample to sample differs from the lines by Brownian bridges.
+        A load as rough between its samples as from sample to sample differs from the lines by Brownian bridges.
         """
         step = np.diff(self.t)
         slope = np.diff(self.wrench, axis=0) / step[:, None]
@@ -286,7 +286,7 @@ class Load:
     def averaged(self, count: int) -> Load:
         """Return `count` knots at equal distances whose lines are nearest to this load (least squares).
 
-        The remainder has no mean over some knots, so it does not move the head for long.
+        The remainder has a mean of zero over some knots, so it does not move the head for long.
         """
         knots = np.linspace(self.t[0], self.t[-1], count)
         within = max(_FINER, math.ceil(2.0 * len(self.t) / count))
@@ -313,7 +313,7 @@ def own_deviations(brought: Iterable[tuple[float, ...]]) -> Array:
 
 
 def useless_deviation() -> Deviation:
-    """Return the stated deviations of x, y [m], theta [rad] beyond which a component counts as not measured."""
+    """Return the stated deviations of x, y [m], theta [rad] from which a component counts as not measured."""
     return tuple(tuning.MUCH_WORSE * bias for bias in priors.BIAS)
 
 
@@ -323,7 +323,7 @@ def believed(stated: Deviation, q: Array, own: Array) -> tuple[Array, Deviation]
     Parameters
     ----------
     stated : tuple of 3 float
-        Least deviation of each component.
+        Smallest deviation of each component.
     q, own : ndarray, shape (n, 3)
         Poses and their stated deviations, NaN where not stated.
 
@@ -360,7 +360,7 @@ def usable_rows(
     """Return stamps (n,) and rows of numbers by pair (n, 8) in order of time, and how many rows had to be left out.
 
     Left out are rows without a finite stamp or any number, with one beyond `largest`, or with a repeated stamp. `names`
-    are those of the rows and of a number in the `error` that arrays of the wrong shape raise.
+    are the words for the rows and for a number in the message of `error`, raised for arrays of the wrong shape.
     """
     times, rows = np.asarray(t, dtype=np.float64), np.array(values, dtype=np.float64)
     if times.ndim != 1 or rows.shape != (len(times), PAIR_COUNT):

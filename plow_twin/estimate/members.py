@@ -1,8 +1,8 @@
 """The members of a follower: twins drawn from a prior or an estimate, moved by an ensemble Kalman filter.
 
 A pose moves all members with perturbed observations (Burgers et al., Mon. Weather Rev. 126 (1998) 1719), a late pose
-through their covariance with the present. A member whose walls the correction would press on with more than half of the
-head's weight is left alone: behind a hard contact a tenth of a millimetre would be an impact that never was.
+through their covariance with the present. A correction that would press a wall with more than half of the head's weight
+is skipped for that member: behind a hard contact a tenth of a millimetre would cause a false impact.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ Rows = NDArray[np.void]
 LATEST_S: Final = 0.25
 #: Bound: least distance in s of what is kept of the motion.
 _PATH_S: Final = 2e-3
-#: Bound: outlying poses in a row after which they are used: the head has jumped, a single glitch does not last so long.
+#: Bound: outlying poses in a row after which they are used: a glitch does not last so long, the head has jumped.
 _MOST_OUTLYING: Final = 5
 _THETA: Final = DOF_NAMES.index("theta")
 #: Derived: places of c, s, X, Y in the solver's state.
@@ -61,7 +61,7 @@ class Ensemble:
     ) -> None:  # fmt: skip
         scenes, gain = draw_scenes(scene, known, members, rng) if members > 1 else ([scene], np.ones((1, 3)))
         scenes[0], gain[0] = middle_of(scene, known)
-        #: whether poses move the first member, whose numbers are those of an estimate; else its double, the second
+        #: whether poses move the first member, drawn from an estimate; otherwise its copy, the second
         self._steers_first = known.horizontal_state is not State.PRIOR
         if not self._steers_first and members > 1:
             scenes[1], gain[1] = scenes[0], gain[0]
@@ -149,7 +149,7 @@ class Ensemble:
         self._newest = whole[:, -1]
 
     def settle(self) -> None:
-        """Copy rates, wear and penetration from the newest rows, which few samples need."""
+        """Copy rates, wear and penetration from the newest rows; only when they are needed."""
         rows, self._newest = self._newest, None
         if rows is not None:
             self._v, self.worn, self._depth = rows["v"].copy(), rows["wear_depth"].copy(), rows["penetration"].copy()
@@ -219,10 +219,10 @@ class Ensemble:
         return out
 
     def stand_like(self, before: Ensemble, wrench: Array) -> None:
-        """Take the places, in shares of the clearances, and the sums of other members under a load.
+        """Take over the places of other members, in shares of the clearances, and their sums, under a load.
 
-        The first member of an estimate takes the place of a prior's second, which the poses have moved; the second
-        member of a prior takes that of an estimate's first.
+        The first member of an estimate takes the place of a prior's second member, which the poses have moved; the
+        second member of a prior takes the place of an estimate's first.
         """
         before.settle()
         from_ = np.where(before.good, np.arange(len(before.good)), int(np.argmax(before.good)))[: len(self.good)]
@@ -247,16 +247,16 @@ class Ensemble:
         self._stand(places, np.tile(v, (len(places), 1)), force)
 
     def _room(self) -> Array:
-        """Return the room of the head, horizontally, vertically, and at its corners, shape (m, 3); 1 if locked."""
+        """Return the free space of the head: horizontal, vertical, and at its corners, shape (m, 3); 1 if locked."""
         room = np.column_stack([self._clearance, self._clearance.min(axis=1)])
         return np.where(self._free, room, 1.0)
 
     def _shares(self, room: Array) -> Array:
-        """Return the room of each member over another room, shape (m, 3)."""
+        """Return the free space of each member over another free space, shape (m, 3)."""
         return np.divide(self._room(), room, out=np.ones_like(room), where=room > 0.0)
 
     def _stand(self, q: Array, v: Array, force: Array, which: NDArray[np.int64] | None = None) -> None:
-        """Put members to poses, or nearer to the middle where a pair would be pressed by more than a force, (m, 8)."""
+        """Move members to poses, or to places nearer the middle where a pair would bear more than a force, (m, 8)."""
         low, high = np.zeros(len(q)), np.ones(len(q))
         free = self._allowed(q, force)
         low[free] = 1.0
@@ -268,7 +268,7 @@ class Ensemble:
         self._put(which, self._nearer(q, low)[which], v[which])
 
     def _nearer(self, q: Array, share: Array) -> Array:
-        """Return poses nearer to the middle, as far as the head is free to move."""
+        """Return poses moved toward the middle in the directions in which the head is free."""
         return np.where(self._free, share[:, None] * q, q)
 
     def correct(self, t: float, q: Array, noise: Array, load_error: Array) -> bool:
@@ -304,7 +304,7 @@ class Ensemble:
         white = self._rng.standard_normal((len(then), len(there)))
         white[0] = 0.0
         off = _off(q, then, there)
-        # bounded, so that one bad pose does not outweigh all others
+        # bounded, so that a bad pose does not outweigh all others
         most = tuning.OUTLYING * noise[there]
         self.square += ((off.clip(-most, most) / noise[there]) ** 2).sum(axis=1)
         weight = np.linalg.solve(scatter, seen[use].T @ about[use] / freedom)
@@ -321,7 +321,7 @@ class Ensemble:
         return True
 
     def _drift(self, load_error: Array) -> None:
-        """Let the errors of the loads drift as Ornstein-Uhlenbeck processes, that of the first without noise."""
+        """Let the errors of the loads drift as Ornstein-Uhlenbeck processes, the first member's without noise."""
         now, before = self.first.time, self._drifted
         self._drifted = now
         if load_error.any() or self._load_off.any():
@@ -331,7 +331,7 @@ class Ensemble:
             self._load_off = kept * self._load_off + math.sqrt(1.0 - kept**2) * load_error * white
 
     def _recover(self) -> None:
-        """Put members that have left the model's range to the places of others; leave them if all have left."""
+        """Move members that have left the model's range to the places of others, unless all have left."""
         lost, left = np.flatnonzero(~self.good), np.flatnonzero(self.good)
         self.good[:] = True
         if not len(lost) or not len(left):
@@ -348,7 +348,7 @@ class Ensemble:
         return found
 
     def _allowed(self, q: Array, force: Array) -> NDArray[np.bool_]:
-        """Return which members may be put to poses (m, 3): no pair is pressed by much more than a force, (m, 8)."""
+        """Return which members may be moved to poses (m, 3): no pair bears much more than a force, (m, 8)."""
         return np.asarray((self._force(self._penetration(q)) < force + self._pressed).all(axis=1))
 
     def _put(self, which: NDArray[np.int64], q: Array, v: Array) -> None:
@@ -406,7 +406,7 @@ def _bytes(rows: Rows) -> NDArray[np.uint8]:
 
 
 def _off(q: Array, then: Array, there: NDArray[np.int64]) -> Array:
-    """Return by how much a pose differs from others (..., k) in the coordinates `there`; angles up to full turns."""
+    """Return a pose minus others (..., k) in the coordinates `there`, angles up to full turns."""
     off: Array = q[there] - then
     turn = there == _THETA
     off[..., turn] = np.remainder(off[..., turn] + np.pi, 2.0 * np.pi) - np.pi
@@ -414,7 +414,7 @@ def _off(q: Array, then: Array, there: NDArray[np.int64]) -> Array:
 
 
 def _worn(one: Scene, scene: Scene, worn: Array, moved: Array) -> Scene:
-    """Return a member's scene with worn pads; the wear accounts for `moved` (2,) of its clearances."""
+    """Return a member's scene with worn pads, whose wear is the part `moved` (2,) of its clearances."""
     assert scene.wear is not None
     depths = tuple(worn.tolist())
     horizontal, vertical = one.clearance.horizontal_m - moved[0], one.clearance.vertical_m - moved[1]

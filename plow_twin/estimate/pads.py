@@ -1,9 +1,9 @@
 """The clearance by groups of pads.
 
-The two pads of a wall may be worn differently, which turns the wall. These turns are found beside a fit of the
-clearances by one linearised step, all other unknowns eliminated; their intervals show whether the motion determines
-them. If walls are turned so far that the fit does not hold, it is repeated with turned walls. A pose cannot separate
-the clearance on one side of the head from that on the other: the difference is the sensor's bias.
+The two pads of a wall may be worn differently, which turns the wall. One linearised step beside a fit of the clearances
+finds these turns, with all other unknowns eliminated; their intervals show whether the motion determines them. If walls
+are turned so far that the fit does not hold, it is repeated with turned walls. A pose cannot divide a clearance between
+the two sides of the head: the difference is the sensor's bias.
 """
 
 from __future__ import annotations

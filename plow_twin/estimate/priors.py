@@ -9,8 +9,8 @@ from plow_twin.model.scene import Mark, Scene
 #: Prior: standard deviation of a number without a stated one, by mark. Drawings do not show the wear of a clearance,
 #: and a contact's numbers are seldom known unless measured. Mass and inertia follow from a drawing to some percent, a
 #: frame's sides to a tolerance and the rounding of its corners. The exponent belongs to an idealised law; friction is
-#: seldom documented. Units: m for lengths, the logarithm of
-#: stiffness and damping (of a restitution its logit), shares of mass and inertia, else the number's own.
+#: seldom documented. Units: m for lengths, the logarithm of stiffness and damping (the logit of a restitution), shares
+#: of mass and inertia, otherwise the number's own.
 DEFAULTS: Final[dict[str, dict[Mark, float]]] = {
     "clearance": {Mark.GIVEN: 8e-3, Mark.MEASURED: 2e-3, Mark.RECONSTRUCTED: 8e-3, Mark.ASSUMED: 8e-3},
     "stiffness": {Mark.GIVEN: 2.5, Mark.MEASURED: 0.5, Mark.RECONSTRUCTED: 2.5, Mark.ASSUMED: 2.5},
@@ -21,7 +21,7 @@ DEFAULTS: Final[dict[str, dict[Mark, float]]] = {
     "exponent": {Mark.GIVEN: 0.07, Mark.MEASURED: 0.03, Mark.RECONSTRUCTED: 0.07, Mark.ASSUMED: 0.07},
     "friction": {Mark.GIVEN: 0.05, Mark.MEASURED: 0.02, Mark.RECONSTRUCTED: 0.05, Mark.ASSUMED: 0.05},
 }
-#: Prior: deviation in m of the radius of corners, half of a normal distribution, where the scene states none.
+#: Prior: deviation in m of the radius of corners, half-normal, where the scene states no radius.
 ROUNDING: Final = 3e-3
 #: Prior: standard deviations of a sensor's scales of x, y and theta; an angle often comes from two distances.
 SCALES: Final = (5e-3, 5e-3, 1e-2)

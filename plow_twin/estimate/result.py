@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 #: Derived: quantile of the normal distribution at which a 90 % interval ends.
 NORMAL_P95: Final = float(ndtri(0.95))
-#: Guard: standard deviations beyond which the normal distribution's tail is as good as exponential.
+#: Guard: standard deviations beyond which the tail of the normal distribution is nearly exponential.
 _FAR = 30.0
 _STANDARD: Final = NormalDist()
 
@@ -106,7 +106,7 @@ class ForcesUsed:
     """How measured contact forces were used.
 
     cells : by pair
-    delay : by which their stamps are later than the motion, in s
+    delay : of their stamps behind the motion, in s
     unused : why they do not improve the estimate; empty where they do
     """
 
@@ -115,7 +115,7 @@ class ForcesUsed:
     unused: str = ""
 
     def in_units(self, force: float, time: float) -> ForcesUsed:
-        """Return it where forces and times were in these units."""
+        """Return the result converted from these units of force and time to SI."""
         cells = {
             name: replace(cell, offset=cell.offset * force, noise=cell.noise * force)
             for name, cell in self.cells.items()
@@ -157,7 +157,7 @@ class Motion:
         return self.measured - self.model
 
     def in_units(self, length: float, time: float) -> Motion:
-        """Return it where lengths and times were in these units."""
+        """Return the result converted from these units of length and time to SI."""
         scale = np.array([length, length, 1.0])
         return Motion(self.t * time, self.measured * scale, self.model * scale)
 
@@ -183,7 +183,7 @@ class Estimate:
     bias_x, bias_y, bias_theta : Interval
         Measured minus true pose in m, m, rad.
     delay : Interval
-        By which the stamps are later than the motion, in s.
+        Delay of the stamps behind the motion, in s.
     noise : tuple of float
         Standard deviation of the measured x, y, theta in m, m, rad.
     model, sensor : str
@@ -198,11 +198,11 @@ class Estimate:
     forces_measured : ForcesUsed, optional
         How measured contact forces were used, where there were some.
     differs : dict of str to (float, float, float)
-        Of each further quantity of machine and sensor: probability that it differs from the scene, and the difference
-        then: mean and standard deviation.
+        For each further quantity of machine and sensor: the probability that it differs from the scene, and mean and
+        standard deviation of the difference if it does.
     apparent : tuple of (Interval, Interval), optional
-        The clearances of a machine of exactly the scene's frame that moves like the measured one, in m, where they are
-        known better than the clearances: twins are drawn from them.
+        The clearances in m of a machine with exactly the scene's frame that moves like the measured one, where these
+        are known better: twins are drawn from them.
     motion : Motion, optional
         What was fitted; None where the motion is not known moment by moment. It is no part of `as_dict`.
     """
@@ -237,7 +237,7 @@ class Estimate:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Estimate:
-        """Return the estimate of which `data` is `as_dict`, without groups, figures and motion."""
+        """Return the estimate from `data`, made by `as_dict`, without groups, figures and motion."""
 
         def clearance(name: str) -> tuple[Interval, State]:
             one = data[name]
@@ -280,7 +280,7 @@ class Estimate:
         return {name: value for name, value in every if value is not None}
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it for JSON, as `plow-twin estimate --json` prints it."""
+        """Return the estimate for JSON, as `plow-twin estimate --json` prints it."""
 
         def clearance(value: Interval, state: State) -> dict[str, Any]:
             return {"mean_m": value.mean, "p05_m": value.p05, "p95_m": value.p95, "state": state.value}

@@ -59,7 +59,7 @@ def refine(
 ) -> tuple[Problem, Fit] | None:  # fmt: skip
     """Fit all poses from a good start: the beginning of each swing first.
 
-    From a start `close` to the optimum, long swings of a hard contact converge too.
+    From a start `close` to the optimum, also long swings of a hard contact converge.
 
     `drift` (3,) is the spectral density of the acceleration by the unknown part of a broad-band load in m2/s3 and
     rad2/s3, None for another load; `turns` (4,) are the turns of the walls, in m.
@@ -76,7 +76,7 @@ def refine(
     window = cut(unknowns.scene, poses, period, shortest)
     near = Problem(forward, unknowns, window, horizon=min(max(0.2 * period, rows[0]), horizon), turns=turns)
     starts = [shared]
-    if unknowns.is_hard(shared):  # only hard contacts are best from there
+    if unknowns.is_hard(shared):  # good for hard contacts only
         starts.append(range_of_hard(unknowns, poses, shared))
     fits = []
     for start in starts:

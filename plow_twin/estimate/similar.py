@@ -1,4 +1,4 @@
-"""Machines of other sizes, estimated in units in which they have the paper's size, for which thresholds were chosen.
+"""Machines of other sizes, estimated in units that give them the paper's size, for which thresholds were chosen.
 
 The equations of motion keep their form in other units of length, mass and time (mechanical similarity). Units are
 powers of two, so nothing is rounded.
@@ -57,7 +57,7 @@ class Units:
         return self.mass * self.length / self.time**2
 
     def scene(self, scene: Scene) -> Scene:
-        """Return a scene without loads and wear in these units."""
+        """Return a scene, without loads and wear, in these units."""
         length, mass, time = self.length, self.mass, self.time
         head, frame, clearance, gravity = scene.head, scene.frame, scene.clearance, scene.gravity
         x, y = head.com_offset_m
@@ -117,7 +117,7 @@ class Units:
         return replace(forces, t=forces.t / self.time, force=forces.force / self.force)
 
     def in_si(self, found: Estimate, scene: Scene) -> Estimate:
-        """Return an estimate in these units in SI units, for the `scene` in SI units."""
+        """Return an estimate converted from these units to SI, for the `scene` in SI units."""
         contact = scene.contact
         length, time = self.length, self.time
         unit = {

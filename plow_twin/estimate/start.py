@@ -24,7 +24,7 @@ _CANDIDATES = 12
 
 
 def filled(poses: Poses) -> Array:
-    """Return the poses with gaps of single components bridged by straight lines, zeros for one never measured."""
+    """Return the poses with gaps of components bridged by straight lines; zeros for a component never measured."""
     out = np.zeros_like(poses.q)
     for i, column in enumerate(poses.q.T):
         there = np.isfinite(column)
@@ -133,7 +133,7 @@ def noise_level(q: Array) -> Array:
 
 
 def first_vectors(problem: Problem, most: int) -> list[Array]:
-    """Return the most promising shared unknowns to start from, shape (11,) each, best first.
+    """Return the most promising starts of the shared unknowns, shape (11,) each, best first.
 
     For each of several stiffnesses and dampings the clearances are set so that the simulated range of motion is the
     measured one, and the delay so that the motions agree best.

@@ -2,7 +2,7 @@
 
 They are read as `tuning.NAME` where they are used, so that `benchmark/tuning_sensitivity.py` can vary them;
 `benchmark/results/tuning.md` shows them with the sensitivity that it measured. Seeds: `benchmark/estimate.py`.
-A penetration is that under the reference force of 100 kN.
+Penetrations are those under the reference force of 100 kN.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ class Tuned:
     Attributes
     ----------
     unit : str
-        Its unit; the part behind a comma belongs to the next element.
+        Its unit; commas separate the units of several elements.
     meaning : str
         Where it acts.
     basis : str
-        What it was set on.
+        The data that it was set on.
     """
 
     unit: str

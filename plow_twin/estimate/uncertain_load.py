@@ -1,8 +1,8 @@
 """Clearances where the load believed does not explain the motion, or where its angle was not measured.
 
 Motions with drawn clearances, contacts and errors of the load are simulated and seen as the sensor sees. A regression
-among those near the measured motion corrects what `equation_error` finds (without an angle: how far the head moves),
-and gives its deviation (approximate Bayesian computation with local-linear adjustment, as in `bouncing`).
+among the motions near the measured one corrects the result of `equation_error` (without an angle: the head's range) and
+gives its deviation (approximate Bayesian computation with local-linear adjustment, as in `bouncing`).
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Compared:
     touched : (2,) whether the head was seen to touch both walls of a direction
     ln_depth, ln_damping : mean and deviation of the logarithms of the penetration in m under the reference force and
         of the damping
-    distance : of the measured motion from nearby drawn ones, over the distance of drawn ones from each other
+    distance : of the measured motion from nearby drawn motions, over the distance of drawn motions from each other
     load_error : error of the load over its amplitude
     """
 
@@ -58,7 +58,7 @@ class Compared:
 
 @dataclass
 class _Spread:
-    """Distribution of the draws: centre of the clearances (2,) in m, means and deviations of all that is drawn."""
+    """Distribution of the draws: centre of the clearances (2,) in m, means and deviations of the other numbers."""
 
     centre: Array
     about: float
@@ -159,7 +159,7 @@ def _with_angle(seen: MotionFeatures, felt: Load, unknowns: Unknowns, poses: Pos
 
 
 def _without_angle(seen: MotionFeatures, felt: Load, unknowns: Unknowns, poses: Poses) -> _Look:
-    """Return the same where only x and y were measured: the head's range stands for the walls."""
+    """Return the same where only x and y were measured, with the head's range in place of the walls."""
     nominal, deviations = unknowns.nominal(), unknowns.deviations()
 
     def features(q: Array) -> Array:
@@ -195,7 +195,7 @@ def _draw(spread: _Spread, rng: np.random.Generator) -> tuple[Array, Array, floa
 
 
 def _with_exponent(unknowns: Unknowns, rng: np.random.Generator) -> Unknowns:
-    """Return the prior about a scene whose exponent is larger in half of the draws: no wall is stiffest at its face."""
+    """Return the prior about a scene; half of the draws have a larger exponent: no wall is stiffest at its face."""
     step = tuning.UNCERTAIN_EXPONENT * max(0.0, rng.standard_normal())
     contact = unknowns.scene.contact
     return replace(unknowns, scene=replace(unknowns.scene, contact=replace(contact, exponent=contact.exponent + step)))

@@ -1,8 +1,8 @@
 """The vector of unknowns, its prior, and the scene of a vector.
 
 Softness stands for the stiffness: u = (F0 / K)^(1/n) is the penetration in m under the reference force F0, and the
-unknown is psi = ln(u + u0). For soft contacts it acts as ln K, for hard contacts as the compliance: the motion shows
-only that K is large then, and psi has a lower end.
+unknown is psi = ln(u + u0). For soft contacts it acts as ln K, for hard contacts as the compliance: their motion only
+shows that K is large, and psi has a lower end.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Quantity:
     step : float, optional
         Step of its difference quotient; None where the derivative is known exactly.
     fine_step : float, optional
-        The same with measured forces, which are less linear.
+        Step with measured forces, which are less linear.
     probe : float
         Standard deviation of the displacement that probes predictability.
     """
@@ -55,10 +55,10 @@ class Quantity:
     probe: float = 0.0
 
 
-#: Prior: all that is estimated, in the order of a vector of unknowns: the clearances in m, the softness psi (given as
-#: the stiffness), the logarithm of the damping (of a restitution its logit), three gains of the load, three biases and
-#: the delay of the sensor. The quantities with a `step` move the head and come first; the others change how its
-#: motion is measured.
+#: Prior: the estimated quantities in the order of a vector of unknowns: the clearances in m, the softness psi
+#: (published as the stiffness), the logarithm of the damping (or the logit of a restitution), three gains of the load,
+#: three biases and the delay of the sensor. The quantities with a `step` move the head and come first; the others
+#: change the measurement of its motion.
 QUANTITIES: Final = (
     Quantity("horizontal", "horizontal clearance [mm]", 1e3, ".3f", 8e-3, (1, 0, 0), 2e-4, 1e-5, 5e-5),
     Quantity("vertical", "vertical clearance [mm]", 1e3, ".3f", 8e-3, (1, 0, 0), 2e-4, 1e-5, 5e-5),
@@ -94,8 +94,8 @@ PROBES: Final = np.array([quantity.probe for quantity in QUANTITIES])
 #: Names in the published correlation; softness is the penetration under a force.
 CORRELATED: Final = tuple("softness" if place == SOFTNESS else QUANTITIES[place].name for place in MOVING)
 
-#: Guard: smallest and largest penetration in m that is simulated; harder contacts move the head alike, softer ones let
-#: it through the wall.
+#: Guard: smallest and largest simulated penetration in m; harder contacts all move the head alike, softer ones let it
+#: through the wall.
 _HARDEST, _SOFTEST = 3e-5, 0.12
 #: Guard: smallest clearance in m that is simulated.
 _LEAST_CLEARANCE = 5e-4
@@ -104,7 +104,7 @@ _LEAST_CLEARANCE = 5e-4
 #: The alternative law of a linear contact.
 OTHER_LAW: Final = {"hunt_crossley": "kelvin_voigt"}
 
-#: Guard: least prior deviation; a number stated to be known exactly stays where it is.
+#: Guard: smallest prior deviation; a number stated as exact keeps its value.
 _HELD = 1e-6
 #: Guard: largest prior deviation of a load's gain.
 _MOST_GAIN = 1.0
@@ -137,7 +137,7 @@ class Unknowns:
 
     @staticmethod
     def stated(scene: Scene, load: Load, poses: Poses) -> Unknowns:
-        """Return the prior with the stated deviations of scene, load (as of its gains) and poses."""
+        """Return the prior with the stated deviations of scene, load (for its gains) and poses."""
         unknowns, deviation, contact = Unknowns(scene), _prior(), scene.contact
         deviation[GX] = deviation_of(scene, "clearance.horizontal_m")
         deviation[GY] = deviation_of(scene, "clearance.vertical_m")
@@ -199,7 +199,7 @@ class Unknowns:
 
     @property
     def hardest_believed(self) -> float:
-        """Upper end of the stiffness if the motion shows only that the contact is hard."""
+        """Upper end of the stiffness if the motion only shows that the contact is hard."""
         return float(self.force / (1e-6) ** self.scene.contact.exponent)
 
     def damping_of(self, value: float) -> float:
@@ -246,7 +246,7 @@ def contact_with(contact: Contact, stiffness: float, damping: float | None) -> C
 
 
 def with_other_law(unknowns: Unknowns) -> Unknowns | None:
-    """Return the prior about a scene with the law that its contact may have instead, None where no such is known."""
+    """Return the prior about a scene with the other possible law of its contact, None where there is none."""
     contact = unknowns.scene.contact
     law = OTHER_LAW.get(contact.law)
     if law is None or contact.exponent != 1.0:

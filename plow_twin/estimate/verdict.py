@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 
 COMPONENTS = ("x", "y", "theta")
 
-#: Bound: moments of a window, about, at which a change is looked for.
+#: Bound: approximate number of moments of a window that are tested for a change.
 MOMENTS = 60
 
 
@@ -99,7 +99,7 @@ def _colour(fit: Fit, verdict: Verdict) -> None:
         if quick <= 0.0 or len(rows) < 50:
             continue
         ratio = float(np.mean(np.minimum(np.abs(rows), 5.0 * quick) ** 2) / quick**2)
-        # the ratio's own scatter: mean square and median of third differences
+        # scatter of the ratio itself: mean square and median of third differences
         limit = 1.0 + (tuning.MOST_RATIO - 1.0) + 4.0 * 2.5 / np.sqrt(len(rows))
         verdict.figures[f"colour_{name}"] = ratio
         if ratio > limit and not verdict.sensor:
@@ -109,8 +109,8 @@ def _colour(fit: Fit, verdict: Verdict) -> None:
 def _repeated(problem: Problem, fit: Fit, period: float, verdict: Verdict) -> None:
     """Test whether the residuals repeat with the load (analysis of variance).
 
-    Residuals of a wrong law, or of a wrong shape of the load, repeat in each period; noise and disturbances do not,
-    whatever their colour.
+    Residuals of a wrong law, or of a wrong shape of the load, repeat in each period; noise and disturbances of any
+    colour do not.
     """
     t, there = problem.window.poses.t, predicted(fit)
     turns = np.floor((t - t[0]) / period).astype(int)
@@ -216,7 +216,7 @@ def _stuck(problem: Problem, fit: Fit, verdict: Verdict) -> None:
 
 
 def _noise_change(fit: Fit, verdict: Verdict) -> None:
-    if not fit.finished:  # motion is left over, more in one part than in another
+    if not fit.finished:  # residual motion, more in one part than in another
         return
     for i, name in enumerate(COMPONENTS):
         residual, swing = fit.point.residual[:, i], fit.point.swing
@@ -232,7 +232,7 @@ def _noise_change(fit: Fit, verdict: Verdict) -> None:
 
 
 def _change_within(problem: Problem, fit: Fit, verdict: Verdict) -> None:
-    """Look for a moment at which a bias or a clearance changes (score test, linearised)."""
+    """Search for a moment at which a bias or a clearance changes (score test, linearised)."""
     if problem.window.swings < 6:
         return
     best: dict[str, tuple[float, Array]] = {}
@@ -256,7 +256,7 @@ def _change_within(problem: Problem, fit: Fit, verdict: Verdict) -> None:
         verdict.sensor.append(f"shifted within the window by {shift[0]:.2g} m, {shift[1]:.2g} m, {shift[2]:.2g} rad")
     elif clearance > bias and np.abs(growth).max() > 0.5 * tuning.OBSERVED:
         verdict.model.append(f"machine changed within the window: clearances by {growth[0]:.2g} m, {growth[1]:.2g} m")
-    # the residuals of a wrong load or law look like a change too, which explains little of them
+    # residuals of a wrong load or law also look like a change, but it explains little of them
     verdict.broken |= len(verdict.sensor) + len(verdict.model) > found and share > tuning.CHANGE_SHARE
 
 

@@ -1,8 +1,8 @@
 """Windows of the sliding estimate, formed from arriving samples and poses.
 
-The windows follow from the stamps alone: each ends at a multiple of the interval and is formed once the newest sample
-of the load is later by the waiting time for late data. The order of arrival within that time has no effect, so the
-journal gives the same windows as the live node.
+The stamps alone determine the windows: each ends at a multiple of the interval and is formed once the load is ahead of
+it by the waiting time for late data. The order of arrival within that time has no effect, so the journal gives the same
+windows as the live node.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 #: A stamp in ns and the measured values.
 Row = tuple[int, tuple[float, ...]]
 
-#: Bound: poses, and gaps, that are kept; more come where the load has stopped, or another clock is ahead by hours.
+#: Bound: poses, and gaps, that are kept; more arrive if the load has stopped, or a clock is ahead by hours.
 MOST_KEPT = 600_000
 
 
@@ -65,7 +65,7 @@ class Windows:
     gaps : float
         Stated deviation of a gap sensor in m.
     early : bool
-        Form shorter windows too, from `tuning.WINDOW_SHARES[1]` of the length on, until there are longer ones.
+        Whether windows of `tuning.WINDOW_SHARES[1]` of the length and more are formed until there are longer ones.
     """
 
     def __init__(
@@ -85,11 +85,11 @@ class Windows:
         self.restart()
 
     def restart(self) -> None:
-        """Drop all data: stamps or machine change."""
+        """Drop all data, because the stamps or the machine change."""
         self._loads: list[Row] = []
         self._poses: deque[tuple[int, tuple[float, ...], tuple[float, ...]]] = deque(maxlen=MOST_KEPT)
         self._gaps: deque[tuple[int, tuple[int, ...], tuple[float, ...]]] = deque(maxlen=MOST_KEPT)
-        #: length [s] and rows of poses or gaps of the newest window that was looked at
+        #: length [s] and rows of poses or gaps of the newest window that was checked
         self._left = (0.0, 0)
         self._newest_ns: int | None = None
         self._end_ns: int | None = None
@@ -124,7 +124,7 @@ class Windows:
         return self._form(end_ns)
 
     def last(self) -> Window | str:
-        """Return the window that ends with the newest sample, when the input has ended; or the reason without one."""
+        """Return the window that ends with the newest sample, at the end of the input, or why there is no window."""
         if self._newest_ns is None:
             return "got no load"
         window = self._form(self._newest_ns + 1)
@@ -138,7 +138,7 @@ class Windows:
         )
 
     def _early_end(self, stamp_ns: int) -> int:
-        """Return the end of the longest early window that is due; they count from the first sample."""
+        """Return the end of the longest early window that is due; early windows begin at the first sample."""
         self._first_ns = stamp_ns if self._first_ns is None else self._first_ns
         least, early, growth = tuning.WINDOW_SHARES
         span, end_ns = early * self._length_ns, self._first_ns

@@ -1,8 +1,8 @@
 """The sliding estimate in its own process, so that it does not delay the samples.
 
 `Worker` is the near side: it queues data, which a thread sends. The far side, `python -m plow_twin.estimate.worker`,
-estimates each window that is due and sends the result back. A window that became due while another was computed gives
-way to a newer one.
+estimates each window that is due and sends the result back. A window that became due while another was computed is
+skipped for a newer one.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from plow_twin.model.scene import Scene
 
 #: Bound: interval at which queued data are sent [s].
 _SEND_S: Final = 0.05
-#: Bound: queued items; the far side has stopped reading long before.
+#: Bound: queued items; that many wait only if the far side has stopped reading.
 _MOST_WAITING: Final = 1_000_000
 #: Bound: `nice` of the far side.
 _NICE: Final = 10
@@ -90,7 +90,7 @@ class Worker:
     def __init__(self, scene: Scene, windows: Windows, asked: Asked = _ESTIMATE_ALONE) -> None:
         near, far = Pipe()
         command = [sys.executable, "-m", "plow_twin.estimate.worker", str(far.fileno()), *loaded_laws()]
-        # one thread of linear algebra: at most one core
+        # a single thread of linear algebra takes at most one core
         environment = os.environ | dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")
         self._process = subprocess.Popen(
             command, pass_fds=[far.fileno()], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, env=environment
@@ -101,7 +101,7 @@ class Worker:
         self._waiting: deque[tuple[Any, ...]] = deque()
         self._restarts = 0
         self._closed = threading.Event()
-        #: cause of the end of estimating; empty before
+        #: reason why estimating has ended; empty before
         self.error = ""
         #: after `finish`, once all is done: why the last window could not be estimated, or empty
         self.ended: str | None = None
@@ -135,7 +135,7 @@ class Worker:
 
     @property
     def behind(self) -> bool:
-        """Whether much waits to be handed on."""
+        """Whether much data waits to be sent."""
         return len(self._waiting) > _MOST_WAITING // 10
 
     def poll(self) -> Found | None:
@@ -156,7 +156,7 @@ class Worker:
                 return found if found.restarts == self._restarts else None
         except (EOFError, OSError):
             code = self._process.poll()
-            if code is not None:  # else it is about to end, and the next call finds the code
+            if code is not None:  # otherwise it is about to end, and the next call finds the code
                 self._fail(f"the estimator ended with code {code}")
         return None
 

@@ -27,7 +27,7 @@ _said: set[str] = set()
 def _load_numba() -> None:
     """Load numba's tables of types and of code without SciPy's linear algebra, which takes 0.15 s, a third of a start.
 
-    Numba imports it only to learn whether a BLAS is there; compiled functions that use one import it themselves.
+    Numba imports it only to check for a BLAS; compiled functions that use a BLAS import it themselves.
     """
     found = linalg.ensure_blas
     linalg.ensure_blas = lambda: None
@@ -117,7 +117,7 @@ def save_or_warn(dispatcher: Any) -> None:
 def for_arguments(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Callable[..., Any]:
     """Return an entry compiled for the types of these arguments; a call of it does not look at types.
 
-    For calls whose types never change: numba needs longer to look at nested tuples and records than a sample takes.
+    For calls whose types never change: numba takes longer to inspect nested tuples and records than a sample takes.
     """
     compile_for = getattr(function, "compile", None)
     if compile_for is None:

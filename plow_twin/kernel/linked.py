@@ -1,8 +1,8 @@
 """Two compilers for numba: one for kernels that only kernels call, one for kernels that Python calls too.
 
 LLVM optimises a kernel together with everything that it calls. Numba would also optimise each called kernel alone and
-make machine code of it, a quarter of the time of compiling; the first compiler stops at code for linking. Both use
-numba's extension point (its manual, "Customizing the Compiler") and lower into a code library of their own.
+generate its machine code, a quarter of the compile time; the first compiler stops at code for linking. Both use numba's
+extension point (its manual, "Customizing the Compiler") and lower into a code library of their own.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class LinkedLibrary(JITCodeLibrary):
     def __init__(self, codegen: Any, name: str) -> None:
         super().__init__(codegen, name)
         self._exported: list[str] = []
-        #: whether sums may be reordered and fused: then the bits may depend on the caller it is inlined into
+        #: whether sums may be reordered and fused, so that the bits may depend on the caller it is inlined into
         self.fast = False
 
     def add_ir_module(self, ir_module: llvmlite.ir.Module) -> None:
@@ -75,8 +75,8 @@ class EntryLibrary(JITCodeLibrary):
     """The code of a kernel that Python calls, with its own copy of every kernel that it calls.
 
     Shared copies would come from the entry that is loaded first: optimised for another caller, they may differ in the
-    last bit. Copies become internal before LLVM optimises, so that it inlines a kernel with one caller; those of `fast`
-    kernels only afterwards: inlined for that reason, their sums would be reordered in other ways.
+    last bit. Copies become internal before LLVM optimises, so that it inlines kernels with one caller. Copies of `fast`
+    kernels become internal afterwards: inlining would reorder their sums in other ways.
     """
 
     def _optimize_final_module(self) -> None:
@@ -147,7 +147,7 @@ class EntryCompiler(_Compiler):
     lowering = _LowerForPython
 
     def compile_extra(self, func: Any) -> Any:
-        """Compile with the collection of garbage paused, which is a seventh of the time: little is freed."""
+        """Compile with garbage collection paused: it would take a seventh of the time and free little."""
         with garbage_kept():
             return super().compile_extra(func)
 

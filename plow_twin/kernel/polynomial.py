@@ -1,7 +1,7 @@
 """Polynomials on an interval: guaranteed sign, first root and maximum, from the Bernstein form.
 
-A polynomial lies within the hull of its Bernstein coefficients, and has no more roots than they have sign changes;
-halving the interval sharpens both (Farouki, Comput. Aided Geom. Des. 29 (2012) 379).
+A polynomial lies within the hull of its Bernstein coefficients, and has at most as many roots as they have sign
+changes; halving the interval sharpens both bounds (Farouki, Comput. Aided Geom. Des. 29 (2012) 379).
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ class Lanes(types.Type):
 
 
 class ExactLanes(Lanes):
-    """The same, but each operation is rounded as written: the surrounding code changes no bit."""
+    """The same, but each operation is rounded as written, so that the surrounding code changes no bit."""
 
     flags = ()
 
@@ -72,7 +72,7 @@ def _load(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
 
 @_operation
 def row(typingctx: Any, array: Any, index: Any) -> Any:
-    """Return row `index` of a contiguous array of shape (n, 8), or row 0 of one of shape (8,)."""
+    """Return row `index` of a contiguous array of shape (n, 8), or all of an array of shape (8,)."""
     return lanes(array, index), _load
 
 
@@ -207,7 +207,7 @@ def choose(typingctx: Any, bits: Any, there: Any, elsewhere: Any) -> Any:
 
 @_operation
 def fused(typingctx: Any, factor: Any, other: Any, term: Any) -> Any:
-    """Return factor * other + term of each, rounded once where the processor can."""
+    """Return factor * other + term of each lane, rounded once where the processor can."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         kind = ir.FunctionType(_VECTOR, [_VECTOR] * 3)

@@ -63,7 +63,7 @@ class Face:
 
         In a turn the speed falls linearly to zero and rises to the other side; half of it belongs to each pass.
         """
-        # the turn happens within the face: its end is reached in the middle of the turn
+        # the turn lies within the face, whose end is reached in the middle of the turn
         steady = (self.length_m - 0.5 * self.speed_m_s * self.turn_s) / self.speed_m_s
         period = steady + self.turn_s
         number = np.floor(t / period).astype(np.int64)
@@ -98,7 +98,7 @@ class CuttingLoad:
     variation : float
         Coefficient of variation of the cutting force.
     correlation_m : float
-        Distance along the face over which the correlation falls to 1/e [m].
+        Distance along the face at which the correlation has fallen to 1/e [m].
     seed : int
 
     Raises
@@ -124,7 +124,7 @@ class CuttingLoad:
             raise ArgumentError(f"turn_s: got {face.turn_s!r}, expected less than two passes of {face.length_m:g} m")
 
     def at(self, t: Array) -> Array:
-        """Return Fx, Fy [N], M [N m] at times `t` (n,) [s], shape (n, 3); in a turn it falls with the speed."""
+        """Return Fx, Fy [N], M [N m] at times `t` (n,) [s], shape (n, 3); in a turn they fall with the speed."""
         position, speed, number = self.face.travel(t)
         force = np.zeros((len(t), 2))
         for one in np.unique(number):

@@ -214,7 +214,7 @@ def summary(lifecycle: str, reason: str, runtime: Runtime | None, preparing: boo
 
 
 def failures(runtime: Runtime) -> list[str]:
-    """Return, in words, how many advances failed, why and when the newest did so, and whence the model went on."""
+    """Return in words how many advances failed, reason and time of the newest failure, and how the model continued."""
     failed = runtime.driver.failed
     if not failed.count:
         return []
@@ -350,7 +350,7 @@ class Health:
         return f"{new} periods left out since the last report" if 0 < runtime.missed_periods <= new else ""
 
     def estimate(self, runtime: Runtime) -> Part:
-        """Return how the estimate is doing."""
+        """Return the state of the estimate."""
         values = dict.fromkeys(KEYS["estimate"], "")
         found = runtime.estimation
         if found is None:
@@ -368,7 +368,7 @@ class Health:
         return (ERROR if found.error else WARN if trouble else OK), trouble or "estimating", values
 
     def follow(self, runtime: Runtime) -> Part:
-        """Return how the twin follows the machine."""
+        """Return the state of following the machine."""
         follower, reduced = runtime.follower, runtime.reduced
         values = dict.fromkeys(KEYS["follow"], "")
         values["follow"] = "off" if follower is None else "full" if follower.steered else "parameters"
@@ -391,7 +391,7 @@ class Health:
         return OK, "following", values
 
     def recorder(self, runtime: Runtime) -> Part:
-        """Return how the recording is doing; loss is an error."""
+        """Return the state of the recording; loss is an error."""
         values = dict.fromkeys(KEYS["recorder"], "")
         if runtime.recording is None:
             return OK, "not recording", values

@@ -1,4 +1,4 @@
-"""Between a live twin and the estimate beside it; imported only where an estimate is wanted."""
+"""Link between a live twin and the estimate beside it; imported only where estimates are made."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ from plow_twin.stream.session import Series, Session
 
 #: Published topics, by base name.
 ESTIMATE, WINDOW_FORCES, FORECAST = ESTIMATES
-#: What a number of a forecast is called in SI.
+#: Names of a forecast's numbers in SI.
 _SI: Final = {"hours": "seconds", "km": "metres"}
-#: How often one looks whether an estimate has come [Hz].
+#: Rate of checks for a finished estimate [Hz].
 RATE_HZ: Final = 10.0
 
 
@@ -51,20 +51,20 @@ class Estimation:
         self._worker = Worker(scene, windows, asked)
         sent = {ESTIMATE: True, WINDOW_FORCES: bool(asked.members), FORECAST: asked.plan is not None}
         self._topics = [topic for topic, wanted in sent.items() if wanted]
-        #: when other pads were set, until an empty message has been sent [ns]
+        #: time at which other pads were set, until an empty message has been sent [ns]
         self._set_ns: int | None = None
-        #: where the clearances come from, and whether model and sensor can be trusted, as of the newest estimate
+        #: origin of the clearances, and trust in model and sensor, by the newest estimate
         self.states = {"horizontal": State.PRIOR, "vertical": State.PRIOR}
         self.trust = {"model": "", "sensor": ""}
         self.reasons: tuple[str, ...] = ()
-        #: estimates that have come, windows that gave way to newer ones, and the time that the newest took [s]
+        #: number of estimates, of windows skipped for newer ones, and the time that the newest estimate took [s]
         self.count = self.skipped = 0
         self.wall_s = 0.0
         self.end_ns: int | None = None
         #: the newest forecast, or the reason why there is no forecast
         self.forecast: dict[str, Any] | None = None
         self.forecast_error = "nothing has been estimated yet"
-        #: the newest one, for a new journal
+        #: the newest estimate, for a new journal
         self.entry: Estimated | None = None
 
     @property
@@ -88,11 +88,11 @@ class Estimation:
 
     @property
     def behind(self) -> bool:
-        """Whether much waits to be read by the estimate."""
+        """Whether much data waits for the estimate."""
         return self._worker.behind
 
     def add(self, entry: Entry) -> None:
-        """Hand an entry that the session has accepted to the estimate."""
+        """Pass an entry that the session has accepted to the estimate."""
         match entry:
             case Sample(stamp_ns, wrench):
                 self._worker.add_load(stamp_ns, wrench)
@@ -111,7 +111,7 @@ class Estimation:
                 self.trust, self.reasons = dict.fromkeys(self.trust, ""), ()
                 self.forecast, self.forecast_error = None, "nothing has been estimated since the pads were set"
             case SetModel():
-                # the clearances now are those of other numbers, so an older estimate no longer applies
+                # the clearances have been replaced, so an older estimate no longer applies
                 self._worker.restart()
                 self._forget()
             case Reset():
@@ -120,14 +120,14 @@ class Estimation:
                     self._forget()
 
     def add_series(self, series: Series) -> None:
-        """Hand samples that have been applied at once to the estimate."""
+        """Pass samples that were applied together to the estimate."""
         for stamp_ns, wrench in zip(series.stamps.tolist(), series.wrench.tolist(), strict=True):
             self._worker.add_load(stamp_ns, tuple(wrench))
 
     def poll(self, session: Session) -> dict[str, plain.JointState]:
-        """Hand an estimate that has come to the session; return its messages by topic; empty without an estimate.
+        """Pass a finished estimate to the session and return its messages by topic, empty without an estimate.
 
-        Once other pads have been set, empty messages take the place of the latched ones.
+        After other pads have been set, empty messages replace the latched ones.
         """
         found = self._worker.poll()
         stamp_ns, self._set_ns = self._set_ns, None
@@ -164,8 +164,8 @@ class Estimation:
 def entry_of(found: Found, session: Session, before: Estimated | None) -> Estimated:
     """Return the journal's entry of an estimate.
 
-    A clearance that cannot be observed stays as it was estimated before, and its interval widens as the wear's prior
-    does; one that is withdrawn is that of the model.
+    A clearance that is not observable keeps its last estimate, with an interval that widens like the wear's prior; a
+    withdrawn clearance is the model's.
     """
     model = session.outputs.modelled(session.wear_depth)
     shift = np.array(before.shift) if before is not None else np.zeros(6)

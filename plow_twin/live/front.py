@@ -34,7 +34,7 @@ NAME: Final = "/plow_twin"
 #: Longest wait for a message [s]: a request to stop is seen within it.
 _POLL_S: Final = 0.1
 _REPORT_S: Final = 1.0
-#: Share of the samples from which on a likely cause is named why they are not used.
+#: Share of unused samples from which a likely cause is named.
 _MANY: Final = 0.01
 
 #: Receives `status`, `alarms` or a part of the diagnostics by name, with level, message and values.
@@ -57,7 +57,7 @@ class BridgeFront:
     Parameters
     ----------
     bridge
-        Where samples come from.
+        Source of the samples.
     mapping
         YAML file of the mapping, or None: recognise columns by name.
     settings, prepared
@@ -106,14 +106,14 @@ class BridgeFront:
         self.runtime = Runtime(self, settings, prepared)
         self._feeder = Feeder(self.roles, self.runtime, self.send, model if "drive" in self.roles else None)
         self._health = diagnostics.Health()
-        #: work that gets its turn while the source is read
+        #: work that is done in turns while the source is read
         self.timers: list[Timer] = []
         self._watchers: list[Watcher] = []
         #: further parts of the diagnostics, by name
         self.more_parts: dict[str, Callable[[], Part]] = {}
 
     def attach(self, watcher: Watcher) -> None:
-        """Let somebody look on from now on."""
+        """Add an observer."""
         self._watchers.append(watcher)
         self.runtime.publishing.watch = self._published
 
@@ -123,7 +123,7 @@ class BridgeFront:
 
     def now_ns(self) -> int:
         """Return the system's time, or the samples' own time [ns]."""
-        # 0 would say that there is no time yet
+        # 0 would mean that there is no time yet
         return (self._feeder.newest_ns or 1) if self.follows_samples else time.time_ns()
 
     def send(self, topic: str, message: memoryview | Message) -> None:
@@ -155,7 +155,7 @@ class BridgeFront:
         return time_text(stamp_ns, own_start=True)
 
     def changed(self) -> None:
-        """Say the status when it is another one."""
+        """Report the status if it has changed."""
         level, message, values = diagnostics.summary("active", "", self.runtime)
         if (level, message, values) == self._said:
             return
@@ -179,7 +179,7 @@ class BridgeFront:
         return [*self._not_read(stop_asked()), *diagnostics.failures(runtime), *lost]
 
     def _not_read(self, stopped: bool) -> list[str]:
-        """Return, in words, the input that never came or was left unread."""
+        """Return in words which input never came or was not read."""
         if self._settings.excitation_source != "excitation":
             return []
         intake, topic = self.runtime.driver.intake, self.roles[_load_role(self.roles)].topic
@@ -195,7 +195,7 @@ class BridgeFront:
         return []
 
     def causes(self) -> list[str]:
-        """Return, in words, likely causes of samples that were not used or reset the motion."""
+        """Return in words likely causes of samples that were not used or that reset the motion."""
         counts, found = self.runtime.driver.intake.counts, []
         many = _MANY * max(1, sum(counts.values()))
         if self._feeder.unfit:
@@ -262,7 +262,7 @@ class BridgeFront:
                 watcher.part(name, part)
 
     def _messages(self, timeout_s: float) -> Messages:
-        """Return the next messages: first those that the check of units has read already."""
+        """Return the next messages, first those that the check of units has already read."""
         if not self._first:
             return self._bridge.poll(timeout_s)
         return self._first.popleft()
@@ -312,7 +312,7 @@ def roles_of(
     if ("drive" in roles) != modelled or {"drive", "excitation"} <= roles.keys():
         raise BridgeError("mapping: expected drive and load_model together, and no excitation beside them")
     if source == "excitation" and not {"drive", "excitation"} & roles.keys():
-        # the content may be no text at all
+        # the content may not be text
         there = "; ".join(f"{topic} ({str(kind)[:120]})" for topic, kind in (topics or {}).items())
         setup = "" if topics is None else "; plow-twin setup FILE writes a mapping"
         raise BridgeError(

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 TOPICS: Final = ("excitation", "tool_forces", "travel", "head_pose", "gaps")
 #: Those besides the load.
 OPTIONAL: Final = ("travel", "head_pose", "gaps")
-#: Another sender counts as there for so long after its last sample [ns].
+#: Time after its last sample for which another sender counts as present [ns].
 _OTHER_SENDER_NS: Final = 3_000_000_000
 #: An optional input that has been heard counts as silent after so long [ns].
 _SILENT_NS: Final = 10_000_000_000
@@ -34,9 +34,9 @@ class Inputs:
     Parameters
     ----------
     front
-        Whom to ask for the time and for the senders that there are.
+        Gives the time and the present senders.
     source
-        The input that the excitation comes on.
+        The input of the excitation.
     depth
         Length of the queue of the excitation.
     late_span_s
@@ -51,11 +51,11 @@ class Inputs:
         self, front: Front, source: str, depth: int, late_span_s: float, *, journaled: bool, **intake: Any
     ) -> None:
         self._front, self._source = front, source
-        #: judges the samples of the load; those that go no further are counted there
+        #: judges the samples of the load, and counts the samples that it refuses
         self.intake = Intake(on_unused=self._sample_unused, **intake)
         #: messages that are not used, for the journal
         self.unused = UnusedMessages(journaled)
-        #: topic and sender of the message that is being taken in, where it is not one of the source
+        #: topic and sender of the message being processed, unless it is from the source
         self.arriving = ("", b"")
         self._poses, self._gap_stamps = RecentStamps(late_span_s), RecentStamps(late_span_s)
         self.depth = depth
@@ -74,7 +74,7 @@ class Inputs:
         self.wait_s = 0.0
         self._heard_ns: dict[str, int] = {}
         self._other_heard_ns: dict[str, int] = {}
-        #: messages that were sent and could not be read, as far as the transport knows
+        #: messages that could not be read, as far as the transport knows
         self.lost = 0
         self.travel, self.head_pose, self.gaps = (Intake(on_unused=self._unused) for _ in OPTIONAL)
         self._gap_limits: Limits | None = None
@@ -92,21 +92,21 @@ class Inputs:
         self.travel.limits, self.head_pose.limits, self._gap_limits = travel, pose, gap
 
     def other_senders(self) -> list[str]:
-        """Return the inputs on which another sender than the one followed sends too."""
+        """Return the inputs on which a sender besides the followed one sends."""
         if not self._other_heard_ns:
             return []
         now_ns = time.monotonic_ns()
         return [topic for topic, heard_ns in self._other_heard_ns.items() if now_ns - heard_ns < _OTHER_SENDER_NS]
 
     def silent(self) -> list[str]:
-        """Return the optional inputs that have been heard and are silent now."""
+        """Return the optional inputs that were heard before and are silent now."""
         if self.ended:
             return []
         now_ns = time.monotonic_ns()
         return [topic for topic, heard_ns in self._heard_ns.items() if now_ns - heard_ns > _SILENT_NS]
 
     def waited(self, messages: int, longest_s: float) -> None:
-        """Take note of how many messages waited in the queue, and how long the first of them [s]."""
+        """Note how many messages waited in the queue, and how long the first waited [s]."""
         self.wait_s = max(self.wait_s, longest_s)
         most, before_s = self._queue_peak
         if messages > most or longest_s > before_s:
@@ -118,7 +118,7 @@ class Inputs:
         return peak
 
     def wanted(self, sender: bytes, number: int, stamp_ns: int, values: Sequence[float], fits: bool = True) -> bool:
-        """Take in that message `number` (from 1) of a sender has come; False, and counted, when it is not used.
+        """Note that message `number` (from 1) of a sender has come; False, and counted, when it is not used.
 
         `fits` : whether a sample could be made of it; `values` are all its numbers.
         """
@@ -145,14 +145,14 @@ class Inputs:
         return True
 
     def _other_heard(self, topic: str, sender: bytes, stamp_ns: int, values: Sequence[float]) -> None:
-        """Take note of a message of a sender that is not followed."""
+        """Count a message of a sender that is not followed."""
         if topic not in self.other_senders():
             self._front.look_for_senders(topic)
         self._other_heard_ns[topic] = time.monotonic_ns()
         self.unused.note(topic, sender, "not_followed", stamp_ns, values)
 
     def _follows(self, topic: str, stamp_ns: int, values: Sequence[float]) -> bool:
-        """Return whether the message on an optional input is of the sender followed; others are counted."""
+        """Return whether the message on an optional input is from the followed sender; others are counted."""
         sender = self.arriving[1]
         followed = self.optional[topic].hear(sender, time.monotonic_ns())
         if not followed:
@@ -173,7 +173,7 @@ class Inputs:
         if not self._follows("head_pose", stamp_ns, (*pose, *deviation)):
             return False
         missing = [math.isnan(value) for value in pose]
-        # a component that was not measured breaks no limit
+        # a component that was not measured is within the limits
         judged = pose if all(missing) else _filled(pose, self._newest_pose)
         verdict = self._judged("head_pose", self.head_pose, stamp_ns, (*judged, *deviation), self._poses)
         if verdict.used and verdict is not Verdict.WORKED_IN:
@@ -196,10 +196,10 @@ class Inputs:
         return verdict.used
 
     def _is_implausible(self, stamp_ns: int, gaps: Mapping[int, float]) -> bool:
-        """Return whether a gap is larger than it can be, or has changed faster since the newest one of its pair."""
+        """Return whether a gap is impossibly large, or has changed impossibly fast since the newest gap of its pair."""
         limits = self._gap_limits
         if limits is None or not all(map(math.isfinite, gaps.values())):
-            return False  # a value that is no number has a reason of its own
+            return False  # a value that is not a number has its own reason
         for pair, gap in gaps.items():
             before_ns, before = self._newest_gaps.get(pair, (stamp_ns, gap))
             passed_s = (stamp_ns - before_ns) * 1e-9

@@ -1,11 +1,11 @@
-"""The load on the head from signals of the drive, with an interval: the wrench itself is not measured.
+"""The load on the head computed from signals of the drive, with an interval, where the wrench is not measured.
 
 The drive pulls the chain with C = efficiency P / v (or C is measured). Without the drag of chain and plough, the
 cutting force along the face is Z = C - idle. The coal gives a second value: Z = specific_force * depth *
 resistance(position). The two are averaged by their variances. The force into the face is Fx = push_ratio Z, the lateral
 one Fy = lateral_ratio Z, both at one point of the head: M = x Fy - y Fx. All coefficients have a standard deviation,
-which propagates to the result. They belong to a machine, from idle runs and weighing, and have no defaults: none are
-published for the machine of the paper.
+which propagates to the result. They are measured at a machine, by idle runs and weighing, and have no defaults, because
+the paper publishes no values.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ from plow_twin.live.part import Part
 if TYPE_CHECKING:
     from prometheus_client.metrics_core import Metric
 
-#: What a name of a metric cannot hold.
+#: Characters that a name of a metric cannot have.
 _OTHER: Final = re.compile(r"[^a-zA-Z0-9_]")
 
 
@@ -58,7 +58,7 @@ class Metrics:
         self._thread.join()
 
     def update(self, name: str, part: Part) -> None:
-        """Keep a part of the diagnostics; cheap, because the page is computed when it is read."""
+        """Keep a part of the diagnostics; the page is computed when it is read."""
         self._parts = {**self._parts, name: part}
 
     def collect(self) -> Iterator[Metric]:

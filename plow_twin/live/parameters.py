@@ -21,7 +21,7 @@ ESTIMATES: Final = names_of(Cadence.ESTIMATE)
 
 
 class Effect(Enum):
-    """When a changed value takes effect, in words."""
+    """The time at which a changed value takes effect, in words."""
 
     START = "at start (read only)"
     CONFIGURE = "on configure; can be changed while unconfigured"
@@ -430,7 +430,8 @@ _FOREIGN: Final = ("use_sim_time", "start_type_description_service")
 def coerce(name: str, value: Any) -> Any:
     """Return the value in the type of the parameter if the conversion is exact.
 
-    Integers become doubles, texts such as `1e-9`, which YAML 1.1 reads as texts, numbers, and sequences tuples.
+    Integers become doubles, sequences become tuples, and texts such as `1e-9`, which YAML 1.1 reads as texts, become
+    numbers.
     """
     default = SPECS[name].default
     if isinstance(default, tuple):
@@ -533,7 +534,7 @@ def model_changes(given: Settings) -> dict[str, float]:
 
 
 def read_parameters(path: Path) -> dict[str, Any]:
-    """Return the parameters in a YAML file: as of a ROS node, `ros__parameters` under any name, or plain names.
+    """Return the parameters in a YAML file: under `ros__parameters`, as for a ROS node, or by plain names.
 
     Raises
     ------

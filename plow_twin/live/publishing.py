@@ -21,12 +21,12 @@ from plow_twin.stream.session import Series
 if TYPE_CHECKING:
     from plow_twin.live.recording import Recording
 
-#: Base name of the topic, and the message: as bytes where it follows from the record of a publication.
+#: Base name of the topic, and the message, as bytes where it is made of the record of a publication.
 Outgoing = tuple[str, memoryview | Message]
 
 
 class Front(Protocol):
-    """Where samples come from and messages go.
+    """The source of the samples and receiver of the messages.
 
     Attributes
     ----------
@@ -37,7 +37,7 @@ class Front(Protocol):
     follows_samples : bool
         Whether the samples alone move the time (`/clock`, a file): silence is not bridged.
     sends_motion : bool
-        Whether messages of the motion are sent; else they are at most recorded.
+        Whether messages of the motion are sent; otherwise they are at most recorded.
     """
 
     name: str
@@ -49,7 +49,7 @@ class Front(Protocol):
         """Return the time on the clock of the stamps [ns]."""
 
     def send(self, topic: str, message: memoryview | Message) -> None:
-        """Send a message on the topic of that base name."""
+        """Send a message on the topic with a base name."""
 
     def look_for_senders(self, topic: str) -> None:
         """Find out whether the followed sender of an input is still there."""
@@ -58,10 +58,10 @@ class Front(Protocol):
         """Return the name of a sender of an input."""
 
     def changed(self) -> None:
-        """Take note that the state of the stream may have changed."""
+        """Note that the state of the stream may have changed."""
 
     def time_text(self, stamp_ns: int) -> str:
-        """Return a stamp in words, as a person who knows the input writes it."""
+        """Return a stamp in the form of the input."""
 
     def say_alarm(self, level: int, text: str) -> None:
         """Log an alarm that has been raised to a level."""
@@ -71,18 +71,18 @@ class Front(Protocol):
 
 
 class Publishing:
-    """The way out of a live twin.
+    """The output of a live twin.
 
     Parameters
     ----------
     front
-        Where messages go.
+        Receives the messages.
     settings
         Parameters of the twin.
     alarms
-        What is watched.
+        The alarms.
     recording
-        What was sent goes there, if anything is recorded.
+        Receives the sent messages, if the run is recorded.
     on_alarm
         Receives a text when an alarm is latched.
     """
@@ -109,14 +109,14 @@ class Publishing:
         self.published = self.withheld = 0
         #: publications computed without a sample, and publications after late samples have been worked in
         self.held_frames = self.corrected_frames = 0
-        #: steady time at which the samples of the next publication were received [ns]; 0: it answers no message
+        #: steady time at which the samples of the next publication were received [ns]; 0: it has no samples
         self.received_ns = 0
-        #: stamp of the sample of a series whose alarms are being said [ns]
+        #: stamp of the sample of a series whose alarms are being reported [ns]
         self.series_ns: int | None = None
         self._newest: Rows | None = None
-        #: brings a publication's intervals once its forces have gone out, where they come later
+        #: computes a publication's intervals after its forces have been sent, where intervals come later
         self.catch_up: Callable[[], object] | None = None
-        #: takes each publication beside the front, where somebody watches
+        #: receives each publication, if there is an observer
         self.watch: Callable[[Published], object] | None = None
 
     @property
@@ -126,20 +126,20 @@ class Publishing:
 
     @property
     def newest(self) -> Rows | None:
-        """Newest row that was published, shape (1,); the next one takes its place."""
+        """Newest published row, shape (1,); the next one overwrites it."""
         return self._newest
 
     @property
     def memory(self) -> Mapping[str, memoryview]:
-        """The memory that holds each message of the motion when it is sent, by base name of its topic."""
+        """The memory of each sent message of the motion, by base name of its topic."""
         return {} if self._messages is None else self._messages.memory
 
     def messages(self, published: Published) -> Iterator[Outgoing]:
         """Yield the messages of a publication of at most one row, forces first; no message when a number is not finite.
 
-        The intervals come last: they are of many twins, which `catch_up` advances meanwhile.
+        The intervals come last, because `catch_up` first advances many twins for them.
 
-        Between them latency and age are counted, alarms are looked at, and the recording gets its share.
+        In between, latency and age are counted, alarms are judged, and the publication is recorded.
         """
         rows, _ = published
         if not len(rows):
@@ -174,9 +174,9 @@ class Publishing:
             yield from self.alarms_changed(stamp_ns)
 
     def series(self, series: Series, journal: Callable[[Series], object]) -> Iterator[Outgoing]:
-        """Journal and record samples that were applied at once, and yield the messages of alarms, each at its place.
+        """Journal and record samples that were applied together, and yield the messages of alarms, each at its place.
 
-        Of the motion no messages are sent.
+        No messages of the motion are sent.
         """
         published, begin = series.published, 0
         if not len(published.rows):
@@ -201,7 +201,7 @@ class Publishing:
                 self.recording.publications(series.published)
 
     def alarms_changed(self, stamp_ns: int) -> Iterator[Outgoing]:
-        """Yield the alarms, a level of which has changed."""
+        """Yield the alarms if a level has changed."""
         yield self.alarms_now(stamp_ns)
         if self.alarms.raised:
             self._on_alarm(f"alarm: {', '.join(self.alarms.raised)}")
@@ -213,7 +213,7 @@ class Publishing:
         return next(text for text in alarm_texts(dict(status.values)) if text.startswith(name.replace("_", " ") + " "))
 
     def alarms_now(self, stamp_ns: int) -> Outgoing:
-        """Return the alarms as they are."""
+        """Return the present alarms."""
         status = alarms_message(self.alarms, self._front.name, self._head)
         if self.recording:
             self.recording.message(ALARMS, stamp_ns, status)

@@ -1,4 +1,4 @@
-"""Priority, processors and locked memory of this process: each is requested, and a refusal is a warning."""
+"""Priority, processors and locked memory of this process, each requested; a refusal is a warning."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _MCL_FUTURE: Final = 2
 
 
 def apply_realtime(settings: Settings) -> list[str]:
-    """Ask the system for the settings; return in words those that it refused."""
+    """Request the settings; return in words which the system refused."""
     refused = []
     if settings.priority:
         try:

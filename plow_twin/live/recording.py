@@ -1,4 +1,4 @@
-"""Between the node and the recorder; imported only when a run is recorded."""
+"""Link between the node and the recorder; imported only when a run is recorded."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Recording:
     Parameters
     ----------
     settings, scene
-        What the node was configured with.
+        Configuration of the node.
     node_name
         Fully qualified name of the node.
     topics
@@ -96,7 +96,7 @@ class Recording:
         return self._recorder.counters
 
     def publication(self, published: Published, sent: Mapping[str, bytes]) -> None:
-        """Take the messages of a publication that has been published; `sent`: their bytes, where there are some."""
+        """Take the messages of a sent publication; `sent`: their bytes, if any."""
         wanted = self._decimation.select(published)
         if wanted is not None:
             self._recorder.publication(wanted, sent if wanted is published else {})
@@ -106,7 +106,7 @@ class Recording:
                 self.message(topic, stamp_ns, message)
 
     def series(self, series: Series) -> None:
-        """Take the journal of samples that were applied at once."""
+        """Take the journal of samples that were applied together."""
         self._series = self._recorder.series(series)
 
     def publications(self, published: Published) -> None:
@@ -120,7 +120,7 @@ class Recording:
                 self._recorder.publications(wanted, np.array([sequence]))
 
     def message(self, topic: str, stamp_ns: int, message: Message) -> None:
-        """Take another message that has been published on the topic of that base name."""
+        """Take another message that was sent on the topic with a base name."""
         self._recorder.output(self._topics[topic], stamp_ns, message)
 
     @property
@@ -134,7 +134,7 @@ class Recording:
         return self._recorder.snapshot_wanted
 
     def renew(self, session: Session) -> bool:
-        """Journal a snapshot when entries were lost and there is room again; return whether it did."""
+        """Journal a snapshot when entries were lost and there is room again; return whether it was journalled."""
         wanted = self._recorder.snapshot_wanted
         if wanted:
             self._recorder.journal(session.renew())

@@ -1,6 +1,6 @@
 """A live twin without its transport, and the way of one sample through it: intake, twin, publication, recording.
 
-A front brings samples and takes messages away: the ROS node is one, `plow-twin live` another. Nothing here knows which.
+A front brings samples and sends messages: the ROS node or `plow-twin live`. This module does not depend on which.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ if TYPE_CHECKING:
 
 _CATCH_UP_S: Final = 0.002
 _LOOK_FOR_CLOCK_HZ: Final = 20.0
-#: What is not used goes into the journal so often [Hz].
+#: Rate at which unused messages are journalled [Hz].
 _UNUSED_HZ: Final = 5.0
-#: The twins that follow do not keep up where samples waited so long [s] in so many seconds in a row.
+#: The following twins do not keep up if samples waited this long [s] in this many seconds in a row.
 _LONGEST_WAIT_S, _WAITING_SECONDS = 0.5, 5
 
 
@@ -56,11 +56,11 @@ class Runtime:
     Parameters
     ----------
     front
-        Where messages go.
+        Receives the messages.
     settings
         The parameters.
     prepared
-        Scene and twin, the solver compiled; the twin belongs to this runtime alone.
+        Scene and twin, with the solver compiled; the twin belongs to this runtime alone.
     kept_wear
         Wear of earlier runtimes of this process, by the scene's identity.
 
@@ -84,11 +84,11 @@ class Runtime:
         self.scene = prepared.scene
         #: seconds that compiling or loading the solver took
         self.compile_s = prepared.compile_s
-        #: turns of the loop that publishes at a fixed rate, or else follows the clock; None: samples set the pace
+        #: turns of the loop that publishes at a fixed rate or follows the clock; None: samples set the pace
         self.periods = _periods(settings)
         #: why time stands still: `waiting` for the first `/clock`, or `paused`; empty: it runs
         self.clock = "running"
-        #: whether somebody else publishes under the names of this twin's outputs
+        #: whether another node publishes under the names of this twin's outputs
         self.others_publish = False
         #: whether the parameters alone follow because all twins did not keep up
         self.reduced = False
@@ -98,7 +98,7 @@ class Runtime:
         self._early: list[Arrival] = []
         self._seen: tuple[Any, ...] = ()
         self.wear_keeper: WearKeeper | None = None
-        #: identity of the scene, by which wear is kept
+        #: identity of the scene, the key of the kept wear
         self.identity = scene_identity(self.scene)
         kept = kept_wear.get(self.identity)
         depth = kept.depth_m if kept else None
@@ -174,12 +174,12 @@ class Runtime:
 
     @property
     def waits_for_clock(self) -> bool:
-        """Whether the journal still waits for a clock: services are refused."""
+        """Whether the journal still waits for a clock, so that services are refused."""
         return self._start_due
 
     @property
     def wear_error(self) -> str:
-        """Why the wear could not be saved; empty: it could, or it is not kept."""
+        """Why the wear could not be saved; empty if it was saved, or is not kept."""
         return self.wear_keeper.error if self.wear_keeper else ""
 
     def kept_wear(self) -> KeptWear:
@@ -195,7 +195,7 @@ class Runtime:
 
     @property
     def reads_at_once(self) -> bool:
-        """Whether samples may be applied and published many at once: they bring their time, and no message is sent."""
+        """Whether many samples may be applied and published together: they bring their time, and no message is sent."""
         return self._front.follows_samples and not self._front.sends_motion
 
     @property
@@ -237,7 +237,7 @@ class Runtime:
         return None if end_ns is None else (self._front.now_ns() - end_ns) * 1e-9
 
     def look_at_clock(self) -> None:
-        """Find out whether the time of the samples goes on; called at intervals."""
+        """Check at intervals whether the time of the samples continues."""
         now_ns = self._front.now_ns()
         if self._front.follows_samples:
             stands = now_ns == self._clock_before_ns
@@ -246,7 +246,7 @@ class Runtime:
 
     @property
     def missed_periods(self) -> int:
-        """Periods left out between two reports from which on there is a warning; 0: no warning."""
+        """Number of missed periods between two reports that is a warning; 0: no warning."""
         return self.settings.missed_periods
 
     def time_text(self, stamp_ns: int) -> str:
@@ -254,7 +254,7 @@ class Runtime:
         return self._front.time_text(stamp_ns)
 
     def send_alarms(self) -> None:
-        """Send the alarms as they are."""
+        """Send the present alarms."""
         self._send([self.publishing.alarms_now(self.stamp_ns)])
 
     def mark(self, text: str) -> tuple[bool, str]:
@@ -306,7 +306,7 @@ class Runtime:
     def periodic(self) -> list[tuple[float, Callable[[], float | None]]]:
         """Return the calls that the front makes while the twin is active, each with its rate [Hz] on a steady clock.
 
-        What is returned is as of `Timer`.
+        Each call returns as in `Timer`.
         """
         settings = self.settings
         periodic: list[tuple[float, Callable[[], float | None]]] = []
@@ -343,7 +343,7 @@ class Runtime:
         if name in MODEL:
             self.driver.set_model(self.stamp_ns, model_changes(settings))
             self._front.changed()
-        elif not isinstance(value, tuple):  # a list acts through the service that takes it, and its entry
+        elif not isinstance(value, tuple):  # a list takes effect by the service that reads it, and by its journal entry
             self.driver.parameter(name, value)
 
     def _set_limits(self, settings: Settings) -> None:
@@ -362,7 +362,7 @@ class Runtime:
         if self._start_due:
             self.start()
         if self._start_due:
-            # kept until the clock comes: one that plays a recording may hear it a little later
+            # kept until the clock comes: a player of a recording may start the clock a little later
             room = self.settings.input_depth - len(self._early)
             self._early += arrived[:room]
             for stamp_ns, wrench in arrived[max(room, 0) :]:
@@ -378,7 +378,7 @@ class Runtime:
     def step_series(self, stamps: NDArray[np.int64], wrench: NDArray[np.float64]) -> Iterator[Outgoing]:
         """Use many samples of a source with its own time, as `step`; stamps [ns], shape (n,), wrenches (n, 3)."""
         if self._start_due or self.publishing.watch is not None or self.settings.record_ring:
-            # who looks on sees each sample; a ring is written with the state after the sample of its alarm
+            # an observer sees each sample; a ring is written with the state after the sample of its alarm
             yield from self.step(list(zip(stamps.tolist(), map(tuple, wrench.tolist()), strict=True)))
             return
         self.publishing.received_ns = now_ns = time.monotonic_ns()
@@ -400,11 +400,11 @@ class Runtime:
             self._front.send(topic, message)
 
     def silence(self) -> float:
-        """Go on without samples when they have been missing for too long; return how long that cannot be so [s]."""
+        """Go on without samples once they are overdue; return the time [s] before which they cannot be."""
         holds, now_ns = self.driver.holds, time.monotonic_ns()
         published = self.driver.silence(now_ns)
         if len(published.rows) or self.driver.holds != holds:
-            # the next publication answers no message
+            # the next publication has no samples
             self.publishing.received_ns = 0
             self._send(self.publishing.messages(published))
             self._advanced()
@@ -423,7 +423,7 @@ class Runtime:
         self._advanced()
 
     def publish_due(self) -> None:
-        """Publish all since the last publication."""
+        """Publish the state reached since the last publication."""
         if self.periods:
             self.periods.turn(time.monotonic())
         self._send(self.publishing.messages(self.driver.due()))
@@ -494,7 +494,7 @@ class Runtime:
             self._front.changed()
 
     def _look_for_lag(self) -> None:
-        """Let the parameters alone follow where all twins do not keep up."""
+        """Follow by the parameters alone if the twins do not keep up."""
         waited_s, self.inputs.wait_s = self.inputs.wait_s, 0.0
         self._waiting_seconds = self._waiting_seconds + 1 if waited_s > _LONGEST_WAIT_S else 0
         if self._waiting_seconds == _WAITING_SECONDS and not self.reduced and not self._start_due:
@@ -513,7 +513,7 @@ class Runtime:
                 self.driver.session.emit(entry)
 
     def save_wear(self) -> None:
-        """Have the wear saved, if it is kept."""
+        """Save the wear, if it is kept."""
         if self.wear_keeper:
             self.wear_keeper.save(self.driver.session.wear_depth)
 
@@ -545,7 +545,7 @@ class Runtime:
         assert self.recording is not None
         renewed = self.recording.renew(self.driver.session)
         if renewed and self.estimation and self.estimation.entry and self.driver.session.following is None:
-            # no part of a snapshot, but of one of a twin that follows
+            # not in the snapshot of a twin, but in that of a follower
             self.recording.journal(self.estimation.entry)
 
 
@@ -556,7 +556,7 @@ def _periods(settings: Settings) -> Periods | None:
 
 
 def policy(settings: Settings) -> Policy:
-    """Return the part of the settings that rules over silence and failures."""
+    """Return the part of the settings about silence and failures."""
     return Policy(settings.excitation_timeout, settings.hold_policy, settings.hold_limit, settings.failure_limit)
 
 

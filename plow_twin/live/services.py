@@ -41,7 +41,7 @@ class Services:
         return self._runtime.mark((self._runtime.settings.mark or "service") if text is None else text)
 
     def reset(self) -> tuple[bool, str]:
-        """Put the motion back to its initial state; return whether that was done, and a text for who asked."""
+        """Reset the motion to its initial state; return whether this was done, and a text for the caller."""
         self._runtime.driver.reset(self._runtime.stamp_ns, "service")
         self._changed()
         return True, "initial motion restored, the wear stays; the next sample is model time 0"
@@ -52,7 +52,7 @@ class Services:
         return True, f"the state at {self._kept.stamp_ns} ns is kept and stands in the journal"
 
     def restore(self) -> tuple[bool, str]:
-        """Go back to the motion of the snapshot kept."""
+        """Return to the motion of the kept snapshot."""
         if self._kept is None:
             return False, "no snapshot has been taken since configure"
         self._runtime.driver.restore(self._runtime.stamp_ns, self._kept)
@@ -60,7 +60,7 @@ class Services:
         return True, f"the motion is that at {self._kept.stamp_ns} ns; the next sample is that of its time, wear stays"
 
     def acknowledge_alarms(self) -> tuple[bool, str]:
-        """Let go the alarms that are latched."""
+        """Release the latched alarms."""
         alarms = self._runtime.alarms
         left = alarms.acknowledge()
         self._runtime.driver.parameter(ACKNOWLEDGED, self._runtime.stamp_ns)

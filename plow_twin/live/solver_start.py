@@ -1,4 +1,4 @@
-"""Scene and solver made ready beside the executor: the node answers while the compiler works."""
+"""Scene and solver prepared beside the executor, so that the node answers while the compiler works."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ class Prepared:
 
 
 class Preparation:
-    """A twin being made ready in a thread of its own.
+    """A twin that is being prepared in its own thread.
 
-    `warm_up` compiles all else that is needed, in the same thread.
+    `warm_up` compiles the other kernels in the same thread.
     """
 
     def __init__(self, settings: Settings, warm_up: Callable[[], None] = lambda: None) -> None:
@@ -72,7 +72,7 @@ class Preparation:
 
 
 def key(settings: Settings) -> tuple[object, ...]:
-    """Return the settings that a prepared twin depends on; a scene file that has been written to counts as another."""
+    """Return the settings that a prepared twin depends on; a rewritten scene file counts as another scene."""
     try:
         found = os.stat(scene_path(settings.scene))
     except (OSError, PlowTwinError):
@@ -104,7 +104,7 @@ def _prepare(settings: Settings, warm_up: Callable[[], None]) -> Prepared:
 
 def leave(code: int, *, at_once: bool = False) -> int:
     """Return the exit code; end the process here when an abandoned compiler would hold it up, or `at_once`."""
-    if at_once:  # a stream that nobody reads can be flushed no more
+    if at_once:  # a stream without a reader can no longer be flushed
         os._exit(code)
     if all(future.done() for future in _started):
         return code

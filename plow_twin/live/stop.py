@@ -12,7 +12,7 @@ class StopRequested(BaseException):
 
 
 def stop_signals() -> list[signal.Signals]:
-    """Return the signals that ask for a stop: SIGHUP, of a terminal that goes, unless it is ignored, as by `nohup`."""
+    """Return the signals that ask for a stop: SIGHUP, when the terminal closes, unless it is ignored, as by `nohup`."""
     ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     return [signal.SIGINT, signal.SIGTERM, *([] if ignored else [signal.SIGHUP])]
 
@@ -40,8 +40,8 @@ class StopSignals:
     def ignore(self) -> None:
         """Ignore the signals, at the end of a program.
 
-        The interpreter gives them their default back while it ends: one more, as of a terminal and a launch at once,
-        would be the end of a process that has done all it was to do.
+        The interpreter restores their default handlers while it ends: a second signal, as from terminal and launch
+        together, would end the process with an error after its work is done.
         """
         for number in self._before:
             signal.signal(number, signal.SIG_IGN)

@@ -17,11 +17,11 @@ class Timer:
         self.restart()
 
     def restart(self) -> None:
-        """Start again: it is due in a period."""
+        """Restart: the next call is due in a period."""
         self.due = time.monotonic() + self._period_s
 
     def look(self) -> None:
-        """Do it when it is due."""
+        """Call `do` when it is due."""
         now = time.monotonic()
         if now >= self.due:
             self.due += self._period_s * (1 + (now - self.due) // self._period_s)

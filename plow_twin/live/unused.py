@@ -8,13 +8,13 @@ from typing import Final
 
 from plow_twin.stream.journal import Unused
 
-#: Messages that one entry of the journal holds in full; of further ones, until it is written, only the count.
+#: Messages that a journal entry holds in full; further ones are only counted.
 _MOST: Final = 500
 
 
 @dataclass
 class _Pending:
-    """Messages of one input, sender and reason since the last entry of them."""
+    """Messages of one input, sender and reason since their last entry."""
 
     count: int = 0
     stamps_ns: list[int] = field(default_factory=list)
@@ -22,12 +22,12 @@ class _Pending:
 
 
 class UnusedMessages:
-    """Collect messages that are not used, so that a flood of them makes few entries of the journal.
+    """Collect unused messages, so that many of them make few entries of the journal.
 
     Parameters
     ----------
     wanted
-        Whether there is a journal for them.
+        Whether there is a journal.
     """
 
     def __init__(self, wanted: bool) -> None:
@@ -35,7 +35,7 @@ class UnusedMessages:
         self._pending: dict[tuple[str, bytes, str], _Pending] = {}
 
     def note(self, topic: str, sender: bytes, reason: str, stamp_ns: int, values: Sequence[float]) -> None:
-        """Take note of one message."""
+        """Note one message."""
         if not self._wanted:
             return
         pending = self._pending.setdefault((topic, sender, reason), _Pending())
@@ -45,7 +45,7 @@ class UnusedMessages:
             pending.values.append(tuple(map(float, values)))
 
     def note_lost(self, topic: str, sender: bytes, count: int) -> None:
-        """Take note of messages that were sent and have not arrived; a `count` below 0: they came after all."""
+        """Note messages that were sent and have not arrived; a negative `count`: they have arrived after all."""
         if self._wanted and count:
             self._pending.setdefault((topic, sender, "lost"), _Pending()).count += count
 

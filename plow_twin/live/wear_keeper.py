@@ -69,13 +69,13 @@ class WearKeeper:
         self._own: tuple[bytes, ...] = ()  # possible contents of the file: as read, or as written last
         self._writer = ThreadPoolExecutor(1, thread_name_prefix="wear")
         self._writing: Future[None] | None = None
-        #: why it could not be saved the last time; empty: it could
+        #: why the wear could not be saved the last time; empty if it was saved
         self.error = ""
 
     def load(self, kept: KeptWear | None = None) -> tuple[float, ...] | None:
         """Return the depths [m] to go on with, or None without any.
 
-        Those of the file, unless it is the one that the `kept` ones could not replace.
+        They come from the file, unless `kept` depths could not replace that file.
 
         Raises
         ------
@@ -117,7 +117,7 @@ class WearKeeper:
     def _save(self, values: tuple[float, ...]) -> None:
         try:
             if not self._is_claimed():
-                # moved, removed or hidden by a mount: who has the folder of that name now is to be found out
+                # moved, removed or hidden by a mount: check who has the folder of that name now
                 self.release()
                 self._claim = claim_folder(self.folder)
             found = read_wear(self.folder)

@@ -4,7 +4,7 @@
     all other laws    F = K d^n (1 + lambda d')
 
 (model of the paper's lost eq. 6; the laws' lambda comes from `contact_laws`). A solver decides when a pair is in
-contact and when its force would pull: there the force is zero.
+contact and when its force would pull; then the force is zero.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def power_term(
 @kernel(fast=True, inline="code")
 def power_terms(base: NDArray[np.float64], power: NDArray[np.float64], k: int, exponent: float) -> Any:
     """Return coefficient k >= 1 of the eight columns of base^exponent, times base[0]: `power_term` without a shift."""
-    # the newest orders come last: most of the sum need not wait for them
+    # the newest orders come last, so that most of the sum does not wait for them
     even, odd = splat(0.0), splat(0.0)
     weight = (exponent + 1.0) * (k - 1) - k
     for j in range(k - 1, 2, -2):

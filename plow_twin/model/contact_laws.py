@@ -25,7 +25,7 @@ DAMPING_NUMBER_CAP: Final = 1e3
 def exact_damping_number(restitution: float) -> float:
     """Return the D that delivers the restitution e exactly:  D (1 + e) = ln((1 + D) / (1 - D e)).
 
-    It holds for F = K d^n (1 + lambda d') whatever K, n and the mass. D is 0 at e = 1 and unbounded as e goes to 0.
+    It holds for F = K d^n (1 + lambda d') with any K, n and mass. D is 0 at e = 1 and unbounded as e goes to 0.
     Source: first integral of the free impact; cf. Hunt and Crossley, J. Appl. Mech. 42 (1975) 440.
     """
     if restitution >= 1.0:
@@ -103,7 +103,7 @@ class ContactLaw:
         return self.number_of is not None
 
     def damping_number(self, restitution: float) -> float:
-        """Return D = lambda v0 of the law for the restitution asked of it.
+        """Return D = lambda v0 of the law for a nominal restitution.
 
         Parameters
         ----------

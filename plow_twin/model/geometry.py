@@ -20,8 +20,8 @@ corner c = (cx, cy) is at
 
 so penetrations and arms are linear again, and the same equations hold with other coefficients.
 
-A rounded corner meets a wall as the centre of its arc meets one that is nearer by the radius. C is that centre then,
-and only friction needs to know: the point that touches is nearer to the wall by the radius (`roll`).
+A rounded corner meets a wall as the centre of its arc meets a wall that is nearer by the radius. C is then that centre;
+only for friction does the point that touches matter, which is nearer to the wall by the radius (`roll`).
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def outline(sides: NDArray[np.float64], radius: float) -> NDArray[np.float64]:
     sides : ndarray, shape (2,)
         Width and height.
     radius : float
-        That of the corners in the same unit; 0 for sharp ones.
+        Radius of the corners in the same unit; 0 for sharp ones.
 
     Returns
     -------
@@ -84,9 +84,9 @@ def outline(sides: NDArray[np.float64], radius: float) -> NDArray[np.float64]:
 
 
 def roll(scene: Scene) -> float:
-    """Return the way in m along its wall by which the angle in rad moves the point of a rounded corner that touches.
+    """Return the distance in m along its wall by which the angle in rad moves the touching point of a rounded corner.
 
-    It counts along the wall's tangent (`slip_rows`); the arm of a force there is less by it (`slip_arm_rows`).
+    It counts along the wall's tangent (`slip_rows`) and shortens the arm of a force there (`slip_arm_rows`).
     """
     return corner_radius(scene) * (1.0 if scene.head.carries == "corners" else -1.0)
 
@@ -118,7 +118,7 @@ def penetration_rows(scene: Scene) -> NDArray[np.float64]:
 
 
 def _of_places(scene: Scene, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return rows of a place; R c with the corner c turns the other way than R^T c, and the head's place counts up."""
+    """Return rows of a place; R c turns opposite to R^T c, and the head's place has a positive sign."""
     if scene.head.carries == "corners":
         rows[1:4] *= -1.0
     return rows
@@ -234,8 +234,8 @@ def state_of(
 ) -> NDArray[np.float64]:
     """Convert pose and rate of the cavity's or the block's centre, shape (3,) each, to the solver's state, shape (8,).
 
-    Of a head that carries walls these are body coordinates. Where it carries corners place and velocity are resolved in
-    world axes; cosine and sine are those of the angle without the quarter turns of a block that tumbles.
+    Of a head that carries walls these are body coordinates. Where it carries corners, place and velocity are resolved
+    in world axes, and cosine and sine are those of the angle without the quarter turns of a tumbling block.
     """
     if scene.head.carries == "walls":
         return body_state(q, v, scene.head.com_offset_m)

@@ -1,4 +1,4 @@
-"""Python modules that define contact laws, named by the user of a command; nothing in a file can name one."""
+"""Python modules that define contact laws, named by the user of a command and never by a file."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def load_laws(names: Iterable[str]) -> None:
 
 
 def loaded_laws() -> tuple[str, ...]:
-    """Return the modules that `load_laws` has imported: a process that this one starts needs them too."""
+    """Return the modules that `load_laws` has imported; a child process needs them too."""
     return tuple(_loaded)
 
 

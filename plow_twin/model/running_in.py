@@ -1,4 +1,4 @@
-"""Running-in: a new pad wears faster, by exp(-h / h0) less the deeper it is worn.
+"""Running-in: a new pad wears faster; the excess falls with the wear depth h as exp(-h / h0).
 
 With the coefficient k_s (1 + (r - 1) exp(-h / h0)) a pad whose wear depth would be z with k_s alone has the depth
 

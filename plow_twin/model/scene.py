@@ -131,10 +131,10 @@ class Contact:
     Exactly one of `damping` and `restitution` is given, or neither for a law without damping. The default law returns
     exactly the given restitution.
 
-    With `restitution_speed_m_s` v1 and `restitution_fall` q the restitution of impacts faster than v1 falls as
-    (w / v1)^-q, w = v (m' / m)^p of the speed of approach v and the effective mass m' of the head at the corner, p the
-    `restitution_mass_power`. With `restitution_fall_along_s_m` it is less by that times the speed of the centre of mass
-    along the wall.
+    With `restitution_speed_m_s` v1 and `restitution_fall` q the restitution of impacts faster than v1 falls as (w /
+    v1)^-q, where w = v (m' / m)^p with the speed of approach v, the effective mass m' of the head at the corner and the
+    `restitution_mass_power` p. `restitution_fall_along_s_m` times the speed of the centre of mass along the wall is
+    subtracted from it.
 
     References
     ----------
@@ -143,7 +143,7 @@ class Contact:
     """
 
     law: str = _choice("contact law", LAWS, "exact_restitution")
-    # must be given; has a default only because it follows a field with one
+    # must be given; has a default only because it follows a field with a default
     stiffness: float = _quantity("N/m^exponent", "K in F = K d^n (...)", math.nan, gt=0.0)
     exponent: float = _quantity("1", "n in F = K d^n (...)", 1.0, ge=1.0, le=4.0)
     damping: float | None = _quantity(
@@ -169,7 +169,7 @@ class Contact:
     )
 
 
-#: What makes the restitution depend on the impact; all absent where it does not.
+#: Numbers by which the restitution depends on the impact; all absent where it does not.
 FALL_NAMES: Final = (
     "restitution_fall",
     "restitution_speed_m_s",
@@ -183,8 +183,8 @@ class Friction:
     """Tangential friction of every pair, by one of two laws.
 
     Without `stick_stiffness_n_m` regularised Coulomb, T = mu N tanh(slip rate / regularisation speed), which creeps.
-    With it Coulomb's law with stick: a corner holds the wall by a spring and a damper until they reach static mu N,
-    then it slips with T = mu N.
+    With it Coulomb's law with stick: a spring and a damper hold a corner to the wall up to static mu N, then it slips
+    with T = mu N.
 
     References
     ----------
@@ -232,7 +232,7 @@ class Harmonic:
     Attributes
     ----------
     name : str
-        What the load is called; no two of a scene alike.
+        Name of the load, unique in a scene.
     """
 
     name: str
@@ -250,7 +250,7 @@ class Constant:
     Attributes
     ----------
     name : str
-        What the load is called; no two of a scene alike.
+        Name of the load, unique in a scene.
     """
 
     name: str
@@ -268,7 +268,7 @@ class Table:
     Attributes
     ----------
     name : str
-        What the load is called; no two of a scene alike.
+        Name of the load, unique in a scene.
     t : ndarray, shape (n,)
         Times in s, strictly increasing.
     wrench : ndarray, shape (n, 3)
@@ -297,9 +297,9 @@ class Initial:
 class Wear:
     """Archard wear of the eight pads by the travel along the face: dh/dt = k_s F v / A.
 
-    With `sliding: total` v is the speed of the corner over its pad, sqrt(v^2 + s'^2), s' that in the plane of the
-    section. With `running_in_ratio` r and `running_in_depth_m` h0 a pad that is worn by h has the coefficient
-    k_s (1 + (r - 1) exp(-h / h0)).
+    With `sliding: total` v is the speed of the corner over its pad, sqrt(v^2 + s'^2), with the speed s' in the plane of
+    the section. With `running_in_ratio` r and `running_in_depth_m` h0 a pad that is worn by h has the coefficient k_s
+    (1 + (r - 1) exp(-h / h0)).
 
     References
     ----------
@@ -343,7 +343,7 @@ class Scene:
     wear : Wear or None
     friction : Friction or None
     support : Support or None
-        Lets the frame give way; without it the frame is fixed.
+        Springs under the frame; without it the frame is fixed.
     marks : mapping of str to Provenance
         Where numbers come from, by their path; no part of equality.
 
@@ -480,7 +480,7 @@ def _check_choice(key: str, value: Any, spec: Field[Any]) -> Iterator[Problem]:
 
 
 def must_be_given(spec: Field[Any]) -> bool:
-    """Return whether a scene must give the field, because its default is no valid value."""
+    """Return whether a scene must give the field, because its default is not a valid value."""
     if spec.default is MISSING:
         return spec.default_factory is MISSING
     return isinstance(spec.default, float) and math.isnan(spec.default)
@@ -564,7 +564,7 @@ def _check_contact(contact: Contact) -> Iterator[Problem]:
     if law.exponent is not None and contact.exponent != law.exponent:
         yield Problem("contact.exponent", contact.exponent, f"{law.exponent:g} for {contact.law}")
     if not law.additive and contact.damping is not None and contact.damping > MOST_DAMPING_FACTOR:
-        # it stops a head at a depth of sqrt(2 m / (K lambda)), of which double precision keeps a few digits only
+        # it stops a head at a depth of sqrt(2 m / (K lambda)), which double precision resolves by a few digits only
         expected = f"at most {MOST_DAMPING_FACTOR:g} s/m for {contact.law}; a restitution gives at most 1e6"
         yield Problem("contact.damping", contact.damping, expected)
     if law.ramped != (contact.ramp_m is not None):

@@ -1,4 +1,4 @@
-"""The alarms of a run: made from its parameters, written as messages, and computed again by a replay."""
+"""The alarms of a run: set by its parameters, written as messages, and computed again by a replay."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ class AlarmCheck:
 
     def _take(self, sequence: NDArray[np.int64], step: NDArray[np.int64], published: Published) -> None:
         if len(published.rows) == 1 and not published.finite:
-            return  # it was not sent
+            return  # the message was not sent
         for index in self._alarms.feed(published):
             self._say(int(sequence[index]), int(step[index]))
 

@@ -41,9 +41,9 @@ if TYPE_CHECKING:
 
 #: Samples advanced together.
 BATCH: Final = 4096
-#: Entries that change the walk of a journal; late samples are sorted in across all others.
+#: Entries at which a walk stops; late samples are sorted in across all others.
 _ACTING: Final = (Travel, Reset, Loss, Restore, Snapshot, SetModel, SetWear)
-#: Those that change a motion that follows measurements, too.
+#: Further ones where a motion follows measurements.
 _FOLLOWED: Final = (Pose, PartOfPose, Estimated, Parameter)
 #: Failed advances in a row after which the model is reset.
 _FAILURE_LIMIT: Final = 10
@@ -55,7 +55,7 @@ class Walked:
 
     stamp_ns: NDArray[np.int64]
     wrench: NDArray[np.float64]
-    #: the rows of `published`: touches are all so far
+    #: the rows of `published`, with all touches so far
     rows: AdvanceSeries
     published: Published
     #: touches since the advance before, shape (n, 8)
@@ -182,14 +182,14 @@ class JournalWalk:
     Parameters
     ----------
     own
-        Walkers that restore states of the journal: after a loss, and wear that was set.
+        Walkers that take states from the journal, after a loss or when wear was set.
     others
         Walkers that keep their own states.
     whole
         Whether the journal begins with the run; otherwise its first snapshot is restored.
     same_scene
-        Whether `own` have the scene of the run: then they follow changes of the model and restored motions; one whose
-        twin follows measurements gets these too.
+        Whether `own` have the scene of the run: then they apply changes of the model and restored motions, and
+        measurements if their twin follows them.
     """
 
     def __init__(
@@ -199,7 +199,7 @@ class JournalWalk:
         self._same = own if same_scene else ()
         self._following = [walker for walker in self._same if walker.session.following is not None]
         self._acting = (*_ACTING, *_FOLLOWED) if self._following else _ACTING
-        #: speeds by their stamps, which have not been reached
+        #: speeds by their stamps, not yet reached
         self._travels: list[Travel] = []
         self._lost = not whole
         self._reached_ns = -1
@@ -254,7 +254,7 @@ class JournalWalk:
             walker.apply(Travel(max(0, self._reached_ns), speed_m_s))  # at once
 
     def _begin_anew(self) -> None:
-        """Forget the time reached: any stamp may come next; speeds ahead of their time act from now on."""
+        """Forget the time reached: any stamp may come next; waiting speeds act from now on."""
         for travel in self._travels:
             self._speed(travel.speed_m_s)
         self._travels, self._reached_ns = [], -1

@@ -37,7 +37,7 @@ class WearState:
 
 
 def scene_identity(scene: Scene) -> str:
-    """Return a hash of the numbers that define the pads: frame, clearance, head, and the initial depths.
+    """Return a hash of the numbers that define the pads: frame, clearance, head and initial depths.
 
     Loads, contact parameters and the wear coefficient may change for the same pads.
     """
@@ -144,12 +144,12 @@ def wear_content(state: WearState) -> bytes:
 
 
 def save_wear(folder: Path, content: bytes) -> None:
-    """Write the file in one step: after a crash it is the old or the new one, whole.
+    """Write the file in one step: after a crash it is the old or the new file, complete.
 
     Raises
     ------
     OSError
-        The disk refuses it; the file is the old version, or the new version, unconfirmed by the disk.
+        The disk refuses it; the file is the old version, or the new version without confirmation by the disk.
     """
     folder.mkdir(parents=True, exist_ok=True)
     write_whole(folder / FILE_NAME, content, sync=True)

@@ -58,8 +58,8 @@ class RunWriter:
     """Writes entries and outputs in the order of the calls.
 
     Journal and outputs have chunks of their own; the chunk of entries precedes that of the outputs sent after them.
-    Every method may raise `OSError` (disk full). After a failed `flush` or write the file is whole up to the flush
-    before and can be written on; after any other failed method only `abandon` may be called.
+    Every method may raise `OSError` (disk full). After a failed `flush` or write the file is complete up to the
+    previous flush and can be continued; after any other failed method only `abandon` may be called.
 
     Parameters
     ----------
@@ -226,7 +226,7 @@ class RunWriter:
             self._part.file.chunk(self._journal)
             self._part.file.chunk(self._outputs)
         except OSError:
-            self._outputs.clear()  # useless without the chunk of the journal
+            self._outputs.clear()  # the outputs are useless without the chunk of the journal
             raise
 
     def flush(self) -> None:
@@ -242,7 +242,7 @@ class RunWriter:
         return None
 
     def shortage(self) -> str | None:
-        """Return a text when the disk has too little free space for the end of the file, or None."""
+        """Return a text when the disk has too little space to end the file, or None."""
         return self._shortage(self.folder)
 
     def _shortage(self, folder: Path) -> str | None:
@@ -251,7 +251,8 @@ class RunWriter:
     def split(self, loss: Mapping[str, int], keep_bytes: int = 0) -> None:
         """Go on in a new part, opened before the old one is closed.
 
-        The caller must write a snapshot next. With `keep_bytes` the oldest parts are removed while all are larger.
+        The caller must write a snapshot next. With `keep_bytes` the oldest parts are removed while the parts are larger
+        in total.
         """
         self._close_chunks()
         old, self._number = self._part, self._number + 1

@@ -96,7 +96,7 @@ class Connections:
         if key in self._said:
             return False
         if other.node_name == _UNNAMED and key not in self._unnamed:
-            self._unnamed.add(key)  # the next look knows the name, if there is one
+            self._unnamed.add(key)  # the next look-up knows the name, if there is one
             return False
         self._said.add(key)
         self._node.get_logger().warning(f"{topic}: {text}")

@@ -165,7 +165,7 @@ class RosFront:
         self.runtime.others_publish = self._node.count_publishers(self.topics["contact_forces"]) > 1
 
     def parts(self) -> dict[str, Part]:
-        """Return further parts of the diagnostics."""
+        """Return the other parts of the diagnostics."""
         return {} if self._server is None else {"source": self._server.part()}
 
     def activate(self) -> None:

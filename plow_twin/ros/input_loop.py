@@ -1,7 +1,7 @@
 """A thread that empties the input queues as messages arrive, and runs timers by a steady clock.
 
-An executor of rclpy makes a task of each message, and rclpy's events executor looks at its timers only when no message
-waits: at 10 kHz, 95 % of its tasks found a queue that the one before had emptied, and nothing was published.
+An executor of rclpy makes a task of each message, and rclpy's events executor checks its timers only when no message
+waits: at 10 kHz, 95 % of its tasks found a queue that the task before had emptied, and nothing was published.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any, Final, Protocol
 
 from plow_twin.live.timer import Timer
 
-#: Largest number of messages taken at once; timers and waiting threads get their turn in between.
+#: Largest number of messages taken at once; timers and waiting threads run in between.
 _MOST: Final = 200
 #: Period at which all queues are polled [s], even without a notification.
 _LOOK_S: Final = 0.1
@@ -77,7 +77,7 @@ class InputLoop:
         self._turns, self._on_error = turns, on_error
         #: queue, receiver and topic by file descriptor
         self._queues: dict[int, tuple[Queue, Receiver, str]] = {}
-        #: the first one always runs
+        #: the first timer always runs
         self._timers = [Timer(_LOOK_S, self._look_at_all)]
         self._active = self._stopped = False
         #: time at which the next timer is due
@@ -152,7 +152,7 @@ class InputLoop:
             self._on_error(error)
 
     def _receive(self, fd: int, *, all_there_are: bool = False) -> bool:
-        """Take messages from a queue; return True if more are waiting."""
+        """Take messages from a queue; return whether more are waiting."""
         queue, receiver, topic = self._queues[fd]
         batch, more = queue.pop(_MOST, all_there_are=all_there_are)
         if batch:

@@ -18,7 +18,7 @@ _SPIN_S: Final = 0.1
 
 
 def make_executor() -> Executor:
-    """Return the events executor where rclpy has it: it does a third of the work per message."""
+    """Return the events executor if rclpy has it: it takes a third of the work per message."""
     try:
         from rclpy.experimental.events_executor import EventsExecutor
     except ImportError:

@@ -24,7 +24,7 @@ _GREY: Final = (0.6, 0.6, 0.6)
 _BLUE: Final = (0.3, 0.55, 0.9)
 _ORANGE: Final = (0.9, 0.6, 0.1)
 _RED: Final = (0.9, 0.2, 0.2)
-#: Width of lines and arrows by the frame's height, and length of an arrow that is as large as the head's weight.
+#: Width of lines and arrows as shares of the frame's height, and length of an arrow for a force of the head's weight.
 _LINE: Final = 0.015
 _ARROW: Final = 0.5
 
@@ -70,7 +70,7 @@ class Markers:
         normal = np.stack([NORMAL_X, NORMAL_Y], axis=1)
         along = np.stack([-NORMAL_Y, NORMAL_X], axis=1) * 0.1 * self._scale
         side = -1.0 if self._scene.head.carries == "corners" else 1.0  # of the force on the head
-        # a pad is drawn where its corner meets the wall
+        # a pad is drawn at the place where its corner meets the wall
         for pair in range(PAIR_COUNT):
             depth, force = float(row["wear_depth"][pair]), float(row["force"][pair])
             foot = self._corners[pair] + normal[pair] * (self._walls[pair] - normal[pair] @ self._corners[pair])

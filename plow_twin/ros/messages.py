@@ -15,7 +15,7 @@ from std_msgs.msg import Header
 from plow_twin.record import messages as plain
 from plow_twin.stream.intake import NS_PER_S
 
-#: Stamp [ns] and numbers of a message, whether they are a load, and whether an out-of-plane component is not zero.
+#: Stamp [ns] and numbers of a message, whether they are a load, and whether it has a non-zero out-of-plane component.
 Read = tuple[int, tuple[float, ...], bool, bool]
 #: A message that cannot be read.
 UNREADABLE: Final[Read] = (0, (), False, False)
@@ -33,7 +33,7 @@ def stamp_ns(header: Header) -> int:
 def deviations(covariance: Sequence[float]) -> tuple[float, ...]:
     """Return the standard deviations of x, y [m] and theta [rad] of a covariance, row-major 6 x 6.
 
-    NaN if a variance is negative: such a message is not used. Empty if all are 0, which means unknown.
+    A negative variance gives NaN: such a message is not used. Empty if all are 0, which means unknown.
     """
     variances = [float(covariance[7 * axis]) for axis in (0, 1, 5)]
     found = tuple(math.sqrt(variance) if variance >= 0.0 else math.nan for variance in variances)

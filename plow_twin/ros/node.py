@@ -41,8 +41,8 @@ class TwinNode(WithoutEvents, LifecycleNode):
     """The twin on ROS 2.
 
     Takes the keyword arguments of `rclpy.node.Node`, so that several can live in one process and executor. Code that
-    creates one calls `start` to do as `autostart` does in the program. `stop_asked` is polled while the solver is
-    compiled.
+    creates a node calls `start`, which does what `autostart` does in the program. `stop_asked` is polled while the
+    solver is compiled.
 
     Raises
     ------
@@ -60,7 +60,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
         self.lifecycle = "unconfigured"
         #: why the last configure failed
         self.reason = ""
-        #: wear of the scenes configured so far, which cleanup does not lose
+        #: wear of the scenes configured so far, which outlives cleanup
         self._kept_wear: dict[str, KeptWear] = {}
         self._preparation: Preparation | None = None
         self._health = diagnostics.Health()
@@ -164,7 +164,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
 
     def release(self) -> None:
         """Release everything and close the recording; can be called at any time."""
-        # a frozen runtime is part of reference cycles and would never be freed
+        # a frozen runtime, part of reference cycles, would never be freed
         gc.unfreeze()
         front, self._front = self._front, None
         if front is None:
@@ -248,7 +248,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
             self._connections.look_for_subscribers(self.publishers)
             self._front.look_for_others()
         elif self.lifecycle == "unconfigured" and not self.reason:
-            # a manager that configures later, perhaps another scene, need not wait for the compiler then
+            # so that a manager that configures later, perhaps another scene, need not wait for the compiler
             self.prepare()
         runtime = self.runtime
         if runtime is not None and runtime.without_clock and self._reports % _SAY_AGAIN == 0:

@@ -1,4 +1,4 @@
-"""Inputs of the node from an OPC UA server in the place of topics."""
+"""Inputs of the node from an OPC UA server instead of topics."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from plow_twin.record.sources import Arrived
 
 
 class OpcUaInput:
-    """A server's nodes as the queue of some inputs, and its receiver.
+    """A server's nodes as the queue of some inputs, with their receiver.
 
-    The server is waited for, at the start as after a break.
+    It waits for the server at the start and after a break.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ class OpcUaInput:
         self._feeder.feed(batch)
 
     def look(self) -> None:
-        """Take over losses and the state of the connection; called at intervals."""
+        """Update losses and the state of the connection; called at intervals."""
         bridge = self._bridge
         self._inputs.lost += bridge.lost - self._lost
         self._lost = bridge.lost

@@ -1,6 +1,6 @@
 """The public, stable C interface below rclpy, for serialised messages: the work done for each sample.
 
-rclpy delivers messages one by one, without the publisher's identity, and checks the type of each one it sends.
+rclpy delivers messages one by one, without the publisher's identity, and checks the type of each message sent.
 """
 
 from __future__ import annotations

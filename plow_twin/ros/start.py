@@ -39,7 +39,7 @@ def without_ros(arguments: Sequence[str]) -> list[str]:
     Raises
     ------
     RosArgumentsError
-        Those for ROS cannot be used.
+        The arguments for ROS cannot be used.
     """
     from rclpy.utilities import remove_ros_args
 

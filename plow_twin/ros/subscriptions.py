@@ -48,7 +48,7 @@ class Subscriptions:
     loop, turns
         The thread that takes the messages, and the lock that keeps it apart from the executor's.
     elsewhere
-        Inputs that are no topics: they come from a server.
+        Inputs that come from a server instead of topics.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class Subscriptions:
         #: number of the next message, by topic and publisher
         self._following: dict[tuple[str, bytes], int] = {}
         self._since_ns = time.time_ns()  # when the excitation was subscribed to
-        #: publishers of the excitation unknown at that time: first message, and losses counted before it
+        #: publishers of the excitation unknown at that time: first message, and losses counted before this message
         self._appeared: dict[bytes, tuple[Taken, int]] = {}
         self._before: frozenset[bytes] = frozenset()
         self._pose = PoseWithCovarianceStamped if runtime.poses_have_covariance else PoseStamped

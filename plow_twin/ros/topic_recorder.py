@@ -238,12 +238,12 @@ def record_topics(
 
 
 def schema_of(message_type: str) -> str:
-    """Return the `ros2msg` text of a type with those it uses: from its package, else that of ROS 2 Jazzy.
+    """Return the `ros2msg` text of a type with the types that it uses: from its package, otherwise of ROS 2 Jazzy.
 
     Raises
     ------
     LookupError
-        Neither is there.
+        Neither exists.
     """
     from ament_index_python.packages import get_package_share_directory
 

@@ -1,4 +1,4 @@
-"""Results of advances: views of the rows that the kernels write, at a time, at many times, of many twins."""
+"""Results of advances as views of the rows that the kernels write: at a time, at many times, of many twins."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class _Column(Generic[Number]):
 
 
 class _View:
-    """Columns that are arrays of one row as of many."""
+    """Columns that are arrays for one row as well as for many."""
 
     __slots__ = ("rows",)
 
@@ -74,9 +74,9 @@ class Advance(_View):
     steps : int
         Steps the solver took.
     status : Status
-        Anything but `OK` means that the state is the last good one.
+        With any other value than `OK` the state is the last good one.
     error_estimate_m : float
-        Estimated error of the pose in m where `max_evaluations` did not suffice for the tolerance, else 0.
+        Estimated error of the pose in m where `max_evaluations` did not suffice for the tolerance, otherwise 0.
     """
 
     __slots__ = ()

@@ -40,8 +40,8 @@ class TwinBatch:
     Parameters
     ----------
     scenes : sequence of Scene
-        One for each twin; the scenes' loads are not used. All contact laws must have the same terms: C d', a ramp, or
-        lambda (zero without damping), and exponents that are all 1, all integers of at least 2, or all fractions.
+        A scene for each twin; the scenes' loads are not used. All contact laws must have the same terms: C d', a ramp,
+        or lambda (zero without damping), and exponents that are all 1, all integers of at least 2, or all fractions.
     tol : float
         As for `Twin`.
     start : float
@@ -60,10 +60,10 @@ class TwinBatch:
 
     Notes
     -----
-    At `max_wall_s` a call raises `LimitError`, after Ctrl-C `RunInterrupted`: all twins stand as before the call.
-    Where every contact has exponent 1 and no scene has wear, friction, support, locks, an offset centre of mass or
-    overdamped contact, twins advance eight to a SIMD vector: each has the same bits alone and in any batch, equal to
-    those of a `Twin` to the tolerance. Other members have the bits of a `Twin` with the same terms.
+    At `max_wall_s` a call raises `LimitError`, after Ctrl-C `RunInterrupted`; all twins then have the state from before
+    the call. Where every contact has exponent 1 and no scene has wear, friction, support, locks, an offset centre of
+    mass or overdamped contact, twins advance eight to a SIMD vector: each has the same bits alone and in any batch,
+    equal to those of a `Twin` to the tolerance. Other members have the bits of a `Twin` with the same terms.
     """
 
     def __init__(
@@ -110,12 +110,12 @@ class TwinBatch:
 
     @property
     def signature(self) -> tuple[bool, ...]:
-        """Which terms the equations have, as of `Twin`: batches of one signature share their compiled code."""
+        """Terms of the equations, as in `Twin`: batches with equal terms share their compiled code."""
         parts = self._workers[0].parts
         return (*(part is not None for part in (*parts.terms, parts.implicit)), *options(self.scenes[0]))
 
     def set_wrench(self, wrench: ArrayLike) -> None:
-        """Set the samples at which the load begins; it runs from there to the next samples on straight lines.
+        """Set the first samples of the load, from which it runs to the next samples on straight lines.
 
         Parameters
         ----------
@@ -216,7 +216,7 @@ class TwinBatch:
         Raises
         ------
         ArgumentError
-            When the data has not the size of a snapshot; the twin is unchanged.
+            When the data does not have the size of a snapshot; the twin is unchanged.
         """
         here, sample, speed = read_snapshot(snapshot, self._states.dtype)
         away = np.broadcast_to(np.asarray(moved, dtype=np.float64), (len(self), 6))
@@ -236,7 +236,7 @@ class TwinBatch:
             self._states["y"][index] = geometry.state_of(self.scenes[index], there[:3], there[3:])
 
     def move(self, which: ArrayLike, q: ArrayLike, v: ArrayLike) -> None:
-        """Put some twins elsewhere at the present time; their wear and counts stay.
+        """Set the places of some twins at the present time; their wear and counts stay.
 
         Parameters
         ----------
@@ -285,7 +285,7 @@ class TwinBatch:
         Raises
         ------
         ArgumentError
-            When the data has not the size of a snapshot.
+            When the data does not have the size of a snapshot.
         """
         wear = self._params["wear_per_impulse"]
         ends = np.cumsum([self._states.nbytes, self._wrench.nbytes, wear.nbytes])

@@ -24,16 +24,16 @@ class EnergyBalance:
     Attributes
     ----------
     kinetic_j, stored_j : tuple of float
-        Kinetic energy, of a frame that gives way too, and elastic energy K d^(n+1) / (n+1) of the contacts, at the
-        start and at the end in J.
+        Kinetic energy, including that of a frame on springs, and elastic energy K d^(n+1) / (n+1) of the contacts, at
+        the start and at the end in J.
     load_work_j, gravity_work_j : float
         Work of the loads without gravity, and of gravity with its constant moment, in J.
     contact_work_j, friction_work_j : float
         Energy taken from the head by normal contact forces and by friction in J.
     support_work_j : float
-        Energy taken by the springs and dampers under a frame that gives way in J.
+        Energy taken by the springs and dampers of a `Support` in J.
     dissipated_j : float
-        Part of `contact_work_j` that is not stored at the end, in J.
+        The part of `contact_work_j` that is not stored at the end, in J.
     turnover_j : float
         Integral of the magnitudes of all powers in J.
     imbalance_j : float

@@ -107,8 +107,8 @@ def simulate_many(
     ArgumentError
         For an argument that cannot be used.
     LimitError, RunInterrupted
-        At `max_wall_s`, and after Ctrl-C; `result` holds the members as far as they had come, those not done with the
-        status `BUDGET`.
+        At `max_wall_s`, and after Ctrl-C; `result` holds the members up to there, unfinished ones with the status
+        `BUDGET`.
     """
     check_times(t_end, output_dt)
     check_limits(max_steps, max_wall_s)
@@ -119,7 +119,7 @@ def simulate_many(
     first, others = run.tasks(threads)
     with ThreadPoolExecutor(threads) as pool:
         try:
-            # alone: it compiles the kernels of all
+            # the first alone, because it compiles the kernels
             for task in first:
                 task()
             for done in [pool.submit(task) for task in others]:
@@ -134,9 +134,9 @@ def simulate_many(
     return ensemble
 
 
-#: Least members in lanes that a thread takes at a time: lanes are empty while the last members end.
+#: Smallest number of members that a thread takes at a time: lanes are empty while the last members end.
 _LEAST_SHARE = 64
-#: Shares a thread, so that all threads end at about the same time.
+#: Number of shares for each thread, so that all threads end at about the same time.
 _SHARES = 4
 
 
@@ -213,7 +213,7 @@ class _Run:
             self._report_progress(len(done))
 
     def _run_alone(self, index: int) -> None:
-        """Run a member that takes a whole vector for its pairs."""
+        """Run a member by the loop of a single scene."""
         self._look()
         compiled, ensemble = self._compiled[index], self._ensemble
         motion = Motion.start(compiled, ensemble.q[index], ensemble.v[index])
@@ -228,7 +228,7 @@ class _Run:
         state: State | NDArray[np.void],
         status: int | NDArray[np.int64],
     ) -> None:
-        """Take over the results of a finished member, or of some."""
+        """Take over the results of one or more finished members."""
         ensemble = self._ensemble
         ensemble.peak[index], ensemble.impulse[index] = totals["peak"], totals["impulse"]
         ensemble.time_in_contact[index], ensemble.makes[index] = totals["time_in_contact"], totals["makes"]

@@ -17,7 +17,7 @@ from plow_twin.solve.state import EVENT, HARMONIC, STATE, TOTALS, Status, Work, 
 
 #: Steps of each lane in the first slice.
 _FIRST_SLICE: Final = 256
-#: Steps that the loop of a single scene takes at most when a lane needs one of another method: a call takes as long as
+#: Most steps that the loop of a single scene takes when a lane needs a step of another method: a call costs as much as
 #: some thirty steps.
 _OTHER_STEPS: Final = 32
 
@@ -31,7 +31,7 @@ class LaneRun:
     compiled : sequence of CompiledScene
         All members.
     members : sequence of int
-        Those that run here.
+        Numbers of the members that run here.
     times : ndarray, shape (n,)
         Times of the rows in s.
     q, v : ndarray, shape (m, n, 3)
@@ -67,7 +67,7 @@ class LaneRun:
         )  # fmt: skip
 
     def go_on(self, waiting: NDArray[np.int64], work: Work, lanes: np.record) -> NDArray[np.bool_]:
-        """Bring members farther by a slice of work in empty lanes; return whether each is done."""
+        """Advance members by a slice of work in empty lanes; return whether each is done."""
         one, begin = self._compiled[waiting[0]], _time.perf_counter()
         terms = one.parts.terms
         run_lanes(

@@ -1,4 +1,4 @@
-"""Live twins in the lanes of a SIMD vector: slices of their advances, and those that lanes leave to another method."""
+"""Live twins in the lanes of a SIMD vector: slices of their advances, and advances left to another method."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class LaneTwins:
     terms : Terms
         Of all twins.
     members : range
-        Those that advance here.
+        Numbers of the twins that advance here.
     work : ndarray of `WORK`, shape (1,)
         Scratch space.
     max_steps : int
@@ -85,7 +85,7 @@ class LaneTwins:
             waiting = self._advance_others(len(times), alone) if self._progress[1] else ()
 
     def _advance_others(self, count: int, alone: Callable[[int, int], None]) -> list[int]:
-        """Advance each of the other twins once; return those that have not done all `count` advances."""
+        """Advance each of the other twins once; return the twins that have not done all `count` advances."""
         others: list[int] = self._other[: self._progress[1]].tolist()
         for member in others:
             alone(member, int(self._place[member]))

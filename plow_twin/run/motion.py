@@ -1,4 +1,4 @@
-"""A run under way: the compiled loop in slices, between which limits, progress and Ctrl-C are seen to."""
+"""A run under way: the compiled loop in slices, between which limits, progress and Ctrl-C are handled."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ class Motion:
     v: Array
     penetration: Array | None = None
     force: Array | None = None
-    #: place and rate of a frame that gives way, shape (n, 6)
+    #: place and rate of a frame on springs, shape (n, 6)
     frame: Array | None = None
     sums: BalanceSums | None = None
     #: rows written
     first: NDArray[np.int64] = field(default_factory=lambda: np.zeros(1, np.int64))
-    #: reached by fixed steps, which leave the state's own time alone
+    #: reached by fixed steps, which do not change the state's own time
     fixed_time: float | None = None
 
     @property
@@ -115,7 +115,7 @@ def run_fixed(
     done, size = np.zeros(1, np.int64), _FIRST_SLICE
     while True:
         begin = _time.perf_counter()
-        # the next slice writes the row at the end of this slice again, unless it is due
+        # the next slice overwrites the row at the end of this slice, unless it is due
         allowed = min(steps, budget, steps if look is None else int(done[0]) + size)
         code = int(fixed_step.integrate_fixed(
             compiled.params, compiled.parts, motion.state, motion.totals, motion.log, z, done, allowed, dt, euler,

@@ -27,7 +27,7 @@ class Pace:
     Parameters
     ----------
     state_type : dtype
-        Of the state that is kept from before the advance under way.
+        Type of the state that is kept from before the advance under way.
     implicit : bool
         Whether the scene can need implicit steps.
     max_wall_s : float
@@ -65,7 +65,7 @@ class Pace:
 
 
 def check_limits(max_steps: int, max_wall_s: float) -> None:
-    """Raise `ArgumentError` for limits that no call can have."""
+    """Raise `ArgumentError` for invalid limits."""
     # a float would compile further kernels
     if isinstance(max_steps, bool) or not isinstance(max_steps, (int, np.integer)) or not max_steps >= 1:
         raise ArgumentError(f"max_steps: got {max_steps!r}, expected an integer >= 1")

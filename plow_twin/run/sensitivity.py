@@ -1,9 +1,8 @@
 """Growth of errors along a motion, which shows how long a tolerance holds.
 
-The columns of the fundamental matrix come from the linearised equations (`solve.tangents`). For terms that these do not
-have, displaced motions are followed beside the motion itself, over short stretches, from states close to it: their
-differences are the columns. They include the jumps at touches and separations (saltation), since each shadow has its
-own events.
+The columns of the fundamental matrix come from the linearised equations (`solve.tangents`). For other terms, displaced
+motions (shadows) are followed beside the motion itself over short stretches from states close to it; their differences
+are the columns. They include the jumps at touches and separations (saltation), since each shadow has its own events.
 """
 
 from __future__ import annotations
@@ -34,18 +33,19 @@ DISPLACEMENT: Final = 1e-7
 _LEAST_DISPLACEMENT: Final = 1e-10
 SHADOW_TOLERANCE: Final = 1e-12
 _STRETCHES: Final = 200
-#: Change of a parameter that is no length, in shares of it.
+#: Change of a parameter that is not a length, as a share of it.
 _RELATIVE_CHANGE: Final = 1e-6
-#: Least distance from walls at the beginning of a stretch, in displacements. If this leaves too small a displacement,
-#: the stretch before is continued, at most so often in a row.
+#: Smallest distance from walls at the beginning of a stretch, in displacements. If this leaves too small a
+#: displacement, the previous stretch is continued, at most so often in a row.
 _CLEAR_OF_WALLS: Final = 100.0
 _MOST_MERGED: Final = 20
-#: Steps of one shadow over one stretch.
+#: Most steps of a shadow in a stretch.
 _SHADOW_BUDGET: Final = 10**7
-#: Tolerance of the motion along which the equations are linearised: its derivatives then are good to some 1e-6 times
-#: what an error grows. Where that is more than the other, the motion is followed at the tolerance asked for.
+#: Tolerance of the motion along which the equations are linearised: the error of its derivatives is some 1e-6 times the
+#: growth of errors. Where this is larger than the tolerance of the run, the latter is used.
 _EQUATIONS_TOLERANCE, _LARGEST_ERROR = 1e-6, 1e-2
-#: Steps before the first look at the clock, and beyond which explicit ones are too many where implicit ones may serve.
+#: Steps before the first look at the clock, and number of explicit steps that is too large where implicit steps are
+#: possible.
 _FIRST_SLICE, _MOST_WITHOUT_IMPLICIT = 2048, 200_000
 #: Growth above which an error is no longer within ten tolerances (`docs/solver.md`).
 TRUSTED_GROWTH: Final = 1e4
@@ -60,8 +60,8 @@ class Sensitivity:
     t : ndarray, shape (n,)
         Times in s.
     growth : ndarray, shape (n,)
-        Largest factor by which an error made at any time before has grown at `t`. Errors count as poses relative to the
-        clearance, velocities over the time in which the largest load crosses it.
+        Largest factor by which an earlier error has grown at `t`. Errors of poses are relative to the clearance, errors
+        of velocities are multiplied by the time in which the largest load crosses it.
     from_start : ndarray, shape (n, k, k)
         Derivatives of the state at `t` by the initial state, of the k / 2 free degrees of freedom: places, then rates.
     exponent : float
@@ -145,7 +145,7 @@ def _scaled(load: Load, factor: float) -> Load:
 
 @dataclass(frozen=True)
 class ChangedScene:
-    """A scene in which one number is a little larger."""
+    """A scene with one number a little larger."""
 
     path: str
     compiled: CompiledScene
@@ -163,7 +163,7 @@ class ChangedScene:
 
 
 def refuse_support(scene: Scene) -> None:
-    """Raise `ArgumentError` for a scene whose frame gives way: shadows are not displaced in its places and rates."""
+    """Raise `ArgumentError` for a scene with a `Support`: shadows are not displaced in its places and rates."""
     if scene.support is not None:
         raise ArgumentError(f"sensitivity: got a scene with {scene.support}, expected one without support")
 
@@ -185,7 +185,7 @@ class StretchProduct:
     rows : ndarray, shape (p, k)
         Derivatives by the parameters.
     growth : float
-        Largest growth since any of the times that are kept, at least 1.
+        Largest growth since any of the kept times, at least 1.
     """
 
     def __init__(self, size: int, parameters: int) -> None:
@@ -213,7 +213,7 @@ class StretchProduct:
         totals, rows, growth : ndarray, shapes (n, k, k), (n, p, k) and (n,)
             The public numbers after each.
         logs : ndarray, shape (n, k)
-            Logarithms of the factors by which each stretch that ends stretched a basis, 0 for the others.
+            Logarithms of the factors by which each stretch that ends has stretched a basis, 0 for the others.
         """
         count, size = matrices.shape[:2]
         totals, rows = np.zeros((count, size, size)), np.zeros((count, len(self.rows), size))
@@ -242,7 +242,7 @@ def sensitivity_of(scene: Scene, t_end: float, tol: float, parameters: Sequence[
     Raises
     ------
     ArgumentError
-        For a parameter that the scene does not have, or a scene whose frame gives way.
+        For a parameter that the scene does not have, or a scene with a `Support`.
     SolverError
         When a shadow could not be followed.
     """
@@ -266,7 +266,7 @@ def sensitivity_of(scene: Scene, t_end: float, tol: float, parameters: Sequence[
         stretches = _by_equations(scene, t_end, tol, parameters) or stretches
         totals, rows, growth, logs = follow(stretches)
     times, ends = _ends(t_end), stretches.ends
-    # the exponent is that of stretches that begin in the second half
+    # the exponent is taken over stretches that begin in the second half
     edges = np.concatenate([[0.0], times[ends]])
     first = int(np.searchsorted(edges, 0.5 * t_end))
     stretched = logs[ends][first:].sum(axis=0)
@@ -318,7 +318,7 @@ def _by_equations(scene: Scene, t_end: float, tol: float, parameters: Sequence[s
 
 def _by_shadows(scene: Scene, t_end: float, tol: float, parameters: Sequence[str]) -> _Stretches:
     """Follow displaced motions beside the motion."""
-    # five digits finer than the displacement
+    # five digits finer than a displacement
     fine = min(max(SHADOW_TOLERANCE, TOLERANCE_RANGE[0]), tol)
     compiled = compile_scene(scene, fine)
     changed = [ChangedScene.of(scene, path, fine) for path in parameters]
@@ -374,25 +374,26 @@ def displacement_beside(
 ) -> float | None:
     """Return the largest displacement of shadows, in shares of the clearance, for a stretch that begins here.
 
-    A spring makes a large velocity of a place that is displaced in its contact, as no step of the solver does: no
-    stretch begins there. Where a damper holds the head, a displacement stays, and a small one is as good.
+    A spring turns a place displaced in contact into a large velocity, which no step of the solver does: no stretch
+    begins there. Where a damper holds the head, a displacement persists, and a small one suffices.
 
     Parameters
     ----------
     penetration : ndarray, shape (n,)
-        Of the pairs that can touch, in m.
+        Penetrations of the pairs that can touch, in m.
     length : float
-        The clearance in m that displacements are shares of.
+        The clearance in m to which displacements refer.
     held : bool
         Whether overdamped contact holds the head.
     reads_speed : bool
-        Whether a contact's damping depends on the speed of its touch, which is not displaced within the contact.
+        Whether a contact's damping depends on the speed of its touch, which a displacement within the contact does not
+        change.
 
     Returns
     -------
     float or None
-        None where a pair is so near to its wall, inside or outside, that no displacement is small beside that, or in a
-        contact that has read its speed.
+        None where a pair is so near its wall that no displacement is small beside the distance, or in a contact whose
+        damping depends on the speed of its touch.
     """
     if reads_speed and bool((penetration > 0.0).any()):
         return None
@@ -414,7 +415,7 @@ def _beside(
     before: Sequence[State],
     work: Work,
 ) -> list[State]:
-    """Return a state and its shadows: for each free place or rate one beside it by `moved`, for each changed scene one.
+    """Return a state and its shadows: one displaced by `moved` for each free place or rate, one for each changed scene.
 
     Shadows of changed scenes are not displaced; they keep the damping set at a touch, from `before`.
     """

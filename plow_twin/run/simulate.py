@@ -35,7 +35,7 @@ Array = NDArray[np.float64]
 #: Type of one contact event: time in s, pair, modes (0 off, 1 on, 2 clipped), rate of penetration in m/s.
 EVENT_DTYPE: Final = EVENT
 _ROWS_BY_DEFAULT = 1000
-#: More rows no memory holds: each takes 176 bytes.
+#: Most rows that fit into memory: each takes 176 bytes.
 _MOST_ROWS: Final = 1e10
 
 
@@ -58,7 +58,7 @@ class Result:
         whole motion, not over the output rows.
     contact_sets : mapping
         `ccw` and `cw`: share of the contact time of that sense in which exactly these corners carry force. Corners by
-        the scene's labels, else by name.
+        the scene's labels, otherwise by name.
     solver : mapping
         method, tol or dt, steps, evaluations (orders of series, or right-hand sides), events.
     wear_depth : ndarray, shape (8,)
@@ -70,8 +70,7 @@ class Result:
     sensitivity : Sensitivity or None
         How errors grow along the motion, on request.
     frame : ndarray, shape (n, 6), or None
-        Displacement of a frame that gives way (`Support`), x, y [m], theta [rad], and its rate; q and v are as seen
-        from it.
+        Displacement of a frame on springs (`Support`), x, y [m], theta [rad], and its rate; q and v are relative to it.
     """
 
     t: Array
@@ -108,7 +107,7 @@ class Result:
         ModuleNotFoundError
             matplotlib (extra `view` or `study`) is not installed.
         """
-        # found by name, as pandas finds its plotting backend: a simulation depends on no picture
+        # found by name, as pandas finds its plotting backend, so that a simulation does not import pictures
         drawn: Figure = import_module("plow_twin.view.motion").plot_motion(self, title)
         return drawn
 
@@ -159,7 +158,7 @@ def simulate(
     dt : float, optional
         The fixed step in s.
     energy_balance : bool
-        Balance energy and momentum (`Result.energy_balance`); off, its code does not run.
+        Balance energy and momentum (`Result.energy_balance`); without it the code does not run.
     max_steps : int
         Steps that the run may take.
     max_wall_s : float
@@ -250,7 +249,7 @@ class _Watch:
 
 
 def check_times(t_end: float, output_dt: float | None, method: str = "events", dt: float | None = None) -> None:
-    """Raise `ArgumentError` for times that no run can have."""
+    """Raise `ArgumentError` for invalid times."""
     if not (_is_finite(t_end) and t_end >= 0.0):
         raise ArgumentError(f"t_end: got {t_end!r}, expected a finite time >= 0 [s]")
     if output_dt is not None and not (_is_finite(output_dt) and output_dt > 0.0):
@@ -394,7 +393,7 @@ def contact_sets_of(scene: Scene, totals: Totals) -> dict[str, dict[str, float]]
     labels = [letters.get(corner, corner) for corner in CORNER_NAMES]
     joint = "" if letters else "+"
     senses = {}
-    # the force on a block that is at a wall turns it the other way than that on a cavity about a corner
+    # the force at a wall turns a block the other way than a cavity about a corner
     order = ("ccw", "cw") if scene.head.carries == "walls" else ("cw", "ccw")
     for sense, times in sorted(zip(order, totals.set_time, strict=True), key=lambda item: item[0]):
         total = times.sum()

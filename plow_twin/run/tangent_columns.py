@@ -19,9 +19,10 @@ _COVERED: Final = {"harmonics", "second", "viscous", "hysteretic", "integer", "f
 
 
 def fits_tangents(compiled: CompiledScene) -> bool:
-    """Return whether the linearised equations have all terms of a scene: no exponent but integers and 1.5.
+    """Return whether the linearised equations have all terms of a scene; exponents must be integers or 1.5.
 
-    Implicit steps are not among them. A law with a restitution has them compiled for slow touches alone, so it fits.
+    Implicit steps are not among them. A law with a restitution has them compiled only for slow touches, so it
+    qualifies.
     """
     terms, contact = compiled.parts.terms, compiled.scene.contact
     there = {name for name, term in zip(Terms._fields, terms, strict=True) if term is not None}
@@ -38,7 +39,7 @@ def is_curved(terms: Terms) -> int | None:
 def columns_beside(
     compiled: CompiledScene, changed: Sequence[tuple[CompiledScene, float]]
 ) -> tuple[NDArray[np.void], _Array, _Array]:
-    """Return columns of the state's displacements and of scenes in which a number is larger by a change.
+    """Return columns for the state's displacements and for scenes in which a number is larger by a change.
 
     Returns
     -------
@@ -46,7 +47,7 @@ def columns_beside(
     omegas : ndarray, shape (h,)
         Angular frequencies of the loads in rad/s.
     amplitudes : ndarray, shape (b, h, 2, 3, 8)
-        What each column changes of sine and cosine amplitudes, per mass and inertia.
+        Change of the sine and cosine amplitudes by each column, per mass and inertia.
     """
     blocks = -(-(STATE_COLUMNS + len(changed)) // WIDTH)
     columns, omegas = new_records(COLUMNS, blocks), compiled.loads.omega

@@ -71,7 +71,7 @@ class Twin:
         one). Beyond them a few Runge-Kutta steps complete the advance, and its `error_estimate_m` is not zero. At
         least `LEAST_EVALUATIONS`.
     max_steps : int
-        Most steps of an advance; beyond them it ends with the status `BUDGET` and moves nothing.
+        Most steps of an advance; beyond them it ends with the status `BUDGET` and leaves the twin unchanged.
     max_wall_s : float
         Seconds that a call for advances may take.
 
@@ -121,13 +121,13 @@ class Twin:
         #: model time, as a view of the state
         self._time = self._states["time"]
         self._wrench = np.zeros(3)
-        #: loads of one sample per mass and inertia, and no snapshots: made once, for live samples come one by one
+        #: loads of one sample per mass and inertia, and empty snapshots, made once for live samples one by one
         self._one_load, self._no_snapshots = np.empty((1, 2, 3)), self._states[:0]
         self._travel_speed = scene.wear.travel_speed_m_s if scene.wear is not None else 0.0
 
     @property
     def signature(self) -> tuple[bool, ...]:
-        """Which terms the equations have: twins of one signature share their compiled code."""
+        """Terms of the equations: twins with equal terms share their compiled code."""
         parts = self._parts
         there = (*parts.terms, parts.harmonics, parts.segments, parts.implicit, self._bound)
         return (*(part is not None for part in there), *options(self.scene))
@@ -227,7 +227,7 @@ class Twin:
         rows: NDArray[np.void] | None,
         digest_after: NDArray[np.int64] = _NO_DIGESTS,
     ) -> Advanced:
-        """Advance to some times: the way of every advance.
+        """Advance to given times; every other advance uses this.
 
         Parameters
         ----------
@@ -320,7 +320,7 @@ class Twin:
         self._wrench = np.zeros(3)
 
     def move(self, q: ArrayLike, v: ArrayLike) -> None:
-        """Put a head under sampled loads elsewhere at the present time; its wear and counts stay.
+        """Set the place of a head under sampled loads at the present time; its wear and counts stay.
 
         Parameters
         ----------
@@ -363,7 +363,7 @@ class Twin:
         Raises
         ------
         ArgumentError
-            When the data has not the size of a snapshot.
+            When the data does not have the size of a snapshot.
         """
         self._states[0], self._wrench, speed = read_snapshot(data, self._states.dtype)
         self._set_wear_rate(speed)
@@ -381,7 +381,7 @@ class Twin:
         return depth
 
     def failure(self, status: int) -> str:
-        """Say why the newest advance that failed did so.
+        """Return the reason why the newest failed advance failed.
 
         Parameters
         ----------
@@ -406,7 +406,7 @@ class Twin:
 
     @property
     def frame(self) -> NDArray[np.float64] | None:
-        """Displacement of a frame that gives way, x, y [m], theta [rad], and its rate, shape (6,); None without one."""
+        """Displacement of a frame on springs, x, y [m], theta [rad], and its rate, shape (6,); None without one."""
         state, work = self._state, self._work
         if self._parts.terms.support is None:
             return None
@@ -451,7 +451,7 @@ class Twin:
     def _stopped(
         self, stop: BaseException, count: int, samples: NDArray[np.float64] | None, rows: NDArray[np.void] | None
     ) -> NoReturn:
-        """Stand after the last advance that was done, of `count`, and raise."""
+        """Keep the state after the last finished advance, of `count`, and raise."""
         steps, done = self.steps, int(self._pace.record.row)
         self._go_back()
         if samples is not None and done > 0:
@@ -490,12 +490,12 @@ class Advanced(NamedTuple):
 
 
 def read_snapshot(data: bytes, dtype: np.dtype[np.void]) -> tuple[np.void, NDArray[np.float64], float]:
-    """Return the state, the wrench (3,) and the travel speed [m/s] of a `Twin.snapshot` whose state is of a type.
+    """Return the state of the given type, the wrench (3,) and the travel speed [m/s] of a `Twin.snapshot`.
 
     Raises
     ------
     ArgumentError
-        When the data has not the size of a snapshot.
+        When the data does not have the size of a snapshot.
     """
     size = dtype.itemsize
     if len(data) != size + 32:

@@ -1,4 +1,4 @@
-"""How errors and changes of parameters grow along the motion of a live twin: shadows that are advanced beside it."""
+"""Growth of errors and of changes of parameters along the motion of a live twin, by shadows advanced beside it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 
 #: Length of a stretch in s; it ends sooner if a shadow is that many displacements away.
 _STRETCH_S, _FAR = 0.1, 100.0
-#: Longest stretch in s, if a contact prevents a new one.
+#: Longest stretch in s, where a contact prevents a new one.
 _LONGEST_S = 0.5
 
 
@@ -53,14 +53,14 @@ class TwinSensitivity:
     by_parameter : dict of str to ndarray, shape (k,)
         Derivatives of the state at `t` by the parameters at constant initial state.
     growth : float
-        Largest factor by which an error made at any time before has grown at `t`, as `Sensitivity.growth`.
+        Largest factor by which an earlier error has grown at `t`, as `Sensitivity.growth`.
     exponent : float
         Largest Lyapunov exponent in 1/s since the beginning.
 
     Raises
     ------
     ArgumentError
-        For a parameter that the scene does not have, a twin that is not sampled, or a scene whose frame gives way.
+        For a parameter that the scene does not have, a twin that is not sampled, or a scene with a `Support`.
     """
 
     def __init__(self, twin: Twin, parameters: Sequence[str] = ()) -> None:
@@ -99,7 +99,7 @@ class TwinSensitivity:
 
     @property
     def growth(self) -> float:
-        """Largest factor by which an error made before has grown."""
+        """Largest factor by which an earlier error has grown."""
         return self._product.growth
 
     @property

@@ -45,7 +45,7 @@ def tables(folder: Path) -> list[Path]:
     return [found[name] for name in sorted(found)]
 
 
-#: Files that are taken for CSV, by their first bytes.
+#: Files that may be taken for CSV, by their first bytes.
 _OTHERS: Final = {
     b"\xff\xfe": "UTF-16 text",
     b"\xfe\xff": "UTF-16 text",
@@ -55,7 +55,7 @@ _OTHERS: Final = {
 
 
 def check_text(begin: bytes) -> None:
-    """Refuse a file that begins so and is no CSV.
+    """Refuse a file whose first bytes show that it is not CSV.
 
     Raises
     ------
@@ -81,7 +81,7 @@ def csv_rows(stream: IO[str], comment: str = "") -> Iterator[tuple[int, list[str
     Raises
     ------
     csv.Error
-        A line is no row.
+        A line is not a row.
     ExcessError
         A row is longer than `LONGEST_ROW`, or there are more than `MOST_COLUMNS`.
     """

@@ -1,4 +1,4 @@
-"""Parquet files as the lines of CSV that they stand for: each reader of CSV reads them, within its bounds."""
+"""Parquet files as equivalent lines of CSV, for each reader of CSV and within its bounds."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 SUFFIX: Final = ".parquet"
 #: Most rows that are turned into lines at once.
 _ROWS: Final = 4096
-#: Most rows for each byte of a file, and those that any file may have: a few bytes stand for any number of rows.
+#: Most rows for each byte of a file, and rows that any file may have: a few bytes can encode any number of rows.
 _MOST_PER_BYTE: Final = 100
 _ALWAYS: Final = 1_000_000
 #: Largest column of a group of rows, unpacked [B]: it is in memory as a whole. Writers make groups of 128 MB.
@@ -47,9 +47,9 @@ class ParquetLines(io.RawIOBase):
     OSError
         It cannot be opened.
     csv.Error
-        It is no Parquet, or damaged; reading raises this too.
+        It is not Parquet, or damaged; reading raises this too.
     ExcessError
-        It stands for more than any telemetry has.
+        It is larger, unpacked, than any telemetry.
     """
 
     def __init__(self, path: Path) -> None:
@@ -75,7 +75,7 @@ class ParquetLines(io.RawIOBase):
         self._rest = memoryview(b"")
 
     def _check(self) -> None:
-        """Raise an `ExcessError` for a file that stands for too much."""
+        """Raise an `ExcessError` for a file that is too large unpacked."""
         facts = self._file.metadata
         if facts.num_columns > _MOST_COLUMNS:
             raise ExcessError(f"{self.name}: got {facts.num_columns} columns, expected at most {_MOST_COLUMNS}")
@@ -151,7 +151,7 @@ def _is_plain(kind: pa.DataType) -> bool:
 
 
 def _as_text(batch: pa.RecordBatch) -> pa.RecordBatch:
-    """Return columns written by their meaning: instants in UTC, durations in seconds, numbers exactly."""
+    """Return columns as text: instants in UTC, durations in seconds, numbers exactly."""
     import pyarrow as pa
 
     columns = []

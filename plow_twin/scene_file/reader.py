@@ -74,10 +74,10 @@ def loads_scene(text: str, base: str | Path | None = ".", *, source: str = "scen
     text : str
         The scene as YAML.
     base : str or Path, optional
-        Folder against which load tables are looked up; the working directory by default. None: tables in files are
+        Folder against which load tables are looked up; the working directory by default. With None, tables in files are
         refused.
     source : str
-        What messages call the scene.
+        Name of the scene in messages.
 
     Raises
     ------
@@ -193,7 +193,7 @@ def _problems_across(parts: Mapping[str, Any]) -> tuple[Problem, ...]:
 
 
 def _as_written(problem: Problem, raw: Mapping[str, Any]) -> Problem:
-    """Return the problem with the key of the file, where `loads[0].force_n` is under the kind of the load."""
+    """Return the problem under the key of the file, in which `loads[0].force_n` lies below the kind of the load."""
     head, _, rest = problem.key.partition("].")
     index = head.removeprefix("loads[")
     if index == head or not index.isdigit() or rest.startswith(("name", "at_m")):

@@ -28,7 +28,7 @@ def read_table(path: Path, columns: Sequence[str] | None = None, key: str = "fil
     columns : sequence of str, optional
         Names in the header of time, Fx, Fy and M; `t, fx, fy, m` by default, or `time` for `t`.
     key : str
-        What messages call the file.
+        Name of the file in messages.
 
     Raises
     ------

@@ -33,11 +33,11 @@ class _Shown:
         return self.text
 
 
-#: The value of a key that is missing.
+#: Stands for the value of a missing key.
 NOTHING: Final = _Shown("nothing")
 #: Longest value that is printed, and longest name [characters].
 _LONGEST: Final = 200
-#: Most problems that are listed: finding the nearest key for each takes time.
+#: Most listed problems: finding the nearest key for each takes time.
 MOST_PROBLEMS: Final = 50
 
 
@@ -57,7 +57,7 @@ def _validator(schema: Schema) -> Validator:
 
 @cache
 def _validator_class() -> Callable[[Schema], Validator]:
-    """Return a validator for YAML: NaN, infinity and integers beyond float64 are no numbers, 1.0 is no integer."""
+    """Return a validator for YAML: NaN, infinity and integers beyond float64 are not numbers, 1.0 is not an integer."""
     checker = Draft202012Validator.TYPE_CHECKER.redefine_many(
         {
             "number": lambda _, value: _is_number(value),
@@ -112,7 +112,7 @@ def _closest_branch(key: str, error: ValidationError, whole: str) -> Iterator[Pr
 
 
 def _is_misfit(error: ValidationError) -> bool:
-    """Return whether an error means that a branch is for values of another type, or for other keys."""
+    """Return whether an error means that the branch is meant for values of another type or for other keys."""
     keys_alone = error.validator == "required" and "properties" not in cast(Schema, error.schema)
     return keys_alone or error.validator in ("type", "const", "enum")
 

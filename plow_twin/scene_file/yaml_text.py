@@ -1,7 +1,7 @@
 """YAML of untrusted files: safe, bounded, numbers by the YAML 1.2 core schema, floats written exactly.
 
-The events of the parser are counted before a document is built: libyaml builds nested collections by recursion in C,
-and a few lines of aliases can stand for any number of values.
+The events of the parser are counted before a document is built: libyaml recurses in C for nested collections, and a few
+lines of aliases can expand to any number of values.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ MOST_VALUES: Final = 1_000_000
 DEEPEST: Final = 20
 #: Most keys of a document: a scene has some hundred, the `metadata.yaml` of 1,000 parts 20,000.
 MOST_KEYS: Final = 50_000
-#: Most values that the aliases of a document stand for together.
+#: Most values to which the aliases of a document expand together.
 MOST_REPEATED: Final = 50_000
 
 _FLOAT: Final = re.compile(r"^(?:[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?|[-+]?\.inf|\.nan)$", re.I)
@@ -106,7 +106,7 @@ def load_yaml(text: str, name: str, sections: str, *, most_values: float = math.
 
 @dataclass
 class _Size:
-    """Size of a node with all below it, each alias counted as its node."""
+    """Size of a node and its children, each alias counted as its node."""
 
     values: int = 1
     keys: int = 0
@@ -141,7 +141,7 @@ def _excess(text: str, most_values: float) -> Problem | None:
                 sizes[anchor] = outer
             outer, is_mapping, anchor = stack.pop()
         elif kind is yaml.AliasEvent:
-            known = sizes.get(event.anchor, scalar)  # the composer says where an anchor is missing
+            known = sizes.get(event.anchor, scalar)  # the composer reports where an anchor is missing
             if known is None:
                 return Problem(_place(event.start_mark), "an alias to itself", "an alias to a node before it")
             node = known
@@ -159,7 +159,7 @@ def _excess(text: str, most_values: float) -> Problem | None:
         if is_mapping:
             outer.keys += 1
         outer.keys += node.keys
-        if outer.keys > 2 * MOST_KEYS:  # an item is a key or its value
+        if outer.keys > 2 * MOST_KEYS:  # items are keys and values
             return _above(event, (outer.keys + 1) // 2, MOST_KEYS, "keys")
         if outer.depth <= node.depth:
             outer.depth = node.depth + 1

@@ -47,11 +47,11 @@ from plow_twin.solve.state import (
 
 #: Tightest and loosest tolerance.
 TOLERANCE_RANGE = (1e-13, 1e-1)
-#: Share of the tolerance that one step may spend: hundreds of steps and impacts that amplify must stay within it.
+#: Share of the tolerance that a step may spend, so that hundreds of steps and amplifying impacts stay within it.
 STEP_SHARE = 3e-4
-#: Most that a step may spend, as a share of the length scale: a loose tolerance is exceeded in fewer steps.
+#: Largest error of a step, as a share of the length scale: fewer steps suffice to exceed a loose tolerance.
 LARGEST_STEP_ERROR = 1e-6
-#: The same for exponents that are not integers: the remainder of a series falls slower near a branch point.
+#: The same for exponents that are not integers: near a branch point the remainder of a series falls more slowly.
 STEP_SHARE_FRACTION = 1e-6
 #: Mode changes at one instant after which the solver steps past it.
 MAX_EVENTS_AT_ONCE = 64
@@ -249,7 +249,7 @@ def _describe(scene: Scene, tol: float, sampled: bool, shared: _Shared) -> _Desc
 
 
 def options(scene: Scene) -> Options:
-    """Return which options a scene has, which its constants have fields for."""
+    """Return which options a scene has; its constants have fields for these."""
     falls = scene.contact.restitution_fall is not None or scene.contact.restitution_fall_along_s_m is not None
     return Options(scene.head.carries == "corners", scene.frame.corner_radius_m is not None, falls)
 
@@ -340,13 +340,13 @@ def _initial_depth(scene: Scene) -> float:
 
 @lru_cache(64)
 def _thresholds(admissible: float, order: int) -> Array:
-    """Return the admissible size of each term over that of the first."""
+    """Return the admissible size of each term over that of the first term."""
     sizes: Array = admissible ** (np.arange(MAX_ORDER + 1) / order)
     return sizes
 
 
 def order_for(admissible: float) -> int:
-    """Return the order for the error admissible in a step: the fastest in measurements of the bench scenes."""
+    """Return the order for the admissible error of a step, the fastest in measurements of the bench scenes."""
     return int(min(MAX_ORDER, max(8, round(6.0 - math.log10(admissible)))))
 
 
@@ -377,7 +377,7 @@ def _segments(scene: Scene, pieces: Pieces) -> Segments:
 
 
 def law_terms(contact: Contact) -> tuple[Terms, float]:
-    """Return which terms the law has, all others absent, and D where lambda = D / v0 (else -1)."""
+    """Return the terms of the law, all others absent, and D where lambda = D / v0 (otherwise -1)."""
     law, exponent = LAWS[contact.law], float(contact.exponent)
     viscous = law.additive and bool(contact.damping)
     number = -1.0 if contact.restitution is None else law.damping_number(contact.restitution)
@@ -454,7 +454,7 @@ def _velocity_scale(scene: Scene, wrench: Array, length: float) -> float:
 def _release(scene: Scene, tol: float, length: float, speed: float) -> float:
     """Return the penetration from which the impulse to separation is below a share of the velocity tolerance.
 
-    integral F dt = K d^(n+1) / ((n+1) v) at the speed v. There may be many separations, a hundred times slower.
+    integral F dt = K d^(n+1) / ((n+1) v) at the speed v. There may be many separations, some a hundred times slower.
     """
     exponent = scene.contact.exponent
     share = 1e-5 if exponent == 1.5 or float(exponent).is_integer() else 1e-8
@@ -465,7 +465,7 @@ def _release(scene: Scene, tol: float, length: float, speed: float) -> float:
         # a released corner lets go of its wall, so the jump of its spring's force must be negligible too
         stretch = max(1e-3 * tol * length, 1e-15 * geometry.half_diagonal(scene))
         held = stretch * friction.stick_stiffness_n_m / friction.coefficient
-        # a corner that crosses it in less than 1e-11 s has series whose terms are not finite
+        # the series of a corner that crosses it in less than 1e-11 s has non-finite terms
         depth = max(float((held / scene.contact.stiffness) ** (1.0 / exponent)), 1e-11 * speed)
         release = min(release, depth)
     return release
@@ -489,7 +489,7 @@ def _implicit(scene: Scene, terms: Terms, values: dict[str, Any]) -> Implicit | 
     if terms.slip is not None:
         damping += values["friction"] * largest_force / values["slip_speed"]
     overdamped = damping * mobility > OVERDAMPED_RATIO * math.sqrt(spring * mobility)
-    # or those of a support
+    # or of a support
     if scene.support is not None:
         overdamped |= bool((values["frame_damping"] > OVERDAMPED_RATIO * np.sqrt(values["frame_stiffness"])).any())
     return new_implicit(scene.support is not None) if overdamped else None
@@ -507,7 +507,7 @@ def _rubbing(scene: Scene) -> dict[str, Any]:
 
 
 def _slip(scene: Scene) -> dict[str, Any]:
-    """Return the numbers of friction; without friction only a speed to divide by, for scenes that run together."""
+    """Return the numbers of friction; without friction only a non-zero speed, for scenes that run together."""
     friction = scene.friction
     if friction is None:
         return {"slip_speed": 1.0}
@@ -523,7 +523,7 @@ def _slip(scene: Scene) -> dict[str, Any]:
 
 
 def _frame(scene: Scene) -> dict[str, Any]:
-    """Return the numbers of a frame that gives way."""
+    """Return the numbers of a `Support`."""
     support = scene.support
     if support is None:
         return {}

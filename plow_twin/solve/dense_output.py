@@ -17,7 +17,7 @@ from plow_twin.solve.support import see_from_frame
 
 @kernel(inline="source")
 def time_along(alpha, beta, sigma):
-    """Return the time that the series' variable stands for:  t = alpha sigma + beta sigma^2 / 2."""
+    """Return the time at a value of the series' variable: t = alpha sigma + beta sigma^2 / 2."""
     return alpha * sigma + 0.5 * beta * sigma * sigma
 
 
@@ -34,7 +34,7 @@ def sigma_at(state, used):
 
 @kernel(fast=True)
 def sum_series(support, state, w, sigma, out) -> None:
-    """Write the sum of the state's series at sigma to `out`, shape (8,), as seen from a frame that gives way."""
+    """Write the sum of the state's series at sigma to `out`, shape (8,), as seen from a frame on springs."""
     order, series = state.order, w.series
     value = row(series, order)
     for k in range(order - 1, -1, -1):

@@ -27,7 +27,7 @@ from plow_twin.solve.state import ON, Harmonics, Segments
 
 
 class Acting(NamedTuple):
-    """Arguments of the equations of motion beside the law: few types, so that scenes share compiled code."""
+    """Arguments of the equations of motion beside the law, of few types, so that scenes share compiled code."""
 
     harmonics: Harmonics | None
     segments: Segments | None
@@ -79,10 +79,10 @@ def about_mass(p, c, s, load):
 
 @kernel()
 def accelerate(p, acts, frozen, state, t, z, load, out) -> None:
-    """Write the rate of z = (x, y, theta, vx, vy, omega), with a frame that gives way that of `support.to_world_both`.
+    """Write the rate of z = (x, y, theta, vx, vy, omega), or with a support of the z of `support.to_world_both`.
 
-    `acts` is an `Acting`. `frozen`: the pairs that are on act by their law, also where it would pull; else those that
-    penetrate push.
+    `acts` is an `Acting`. `frozen`: the pairs that are on act by their law, also where it would pull; otherwise the
+    pairs that penetrate push.
     """
     load_at(p, acts.harmonics, acts.segments, t, load)
     _accelerate(p, acts.offset, acts.free, acts.slip, acts.stick, acts.support, frozen, state, z, load, out)

@@ -23,10 +23,10 @@ from plow_twin.solve.loads import load_at
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, X, Y, new_record
 from plow_twin.solve.support import to_ground
 
-#: Nodes of the quadrature, exact to degree 15: more nodes leave the imbalance as it is, for over a step the higher
+#: Nodes of the quadrature, exact to degree 15: more nodes do not reduce the imbalance, because over a step the higher
 #: terms of a series are as small as its error.
 _NODES = 8
-#: Radians of the fastest harmonic in one panel of a flight, or of rest: a product of two is then exact to 1e-13.
+#: Radians of the fastest harmonic in a panel of a flight or rest: a product of two harmonics is then exact to 1e-13.
 _PANEL_PHASE = 2.0
 # indices into the powers and impulses at one instant
 LOADS, NORMAL, FRICTION, SUPPORT, LOAD_X, LOAD_Y, LOAD_M, CONTACT_X, CONTACT_Y, CONTACT_M, SIZE = range(11)
@@ -52,7 +52,7 @@ BALANCE = np.dtype(
         ("now", "f8", (SIZE,)),  # powers and forces at one instant
         ("before", "f8", (SIZE,)),  # the same a step before
         ("body", "f8", (STATE_SIZE,)),  # body coordinates at a node
-        ("ground", "f8", (STATE_SIZE,)),  # absolute body coordinates, where the frame gives way
+        ("ground", "f8", (STATE_SIZE,)),  # absolute body coordinates, with a support
         ("wear_depth", "f8", (PAIR_COUNT,)),  # wear depth at a node
         ("pairs", "f8", (3, PAIR_COUNT)),  # penetration, rate, force
         ("sums", SUMS),
@@ -71,7 +71,7 @@ def new_balance() -> BalanceSums:
 
 @kernel()
 def _powers(p, parts, state, wear_depth, y, frame, t, balance, out) -> None:
-    """Write powers and forces at time t in body coordinates y; `frame` is the state of a frame that gives way."""
+    """Write powers and forces at time t in body coordinates y; `frame` is the state of a frame on springs."""
     terms, load = parts.terms, out[LOAD_X : LOAD_M + 1]
     load_at(p, parts.harmonics, parts.segments, t, load)
     angle = named_angle(p, y, y[THETA])
@@ -161,7 +161,7 @@ def _balance(p, support, seen, frame, balance, start) -> None:
 
 @kernel()
 def _frame_of(support, state):
-    """Return the state of a frame that gives way."""
+    """Return the state of a frame on springs."""
     if support is not None:
         return state.frame
     return None

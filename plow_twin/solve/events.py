@@ -45,7 +45,8 @@ def _guards(p, state, w, order, penetrating, viscous, ramp) -> None:
     for pair in range(PAIR_COUNT):
         first = max(guard[0, pair], 0.0)
         if state.mode[pair] == ON:
-            # released below a quarter of the penetration at which it acts again, so that no pair hovers between
+            # released below a quarter of the penetration at which it acts again, so that no pair alternates between the
+            # two
             first -= min(_LET_GO * p.release, 0.5 * first)
         elif state.mode[pair] == RELEASED and first <= _ON_THE_WALL * p.release:
             # a pair that rests on the wall is let go a little outside
@@ -144,8 +145,8 @@ def _unsafe_pairs(w, order, h):
 def _nothing_ends(p, state, w, order, h, penetrating, hysteretic) -> bool:
     """Return whether each pair of an integer law without a ramp surely keeps its mode on [0, h].
 
-    Make the first proof of `_unsafe_pairs` and the proof of `_stays` for all pairs side by side, with
-    room for rounding: where they hold here they hold there too.
+    Make the first proof of `_unsafe_pairs` and the proof of `_stays` for all pairs side by side, with an allowance for
+    rounding: proofs that hold here also hold there.
     """
     weights = w.per_pair
     for pair in range(PAIR_COUNT):
@@ -222,9 +223,9 @@ def _guards_end_with(w, order, at, within):
 def note_switches(
     p, state, w, order, at, event, target, penetrating, viscous, hysteretic, integer, fraction, ramp, stick
 ) -> None:
-    """Write the mode of each pair that switches at the event to `w.switch`, -1 for the others.
+    """Write to `w.switch` the next mode of each pair that switches at the event, -1 for the others.
 
-    Changes that differ in time by rounding only happen together: a symmetric motion stays symmetric.
+    Changes that differ in time only by rounding happen together, so that a symmetric motion stays symmetric.
     """
     column, within = w.column[0], _AT_ONCE * at
     ending = _guards_end_with(w, order, at, within)

@@ -1,7 +1,7 @@
 """Fixed-step methods without event location: RK4 as in the paper, and semi-implicit Euler.
 
-They evaluate the equations of motion (paper, eq. 5) in world axes about the centre of mass: a check of
-steps and events as much as a method. Geometry and the value of the force are shared.
+They evaluate the equations of motion (paper, eq. 5) in world axes about the centre of mass, and check the steps and
+events of the series. Geometry and the value of the force are shared.
 """
 
 from __future__ import annotations
@@ -74,9 +74,9 @@ def _runge_kutta(p, acts, state, t, dt, z, trial, k, load) -> None:
 def end_coarsely(p, parts, state, totals, target, bound) -> int:
     """Bring the state to `target` by the bound's few Runge-Kutta steps; estimate the error. Returns a `Status`.
 
-    The estimate is the two middle stages' difference, |k2 - k3| dt / 3, of the order below the method's, with errors of
-    the velocity counted over the time left; and where a pair has touched or parted within a step the impulse in doubt,
-    F dt / 2, over the time in which the largest load crosses the clearance.
+    The estimate is the difference of the two middle stages, |k2 - k3| dt / 3, one order below the method's, with errors
+    of the velocity multiplied by the remaining time. Where a pair has touched or parted within a step, the uncertain
+    impulse F dt / 2 counts, over the time in which the largest load crosses the clearance.
     """
     terms = parts.terms
     acts, y, size = acting(parts), state.y, 6 if terms.support is None else 12
@@ -86,7 +86,7 @@ def end_coarsely(p, parts, state, totals, target, bound) -> int:
     dt = (target - start) / bound.steps
     _to_world(p, parts.terms.support, state, z)
     for pair in range(PAIR_COUNT):
-        # a pair that was clipped or released is inside all the same
+        # a pair that was clipped or released is also inside
         state.mode[pair] = OFF if state.mode[pair] == OFF else ON
     pair_outputs(p, state, state.wear_depth, y, pen, rate, now)
     state.bounded += 1
@@ -132,8 +132,8 @@ def integrate_fixed(
 ) -> int:
     """Take `steps` steps of `dt` from step `done[0]` on; row i is written after step i stride. Returns a `Status`.
 
-    z (6,) or (12,) (`support.to_world_both`) keeps the integrated numbers from call to call: converted there and
-    back it would lose its last bits.
+    z (6,) or (12,) (`support.to_world_both`) keeps the integrated numbers from call to call: converting them back and
+    forth would lose the last bits.
     """
     trial, k = np.empty(z.size), np.empty((4, z.size))
     load, y, acts = np.empty(3), state.y, acting(parts)

@@ -1,14 +1,14 @@
-"""Friction with stick: how the corners hold the walls, when they let go, and when they hold again.
+"""Friction with stick: the force of sticking corners, and the conditions for slip and stick.
 
 A corner that sticks holds its wall by a spring and a damper from an anchor a along the wall; one that slips drags it:
 
     sticks    T = k (s - a) + c s'      while |T| <= mu_s N
     slips     T = +-mu N                while +-(k s' + c s'') >= mu N'
 
-s is the corner's place along the wall, N the normal force. The second condition: the spring and the damper,
-dragged along so that they carry mu N, would not carry less if the corner held now. T has no jump where mu_s = mu:
-the accelerations are the same on both sides, so pairs decide one by one. Sources: Cundall and Strack, Geotechnique 29
-(1979) 47; Luding, Granul. Matter 10 (2008) 235, sec. 3.2.
+s is the corner's place along the wall, N the normal force. The second condition: spring and damper, dragged along
+carrying mu N, would not carry less if the corner stuck now. Where mu_s = mu, T does not jump: accelerations are equal
+on both sides, so each pair decides alone. Sources: Cundall and Strack, Geotechnique 29 (1979) 47; Luding, Granul.
+Matter 10 (2008) 235, sec. 3.2.
 """
 
 from __future__ import annotations
@@ -71,29 +71,29 @@ def tangential_force(p, state, frozen, pair, normal, place, rate):
 
 @kernel(inline="code")
 def _anchor(p, state, pair, force, place, rate) -> None:
-    """Put the anchor where spring and damper carry `force`."""
+    """Set the anchor so that spring and damper carry `force`."""
     state.anchor[pair] = place - (force - p.stick_damping * rate) / p.stick_stiffness
 
 
 @kernel(inline="code")
 def _normal_force(p, state, pair, depth):
-    """Return N of a pair that pushes, as in its series, also for a penetration that is negative by its error."""
+    """Return N of a pair that pushes, as in its series, also for a penetration that an error makes negative."""
     return max(law_force(p, state, pair, depth, rate_of(p, pair, state.y)), 0.0)
 
 
 @kernel()
 def grasp(p, state, pair, old) -> None:
-    """Let the corner of a pair that begins to push hold its wall by a slack spring, or slip where that is too much.
+    """Let the corner of a pair that begins to push stick with a slack spring, or slip where this exceeds the limit.
 
-    The mode before, `old`, gives the force exactly: at a touch the force of depth 0, which Kelvin-Voigt's damper has,
-    and 0 where a clipped pair pushes again. With the rounded depth, rounding would decide between stick and slip.
+    The previous mode `old` gives the force exactly: at a touch the force at depth 0 (of Kelvin-Voigt's damper), and 0
+    where a clipped pair pushes again. The rounded depth would let rounding decide between stick and slip.
     """
     place, rate = _along(p, pair, state.y)
     depth = 0.0 if old == OFF else penetration_of(p, state, pair, state.y)
     normal = 0.0 if old == CLIPPED else _normal_force(p, state, pair, depth)
     state.anchor[pair], state.grip[pair] = place, 0
     held = p.stick_damping * rate
-    # without a force yet the rates of both decide, as in the guard of a slip
+    # without a force so far the rates of both decide, as in the guard of a slip
     if abs(held) > p.static_friction * normal or (normal <= 0.0 and rate != 0.0):
         state.grip[pair] = 1 if rate > 0.0 else -1
 
@@ -149,10 +149,10 @@ def grip_terms(p, state, w, k, place, rate):
 
 @kernel()
 def grip_guard(p, state, w, order, pair, side) -> int:
-    """Write a guard of a corner's grip to `w.column[0]`; return what follows when it turns negative, 0 without one.
+    """Write a guard of a corner's grip to `w.column[0]`; return the outcome when it turns negative, 0 without a guard.
 
-    Sticks: mu_s N -+ T for the two sides; slips: the condition of the module's text times the time per sigma, first
-    side only.
+    Sticks: mu_s N -+ T for the two sides; slips: the condition in the module's docstring times the time per sigma,
+    first side only.
     """
     g, rate, force, drag = w.column[0], w.slip[0], w.force, w.slip[4]
     grip = state.grip[pair]
@@ -167,7 +167,7 @@ def grip_guard(p, state, w, order, pair, side) -> int:
         # a pair that is on is outside its wall at most by the error of the place of its touch
         g[0] = p.static_friction * max(force[0, pair], 0.0) - sign * drag[0, pair]
         size, noise = p.static_friction * abs(force[0, pair]) + abs(drag[0, pair]), 0.0
-        # it lets go so much later, or rounding would release it again as soon as it holds
+        # it slips that much later, otherwise rounding would release it as soon as it sticks
         late = _FINEST * (p.stick_stiffness * p.leverage + p.stick_damping * p.threshold[0])
     else:
         for k in range(order - 1):

@@ -9,8 +9,8 @@ from plow_twin.kernel.compiler import kernel
 
 #: Earlier times from which growth is kept; every second one is dropped beyond.
 MOST_KEPT: Final = 256
-#: Squarings at most: singular values that are closer than 1e-6 count as one. What is left has rank one where the
-#: trace of its square is larger than this share of its trace's.
+#: Squarings at most: singular values that are closer than 1e-6 count as one. The rest has rank one where the trace of
+#: its square exceeds this share of the square of its trace.
 _SQUARINGS, _RANK_ONE = 18, 1.0 - 1e-9
 
 
@@ -68,7 +68,7 @@ def _larger_norm(a, height, most, gram, power, square) -> float:
 
 @kernel(fast=True)
 def _multiply_all(matrix, since, count, grown) -> None:
-    """Multiply matrices since[:, i, :] from the left: all columns of all of them are one long row."""
+    """Multiply matrices since[:, i, :] from the left, with all columns of all matrices in one long row."""
     size = len(matrix)
     length = count * size
     for i in range(size):
@@ -84,7 +84,7 @@ def _multiply_all(matrix, since, count, grown) -> None:
 def _largest(grown, count, height, scratch) -> float:
     """Return the largest spectral norm of the first rows of matrices grown[:, i, :], at least 1.
 
-    Its square is no larger than the sum of squares: few have to be looked at once the largest sum has been.
+    The square of a norm is at most the sum of squares, so that after the largest sum few matrices remain to be checked.
     """
     most, begin, size = 1.0, 0, len(grown)
     squares = scratch[5:].reshape(-1)
@@ -111,7 +111,7 @@ def _stretch_basis(matrix, basis, moved, logs) -> None:
     _multiply(matrix, basis, moved)
     for j in range(size):
         for i in range(2 * j):
-            # orthogonal to all before, twice: once leaves roundings of what is taken away
+            # made orthogonal to all before twice, because once leaves rounding errors
             before, share = i % j, 0.0
             for k in range(size):
                 share += basis[k, before] * moved[k, j]
@@ -135,9 +135,9 @@ def follow_growth(matrices, changes, ends, since, kept, whole, basis, scratch, t
     matrices : ndarray, shape (n, k, k)
         Fundamental matrices since the last stretch that ended.
     changes : ndarray, shape (n, p, k)
-        What the parameters give in it.
+        Effects of the parameters in each stretch.
     ends : ndarray of int64, shape (n,)
-        1 where a stretch ends; others tell of the stretch so far. There growth counts places alone.
+        1 where a stretch ends; other rows describe the stretch so far. There growth counts places alone.
     since : ndarray, shape (2, k, m, k)
         Products since earlier times, since[0, :, i, :], of which there are `kept[0]`; the other half is scratch space.
     whole : tuple of ndarray, shapes (k, k) and (p, k)

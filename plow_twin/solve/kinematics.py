@@ -1,4 +1,4 @@
-"""Kinematics of the head: penetrations and their rates, and the ways between body and world axes.
+"""Kinematics of the head: penetrations and their rates, and conversions between body and world axes.
 
 All rows of `model.geometry` are linear in cosine, sine and place.
 """
@@ -24,14 +24,14 @@ fixed_axes = by_field("tumbles", lambda p: 1, lambda p: None)
 may_tumble = by_field("tumbles", lambda p: p.tumbles != 0.0, lambda p: False)
 
 
-#: 1 where the corners are rounded, else None; and by which way along its wall the angle moves the point that touches.
+#: 1 where the corners are rounded, otherwise None; then the angle moves the touching point along its wall.
 _is_rounded = by_field("roll", lambda p: 1, lambda p: None)
 _roll = by_field("roll", lambda p: p.roll, lambda p: 0.0)
 
 
 @kernel(inline="code")
 def along(p, c, s):
-    """Return cosine and sine of the angle of the axes along which the state is resolved; the head's are at (c, s)."""
+    """Return cosine and sine of the angle of the axes of the state; the head's axes are at (c, s)."""
     if fixed_axes(p) is not None:
         return 1.0, 0.0
     return c, s
@@ -39,7 +39,7 @@ def along(p, c, s):
 
 @kernel(inline="code")
 def spin_of_axes(p, omega):
-    """Return the rate in rad/s at which the axes turn along which the state is resolved."""
+    """Return the rate in rad/s at which the axes of the state turn."""
     if fixed_axes(p) is not None:
         return 0.0
     return omega
@@ -47,7 +47,7 @@ def spin_of_axes(p, omega):
 
 @kernel(inline="code")
 def named_angle(p, y, theta):
-    """Return theta without the quarter turns after which the corners have the names that they have in y.
+    """Return theta without the quarter turns of the names of the corners in y.
 
     Cosine and sine in y are those of that angle. Where the head carries walls it is theta itself.
     """
@@ -78,7 +78,7 @@ def row_rate(p, rows, pair, c, s, omega, x, y, vx, vy):
 
 @kernel(inline="code")
 def slip_place(p, pair, c, s, x, y, theta):
-    """Return the place in m along its wall of the point of a corner that touches."""
+    """Return the place in m, along its wall, of the touching point of a corner."""
     place = row_value(p.slip_rows, pair, c, s, x, y)
     if _is_rounded(p) is not None:
         place += _roll(p) * theta
@@ -105,7 +105,7 @@ def slip_arm(p, pair, c, s, x, y):
 
 @kernel(fast=True, inline="code")
 def rolled(p, values, angle):
-    """Return places or slip rates of all pairs with what the angle, or its rate, adds to those of rounded corners."""
+    """Return places or slip rates of all pairs, with the part that the angle, or its rate, adds for rounded corners."""
     if _is_rounded(p) is not None:
         values = values + splat(_roll(p) * angle)
     return values
@@ -121,7 +121,7 @@ def slip_arms(p, arms, k):
 
 @kernel(inline="code")
 def penetration_at(p, state, pair, c, s, x, y):
-    """Return the penetration of one pair in m, with the pad as worn as it is at the step's start."""
+    """Return the penetration of one pair in m, with the wear at the step's start."""
     return row_value(p.penetration_rows, pair, c, s, x, y) + p.penetration_rows[4, pair] - state.wear_depth[pair]
 
 

@@ -51,7 +51,7 @@ def _next(p, parts, state, w, stop_time, budget) -> int:
 
 @kernel()
 def _present(p, harmonics, flight, support, state, w, y) -> None:
-    """Write the body coordinates at the present time to y, also within a step; a frame that gives way to `w`."""
+    """Write the body coordinates at the present time to y, also within a step, and a frame on springs to `w`."""
     if state.step_size >= 0.0:
         evaluate(p, harmonics, flight, support, state, w, sigma_at(state, state.elapsed), y)
     else:
@@ -74,7 +74,7 @@ def _proceed(p, parts, state, w, totals, target, stop_time, budget) -> int:
         if code != _OK:
             return code
         low = sigma_at(state, state.elapsed)
-        # a step to a stop may end a rounding error behind it; no remainder is left
+        # a step to a stop may end a rounding error beyond it; no remainder is left
         stopped = state.ends_at_stop == 1 and target >= state.stop_time
         if target < t0 + state.step_size and not stopped:
             if totals is not None:
@@ -118,7 +118,7 @@ def _clear(totals) -> None:
 
 @kernel()
 def _undo(support, state, w, target) -> None:
-    """Let time go on to `target` after a failed advance, with the head in the restored state from before it.
+    """Set the time to `target` after a failed advance, with the head in the restored state from before it.
 
     A step under way ends at the time before the advance: its place and wear there are in `w.saved`.
     """
@@ -132,10 +132,10 @@ def _undo(support, state, w, target) -> None:
 
 @kernel()
 def _advance(p, parts, states, index, saved, w, totals, target, stop_time, budget, bound, pace):
-    """Proceed to `target`, or go on with it; return a `Status` and the steps taken.
+    """Start or continue an advance to `target`; return a `Status` and the steps taken.
 
-    Where it fails, time goes on, the head keeps its state, and nothing is counted. `saved` is an array of one
-    record. With a bound, a used-up budget is no failure: the rest is computed coarsely.
+    Where it fails, the time becomes `target`, the head keeps its state, and nothing is counted. `saved` is an array of
+    one record. With a bound, a used-up budget is not a failure: the rest is computed coarsely.
     """
     state = states[index]
     if pace.underway == 0:
@@ -213,7 +213,7 @@ def advance_rows(
     params, states : ndarray of records, shape (m,)
         Of all members.
     saved, work, totals : ndarray of records, shape (1,)
-        The state before the advance under way, scratch space and sums. Without totals nothing is counted nor read out,
+        The state before the advance under way, scratch space and sums. Without totals nothing is counted or read out,
         and the motion is the same.
     times : ndarray, shape (n,)
         Times in s, never falling.
@@ -227,12 +227,12 @@ def advance_rows(
     bound
         As of `_advance`.
     pace
-        Where the call goes on.
+        Place at which the call continues.
 
     Returns
     -------
     bool
-        Whether all advances are done; else the caller checks its limits and calls again with the same `pace`.
+        Whether all advances are done; otherwise the caller checks its limits and calls again with the same `pace`.
     """
     parts, states = _unowned_loads(parts), unowned(states)
     w, count = work[0], times.size
@@ -284,14 +284,14 @@ def interrupt_step(p, parts, state, w, totals) -> None:
 def lay_out_again(p, parts, state, w) -> None:
     """Compute the step under way once more after a restore: its series are not part of the state.
 
-    Only the scene's own loads leave a step under way, and there nothing stops it.
+    Only under the scene's own loads is a step left under way, and then nothing bounds it.
     """
     if state.at_rest == 1:
         write_rest(p, state, w)
         return
     used, implicit = state.elapsed, parts.implicit
     if implicit is not None:
-        # fields that laying it out has changed
+        # fields that the layout of the step has changed
         state.implicit_size, state.decay_times = state.implicit_size_before, state.decay_times_before
         state.refused = state.refused_before
     steps, evaluations, guard_roots = state.steps, state.evaluations, state.guard_roots
@@ -306,7 +306,7 @@ def lay_out_again(p, parts, state, w) -> None:
 def _rows_in_flight(p, harmonics, flight, state, w, t, i, q, v, penetration, force):
     """Fill the rows within a step of free flight from row i on; return the first row after it.
 
-    Apart from `integrate`, whose loop over rows is a tenth faster without the choice.
+    Separate from `integrate`, whose loop over rows is a tenth faster without the branch.
     """
     if flight is not None:
         t0, y, rate = state.step_start, np.empty(8), np.empty(8)

@@ -52,7 +52,7 @@ def penetration_and_rate(p, state, pair):
 
 @kernel()
 def _fallen_number(p, y, pair, speed):
-    """Return D of the restitution that is left of an impact of a speed (`model.scene.Contact`)."""
+    """Return D of the restitution at an impact speed (`model.scene.Contact`)."""
     arm = row_value(p.arm_rows, pair, y[COS], y[SIN], y[X], y[Y])
     mobility = 1.0 + p.free[2] * arm * arm * p.inverse_inertia / p.inverse_mass
     impact = speed * mobility**-p.fall_mass
@@ -83,14 +83,14 @@ def touch(p, state, pair) -> None:
 
 @kernel()
 def _impact_speed(number, rate, energy) -> float:
-    """Return the speed of the impact that passes through a state inside a wall: its elastic energy per mass, its rate.
+    """Return the speed of the impact that passes through a state inside a wall, given elastic energy per mass and rate.
 
     First integral of the free impact, u = D d' / v0:  u - ln(1 + u) + D^2 E / (m v0^2) = D - ln(1 + D).
     """
     if number <= 0.0 or (energy <= 0.0 and rate == 0.0):
         return 0.0
     full = number - math.log1p(number)
-    # an impact of this speed turns back at the energy; a pair that still moves inward needs a faster one
+    # an impact of this speed turns back at the energy; a pair that still moves inward had a faster impact
     low = math.sqrt(number * number * energy / full)
     high = max(low, abs(rate)) * (1.0 + number)
     low = max(low, rate, -number * rate)
@@ -114,7 +114,7 @@ def _start_inside(p, state, pair, energy) -> None:
     if p.damping_number >= 0.0:
         y = state.y
         arm = row_value(p.arm_rows, pair, y[COS], y[SIN], y[X], y[Y])
-        # and of a frame that gives way, with the arm about its own centre
+        # and of a frame on springs, with the arm about its own centre
         arm_of_frame = row_value(p.arm_rows, pair, y[COS], y[SIN], 0.0, 0.0)
         mobility = p.inverse_mass + p.free[2] * arm * arm * p.inverse_inertia
         mobility += p.frame_mobility[0] + arm_of_frame * arm_of_frame * p.frame_mobility[2]
@@ -165,7 +165,7 @@ def settle_modes(p, state, stick) -> None:
 
 @kernel(entry=True)
 def settle_moved(params, states, which, places, time, stick) -> None:
-    """Put states `which` into body coordinates `places` at a time; a contact that goes on keeps its touch's damping."""
+    """Set states `which` to body coordinates `places` at a time; a lasting contact keeps the damping of its touch."""
     touched = np.zeros(PAIR_COUNT, np.int64)
     damping = np.zeros(PAIR_COUNT)
     for i in range(which.size):
@@ -212,7 +212,7 @@ def weigh_pairs(p, state, w, viscous, fraction, ramp, stick) -> bool:
             if penetration > _SHALLOW * p.release:
                 per_pair[BASE, pair] = 0.5 / math.sqrt(penetration) if p.exponent == 1.5 else 1.0 / penetration
             else:
-                # interrupted right after its touch: too shallow for a series of its power
+                # interrupted right after its touch, too shallow for a series of its power
                 mode[pair] = RELEASED
         acts = mode[pair] == ON
         per_pair[ACTS, pair] = p.stiffness if acts else 0.0
@@ -226,7 +226,7 @@ def weigh_pairs(p, state, w, viscous, fraction, ramp, stick) -> bool:
 
 @kernel(inline="source")
 def slow_touch(p) -> float:
-    """Return the speed below which a pair cannot reach the release penetration by the speed of its touch alone."""
+    """Return the speed of a touch below which a pair cannot reach the release penetration by that speed alone."""
     acceleration = p.threshold[0] * p.weight / p.radius
     return _SHALLOW * math.sqrt(2.0 * acceleration * p.release)
 

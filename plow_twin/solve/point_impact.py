@@ -1,4 +1,4 @@
-"""Single impacts of bodies that touch a wall at one point, many at once: place and arms stay, velocities change.
+"""Single impacts of bodies that touch a wall at one point, many at once: velocities change, place and arms do not.
 
 The contact is that of `model.contact`, friction is regularised (`model.friction`) or the spring of `solve.grip`.
 """
@@ -32,7 +32,7 @@ def _strike(point, damping, normal_arm, tangential_arm, inertia, speed, slip, ou
     normal = 1.0 + normal_arm * normal_arm / inertia
     along = 1.0 + tangential_arm * tangential_arm / inertia
     coupling = -normal_arm * tangential_arm / inertia
-    # how deep and how long without damping, but for a factor near 1
+    # depth and time without damping, up to a factor near 1
     power = point.exponent + 1.0
     deepest = (power * speed * speed / (2.0 * point.stiffness * normal)) ** (1.0 / power)
     h = math.pi * deepest / (speed * _STEPS)

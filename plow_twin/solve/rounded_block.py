@@ -16,8 +16,8 @@ from plow_twin.model.contact import normal_force
 
 #: Numbers of a block, per mass: half the distance between the centres of its corners' arcs [m], their radius [m],
 #: radius of gyration [m], height of the table [m], stiffness K [1/s^2], tangential stiffness over K [1], tangential
-#: damping over the critical one [1], restitution and friction at 1 m/s, by which power of the impact they fall, which
-#: power of the moving mass counts in it, gravity [m/s^2], drag of place and of angle [1/s].
+#: damping over the critical one [1], restitution and friction at 1 m/s, the power of the impact by which they fall, the
+#: power of the moving mass in the impact, gravity [m/s^2], drag of place and of angle [1/s].
 BLOCK = np.dtype(
     [
         (name, "f8")
@@ -30,12 +30,12 @@ BLOCK = np.dtype(
 CORNERS = 4
 #: Steps in half a period of the stiffest contact.
 _STEPS = 70.0
-#: Slowest touch in m/s that a restitution is read at, least and largest restitution.
+#: Slowest touch in m/s that sets a restitution, least and largest restitution.
 _SLOWEST, _LEAST, _LARGEST = 0.01, 0.05, 0.9
-#: Impact in m/s below which restitution and friction fall no more.
+#: Impact in m/s below which restitution and friction are constant.
 _SMALLEST_IMPACT = 0.05
-#: Mobility of a corner on a mass of 1 about which the powers of the moving mass count: that of a uniform square that
-#: lands on an edge's end.
+#: Reference mobility of a corner on a mass of 1 for the powers of the moving mass: a uniform square that lands on the
+#: end of an edge.
 _USUAL_MOBILITY = 1.5
 
 
@@ -133,8 +133,8 @@ def toss_blocks(blocks, numbers, scatter, dt, rows) -> None:
     numbers : ndarray, shape (k,)
         Damping number D of restitutions from 0 to 1, evenly spaced.
     scatter : ndarray, shape (m, touches, 3)
-        Each touch's addition to restitution and to the friction's logarithm, and by how much [m] its force acts beside
-        the lowest point; later touches take the last row.
+        Additions of each touch to restitution and to the logarithm of friction, and the distance [m] of its force from
+        the lowest point; later touches use the last row.
     dt : float
     rows : ndarray, shape (m, n, 6)
         x, z, theta and their rates; the first row of each block is given.

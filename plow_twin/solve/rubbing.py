@@ -2,8 +2,8 @@
 
     dh/dt = (k_s v / A) F sqrt(1 + (s' / v)^2) (1 + a exp(-h / h0))
 
-s' is the rate at which the corner slides along its wall, across the travel; a plough that stands wears nothing. For its
-own speed the way has a kink at s' = 0 that no series could follow, so v in the root is not below `SLOWEST_TRAVEL`.
+s' is the rate at which the corner slides along its wall, across the travel; a standing plough does not wear. With v
+= 0 the distance would have a kink at s' = 0 that no series could follow, so v in the root is at least `SLOWEST_TRAVEL`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from plow_twin.kernel.compiler import kernel
 from plow_twin.solve.kinematics import slip_rate
 from plow_twin.solve.state import COS, OMEGA, SIN, VX, VY, X, Y
 
-#: Speed along the face in m/s below which the sliding in the plane counts as at this one, by the speed's share.
+#: Speed along the face in m/s below which the sliding in the plane counts as at this speed, times the speed's share.
 SLOWEST_TRAVEL: Final = 0.01
 
 
@@ -29,7 +29,7 @@ def time_per_way(p, pair) -> float:
 
 @kernel()
 def rubbing(p, pair, y, depth, sliding, running_in) -> float:
-    """Return by how much a pad at a wear depth wears faster than by travel alone, with the head at y, shape (8,)."""
+    """Return the factor by which a pad at a wear depth wears faster than by travel alone, at state y, shape (8,)."""
     factor = 1.0
     if sliding is not None:
         rate = slip_rate(p, pair, y[COS], y[SIN], y[OMEGA], y[X], y[Y], y[VX], y[VY])

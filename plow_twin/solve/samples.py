@@ -1,4 +1,4 @@
-"""Samples as the kernels take them: model times, and loads per mass and inertia."""
+"""Samples in the form of the kernels: model times, and loads per mass and inertia."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from plow_twin.kernel.compiler import kernel
 
 @kernel(entry=True)
 def lay_out(before, samples, inertias, per) -> bool:
-    """Write the sample before, shape (3,), and those that follow, (n, 3), per mass and inertia to `per`, (n + 1, 3).
+    """Write the last sample, shape (3,), and the following ones, (n, 3), per mass and inertia to `per`, (n + 1, 3).
 
-    Returns whether those that follow are finite.
+    Returns whether the latter are finite.
     """
     finite = True
     for j in range(3):

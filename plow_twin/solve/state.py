@@ -35,7 +35,7 @@ CLIPPED: Final = 2
 RELEASED: Final = 3
 #: Not a mode but the outcome of an event: a pair crosses the end of its damping's ramp.
 CROSSING: Final = 4
-#: Outcomes of an event too: the corner slips along the wall, forward or backward, or sticks.
+#: Further outcomes of an event: the corner slips along the wall, forward or backward, or sticks.
 SLIPS_FORWARD: Final = 5
 SLIPS_BACKWARD: Final = 6
 STICKS: Final = 7
@@ -52,7 +52,7 @@ class Status(IntEnum):
     OK
         The time asked for was reached.
     OUT_OF_RANGE
-        abs(theta) above 45 degrees, or half the cavity penetrated: the pairs would no longer be the right ones.
+        abs(theta) above 45 degrees, or half the cavity penetrated: the pairs no longer describe the contacts.
     NON_FINITE
         A number became infinite or NaN.
     BUDGET
@@ -65,9 +65,9 @@ class Status(IntEnum):
     OUT_OF_RANGE = 1
     NON_FINITE = 2
     BUDGET = 3
-    #: internal: the event log is full, the caller makes room and goes on
+    #: internal: the event log is full; the caller makes room and continues
     LOG_FULL = 4
-    #: internal: a slice of the work is done, the caller looks at its limits and goes on
+    #: internal: a slice of the work is done; the caller checks its limits and continues
     PAUSED = 5
 
     @property
@@ -110,7 +110,7 @@ def _in_lines(fields: list[tuple[Any, ...]]) -> np.dtype[np.void]:
     )
 
 
-#: Steps of the grid of restitutions on which their damping numbers are known; the least restitution that can be is one.
+#: Steps of the grid of restitutions on which their damping numbers are known; a step is the least restitution.
 RESTITUTIONS: Final = 1000
 
 #: Constants of one scene and one tolerance, per mass and inertia where that saves work.
@@ -118,7 +118,7 @@ _PARAM_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("penetration_rows", "f8", (5, PAIR_COUNT)),  # penetration rows for c, s, X, Y, 1
     ("arm_rows", "f8", (4, PAIR_COUNT)),  # arm rows for c, s, X, Y
     ("slip_rows", "f8", (4, PAIR_COUNT)),  # place along the wall, rows for c, s, X, Y
-    ("slip_arm_rows", "f8", (4, PAIR_COUNT)),  # its arm about G
+    ("slip_arm_rows", "f8", (4, PAIR_COUNT)),  # arm about G of a force along the wall
     ("wear_per_impulse", "f8", (PAIR_COUNT,)),  # depth of each pad per impulse, k_s v / A
     ("speed_per_wear", "f8"),  # A / k_s: turns depth per impulse into v; 0 where sliding in the plane does not wear
     ("running_in", "f8"),  # share by which a new pad wears faster
@@ -142,7 +142,7 @@ _PARAM_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("static_friction", "f8"),  # mu up to which a corner sticks
     ("stick_stiffness", "f8"),
     ("stick_damping", "f8"),
-    ("frame_mobility", "f8", (3,)),  # 1/m, 1/m, 1/I of a frame that gives way, else 0
+    ("frame_mobility", "f8", (3,)),  # 1/m, 1/m, 1/I of a frame on springs, otherwise 0
     ("frame_stiffness", "f8", (3,)),  # of its support, per mass and inertia
     ("frame_damping", "f8", (3,)),
     ("order", "i8"),
@@ -160,10 +160,10 @@ _PARAM_FIELDS: Final[list[tuple[Any, ...]]] = [
 ]
 PARAMS: Final = _in_lines(_PARAM_FIELDS)
 
-#: What only some scenes have, by their `Options`.
+#: Constants that only some scenes have, by their `Options`.
 _OPTION_FIELDS: Final[dict[str, list[tuple[Any, ...]]]] = {
     "corners": [("tumbles", "f8")],  # the head carries corners; 1 where the block may tumble
-    "rounded": [("roll", "f8")],  # way of a rounded corner along its wall by the angle [m]
+    "rounded": [("roll", "f8")],  # distance of a rounded corner along its wall by the angle [m]
     "falling": [  # a restitution that falls with the impact
         ("damping_numbers", "f8", (RESTITUTIONS + 1,)),  # e D(e) on a grid from 0 to 1
         ("restitution", "f8"),  # of impacts up to `fall_speed`
@@ -176,7 +176,7 @@ _OPTION_FIELDS: Final[dict[str, list[tuple[Any, ...]]]] = {
 
 
 class Options(NamedTuple):
-    """Which fields the constants of a scene have beside those of every scene."""
+    """Fields of the constants that only some scenes have."""
 
     corners: bool  #: the head carries corners
     rounded: bool  #: the corners are rounded
@@ -186,7 +186,7 @@ class Options(NamedTuple):
 @cache
 def params_type(options: Options) -> np.dtype[np.void]:
     """Return the record type of a scene's constants."""
-    # what is more comes first, as in `state_type`
+    # further fields come first, as in `state_type`
     more = [field for name in Options._fields if getattr(options, name) for field in _OPTION_FIELDS[name]]
     return _in_lines([*more, *_PARAM_FIELDS]) if more else PARAMS
 
@@ -207,10 +207,10 @@ _STATE_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("stop_time", "f8"),  # where a step must end: a sample, a knot of the load, the end of the run
     ("last_step_size", "f8"),
     ("touch_time", "f8"),  # of the last touch
-    ("time", "f8"),  # the present, bit for bit as the caller gave it
+    ("time", "f8"),  # the present time, bit for bit as the caller gave it
     ("implicit_size", "f8"),  # of the next implicit step
     ("decay_times", "f8"),  # that have passed in overdamped contact since a contact changed
-    ("implicit_size_before", "f8"),  # both as they were before the step under way was laid out
+    ("implicit_size_before", "f8"),  # both before the step under way was laid out
     ("decay_times_before", "f8"),
     ("order", "i8"),  # of the series of the step under way
     ("event_pair", "i8"),  # the pair whose event ends the step, or -1
@@ -219,7 +219,7 @@ _STATE_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("events_at_once", "i8"),  # events so far at one instant
     ("piece", "i8"),  # of the sampled load
     ("ends_at_stop", "i8"),  # 1 where the step ends at `stop_time`
-    ("refused", "i8"),  # implicit steps that were not worth it since a contact changed
+    ("refused", "i8"),  # implicit steps that were too short since a contact changed
     ("refused_before", "i8"),  # the same before the step under way was laid out
     ("in_flight", "i8"),  # 1 during a step of free flight
     ("at_rest", "i8"),  # 1 during a step of rest
@@ -238,11 +238,11 @@ _GRIP_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("anchor", "f8", (PAIR_COUNT,)),  # place along the wall in m where a sticking corner's spring is slack
     ("grip", "i8", (PAIR_COUNT,)),  # 0 sticks, 1 slips forward, -1 backward
 ]
-#: A frame that gives way: x, y, theta from where its springs are slack, and their rates; y is then seen from it.
+#: A frame on springs: x, y, theta from where its springs are slack, and their rates; y is then relative to it.
 _FRAME_FIELDS: Final[list[tuple[Any, ...]]] = [("frame", "f8", (6,))]
 
-#: Scratch space: series of one step. Rows are orders, the eight columns state components or pairs: SIMD lanes. What has
-#: eight columns comes first: each of its rows then fills a cache line.
+#: Scratch space: series of one step. Rows are orders, the eight columns state components or pairs: SIMD lanes. Arrays
+#: of eight columns come first, so that each of their rows fills a cache line.
 WORK: Final = np.dtype(
     [
         ("series", "f8", _WIDE),  # state
@@ -259,7 +259,7 @@ WORK: Final = np.dtype(
         ("power", "f8", (4, *_WIDE)),  # powers of the penetration
         ("ramp", "f8", (3, *_WIDE)),  # square and cube of the penetration, share of C
         ("slip", "f8", (6, *_WIDE)),  # friction: slip rate r / v_s, k r_k, tanh r, 1 - tanh^2 r, force, arm
-        ("frame", "f8", _WIDE),  # a frame that gives way (`solve.support`)
+        ("frame", "f8", _WIDE),  # a frame on springs (`solve.support`)
         ("frame_left", "f8", (3, *_WIDE)),  # factors of its Cauchy products
         ("frame_right", "f8", (3, *_WIDE)),
         ("seen", "f8", _WIDE),  # implicit steps: the head as seen from it
@@ -319,8 +319,8 @@ ROW: Final = np.dtype(
         ("steps", "i8"),
         ("status", "i8"),
         ("error_estimate", "f8"),
-        # written where the row is published (`solve.totals.publish`): touches are then all so far, impulse and peak
-        # those since the publication before
+        # where the row is published (`solve.totals.publish`), touches are all so far, impulse and peak since the
+        # publication before
         ("stamp_ns", "i8"),
         ("samples", "i8"),  # advances since then that ended at a sample
         ("measured_peak", "f8", (PAIR_COUNT,)),  # largest force in these
@@ -355,10 +355,10 @@ Segments: TypeAlias = NDArray[np.void]
 
 
 class Terms(NamedTuple):
-    """Which terms the equations of motion have: 1, or `None` for one that is absent. Their numbers are in `Params`.
+    """Terms of the equations of motion: 1, or `None` for an absent term. Their numbers are in `Params`.
 
-    The types are part of the compiled signature. A kernel takes them one by one, since a branch is left out of the
-    compiled code only by an argument of its own that is `None`.
+    The types are part of the compiled signature. A kernel takes them as separate arguments, since only a separate
+    argument that is `None` leaves a branch out of the compiled code.
     """
 
     harmonics: int | None
@@ -368,7 +368,7 @@ class Terms(NamedTuple):
     hysteretic: int | None  #: lambda d', lambda from State.damping_factor
     integer: int | None  #: an integer exponent of at least 2
     fraction: int | None  #: an exponent that is not an integer
-    ramp: int | None  #: the viscous part grows with the penetration
+    ramp: int | None  #: the viscous part is ramped over the penetration
     wear: int | None
     sliding: int | None  #: sliding in the plane wears too
     running_in: int | None  #: new pads wear faster
@@ -376,7 +376,7 @@ class Terms(NamedTuple):
     free: int | None  #: some degree of freedom is locked
     slip: int | None  #: regularised friction
     stick: int | None  #: friction with stick
-    support: int | None  #: the frame gives way
+    support: int | None  #: the frame is on springs
     flight: int | None  #: free flight in closed form (`solve.method.flight`)
     rest: int | None  #: rest can be recognised (`solve.method.rest`)
 
@@ -394,8 +394,8 @@ class Parts(NamedTuple):
 BOUND: Final = np.dtype(
     [
         ("steps", "i8"),  # Runge-Kutta steps that are kept for the end
-        ("error", "f8"),  # estimate in m of the advance, 0 while the bound does not bite
-        ("z", "f8", (6, 12)),  # state, trial state, four stages; of a frame that gives way too
+        ("error", "f8"),  # estimate in m of the advance, 0 while the bound is not reached
+        ("z", "f8", (6, 12)),  # state, trial state, four stages; also of a frame on springs
         ("load", "f8", (3,)),
         ("pairs", "f8", (4, PAIR_COUNT)),  # penetration, rate, force, force before
     ]
@@ -409,9 +409,9 @@ PACE: Final = np.dtype(
     [
         ("slice", "i8"),  # steps of a slice
         ("left", "i8"),  # of it
-        ("row", "i8"),  # the advance that comes next, members one after the other
-        ("underway", "i8"),  # 1 where it has begun
-        ("mark", "i8"),  # the mark that comes next
+        ("row", "i8"),  # the next advance, members one after the other
+        ("underway", "i8"),  # 1 where the advance has begun
+        ("mark", "i8"),  # the next mark
         ("failed", "i8"),  # advances that failed
     ]
 )

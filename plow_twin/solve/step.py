@@ -29,7 +29,7 @@ from plow_twin.solve.tumbling import turn_at, turn_corners
 METHODS: Final[tuple[Method, ...]] = (flight, rest, implicit, taylor)
 #: Longest step in s; keeps every power of it finite.
 LONGEST_STEP = 100.0
-#: How far in sigma a step goes past an instant at which modes would flip without end.
+#: Step in sigma past an instant at which modes would flip without end.
 PAST_AN_INSTANT = 1e-9
 #: Two times in s closer than this share of them are one instant: some roundings.
 ONE_INSTANT = 1e-15
@@ -59,7 +59,7 @@ def _set_load(p, segments, state, w):
 
 @kernel()
 def _begin_step(p, parts, state, w, stop_time):
-    """Start to lay out a step; return how long it may be and whether any pair penetrates."""
+    """Begin the layout of a step; return its largest length and whether any pair penetrates."""
     terms = parts.terms
     penetrating = weigh_pairs(p, state, w, terms.viscous, terms.fraction, terms.ramp, terms.stick)
     state.stop_time = min(stop_time, _set_load(p, parts.segments, state, w))

@@ -10,7 +10,7 @@ rate, phi and psi, and the contacts' force f = (fx, fy) in head axes, each colum
 
 with n the row of a penetration for X and Y, de its change by a clearance, dtau the change of the contacts' moment with
 the angle. The factors are series that the step has: each order is a sum of Cauchy products, eight columns side by side.
-The force jumps at a touch by C d' (Kelvin-Voigt): a column that touches dd / d' sooner has got the impulse C dd by
+At a touch the force jumps by C d' (Kelvin-Voigt): a column that touches dd / d' sooner has received the impulse C dd by
 then. All other changes of contact leave the force continuous.
 """
 
@@ -34,7 +34,7 @@ from plow_twin.solve.step import complete_step, lay_out_series_step
 WIDTH: Final = 8
 #: Derivatives by the state: the first columns.
 STATE_COLUMNS: Final = 6
-#: Places and rates of a column: x, y, theta and theirs.
+#: Places and rates of a column: x, y, theta and their rates.
 PLACE_X, PLACE_Y, PLACE_THETA, RATE_X, RATE_Y, RATE_THETA = range(6)
 
 _ROWS: Final = MAX_ORDER + 1
@@ -75,7 +75,7 @@ ALONG: Final = np.dtype(
         ("damped", "f8", (_ROWS, PAIR_COUNT)),  # d^n d'
         ("push", "f8", (4, _ROWS)),  # fx, fy, derivative of the moment by the angle, -fy
         ("mode", "i8", (PAIR_COUNT,)),  # before the step's event
-        ("waiting", "i8"),  # ends of stretches in a row at which none began
+        ("waiting", "i8"),  # ends of stretches in a row at which no stretch began
     ]
 )
 Along: TypeAlias = np.record
@@ -315,7 +315,7 @@ def _second_rate(state, w, pair):
 
 @kernel()
 def _touch(p, state, w, columns, pair, viscous) -> None:
-    """Let a pair touch in eight columns: the impulse of columns that touch sooner, and the speed that each reads."""
+    """Let a pair touch in eight columns: the impulse of columns that touch sooner, the change of the impact speed."""
     y, now = state.y, columns.now
     c, s, om = y[COS], y[SIN], y[OMEGA]
     arm = row_value(p.arm_rows, pair, c, s, y[X], y[Y])
@@ -343,7 +343,7 @@ def _touch(p, state, w, columns, pair, viscous) -> None:
 def _start_columns(c, s, columns, first) -> None:
     """Begin a stretch: the columns of the state with a displacement of 1 each, columns of parameters with 0.
 
-    A contact that has read its speed keeps what the parameters have changed of it.
+    A contact whose impact speed is fixed keeps its change by the parameters.
     """
     for lane in range(WIDTH):
         column = first + lane
@@ -372,7 +372,7 @@ def _read_columns(c, s, columns, first, out) -> None:
 
 @kernel()
 def _is_clear(p, state, room) -> bool:
-    """Return whether a stretch may begin: every pair is `room` from its wall, and no contact has read its speed."""
+    """Return whether a stretch may begin: every pair is `room` from its wall, no contact has fixed its impact speed."""
     for pair in range(PAIR_COUNT):
         if p.enabled[pair] == 1:
             if abs(penetration_of(p, state, pair, state.y)) < room:
@@ -428,9 +428,9 @@ def follow_columns(
     room : float
         Distance in m from walls at which a stretch may begin.
     longest_wait : int
-        Ends in a row at which none may begin; the next one begins all the same.
+        Ends in a row at which no stretch may begin; then the next one begins anyway.
     reached : ndarray of int64, shape (1,)
-        Ends that have been reached; a call goes on from there.
+        Number of ends reached; a call continues from there.
     budget : int
         Steps of the motion at most.
     out : ndarray, shape (n, 6, columns)

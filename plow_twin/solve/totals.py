@@ -14,7 +14,7 @@ from plow_twin.solve.state import FIRST, ON, SECOND, SUM
 
 @kernel()
 def _seal(row_of, window) -> None:
-    """Give a row the sums of its whole window, and begin the next window; touches go on counting."""
+    """Give a row the sums of its whole window, and begin the next window; the count of touches continues."""
     for pair in range(PAIR_COUNT):
         row_of.makes[pair], row_of.impulse[pair] = window.makes[pair], window.impulse[pair]
         row_of.peak[pair], row_of.measured_peak[pair] = window.peak[pair], window.measured_peak[pair]
@@ -88,7 +88,7 @@ def publish(rows, stamps, held, taken, windows, waits) -> int:
 
 @kernel()
 def _copy_motion(row_of, target) -> None:
-    """Let another record show the motion of a row."""
+    """Copy the motion of a row to another record."""
     target.t, target.stamp_ns, target.held = row_of.t, row_of.stamp_ns, row_of.held
     for j in range(3):
         target.q[j], target.v[j] = row_of.q[j], row_of.v[j]

@@ -24,7 +24,7 @@ from plow_twin.stream.outputs import CLEARANCE_NAMES, Published, Rows
 
 #: A level is left below this share of its threshold.
 HYSTERESIS: Final = 0.95
-#: The rate of change of the clearance is that over this time [ns]: its steps of a tenth of a second say little.
+#: Time [ns] over which the growth rate of the clearance is taken: its steps of a tenth of a second are too short.
 RATE_SPAN_NS: Final = 10 * NS_PER_S
 #: Time for which poses of the model are kept for late measured poses [ns].
 _KEPT_NS: Final = 2 * NS_PER_S
@@ -42,7 +42,7 @@ class Level(IntEnum):
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Values from which on there is a warning and an error; 0: never."""
+    """Values from which there is a warning and an error; 0: never."""
 
     warn: float = 0.0
     error: float = 0.0
@@ -59,7 +59,7 @@ class Thresholds:
 
 @dataclass(frozen=True)
 class Raised:
-    """How an alarm came to its latched level: value, threshold, stamp, and the pair or axis, empty without one."""
+    """Origin of an alarm's latched level: value, threshold, stamp, and the pair or axis, if there is one."""
 
     value: float
     threshold: float
@@ -182,7 +182,7 @@ class Alarms:
         self._duration_ns = round(duration_s * NS_PER_S)
         self._model = _Model() if "residual" in self.alarms else None
         self._clearances: deque[tuple[int, float]] = deque()
-        #: names of those that the latest take has latched at a higher level
+        #: names of the alarms that the newest judgement has latched at a higher level
         self.raised: list[str] = []
 
     def feed(self, published: Published) -> Iterator[int]:

@@ -61,7 +61,7 @@ class Following(Driven, Protocol):
     defers: bool
 
     def catch_up(self) -> None:
-        """Do what the newest row left over, if it is not done; every other call does it first."""
+        """Finish the work that the newest row left, if any; every other call does this first."""
 
     def add_pose(self, t: float, q: ArrayLike, known: float = ...) -> None:
         """Add a pose measured at model time `t` in s, shape (3,), NaN where not measured; it acts from `known` on."""

@@ -44,7 +44,7 @@ class FaceChart:
         self._speed = self._place_m = 0.0
         self._direction = 0.0
         self._reached_ns: int | None = None
-        #: speeds by their stamps, which have not been reached
+        #: speeds by their stamps, not yet reached
         self._coming: list[Travel] = []
         self.known = False
 

@@ -22,11 +22,11 @@ from plow_twin.record.sources import Arrived
 from plow_twin.stream.driver import Arrival
 from plow_twin.stream.intake import Intake, Verdict
 
-#: A number that falls or rises by more than this is believed if the next one continues it: the sender has restarted.
+#: A larger fall or rise of the numbers is believed if the next number continues it: the sender has restarted.
 _RESTART = 1000
 #: Most samples lost between two messages: a day at 10 kHz.
 _MOST_LOST = 10**9
-#: A 0 or 1 after this number of messages is a restart, before it a late message.
+#: A 0 or 1 after at least this many messages is a restart, after fewer a late message.
 _FIRST = 10
 #: Least relative change of a deviation of the load that is journalled.
 _NOTABLE = 0.02
@@ -84,7 +84,7 @@ class Feeder:
         inputs.senders.alive([self._name])
 
     def begin(self, messages: Iterable[Arrived]) -> None:
-        """Begin the time of a source with its own time at the first message that the next one continues."""
+        """Begin the time of a source with its own time at the first message that the following one continues."""
         read = (role.read(arrived) for arrived in messages for _, role in self._by_topic.get(arrived.topic, ()))
         stamps = (found[0] for found in read if found is not None)
         back_ns = round(self._runtime.settings.jump_back * 1e9)
@@ -121,7 +121,7 @@ class Feeder:
             self._send(topic, message)
 
     def _feed_table(self, table: Table) -> bool:
-        """Process lines as a table; False, without effect, where the load cannot be read so."""
+        """Process lines as a table; without effect and False where the load cannot be read in this way."""
         roles, inputs = self._by_topic.get(table.topic, []), self._runtime.inputs
         role = next((role for name, role in roles if name == "excitation"), None)
         if role is None or role.sequence or not (self._at_once and inputs.active):
@@ -222,7 +222,7 @@ class Feeder:
         return self._name, number, again
 
     def _goes_on(self, number: int) -> bool:
-        """Return whether a number continues those before, or an odd one just before it."""
+        """Return whether a number continues the numbers before, or the single odd number just before it."""
         odd, before = self._odd, self._number
         if odd is not None and abs(number - odd) < abs(number - before):
             if not before < odd <= before + _MOST_LOST:

@@ -29,7 +29,7 @@ _BLOCK: Final = 1 << 18
 _REMEMBERED: Final = 256
 #: Interval at which a followed file is read [s].
 _LOOK_S: Final = 0.02
-#: Interval at which files are looked for that are not there yet [s].
+#: Interval at which missing files are searched for [s].
 _LOOK_FOR_FILES_S: Final = 0.2
 STDIN_TOPIC: Final = "stdin"
 
@@ -46,14 +46,14 @@ class _Tail:
     _file: Any = None
     #: the newest bytes read, which differ in a rewritten file
     _newest: bytes = b""
-    #: lines whose end never came: the file was cut or replaced
+    #: lines that were never completed: the file was cut or replaced
     left: int = 0
 
     def __post_init__(self) -> None:
         self.topic = self.topic or self.path.stem
 
     def columns(self, *, grows: bool) -> list[str] | None:
-        """Return the columns by the first line; None: there is no file, or no line, and a whole one if it `grows`."""
+        """Return the columns by the first line, which must be whole if the file `grows`; None without file or line."""
         rows = Rows()
         try:
             with _readable(self.path), _open(self.path) as stream:
@@ -76,7 +76,7 @@ class _Tail:
     def _block(self) -> bytes:
         if self._file is None or self._is_another():
             rest = b"" if self._file is None or self._is_anew() else self._read()
-            if rest:  # the rest of the file that was moved away
+            if rest:  # the rest of a file that was moved away
                 return rest
             try:
                 with _readable(self.path):
@@ -98,13 +98,13 @@ class _Tail:
         return data
 
     def _is_anew(self) -> bool:
-        """Return whether the file was cut, even if it has grown beyond its old size since."""
+        """Return whether the file was cut, even if it has since grown beyond its old size."""
         begin = self._file.tell() - len(self._newest)
         return os.pread(self._file.fileno(), len(self._newest), begin) != self._newest
 
     def _is_another(self) -> bool:
         """Return whether the file was rewritten, or another file is at its path."""
-        if isinstance(self._file, ParquetLines):  # it is read once
+        if isinstance(self._file, ParquetLines):  # the file is read once
             return False
         try:
             found = self.path.stat()
@@ -141,7 +141,7 @@ def _readable(path: Path) -> Iterator[None]:
 class _Dated:
     """The files of a pattern, as one topic under the pattern's name.
 
-    Followed, the newest of them comes first, then each that appears; the one before is read on beside it.
+    When followed, the newest file comes first, then each new file; the file before is still read beside it.
     """
 
     def __init__(self, pattern: Path) -> None:

@@ -31,7 +31,7 @@ class Mqtt(SourceState):
     Parameters
     ----------
     access
-        The broker.
+        Address and credentials of the broker.
     connect_s
         Longest wait for its answer [s].
 
@@ -107,7 +107,7 @@ class Mqtt(SourceState):
             self.trouble = f"refused: {refused}"
             self._answer.set()
             return
-        # in a resumed session brokers may mark messages that they kept for it as retained too
+        # in a resumed session, brokers may also mark messages that they kept for it as retained
         resumed = is_resumed(flags)
         self._from_before = not resumed
         if self._subscribed and resumed:

@@ -1,4 +1,4 @@
-"""Clients of MQTT by paho 1.6 and 2, whose callbacks get the same facts in other forms."""
+"""MQTT clients by paho 1.6 and 2, whose callbacks get the same facts in different forms."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def is_resumed(flags: Any) -> bool:
 
 
 def refusal(reason: Any) -> str:
-    """Return in words why a connection was refused; empty: it was not."""
+    """Return in words why a connection was refused; empty if it was accepted."""
     if isinstance(reason, int):
         from paho.mqtt.client import connack_string
 
@@ -56,7 +56,7 @@ def refusal(reason: Any) -> str:
 
 
 def subscription_refusal(reason: Any) -> str:
-    """Return in words why a subscription was refused; empty: it was not."""
+    """Return in words why a subscription was refused; empty if it was accepted."""
     if isinstance(reason, int):
         return "not authorized, or no such topic" if reason >= _REFUSED else ""
     return str(reason) if reason.is_failure else ""

@@ -13,7 +13,7 @@ from plow_twin.record.merging import StampOf
 from plow_twin.record.sources import Arrived, Columns, TopicType, columns_of
 from plow_twin.scene_file.csv_rows import delimiter_of
 
-#: Most messages that a source hands over at once.
+#: Most messages that a source returns at once.
 BATCH: Final = 256
 #: Longest line or payload that is read [B].
 LONGEST: Final = 65536
@@ -43,7 +43,7 @@ class Bridge(Protocol):
     lost : int
         Messages that were dropped before they were read.
     trouble : str
-        Why no messages can come just now, or empty.
+        Why no messages can come at present; empty if they can.
     """
 
     ends: bool
@@ -93,7 +93,7 @@ def read_json(data: bytes) -> dict[str, Any] | None:
 
 
 class Lines:
-    """Splits bytes into whole lines; a line that is too long is None."""
+    """Splits bytes into whole lines, with None for a line that is too long."""
 
     def __init__(self) -> None:
         self._rest = b""
@@ -143,7 +143,7 @@ class Rows:
         return columns_of(source, self.columns or ())
 
     def of_another_file(self) -> Rows:
-        """Return the parser of a file that replaces this one: by its own header, or without one by this header."""
+        """Return the parser of the file that replaces this one: by its own header, or by this header if it has none."""
         rows = Rows()
         rows._before = self.columns
         return rows
@@ -169,7 +169,7 @@ class Rows:
                 return False
             self.columns = self._before
         if [cell.strip() for cell in cells] == self.columns:
-            return False  # a file that repeats its header
+            return False  # the file repeats its header
         if len(cells) != len(self.columns):
             return None
         if self.delimiter != ",":  # decimal commas

@@ -15,7 +15,7 @@ from plow_twin.record.times import OF_NUMBERS, TIMES, times_ns
 
 
 class Table:
-    """Some lines of a file under its header: messages one by one, or a role of all of them at once.
+    """Some lines of a file under its header, as messages one by one or as a role of all lines at once.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ class Table:
         return len(self._lines)
 
     def __iter__(self) -> Iterator[Arrived]:
-        """Yield the message of each line that is one."""
+        """Yield the message of each line that has one."""
         now_ns = time.time_ns()
         for line in self._lines:
             content = self._rows.read(line)
@@ -45,7 +45,7 @@ class Table:
     def read(self, role: Role) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
         """Return stamps [ns], shape (n,), and numbers (n, k) of a role as `Role.read` does.
 
-        None where a line is to be read by itself: it is no row, a number is missing, or is not plain decimal.
+        None where the lines must be read one by one: a line is not a row, or a number is missing or not plain decimal.
         """
         names = self._rows.columns or []
         stamp = next((name for name in TIMES if name in names), None) if role.stamp == "header" else role.stamp

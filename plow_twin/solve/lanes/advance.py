@@ -44,7 +44,7 @@ from plow_twin.solve.method.rest import slow_enough
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, Status, X, Y
 from plow_twin.solve.step import LONGEST_STEP
 
-#: Steps to a sample after which rest is looked for under a constant load: the check costs as much.
+#: Steps to a sample after which rest is checked under a constant load: the check costs as much.
 _MAY_REST: Final = 32
 #: Share of the last order's admissible size, below which a term has vanished (`method.series`).
 _VANISHED: Final = 0.4
@@ -82,7 +82,7 @@ def _unowned_samples(s):
 
 @kernel()
 def _begin_sample(s, lanes, lane) -> None:
-    """Let the load of a lane run straight to the next sample; keep its state from before."""
+    """Let the load of a lane run straight to the next sample; save its present state."""
     member = lanes.member[lane]
     i, state = s.place[member], s.states[member]
     lanes.stop[lane], lanes.knot[lane], lanes.before[lane] = s.times[i], lanes.time[lane], state.steps
@@ -117,7 +117,7 @@ def _clear_sums(s, lanes, lane) -> None:
 
 @kernel()
 def _leave(s, lanes, lane) -> None:
-    """Take a twin out of its lane as it was at the sample before."""
+    """Take a twin out of its lane, with its state at the sample before."""
     member = lanes.member[lane]
     _clear_sums(s, lanes, lane)
     save_lane(s.states[member], s.totals[lane], lanes, lane)
@@ -126,7 +126,7 @@ def _leave(s, lanes, lane) -> None:
 
 @kernel()
 def _fail(s, lanes, lane, code) -> None:
-    """Undo the advance of a lane, whose time goes on to the sample; its twin waits for a lane again."""
+    """Undo the advance of a lane, with its time at the next sample; its twin waits for a lane again."""
     member = lanes.member[lane]
     i, steps = s.place[member], s.states[member].steps - lanes.before[lane]
     _leave(s, lanes, lane)
@@ -237,7 +237,7 @@ def _is_steady(lanes, lane) -> bool:
 
 @kernel()
 def _look(s, rest, lanes, lane, budget, in_range) -> int:
-    """Return `OK` where a lane takes a step, `_AT_SAMPLE` where it has reached a sample, else why it leaves."""
+    """Return `OK` where a lane takes a step, `_AT_SAMPLE` where it has reached a sample, otherwise why it leaves."""
     member = lanes.member[lane]
     p, state = s.params[member], s.states[member]
     if not in_range and not lane_in_range(lanes, p, state, lane):
@@ -258,7 +258,7 @@ def _look(s, rest, lanes, lane, budget, in_range) -> int:
 
 @kernel()
 def _get_ready(s, viscous, hysteretic, rest, lanes, budget) -> bool:
-    """Write rows of the samples that were reached and fill the lanes; return whether any lane has a step to take."""
+    """Write rows of the reached samples and fill the lanes; return whether any lane has a step to take."""
     while True:
         in_range, reached, live, changed = bits_in_range(lanes), 0, False, False
         for lane in range(WIDTH):
@@ -327,8 +327,8 @@ def advance_lanes(s, viscous, hysteretic, rest, order, eight, work, budget, iter
     """Advance the twins in the queue through all samples, eight at a time; return False where `iterations` are used up.
 
     `eight` and `work`, (1,), are lanes and scratch space. `budget` are the steps that an advance to a sample may take.
-    Where one fails the twin stays as it was, and its time goes on. A twin whose advance is one of rest leaves its lane
-    before it (`Samples.other`).
+    Where one fails the twin stays as it was, and its time goes on. A twin at rest leaves its lane before the advance
+    (`Samples.other`).
     """
     s, lanes, w = _unowned_samples(s), eight[0], work[0]
     for _ in range(iterations):

@@ -17,7 +17,8 @@ from plow_twin.solve.state import CLIPPED, COS, OFF, ON, SIN, X, Y
 
 #: Events are one instant when they are closer than this share of the step before them.
 _AT_ONCE = 1e-12
-#: Change of a root that is small enough, as the next is of the order of its cube, and its roundings.
+#: Change of a root that ends its search, as the next change is of the order of its cube, and rounding errors of the
+#: root.
 _FOUND, _STRAIGHT, _ROUNDED = 1e-6, 1e-3, 2e-16
 _MOST_CHANGES = 80
 #: Rows of `lanes.chosen` after those of a penetration.
@@ -65,7 +66,7 @@ def _later(series, order, h):
 
 @kernel()
 def _list_off(lanes, order) -> None:
-    """List pairs that are off: their penetration stays negative if its first terms and bounds of the others say so."""
+    """List the guards of pairs that are off, unless the first terms and bounds of the rest prove that they stay off."""
     h, series, cosine, sine = exact_row(lanes.step, 0), lanes.series, lanes.series[COS], lanes.series[SIN]
     x, y = series[X], series[Y]
     later_c, later_s = _later(cosine, order, h), _later(sine, order, h)
@@ -109,7 +110,7 @@ def _write_guard(lanes, rows, of_depth, of_rate, constant, guard, order, h):
 
 @kernel()
 def _choose_guards(lanes, at, hysteretic):
-    """Choose the next guard of each lane that has one; return bits for these lanes, and where a pair touches again."""
+    """Choose the next guard of each lane that has one; return bits for these lanes, and for those with a new touch."""
     bits = again = 0
     for lane in range(WIDTH):
         lanes.guarded[at, lane] = -1
@@ -151,7 +152,7 @@ def _write_choice(lanes, lane, guard, hysteretic) -> None:
 
 @kernel()
 def _shift(lanes, guard, pair, lane, order) -> None:
-    """Let the guard of a pair that has parted begin there."""
+    """Let the guard of a pair that has parted begin at that point."""
     x = lanes.parted[pair, lane]
     for r in range(order):
         for j in range(order - 1, r - 1, -1):
@@ -161,7 +162,7 @@ def _shift(lanes, guard, pair, lane, order) -> None:
 
 @kernel()
 def _isolate(lanes, column, w, order, bits):
-    """Return bits for the lanes whose column has one root in [0, reach), and several; write the chord's root to `root`.
+    """Return bits for lanes whose column has one root in [0, reach), and for several; write the chord's root to `root`.
 
     The Bernstein coefficients have as many sign changes as roots, or an even number more.
     """
@@ -223,7 +224,7 @@ def _leaves(guard, lane, order, h) -> bool:
 
 @kernel()
 def _note_root(lanes, lane, at, order) -> None:
-    """Take a root of a lane's guard: it ends the step there, or is a pair that parts."""
+    """Use a root of a lane's guard: it ends the step, or marks the parting of a pair."""
     guard, root = lanes.guarded[at, lane], lanes.root[lane]
     pair = guard % PAIR_COUNT
     if guard < SECOND and lanes.mode[pair, lane] == CLIPPED:
@@ -270,7 +271,7 @@ def first_events(states, lanes, w, order, full, hysteretic) -> None:
 
 @kernel()
 def _write_chosen(lanes, guard, order, full):
-    """Write the guards chosen; return as `_write_guard`."""
+    """Write the chosen guards; return as `_write_guard`."""
     chosen, zero = lanes.chosen, exact_splat(0.0)
     for k in range(order + 1, full + 1):
         set_row(guard, k, zero)
@@ -327,7 +328,7 @@ def _ends_with(guard, order, at, within):
 def note_switches(lanes, order, viscous) -> None:
     """Write the modes that pairs take at the end of the steps to `lanes.switch`, -1 for those that stay.
 
-    Events that differ in time by rounding only happen together: a symmetric motion stays symmetric.
+    Events that differ in time only by rounding happen together, so that a symmetric motion stays symmetric.
     """
     ending = 0
     for lane in range(WIDTH):

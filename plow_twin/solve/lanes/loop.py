@@ -223,7 +223,7 @@ def move(lanes) -> None:
 
 @kernel()
 def go_past_an_instant(params, states, lanes) -> None:
-    """Step past an instant at which modes flip without end, with the present modes."""
+    """Step past an instant at which modes would flip without end, keeping the present modes."""
     for lane in range(WIDTH):
         member = lanes.member[lane]
         if member >= 0 and lanes.event[lane] >= 0:
@@ -271,7 +271,7 @@ def _unowned_members(members):
 def run_lanes(
     members, waves, second, viscous, hysteretic, flight, rest, order, lanes, w, queue, t_end, budget, iterations, t
 ) -> bool:
-    """Take the members numbered in `queue` to `t_end`, eight at a time; return False where `iterations` are used up.
+    """Advance the members numbered in `queue` to `t_end`, eight at a time; return False where `iterations` are used up.
 
     `t` are the times of the rows, `order` is the series' order, `budget` the steps that each scene may take. A scene
     leaves its lane with a `Status`, `OTHER_METHOD` or, where the iterations are used up, `PAUSED`.

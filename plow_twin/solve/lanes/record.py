@@ -33,7 +33,7 @@ LANES: Final = np.dtype(
         ("series", "f8", (COMPONENTS, _ROWS, WIDTH)),  # state
         ("moment", "f8", (4, _ROWS, WIDTH)),  # factors of cosine, sine, X and Y in the contacts' moment
         ("load", "f8", (3, _ROWS, WIDTH)),  # S1, S2, M
-        ("depth", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # with lambda d': penetration of each slot's pairs
+        ("depth", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # with lambda d', the penetration of each slot's pairs
         ("push", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # F / K of each slot's pairs
         ("guard", "f8", (GUARDS, _ROWS, WIDTH)),  # in each round one guard of each lane
         ("bernstein", "f8", (_ROWS, WIDTH)),
@@ -43,14 +43,14 @@ LANES: Final = np.dtype(
         ("factor", "f8", _PAIRS),  # lambda
         ("gear", "f8", (PAIR_COUNT, 8, WIDTH)),  # of each slot's pairs: rows, arms, lambda
         ("chosen", "f8", (8, WIDTH)),  # one guard of each lane: rows, factors of d and d', further constant
-        ("along", "f8", (2, 6, WIDTH)),  # higher orders of the forces: of c, s, X or Y, their rates
-        ("turn", "f8", (2, 8, WIDTH)),  # and of the factors in the moment: of c, s, X, Y, their rates
+        ("along", "f8", (2, 6, WIDTH)),  # higher orders of the forces, by c, s, X or Y and their rates
+        ("turn", "f8", (2, 8, WIDTH)),  # and of the factors in the moment, by c, s, X, Y and their rates
         ("constant", "f8", (3, WIDTH)),
         ("slope", "f8", (3, WIDTH)),  # sampled loads: rise from the last sample to the next one
         ("sample", "f8", (3, WIDTH)),  # the last one
         ("held", "f8", (3, WIDTH)),  # load at the step's start, the constant one with it
         ("knot", "f8", _LANES_OF),  # time of the last sample
-        ("small", "f8", _LANES_OF),  # size of a term over the longest step wanted that has vanished
+        ("small", "f8", _LANES_OF),  # size below which a term over the longest wanted step has vanished
         ("direction", "f8", (4, WIDTH)),
         ("inverse_mass", "f8", _LANES_OF),
         ("inverse_inertia", "f8", _LANES_OF),
@@ -86,14 +86,14 @@ LANES: Final = np.dtype(
         ("off", "i8", (PAIR_COUNT,)),  # and in which it is off and can touch
         ("taken", "i8", (PAIR_COUNT,)),  # a bit for each lane with a pair in the slot
         ("slot", "i8", _PAIRS),  # the pair in each slot
-        ("watched", "i8", _LANES_OF),  # a bit for each guard that is searched in any case
+        ("watched", "i8", _LANES_OF),  # a bit for each guard that is always searched
         ("inside", "i8", _LANES_OF),  # pairs that penetrate
         ("event", "i8", _LANES_OF),  # the guard that ends the step, or -1
         ("ends_at_stop", "i8", _LANES_OF),
-        ("todo", "i8", _LANES_OF),  # a bit for each guard that is still to be searched
+        ("todo", "i8", _LANES_OF),  # a bit for each guard that remains to be searched
         ("guarded", "i8", (GUARDS, WIDTH)),  # the guard in each round, or -1
         ("rounds", "i8", (1,)),
-        ("orders", "i8", _LANES_OF),  # of the series of each lane: the terms beyond have vanished
+        ("orders", "i8", _LANES_OF),  # order of the series of each lane; the terms beyond have vanished
         ("vanished", "i8", (1,)),  # a bit for each lane whose series ends early
         ("before", "i8", _LANES_OF),  # steps before the sample
         ("carrying", "i8", _LANES_OF),  # a bit for each pair that is on

@@ -1,9 +1,9 @@
 """Taylor series of eight scenes side by side, contact modes frozen (equations in `method.series`).
 
 Where the contacts' force is linear in penetration and rate, all acting pairs of a scene are one affine map of the
-state: an order takes twelve Cauchy products, however many pairs act and whichever they are. With lambda d' the force
-K d (1 + lambda d') is K (d + lambda / 2 (d^2)'): half a product more for each slot, which holds one acting pair of each
-lane, whichever that is.
+state: an order takes twelve Cauchy products, however many pairs act and whichever they are. With lambda d' the force K
+d (1 + lambda d') is K (d + lambda / 2 (d^2)'): half a product more for each slot, which holds any one acting pair of
+each lane.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from plow_twin.solve.lanes.record import DC, DS, DX, DY, WIDTH, linear_at, penet
 from plow_twin.solve.lanes.waves import turn_lanes
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, X, Y
 
-#: A term beyond this is not finite, or its products would not be.
+#: A larger term is not finite, or its products would not be.
 _FINITE = 1e300
-#: A series that ends because its terms vanish has at least so many orders.
+#: Fewest orders of a series that ends because its terms vanish.
 _FEWEST_ORDERS = 4
 _ALL = 2**WIDTH - 1
 
@@ -80,8 +80,8 @@ def expand_loads(harmonics, extent, second, lanes, w, order) -> None:
 def expand(lanes, w, limit, waves, second, viscous, hysteretic, segments) -> int:
     """Write the series of the state; return the order.
 
-    Under sampled loads a lane's terms are zero beyond the order from which on they vanish over the longest step wanted:
-    later orders of other lanes change no bit of it.
+    Under sampled loads a lane's terms are zero beyond the order at which they vanish over the longest wanted step, so
+    that later orders of other lanes change none of its bits.
     """
     series, moment = lanes.series, lanes.moment
     zero = exact_splat(0.0)
@@ -240,8 +240,8 @@ def _waves(load, series, k, c0, s0, c, s, share):
 def _start(lanes, viscous, c, s, x, y, dc, ds, dx, dy):
     """Return the contacts' forces along X and Y and their factors of cosine and sine in the moment at the start.
 
-    They come from the very penetrations of the guards: a sum of maps would round them otherwise, and walls that
-    push and walls that let go would lie 1e-17 m apart.
+    They are computed from the same penetrations as the guards: a sum of maps would be rounded differently, and the
+    walls of force and guard would lie 1e-17 m apart.
     """
     fx = fy = gc = gs = exact_splat(0.0)
     for slot in range(PAIR_COUNT):

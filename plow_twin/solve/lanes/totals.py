@@ -10,7 +10,7 @@ from plow_twin.solve.lanes.record import COMPONENTS, WIDTH, linear_at, penetrati
 from plow_twin.solve.state import COS, SIN, X, Y
 from plow_twin.solve.totals import add_set_times
 
-#: Allowance of a force's bound for rounding, and between a peak and the maximum.
+#: Allowance for rounding in a force's bound, and between a peak and the maximum.
 _ROUNDED, _SAME = 1.0 + 1e-9, 1.0 + 1e-12
 
 
@@ -42,7 +42,7 @@ def add_step(totals, lanes, w, order, full, viscous, hysteretic) -> None:
     """
     last = order - 1
     if totals is None:
-        # under samples the series of a lane may end before; then its guard has one more term
+        # under samples the series of a lane may end earlier; its guard then has one more term
         last = order
     for slot in range(PAIR_COUNT):
         taken = lanes.taken[slot]
@@ -94,7 +94,8 @@ def _impulses(lanes, gear, viscous, hysteretic):
 def _raise_peaks(lanes, w, push, order, full, on) -> int:
     """Raise the peaks in `lanes.gained` by the series of F / K; return a bit for each lane that was looked at.
 
-    First a bound; where it exceeds the peak, the larger end; the maximum only where that may be in between.
+    First comes a bound; where it exceeds the peak, the larger end; only where the maximum may lie in between, the
+    maximum.
     """
     h, zero, half = exact_row(lanes.step, 0), exact_splat(0.0), exact_splat(0.5)
     end = bend = slope = zero

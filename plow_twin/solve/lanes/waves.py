@@ -7,7 +7,7 @@ import math
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import below, choose, exact_row, exact_splat, fused, magnitude, set_row
 
-#: Beyond it the product of the number of quarter turns and the first part of pi / 2 is not exact.
+#: Largest angle for which the product of the number of quarter turns and the first part of pi / 2 is exact.
 _LARGEST = 1e5
 #: Added and taken away again it rounds to a whole number.
 _ROUNDS = 6755399441055744.0

@@ -1,8 +1,8 @@
 """Free flight in closed form: where no wall can be reached, a step of any size.
 
 While no pair touches, the centre of mass and the angle follow from integrating the load twice: constants, linear pieces
-and harmonics have elementary integrals. How far the head can get within a time is bounded without following it
-(conservative advancement): the bound decides how long the step may be. Near a wall the series take over, and meet it.
+and harmonics have elementary integrals. The distance of the head within a time is bounded without following it
+(conservative advancement), and the bound limits the step. Near a wall the series take over, and meet it.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from plow_twin.kernel.compiler import kernel
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.kinematics import penetration_of, to_body, to_world
 
-#: Radians of the fastest harmonic that a flight must span; a series gets some two of them into a step.
+#: Radians of the fastest harmonic that a flight must span; a step of a series covers about two.
 _LEAST_PHASE = 8.0
-#: Part of the smallest gap that the bound may use up.
+#: Share of the smallest gap that the bound may reach.
 _SAFE = 0.9
 
 
@@ -100,7 +100,7 @@ def safe_time(p, harmonics, state, w, span) -> float:
     z = w.flight[0]
     to_world(p, state.y, z)
     _bounds(p, harmonics, state.step_start, z, w)
-    # the walls' rows turn with the head: a place counts like a point of it
+    # the walls' rows turn with the head: a place counts like a point of the head
     leverage = p.leverage + math.hypot(z[0], z[1]) + max(gap, 0.0)
     time = span
     while time >= least:
@@ -126,7 +126,7 @@ def fly(p, harmonics, flight, state, w, time, y) -> None:
 
 @kernel()
 def _swing(p, harmonics, j, t, time):
-    """Return rate and way that the harmonics give along x, y or theta from t on within `time`."""
+    """Return rate and distance that the harmonics add along x, y or theta within `time` from t on."""
     rate = way = 0.0
     for i in range(harmonics.size):
         one = harmonics[i]

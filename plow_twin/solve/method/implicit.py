@@ -2,8 +2,8 @@
 
 Where damping stops a pair long before its spring moves it, an explicit series is bound by stability: steps of a few
 decay times, however smooth the motion. Radau IIA collocation (Hairer and Wanner, Solving ODEs II, sec. IV.5) is stable
-there. Its solution is a polynomial in time too: written as a series, events, output and statistics are those of any
-other step.
+there. Its solution is also a polynomial in time: written as a series, it needs no events, output or statistics of its
+own.
 """
 
 from __future__ import annotations
@@ -50,25 +50,25 @@ from plow_twin.solve.support import (
 
 #: Stages: the polynomials' degree. The order is 2 s - 1.
 STAGES = 9
-#: A contact is overdamped where its dampers act so many times faster than its springs; the same ratio decides when a
-#: scene is compiled whether it can need implicit steps.
+#: A contact is overdamped where its dampers act this many times faster than its springs; the same ratio decides at
+#: compile time whether a scene can need implicit steps.
 OVERDAMPED_RATIO = 20.0
 #: Explicit steps, bound by stability, that an implicit step must replace: it costs as much.
 _WORTH = 30.0
-#: Share of the tolerance, in shares of a step of the series, that an implicit step may spend: it stands for many.
+#: Share of the tolerance that an implicit step may spend, in shares of a step of the series: it replaces many.
 _GAIN = 100.0
-#: Rounding error of a velocity, as a share of the largest: no step is refused for less.
+#: Rounding error of a velocity, as a share of the largest velocity: no step is refused for a smaller error.
 _NOISE = 1e-12
 #: Rounding error of a guard of the corners' grip, as a share of its largest term.
 _GUARD_NOISE = 1e-6
-#: Failed attempts after which the wait for the next attempt doubles no more.
+#: Number of failed attempts after which the wait no longer doubles.
 _MOST_REFUSED = 12
 
 
 def _coefficients(nodes: NDArray[np.longdouble]) -> NDArray[np.longdouble]:
     """Return c with sum_i c[k, i] f(nodes[i]) the coefficient k of the polynomial through the nodes, shape (n, n).
 
-    In extended precision: the inverse of a Vandermonde matrix would lose half of the digits.
+    Computed in extended precision, as the inverse of a Vandermonde matrix would lose half of the digits.
     """
     n = len(nodes)
     columns = np.zeros((n, n), np.longdouble)
@@ -87,7 +87,7 @@ def _coefficients(nodes: NDArray[np.longdouble]) -> NDArray[np.longdouble]:
 @cache
 def _rule() -> tuple[NDArray[np.float64], ...]:
     """Return nodes, weights, and the coefficients from values at the start and the nodes, and at the nodes alone."""
-    # only stiff scenes need it, and it takes a while to import
+    # only stiff scenes need it, and its import takes a while
     from scipy.special import roots_jacobi
 
     inner = 0.5 * (roots_jacobi(STAGES - 1, 1.0, 0.0)[0] + 1.0)
@@ -187,7 +187,7 @@ def stable_decay(order):
 
 @kernel(inline="source")
 def has_decayed(p, state) -> bool:
-    """Return whether the motion set off by a change of contact has decayed, by the decay times passed since.
+    """Return whether the motion after a change of contact has decayed, by the decay times passed since.
 
     Each attempt that failed doubles the wait.
     """
@@ -210,7 +210,7 @@ def _jacobian(p, acts, state, t, z, implicit, base, out) -> None:
     rate, moved, n = implicit.rate[0], implicit.rate[1], base.size
     accelerate(p, acts, True, state, t, z, implicit.load, rate)
     for j in range(2 * n):
-        # where the law is linear, any difference large against rounding will do
+        # where the law is linear, any difference that is large compared with rounding suffices
         delta = 1e-8 / (p.radius if j % 3 == 2 else 1.0)
         saved = z[j]
         z[j] = saved + delta
@@ -342,9 +342,9 @@ def _wear_at_nodes(p, support, state, h, implicit, sliding, running_in) -> float
 def _solve(p, acts, support, state, t, h, implicit, wear, sliding, running_in) -> bool:
     """Find the velocities at the nodes by Newton's method; return whether it converged.
 
-    The derivatives are taken at every node: as the head turns, so does the direction that is damped. Down to rounding:
-    a strong damper turns a small error of a velocity into a large one of its force. Wear, which is slow, follows from
-    the iterate before.
+    The derivatives are taken at every node: as the head turns, so does the direction that is damped. The iteration goes
+    down to rounding: a strong damper turns a small error of a velocity into a large error of its force. Wear, which is
+    slow, is taken from the previous iterate.
     """
     z, s, a, residual = implicit.z, implicit.nodes.size, implicit.weights, implicit.residual
     n = implicit.accelerations.shape[1]
@@ -384,7 +384,7 @@ def _solve(p, acts, support, state, t, h, implicit, wear, sliding, running_in) -
                 * p.velocity_tolerance
                 / p.position_tolerance
             )
-        # the convergence is quadratic: the last iterate is the first that does not fall further
+        # the convergence is quadratic: the first iterate that does not improve is the last
         if change < 1e-14 * p.threshold[0] or (change < 0.1 * p.velocity_tolerance and change > 0.1 * before):
             _places(implicit, h)
             return True
@@ -396,7 +396,8 @@ def _solve(p, acts, support, state, t, h, implicit, wear, sliding, running_in) -
 def _interpolate(values, coefficients, h, out) -> None:
     """Write the series of the polynomials of a step of size h that take eight values at each node.
 
-    From the differences to the last value: the coefficients are large and would cancel a common value only to rounding.
+    It uses the differences from the last value: the coefficients are large and would cancel a common value only up to
+    rounding.
     """
     scale, n = 1.0, len(coefficients)
     last = row(values, n - 1)
@@ -427,7 +428,7 @@ def _series_seen(support, h, w, implicit):
 
 @kernel()
 def _frame_terms(p, support, w, implicit, scale):
-    """Return the frame's parts of the velocity left out at the start and of the last term's size in `_write_series`."""
+    """Return the frame's parts of two results of `_write_series`: velocity left out at the start, last term's size."""
     off = size = 0.0
     if support is not None:
         s = implicit.nodes.size
@@ -507,7 +508,7 @@ def _write_grip(p, state, h, w, implicit, seen, series) -> None:
 
 @kernel()
 def _last_of_guards(p, state, w, h) -> float:
-    """Return the largest share of a last term in its guard of a corner's grip; it matters however small the force."""
+    """Return the largest share of a last term in its guard of a corner's grip, which matters for any small force."""
     guard, share = w.column[0], 0.0
     for pair in range(PAIR_COUNT):
         for side in range(2):
@@ -528,7 +529,7 @@ def _write_ramp(p, h, w, implicit) -> float:
     """Write the law's force as K times the elastic part, of which only d^1 has a series here, and C times the rest.
 
     Return the last term's size, as a velocity per h^(STAGES - 1). The series of a clipped pair moves nothing, but gives
-    the time when it pushes again.
+    the time at which it pushes again.
     """
     s, largest = implicit.nodes.size, 0.0
     _interpolate(implicit.pairs[1], implicit.from_stages, h, w.damped)
@@ -605,7 +606,7 @@ def _start(p, support, state, implicit) -> None:
 
 @kernel()
 def _collocate(p, parts, support, state, w, span, decay, implicit, ramp, wear, sliding, running_in, stick) -> float:
-    """Lay out an implicit step as series of order `STAGES`; return its size, or 0 when explicit ones are better.
+    """Lay out an implicit step as series of order `STAGES`; return its size, or 0 when explicit steps are better.
 
     `decay` is the `decay_rate`.
     """
@@ -622,7 +623,7 @@ def _collocate(p, parts, support, state, w, span, decay, implicit, ramp, wear, s
             size = _write_series(p, support, state, h, w, implicit, ramp, wear, stick)
             better = 0.9 * (admissible / max(size, 1e-6 * admissible)) ** (1.0 / (STAGES - 1))
             if size <= admissible:
-                # a step cut short by a sample says nothing against a longer one
+                # a step cut short by a sample is no evidence against a longer step
                 longer = h * min(better, 4.0)
                 state.implicit_size = max(longer, state.implicit_size) if h == span else longer
                 state.implicit_steps += 1

@@ -1,9 +1,9 @@
-"""Rest: the vanishing vibration of a head that its contacts hold still is not followed.
+"""Rest: the vanishing vibration of a head that its contacts hold is not followed.
 
 With constant loads and no other drive, the sum of kinetic and potential energy cannot grow. Where the
-stiffness is positive definite it bounds for all time how far the head can get from its equilibrium. Once that is far
-below the tolerance the head is put there, and steps are as long as they may be. Harmonics may act that move the head no
-farther than that (`small_harmonics`).
+stiffness is positive definite it bounds for all time how far the head can get from its equilibrium. Once the bound is
+far below the tolerance the head is set to its equilibrium, and steps are as long as possible. Harmonics may act if they
+move the head no farther (`small_harmonics`).
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from plow_twin.solve.state import OMEGA, ON, VX, VY
 
 #: Share of the tolerances that the motion left out may reach.
 _SHARE = 1e-3
-#: How much deeper than that a pair must be, or how much farther away.
+#: Factor by which a pair must be deeper, or farther away, than that.
 _MARGIN = 10.0
-#: Least such depth in m, for the differences that give the stiffness.
+#: Smallest such depth in m, for the difference quotients of the stiffness.
 _DEEP = 1e-7
 #: Most evaluations of the equations of motion that the check takes.
 AT_REST = 5 + EVALUATIONS
@@ -71,7 +71,7 @@ def _still(p, acts, harmonics, state, w) -> bool:
 
 @kernel()
 def _still_as_before(p, acts, harmonics, state, w) -> bool:
-    """Return whether place and load are unchanged since the head was found at rest."""
+    """Return whether place and load are unchanged since rest was found."""
     z, rate = w.rest[0], w.rest[1]
     to_world(p, state.y, z)
     accelerate(p, acts, True, state, state.step_start, z, w.rest[3, :3], rate)

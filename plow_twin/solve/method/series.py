@@ -36,9 +36,9 @@ from plow_twin.solve.support import (
     start_frame,
 )
 
-#: A term has vanished where it is below this share of what the last order may have.
+#: A term has vanished where it is below this share of the admissible size of the last order.
 _VANISHED = 0.4
-#: Factors in the rates of the state's components: of omega (S1 in lanes 4 and 7), and of rates that are components.
+#: Factors in the rates of the state's components: of omega (S1 in lanes 4 and 7), and of components that are rates.
 _turned = permutation(Y, X, VY, VX, COS, SIN, COS, SIN)
 _rates_of = permutation(VX, VY, VX, VY, OMEGA, COS, SIN, OMEGA)
 
@@ -200,9 +200,9 @@ def _hold(p, w, k, fx, fy):
 
 @kernel(fast=True)
 def _loads(p, w, k, c, s, c1, s1, c2, s2, product, alpha, beta, harmonics, second, segments):
-    """Return order k of the load per mass, turned into head axes, and of its moment per inertia.
+    """Return order k of the load per mass in head axes and of its moment per inertia.
 
-    c, s are the orders k of cosine and sine, c1, s1 and c2, s2 those one and two before; `product` has S1 c and S1 s.
+    c, s are the orders k of cosine and sine, c1, s1 and c2, s2 the orders k - 1 and k - 2; `product` has S1 c and S1 s.
     """
     if fixed_axes(p) is not None:
         return _loads_along_world(p, w, k, alpha, beta, harmonics, second, segments)
@@ -305,9 +305,9 @@ def _hold_on(p, state, w, k, c, s, x, y, theta, om, dc, ds, dx, dy):
 
 @kernel(fast=True)
 def _slide(p, w, k, om, dc, ds, dx, dy) -> None:
-    """Write order k of the force times the way that a corner slides per travel to `w.rub[2]`.
+    """Write order k of the force times the sliding distance of a corner per travel to `w.rub[2]`.
 
-    The way is sqrt(q) with q = 1 + (s' / v)^2:  2 root_0 root_k = q_k - sum of root_j root_{k-j} without its ends.
+    The distance is sqrt(q) with q = 1 + (s' / v)^2: 2 root_0 root_k = q_k - sum of root_j root_{k-j} without its ends.
     """
     sliding, way = w.rub[0], w.rub[1]
     rate = rolled(p, row_values(p.slip_rows, dc, ds, dx, dy), om)
@@ -372,7 +372,7 @@ def _wear(p, state, w, k, alpha, beta, om, dc, ds, dx, dy, sliding, running_in) 
 
 @kernel(fast=True, inline="code")
 def _slide_size(p, w, k, sliding, running_in):
-    """Return the size of order k - 1 of the speed at which the pads that carry slide: order k is not known yet."""
+    """Return the size of order k - 1 of the sliding speed of the pads that carry force: order k is not known yet."""
     size = 0.0
     if sliding is not None:
         for pair in range(PAIR_COUNT):
@@ -563,7 +563,7 @@ def expand(
                 applied, pushed = applied + dragged, pushed + dragged
             if wear is not None:
                 _wear(p, state, w, k, alpha, beta, om, dc, ds, dx, dy, *rub_terms)
-            # the penetration of the next order needs this order's rates alone: no forces to wait for
+            # the penetration of the next order needs only this order's rates, and need not wait for forces
             penetration = rate * steady + closing * bent
             closing = rate
         if support is not None:

@@ -1,4 +1,4 @@
-"""Rest under harmonics: whether their motion of a head that its contacts hold stays below the tolerance for all time.
+"""Rest under harmonics: whether the motion of a head held by its contacts stays below the tolerance for all time.
 
 About its equilibrium such a head obeys  e'' + C e' + K e = r,  with e its distance from the linear answer to the
 harmonics (the angle counts as a place, times the radius of gyration) and r what the linear equations leave out. The
@@ -7,7 +7,7 @@ least eigenvalues of K and C, and S is the largest one of C,
 
     V = (e'e' + e K e) / 2 + eps (e e' + e C e / 2),  V' <= -eps W + r (1 + eps / sqrt(s)) sqrt(W),  W = e'e' + e K e
 
-is between 0.45 W and 0.55 W. So sqrt(W) stays below the larger of 1.2 times what it is now and 1.4 r / eps for all
+is between 0.45 W and 0.55 W. So sqrt(W) stays below the larger of 1.2 times its present value and 1.4 r / eps for all
 time, and e below sqrt(W / s). Without damping nothing keeps r from swinging the head up.
 """
 
@@ -63,7 +63,7 @@ def _damping_at(p, acts, state, w, gyration) -> None:
 
 @kernel()
 def _least_eigenvalue(h) -> float:
-    """Return a bound from below of the least eigenvalue, not far below half of it; 0 where it is not positive."""
+    """Return a lower bound of the least eigenvalue, not far below half of it; 0 where it is not positive."""
     least = 0.99 * min(h[0, 0], h[1, 1], h[2, 2])
     for _ in range(_HALVINGS):
         if stiffer_than(h, least):
@@ -74,7 +74,7 @@ def _least_eigenvalue(h) -> float:
 
 @kernel()
 def _trace(p, h) -> float:
-    """Return a bound from above of the largest eigenvalue."""
+    """Return an upper bound of the largest eigenvalue."""
     trace = 0.0
     for j in range(3):
         trace += h[j, j] if p.free[j] != 0.0 else 0.0
@@ -83,7 +83,7 @@ def _trace(p, h) -> float:
 
 @kernel(inline="code")
 def _dynamic_stiffness(p, w, omega, i, j):
-    """Return an entry of K - omega^2 + i omega C; a locked place has an equation of its own."""
+    """Return an entry of K - omega^2 + i omega C, with a separate equation for a locked place."""
     if p.free[i] == 0.0 or p.free[j] == 0.0:
         return complex(1.0 if i == j else 0.0, 0.0)
     return complex(w.hessian[i, j] - (omega * omega if i == j else 0.0), omega * w.damping[i, j])
@@ -114,7 +114,7 @@ def _answer(p, one, w, gyration):
 
 @kernel()
 def _left_out(p, state, w, reach, rate, gyration) -> float:
-    """Return a bound of r within distances `reach` and rates `rate`: how the pairs' forces bend, and how they turn."""
+    """Return a bound of r within distances `reach` and rates `rate`, by curvature and turning of the pairs' forces."""
     y, left_out = state.y, 0.0
     arm = (p.leverage + math.hypot(y[X], y[Y])) / gyration
     way = math.sqrt(1.0 + arm * arm)
@@ -132,9 +132,9 @@ def _left_out(p, state, w, reach, rate, gyration) -> float:
 
 @kernel()
 def stays_at_rest(p, acts, harmonics, state, w, distance, way, fast, gyration) -> bool:
-    """Return whether the head stays within `way` of its equilibrium, and slower than `fast`, for all time.
+    """Return whether the head stays within the distance `way` of its equilibrium, and slower than `fast`, for all time.
 
-    `distance` is sqrt(W) of the head now, were there no harmonics; `w.hessian` has its stiffness.
+    `distance` is the present sqrt(W) of the head without harmonics; `w.hessian` has its stiffness.
     """
     least = _least_eigenvalue(w.hessian)
     _damping_at(p, acts, state, w, gyration)

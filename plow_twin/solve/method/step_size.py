@@ -1,4 +1,4 @@
-"""How far a step reaches: where its series stops being accurate, and shorter where the series cannot show it."""
+"""The length of a step: up to where its series stops being accurate, and shorter where the series cannot show this."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from plow_twin.solve.method.series import expand, expand_harmonics, one_by_one
 from plow_twin.solve.modes import penetration_and_rate
 from plow_twin.solve.state import CLIPPED, ON
 
-#: Steps like the last within which a parting pair is looked for, and the order of its series.
+#: Number of steps of the last size within which a parting is searched, and the order of its series.
 _PARTING_REACH, PARTING_ORDER = 1.3, 6
-#: The same with friction that sticks, where the remaining force has a measure of its own and steps are shorter.
+#: The same with friction that sticks, where the remaining force is judged separately and steps are shorter.
 _PARTING_REACH_STICK = 8.0
 #: Newton steps to its root, and the relative change at which they end: the next step corrects the rest.
 _NEWTON_STEPS, _ROOT_FOUND = 6, 1e-9
-#: A term beyond this is not finite, or its products would not be.
+#: A larger term is not finite, or its products would not be.
 _FINITE = 1e300
-#: How often a step is shortened, because the largest term over it shrinks too, and the change that counts as zero.
+#: How often a step is shortened (the largest term over it also shrinks), and the change that counts as zero.
 _SHORTER, _SHORT_ENOUGH = 20, 0.9
 
 
@@ -31,7 +31,7 @@ def accurate_step(p, w, order, sigma_limit):
     """Return the sigma over which the series meets its share of the tolerance; NaN if it is not finite.
 
     Term k may be as large as `threshold[k]`, which falls geometrically to the admissible error at the last order (root
-    test as by Jorba and Zou, sec. 3.2). All of the last `lacuna` orders are looked at, since single ones can vanish.
+    test as by Jorba and Zou, sec. 3.2). All of the last `lacuna` orders are checked, since single orders can vanish.
     """
     least = np.inf
     for k in range(order, order - max(p.lacuna, 2), -1):
@@ -52,7 +52,7 @@ def accurate_step(p, w, order, sigma_limit):
 def before_sticking(p, state, w, order, sigma) -> float:
     """Return the part of `sigma` over which the series of tanh r converges well enough.
 
-    Far from sticking tanh r is constant to the last bit: no coefficient shows that its poles at r = +-i pi/2 come near.
+    Far from sticking tanh r is constant to the last bit, and no coefficient shows its poles at r = +-i pi/2.
     With |r - r_0| at most theta times their distance, the remainder of the series is below theta^order.
     """
     theta = (p.threshold[p.order] / p.threshold[0]) ** (1.0 / order)
@@ -72,12 +72,12 @@ def before_sticking(p, state, w, order, sigma) -> float:
 
 @kernel()
 def before_pushing_again(p, state, w, order, sigma, integer, fraction) -> float:
-    """Return the part of `sigma` over which the ramped force of clipped pairs is accurate: it moves nothing yet.
+    """Return the part of `sigma` over which the ramped force of clipped pairs, which does not act yet, is accurate.
 
-    Only a guard depends on this force, so no other check shortens a step for it. The same root test as for the motion,
-    of the velocity that it would give; the acting share of C is a cubic, whose series ends after the penetration's,
-    and a force d^n has its branch point where the pair parts. The motion's own terms may have ended early: the test is
-    of as many orders as there are.
+    Only a guard depends on this force, so no other check shortens a step for it. It uses the root test of the motion on
+    the velocity that the force would give. The acting share of C is a cubic, whose series ends after the penetration's,
+    and a force d^n has its branch point where the pair parts. The motion's own terms may have ended early: the test
+    uses the orders that exist.
     """
     least, share = np.inf, math.log(p.threshold[p.order] / p.threshold[0]) / order
     for pair in range(PAIR_COUNT):
@@ -93,7 +93,7 @@ def before_pushing_again(p, state, w, order, sigma, integer, fraction) -> float:
 
 @kernel()
 def before_gripping(p, state, w, order, sigma) -> float:
-    """Return the part of `sigma` over which the guards of the corners' grip are accurate.
+    """Return the part of `sigma` over which the guards of stick and slip are accurate.
 
     A force far too small to move the head still decides whether its corner holds: the same root test, relative to the
     largest term of the guard.
@@ -109,7 +109,7 @@ def before_gripping(p, state, w, order, sigma) -> float:
 
 @kernel()
 def _relatively_accurate(g, order, lacuna, share, sigma) -> float:
-    """Return the part of `sigma` over which the last terms of a polynomial g are small beside its largest one.
+    """Return the part of `sigma` over which the last terms of a polynomial g are small beside its largest term.
 
     Term k may be exp(share k) of it. Only the upper half counts: near a root the first terms are large beside the rest.
     """

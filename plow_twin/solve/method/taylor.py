@@ -1,4 +1,4 @@
-"""A step by Taylor series: how its variable runs in time, its series, and how far they are accurate."""
+"""A step by Taylor series: the variable of the series, the series, and its accurate length."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from plow_twin.solve.method.step_size import (
     time_to_separation,
 )
 
-#: Steps like the last for which a touch still shapes the series.
+#: Number of steps of the last size for which a touch still shapes the series.
 _TOUCH_REACH = 2.5
 
 
@@ -57,7 +57,7 @@ def _lay_out(p, parts, slip, ramp, fraction, stick, implicit, state, w, span, pe
 
 @kernel()
 def _choose_map(p, parts, fraction, stick, state, w, span, penetrating):
-    """Choose how the series' variable runs in time; return its value after `span`, and whether a step may go so far."""
+    """Choose the series' variable; return its value after `span`, and whether a step may be that long."""
     if fraction is None:
         return span, True
     if state.touching != 0:
@@ -74,7 +74,7 @@ def _choose_map(p, parts, fraction, stick, state, w, span, penetrating):
         return (root if parting <= span else root - math.sqrt(parting - span)), parting > span
     since = state.step_start - state.touch_time
     if 0.0 < since < _TOUCH_REACH * state.last_step_size:
-        # and still in the root of the time since its start, some steps on
+        # also some steps later in the root of the time since its start
         root = math.sqrt(since)
         state.alpha, state.beta = 2.0 * root, 2.0
         return math.sqrt(since + span) - root, True

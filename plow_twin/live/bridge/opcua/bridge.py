@@ -36,7 +36,7 @@ _WAIT_S: Final = 5e-3 * PUBLISHING_MS
 _PIECE_NS: Final = 10_000_000_000
 #: Longest delay of one node's values after the values of another [ns].
 _OVERLAP_NS: Final = 1_000_000_000
-#: What a server has sent may reach its history so much later [s].
+#: Longest delay of a sent value in the server's history [s].
 _HISTORY_LAG_S: Final = 5.0
 #: First wait before another attempt to connect, and the longest [s].
 _FIRST_WAIT_S: Final = 1.0
@@ -109,7 +109,7 @@ class OpcUa(SourceState):
         self._link: Link | None = None
         #: values that come while the history is read
         self._held_back: list[tuple[list[tuple[int, Any]], bool]] | None = None
-        #: why the history of this connection cannot be read; empty: it may be
+        #: why the history of this connection cannot be read; empty if it may be
         self._no_history = ""
         logging.getLogger("asyncua").addHandler(logging.NullHandler())
 
@@ -142,7 +142,7 @@ class OpcUa(SourceState):
         """Disconnect."""
         self._stop.set()
         if self._loop is not None and self._task is not None:
-            with suppress(RuntimeError):  # it has ended by itself
+            with suppress(RuntimeError):  # the connection has ended by itself
                 self._loop.call_soon_threadsafe(self._task.cancel)
         if self._thread.is_alive():
             self._thread.join()
@@ -239,7 +239,7 @@ class OpcUa(SourceState):
         self._pass_on(now_s)
 
     def _is_new(self, number: int, value: Any) -> bool:
-        """Return whether a value is newer than all of its node."""
+        """Return whether a value is newer than all earlier values of its node."""
         found = reading(value, self._by_server(number), Counts())
         return found is not None and found[0] > self._newest_ns(number)
 
@@ -248,7 +248,7 @@ class OpcUa(SourceState):
         return found is not None and found[0] <= end_ns
 
     def _is_known(self, number: int, value: Any) -> bool:
-        """Return whether the history has had a value; one from long before is new: the server's clock was put back."""
+        """Return whether the history had a value; a value from long before is new: the server's clock was set back."""
         found = reading(value, self._by_server(number), Counts())
         return found is not None and 0 <= self._newest_ns(number) - found[0] < _PIECE_NS
 

@@ -38,7 +38,7 @@ _LARGEST_MESSAGE: Final = 64 << 20
 _LARGEST_PART: Final = 1 << 20
 #: Most values of the history that are read at once: 10 s of ten nodes at 10 kHz.
 _MOST_HISTORY: Final = 1_000_000
-#: Sequence numbers begin again at 1 behind this.
+#: Sequence numbers begin again at 1 after this number.
 _LAST_NUMBER: Final = 2**32 - 1
 
 #: Takes values by number of their node, and whether values before them are missing.
@@ -54,7 +54,7 @@ class Revised:
     queue: int
 
     def complaint(self, sampling_ms: float) -> str:
-        """Return in words which requests the server does not meet; empty: it meets all."""
+        """Return in words which requests the server does not meet; empty if it meets all."""
         slow = self.sampling_ms > max(1.01 * sampling_ms, self.publishing_ms if sampling_ms == 0.0 else 0.0)
         found = [f"samples every {self.sampling_ms:g} ms, asked every {sampling_ms:g} ms"] * slow
         needed = self.publishing_ms / sampling_ms if sampling_ms else 1.0
@@ -131,7 +131,7 @@ class Link:
         """Disconnect."""
         try:
             await asyncio.wait_for(self._client.disconnect(), _CLOSE_S)
-        except Exception:  # whatever the state of the connection was
+        except Exception:  # in any state of the connection
             self._client.disconnect_socket()
 
     def _placed(self, node: ua.NodeId, uris: Sequence[str]) -> ua.NodeId:
@@ -263,13 +263,13 @@ class Link:
     def _missing(self, number: int) -> range:
         """Return the sequence numbers that should have come before this one."""
         expected = self._next_number
-        if expected is not None and number == expected - 1:  # the newest one again
+        if expected is not None and number == expected - 1:  # the newest value again
             return range(0)
         self._next_number = number % _LAST_NUMBER + 1
         return range(0) if expected is None or number < expected else range(expected, number)
 
     async def _again(self, number: int) -> ua.NotificationMessage | None:
-        """Return a message that the server may still have."""
+        """Return a message, if the server still has it."""
         try:
             message = await self._client.uaclient.session.republish(self._subscription, number)
         except UaError:

@@ -9,12 +9,12 @@ from typing import Any, Final
 from plow_twin.live.bridge.opcua.samples import NOT_MEASURED, Value
 
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
-#: Times beyond this stand for none [ns].
+#: Times beyond this mean that there is no time [ns].
 _FARTHEST_NS: Final = 4_000_000_000_000_000_000
 _MICROSECOND: Final = timedelta(microseconds=1)
 _SEVERITY: Final = 0xC0000000
 _UNCERTAIN: Final = 0x40000000
-#: Bits of a status that say: values before this one were dropped from the server's queue.
+#: Bits of a status: values before this one were dropped from the server's queue.
 _OVERFLOW: Final = 0x00000480
 
 
@@ -34,9 +34,9 @@ class Counts:
     breaks: int = 0
     breaks_filled: int = 0
     values_filled: int = 0
-    #: values of the history from times that it was not asked for
+    #: values of the history from times that were not requested
     history_strays: int = 0
-    #: time that neither a message nor the history covers
+    #: time covered by neither a message nor the history
     unfilled_s: float = 0.0
 
 
@@ -48,8 +48,8 @@ def overflowed(value: Any) -> bool:
 def reading(data: Any, by_server: bool, counts: Counts) -> tuple[int, Value] | None:
     """Return stamp [ns] and value of a `DataValue`, or None for a value without a stamp.
 
-    A value whose status is Bad or Uncertain, and one that is no number, is not measured. A source without a stamp has
-    that of the server.
+    A value whose status is Bad or Uncertain, or that is not a number, counts as not measured. Without a source
+    timestamp the server's is used.
     """
     counts.values += 1
     stamp_ns = None if by_server else _stamp_ns(data.SourceTimestamp, data.SourcePicoseconds)
@@ -76,7 +76,7 @@ def _stamp_ns(time: datetime | None, picoseconds: int | None) -> int | None:
         return None
     time = time if time.tzinfo else time.replace(tzinfo=UTC)
     stamp_ns = (time - _EPOCH) // _MICROSECOND * 1000 + (picoseconds or 0) // 100
-    return stamp_ns if 0 < stamp_ns < _FARTHEST_NS else None  # 1601 and 9999 stand for no time
+    return stamp_ns if 0 < stamp_ns < _FARTHEST_NS else None  # 1601 and 9999 mean that there is no time
 
 
 def date_of(stamp_ns: int) -> datetime:

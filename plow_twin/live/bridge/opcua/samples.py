@@ -1,4 +1,4 @@
-"""Values of OPC UA nodes put together to samples by their stamps."""
+"""Values of OPC UA nodes combined into samples by their stamps."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ _MOST_WAITING: Final = 10_000
 class Samples:
     """Samples of one role: the values of its nodes at one stamp.
 
-    A server does not send a value again that has not changed: a node without a value at a stamp keeps the one before.
-    A stamp is complete when each node has a value there or at a later one; else it waits for `wait_s`.
+    A server does not resend an unchanged value: a node without a value at a stamp keeps the value before.
+    A stamp is complete when each node has a value there or at a later stamp; otherwise it waits for `wait_s`.
 
     Parameters
     ----------
@@ -38,14 +38,14 @@ class Samples:
         #: nodes of which only the value before the first sample has come
         self._begun: set[str] = set()
         self._released_ns = 0
-        #: late stamps that were dropped, for the other values of that time had been used
+        #: late stamps that were dropped because the other values of that time had been used
         self._incomplete = 0
 
     def add(self, node: str, stamp_ns: int, value: Value, now_s: float) -> None:
         """Take in a value; the same stamp of a node again is ignored."""
         if stamp_ns == self.newest_ns[node]:
             return
-        # the first value's clock, perhaps the server's at its start, does not bind later values
+        # the clock of the first value, perhaps that of the starting server, does not bind later values
         self.newest_ns[node] = stamp_ns if node in self._begun else max(stamp_ns, self.newest_ns[node])
         self._begun.discard(node)
         if stamp_ns not in self._waiting:
@@ -54,13 +54,13 @@ class Samples:
         self._waiting[stamp_ns][1].setdefault(node, value)
 
     def begin(self, node: str, stamp_ns: int, value: Value) -> None:
-        """Take the value that a node had before the first sample: it completes that sample, and is no sample itself."""
+        """Take the value that a node had before the first sample, to complete that sample."""
         self.newest_ns[node] = stamp_ns
         self._begun.add(node)
         self._held[node] = value
 
     def take(self, now_s: float) -> list[tuple[int, dict[str, Value]]]:
-        """Return the stamps [ns] in order, with the value of each node, that wait no longer at `now_s`."""
+        """Return in order the stamps [ns] that no longer wait at `now_s`, with the value of each node."""
         found = []
         while self._stamps_ns and self._is_due(self._stamps_ns[0], now_s):
             stamp_ns = self._stamps_ns.pop(0)
@@ -73,7 +73,7 @@ class Samples:
         return found
 
     def take_incomplete(self) -> int:
-        """Return the number of late stamps since the last call that were dropped for want of values."""
+        """Return the number of late stamps since the last call that were dropped because values were missing."""
         found, self._incomplete = self._incomplete, 0
         return found
 
@@ -85,7 +85,7 @@ class Samples:
         return stamp_ns > self._released_ns and all(self.newest_ns[node] > stamp_ns for node in missing)
 
     def _with_held(self, stamp_ns: int) -> dict[str, Value]:
-        """Return the values at a stamp, with those that have not changed since the one before."""
+        """Return the values at a stamp, completed by the unchanged values of the stamp before."""
         self._held |= self._waiting.pop(stamp_ns)[1]
         self._released_ns = stamp_ns
         return dict(self._held)
