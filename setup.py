@@ -18,10 +18,10 @@ EXTRAS = {
         f"ros-jazzy-common-interfaces==5.3.6{ROS_WHEELS}",
     ],
     # Writer.flush of mcap came after 1.4; 1.6 is what the tests run with
-    "record": ["mcap>=1.6", "rosbags>=0.11", "ruamel.yaml>=0.18", "lz4>=4.3", "zstandard>=0.22", "isal>=1.6"],
+    "record": ["mcap>=1.6", "rosbags>=0.11", "ruamel.yaml>=0.17.21", "lz4>=4.0.2", "zstandard>=0.22", "isal>=1.6"],
     "mqtt": ["paho-mqtt>=1.6"],
     "opcua": ["asyncua>=2.1"],
-    "sparkplug": ["paho-mqtt>=1.6", "protobuf>=4.22"],
+    "sparkplug": ["paho-mqtt>=1.6", "protobuf>=4.21.12"],
     "influx": ["influxdb-client>=1.36"],
     "metrics": ["prometheus-client>=0.19"],
     "dashboard": ["starlette>=0.31", "uvicorn>=0.27", "websockets>=13"],

@@ -5,14 +5,16 @@ from __future__ import annotations
 import asyncio
 import gc
 import json
+import socket
 import subprocess
 import sys
 import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -22,6 +24,7 @@ from commands import plow_twin_here
 from test_live import ROOT, _csv, _free_port, _live, _row
 
 from plow_twin.cli.app import run as run_cli
+from plow_twin.live.bridge import mqtt
 from plow_twin.live.bridge.access import Access
 from plow_twin.live.bridge.mqtt import Mqtt
 from plow_twin.live.bridge.paho_client import make_client, use_tls
@@ -30,7 +33,10 @@ from plow_twin.record.entries import EntryRecord
 from plow_twin.record.reader import RunReader
 from plow_twin.stream.journal import Digest
 from plow_twin.telemetry.mqtt import Broker, Message
+from plow_twin.telemetry.sparkplug import Payload
 
+#: A broker before 0.12 closes the connection where it refuses one.
+AMQTT = tuple(map(int, version("amqtt").split(".")[:2]))
 STALE = ("--set", "excitation_timeout=3600")
 
 
@@ -194,17 +200,75 @@ def test_a_misspelt_topic_of_a_broker_is_no_success(
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_wrong_password_a_strange_certificate_and_a_broker_without_tls_are_refused(broker: Access) -> None:
     for wrong, said in (
-        ({"password": "guess"}, "refused"),
+        ({"password": "guess"}, "refused" if AMQTT >= (0, 12) else "the connection broke"),
         ({"ca": None}, "certificate verify failed"),
         ({"url": broker.url.replace("mqtts", "mqtt")}, "no answer"),
     ):
-        bridge = Mqtt(replace(broker, **wrong), connect_s=2.0 if said == "no answer" else 60.0)
+        bridge = Mqtt(
+            replace(broker, **wrong), connect_s=60.0 if said in ("refused", "certificate verify failed") else 2.0
+        )
         with pytest.raises(BridgeError, match=said):
             bridge.start(["plough/load"])
         assert not bridge.connected
     for topic, said in (("prohibited", "refused: prohibited"), ("plough/+/load", r"topic: got 'plough/\+/load'")):
         with pytest.raises(BridgeError, match=said):
             Mqtt(replace(broker, client_id="other"), connect_s=60.0).start(["plough/load", topic])
+
+
+@contextmanager
+def _hostile(*answers: bytes) -> Iterator[Access]:
+    """A broker that gives these answers to the packets of each connection, then closes it at the next one."""
+    listening = socket.create_server(("127.0.0.1", 0))
+
+    def serve() -> None:
+        with suppress(OSError):
+            while True:
+                connection, _ = listening.accept()
+                with connection, suppress(OSError):
+                    for answer in answers:
+                        connection.recv(4096)
+                        connection.sendall(answer)
+                    if answers[-1]:
+                        connection.recv(4096)
+
+    threading.Thread(target=serve, daemon=True).start()
+    try:
+        yield Access(f"mqtt://127.0.0.1:{listening.getsockname()[1]}")
+    finally:
+        listening.shutdown(socket.SHUT_RDWR)
+        listening.close()
+
+
+@pytest.mark.parametrize(
+    ("answer", "said"),
+    [
+        (b"\x20\x02\x00\x05", "refused: .*not authori[sz]ed"),
+        (b"", "no answer within 1 s; the connection broke"),
+        (b"HTTP/1.1 400 Bad Request\r\n\r\n", "no answer within 1 s$"),
+    ],
+    ids=["refuses", "closes", "is none"],
+)
+def test_a_broker_that_does_not_accept_is_told(answer: bytes, said: str) -> None:
+    with _hostile(answer) as access, pytest.raises(BridgeError, match=f"(?i){said}"):
+        Mqtt(access, connect_s=1.0).start(["a"])
+
+
+def test_a_broker_that_sends_more_than_can_wait_fills_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mqtt, "_QUEUED_BYTES", 500_000)
+
+    def published(size: int) -> bytes:
+        length = size + 3
+        return bytes([0x30, length & 127 | 128, length >> 7 & 127 | 128, length >> 14]) + b"\0\1a" + bytes(size)
+
+    flood = published(100_000) * 5 + published(60_000) * 20 + published(1)
+    with _hostile(b"\x20\x02\x00\x00", b"\x90\x03\x00\x01\x01" + flood) as access:
+        bridge = Mqtt(access)
+        bridge.start(["a"])
+        _until(lambda: (bridge.lost, len(bridge._queue)) == (12, 14))
+        waiting = [len(payload) for _, payload, _, _ in bridge._queue]
+        assert waiting == [0] * 5 + [60_000] * 8 + [1]
+        assert [found.content for found in bridge.poll(0.0)] == [None] * 14
+        bridge.close()
 
 
 @pytest.mark.parametrize(
@@ -310,6 +374,58 @@ def test_messages_that_wait_for_a_broker_are_bounded_counted_and_come_in_order(t
         subscriber.close()
     _until(lambda: not way.state.connected)
     asyncio.run(way.close(there, 0.0))
+
+
+class EdgeNode:
+    """Messages of the node `mine/plough` at a host of Sparkplug B."""
+
+    def __init__(self, port: int) -> None:
+        self.subscriber = Subscriber(port, topics="spBv1.0/#")
+
+    def messages(self, kind: str) -> list[Any]:
+        topic = f"spBv1.0/mine/{kind}/plough"
+        return [Payload.FromString(payload) for name, payload, _ in self.subscriber.messages if name == topic]
+
+    def until(self, kind: str, count: int) -> Any:
+        self.subscriber.until(lambda: len(self.messages(kind)) >= count)
+        return self.messages(kind)[count - 1]
+
+    def ask_for_rebirth(self) -> None:
+        # field 2 of the payload: a metric with its name (1), data type boolean (4) and value (14)
+        name = b"Node Control/Rebirth"
+        metric = bytes([0x0A, len(name)]) + name + bytes([0x20, 11, 0x70, 1])
+        for payload in (b"\xff\xff", bytes([0x12, len(metric)]) + metric):
+            self.subscriber.client.publish("spBv1.0/mine/NCMD/plough", payload, 1).wait_for_publish(30.0)
+
+
+def _metrics(payload: Any) -> dict[str, Any]:
+    return {found.name: found for found in payload.metrics}
+
+
+def test_a_host_of_sparkplug_hears_birth_data_rebirth_and_death_in_sequence(tmp_path: Path) -> None:
+    port, path = _free_port(), _csv(tmp_path / "load.csv", 500)
+    arguments = (str(path), "--follow", "--mqtt-out", f"mqtt://127.0.0.1:{port}", "--sparkplug", "mine/plough")
+    with ExitStack() as opened:
+        opened.enter_context(_open_broker(tmp_path, port))
+        host = EdgeNode(port)
+        live = opened.enter_context(_live(*arguments, "--out-rate", "10", "--set", "excitation_timeout=0.1"))
+        live.until_count("samples_used", 500)
+        birth, data = host.until("NBIRTH", 1), host.until("NDATA", 5)
+        born = _metrics(birth)
+        assert birth.seq == 0 and born["bdSeq"].long_value == 0 and not born["Node Control/Rebirth"].boolean_value
+        assert born["clearance/horizontal"].datatype == 10 and born["flags/stream"].datatype == 12
+        assert [value.string_value for value in born["wear/top_left_top/p05"].properties.values] == ["m"]
+        assert _metrics(data).keys() <= born.keys()
+        numbers = [found.seq for found in host.messages("NDATA")]
+        assert numbers == list(range(1, len(numbers) + 1))
+        host.ask_for_rebirth()
+        assert host.until("NBIRTH", 2).seq == 0
+        again = _metrics(host.messages("NBIRTH")[1])
+        assert again.keys() == born.keys() and again["bdSeq"].long_value == 0
+        assert again["clearance/horizontal"].double_value == pytest.approx(0.025)
+        live.process.kill()
+        assert _metrics(host.until("NDEATH", 1))["bdSeq"].long_value == 0
+        host.subscriber.close()
 
 
 @pytest.mark.parametrize(

@@ -14,9 +14,10 @@ from pyarrow import csv, parquet
 from record_support import PAPER_AMPLITUDE
 
 from plow_twin.cli.app import run as cli
+from plow_twin.record import measured
 from plow_twin.record.column_guess import guess_columns
 from plow_twin.record.mapping import messages_of, read_map, readings
-from plow_twin.record.measured import read_measured
+from plow_twin.record.measured import read_measured, read_recording
 from plow_twin.record.reader import RunReader
 from plow_twin.record.sources import open_source
 from plow_twin.record.times import time_ns
@@ -132,7 +133,7 @@ def test_missing_values_are_empty_numbers_are_exact_and_lists_are_left_out(tmp_p
 
 
 def test_the_estimates_folder_calibration_and_setup_take_parquet(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seconds = 1e-3 * np.arange(200)
     load = pa.table({"t": seconds, "fx": seconds, "fy": 2.0 * seconds, "m": 3.0 * seconds})
@@ -145,6 +146,13 @@ def test_the_estimates_folder_calibration_and_setup_take_parquet(
     np.testing.assert_array_equal(found[0].load, found[1].load)
     np.testing.assert_array_equal(found[0].poses, found[1].poses)
     assert len(found[0].load) == 200 and np.isnan(found[0].poses[:, 2]).all() and not found[0].unreadable
+    (tmp_path / "c" / "load.csv").rename(tmp_path / "c" / "excitation.csv")
+    with monkeypatch.context() as patched:  # rows beyond those that fit: the newest stay, and the others are counted
+        patched.setattr(measured, "MOST_ROWS", 50)
+        newest = read_measured(tmp_path / "p", Path("paper")), read_recording(tmp_path / "c", Path("paper"))
+    for one in newest:
+        assert one.lost == {"older_rows": 300} and len(one.poses) == 50
+        np.testing.assert_array_equal(one.load[:, 1:], found[0].load[150:, 1:])
     parquet.write_table(pose.set_column(2, "y", pa.array(seconds)), tmp_path / "motion.parquet")
     assert load_poses(tmp_path / "motion.parquet").q.shape == (200, 3)
 

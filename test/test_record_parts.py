@@ -20,6 +20,7 @@ from plow_twin import Wear
 from plow_twin.cli.app import run as cli
 from plow_twin.cli.recording_facts import read_recording
 from plow_twin.errors import RecordingError
+from plow_twin.record import measured
 from plow_twin.record.bag import BagWriter, Topic
 from plow_twin.record.decimation import Decimation
 from plow_twin.record.doctor import examine, repair
@@ -363,12 +364,20 @@ def test_parts_that_are_removed_while_others_are_read_are_passed_over(
     assert reader.parts == [parts[1], *parts[3:]]
 
 
-def test_estimate_and_forecast_report_missing_parts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_estimate_and_forecast_report_missing_parts_and_rows_beyond_the_limit(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     poses = (Pose(paper_sample(index).stamp_ns, (0.0, 0.0, 0.0)) for index in range(COUNT))
     entries = (entry for pair in zip(map(paper_sample, range(COUNT)), poses, strict=True) for entry in pair)
     run = record_run(tmp_path / "run", entries, frame_every=10**9, wear=Wear(1e-14, 0.015, 2.0), **SMALL)
     forecast = ["forecast", str(run.folder), "--limit-horizontal", "40", "--limit-vertical", "45", "--json"]
-    assert read_measured(run.folder).lost == {} and cli(forecast) == 0
+    whole = read_measured(run.folder)
+    assert whole.lost == {} and cli(forecast) == 0
+    with monkeypatch.context() as patched:
+        patched.setattr(measured, "MOST_ROWS", 100)
+        newest = read_measured(run.folder)
+    assert newest.lost == {"older_rows": 2 * (COUNT - 100)} and len(newest.poses) == 100
+    np.testing.assert_array_equal(newest.load[:, 1:], whole.load[-100:, 1:])
     RunReader(run.folder).parts[1].unlink()
     found = read_measured(run.folder)
     assert found.lost["missing_parts"] == 1 and found.unreadable == sum(found.lost.values())

@@ -6,11 +6,12 @@ import os
 import resource
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from test_live import ROOT, _csv
+from test_live import ROOT, _csv, _live
 
 from plow_twin.cli.app import EXTRA_OF_MODULE
 from plow_twin.record.replay import replay
@@ -23,12 +24,16 @@ def _limit(kind: int, most: int) -> Callable[[], None]:
 
 
 def _run(
-    folder: Path, *words: str, before: Callable[[], None] | None = None, **environment: str | None
+    folder: Path,
+    *words: str,
+    before: Callable[[], None] | None = None,
+    within: tuple[str, ...] = (),
+    **environment: str | None,
 ) -> tuple[int, list[str]]:
     """Run a command where something is missing; return its exit code and what it said on standard error."""
     given = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "10000", **environment}
     done = subprocess.run(
-        [sys.executable, "-m", "plow_twin", *words],
+        [*within, sys.executable, "-m", "plow_twin", *words],
         cwd=folder,
         env={name: value for name, value in given.items() if value is not None},
         preexec_fn=before,
@@ -68,6 +73,45 @@ def folder(compiled: None, tmp_path: Path) -> Path:
 )
 def test_a_run_works_and_is_repeated_where_little_is_there(lacking: dict[str, object], folder: Path) -> None:
     assert _run(folder, *LIVE, **lacking) == (0, [])  # type: ignore[arg-type]
+    report = replay(folder / "run")
+    assert (report.exit_code, report.samples) == (0, 1500)
+
+
+#: As a user has it where another has installed: package, cache and home cannot be written, and there is no /dev/shm.
+NOTHING_WRITABLE = """
+for place in "$PACKAGE" "$CACHE" "$HOME"; do
+    mount --bind "$place" "$place"
+    mount -o remount,bind,ro "$place"
+done
+mount -t tmpfs -o ro none /dev/shm
+! touch "$PACKAGE/x" "$CACHE/x" "$HOME/x" /dev/shm/x 2>/dev/null
+exec "$@"
+"""
+NAMESPACE = ("unshare", "--user", "--map-root-user", "--mount")
+
+
+def test_a_run_works_with_what_another_user_has_compiled_where_nothing_else_can_be_written(folder: Path) -> None:
+    if subprocess.run([*NAMESPACE, "true"], stderr=subprocess.DEVNULL).returncode:
+        pytest.skip("the system allows no mounts of one's own")
+    (folder / "home").mkdir()
+    home, package = str(folder / "home"), str(ROOT / "plow_twin")
+    places = {"HOME": home, "XDG_CACHE_HOME": home, "PACKAGE": package}
+    places["CACHE"] = os.environ.get("NUMBA_CACHE_DIR", package)
+    assert _run(folder, *LIVE, within=(*NAMESPACE, "sh", "-ec", NOTHING_WRITABLE, "sh"), **places) == (0, [])
+    report = replay(folder / "run")
+    assert (report.exit_code, report.samples) == (0, 1500)
+
+
+def test_a_recording_is_replayed_while_it_is_written_as_far_as_it_goes(folder: Path) -> None:
+    stale = ("--set", "excitation_timeout=3600")
+    with _live("load.csv", "--follow", "--record", "run", *stale, cwd=folder) as live:
+        live.until_count("samples_used", 1500)
+        give_up = time.monotonic() + 60.0
+        while not ((folder / "run").is_dir() and (report := replay(folder / "run")).samples == 1500):
+            assert time.monotonic() < give_up
+            live.until(lambda heard: True, "a report")
+        assert report.exit_code == 3
+        assert live.stop() == 0
     report = replay(folder / "run")
     assert (report.exit_code, report.samples) == (0, 1500)
 

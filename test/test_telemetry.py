@@ -8,7 +8,6 @@ import threading
 import time
 from collections.abc import Callable, Coroutine
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -19,11 +18,10 @@ from asyncua.crypto.security_policies import SecurityPolicyAes256Sha256RsaPss
 from asyncua.crypto.uacrypto import CertProperties
 from commands import plow_twin_here
 from test_live import Live, _csv, _free_port, _live
-from test_mqtt import STALE, Subscriber, _entries, _open_broker
+from test_mqtt import STALE, _entries
 
 from plow_twin.stream.journal import Parameter
 from plow_twin.telemetry.opcua.model import NAMESPACE
-from plow_twin.telemetry.sparkplug import Payload
 
 
 class Heard:
@@ -177,58 +175,6 @@ def _certificate(folder: Path, name: str) -> None:
          "-keyout", str(folder / f"{name}.key.pem"), "-out", str(folder / f"{name}.pem")],
         check=True, capture_output=True,
     )  # fmt: skip
-
-
-class EdgeNode:
-    """Messages of the node `mine/plough` at a host of Sparkplug B."""
-
-    def __init__(self, port: int) -> None:
-        self.subscriber = Subscriber(port, topics="spBv1.0/#")
-
-    def messages(self, kind: str) -> list[Any]:
-        topic = f"spBv1.0/mine/{kind}/plough"
-        return [Payload.FromString(payload) for name, payload, _ in self.subscriber.messages if name == topic]
-
-    def until(self, kind: str, count: int) -> Any:
-        self.subscriber.until(lambda: len(self.messages(kind)) >= count)
-        return self.messages(kind)[count - 1]
-
-    def ask_for_rebirth(self) -> None:
-        # field 2 of the payload: a metric with its name (1), data type boolean (4) and value (14)
-        name = b"Node Control/Rebirth"
-        metric = bytes([0x0A, len(name)]) + name + bytes([0x20, 11, 0x70, 1])
-        for payload in (b"\xff\xff", bytes([0x12, len(metric)]) + metric):
-            self.subscriber.client.publish("spBv1.0/mine/NCMD/plough", payload, 1).wait_for_publish(30.0)
-
-
-def _metrics(payload: Any) -> dict[str, Any]:
-    return {found.name: found for found in payload.metrics}
-
-
-def test_a_host_of_sparkplug_hears_birth_data_rebirth_and_death_in_sequence(tmp_path: Path) -> None:
-    port, path = _free_port(), _csv(tmp_path / "load.csv", 500)
-    arguments = (str(path), "--follow", "--mqtt-out", f"mqtt://127.0.0.1:{port}", "--sparkplug", "mine/plough")
-    with ExitStack() as opened:
-        opened.enter_context(_open_broker(tmp_path, port))
-        host = EdgeNode(port)
-        live = opened.enter_context(_live(*arguments, "--out-rate", "10", "--set", "excitation_timeout=0.1"))
-        live.until_count("samples_used", 500)
-        birth, data = host.until("NBIRTH", 1), host.until("NDATA", 5)
-        born = _metrics(birth)
-        assert birth.seq == 0 and born["bdSeq"].long_value == 0 and not born["Node Control/Rebirth"].boolean_value
-        assert born["clearance/horizontal"].datatype == 10 and born["flags/stream"].datatype == 12
-        assert [value.string_value for value in born["wear/top_left_top/p05"].properties.values] == ["m"]
-        assert _metrics(data).keys() <= born.keys()
-        numbers = [found.seq for found in host.messages("NDATA")]
-        assert numbers == list(range(1, len(numbers) + 1))
-        host.ask_for_rebirth()
-        assert host.until("NBIRTH", 2).seq == 0
-        again = _metrics(host.messages("NBIRTH")[1])
-        assert again.keys() == born.keys() and again["bdSeq"].long_value == 0
-        assert again["clearance/horizontal"].double_value == pytest.approx(0.025)
-        live.process.kill()
-        assert _metrics(host.until("NDEATH", 1))["bdSeq"].long_value == 0
-        host.subscriber.close()
 
 
 class Database(BaseHTTPRequestHandler):

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import hashlib
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, Literal
 
 import numba
+from numba.core import caching
 from numba.core.registry import cpu_target
 from numba.np import linalg
 
@@ -21,7 +23,8 @@ from plow_twin.kernel.linked import EntryCompiler, LinkedCompiler, garbage_kept,
 #: Value-preserving relaxations only: sums may be reordered and fused, but NaN and infinity keep their meaning.
 FASTMATH: Final = frozenset({"contract", "reassoc", "nsz", "arcp"})
 
-_said: set[str] = set()
+#: the warning, once it has been given
+_said: list[str] = []
 
 
 def _load_numba() -> None:
@@ -80,7 +83,7 @@ def kernel(
         options["pipeline_class"] = EntryCompiler if entry else LinkedCompiler
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
-        dispatcher = numba.njit(cache=True, nogil=True, error_model="numpy", **options)(function)
+        dispatcher = kept(function, **options)
         # absent with NUMBA_DISABLE_JIT
         cache_file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
         if cache_file is not None:
@@ -89,16 +92,38 @@ def kernel(
             cache_file._version = f"{numba.__version__} {SOURCE_DIGEST}"
             if inline != "source" and not entry:
                 keep_from_python(dispatcher)
-            save_or_warn(dispatcher)
         compiled: Callable[..., Any] = dispatcher
         return compiled
 
     return decorate
 
 
-def save_or_warn(dispatcher: Any) -> None:
-    """Warn if the cache cannot be written: a compiled kernel works without it."""
-    cache = dispatcher._cache
+@contextmanager
+def _read_only_cache() -> Iterator[None]:
+    """Have numba take the cache beside the sources, which another user may have filled, without a trial of writing."""
+    locator: Any = caching._CacheLocator
+    found = locator.ensure_cache_path
+    locator.ensure_cache_path = lambda its: None
+    try:
+        yield
+    finally:
+        locator.ensure_cache_path = found
+
+
+def kept(function: Callable[..., Any], **options: Any) -> Any:
+    """Return numba's dispatcher with a cache on disk, which warns if that cannot be written: it works without it."""
+    compiler = numba.njit(cache=True, nogil=True, error_model="numpy", **options)
+    try:
+        dispatcher = compiler(function)
+    except RuntimeError:  # neither the package's folder nor the user's can be written
+        with _read_only_cache():
+            dispatcher = compiler(function)
+    if hasattr(dispatcher, "_cache"):  # absent with NUMBA_DISABLE_JIT
+        _save_or_warn(dispatcher._cache)
+    return dispatcher
+
+
+def _save_or_warn(cache: Any) -> None:
     save = cache.save_overload
 
     def attempt(signature: Any, result: Any) -> None:
@@ -106,10 +131,9 @@ def save_or_warn(dispatcher: Any) -> None:
             save(signature, result)
         except OSError as error:
             place = Path(cache.cache_path).parent
-            text = f"compiled kernels are not kept for the next start: {place}: {error.strerror or error}"
-            if text not in _said:  # numba resets Python's register of warnings
-                _said.add(text)
-                warnings.warn(text, RuntimeWarning, stacklevel=1)
+            if not _said:  # numba resets Python's register of warnings
+                _said.append(f"compiled kernels are not kept for the next start: {place}: {error.strerror or error}")
+                warnings.warn(_said[0], RuntimeWarning, stacklevel=1)
 
     cache.save_overload = attempt
 

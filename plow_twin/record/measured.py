@@ -8,8 +8,9 @@ Each of the tables may be Parquet instead: load.parquet.
 from __future__ import annotations
 
 import math
+from array import array
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 
 from plow_twin.errors import RecordingError
 from plow_twin.estimate import tuning
-from plow_twin.estimate.measurements import UNSTATED, Deviation, believed, own_deviations
+from plow_twin.estimate.measurements import UNSTATED, Deviation, believed
 from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
 from plow_twin.model.scene import Scene
 from plow_twin.record.bag import readable_beside
@@ -42,6 +43,44 @@ SCENE_FILE, LOAD_FILE, POSE_FILE, GAPS_FILE = "scene.yaml", "load.csv", "pose.cs
 FORCES_FILE = "contact_forces.csv"
 _LOAD_COLUMNS: Final = ("t", "fx", "fy", "m")
 _POSE_COLUMNS: Final = ("t", "x", "y", "theta")
+_NOT_STATED: Final = (math.nan,) * 3
+#: Bound: rows of a table that are kept, the newest: 320 MB of a load, nearly three hours at 1 kHz.
+MOST_ROWS: Final = 10_000_000
+#: Among the losses: rows before those.
+OLDER_ROWS: Final = "older_rows"
+
+
+class _Rows:
+    """Rows of numbers in bounded memory: the newest `MOST_ROWS`, and up to a quarter more until `table`."""
+
+    def __init__(self, columns: int) -> None:
+        self._columns, self._values = columns, array("d")
+        #: rows that came and are not kept
+        self.dropped = 0
+
+    @property
+    def came(self) -> int:
+        """Number of rows, kept or not."""
+        return self.dropped + len(self._values) // self._columns
+
+    def add(self, values: Iterable[float] | Array) -> None:
+        """Take in the numbers of a row, or rows, shape (n, columns)."""
+        if isinstance(values, np.ndarray):
+            self._values.frombytes(values.tobytes())
+        else:
+            self._values.extend(values)
+        if len(self._values) > MOST_ROWS * 5 // 4 * self._columns:
+            self._cut()
+
+    def table(self) -> Array:
+        """Return the rows, shape (n, columns); none may be added after it."""
+        self._cut()
+        return np.asarray(self._values, dtype=np.float64).reshape(-1, self._columns)
+
+    def _cut(self) -> None:
+        beyond = max(len(self._values) // self._columns - MOST_ROWS, 0)
+        del self._values[: beyond * self._columns]
+        self.dropped += beyond
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,22 +116,22 @@ def read_measured(folder: Path, scene: Path | None = None) -> Measured:
     SceneError
         When the scene cannot be used.
     """
-    load, bad_load = _read(_table(folder, LOAD_FILE), _LOAD_COLUMNS)
-    gaps, bad_gaps = np.zeros((0, 1 + PAIR_COUNT)), 0
+    lost = Counter[str]()
+    load = _read(_table(folder, LOAD_FILE), lost, _LOAD_COLUMNS)
+    gaps = forces = np.zeros((0, 1 + PAIR_COUNT))
     if (file := _table(folder, GAPS_FILE)).is_file():
-        gaps, bad_gaps = _read(file, ("t",), PAIR_NAMES)
-    forces, bad_forces = np.zeros((0, 1 + PAIR_COUNT)), 0
+        gaps = _read(file, lost, ("t",), PAIR_NAMES)
     if (file := _table(folder, FORCES_FILE)).is_file():
-        forces, bad_forces = _read(file, ("t",), PAIR_NAMES)
-    poses, bad_poses = np.zeros((0, 4)), 0
+        forces = _read(file, lost, ("t",), PAIR_NAMES)
+    poses = np.zeros((0, 4))
     if (file := _table(folder, POSE_FILE)).is_file() or not len(gaps):
-        poses, bad_poses = _read(file, _POSE_COLUMNS)
+        poses = _read(file, lost, _POSE_COLUMNS)
     model = load_scene(scene_path(str(scene)) if scene else folder / SCENE_FILE)
     if len(load) and load[0, 0] >= EPOCH_S:
         # as in a recording: dates count from the first sample of the load
         for table in (poses, gaps, forces, load):
             table[:, 0] -= load[0, 0]
-    return Measured(model, load, poses, bad_load + bad_poses + bad_gaps + bad_forces, gaps=gaps, forces=forces)
+    return Measured(model, load, poses, lost.total(), gaps=gaps, lost=dict(lost), forces=forces)
 
 
 def is_measured(folder: Path) -> bool:
@@ -131,18 +170,18 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
     else:
         given = scene is not None
         model = load_scene(scene_path(str(scene))) if given else own.header.scene(own.path)
-        loads, begins, journalled, gaps, spread, brought = _journal(own)
+        lost = Counter[str]()
+        loads, begins, journalled, gaps, spread, brought = _journal(own, lost)
         gaps_deviation = float(own.header.parameters.get("gaps_deviation", 0.0))
         of_poses, of_load = stated(own.header.parameters)
         journalled[:, 1:], of_poses = believed(of_poses, journalled[:, 1:], brought)
         deviations = of_poses, tuple(np.maximum(of_load, spread).tolist())
-        rows, lost, why = {"head_pose": journalled}, Counter[str](), ""
+        rows, why = {"head_pose": journalled}, ""
         if mapping is not None or not (len(journalled) or len(gaps)):
             folder = path if path.is_dir() else path.parent
-            unread = Counter[str]()
-            places = [folder, *readable_beside(folder, unread)]
-            rows, _, lost, why = _collect(places, mapping, ("head_pose", "forces"), own.header.node)
-            lost.pop("missing_parts", 0)  # the run has counted it
+            places = [folder, *readable_beside(folder, lost)]
+            rows, _, unread, why = _collect(places, mapping, ("head_pose", "forces"), own.header.node)
+            unread.pop("missing_parts", 0)  # the run has counted it
             lost.update(unread)
         lost.update(own.lost, damaged_chunks=own.damaged_chunks, **own.lost_parts)
     poses = rows["head_pose"]
@@ -159,46 +198,38 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
     return Measured(model, loads, poses, sum(counted.values()), *deviations, gaps, gaps_deviation, counted, forces)
 
 
-def _journal(reader: RunReader) -> tuple[Array, list[int], Array, Array, Array, Array]:
+def _journal(reader: RunReader, lost: Counter[str]) -> tuple[Array, list[int], Array, Array, Array, Array]:
     """Return samples, the rows of them before which some are missing, poses, gaps, and stated deviations.
 
     Stamps in ns are in front. The deviations are the largest of the load, (3,), and those that came with each pose,
     (n, 3), NaN where not stated. Data before new pads, or a step of the clock, belong to another machine or time: the
     last stretch counts.
     """
-    nothing = [np.zeros((0, 4))]
-    loads, spread = [*nothing], np.zeros(3)
-    holes, begins = Holes(), list[int]()
-    poses: list[tuple[float, ...]] = []
-    brought: list[tuple[float, ...]] = []
-    gaps: list[Array] = []
+    loads, poses, gaps = _Rows(4), _Rows(7), _Rows(1 + PAIR_COUNT)
+    holes, begins, spread = Holes(), list[int](), np.zeros(3)
     for batch in reader.batches(outputs=False):
         entries = batch.entries
         rows, since = np.column_stack([entries.stamp_ns, entries.wrench]), 0
         for index, entry in sorted(entries.others.items()):
             if isinstance(entry, Reset | SetWear):
-                loads, since, begins = [*nothing], index, []
-                poses.clear()
-                brought.clear()
-                gaps.clear()
+                loads, poses, gaps = _Rows(4), _Rows(7), _Rows(1 + PAIR_COUNT)
+                since, begins = index, []
             elif isinstance(entry, Pose):
-                poses.append((entry.stamp_ns, *entry.pose))
-                brought.append(entry.deviation or ())
+                poses.add((entry.stamp_ns, *entry.pose, *(entry.deviation or _NOT_STATED)))
             elif isinstance(entry, PartOfPose):
-                poses.append((entry.stamp_ns, *whole_pose(entry)))
-                brought.append(())
+                poses.add((entry.stamp_ns, *whole_pose(entry), *_NOT_STATED))
             elif isinstance(entry, Gaps):
                 row = np.full(1 + PAIR_COUNT, np.nan)
                 row[0], row[1 + np.array(entry.pairs)] = entry.stamp_ns, entry.gaps
-                gaps.append(row)
+                gaps.add(row)
             elif isinstance(entry, Spread):
                 spread = np.maximum(spread, entry.deviation)
-        before = sum(map(len, loads))
-        begins += [before + int(entries.sample[since:place].sum()) for place in holes.find(entries) if place >= since]
-        loads.append(rows[since:][entries.sample[since:]])
-    measured = np.array(poses, dtype=np.float64).reshape(-1, 4)
-    all_gaps = np.array(gaps).reshape(-1, 1 + PAIR_COUNT)
-    return np.concatenate(loads), begins, measured, all_gaps, spread, own_deviations(brought)
+        places = [place for place in holes.find(entries) if place >= since]
+        begins += [loads.came + int(entries.sample[since:place].sum()) for place in places]
+        loads.add(rows[since:][entries.sample[since:]])
+    tables = [_counted(found, lost) for found in (loads, poses, gaps)]
+    begins = [row - loads.dropped for row in begins]
+    return tables[0], begins, tables[1][:, :4], tables[2], spread, tables[1][:, 4:]
 
 
 def _longest(rows: Array, begins: list[int]) -> Array:
@@ -223,25 +254,27 @@ def _collect(
 
     The rows after gaps belong to the load; the reason says why no message fits.
     """
-    rows: dict[str, list[list[float]]] = {name: [] for name in wanted}
+    rows = {name: _Rows(1 + len(ROLES[name])) for name in wanted}
     lost, begins = Counter[str](), list[int]()
     for source, roles in roles_by_source([*map(open_source, places)], mapping, f"{node}/" if node else ""):
         roles = {name: role for name, role in roles.items() if name in wanted}
         for name, arrived, found in readings(messages_of(source, roles), roles):
             if arrived.after_hole:
-                begins.append(len(rows.get("excitation", ())))
+                begins.append(rows["excitation"].came if "excitation" in rows else 0)
             if found is None:
                 lost[f"{UNFIT}{name}: {roles[name].why_unfit(arrived)}"] += 1
             else:
                 stamp_ns, values = found
-                rows[name].append([float(stamp_ns), *(values.get(key, math.nan) for key in ROLES[name])])
+                rows[name].add((float(stamp_ns), *(values.get(key, math.nan) for key in ROLES[name])))
         lost.update(source.losses.counts)
-    tables = {name: np.array(found, dtype=float).reshape(-1, 1 + len(ROLES[name])) for name, found in rows.items()}
+    tables = {name: _counted(found, lost) for name, found in rows.items()}
+    if "excitation" in rows:
+        begins = [row - rows["excitation"].dropped for row in begins]
     return tables, begins, lost, "".join(f"; {why.removeprefix(UNFIT)}" for why in lost if why.startswith(UNFIT))
 
 
-def _read(path: Path, columns: tuple[str, ...], some: tuple[str, ...] = ()) -> tuple[Array, int]:
-    """Return the rows of a csv file, NaN for an empty cell, and how many could not be read.
+def _read(path: Path, lost: Counter[str], columns: tuple[str, ...], some: tuple[str, ...] = ()) -> Array:
+    """Return the rows of a csv file, NaN for an empty cell; rows that could not be read are counted in `lost`.
 
     `columns` must be there; of `some` those that are not are NaN.
     """
@@ -255,16 +288,25 @@ def _read(path: Path, columns: tuple[str, ...], some: tuple[str, ...] = ()) -> t
     if some and not set(some) & set(names):
         raise RecordingError(f"{path}: got the {header}, expected t and some of {', '.join(some)}")
     places = [names.index(name) if name in names else len(names) for name in (*columns, *some)]
-    found, bad = [], 0
+    found = _Rows(len(places))
     for row in rows:
         numbers = [_number(row[place]) if place < len(row) else math.nan for place in places]
         if numbers[0] is None:
             numbers[0] = _date(row[places[0]])
-        if None in numbers:
-            bad += 1
+        whole = [number for number in numbers if number is not None]
+        if len(whole) < len(numbers):
+            lost["unreadable_rows"] += 1
         else:
-            found.append(numbers)
-    return np.array(found, dtype=float).reshape(-1, len(places)), bad
+            found.add(whole)
+    return _counted(found, lost)
+
+
+def _counted(rows: _Rows, lost: Counter[str]) -> Array:
+    """Return the table of rows, with those that are not kept among the losses."""
+    table = rows.table()
+    if rows.dropped:
+        lost[OLDER_ROWS] += rows.dropped
+    return table
 
 
 def _date(cell: str) -> float | None:

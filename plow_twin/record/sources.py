@@ -410,24 +410,29 @@ class CsvSource:
             self.losses.counts["truncated_files"] += 1
 
 
-def read_table(path: Path) -> tuple[Columns, list[list[str]]]:
-    """Return the columns of a CSV or Parquet file and its rows, as `CsvSource` reads them.
+def read_table(path: Path) -> tuple[Columns, Iterator[list[str]]]:
+    """Return the columns of a CSV or Parquet file and its rows, one at a time, as `CsvSource` reads them.
 
     Lines that begin with `#` are left out.
 
     Raises
     ------
     RecordingError
-        The file cannot be read, or has two columns of one name.
+        The file cannot be read, or has two columns of one name; the rows raise it too.
     """
+    rows = _table_rows(path)
+    names = tuple(name.strip() for name in next(rows, ()))
+    return columns_of(path, names), rows
+
+
+def _table_rows(path: Path) -> Iterator[list[str]]:
+    """Yield the rows of a file, the header first."""
     try:
         with open_csv(path) as stream:
-            rows = [cells for _, cells in csv_rows(stream, "#")]
+            yield from (cells for _, cells in csv_rows(stream, "#"))
     except (OSError, csv.Error) as error:
         reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
         raise RecordingError(f"{path}: {reason}") from None
-    names = tuple(name.strip() for name in rows[0]) if rows else ()
-    return columns_of(path, names), rows[1:]
 
 
 def columns_of(source: Path | str, names: Sequence[str]) -> Columns:

@@ -10,12 +10,11 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, Final, Self
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.errors import RecordingError
-from plow_twin.kernel.compiler import save_or_warn
+from plow_twin.kernel.compiler import kept
 from plow_twin.record.cdr import encode
 from plow_twin.record.messages import Message
 from plow_twin.record.words import set_word, word
@@ -30,9 +29,7 @@ _SECOND_NS: Final = 1_000_000_000
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function that works on bytes."""
-    dispatcher: Callable[..., Any] = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
-    if hasattr(dispatcher, "_cache"):  # else numba's compiler is switched off
-        save_or_warn(dispatcher)
+    dispatcher: Callable[..., Any] = kept(function)
     return dispatcher
 
 

@@ -57,10 +57,9 @@ def _messages() -> tuple[Any, Any]:
                 added.type_name = f".plow_twin.sparkplug.{of}"
     pool = descriptor_pool.DescriptorPool()
     pool.Add(file)
-    return tuple(
-        message_factory.GetMessageClass(pool.FindMessageTypeByName(f"plow_twin.sparkplug.{name}"))
-        for name in ("Payload", "Metric")
-    )
+    # from protobuf 4.22 on; before that, a method of a factory
+    class_of = getattr(message_factory, "GetMessageClass", None) or message_factory.MessageFactory(pool).GetPrototype
+    return tuple(class_of(pool.FindMessageTypeByName(f"plow_twin.sparkplug.{name}")) for name in ("Payload", "Metric"))
 
 
 Payload, Metric = _messages()

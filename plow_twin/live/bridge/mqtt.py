@@ -16,12 +16,13 @@ from plow_twin.live.bridge.paho_client import (
     subscription_refusal,
     use_tls,
 )
-from plow_twin.live.bridge.source import BridgeError, SourceState, read_json
+from plow_twin.live.bridge.source import LONGEST, BridgeError, SourceState, read_json
 from plow_twin.record.merging import StampOf
 from plow_twin.record.sources import Arrived
 
-#: Most messages that wait to be read; further ones are counted as lost.
+#: Most messages, and bytes of them, that wait to be read; further ones are counted as lost.
 _QUEUE: Final = 100_000
+_QUEUED_BYTES: Final = 2**26
 _PORTS: Final = {"mqtt": 1883, "mqtts": 8883}
 
 
@@ -50,6 +51,8 @@ class Mqtt(SourceState):
         #: whether messages marked as retained are older than the subscription
         self._from_before = True
         self._queue: deque[tuple[str, bytes, int, bool]] = deque()
+        #: bytes of payloads that came into the queue, and that left it: each changed by one thread
+        self._came = self._left = 0
         self._arrived = threading.Event()
         self._answer = threading.Event()
         self._client = self._make_client(tls)
@@ -72,8 +75,9 @@ class Mqtt(SourceState):
         answered = self._answer.wait(self._connect_s)
         trouble = self.trouble if answered else f"no answer within {self._connect_s:g} s"
         if trouble:
+            seen = f"; {self.trouble}" if self.trouble and not answered else ""
             self.close()
-            raise BridgeError(f"{self._access.url}: {trouble}")
+            raise BridgeError(f"{self._access.url}: {trouble}{seen}")
 
     def poll(self, timeout_s: float) -> list[Arrived]:
         """Return the messages that have arrived."""
@@ -81,6 +85,7 @@ class Mqtt(SourceState):
             self._arrived.wait(timeout_s)
         self._arrived.clear()
         taken = [self._queue.popleft() for _ in range(len(self._queue))]
+        self._left += sum(len(payload) for _, payload, _, _ in taken)
         return [Arrived(topic, time_ns, read_json(payload), retained) for topic, payload, time_ns, retained in taken]
 
     def close(self) -> None:
@@ -127,10 +132,13 @@ class Mqtt(SourceState):
         self.trouble = self.trouble or f"the connection broke: {end_of(*facts)}; it is tried again"
 
     def _on_message(self, client: Any, data: Any, message: Any) -> None:
-        if len(self._queue) >= _QUEUE:
+        # one that is too long is not kept: without its text it is unreadable too
+        payload = message.payload if len(message.payload) <= LONGEST else b""
+        if len(self._queue) >= _QUEUE or self._came - self._left + len(payload) > _QUEUED_BYTES:
             self.lost += 1
             return
-        self._queue.append((message.topic, message.payload, time.time_ns(), message.retain and self._from_before))
+        self._came += len(payload)
+        self._queue.append((message.topic, payload, time.time_ns(), message.retain and self._from_before))
         self._arrived.set()
 
 
