@@ -1,4 +1,4 @@
-"""A headless Chromium, or Firefox: a page opened, looked at as a picture, and its console read."""
+"""A headless Chromium or Firefox that opens a page, takes its picture and reads its console."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from websockets.sync.client import ClientConnection, connect
 
 #: The browser's program, or None.
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-#: What draws WebGL without a graphics card.
+#: Options that let Chromium draw WebGL without a graphics card.
 _OPTIONS = (
     "--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--remote-debugging-port=0",

@@ -1,4 +1,4 @@
-"""The command line as a user runs it, in a process of its own, and as quickly as can be, in this one."""
+"""The command line as a user runs it, in its own process, and, faster, in this process."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def plow_twin(*arguments: str | Path, cwd: Path | None = None) -> subprocess.Com
 
 @contextmanager
 def started(command: Sequence[str], **options: Any) -> Iterator[subprocess.Popen[str]]:
-    """Run a program beside the test; it has ended by itself or is killed, for `Popen` alone would wait for ever."""
+    """Run a program beside the test, and kill it at the end if it still runs: `Popen` alone would wait for ever."""
     with subprocess.Popen(command, text=True, **options) as process:
         try:
             yield process

@@ -22,7 +22,7 @@ def _prepare_environment() -> None:
     """Set what child processes inherit; runs before rclpy and numpy are imported anywhere."""
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.environ.pop("ROS_LOCALHOST_ONLY", None)
-    # 1..101 keeps clear of the ephemeral ports; each process of a run has its own, two runs at once have others
+    # 1..101 avoids the ephemeral ports; each process of each run has its own
     worker = os.environ.get("PYTEST_XDIST_WORKER", "")
     number = 8 * (os.getppid() if worker else os.getpid()) + int(worker.removeprefix("gw") or 0)
     os.environ["ROS_DOMAIN_ID"] = str(1 + number % 101)
@@ -31,13 +31,13 @@ def _prepare_environment() -> None:
     logs = tempfile.mkdtemp(prefix="plow_twin-ros-log-")
     atexit.register(shutil.rmtree, logs, ignore_errors=True)
     os.environ["ROS_LOG_DIR"] = logs
-    # a suite that a shell started in the background would ignore Ctrl-C, and with it the tests that press it
+    # a suite that a shell has started in the background would ignore Ctrl-C, also in the tests that press it
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 _prepare_environment()
 settings.register_profile("plow_twin", deadline=None, derandomize=True, database=None)
-# `make stress` asks for this one and prints the seed: other examples each time, shrunk when one fails
+# the profile of `make stress`, which prints the seed: new examples each time, shrunk on failure
 FRESH = (Phase.explicit, Phase.generate, Phase.shrink)
 settings.register_profile("stress", deadline=None, derandomize=False, database=None, print_blob=True, phases=FRESH)
 settings.load_profile("plow_twin")

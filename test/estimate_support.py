@@ -1,4 +1,4 @@
-"""Synthetic truths for the tests of the estimate, and two of them that are estimated once for all files."""
+"""Synthetic truths for the tests of the estimate; two are estimated once for all test files."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
     python test/golden.py
 
-computes them all and prints the figures as JSON.
+computes all motions and prints the figures as JSON.
 """
 
 from __future__ import annotations

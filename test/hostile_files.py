@@ -147,7 +147,7 @@ MADE: dict[str, Callable[[Path], object]] = {
     "channels.mcap": lambda path: path.write_bytes(
         run(more=b"".join(channel(n % 65536, 1, f"/t{n}") for n in range(100_000)))
     ),
-    # 170 kB for 5 GB, in chunks that are too large alone, and in chunks that are not
+    # 170 kB that unpack to 5 GB, in chunks that are too large singly or only together
     "large_chunks.mcap": lambda path: path.write_bytes(run(more=20 * chunk(bytes(250 * 2**20)))),
     "many_chunks.mcap": lambda path: path.write_bytes(run(more=100 * chunk(bytes(50 * 2**20)))),
     "lying_zstd.mcap": lambda path: path.write_bytes(

@@ -42,7 +42,7 @@ def copy_sources(target: Path) -> Path:
 
 
 def clean_environment(**extra: str) -> dict[str, str]:
-    """Return this process's variables without those that would let another installation shine through."""
+    """Return this process's environment without the variables by which another installation would be found."""
     hidden = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV", "AMENT_PREFIX_PATH", "COLCON_PREFIX_PATH")
     # the ROS wheels restart Python with these; a child in another environment must not inherit them
     hidden += ("LD_LIBRARY_PATH", "_ROS_WHEELS_BOOTSTRAP_COMPLETE", "NUMBA_CACHE_DIR")
@@ -50,7 +50,7 @@ def clean_environment(**extra: str) -> dict[str, str]:
 
 
 def run(*command: str | Path, cwd: Path, env: dict[str, str] | None = None, code: int = 0) -> str:
-    """Run a command that ends with `code` and return its standard output (error if code); else show all it said."""
+    """Run a command that must end with `code`; return its standard output (error if `code`), or show all output."""
     done = subprocess.run(
         [str(part) for part in command],
         cwd=cwd,

@@ -25,7 +25,7 @@ EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 class OneUser(UserManager):
-    """Only the user `plough` may come, or the one with a certificate."""
+    """Only the user `plough`, or the user of a certificate, may connect."""
 
     def __init__(self, certificate: Path | None) -> None:
         read = None if certificate is None else x509.load_pem_x509_certificate(certificate.read_bytes())
@@ -60,12 +60,12 @@ class Plant:
             await asyncio.sleep(pause_s)
 
     async def number(self, more: int) -> None:
-        """Let each subscription skip numbers, as if messages had been lost, or use one again."""
+        """Let each subscription skip numbers, as if messages had been lost, or repeat a number."""
         for found in self._server.iserver.subscription_service.subscriptions.values():
             found._notification_seq += more
 
     async def lie(self, kind: str) -> None:
-        """Give a history from the far future, or one that never ends."""
+        """Return a history from the far future, or a history without end."""
 
         def answer(*asked: Any) -> Any:
             years = {"future": (2090, 9999), "endless": (2026,), "nothing": ()}[kind]

@@ -51,7 +51,7 @@ def paper_entries(count: int) -> list[Entry]:
 
 @dataclass
 class Run:
-    """A recording and all that went into it."""
+    """A recording, with all entries and messages that were written."""
 
     folder: Path
     file: Path
@@ -107,7 +107,7 @@ def rewrite(
     *,
     metadata_last: bool = False,
 ) -> Path:
-    """Copy an MCAP file with other tools than the package's; `change` may return other bytes for a message."""
+    """Copy an MCAP file by other tools than the package's; `change` may return other bytes for a message."""
     with source.open("rb") as stream, target.open("wb") as out:
         writer = Writer(out, chunk_size=64 * 1024)
         writer.start(profile="ros2", library="test")

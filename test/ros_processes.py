@@ -1,4 +1,4 @@
-"""Real processes and a real node to look at them with, for the tests of the ROS side."""
+"""Real processes, and a real node that observes them, for the tests of the ROS side."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ class Process:
 
 @cache
 def _context() -> Context:
-    """Return the one participant of this process: on localhost only its first 32 are discovered."""
+    """Return the only ROS participant of this process: on localhost only 32 are discovered."""
     context = Context()
     context.init(args=[])
     return context
@@ -106,7 +106,7 @@ class Probe:
         self._clients: dict[str, Any] = {}
         self.status: list[DiagnosticStatus] = []
         self.reports: list[dict[str, DiagnosticStatus]] = []
-        # deeper than the twin's own, so that no quick change is missed
+        # deeper than the twin's queue, so that no quick change is missed
         latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.node.create_subscription(DiagnosticStatus, "status", self.status.append, latched)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._report, 100)
@@ -115,7 +115,7 @@ class Probe:
         self.reports.append({status.name: status for status in message.status})
 
     def listen(self, kind: type, topic: str) -> list[Any]:
-        """Return the list that all messages from now on are added to."""
+        """Return a list to which all later messages are added."""
         heard: list[Any] = []
         subscription = self.node.create_subscription(kind, topic, heard.append, QoSProfile(depth=20000))
         self.until(lambda: subscription.get_publisher_count() > 0, f"a publisher of {topic}")
@@ -123,7 +123,7 @@ class Probe:
         return heard
 
     def until(self, reached: Callable[[], Any], what: str, timeout_s: float = WAIT_S) -> None:
-        """Wait for something to be true."""
+        """Wait until a condition is true."""
         give_up = time.monotonic() + timeout_s
         while not reached():
             assert time.monotonic() < give_up, f"{what}: not within {timeout_s} s; last status {self.status[-1:]}"
@@ -181,7 +181,7 @@ class Probe:
             self.pause(0.04)
 
     def pause(self, seconds: float) -> None:
-        """Give discovery on the other side its time."""
+        """Wait for discovery on the other side."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             self._executor.spin_once(timeout_sec=0.02)

@@ -47,7 +47,7 @@ def wall_and_point(
     gap: float = 0.01,
     pairs: tuple[str, ...] = ("top_left_top",),
 ) -> Scene:
-    """A mass that can only move up and down, `gap / 2` above the corner it falls on."""
+    """A mass that can only move vertically, `gap / 2` above the corner on which it falls."""
     return Scene(
         head=Head(mass, 1.0),
         frame=Frame(0.2, 0.2),

@@ -64,7 +64,7 @@ def test_the_ensemble_ends_at_the_tolerance_that_every_pair_needs(rows: list[dic
     pairs = [row for row in rows if row["section"] == "ensemble" and not row["wall_ms"]]
     assert float(timed[-1]["error"]) <= 1e-4 and float(timed[-1]["value"]) == 0.0
     assert len(pairs) == 6 and all(float(row["amplification"]) > 0.1 for row in pairs)
-    # every pair again, alone and by another way to the error
+    # every pair again, singly, with its error computed in another way
     code = (
         "import numpy as np, ensemble_rows as e; from plow_twin import simulate, simulate_many\n"
         "for scene in e.clearance_pairs(3, 2):\n"
@@ -81,7 +81,7 @@ def test_the_ensemble_ends_at_the_tolerance_that_every_pair_needs(rows: list[dic
 
 
 def test_work_grows_with_contact_events_not_with_time(rows: list[dict[str, str]]) -> None:
-    """From 80 events to 1089 in the same 20 s: a few steps for each, and few without them."""
+    """From 80 to 1089 events in the same 20 s: a few steps for each event, and few between events."""
     driven = [row for row in rows if row["section"] == "contact_events"]
     steps, events = ([int(row[name]) for row in driven] for name in ("steps", "events"))
     assert events == sorted(events) and events[-1] > 10 * events[0] > 0
@@ -116,7 +116,7 @@ def test_a_target_is_reached_when_the_peer_takes_so_many_times_as_long() -> None
         "print(sorted(levels.contenders([row(w.OURS_BARE, 'tol', 1.0, 1e-7), *ladder])))\n"
     )
     within, beyond, without, contenders = run(f"exec({code!r})").strip().splitlines()
-    # 30 times at 1e-6 is 0.667 ms; at 1e-9 the peer has no row, which counts as reached and is said
+    # 30 times at 1e-6 is 0.667 ms; at 1e-9 the peer has no row, which counts as reached and is reported
     assert within == "[True, True]" and beyond == "[False, True]"
     assert without == "[]" and contenders == "[0, 1, 2]"
 

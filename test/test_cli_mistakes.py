@@ -128,7 +128,7 @@ def test_a_stranger_s_mistake_is_named_in_a_message(
     assert cli(arguments) == code
     shown = capsys.readouterr().err
     assert said in " ".join(shown.split()), shown
-    # one line names the mistake; no content of the file is printed, and no file is left behind
+    # one line names the mistake, without content of the file, and no file is left behind
     assert len([line for line in shown.splitlines() if not line.startswith("Usage")]) <= 3 and len(shown) < 500
     assert sorted(desk.rglob("*")) == before
 
@@ -137,7 +137,7 @@ def test_a_load_that_looks_like_kilonewtons_is_named_before_it_is_estimated(
     desk: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(desk)
-    # gains of the load are estimated: such a load is a warning there, and no result stands on it
+    # the estimate has gains of the load, so that such a load is a warning, and gives no result
     assert cli(["estimate", "kN", "--json"]) == 0
     shown = capsys.readouterr()
     assert "fx, fy: got 30, expected some 3.2e+04 N as in the scene; they look like kN: convert the file" in shown.err

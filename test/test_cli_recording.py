@@ -216,12 +216,12 @@ def test_view_serves_a_page_on_the_loopback_address_alone(served: str) -> None:
 def test_a_browser_shows_the_run_at_the_address_that_view_names(served: str, tmp_path: Path) -> None:
     with browser.page(tmp_path, served) as page:
         deadline = time.monotonic() + 90
-        # dark is the ground of the cross-sections, which no page of the viewer's own has
+        # the cross-sections have a dark ground, unlike the viewer's own pages
         while _dark(page.picture()) < 0.15:
             assert time.monotonic() < deadline, f"no picture: {page.errors}, {page.requests}"
             time.sleep(0.5)
         assert not page.errors
-        # in the dark theme, whatever the browser's: next to nothing is white
+        # in the dark theme with any theme of the browser: hardly a dot is white
         dots = np.asarray(Image.open(BytesIO(page.picture())).convert("L"))
         assert (dots > 230).mean() < 0.05
         assert any("ReadMessages" in request for request in page.requests)

@@ -1,4 +1,4 @@
-"""The command line: files, JSON, exit codes; as a program where that is the point, else in this process."""
+"""The command line: files, JSON, exit codes; as a program where that matters, otherwise in this process."""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ def test_a_scene_s_numbers_stand_in_one_line_each(printed: Callable[..., list[st
     assert any(
         re.fullmatch(r"│ +stiffness +│ +9\.6975e\+06 │ N/m\^exponent │ +reconstructed +\d+ │", line) for line in lines
     )
-    # a row is never continued: each one has its value or is a heading
+    # a row is never continued: each row has its value or is a heading
     numbers, _ = "\n".join(lines).split("what follows")
     rows = [line for line in numbers.splitlines() if line.startswith("│")]
     assert all(re.match(r"│ (\w+(\[\d\])? +│ +│|  \w+(\[\d\])? +│ +\S)", line) for line in rows)

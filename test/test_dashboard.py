@@ -64,7 +64,7 @@ def test_a_feed_without_a_reader_does_not_wait_and_keeps_the_peaks() -> None:
             updates.append(update)
         feed.turn()
         updates.append(far.receive() or {})
-        # the first has the facts; the first one after there is room has the refused updates' largest force
+        # the first update has the facts; the first update after there is room has the largest force of the refused ones
         assert updates[0]["facts"]["can_ask"] is False and len(updates) == feed.taken
         assert max(update["motion"]["peak"][0] for update in updates) == 7e5
         assert updates[-1]["not_taken"] == feed.not_taken and updates[-1]["motion"]["t"] == pytest.approx(2.999)
@@ -77,7 +77,7 @@ def test_each_second_of_a_file_has_its_update_on_the_screen_and_a_way_out_keeps_
     for by_second, expected in ((True, [float(second) for second in range(1, 30)]), (False, [])):
         link, theirs = pair()
         feed = Feed(link, FACTS, by_second=by_second)
-        for index in range(580):  # of 20 Hz, as fast as they can be computed
+        for index in range(580):  # at 20 Hz of stamps, as fast as computed
             feed.publication(_published(1.0 + 0.05 * index, 1.0 + index // 20))
         with theirs:
             far, peaks = Link(theirs), []
@@ -271,7 +271,7 @@ def _twin(*options: str | Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
 
 
 def _said(process: subprocess.Popen[str], begin: str) -> str:
-    """Return the line on standard error that begins so."""
+    """Return the line on standard error with this beginning."""
     assert process.stderr is not None
     while line := process.stderr.readline():
         if line.startswith(begin):
@@ -344,7 +344,7 @@ def test_an_operator_acknowledges_and_marks_and_the_journal_has_both(tmp_path: P
         see(lambda: told.get("motion", {}).get("t", 0) >= 0.999e-3 * COUNT)
         assert told["alarms"]["force_latched"] == "warn" and told["motion"]["clearance"]["horizontal"] > 0.02
         page.send("no JSON")
-        page.send(json.dumps({"do": "reset"}))  # not a wish of the page
+        page.send(json.dumps({"do": "reset"}))  # not a request of the page
         page.send(json.dumps({"do": "mark", "text": "x" * 1000}))
         page.send(json.dumps({"do": "mark", "text": "<b>shift</b> " + "x" * 180}))
         page.send(json.dumps({"do": "acknowledge"}))
@@ -405,7 +405,7 @@ def test_a_recording_is_shown_while_it_is_written_and_afterwards_and_nothing_can
     assert max(max(row[1:9]) for row in seconds.values()) == pytest.approx(peaks[:, 16:].max(), rel=1e-6)
 
 
-#: What the page says, read by its own means.
+#: Text of the page, read by scripts in it.
 _SEEN = """JSON.stringify({pads: document.querySelectorAll('#pads tbody tr').length,
     colors: [...document.querySelectorAll('#section rect.pad')].map((pad) => pad.getAttribute('fill')),
     alarms: document.getElementById('alarms').innerText, clearance: document.getElementById('clearance').innerText,

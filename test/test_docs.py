@@ -102,7 +102,7 @@ def test_every_public_name_is_on_the_reference_page_and_there_is_no_other() -> N
 
 
 def test_no_heading_begins_with_a_digit() -> None:
-    """The site's contents follow the reader by selectors of the headings' names, which may not begin with one."""
+    """The site's contents select headings by their names, and a selector may not begin with a digit."""
     pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md"), *(ROOT / "examples").glob("**/README.md")]
     found = [line for page in pages for line in re.findall(r"^#+ \d.*", page.read_text(), re.MULTILINE)]
     assert found == []
@@ -166,7 +166,7 @@ def test_the_page_s_example_runs(page: str) -> None:
 
 def test_the_law_of_the_how_to_runs() -> None:
     (example,) = blocks(ROOT / "docs" / "how_to_own_law.md", "python")
-    # a process of its own: the law stays where it was added
+    # a process of its own, because an added law stays in its process
     code = f"{example}\nfrom plow_twin.model.contact_laws import LAWS\nprint(LAWS[contact.law].damping_number(0.4))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=280, check=False)
     assert (done.stdout.strip(), done.stderr) == (str(1.2 * (1.0 - 0.4) / 0.4), "")

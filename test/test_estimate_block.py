@@ -19,7 +19,7 @@ from plow_twin.study.measured.drops import Drops
 
 DATA = Path(__file__).resolve().parent.parent / "benchmark" / "data" / "measured" / "square_drops.npz"
 SQUARE = load_scene("measured_square")
-#: The prior of the clearance belongs to a table whose height is known to 5 mm.
+#: The prior of the clearance is that of a table whose height is known to 5 mm.
 DEVIATION = 0.01
 
 

@@ -44,9 +44,9 @@ def test_a_hard_contact_is_estimated_by_its_bounces() -> None:
 
 
 def test_the_deviate_of_a_path_is_normal_for_a_right_model_and_large_for_a_wrong_one() -> None:
-    """Paths scatter together, far along a few directions: there a right path is as far off as any drawn path.
+    """Paths scatter far along a few common directions, where a right path is as far off as any drawn path.
 
-    A wrong path that is off across these is found, though it is nearer by the mean square over the phases.
+    A wrong path that is off in another direction is found, although its mean square over the phases is smaller.
     """
     rng = np.random.default_rng(5)
     modes, slopes = rng.standard_normal((3, 60)), rng.standard_normal((14, 60))
@@ -77,7 +77,7 @@ def test_a_method_that_disagrees_widens_the_interval() -> None:
     both = with_bounced(fitted, bounced, 0)
     assert both.horizontal.deviation == pytest.approx(2.4e-5)
     assert both.horizontal.mean == pytest.approx(0.0300108)
-    # 8 deviations apart: both are held
+    # 8 deviations apart: both intervals hold
     assert both.vertical.p05 < 0.0201 and both.vertical.p95 > 0.0202
     assert both.vertical.deviation == pytest.approx(8.0 * 2.4e-5)
     unlike = with_bounced(fitted, replace(bounced, distance=2.0 * tuning.MOST_DISTANCE), 0)
@@ -86,7 +86,7 @@ def test_a_method_that_disagrees_widens_the_interval() -> None:
 
 @pytest.mark.parametrize("turn", [0.0, -0.1])
 def test_the_bias_of_a_sensor_behind_a_hard_contact_is_found(turn: float) -> None:
-    """Half a degree of bias had the estimate withdrawn, 9 mm along y made the horizontal clearance 1 mm too large."""
+    """Half a degree of bias withdrew the estimate; 9 mm along y made the horizontal clearance 1 mm too large."""
     truth = draw(replace(GROUPS["hard"], periods=4.0), 3)
     bias = np.array([1e-3, -9e-3, turn])
     found = bias_of_hard(Unknowns(truth.nominal), truth.poses.moved(bias))
@@ -94,7 +94,7 @@ def test_the_bias_of_a_sensor_behind_a_hard_contact_is_found(turn: float) -> Non
 
 
 def test_a_bias_changes_the_other_features_of_a_hard_motion_hardly_at_all() -> None:
-    """A remaining turn of 3e-4 rad on the whole moved the measured motion among drawn ones, which had no turn."""
+    """A remaining common turn of 3e-4 rad moved the measured motion relative to the drawn ones, which have no turn."""
     truth = draw(replace(GROUPS["hard"], periods=4.0), 3)
     eye = MotionFeatures(Unknowns(truth.nominal), truth.poses, truth.load.period())
     bias = np.array([1e-4, -1e-4, 6e-4])
@@ -165,7 +165,7 @@ def test_a_hard_contact_is_estimated_from_a_sensor_with_bias_delay_and_gaps() ->
 
 
 def test_a_contact_of_any_hardness_gives_finite_numbers() -> None:
-    """A regression that extrapolates said a softness of e^800 m, which is no number in JSON."""
+    """An extrapolating regression gave a softness of e^800 m, which JSON cannot hold."""
     unknowns = Unknowns(preset("paper"))
     poses, _ = Poses.of(np.arange(100) * 0.01, np.zeros((100, 3)))
     two = np.full(2, 1e-2)
@@ -209,7 +209,7 @@ def test_what_a_hard_motion_hides_widens_the_clearances_and_not_the_twins() -> N
     assert back.apparent == result.apparent
     scenes, _ = draw_scenes(truth.nominal, back, 50, np.random.default_rng(0))
     assert np.std([scene.clearance.horizontal_m for scene in scenes]) < 7e-5
-    # a scene that states how well its sides are known states its corners with it
+    # a scene that states the deviation of its sides includes its corners
     exact = Provenance(Mark.MEASURED, deviation=0.0)
     marks = {**truth.nominal.marks, "frame.width_m": exact, "frame.height_m": exact}
     stated = replace(unknowns, scene=replace(truth.nominal, marks=marks))

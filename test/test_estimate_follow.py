@@ -66,7 +66,7 @@ def _known(truth: Truth, state: State = State.ESTIMATED) -> Estimate:
 
 
 def _run(follower: Follower, truth: Truth, end: float, begin: float = -1.0, late: float = 0.0) -> Array:
-    """Go on to a time with load and poses, these `late` s late; return the forces of the median twin."""
+    """Continue to a time with load and poses, the latter `late` s late; return the forces of the median twin."""
     load, poses = truth.load, truth.poses
     there = np.flatnonzero((load.t > begin) & (load.t <= end))
     rows, place = np.zeros(len(there), ROW), int(np.searchsorted(poses.t + late, begin, side="right"))
@@ -79,7 +79,7 @@ def _run(follower: Follower, truth: Truth, end: float, begin: float = -1.0, late
 
 
 def _take(follower: Follower, found: Estimate) -> bool:
-    """Let an estimate be known now; return whether it is followed, or the prior again."""
+    """Add an estimate now; return whether it is followed, or the prior again."""
     before = follower.drawn
     follower.add_estimate(json.dumps(found.as_dict()), follower.time)
     return follower.drawn != before
@@ -204,7 +204,7 @@ def test_late_poses_correct_too_and_later_poses_have_no_effect(truth: Truth, for
 
 
 def test_the_load_error_of_a_rough_estimate_lets_the_intervals_hold(truth: Truth, forces: Array) -> None:
-    """A constant force that is not believed: 4 kN, an eighth of the load's amplitude."""
+    """A constant force of 4 kN, an eighth of the load's amplitude, that the believed load lacks."""
     figures = {f"load_error_{name}": 0.01 for name in ("fx", "fy", "m")}
     rough = replace(_known(truth, State.ROUGH), figures=figures)
     wrench = truth.load.wrench + np.array([4e3, 0.0, 0.0])
@@ -242,7 +242,7 @@ def test_a_machine_without_gravity_is_steered_too(truth: Truth, monkeypatch: pyt
     monkeypatch.setattr(TwinBatch, "move", counted)
     nominal = replace(truth.nominal, gravity=replace(truth.nominal.gravity, acceleration_m_s2=0.0))
     _run(Follower(nominal, MEMBERS), truth, 1.0)
-    assert np.mean(moved) > MEMBERS / 3  # with a limit of zero: no pose
+    assert np.mean(moved) > MEMBERS / 3  # with a limit of zero no pose is kept
 
 
 def test_a_member_is_never_pushed_into_a_hard_wall() -> None:

@@ -53,7 +53,7 @@ def test_the_jump_agrees_with_the_direct_run_with_sliding_in_the_plane_and_runni
     assert path.depth[-1] == pytest.approx(direct, rel=0.03, abs=1e-5)
     travel_only = wear_path(replace(preset("paper"), wear=replace(slow, sliding="travel")), (1.0, 1.0), exposure)
     assert direct.max() > 1.5 * travel_only.depth[-1].max() > 1e-4
-    # one path serves every coefficient: so it does at a quarter, where running-in is under way
+    # one path serves every coefficient, also at a quarter, where running-in is under way
     quarter = simulate(replace(scene, wear=replace(scene.wear, coefficient_m2_n=7.5e-10)), span, span, 1e-6).wear_depth
     early = [np.interp(0.25 * exposure, path.exposure, pad) for pad in path.depth.T]
     assert early == pytest.approx(quarter, rel=0.05, abs=1e-5)
@@ -79,7 +79,7 @@ def test_quantiles_scale_with_the_coefficient_and_the_horizon_cuts(tmp_path: Pat
     life = forecast(scene, plan)
     p10, p50, p90 = (life.quantile(share) for share in (0.1, 0.5, 0.9))
     assert p10 is not None and p50 is not None and p90 is not None and p10 < p50 < p90
-    # log-normal: the 10 % and 90 % points of 1/k_s are a factor apart that the prior fixes
+    # log-normal: the prior fixes the ratio of the 10 % and 90 % points of 1/k_s
     assert np.log(p90 / p10) == pytest.approx(np.log(4.0) * 1.2816 / 1.6449, rel=0.1)
     doubled = replace(scene, wear=replace(slow, prior_m2_n=(1e-14, 4e-14)))
     assert forecast(doubled, plan).quantile(0.5) == pytest.approx(0.5 * p50, rel=0.02)
@@ -116,7 +116,7 @@ def test_scenarios_are_forecasts_of_their_own_from_the_same_draws() -> None:
     alone = forecast(scene, replace(plan, scenarios=()))
     assert np.array_equal(found.hours, alone.hours)
     assert found.scenarios["dry"].hours == pytest.approx(2.0 * found.hours, rel=1e-2)
-    # the force grows with the load, by a share that the contact decides
+    # the force grows with the load, by a share that depends on the contact
     middle, sooner = found.quantile(0.5), found.scenarios["heavy"].quantile(0.5)
     assert middle is not None and sooner is not None and 0.6 * middle < sooner < 0.95 * middle
     for text in ("no numbers:load", "a:speed=2", "b:load=0", ":load=2", "c:load=nan"):
@@ -127,7 +127,7 @@ def test_scenarios_are_forecasts_of_their_own_from_the_same_draws() -> None:
 
 
 def test_a_table_of_enough_periods_is_a_load_to_forecast_under() -> None:
-    """The load as a recording has it: the harmonic one sampled gives the same mean forces."""
+    """The load as in a recording: the sampled harmonic load gives the same mean forces."""
     scene = preset("paper")
     t = np.arange(0.0, 20.0, 0.01)
     sampled = replace(scene, loads=(Table("recorded", t, compile_loads(scene.loads).at(t)),))
@@ -184,7 +184,7 @@ def test_a_scene_without_wear_or_period_is_refused() -> None:
 
 
 def test_a_history_of_clearances_determines_the_coefficient(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The truth is a direct run, which shares no jump with the estimate; its coefficient is not the prior's middle."""
+    """The truth is a direct run without jumps of wear; its coefficient is not the prior's middle."""
     true_k = 1.8e-9
     scene = replace(preset("paper"), wear=replace(FAST, coefficient_m2_n=1e-9, prior_m2_n=(2.5e-10, 4e-9)))
     worn = replace(scene, wear=replace(FAST, coefficient_m2_n=true_k))
@@ -202,7 +202,7 @@ def test_a_history_of_clearances_determines_the_coefficient(tmp_path: Path, caps
     sure = replace(known, weight=np.eye(len(known.value))[len(known.value) // 2]).interval()
     assert sure.p95 / sure.p05 > math.exp(3.2 * tuning.PATH_DEVIATION)
     assert np.abs(known.clearance - [0.025, 0.030] - grown[-1]).max() < 4.0 * noise
-    # the forecast goes on along the path, whose pads are not worn alike
+    # the forecast continues along the path, whose pads are worn unequally
     assert known.depth == pytest.approx(depth[-1], rel=0.1, abs=5e-5)
     ahead = with_clearances(scene, *map(float, known.clearance), known.depth)
     assert ahead.wear is not None and ahead.wear.initial_depth_m == pytest.approx(known.depth)
@@ -210,7 +210,7 @@ def test_a_history_of_clearances_determines_the_coefficient(tmp_path: Path, caps
         [known.depth @ np.abs(NORMAL_X), known.depth @ np.abs(NORMAL_Y)]
     )
     assert total == pytest.approx(known.clearance)
-    # knowledge narrows the forecast
+    # more knowledge narrows the forecast
     plan = Plan(0.030, 0.035, 1.0, load_deviation=0.0)
     prior, posterior = (forecast(scene, plan, known=knowledge) for knowledge in (None, known))
     ratios = [life.quantile(0.9) / life.quantile(0.1) for life in (prior, posterior)]  # type: ignore[operator]
@@ -228,7 +228,7 @@ def test_a_history_of_clearances_determines_the_coefficient(tmp_path: Path, caps
 
 
 def test_a_forecast_wears_the_pads_by_the_contact_that_was_estimated() -> None:
-    """Another contact bears on other pads; the one believed went on wearing, whatever the estimate said of it."""
+    """Another contact loads other pads; the believed contact kept wearing, against the estimate."""
     wear = Wear(1e-14, 0.015, 2.0, prior_m2_n=(5e-15, 2e-14))
     believed = replace(preset("paper"), wear=wear)
     hard = replace(believed, contact=replace(believed.contact, stiffness=2.4 * believed.contact.stiffness))
@@ -258,7 +258,7 @@ def test_a_path_that_does_not_come_to_its_end_is_no_limit_never_reached() -> Non
 
 
 def test_a_clearance_hardly_known_is_not_below_zero() -> None:
-    """Drawn from its prior it was -70 mm: the path to the limit from there left the model's range."""
+    """Drawn from its prior, a clearance was -70 mm, from which the path to the limit left the model's range."""
     scene = replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0, prior_m2_n=(5e-15, 2e-14)))
     found = forecast(scene, Plan(0.026, 0.031, 1e3, draws=50), (0.03, 0.03))
     assert found.now.min() > 0.0
@@ -284,7 +284,7 @@ def test_a_history_that_the_prior_does_not_allow_is_refused() -> None:
 
 
 def test_a_history_that_shrinks_is_refused() -> None:
-    """By 20 of its deviations: the result was a coefficient of nearly 0 with a narrow interval."""
+    """By 20 of its deviations, the result was a coefficient near 0 with a narrow interval."""
     scene = replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0))
     travel, shrunk = np.array([0.0, 1e4]), np.array([[0.025, 0.030], [0.0245, 0.0295]])
     with pytest.raises(LifeError, match=r"no wear of this scene explains.*row 2 is -0\.2\d+ mm off"):
@@ -295,7 +295,7 @@ def test_a_history_that_shrinks_is_refused() -> None:
 def test_unusable_input_of_a_forecast_is_refused_and_not_left_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A stop beyond the horizon, an empty estimate, a missing contact: all gave some forecast."""
+    """A stop beyond the horizon, an empty estimate and a missing contact used to give a forecast."""
     scene = replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0, prior_m2_n=(5e-15, 2e-14)))
     file, found, history = (tmp_path / name for name in ("scene.yaml", "estimate.json", "history.csv"))
     file.write_text(dump_scene(scene))

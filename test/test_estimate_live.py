@@ -1,4 +1,4 @@
-"""The estimate beside the live node: real processes, late data, and the journal that gives it again."""
+"""The estimate beside the live node: real processes, late data, and the same estimate from the journal."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_windows_do_not_depend_on_the_order_of_arrival() -> None:
 
 
 def test_measurements_without_a_load_do_not_pile_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A load that has stopped, or poses of a clock that is ahead by hours."""
+    """A load that has stopped, or poses from a clock that is hours ahead."""
     monkeypatch.setattr("plow_twin.estimate.window.MOST_KEPT", 100)
     windows = Windows(4.0, 1.0, 0.5)
     for index in range(300):
@@ -159,13 +159,13 @@ def test_the_live_estimate_is_published_and_given_again_by_the_journal(tmp_path:
         forecasts: list[JointState] = probe.listen(JointState, "forecast")
         assert value(probe.status[-1], "horizontal") == "prior"
         _play(running, truth, late=True)
-        # windows end each 4 s: one is left out where the machine is slow, the last one is not
+        # windows end each 4 s; a slow machine leaves out one, but not the last
         last_s = (START_NS + round((truth.load.t[-1] - WAIT_S) * 1e9)) // round(INTERVAL_S * 1e9) * round(INTERVAL_S)
         probe.until(lambda: heard and heard[-1].header.stamp.sec == last_s, "the last window's estimate", 100.0)
         probe.until_figure("estimate", "estimates", *map(str, range(1, 9)))
         probe.until(lambda: value(probe.status[-1], "horizontal") == "estimated", "the flag")
         found = dict(zip(heard[-1].name, heard[-1].position, strict=True))
-        # the next slow publication: the hold policy continues meanwhile
+        # the next slow publication, under the hold policy
         probe.until(lambda: abs(clearances[-1].position[0] - found["horizontal"]) < 1e-9, "the clearance")
         last = dict(zip(clearances[-1].name, clearances[-1].position, strict=True))
         status: DiagnosticStatus = probe.status[-1]
@@ -227,12 +227,12 @@ def test_an_estimate_stays_until_it_is_withdrawn_or_the_pads_are_changed() -> No
     assert [now[f"horizontal{point}"] for point in ("", "/p05", "/p95")] == pytest.approx(
         [0.02, 0.019, 0.021], abs=1e-6
     )
-    # a late sample goes back behind the estimate, which stays
+    # a late sample goes back beyond the estimate, which stays
     clearance(0.6)
     session.apply(Sample(START_NS + 100_000_000, (4e4, -1e4, 0.0)))
     later = clearance(1.8)
     assert later["vertical"] == pytest.approx(0.03, abs=1e-6)
-    # and its interval widens as the wear's prior does
+    # and its interval widens like the wear's prior
     assert later["horizontal/p95"] - later["horizontal/p05"] > now["horizontal/p95"] - now["horizontal/p05"]
     second = entry_of(_found(State.NOT_OBSERVABLE, State.WITHDRAWN), session, first)
     assert second.shift == (*first.shift[:3], 0.0, 0.0, 0.0)
@@ -274,10 +274,10 @@ def test_other_pads_and_other_model_numbers_discard_earlier_estimates(
         return estimation.poll(session)
 
     assert told()["forecast"].name == ("seconds/p50",)
-    # an estimate of the machine before is under way
+    # an estimate of the previous machine is under way
     estimation._worker.found.append(_found(State.ESTIMATED, State.ESTIMATED))
     session.apply(SetModel(START_NS, json.dumps({"clearance.horizontal_m": 0.026})))
-    # the clearance is the model's again: no estimate is held beside one that cannot be observed
+    # the clearance is the model's again: beside a clearance that is not observable no estimate is kept
     assert estimation.entry is None and set(estimation.states.values()) == {State.PRIOR}
     assert estimation.forecast is not None and estimation.poll(session) == {}
     told()
@@ -301,7 +301,7 @@ def test_a_frozen_worker_is_reported_and_costs_no_further_memory(monkeypatch: py
         for _ in range(1000):
             worker.add_load(START_NS, (0.0, 0.0, 0.0))
         assert worker.poll() is None
-        # so slow that it is waited for with less than that in hand
+        # so slow that the source waits for it with less data than that
         time.sleep(0.1)
     assert worker.error == "the estimator did not read for 20000 samples"
     worker.add_load(START_NS, (0.0, 0.0, 0.0))
@@ -314,7 +314,7 @@ def test_the_death_of_a_worker_is_reported_and_stops_nothing() -> None:
     worker = Worker(preset("paper"), Windows(10.0, 4.0, 1.0))
     os.kill(worker._process.pid, signal.SIGSTOP)
     worker._connection.close()
-    assert worker.poll() is None and not worker.error  # its end is not waited for
+    assert worker.poll() is None and not worker.error  # the test does not wait for its end
     worker._process.kill()
     give_up = time.monotonic() + 20.0
     while not worker.error and time.monotonic() < give_up:

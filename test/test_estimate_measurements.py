@@ -25,7 +25,7 @@ def test_implausible_poses_and_loads_are_left_out_and_counted() -> None:
 
 
 def test_the_covariance_of_a_pose_is_believed() -> None:
-    """A covariance of 1e6 says `not measured`: it made all the others useless."""
+    """A covariance of 1e6, which means `not measured`, made all other poses useless."""
     q, own = np.ones((40, 3)), np.full((40, 3), 1e-3)
     own[7], own[8, 0], own[9] = 1e3, 0.02, np.nan
     kept, deviation = believed((0.0, 0.0, 4e-3), q, own)

@@ -73,7 +73,7 @@ def test_effects_outside_the_model_are_flagged_and_rough_at_best(name: str) -> N
 
 
 def test_a_lever_arm_of_the_sensor_is_found_and_the_interval_holds() -> None:
-    """Without it the fit did not come to its end, or was 0.4 mm off under 0.05 mm."""
+    """Without it the fit did not converge, or was 0.4 mm off with an interval of 0.05 mm."""
     truth = mismatched(replace(KINDS["lever"], periods=6.0), 80_000)
     result = estimate(truth.nominal, truth.load, truth.poses)
     for value, state, true in zip(
@@ -98,7 +98,7 @@ def test_the_vertical_clearance_of_a_head_that_never_moves_sideways_is_estimated
 
 @pytest.mark.parametrize("seed", [pytest.param(43202, marks=pytest.mark.stress), 43210])
 def test_intervals_hold_between_soft_and_hard_contacts(seed: int) -> None:
-    # one was taken for hard and flagged, the other's fit did not come to its end
+    # one was taken for hard and flagged, the fit of the other did not converge
     truth = draw(GROUPS["middle"], seed)
     result = estimate(truth.nominal, truth.load, truth.poses)
     for value, state, true in zip(
@@ -180,7 +180,7 @@ def test_a_clearance_without_evidence_is_not_estimated() -> None:
 
 
 def test_stated_deviations_of_the_measurements_are_believed() -> None:
-    """Noise is not taken to be less than stated, and intervals follow; so does the prior of the load's gains."""
+    """The stated noise is a lower bound, which intervals and the prior of the load's gains reflect."""
     scene = preset("paper")
     t = np.arange(0.0, 10.0, 0.01)
     wrench = compile_loads(scene.loads).at(t)
@@ -242,7 +242,7 @@ def test_a_pose_with_a_large_stated_deviation_does_not_make_the_model_suspect() 
 
 
 def test_a_silence_of_the_load_is_not_bridged() -> None:
-    """A line across a lost period had the sensor taken for a bad one."""
+    """With a line drawn across a lost period the sensor counted as bad."""
     truth, _ = known()[0]
     there = (truth.load.t < 11.0) | (truth.load.t > 14.0)
     load = Load(truth.load.t[there], truth.load.wrench[there])
@@ -279,7 +279,7 @@ def test_a_machine_at_rest_does_not_make_the_model_suspect() -> None:
     rests[:200] += np.linspace(1e-2, 0.0, 200)[:, None]
     result = estimate(truth.nominal, Load.of(t, idle)[0], Poses.of(t, rests)[0])
     assert (result.horizontal_state, result.model) == (State.NOT_OBSERVABLE, "ok")
-    # a head that is pushed and does not move is stuck, or its sensor is
+    # if a pushed head does not move, it or its sensor is stuck
     pushed = Load.of(t, idle + np.outer(np.sin(2.0 * t), [3e4, 1e4, 4e4]))[0]
     result = estimate(truth.nominal, pushed, Poses.of(t, rests)[0])
     assert result.horizontal_state is State.WITHDRAWN
@@ -315,7 +315,7 @@ def test_a_rough_load_costs_little_accuracy() -> None:
 
 
 def test_ten_poses_a_second_are_fitted_to_the_end_and_the_sensor_is_not_suspect() -> None:
-    """A fit that stopped on its way left motion over, which was taken for a sensor that is noisier for a time."""
+    """The residual motion of a fit that had not converged was taken for a temporarily noisier sensor."""
     truth = draw(GROUPS["slow"], 33001)
     result = estimate(truth.nominal, truth.load, truth.poses)
     assert (result.sensor, result.horizontal_state) == ("ok", State.ESTIMATED), result.reasons
@@ -323,7 +323,7 @@ def test_ten_poses_a_second_are_fitted_to_the_end_and_the_sensor_is_not_suspect(
 
 
 def test_a_load_with_a_little_noise_is_followed_in_long_swings() -> None:
-    """Swings as short as under a load of another value each sample had this right model withdrawn."""
+    """With the short swings of a load that changes at each sample this right model was withdrawn."""
     truth = draw(replace(GROUPS["plain"], load_step=1e-3, periods=8.0), 42004)
     noise = 0.01 * truth.load.wrench.std(axis=0) * np.random.default_rng(1).standard_normal(truth.load.wrench.shape)
     result = estimate(truth.nominal, Load(truth.load.t, truth.load.wrench + noise), truth.poses)

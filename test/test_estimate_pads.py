@@ -46,7 +46,7 @@ def worn_askew(depth: np.ndarray, seed: int) -> tuple[Estimate, dict[str, float]
 
 
 def test_walls_worn_askew_are_estimated_and_the_model_is_not_suspect() -> None:
-    """Pads as uneven as towards the end of a life: a fit of even pads does not hold."""
+    """Pads as uneven as near the end of life, where a fit with even pads fails."""
     result, true = worn_askew(UNEVEN, 1)
     assert (result.model, result.horizontal_state) == ("ok", State.ESTIMATED), result.reasons
     assert result.horizontal.mean == pytest.approx(0.5 * (true["horizontal_top"] + true["horizontal_bottom"]), abs=3e-4)
@@ -58,7 +58,7 @@ def test_walls_worn_askew_are_estimated_and_the_model_is_not_suspect() -> None:
 
 
 def test_walls_worn_less_askew_do_not_make_the_clearance_too_small() -> None:
-    """Here a fit of even pads is not objected to: it was 0.26 mm too small, with a deviation of 0.29 mm."""
+    """Here a fit with even pads passes all checks: it was 0.26 mm too small, with a deviation of 0.29 mm."""
     result, true = worn_askew(0.6 * UNEVEN, 2)
     off = result.vertical.mean - 0.5 * (true["vertical_left"] + true["vertical_right"])
     assert abs(off) < 1.5e-4 and result.vertical.deviation < 2e-4

@@ -13,7 +13,7 @@ from scenes import ROOT
 from plow_twin.estimate import tuning
 
 FOLDER = ROOT / "plow_twin" / "estimate"
-#: What a number outside of the table can be.
+#: Permitted reasons for a number outside the table.
 ORIGIN = re.compile(r"\b(Definition|Derived|Bound|Guard|Step|Prior): ")
 
 

@@ -28,7 +28,7 @@ def test_the_prior_is_the_scene_s_or_that_of_the_mark() -> None:
         "contact.damping": Provenance(Mark.ASSUMED, "", 0.2 * (scene.contact.damping or 0.0)),
     }
     stated = Unknowns.stated(replace(scene, marks=marks), load, poses).deviations()
-    # 10 % of the stiffness is 10 % of the penetration, of which 0.1 mm is no more than zero
+    # 10 % of the stiffness is 10 % of the penetration; 0.1 mm of it counts as zero
     np.testing.assert_allclose(stated[:4], [2e-3, 2e-3, 0.1, 0.2], rtol=0.02)
     # the same in the units of a machine of another size
     units = Units(0.5, 2.0, 0.25)

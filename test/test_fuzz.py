@@ -1,4 +1,4 @@
-"""Damaged files of each kind: readers refuse them by an error of the package, and by no other."""
+"""Damaged files of each kind: readers refuse them by an error of the package only."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Pinned motions: no bit and no count of steps, evaluations or events changes unless somebody means it to.
+"""Pinned motions: bits and counts of steps, evaluations and events change only on purpose.
 
-`pytest test/test_golden.py --golden-update` pins them again for the present build. A build without a file of its own is
-held to the counts of another one: rounding moves single events, not the work.
+`pytest test/test_golden.py --golden-update` pins them again for the present build. A build without its own file must
+reach the counts of another build: rounding moves single events, not the work.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from golden import CASES, build_name
 
 FOLDER = Path(__file__).resolve().parent / "data" / "golden"
 PROGRAM = Path(__file__).resolve().parent / "golden.py"
-#: By how much rounding may change a count on another build.
+#: Largest change of a count by rounding on another build.
 OTHER_BUILD = 0.02
 
 # all kernels are compiled first
@@ -38,7 +38,7 @@ def found() -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def pinned() -> dict[str, Any]:
-    """Return the figures of this build, else another build's without their digests."""
+    """Return the figures of this build, or of another build without digests."""
     own = FOLDER / f"{build_name()}.json"
     path = own if own.exists() else sorted(FOLDER.glob("*.json"))[0]
     figures: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""Files from anybody: lines that stand for millions of values, nesting without end, names that act on a terminal."""
+"""Untrusted files: lines that expand to millions of values, endless nesting, names that act on a terminal."""
 
 from __future__ import annotations
 
@@ -230,7 +230,7 @@ def test_absurd_recordings_end_with_one_line(kind: str, tmp_path: Path) -> None:
                     ],
                 )
             )
-    if kind == "run":  # compiling, which may be due, is no part of the processor time
+    if kind == "run":  # compiling does not count in the processor time
         (tmp_path / "plain.mcap").write_bytes(recorded())
         subprocess.run(
             [sys.executable, "-m", "plow_twin", "replay", "plain.mcap", "-q"],

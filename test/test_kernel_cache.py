@@ -14,7 +14,7 @@ from plow_twin.kernel.compiler import kernel
 from plow_twin.model import contact
 
 ROOT = Path(__file__).resolve().parent.parent
-#: How many functions of machine code a kernel has that `settle_modes` alone calls.
+#: Number of machine-code functions of a kernel that only `settle_modes` calls.
 LINKED = (
     "from plow_twin import load_scene; from plow_twin.solve import compiled_scene, modes; "
     "compiled_scene.compile_scene(load_scene('paper'), 1e-6).initial_state(); "
@@ -41,7 +41,7 @@ def run(cache: Path, program: str = MISSES) -> str:
 
 
 def test_an_index_of_other_sources_is_replaced_unread(tmp_path: Path) -> None:
-    """After an upgrade an index may name types that are gone: reading it would raise."""
+    """After an upgrade an index may name removed types, which would raise an error when read."""
     assert run(tmp_path) == "1" and run(tmp_path) == "0"
     (index,) = tmp_path.rglob("contact.power_term*.nbi")
     index.write_bytes(pickle.dumps("another version") + b"cannot be read")
@@ -49,12 +49,12 @@ def test_an_index_of_other_sources_is_replaced_unread(tmp_path: Path) -> None:
 
 
 def test_a_kernel_that_only_kernels_call_has_no_machine_code(tmp_path: Path) -> None:
-    """It would be compiled again in each caller: that took a third of the time."""
+    """Compiled again in each caller, it took a third of the time."""
     assert run(tmp_path, LINKED) == "0"
 
 
 def test_an_entry_holds_its_own_copy_of_every_kernel_it_calls(tmp_path: Path) -> None:
-    """Bits would depend on which entry a process loads first, and on whether it compiles or finds them compiled."""
+    """Otherwise bits would depend on which entry a process loads first, and on whether it compiles or loads them."""
     assert run(tmp_path, ENTRY) == "True False"
 
 

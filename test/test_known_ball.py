@@ -1,6 +1,6 @@
 """A ball on a rigid table: bouncing to rest, and on a vibrating table from period one to its doubling.
 
-Both answers belong to a rigid table with restitution e; here the contact is stiff and the error falls with its
+Both answers hold for a rigid table with restitution e; here the contact is stiff, and the error falls with its
 stiffness. Linear contact with the exact restitution; the floor of the impact speed lies below every bounce that counts.
 """
 

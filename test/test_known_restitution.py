@@ -18,7 +18,7 @@ from scipy.integrate import solve_ivp
 from plow_twin import Contact
 from plow_twin.model.contact_laws import LAWS, exact_damping_number
 
-# delivered restitution at restitution asked for .1 .. .9, .95; published tables of the laws
+# delivered restitution at nominal .1 .. .9, .95; published tables of the laws
 ASKED = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
 DELIVERED = {
     "lankarani_nikravesh": (0.6653, 0.6723, 0.6842, 0.7016, 0.7252, 0.7561, 0.7960, 0.8471, 0.9132, 0.9535),
@@ -28,7 +28,7 @@ DELIVERED = {
 
 
 def load_benchmark(name: str) -> ModuleType:
-    """Import a module of the benchmark folder, which is no package."""
+    """Import a module of the benchmark folder, which is not a package."""
     spec = importlib.util.spec_from_file_location(name, ROOT / "benchmark" / f"{name}.py")
     assert spec is not None and spec.loader is not None
     sys.modules[name] = module = importlib.util.module_from_spec(spec)
@@ -53,7 +53,7 @@ def test_exact_restitution_is_returned_for_any_stiffness_exponent_and_mass(n: fl
 )
 @pytest.mark.parametrize("n", [1.0, 2.2])
 def test_a_constant_factor_of_the_published_d_returns_its_restitution(e: float, d: float, n: float) -> None:
-    """D = lambda v0, given as plain damping to a law that knows nothing of the identity."""
+    """D = lambda v0, given as plain damping, so that the law does not use the identity."""
     speed = 0.4
     contact = Contact("hunt_crossley", 1e9, n, damping=d / speed)
     # the table gives six decimals of D; de/dD is at most 0.35 there
@@ -123,7 +123,7 @@ def test_the_page_shows_the_results_of_the_solver() -> None:
     tables = (restitution.page_table, restitution.laws_table, restitution.ratio_table, restitution.ramp_table)
     for line in (line for table in tables for line in table(rows)):
         assert f"{line}\n" in page, line
-    # damped, as in the tests above: without damping the kernels are others, and each law returns 1
+    # damped, as in the tests above: without damping each law returns 1, by other kernels
     for law in ("zhiying_qishao", "kelvin_voigt"):
         stored = {row.asked: row.delivered for row in rows if row.law == law}
         for again in restitution.measure(law, list(stored)[5:-1:10]):

@@ -1,7 +1,8 @@
 """The slider with clearance in its guide of Flores, Leine and Glocker, Multibody Syst. Dyn. 23 (2010) 165.
 
-Same topology as ours, four corners in a guide. Their gap functions against our penetrations; their mechanism with rigid
-impacts, integrated here with its events, against our solver. Siconos' own data: docs/known_answers.md.
+Same topology as ours, four corners in a guide. The paper's gap functions are compared with our penetrations; its
+mechanism with rigid impacts, integrated here with located events, with our solver. Siconos' own data:
+docs/known_answers.md.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ siconos = load_benchmark("siconos")
 
 
 def penetrations(y: float, theta: float) -> np.ndarray:
-    """Our penetrations where the head is the guide, seen from the slider: the inverse of the slider's pose."""
+    """Our penetrations with the head as the guide, seen from the slider: the pose is the inverse of the slider's."""
     scene = replace(
         preset("paper"), frame=Frame(2.0 * siconos.HALF_LENGTH, 2.0 * siconos.HALF_HEIGHT),
         clearance=Clearance(1.0, 2.0 * siconos.GAP), initial=Initial((-np.sin(theta) * y, -np.cos(theta) * y, -theta)),
@@ -37,7 +38,7 @@ def test_gap_functions_are_our_penetrations() -> None:
 
 
 def test_touches_are_those_of_the_rigid_mechanism() -> None:
-    """Times of the first five touches, hence the speeds after them; late by the contact's duration, K^-1/2."""
+    """Times of the first five touches, and thus the speeds after them, are late by the contact's duration, K^-1/2."""
     t, states, impacts = siconos.rigid_motion(0.009, 5)
     assert len(impacts) >= 5 and impacts[0] == pytest.approx(2.69e-3, abs=2e-5)
     late = []

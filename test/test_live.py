@@ -1,4 +1,4 @@
-"""The live twin without ROS: files, standard input and MQTT end in the same session, counters and recording."""
+"""The live twin without ROS: files, standard input and MQTT feed the same session, counters and recording."""
 
 from __future__ import annotations
 
@@ -73,12 +73,12 @@ def _csv(path: Path, count: int, more: str = "", times: float = 1.0) -> Path:
     return path
 
 
-#: What a damaged number may read.
+#: Texts of damaged numbers.
 STRAY = ("5000000", "1e30", "0", "-7", "nan")
 
 
 def _run(path: Path, mapping: Path | None = None, reports: list[Part] | None = None, **values: Any) -> dict[str, Part]:
-    """Feed a twin from a file and return its diagnostics; those of its state on the way go to `reports`."""
+    """Feed a twin from a file and return its diagnostics; reports of its state in between go to `reports`."""
     settings = parameters.settings(values)
     said: list[str] = []
 
@@ -128,7 +128,7 @@ def test_a_file_is_fed_recorded_and_replayed_and_every_row_is_counted(
 def test_a_time_that_stands_alone_is_no_clock_and_no_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     date = "2026-01-01T00:00:{:06.3f}".format
     rows = [f"{date(index * 1e-3)},1,2,3\n" for index in range(300)]
-    rows[150:150] = ["2080-01-01,1,2,3\n"]  # a stamp that does not go on
+    rows[150:150] = ["2080-01-01,1,2,3\n"]  # a stamp that does not continue
     rows[200:200] = ["9999-12-31,1,2,3\n", "9999-12-31,1,2,3\n"]
     path = tmp_path / "load.csv"
     path.write_text("time,fx,fy,m\n" + "".join(rows))
@@ -188,7 +188,7 @@ def test_bounded_work_is_reported_with_its_error_and_repeated_by_the_journal(tmp
     given = {"scene": "bench_kv", "max_evaluations": 16, "record_path": str(tmp_path / "run")}
     reports: list[Part] = []
     parts = _run(_csv(tmp_path / "load.csv", 1500), reports=reports, **given)
-    # each report tells of the time since the one before it
+    # each report covers the time since the report before it
     largest = max(float(values["error_estimate_m"]) for _, _, values in (*reports, parts["state"]))
     assert int(parts["state"][2]["coarse_advances"]) > 0 and 0.0 < largest < 1e-3
     report = replay(tmp_path / "run")
@@ -219,7 +219,7 @@ def test_the_alarms_of_a_run_are_computed_again_and_compared(tmp_path: Path) -> 
         return False
 
     assert front.run(acknowledge) == [] and acknowledged
-    # beside the changes of a level, which are recorded, the alarms are said once a second
+    # beside the recorded changes of a level, the alarms are reported once a second
     alarms = [part[2] for name, part in said if name == "alarms"]
     assert any(values["residual_latched"] == "warn" for values in alarms)
     recorded = [
@@ -237,7 +237,7 @@ def test_the_alarms_of_a_run_are_computed_again_and_compared(tmp_path: Path) -> 
     file = next((tmp_path / "run").glob("*.mcap"))
     report = replay(rewrite(file, tmp_path / "other.mcap", metadata=other_thresholds))
     assert report.exit_code == 1 and report.first_divergence is not None
-    # the alarm of the residual is none any more: it was raised, and went
+    # the alarm of the residual has ended: it was raised, and released
     found = report.first_divergence
     assert (report.divergences, found.topic, found.recorded, found.computed) == (2, "alarms", "a message", "none")
 
@@ -248,7 +248,7 @@ def test_the_alarms_of_a_run_are_computed_again_and_compared(tmp_path: Path) -> 
     assert report.first_divergence is not None
     found = report.first_divergence
     assert (found.topic, found.recorded, found.computed) == ("alarms", "none", "warn") and "_l" in found.field
-    # where the outputs are not all there nothing is said of alarms
+    # where outputs are missing, alarms are not compared
     few = given | {"record_path": str(tmp_path / "few"), "record_outputs": "none"}
     _run(path, mapping, **few)
     report = replay(tmp_path / "few")
@@ -286,7 +286,7 @@ def test_the_senders_own_numbers_show_loss_repetition_and_a_new_start(tmp_path: 
     ("numbers", "lost"),
     [
         *((["1", "2", *map(str, range(3, 150)), stray, *map(str, range(151, 301))], 0) for stray in STRAY),
-        # a jump that the next one goes on from: back to the second of a new beginning, ahead, beyond all that can be
+        # a jump from which the next stamp continues: back to the start of a new count, ahead, or to an impossible time
         ([*map(str, range(2000, 2150)), *map(str, range(2, 150))], 1),
         ([*map(str, range(1, 150)), *map(str, range(5000, 5150))], 4850),
         ([*map(str, range(1, 150)), *map(str, range(10**15, 10**15 + 150))], 0),
@@ -349,7 +349,7 @@ def test_a_mapping_takes_units_offsets_clocks_and_names_its_faults(tmp_path: Pat
         with pytest.raises(RecordingError, match="head_pose") as caught:
             read_map(path, None)
         assert said in str(caught.value)
-    # a time that is asked for by name is not that of receipt where it is absent
+    # an absent time that was requested by name is not replaced by the time of receipt
     assert read("head_pose: {topic: p, stamp: at}", x=1, y=2, theta=3) is None
     for key, name in (("stamp", "at"), ("sequence", "n")):
         path.write_text(f"head_pose: {{topic: p, {key}: {name}}}")
@@ -403,7 +403,7 @@ def test_a_reader_of_the_lines_that_hangs_stops_nothing_and_what_it_does_not_get
         outlet.put(str(number))
     assert lost_at == [1] and 99 <= outlet.lost <= 100
     hangs.set()
-    # the newest are there, in order, behind the one that was being written
+    # the newest lines are there, in order, behind the line that was being written
     assert outlet.close() and len(taken) + outlet.lost == MOST_WAITING + 100
     assert taken[-MOST_WAITING:] == list(map(str, range(100, MOST_WAITING + 100)))
 
@@ -485,7 +485,7 @@ def test_a_file_is_followed_while_it_grows_and_when_it_is_replaced(tmp_path: Pat
     path, run = tmp_path / "load.csv", tmp_path / "run"
     _csv(path, 100)
     arguments = (str(path), "--follow", "--record", str(run), "--set", "excitation_timeout=3600")
-    # not of a `nohup` above the tests
+    # not that of a `nohup` around the tests
     with _live(*arguments, preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL)) as live:
         live.until_count("samples_used", 100)
         text = "".join(",".join(map(repr, _row(index))) + "\n" for index in range(100, 200))
@@ -499,7 +499,7 @@ def test_a_file_is_followed_while_it_grows_and_when_it_is_replaced(tmp_path: Pat
         path.write_text("t,fx,fy,m\n" + "".join(",".join(map(repr, _row(index))) + "\n" for index in range(200, 300)))
         values = live.until_count("samples_used", 300)
         assert values["samples_in"] == "300"
-        assert live.stop(signal.SIGHUP) == 0  # of a terminal that is closed
+        assert live.stop(signal.SIGHUP) == 0  # as from a closed terminal
     report = replay(run)
     assert (report.samples, report.exit_code) == (300, 0)
 
@@ -566,11 +566,11 @@ def test_files_with_dates_are_waited_for_and_followed_from_one_to_the_next(
         with days[1].open("a") as before:
             days[2].write_text("t,fx,fy,m\n" + text(150, 200))
             live.until_count("samples_used", 150)
-            before.write(text(100, 150))  # its writer was slow to let it go: these are late and worked in
+            before.write(text(100, 150))  # its writer released it late: these rows are late and worked in
         values = live.until_count("samples_used", 200)
         assert (values["samples_in"], values["rolled_back"]) == ("200", "50")
         assert live.stop() == 0
-    # of files that end all are read, by the numbers in their names; a name with a date needs no other mapping
+    # all files that end are read, in the order of the numbers in their names; a name with a date needs no other mapping
     days[0].write_text("t,fx,fy,m\n" + text(-30, 0))
     for source, count in ((arguments[0], 230), (str(days[0]), 30)):
         assert run_cli(["live", source, "--map", str(mapping), "--json"]) == 0
@@ -601,7 +601,7 @@ def test_nothing_of_a_followed_file_is_lost_unseen_when_it_is_cut_or_another_tak
         return [None if content is None else float(content.get("fx", math.nan)) for content in contents]
 
     assert read() == [10.0, 20.0]
-    path.write_text("4,40,0,0\n")  # cut, and its writer goes on without a header; half a line was there
+    path.write_text("4,40,0,0\n")  # cut, and its writer continues without a header; half a line was there
     assert read() == [None, 40.0]
     path.rename(tmp_path / "load.csv.1")
     with (tmp_path / "load.csv.1").open("a") as stream:
@@ -609,7 +609,7 @@ def test_nothing_of_a_followed_file_is_lost_unseen_when_it_is_cut_or_another_tak
     assert read() == [50.0]
     path.write_text("m;fx;t;fy\n0;60;6;0\n")
     assert read() == [60.0]
-    path.write_text("0,7\n0,70,7,0\n")  # cut within a line: its second half is none
+    path.write_text("0,7\n0,70,7,0\n")  # cut within a line: the second half does not count
     assert read() == [None, 70.0]
     path.write_text("t,fx,fy,m\n" + "8,80,0,0\n" * 3)  # written anew, and longer than it was
     assert read() == [80.0] * 3
@@ -640,13 +640,13 @@ def test_lines_on_standard_input_are_taken_and_silence_is_held(tmp_path: Path) -
 
 
 def test_a_closed_standard_input_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "stdin", None)  # as Python finds it closed
+    monkeypatch.setattr(sys, "stdin", None)  # as Python sees a closed stream
     with pytest.raises(BridgeError, match="closed standard input"):
         StandardInput()
 
 
 class Endless:
-    """Samples at 1 kHz without an end, with poses and speeds between them; `look` is asked before each batch."""
+    """Endless samples at 1 kHz, with poses and speeds in between; `look` is called before each batch."""
 
     def __init__(self, look: Callable[[int], bool]) -> None:
         self.ends = self.finished = False
@@ -706,7 +706,7 @@ def test_nothing_lives_longer_than_the_time_remembered_but_the_index_of_the_reco
     finally:
         tracemalloc.stop()
     (_, _, _), (objects, size, before), (more, larger, after) = found
-    # of 8,000 samples and 25,000 messages; what is remembered of the last seconds breathes by some hundred
+    # of 8,000 samples and 25,000 messages; the memory of the last seconds varies by some hundred
     assert more - objects < 800 and larger - size < 100_000, found
     # some 140 B a chunk: 2 MB an hour, until the part ends
     assert 0 < after - before < 20_000
@@ -806,12 +806,12 @@ def test_poses_gaps_and_speeds_that_cannot_be_are_not_used() -> None:
     used.clear()
     nan = math.nan
     poses = [(0.01, 0.0, 0.0), (0.04, nan, 0.0), (0.02, 0.06, 0.0), (-0.04, 0.0, 0.0), (nan, 0.001, 0.0)]
-    for at, pose in enumerate(poses):  # of the third y is too large, the fourth changes too fast
+    for at, pose in enumerate(poses):  # y of the third is too large, the fourth changes too fast
         used += [pose] if inputs.uses_pose(second + at * 50_000_000, pose) else []
     assert [pose[0] for pose in used[:2]] == [0.01, 0.04] and used[2][1] == 0.001 and len(used) == 3
     assert inputs.head_pose.counts[Verdict.IMPLAUSIBLE] == 2
     used.clear()
-    # pair 3 is not in the second; its change counts from the first on
+    # the second lacks pair 3, whose change counts from the first
     for at, gaps in enumerate([{1: 0.01, 3: 0.01}, {1: 0.02}, {3: 0.09, 1: 0.02}, {1: 0.11}, {3: 0.05, 1: 0.03}]):
         used += [gaps] if inputs.uses_gaps(second + at * 20_000_000, gaps) else []
     assert used == [{1: 0.01, 3: 0.01}, {1: 0.02}, {3: 0.05, 1: 0.03}]
@@ -927,7 +927,7 @@ def test_utf16_a_folder_that_is_taken_and_a_threshold_in_kilonewtons_are_named(
 
 
 def _troubled_rows(seed: int, count: int) -> Iterator[str]:
-    """Yield rows of a file: mostly a load that goes on, and now and then something that is not as usual."""
+    """Yield rows of a file: mostly a continuing load, and now and then something unusual."""
     rng = np.random.default_rng(seed)
     kinds = ["gap", "late", "twice", "stray", "text", "empty", "wild", "pose", "header", "integer", "triple"]
     stamp = 500.0
@@ -961,7 +961,7 @@ def _troubled_rows(seed: int, count: int) -> Iterator[str]:
 def _recorded(run: Path) -> tuple[list[Any], list[Any]]:
     """Return journal and outputs of a recording, each output with the number of entries before it.
 
-    Without the parts that wall-clock time decides: the status, and the time of notes on unused messages.
+    Without the parts that depend on wall-clock time: the status, and the time of notes on unused messages.
     """
     entries: list[EntryRecord] = []
     outputs = []
@@ -994,7 +994,7 @@ def test_a_file_gives_the_same_journal_outputs_and_counts_in_batches_as_row_by_r
         prepared = Preparation(settings).result(lambda: False)
         front = BridgeFront(Files([path], follow=False), None, settings, prepared, lambda *_: None, pytest.fail)
         if name == "single":
-            front.attach(_Onlooker())  # who looks on sees each sample
+            front.attach(_Onlooker())  # an observer sees each sample
         front.run(lambda: False)
         figures = front.parts()
         counts = {key: figures["input"][2][key] for key in figures["input"][2] if not key.endswith(("_s", "_ms"))}
@@ -1009,7 +1009,7 @@ def test_a_file_gives_the_same_journal_outputs_and_counts_in_batches_as_row_by_r
 
 
 class _Onlooker:
-    """Somebody who looks on and does nothing."""
+    """An observer that does nothing."""
 
     def publication(self, published: Any) -> None: ...
     def part(self, name: str, part: Part) -> None: ...

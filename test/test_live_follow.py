@@ -166,10 +166,10 @@ def test_an_estimate_that_stands_is_taken_over_and_undone_when_it_is_withdrawn(t
     assert known[:, 0] == pytest.approx(truth.clearance, abs=1e-6) and (np.ptp(known, axis=1) < 2e-4).all()
     fine = simulate(truth.scene, 6.0, 1e-3, 1e-6).force
     assert _error(nominal, fine[:3000:10][: len(nominal)]) > (0.3 if how == "parameters" else 0.1)
-    # one twin forgets within some load periods where it was; those that are steered were where the machine is
+    # a single twin forgets its place within some load periods; steered twins were at the machine's place
     first, most, above = (150, 0.2, 1.3) if how == "parameters" else (50, 0.03, 1.1)
     assert _error(live.column("force")[first:], fine[3000::10][first : len(live.column("force"))]) < most
-    # nothing on the way looks like an impact
+    # no change on the way looks like an impact
     assert (live.column("peak").max(axis=0) < above * fine[2900:].max(axis=0) + 2e3).all()
     assert (live.column("followed") == WITH_INTERVALS).all() == (how == "full")
     live.take([_known(truth, State.WITHDRAWN), *_in_turn(truth, 6.0, 6.3)])
@@ -326,9 +326,9 @@ def test_a_snapshot_holds_all_that_a_later_run_needs(truth: Truth) -> None:
     for name in ROW.names or ():
         assert np.array_equal(live.column(name), other.column(name)), name
     assert live.twin.digest() == other.twin.digest()
-    # the motion of then, with the wear of now
+    # the earlier motion with the present wear
     live.take([Restore(_stamp(1.1), snapshot.data), *_in_turn(truth, 0.8, 0.9)])
-    # the next sample is that of its time
+    # the next sample belongs to its time
     assert live.twin.time == pytest.approx(0.88) and np.isfinite(live.column("force")).all()
     assert _again(live.journal, truth.nominal).twin.digest() == live.twin.digest()
 
@@ -356,7 +356,7 @@ def test_live_and_offline_give_the_same_rows(truth: Truth) -> None:
 
 
 def test_twins_that_catch_up_later_give_the_same_bits(truth: Truth) -> None:
-    """Whatever comes between forces and the other twins: poses, late samples, an estimate, a hold, other numbers."""
+    """Any event between the forces and the other twins: poses, late samples, an estimate, a hold, other numbers."""
     entries = [
         *_in_turn(truth, 0.0, 0.6), *_poses(truth, 0.3, 0.35), _known(truth), *_in_turn(truth, 0.6, 0.81),
         *_late(truth, 0.7), *_in_turn(truth, 0.81, 0.9), PartOfPose(_stamp(0.7), (0, 2), (0.001, 0.0)),
@@ -478,7 +478,7 @@ def test_waiting_poses_are_bounded_dropped_ones_counted_and_no_estimate_is_dropp
     live.take([Pose(_stamp(t), (0.0, 0.0, 0.0)) for t in (3601.0, 7200.0)])
     assert live.session.poses_dropped == 2
     before, more = live.twin.added, 10_050
-    # the load is silent, and a late sample would need all of these again
+    # the load is silent, and a late sample would need all of these poses again
     live.take([Pose(_stamp(0.51) + 100_000 * index, (0.0, 0.0, 0.0)) for index in range(more)])
     assert live.session.poses_dropped == 2 + before + more - 10_000
     assert live.twin.poses_dropped == more - 10_000
@@ -575,7 +575,7 @@ def _seconds(message: JointState) -> float:
 
 
 class Front:
-    """Where a runtime's messages go: they are kept."""
+    """Receives and keeps a runtime's messages."""
 
     name, follows_samples, sends_motion = "/plow_twin", False, True
     topics = {topic.name: f"/{topic.name}" for topic in TOPICS}  # noqa: RUF012

@@ -1,4 +1,4 @@
-"""OPC UA in: a real server in a process of its own, its losses, breaks and history, and trust."""
+"""OPC UA inputs: a real server in its own process, with losses, breaks, history and certificates."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Plant:
         self.mend()
 
     def do(self, name: str, *arguments: Any, **how: Any) -> None:
-        """Give the server a command, and wait until it is carried out."""
+        """Send the server a command, and wait until it is carried out."""
         assert self._process.stdin is not None and self._process.stdout is not None
         self._process.stdin.write(json.dumps([name, arguments, how]) + "\n")
         self._process.stdin.flush()
@@ -166,13 +166,13 @@ def test_values_of_a_stamp_are_a_sample_and_unchanged_fields_stay() -> None:
     samples.add("a", 10, 1.0, 0.0)
     samples.add("b", 10, 2.0, 0.1)
     samples.add("a", 20, 3.0, 0.2)
-    assert samples.take(0.3) == [(10, {"a": 1.0, "b": 2.0})]  # b may come yet
+    assert samples.take(0.3) == [(10, {"a": 1.0, "b": 2.0})]  # b may still come
     samples.add("b", 30, 4.0, 0.4)
     samples.add("a", 30, 5.0, 0.4)
     assert samples.take(0.5) == [(20, {"a": 3.0, "b": 2.0}), (30, {"a": 5.0, "b": 4.0})]
     samples.add("b", 40, NOT_MEASURED, 0.6)
     assert samples.take(0.7) == [] and samples.take(1.7) == [(40, {"a": 5.0, "b": NOT_MEASURED})]
-    samples.add("a", 35, 6.0, 2.0)  # late: the value of b at that time is not known any more
+    samples.add("a", 35, 6.0, 2.0)  # late: the value of b at that time is no longer known
     samples.add("b", 25, 7.0, 2.0)
     samples.add("a", 25, 8.0, 2.0)
     assert samples.take(2.1) == [(25, {"a": 8.0, "b": 7.0})]
@@ -244,7 +244,7 @@ def test_the_server_s_grants_are_compared_with_the_requests() -> None:
 def test_a_minute_without_a_connection_is_filled_and_ends_in_the_digest_of_the_uninterrupted_run(
     server: Plant, tmp_path: Path
 ) -> None:
-    """The model goes on by the hold policy meanwhile, and back to where the samples had ended."""
+    """Meanwhile the model follows the hold policy, then goes back to the end of the samples."""
     (tmp_path / "map.yaml").write_text(MAP)
     run, step_ns = tmp_path / "run", 10 * MS
     start_ns = time.time_ns() // MS * MS - 63_000 * MS
@@ -303,7 +303,7 @@ def test_a_history_that_lies_is_not_believed(kind: str, roles: Any) -> None:
             plant.do("rows", _rows(start_ns, 0, 5))
             _until(bridge, lambda found: start_ns + 4 * MS in _stamps(found))
             plant.do("lie", kind)
-            plant.do("number", -1)  # a number twice loses nothing
+            plant.do("number", -1)  # a repeated number loses nothing
             plant.do("rows", _rows(start_ns, 5, 6))
             _until(bridge, lambda found: start_ns + 5 * MS in _stamps(found))
             assert bridge.part()[2]["notifications_lost"] == "0"

@@ -55,7 +55,7 @@ def _hash(password: str) -> str:
 
 @pytest.fixture
 def broker(tmp_path: Path) -> Iterator[Access]:
-    """A broker with TLS and one user, whose messages it keeps while he is away."""
+    """A broker with TLS and one user, for whom it keeps messages during absence."""
     certificate, key = tmp_path / "broker.pem", tmp_path / "broker.key"
     subprocess.run(
         ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-days", "2",
@@ -174,7 +174,7 @@ def test_a_broker_keeps_messages_for_an_absent_twin_and_garbage_is_counted(broke
     sender.send(50)
     with _live(*arguments) as live:
         values = live.until_count("samples_used", 50)
-        # the broker keeps the empty message too that takes back the retained one
+        # the broker also keeps the empty message that removes the retained one
         assert (values["samples_lost"], values["dropped_malformed"]) == ("0", "1")
         assert live.stop() == 3
     sender.close()
@@ -192,7 +192,7 @@ def test_a_misspelt_topic_of_a_broker_is_no_success(
     arguments = ["live", broker.url, "--map", str(mapping), "--scene", "paper", "--seconds", "1", "--quiet"]
     assert run_cli([*arguments, *access]) == 3
     assert "no sample came on plough/mistaken" in capsys.readouterr().err
-    gc.collect()  # here, where the warning about the socket is ignored
+    gc.collect()  # here, because the warning about the socket is ignored here
 
 
 # paho drops the socket of a handshake that failed, and leaves closing it to the collector

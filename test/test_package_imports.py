@@ -1,4 +1,4 @@
-"""The subpackages: who may import whom, and which library is let in where."""
+"""The subpackages: permitted imports between them, and permitted libraries."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PACKAGE = Path(__file__).resolve().parent.parent / "plow_twin"
 
 SOLVER = {"errors", "kernel", "model", "solve"}
 CORE = SOLVER | {"run"}
-#: For each subpackage, those it may import.
+#: For each subpackage, the subpackages that it may import.
 SUBPACKAGES = {
     "errors": set(),
     "build": set(),
@@ -169,13 +169,13 @@ def test_no_module_imports_itself_by_a_detour() -> None:
 
 
 def test_the_cache_stamp_and_the_build_fingerprint_cover_every_kernel() -> None:
-    """A kernel outside would be read from the cache after a change, and replayed as the same build."""
+    """After a change, a kernel outside would be loaded from the cache, and a replay would count as the same build."""
     compiled = [path for path in _modules() if "plow_twin.kernel.compiler.kernel" in _imported_names(path)]
     assert len(compiled) > 10
     subpackages = {path.relative_to(PACKAGE).parts[0] for path in compiled}
     assert subpackages <= {*KERNEL_FOLDERS} and {*KERNEL_FOLDERS} <= {*NUMERIC_SUBPACKAGES}
     assert all((PACKAGE / subpackage).is_dir() for subpackage in (*KERNEL_FOLDERS, *NUMERIC_SUBPACKAGES))
-    # one file only uses numba's own decorator: it calls no kernel of another, so numba sees its changes
+    # only one file uses numba's own decorator: it calls no kernel of another file, so numba sees its changes
     direct = {path.relative_to(PACKAGE).as_posix() for path in _modules() if "numba" in {*_imports(path)}}
     assert {name for name in direct if not name.startswith("kernel/")} == {"build.py", "record/template.py"}
     modules = {_module_name(path) for path in compiled}
@@ -219,7 +219,7 @@ def _imported_names(path: Path) -> set[str]:
                 "plow_twin.dashboard",
             },
         ),
-        # the server of the screen is a process of its own, beside the twin: it needs no numbers
+        # the server of the screen, a process beside the twin, needs no numeric library
         ("import numpy, plow_twin.dashboard.server", {"numba", "scipy", "plow_twin.model.scene", "plow_twin.live"}),
         ("import plow_twin.ros.node", {*SCIPY, "mcap", "rosbags", "rerun"}),
         (

@@ -1,4 +1,4 @@
-"""Own files: separator, time, columns and units are guessed, or the option that states them is named."""
+"""Users' files: separator, time, columns and units are guessed, or the option that states them is named."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def _in_terminal(folder: Path, *said: bytes) -> tuple[int, str]:
     screen, answers, seen = b"", list(said), 0
     with suppress(OSError):  # the other side is gone
         while True:
-            # readline does not see a signal that comes just before it waits; one presses the key again then
+            # readline misses a signal just before it waits, so the key is pressed again
             while said[-1] == CTRL_C and not answers and not select.select([near], [], [], 5.0)[0]:
                 os.write(near, CTRL_C)
             found = os.read(near, 4096)

@@ -203,11 +203,11 @@ def test_a_damaged_byte_costs_one_chunk_and_is_reported(run: Run, tmp_path: Path
         assert (reader.damaged_chunks, reader.status) == (1, FileStatus.DAMAGED)
         rest = iter(whole)
         assert 0 < len(records) < len(whole)
-        assert all(record in rest for record in records)  # in order, without invented entries
+        assert all(record in rest for record in records)  # in order, and without further entries
 
 
 def write_large(source: Path, target: Path, images: int, image_size: int, attachments: int) -> None:
-    """Copy a recording with somebody's camera and large attachments in it; their bytes are holes in the file."""
+    """Copy a recording, adding a camera's messages and large attachments, whose bytes are holes in the file."""
 
     def text(value: str) -> bytes:
         return struct.pack("<I", len(value)) + value.encode()
@@ -263,7 +263,7 @@ def test_ten_gigabytes_take_the_memory_of_some_chunks(run: Run, tmp_path: Path) 
 
 
 def test_a_file_that_another_program_rewrote_is_a_run(run: Run, tmp_path: Path) -> None:
-    """Its header is behind the chunks; without an index at the end it is found all the same."""
+    """Its header is behind the chunks, and is found even without an index at the end."""
     file = rewrite(run.file, tmp_path / "anew.mcap", metadata_last=True)
     report = replay(file)
     assert (report.exit_code, report.messages_compared) == (0, replay(run.file).messages_compared)

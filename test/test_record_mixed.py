@@ -1,4 +1,4 @@
-"""Whatever comes, in whatever order: a replay of the recording gives each message and each alarm of the live run."""
+"""With any input in any order, a replay of the recording gives each message and each alarm of the live run."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ NAMES = {topic.name: f"/{topic.name}" for topic in TOPICS}
 
 
 class Front:
-    """Where the messages go: they are kept."""
+    """Receives and keeps the messages."""
 
     name, topics, follows_samples, sends_motion = "/plow_twin", NAMES, True, True
 
@@ -239,7 +239,7 @@ def test_a_speed_before_the_first_sample_acts_from_there_on_however_often_it_is_
 
 
 def _drive(live: Mixed, random: Random, calls: int) -> None:
-    """Call a live twin with whatever there is, in any mix."""
+    """Call a live twin with any mix of inputs."""
     index, skipped, fails = 0, [], random.random() < 0.4
     span_ms = round(1000 * live.settings.rollback_span)
     kinds = {

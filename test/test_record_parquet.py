@@ -1,4 +1,4 @@
-"""Parquet in wherever CSV goes in: the same numbers, instants of any zone, and files that stand for too much."""
+"""Parquet instead of CSV: the same numbers, instants of any zone, and files that are too large unpacked."""
 
 from __future__ import annotations
 

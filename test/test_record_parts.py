@@ -40,7 +40,7 @@ from plow_twin.stream.session import Session
 from plow_twin.study.analysis.analyse import analyse
 
 COUNT = 3000
-#: What makes several parts of such a run.
+#: Options that split such a run into several parts.
 SMALL: dict[str, Any] = {"part_bytes": 200_000, "flush_period_s": 0.01, "chunk_size": 50_000}
 
 

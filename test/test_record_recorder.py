@@ -95,7 +95,7 @@ def joint_state(index: int) -> JointState:
     return JointState(BASE_NS + index * STEP_NS, "slide_frame", PAIR_NAMES, values, values, values)
 
 
-#: Forks a writer for each line `folder flush_period` that it reads, says its number, and when it has ended.
+#: Forks a writer for each line `folder flush_period` that it reads; prints its number, and its end.
 FORKS = """
     import json, os, sys
     import plow_twin.record.writer, mcap.writer, rosbags.typesys, lz4.frame, zstandard
@@ -149,8 +149,8 @@ def check_killed(folder: Path, lines: list[str], flush_s: float) -> None:
     messages = [r.message() for r in records if isinstance(r, OutputRecord)]
     assert [m.stamp_ns for m in messages] == [BASE_NS + index * STEP_NS for index in range(len(messages))]
     assert len(messages) <= len(stamps) <= last_index + 2
-    # What came in up to one flush period before the kill is there, and messages up to one more: a journal's chunk is
-    # written before theirs. The slack is the machine's, not the recorder's.
+    # Entries up to one flush period before the kill are there, and messages up to two: the journal's chunk is written
+    # first. The allowance is for the machine, not for the recorder.
     first_ns = int(lines[0].split()[1])
     for kind, periods in ((EntryRecord, 1), (OutputRecord, 2)):
         newest_ns = max((r.log_time_ns for r in records if isinstance(r, kind)), default=first_ns)
@@ -226,7 +226,7 @@ def test_a_full_disk_stops_the_recording_and_nothing_else(tmp_path: Path) -> Non
     reader = RunReader(tmp_path / "run")
     entries = [record for record in reader if isinstance(record, EntryRecord)]
     assert reader.status is FileStatus.TRUNCATED and len(entries) > 100
-    # every item is there or counted; an item on its way when the disk filled up may be both
+    # every item is there or counted; an item under way when the disk filled up may be both
     assert len(entries) + report["lost"][JOURNAL] >= 3000
 
 
@@ -360,7 +360,7 @@ def test_a_ring_keeps_the_last_seconds_and_writes_them_at_a_mark(
         report = replay(path)
         assert (report.exit_code, report.divergences) == (0, 0) and report.messages_compared
         assert 0.02 < report.span_s < 0.7 * index * 1e-3  # a busy machine gives few samples in the 0.4 s
-    # items between the two are in one of them or in neither
+    # items between the two are in one of the recordings or in neither
     stamps = [
         {int(stamp) for batch in RunReader(path).batches() for stamp in batch.entries.stamp_ns[batch.entries.sample]}
         for path in written
@@ -510,7 +510,7 @@ def test_with_sync_flushed_data_survive_a_loss_of_power(tmp_path: Path) -> None:
                 before = index if flushes == 3 else before  # waited for by the flush after this one at the latest
             if flushes == 5:
                 process.kill()
-    # a loss of power may leave no more than that
+    # a loss of power may leave only that
     assert {str(folder), str(tmp_path)} <= {path for path, _ in synced}
     os.truncate(file, max(size for path, size in synced if path == str(file)))
     reader = RunReader(folder)

@@ -1,4 +1,4 @@
-"""Replay computes: the same run gives the same bits, and whatever was changed in a recording is found where it is."""
+"""Replay computes: the same run gives the same bits, and any change of a recording is found at its place."""
 
 from __future__ import annotations
 

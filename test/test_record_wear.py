@@ -1,4 +1,4 @@
-"""The wear of the pads on disk: whole or not at all, of one head and one scene."""
+"""The wear of the pads on disk: complete or not at all, of one head and one scene."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def test_a_disk_that_takes_nothing_leaves_the_old_file(tmp_path: Path, monkeypat
 
 
 def test_a_file_that_came_while_the_twin_ran_is_left_as_it_is(tmp_path: Path) -> None:
-    # as a volume that is mounted late: another folder is there of a sudden, with the wear of before
+    # as by a volume that is mounted late: suddenly another folder is there, with earlier wear
     folder, volume = tmp_path / "wear", tmp_path / "volume"
     volume.mkdir()
     path = _save(volume)
@@ -121,7 +121,7 @@ def test_a_file_that_came_while_the_twin_ran_is_left_as_it_is(tmp_path: Path) ->
     assert _loaded(folder, "head 7", SCENE) == DEPTH
     with pytest.raises(WearStateError, match="another twin keeps its wear there"):
         WearKeeper(folder, "head 7", SCENE)
-    # the one of before is back; then it is written to by somebody, then removed
+    # the former folder is back; then another program writes to it, then it is removed
     folder.rename(volume)
     (tmp_path / "beneath").rename(folder)
     assert _saved(keeper, WORN) == "" and _loaded(folder, "head 7", SCENE) == tuple(WORN)
@@ -163,7 +163,7 @@ def test_wear_that_could_not_be_saved_goes_on_unless_the_file_is_another_one(
 
         def fail(descriptor: int) -> None:
             calls.append(descriptor)
-            if len(calls) == 1 + waited:  # of the file, or of the folder, when the new file is there already
+            if len(calls) == 1 + waited:  # error of the file, or of the folder when the new file is already there
                 raise OSError(28, "No space left on device")
 
         full.setattr(os, "fsync", fail)

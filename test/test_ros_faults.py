@@ -1,4 +1,4 @@
-"""Faults with real processes: whatever happens, every sample sent is accounted for, and the twin goes on."""
+"""Faults with real processes: every sample sent is accounted for, and the twin goes on."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def _accounted(figures: dict[str, str]) -> int:
 
 
 def _until_accounted(running: Bench, sent: int) -> dict[str, str]:
-    """Wait until all samples sent are accounted for; a loss at the very end shows with a sample after it."""
+    """Wait until all samples sent are accounted for; a loss at the very end shows by a later sample."""
     figures: dict[str, str] = {}
 
     def reached() -> bool:
@@ -126,8 +126,8 @@ def test_outputs_come_in_time_while_samples_come_ten_times_as_fast(tmp_path: Pat
     with bench(tmp_path, **settings, **RELIABLE_INPUT) as running:
         publisher = running.publisher("--rate", "10000", "--seconds", "5")
         _until_accounted(running, _sent(publisher))
-        # an executor that looked at its timers only when nothing waited sent 23 of the 500 that were due; a loop that
-        # does so still finds the queue empty now and then at this rate: test_ros_runtime keeps it full
+        # an executor that checked its timers only when nothing waited sent 23 of 500 due messages; at this rate such a
+        # loop sometimes finds an empty queue, so test_ros_runtime keeps the queue full
         figures = running.probe.figures("output")
         assert int(figures["published"]) - int(figures["held"]) > 60
 
@@ -161,7 +161,7 @@ def test_a_disk_that_takes_no_more_stops_the_recording_and_not_the_twin(tmp_path
         # as good as a full disk: a write beyond that size fails
         resource.prlimit(running.twin._process.pid, resource.RLIMIT_FSIZE, (200_000, 200_000))
         publisher = running.publisher("--rate", "1000", "--seconds", "120")
-        # losses of a busy machine are trouble too, and may be reported before
+        # losses of a busy machine are also trouble, and may be reported earlier
         running.probe.until(lambda: running.probe.figures("recorder")["error"], "the full disk")
         running.probe.until(lambda: value(running.probe.status[-1], "recorder") == "trouble", "the full disk in status")
         assert running.probe.status[-1].level == b"\x02"
@@ -522,7 +522,7 @@ def test_two_twins_in_one_process_do_not_disturb_each_other() -> None:
 
 def test_two_minutes_with_the_recorder_account_for_every_message_and_grow_by_nothing() -> None:
     command = [sys.executable, str(ROOT / "benchmark" / "live_load.py"), "--minutes", "2", "--rate", "500"]
-    environment = os.environ | {"ROS_DOMAIN_ID": "97"}  # reports of other nodes are not its
+    environment = os.environ | {"ROS_DOMAIN_ID": "97"}  # other nodes report too
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=400.0)
     rows = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]

@@ -57,7 +57,7 @@ def waiting(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
 
 @pytest.fixture
 def managed(waiting: Bench) -> Iterator[Bench]:
-    """The same node, unconfigured and with the parameters of a start; left so again."""
+    """The same node, unconfigured and with its initial parameters, before and after."""
     for name, given in (("scene", "paper"), ("record_path", ""), ("wear_state_path", "")):
         assert _set(waiting, name, given).successful
     yield waiting
@@ -214,7 +214,7 @@ def test_a_parameter_file_with_integers_for_doubles_and_a_typing_error(tmp_path:
         found = running.probe.call(GetParameters, service, request).values
         assert [item.type for item in found] == [ParameterType.PARAMETER_DOUBLE] * 2
         assert [item.double_value for item in found] == [2.0, 1e-8]
-        # all its parameters, given back to it while active, are accepted without a change
+        # all its own parameters, set again while active, are accepted without a change
         assert _set(running, "tolerance", 1e-8).successful and _set(running, "scene", "paper").successful
         assert not _set(running, "tolerance", 1e-7).successful
         assert "unknown parameter hold_polcy: 'zero' is not used; did you mean hold_policy?" in running.twin.output()

@@ -183,7 +183,7 @@ def test_an_overrun_of_the_queue_is_counted_as_loss_and_reported(tmp_path: Path)
         sent, figures = 1000, probe.figures("input")
 
         def accounted() -> bool:
-            """Send one more, which reveals the missing ones before it; a busy middleware may have kept none."""
+            """Send one more message, which reveals missing ones before it; a busy middleware may keep no message."""
             nonlocal sent
             send(T0 + sent * MS, (1.0, 2.0, 3.0))
             sent += 1
@@ -216,7 +216,7 @@ def test_one_publisher_is_followed_and_a_second_reported_until_a_switch(tmp_path
         probe.until(lambda: len(forces) == 41, "an answer to the second")
         assert stamp_ns(forces[-1].header) == T0 + 41 * MS
         running.twin.stop()
-    # the file has the sender of each message
+    # the file names the sender of each message
     unused = list(unused_messages(tmp_path / "run"))
     assert {found["reason"] for found in unused} == {"not_followed"} and len(unused) == 41
     told = [(found["stamp_ns"], found["values"][0]) for found in unused]
@@ -329,7 +329,8 @@ def test_an_alarm_stays_until_it_is_acknowledged_and_writes_the_time_before_it(t
     assert (before.exit_code, after.exit_code) == (0, 0)
     # at the alarm and not at the end; the time after it is in the second one
     assert 0 < before.samples < 600 and before.samples + after.samples == 601
-    # the first one, with the beginning, raises the alarm again; the cause of the second one's is not in it
+    # the first ring, from the beginning, raises the alarm again; the second ring does not contain the cause of its
+    # alarm
     assert (before.compared["alarms"], after.compared["alarms"]) == (1, 0) and after.not_compared["alarms"] > 0
     kinds = [type(record.entry).__name__ for record in RunReader(tmp_path / "run_2") if hasattr(record, "entry")]
     # the acknowledgement, the text of the mark, and the mark
@@ -359,10 +360,10 @@ def test_a_delay_that_rises_for_good_is_worked_in_marked_and_replayed_exactly(tm
         for index in range(300):
             send(T0 + index * MS, wrench[index])
             probe.pace(index)
-        # far enough ahead of the next sample that it is late, however soon it is sent
+        # so far ahead that the next sample is late even if sent at once
         probe.until(lambda: quality and stamp_ns(quality[-1].header) > T0 + 350 * MS, "advances without a sample")
         assert tuple(quality[0].name) == ("held", "corrected")
-        for index in range(300, 600):  # as late as that from now on
+        for index in range(300, 600):  # from now on late by that much
             send(T0 + index * MS, wrench[index])
             probe.pace(index)
         probe.until(lambda: forces and stamp_ns(forces[-1].header) > T0 + 700 * MS, "silence again")
@@ -503,7 +504,7 @@ def test_an_absurd_load_gives_an_error_status_and_no_message(tmp_path: Path) -> 
         send(T0 + 5 * MS, (0.0, 0.0, 0.0))
         probe.until(lambda: len(forces) == 2, "recovery")
         probe.until(lambda: probe.status[-1].level == b"\x00", "status OK")
-        # once more, the straight line out of it too, and a good one at once: the next report says so all the same
+        # once more, with the line out of it, followed at once by a good sample: the next report still says so
         send(T0 + 6 * MS, (1e200, 1e200, 1e200))
         for index in (7, 8):
             send(T0 + index * MS, (0.0, 0.0, 0.0))
@@ -539,7 +540,7 @@ def test_a_stop_under_load_is_clean_and_closes_the_recording(tmp_path: Path, num
 
 
 def test_a_twin_ends_cleanly_when_its_launch_has_gone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # `launch` at SIGTERM ends at once and hands nothing on; it is no part of the tests: what the file asks it for is
+    # `launch` ends at once at SIGTERM without passing it on; the tests check only what the launch file requests
     asked = {name: MagicMock() for name in ("launch", "launch_ros")}
     for package, names in (("launch", "actions conditions substitutions"), ("launch_ros", "actions substitutions")):
         for name in ("", *names.split(), *(("parameter_descriptions",) if package == "launch_ros" else ())):
@@ -611,7 +612,7 @@ def test_silence_is_held_and_reported(tmp_path: Path) -> None:
         assert states == ["waiting", "running", "stale", "running", "stale"]
         assert [status.level for status in probe.status[-3:]] == [b"\x01", b"\x00", b"\x01"]
         assert value(probe.status[-1], "stale_inputs") == "excitation"
-        # the stamps go on with the clock, the newest sample does not
+        # the stamps follow the clock, the newest sample does not
         probe.until(lambda: stamp_ns(forces[-1].header) > T0 + 9_200 * MS, "held frames")
         sent_ns = T0 + 9_000 * MS
         assert float(probe.figures("input")["newest_sample_age_s"]) <= (time.time_ns() - sent_ns) * 1e-9
@@ -737,7 +738,7 @@ def test_tool_forces_drive_the_model_like_their_sum(tmp_path: Path) -> None:
         heads = probe.listen(Odometry, "head_state")
         publisher = probe.publisher(JointState, "tool_forces")
         for index, share in enumerate(scale):
-            # any order of the names will do
+            # any order of the names is accepted
             names = sorted(amplitudes, reverse=bool(index % 2))
             message = JointState(name=names, effort=[amplitudes[name] * share for name in names])
             message.header.stamp.sec, message.header.stamp.nanosec = divmod(T0 + index * MS, 1_000_000_000)

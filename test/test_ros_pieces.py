@@ -1,4 +1,4 @@
-"""Files and topics beside the node: markers, layouts, groups of diagnostics, rights."""
+"""Files and topics beside the node: markers, layouts, groups of diagnostics, access rights."""
 
 from __future__ import annotations
 

@@ -166,7 +166,7 @@ def test_who_cannot_connect_is_named_though_its_topics_are_discovered_before_it(
         monkeypatch.setattr(node, "get_publishers_info_by_topic", discovered)
         connections = Connections(node)
         assert [connections.publishers(taken) for _ in range(3)] == [([], 0), ([], 1), ([], 0)]
-        identity = [2]  # one whose name never comes is said all the same
+        identity = [2]  # a publisher whose name never arrives is reported all the same
         assert [connections.publishers(taken) for _ in range(2)] == [([], 0), ([], 1)]
     said = [line for line in capfd.readouterr().err.splitlines() if "nothing is received" in line]
     assert ["publisher sender: type" in line for line in said] == [True, False]
@@ -308,7 +308,7 @@ def test_under_a_flood_of_samples_due_work_is_done_and_others_have_their_turn() 
 
 
 def test_a_queue_that_fills_while_it_is_emptied_is_emptied_to_its_end() -> None:
-    # as many are asked for as have been signalled: those that a turn leaves over must not be forgotten for newer ones
+    # as many messages are requested as were signalled: the rest of a turn must not be forgotten for newer ones
     with _node() as node:
         heard: list[int] = []
         subscription = node.create_subscription(TwistStamped, "burst", lambda _: None, sensor_input(1000), raw=True)
@@ -364,7 +364,7 @@ def test_messages_from_before_the_subscription_are_no_loss_whenever_their_publis
     period_ns = 5_000_000
 
     def hear(node: TwinNode, sender: bytes, after_s: float, *numbers: int) -> int:
-        """Have samples come, the first of them so long after the subscription; return the loss."""
+        """Send samples, the first so long after the subscription; return the loss."""
         assert node._front is not None and node.runtime is not None
         subscriptions = node._front.subscriptions
         begun_ns = subscriptions._since_ns + round(after_s * 1e9) - numbers[0] * period_ns
@@ -392,7 +392,7 @@ def test_the_middleware_is_asked_for_no_events() -> None:
         topics = [*node.publishers, *node.subscriptions, *node._front.subscriptions._taken_from.values()]  # type: ignore[union-attr]
         names = {topic.topic_name.rpartition("/")[2] for topic in topics}
         assert {"contact_forces", "excitation", "estimate", "status", "parameter_events"} <= names
-        # taking one while another arises stops rmw_fastrtps for good
+        # taking an event while another arises blocks rmw_fastrtps for good
         assert [topic.topic_name for topic in topics if topic.event_handlers] == []
 
 

@@ -112,7 +112,7 @@ def test_one_sample_a_call_a_pause_and_a_restored_snapshot_change_no_bit() -> No
 
 
 def test_members_may_lack_terms_that_others_have() -> None:
-    """Friction and wear of one member are zero for the other."""
+    """One member has friction and wear, which are zero in the other."""
     plain = preset("bench_kv")
     scenes = [plain, dataclasses.replace(plain, friction=Friction(0.2, 0.02), wear=Wear(1e-9, 0.015, 2.0))]
     wrench = samples(1)[0]

@@ -96,7 +96,7 @@ def test_the_derivatives_by_parameters_are_finite_differences_of_the_motion(name
 
 
 def _law(name: str) -> Scene:
-    """The paper's scene, thrown, with a law whose force is not linear, or one that reads the speed of a touch."""
+    """The paper's scene, thrown, with a law whose force is not linear or depends on the speed of a touch."""
     scene = replace(preset("paper"), initial=Initial((0.001, 0.002, 0.003), (0.4, 0.1, 0.8)))
     stiffness = scene.contact.stiffness
     contact = {
@@ -110,7 +110,7 @@ def _law(name: str) -> Scene:
 
 @pytest.mark.parametrize("name", ["restitution", "Hertz with restitution", "square", "cube"])
 def test_the_linearised_equations_agree_with_displaced_motions(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Laws that no difference of two runs covers above; the equations run, they are not replaced by shadows."""
+    """Laws that the differences of runs above do not cover; the equations are used, not shadows."""
     scene, used = _law(name), list[int]()
     paths = tuple(sensitivity_parameters(scene))
     beside = sensitivity.columns_beside
@@ -129,7 +129,7 @@ def test_the_linearised_equations_agree_with_displaced_motions(name: str, monkey
 
 
 def test_derivatives_where_errors_grow_follow_a_motion_that_is_known_better(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Stiff walls multiply errors: the motion at the first tolerance would soon be another one."""
+    """Stiff walls multiply errors: at the first tolerance the motion would soon be a different one."""
     scene = replace(preset("bench_kv"), contact=Contact("kelvin_voigt", 1e9, damping=1e4))
     tolerances, follow = [], sensitivity._by_equations
 
@@ -145,7 +145,7 @@ def test_derivatives_where_errors_grow_follow_a_motion_that_is_known_better(monk
 
 
 def test_products_of_stretches_grow_as_their_matrices_do() -> None:
-    """Growth against numpy's norms, in one call and in portions, with stretches that go on at some ends."""
+    """Growth against numpy's norms, in one call and in portions, with stretches that continue past some ends."""
     random = np.random.default_rng(3)
     matrices = 0.5 * random.normal(size=(300, 4, 4))
     changes, ends = random.normal(size=(300, 2, 4)), random.random(300) < 0.7

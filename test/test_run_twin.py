@@ -149,7 +149,7 @@ def test_a_failed_advance_leaves_no_trace_in_later_ones(depth: float) -> None:
     twins[1].advance(t, idle)
     assert twins[1].advance(t + 0.1, (0.0, -1e6, 0.0)).status is Status.OUT_OF_RANGE
     assert twins[1].advance(t + 0.1, idle).status is Status.OK
-    # to rounding: a step ends where the failure was
+    # up to rounding: a step ends where the failure was
     expected, after = twins[0].advance(t + 0.01, idle), twins[1].advance(t + 0.11, idle)
     assert after.q == pytest.approx(expected.q, abs=1e-13) and after.v == pytest.approx(expected.v, rel=1e-9)
 

@@ -226,7 +226,7 @@ def test_table_from_a_file_stands_in_the_dump(tmp_path: Path) -> None:
 
 
 def test_a_table_is_read_as_any_other_csv_file(tmp_path: Path) -> None:
-    """A mark of the byte order was a part of `t`, and semicolons were no columns."""
+    """A byte order mark was taken for a part of `t`, and semicolons did not separate columns."""
     scene = MINIMAL + "loads: [{name: cut, table: {file: load.csv}}]"
     for text in (
         "time;fx;fy;m\r\n0;1,5;2;3\r\n\r\n0,5;1;-2,25;3\r\n",

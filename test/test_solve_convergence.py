@@ -1,4 +1,4 @@
-"""Convergence orders, measured: with event location the method's own, with a fixed step that of the missed touch."""
+"""Measured convergence orders: the method's with event location, the missed touch's with a fixed step."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def fixed_step_errors(
 ) -> list[float]:
     """Mean error of the pose after one impact, for steps of 80 us halved again and again.
 
-    The touch falls on every phase of the step alike, and so does the separation by a stiffness that varies a little:
-    the mean is smooth in dt where a single run is not.
+    The touch falls on all phases of the step equally, and, by a slightly varied stiffness, so does the separation: the
+    mean is smooth in dt where a single run is not.
     """
     t_end, errors = 0.016, []
     for count in 200 * 2 ** np.arange(halvings + 1):

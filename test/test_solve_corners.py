@@ -51,7 +51,7 @@ def block(**changes: object) -> Scene:
 
 
 def on_table(t: float, z: np.ndarray) -> list[float]:
-    """Return the rate of z = (x, y, theta, vx, vy, omega) of the block, its four corners as they are."""
+    """Return the rate of z = (x, y, theta, vx, vy, omega) of the block, computed from its four corners."""
     _, y, theta, vx, vy, omega = z
     c, s, half = math.cos(theta), math.sin(theta), 0.5 * SIDE
     fx = fy = moment = 0.0
@@ -131,7 +131,7 @@ def mirrored(scene: Scene) -> Scene:
     )
 
 
-#: So heavy to turn that it does not; locked it would have kernels of its own.
+#: With so much inertia that it does not turn; a locked angle would need its own kernels.
 GUIDED = block(
     head=Head(MASS, 1e12, carries="corners"),
     frame=Frame(0.3, 0.2),

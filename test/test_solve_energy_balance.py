@@ -1,4 +1,4 @@
-"""The balance of energy and momentum: they balance where the motion is right, and only there."""
+"""The balance of energy and momentum holds where the motion is right, and only there."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_the_balance_changes_no_bit_of_the_motion_and_costs_nothing_when_off() -
 
 
 def test_a_wrong_motion_does_not_balance() -> None:
-    """The balance looks at forces of its own: a solver that takes another stiffness is found out."""
+    """The balance computes its own forces: a solver with another stiffness is detected."""
     compiled = compile_scene(PAPER, 1e-9)
     motion = Motion.start(compiled, np.zeros((1, 3)), np.zeros((1, 3)), outputs=True)
     motion.sums = new_balance()

@@ -1,4 +1,4 @@
-"""A restitution that falls with the impact: what single impacts return, that none gains energy, and that off is off."""
+"""A restitution that falls with the impact: single impacts, no gain of energy, and no code without it."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ LAW = Contact(
     "exact_restitution", 1e8, restitution=E, restitution_fall=FALL, restitution_speed_m_s=SPEED,
     impact_speed_floor_m_s=0.01,
 )  # fmt: skip
-#: A block that no impact turns. Heavy instead of locked, with a friction that is nothing to speak of and with the
-#: balance of energy, these scenes have the same kernels.
+#: A block that no impact turns. Heavy instead of locked, with negligible friction and with the balance of energy, these
+#: scenes have the same kernels.
 HEAVY = Head(MASS, 1e12, carries="corners")
 SMOOTH = Friction(1e-12, 0.05)
 
@@ -104,7 +104,7 @@ def test_restitution_falls_with_the_speed_along_the_wall(along: float) -> None:
     contact = Contact("exact_restitution", 1e8, restitution=E, restitution_fall_along_s_m=0.2)
     scene = impact(contact, (along, -1.0, 0.0), head=HEAVY, pairs=("bottom_left_bottom",))
     assert returned(scene) == pytest.approx(E - 0.2 * 1.5, abs=2e-5)
-    # what is left cannot be less than nothing
+    # the restitution cannot become negative
     fast = replace(scene, initial=replace(scene.initial, v=(10.0 * along, -1.0, 0.0)))
     assert 0.0 <= returned(fast) < 2e-3
 
@@ -118,7 +118,7 @@ def test_head_with_walls_reads_the_same_restitution() -> None:
     result = simulate(scene, t_end=2.5e-3, output_dt=5e-4)
     by_wall = [float(rate) for rate in result.v[-1, :2]]
     before = (0.5, 0.8)
-    # the lower wall is met first, so the head slides along the left one with what that left it
+    # the lower wall is met first, so the head slides along the left wall with the remaining speed
     for axis, along in ((1, before[0]), (0, by_wall[1])):
         expected = E * (before[axis] / SPEED) ** -FALL - 0.1 * abs(along)
         assert -by_wall[axis] / before[axis] == pytest.approx(expected, abs=2e-5)

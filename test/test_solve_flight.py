@@ -1,4 +1,4 @@
-"""Free flight in closed form: against the formula, against the series, and not a wall passed."""
+"""Free flight in closed form: compared with the formula and the series, without passing a wall."""
 
 from __future__ import annotations
 

@@ -101,14 +101,14 @@ def assert_within_the_gate(scene: Scene, tolerances: tuple[float, ...]) -> None:
     for tol in tolerances:
         result = simulate(scene, 2.0, output_dt=0.01, tol=tol)
         assert result.solver["steps"] <= (15_000 if tol >= 1e-8 else 30_000), tol
-        # where a displacement grows the tolerance has no meaning
+        # where displacements grow, the tolerance has no meaning
         if growth < 1e3:
             assert pose_error(shown, result.q, exact.q) <= 10.0 * tol, (tol, growth)
 
 
 @pytest.mark.parametrize("damping", [1e8, 1e9, 1e10])
 def test_the_tolerance_holds_however_loose_it_is(damping: float) -> None:
-    """The tolerance decides how accurate a step is, not which method takes it."""
+    """The tolerance determines the accuracy of a step, not its method."""
     scene = replace(BENCH, contact=overdamped("kelvin_voigt", damping))
     assert_within_the_gate(scene, (1e-2, 1e-4, 1e-6, 1e-8, 1e-10))
     for other in (THROWN, CLAMPED):
@@ -116,7 +116,7 @@ def test_the_tolerance_holds_however_loose_it_is(damping: float) -> None:
 
 
 def test_growth_while_dampers_hold_the_head_is_reported() -> None:
-    """A rest on two corners 1e-8 m deep amplifies rounding errors, for less time than the rest lasts.
+    """Resting on two corners 1e-8 m deep amplifies rounding errors, but not for the whole rest.
 
     The energy balance has the kernels of `test_implicit_and_explicit_steps_agree` used again.
     """

@@ -1,4 +1,4 @@
-"""Scenes in the lanes of one SIMD vector: bits of their own, and the motion that the loop of a single scene finds."""
+"""Scenes in the lanes of one SIMD vector: bits that depend on the scene alone, and the motion of the single loop."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The contract of a method (`solve.method.protocol`), kept by each of them on the states that it takes and refuses."""
+"""The contract of a method (`solve.method.protocol`), checked for each on states that it takes and refuses."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""A search for scenes that the solver cannot take: a finite answer that obeys the energy balance, or a named status.
+"""A search for scenes that break the solver: it gives a finite answer that obeys the energy balance, or a named status.
 
 The structure of a scene (which parts it has, hence what is compiled) comes from a fixed list, its numbers are drawn
-over decades. H = kinetic + potential + stored elastic energy can only fall, but for the work of loads that change in
-time: the damping of every law takes energy, and so do the clipping of the force and the wear.
+over decades. H = kinetic + potential + stored elastic energy can only fall, except by the work of loads that change in
+time: the damping of every law, the clipping of the force and the wear take energy.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ def cases(draw: Draw, structure: str) -> Case:
         PAIR_NAMES if draw(st.booleans()) else tuple(draw(SOME_PAIRS)),
         Wear(draw(decades(1e-15, 1e-9)), 0.015, 2.0) if "wear" in structure else None,
     )  # fmt: skip
-    # requests: a grid, and steps of nothing and next to nothing among them
+    # requests: a grid, with zero and tiny steps among them
     end = (
         draw(decades(1e-4, 2.0))
         if "harmonic" not in structure
@@ -221,7 +221,7 @@ def check_energy(
     scale = kinetic.max() + elastic.max() + np.ptp(potential) + np.ptp(work)
     # hundreds of steps and impacts spend the tolerance, and amplify
     slack = (1e3 * case.tol + 1e-9) * scale + work_error
-    # and is absolute for speeds below a thousandth of the clearance in a second
+    # and it is absolute for speeds below a thousandth of the clearance in a second
     slack += case.tol * length_scale(case.scene) * np.sqrt(2.0 * case.scene.head.mass_kg * kinetic.max())
     # the tolerance is one of the pose: where the forces push, it is energy
     slack += 100.0 * case.tol * length_scale(case.scene) * peak.sum(axis=1).max()

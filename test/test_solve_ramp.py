@@ -102,7 +102,7 @@ def test_a_clipped_pair_pushes_again_before_it_parts_at_every_tolerance() -> Non
 def test_a_clipped_pair_does_not_push_before_its_time() -> None:
     """Its force is a cubic of a penetration that leaves the ramp far behind, whose series ends late.
 
-    In steps as long as the motion allows it pushed, and pulled, too early: 28 tolerances off.
+    With steps as long as the motion allows, the force acted too early: 28 tolerances off.
     """
     scene = Scene(
         Head(9678.65468622175, 6223.158278044431), Frame(0.5358668741978295, 0.8164604022979493),

@@ -28,12 +28,12 @@ def fallen(law: str = "kelvin_voigt") -> Scene:
 
 
 def fallen_under_a_harmonic(force: float, omega: float) -> Scene:
-    """The same under a harmonic besides its weight; at 23.2 rad/s the head on its three pairs resonates."""
+    """The same under a harmonic and its weight; at 23.2 rad/s the head on its three pairs resonates."""
     return dataclasses.replace(fallen(), loads=(Harmonic("small", (force, 0.3 * force), omega, 0.3, 0.1 * force),))
 
 
 def static_pose(scene: Scene, guess: np.ndarray) -> np.ndarray:
-    """Solve the balance of weight and springs by another way: scipy, forces in head axes."""
+    """Solve the balance of weight and springs in another way: scipy, forces in head axes."""
     mass, g, arm = scene.head.mass_kg, scene.gravity.acceleration_m_s2, scene.gravity.arm_m
     rows, arms, contact = penetration_rows(scene), arm_rows(scene), scene.contact
 
@@ -62,7 +62,7 @@ def test_an_hour_at_rest_costs_next_to_nothing_and_is_in_balance(law: str) -> No
         and result.energy_balance.imbalance_j < 1e-12 * result.energy_balance.turnover_j
     )
     assert np.abs(result.energy_balance.momentum_imbalance).max() < 1e-12 * weight * 3600.0
-    # the pads carry the weight meanwhile: the totals go on
+    # the pads carry the weight meanwhile, so the totals continue
     carried = sum(row["impulse"] for row in result.statistics.values())
     before = sum(row["impulse"] for row in settled.statistics.values())
     assert carried == pytest.approx(before + result.force[-1].sum() * (3600.0 - 120.0), rel=1e-9)
@@ -141,7 +141,7 @@ def test_a_spring_that_nothing_damps_goes_on_ringing() -> None:
 def test_a_harmonic_that_cannot_be_seen_lets_the_head_rest(
     force: float, omega: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The way it moves the head is below a thousandth of the tolerance: proved beforehand, seen with rest left out."""
+    """Its motion of the head is below a thousandth of the tolerance: proved beforehand, and seen without rest."""
     tol, scene = 1e-6, fallen_under_a_harmonic(force, omega)
     rested = simulate(scene, 400.0, 0.317, tol=tol)
     assert rested.solver["steps"] == simulate(scene, 200.0, tol=tol).solver["steps"] + 2

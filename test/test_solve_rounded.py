@@ -1,4 +1,4 @@
-"""Rounded corners: a block that rolls on them, a frame that has them, and that sharp ones know nothing of it."""
+"""Rounded corners: a block that rolls on them, a frame with them, and no effect on sharp corners."""
 
 from __future__ import annotations
 

@@ -86,7 +86,7 @@ class Slider:
         return slip * v if slip else self.static - abs(self.grip * (x - anchor))
 
     def run(self, times: np.ndarray) -> tuple[np.ndarray, list[float]]:
-        """Return x, v at the times, shape (n, 2), and when the block let go or held again."""
+        """Return x, v at the times, shape (n, 2), and the times at which the block slips or sticks."""
         rows, switches = [], []
         t, state, anchor, slip = 0.0, np.zeros(2), 0.0, 0
         while len(rows) < len(times):
@@ -127,7 +127,7 @@ def test_a_block_pulled_back_and_forth_sticks_and_slips_as_in_closed_form() -> N
 def belt(speed: float) -> tuple[Scene, Slider]:
     """A block on a moving belt, seen from the belt: clamped between four corners, held by springs that run away.
 
-    They run as a slow sine does at first; the damping, which has other tests' kernels used again, acts on nothing.
+    They run like a slow sine at first; the damping has no effect, but lets other tests' kernels be used again.
     """
     stiffness, deep, wide, static, kinetic, omega = 1e6, 1e-3, 0.02, 0.5, 0.3, 0.05
     friction = Friction(kinetic, stick_stiffness_n_m=1e7, static_coefficient=static)
@@ -152,7 +152,7 @@ def test_a_block_on_a_moving_belt_sticks_and_slips_for_ever() -> None:
 
 
 def test_a_load_below_the_limit_is_held_without_creep() -> None:
-    """Pressed by up to 0.9 mu N back and forth: the way is the spring's, F / k, and 20 periods leave no creep."""
+    """Pressed by up to 0.9 mu N back and forth: the displacement is F / k, without creep in 20 periods."""
     amplitude, omega = 0.9 * MU * MASS * G, 2.0 * math.pi
     load = Harmonic("pull", (amplitude, 0.0), omega_rad_s=omega)
     scene = replace(block(0.0, 0.0), friction=HELD, loads=(load,))
@@ -198,7 +198,7 @@ def test_whether_a_corner_holds_from_its_touch_on_is_not_decided_by_rounding() -
 
 
 def test_whether_a_clipped_corner_that_pushes_again_holds_is_not_decided_by_rounding() -> None:
-    """Its force begins at zero; with mu_s > mu stick and slip both go on there."""
+    """Its force begins at zero; with mu_s > mu both stick and slip are possible there."""
     friction = Friction(0.2, stick_stiffness_n_m=1e8, static_coefficient=0.28)
     scene = replace(
         preset("bench_kv"), contact=Contact("kelvin_voigt", 2.6e9, damping=1e7), friction=friction,
@@ -211,7 +211,7 @@ def test_whether_a_clipped_corner_that_pushes_again_holds_is_not_decided_by_roun
 
 @pytest.mark.parametrize("damping", [1e5, 1e6])
 def test_a_corner_grips_at_its_touch_as_with_fixed_steps(damping: float) -> None:
-    """Kelvin-Voigt's force is there at once: the damper holds from the touch on, or is too much and drags."""
+    """Kelvin-Voigt's force is there at once: the corner sticks from the touch on, or slips by too large a damper."""
     friction = Friction(0.3, stick_stiffness_n_m=5e7, stick_damping_n_s_m=damping)
     scene = replace(preset("bench_kv"), friction=friction)
     events = simulate(scene, 0.3, output_dt=0.1, energy_balance=True)
@@ -220,7 +220,7 @@ def test_a_corner_grips_at_its_touch_as_with_fixed_steps(damping: float) -> None
 
 
 def test_painleves_case_is_an_impact_without_collision() -> None:
-    """A corner that its own friction presses into the wall: the force grows as cosh, stops the slip, and throws."""
+    """A corner that its own friction presses into the wall: the force grows as cosh and stops the slip."""
     mass, inertia, stiffness, mu = 1.0, 0.002, 1e8, 0.5
     scene = Scene(
         Head(mass, inertia), Frame(0.1, 0.6), Clearance(0.1, 0.1), Contact("kelvin_voigt", stiffness, damping=1e-3),
@@ -331,7 +331,7 @@ def furthest_off(scene: Scene, tolerances: tuple[float, ...]) -> float:
     [("hertz", 8), pytest.param("hertz", 47, marks=pytest.mark.stress), ("hertz", 81), ("exact_restitution", 237)],
 )
 def test_a_force_too_small_to_move_the_head_still_decides_whether_its_corner_holds(law: str, seed: int) -> None:
-    """Steps that follow the motion well enough had let corners go that hold, and moved where they are held."""
+    """Steps that were accurate for the motion released sticking corners, and moved their anchors."""
     assert furthest_off(held_scene(law, seed), (1e-3, 1e-4, 1e-6, 1e-7, 1e-8)) < 10.0
 
 

@@ -1,4 +1,4 @@
-"""Numerical stress: whatever the scene, a finite answer or a named error, in bounded work."""
+"""Numerical stress: any scene gives a finite answer or a named error, in bounded work."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ def test_two_masses_pressed_together_move_as_their_eigenmodes() -> None:
     omega, amplitude = 40.0, 4e3
     scene = pressed(Harmonic("up and down", (0.0, amplitude), omega_rad_s=omega))
     result = simulate(scene, 1.0, output_dt=0.01, tol=1e-10)
-    # y of the head, v of the frame, their rates, weight, sine and cosine of the load; both from where contact begins
+    # y of the head and v of the frame (from where contact begins), their rates, weight, sine and cosine of the load
     k, c, mass = 2.0 * LAW.stiffness, 2.0 * (LAW.damping or 0.0), HEAD.mass_kg
     matrix = np.zeros((7, 7))
     matrix[0, 2] = matrix[1, 3] = 1.0
@@ -123,7 +123,7 @@ def reference(scene: Scene, times: np.ndarray) -> np.ndarray:
 
 
 def test_a_tilted_throw_agrees_with_equations_of_its_own() -> None:
-    """All six places move, corners hit and part; q is the head as seen from the frame, its turned axes included."""
+    """All six places move, corners hit and part; q is the head's pose relative to the frame and its turned axes."""
     load = Harmonic("cut", (4e4, 1.1e4), omega_rad_s=9.0, at_m=(0.1, -0.6))
     scene = replace(pressed(load), initial=Initial((1e-3, 2e-3, 0.01), (0.3, -0.2, 0.5)))
     result = simulate(scene, 0.5, output_dt=0.025, tol=1e-10)

@@ -73,7 +73,7 @@ def worn_by(exposure: float) -> float:
 @pytest.mark.parametrize("damping", [1e3, 1e8], ids=["explicit", "implicit"])
 @pytest.mark.parametrize(("along", "t"), [(0.0, 20.0), (0.4, 1.0)])
 def test_sliding_in_the_plane_and_running_in_under_a_constant_load(damping: float, along: float, t: float) -> None:
-    """A head that slides steadily along the bottom wears its pads by the way of both motions, less as they run in."""
+    """A head that slides steadily along the bottom wears its pads by both motions, less as they run in."""
     weight, stiffness = 2000.0 * 9.81, 1e7
     scene = dataclasses.replace(
         pressed(RUBBED, clearance=0.02, gravity=9.81, stiffness=stiffness),

@@ -1,4 +1,4 @@
-"""A machine that lacks something: the twin works, or names in one line what is missing."""
+"""A machine with a shortage: the twin works, or names the shortage in one line."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def _run(
     within: tuple[str, ...] = (),
     **environment: str | None,
 ) -> tuple[int, list[str]]:
-    """Run a command where something is missing; return its exit code and what it said on standard error."""
+    """Run a command under a shortage; return its exit code and its standard error."""
     given = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "10000", **environment}
     done = subprocess.run(
         [*within, sys.executable, "-m", "plow_twin", *words],
@@ -47,7 +47,7 @@ def _run(
 
 @pytest.fixture(scope="module")
 def compiled(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """Have the compiled code in the cache: the compiler needs more than what a run does."""
+    """Compile into the cache first: the compiler needs more than a run."""
     folder = tmp_path_factory.mktemp("compiled")
     _csv(folder / "load.csv", 100)
     assert _run(folder, *LIVE) == (0, [])
@@ -132,7 +132,7 @@ def test_lacking_resources_are_named(lacking: dict[str, object], code: int, said
     assert len(lines) <= (2 if code == 3 else 1), lines  # with loss: the reason, then what was lost
 
 
-#: A command for each library of an extra that it cannot do without.
+#: A command for each library of an extra that it needs.
 NEEDING: dict[str, tuple[str, ...]] = {
     "mcap": LIVE,
     "paho": ("live", "mqtt://127.0.0.1:9", "--map", "map.yaml", "--scene", "paper"),

@@ -119,7 +119,7 @@ def test_a_late_burst_after_a_long_silence_is_dropped_and_the_model_goes_on() ->
     assert "Reset" not in bench.kinds()
     assert driver.session.twin.digest() == digest
     assert bench.sample(T0 + 3000 * MS, LOAD, now_ns=3000 * MS) is not None
-    # a jump that came twice is no step of the clock, and a duplicate just after a jump is not late
+    # a repeated jump is not a step of the clock, and a duplicate just after a jump is not late
     assert bench.sample(T0 - 60 * NS_PER_S, LOAD, now_ns=3001 * MS) is None
     assert bench.sample(T0 - 60 * NS_PER_S, LOAD, now_ns=3001 * MS) is None
     assert bench.sample(T0 - 60 * NS_PER_S + MS, LOAD, now_ns=3001 * MS) is not None
@@ -253,7 +253,7 @@ def test_wrong_stamps_one_after_another_reset_no_more_than_five_times_and_keep_n
         bench.sample(T0 + index * MS + ahead_ns, LOAD, now_ns=index * MS)
     bench.driver.pause()
     counted = counters(bench.driver)
-    # five in ten seconds may be a step of the clock, each with the way back
+    # five in ten seconds may be steps of the clock, each with its return
     assert counted["resets"] <= 10
     assert counted["samples_used"] >= 1900
     assert counted["samples_used"] + counted["dropped_unsteady"] + counted["dropped_stray"] == 2000
@@ -295,7 +295,7 @@ def test_failures_within_a_batch_end_in_a_reset_and_count_for_nothing() -> None:
 
 
 def _troubled(seed: int, count: int) -> list[tuple[str, list[tuple[int, tuple[float, float, float]]], int]]:
-    """Return calls of a driver: mostly one sample each, and now and then something that is not as usual."""
+    """Return calls of a driver: mostly one sample each, and now and then something unusual."""
     rng = np.random.default_rng(seed)
     calls, stamp, now = [], T0, 0
     kinds = ["late", "twice", "stray", "jump", "nan", "wild", "batch", "travel", "silence", "reset"]

@@ -45,12 +45,12 @@ def test_real_time_factor_is_model_time_over_wall_time() -> None:
 
 def test_periods_left_out_are_counted_and_the_others_described_since_the_last_look() -> None:
     periods = Periods(0.01)
-    for now_s in (1.0, 1.011, 1.02, 1.051, 1.06):  # the one at 1.05 comes after two have been left out
+    for now_s in (1.0, 1.011, 1.02, 1.051, 1.06):  # the turn at 1.05 comes after two missed periods
         periods.turn(now_s)
     mean, deviation, largest = periods.recent()
     passed = np.array([0.011, 0.009, 0.031, 0.009])
     assert (mean, deviation, largest) == pytest.approx((passed.mean(), passed.std(), 0.031))
     assert periods.missed == 2 and np.isnan(periods.recent()).all()
     periods.begin()
-    periods.turn(7.0)  # a time spent inactive is no period
+    periods.turn(7.0)  # time spent inactive is not a period
     assert periods.missed == 2 and np.isnan(periods.recent()).all()

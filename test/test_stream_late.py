@@ -1,4 +1,4 @@
-"""Late, reordered and batched samples are worked in; wear outlives everything but its own service."""
+"""Late, reordered and batched samples are worked in; only its own service sets the wear."""
 
 from __future__ import annotations
 
@@ -195,7 +195,7 @@ def test_speeds_of_another_clock_act_from_the_time_reached_on_and_are_counted_an
         right = live.wear if right is None else right
         assert (live.wear == right).all()
     live = Live()
-    # while no sample comes the speeds wait for it, no more of them than a step of the clock lasts
+    # without a sample the speeds wait, but only those within a step of the clock
     live.send(*(_arrival(index) for index in range(10)))
     for index in range(0, 30_000, 10):
         live.driver.travel(T0 + index * MS, 2.0 + 1e-6 * index)
@@ -227,7 +227,7 @@ def test_clocks_out_of_step_end_in_an_error_and_not_in_resets_for_ever() -> None
     dropped = sum(count for key, count in counted.items() if key.startswith("dropped_"))
     assert counted["samples_used"] + dropped + (live.driver._steps._jumped is not None) == 400
     assert counted["dropped_unsteady"] > 50
-    # once it is steady again, a step is a step
+    # once the stamps are steady again, a step counts as a step
     live.send(_arrival(60_000), _arrival(60_001), now_ns=20_000 * MS)
     assert live.driver.resets == 6 and not live.driver.unsteady(20_000 * MS)
 

@@ -1,4 +1,4 @@
-"""The machine that live node and replay drive: same entries, same bits; no loss between two publications."""
+"""The session behind live node and replay: same entries, same bits; no loss between two publications."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class Run:
         return self
 
 
-#: What is published of a row, beside its stamp.
+#: Published numbers of a row, beside its stamp.
 NUMBERS = ("penetration", "rate", "force", "makes", "impulse", "peak", "q", "v")
 
 
@@ -122,7 +122,7 @@ def test_one_flipped_bit_of_a_sample_shows_in_the_next_digest(reference: Run) ->
         [entry for entry in run.emitted if isinstance(entry, Digest)],
         strict=False,
     )
-    # the ones after may be the same again: damped contact forgets the last bits
+    # later digests may agree again: damped contact forgets the last bits
     same = [(ours.stamp_ns < sample.stamp_ns, ours == theirs) for ours, theirs in pairs]
     before = sum(earlier for earlier, _ in same)
     assert 0 < before < len(same)
@@ -258,7 +258,7 @@ def test_a_speed_at_which_the_damping_lets_no_contact_last_is_refused_by_name() 
     ):
         with pytest.raises(ArgumentError, match=r"got -?4.1, expected at most 4 m/s, .* contact.damping 200000.0 N"):
             refuse()
-    # nor can the damping be raised beside a speed that is to come
+    # nor can the damping be raised while a speed waits
     with pytest.raises(ArgumentError, match=r"speed_m_s: got -3.9, expected at most 3.2 m/s"):
         session.check_model({"contact.damping": 1.25 * damping})
     session.check_model({"contact.damping": damping})

@@ -1,4 +1,4 @@
-"""Other people's recordings through the twin: a sensor's bias and delay, files of every kind, damage."""
+"""Foreign recordings through the twin: a sensor's bias and delay, files of every kind, damage."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_values_of_another_clock_and_impossible_ones_are_counted(tmp_path: Path)
     pose.write_text("t,x,y,theta\n" + "".join(f"{t},{x},{y},{theta}\n" for t, x, y, theta in late))
     found = analyse(tmp_path, scene=PAPER, out=tmp_path / "out")
     assert found.facts()["outside"] == {"x": 10, "y": 11} and found.facts()["signals"]["x"]["n"] == 18
-    assert found.lost == {"measured_implausible": 1, "measured_outside_the_load": 11}  # y, of which no value is inside
+    assert found.lost == {"measured_implausible": 1, "measured_outside_the_load": 11}  # y, without a value inside
     write_report(found, tmp_path / "out")
     assert "outside the time of the load" in (tmp_path / "out" / "report.html").read_text()
     pose.write_text("t,x,y,theta\n" + "".join(f"{t + 1e6},{0},{y},{theta}\n" for t, (_, y, theta) in poses))
@@ -271,7 +271,7 @@ def test_travel_makes_passes_of_the_face(tmp_path: Path) -> None:
     assert facts is not None and loads.pad_wear[0].max() > 0.0 < loads.pad_wear[1].max()
     # the pads' wear in both directions adds up to the model's
     assert loads.pad_wear.sum(axis=0) == pytest.approx(prediction.clearance.series()[1][-1][2:10], rel=0.03)
-    # the slide as a whole wears as pad length to the way gone, and each place by what passed it
+    # the whole slide wears in the ratio of pad length to distance, each place by the pads that passed it
     whole = np.array(list(facts["slide_mean_m"].values())) * facts["slide_pieces"]
     assert whole == pytest.approx(0.3 * loads.pad_wear.sum(axis=0), rel=1e-12)
     assert {backward for backward, _ in loads.slide_wear} == {0, 1}
@@ -283,7 +283,7 @@ def test_travel_makes_passes_of_the_face(tmp_path: Path) -> None:
 @pytest.mark.parametrize("lag_s", [0.0, 0.0203, -0.4])
 @pytest.mark.parametrize(("rate_hz", "times_each"), [(1000, 1), (1000, 2), (200, 1), (37, 1)])
 def test_the_lag_is_found_at_any_rate_of_the_sensor(rate_hz: int, times_each: int, lag_s: float) -> None:
-    """Also of a signal that is slow against the time recorded, and where rows stand twice."""
+    """Also for a signal that is slow compared with the recorded time, and with repeated rows."""
     t = np.arange(0.0, 3.0, 1e-3)
 
     def signal(at: np.ndarray) -> np.ndarray:
@@ -306,7 +306,7 @@ def test_lag_and_correlation_stay_within_their_bounds() -> None:
 
 
 def test_duty_is_a_share_of_time_however_coarsely_the_load_is_sampled(tmp_path: Path) -> None:
-    """The same load, linear between four knots, by its knots alone and by many samples on the lines between them."""
+    """The same load, linear between four knots, given by its knots or by many samples on the lines."""
     knots, count = np.array([0.0, 0.7, 1.5, 2.0]), 2001
     wrench = np.array([[0, 0, 0], [32e3, -11e3, -45e3], [-32e3, 11e3, 45e3], [0, 0, 0]])
     found = {}
@@ -377,7 +377,7 @@ def test_contacts_under_gravity_alone_take_the_energy_of_the_height_lost(rotatio
 
 
 def test_energy_stored_where_a_recording_begins_is_no_gain_of_the_contacts(tmp_path: Path) -> None:
-    """Contacts almost without damping take no energy, for any stored energy at the begin, 66 J, and at the end."""
+    """Contacts almost without damping take no energy, with 66 J stored at the beginning, and any energy at the end."""
     scene = load_scene(PAPER)
     scene = replace(scene, initial=Initial(q=(0.0151, 0.0, 0.0)), contact=replace(scene.contact, damping=1e-9))
     (tmp_path / "scene.yaml").write_text(dump_scene(scene))
@@ -516,7 +516,7 @@ def test_cycles_are_those_of_the_whole_series_for_any_length(monkeypatch: pytest
     for part in np.array_split(forces, 7):
         series.add(reversals(part))
     expected = rainflow.count_cycles(forces, nbins=loads.CYCLE_BINS)
-    for _ in range(2):  # a run that is still written is asked again and again
+    for _ in range(2):  # a run that is still being written is polled
         counted = rainflow.count_cycles(series, binsize=(series.high - series.low) / loads.CYCLE_BINS)
         np.testing.assert_allclose(counted, expected, rtol=1e-12)
 

@@ -174,7 +174,7 @@ def test_columns_that_are_missing_or_there_twice_are_named(tmp_path: Path) -> No
 
 
 def test_a_mapping_without_a_field_or_stamp_is_named(tmp_path: Path) -> None:
-    """A typo of `header` was taken for it; of a field `malformed 300` was all that was said."""
+    """A typo of `header` was taken for `header`; a typo of a field gave only `malformed 300`."""
     schema = STORE.generate_msgdef(TYPE, ros_version=2)[0].encode()
     times = [BASE_NS + i * STEP_NS for i in range(COUNT)]
     messages = [(time_ns, wrench_message(time_ns, paper_sample(i).wrench)) for i, time_ns in enumerate(times)]
@@ -196,7 +196,7 @@ def test_a_mapping_without_a_field_or_stamp_is_named(tmp_path: Path) -> None:
 
 
 def test_the_estimate_reads_csv_as_the_analysis_does(tmp_path: Path) -> None:
-    """A mark of the byte order was an invisible part of `t`, semicolons were no columns and dates no times."""
+    """A byte order mark became an invisible part of `t`, semicolons separated no columns, dates were not times."""
     scene, names = Path(PAPER), ("t", "x", "y", "theta")
     sheet(tmp_path / "load.csv", ",", comma=False, mark=False)
     sheet(tmp_path / "pose.csv", ",", comma=False, mark=False, header=names)
@@ -284,7 +284,7 @@ def bag_of_parts(folder: Path, kind: StoragePlugin) -> list[Path]:
 
 @pytest.mark.parametrize("kind", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
 def test_of_a_bag_with_a_damaged_or_missing_part_the_others_are_used(kind: StoragePlugin, tmp_path: Path) -> None:
-    """And no load is drawn over the hole, however short: a damaged file made all of the bag unreadable."""
+    """No load is interpolated over a gap of any length; a damaged file used to make the whole bag unreadable."""
     parts = bag_of_parts(tmp_path / "bag", kind)
     plain = analyse(tmp_path / "bag", scene=PAPER)
     assert (plain.input["samples_used"], plain.lost, len(plain.predictions[0].spans)) == (COUNT, {}, 1)

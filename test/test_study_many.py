@@ -169,7 +169,7 @@ def test_a_run_is_analysed_while_it_is_recorded(tmp_path: Path) -> None:
     kept: dict[str, Any] = {"flush_period_s": 0.05}
     writer = threading.Thread(target=record_run, args=(tmp_path / "run", entries()), kwargs=kept)
     writer.start()
-    (out := tmp_path / "out").mkdir()  # of an analysis before, of something else
+    (out := tmp_path / "out").mkdir()  # of an earlier analysis of another recording
     for name in ("asked.json", "predicted_1.parquet"):
         (out / name).write_text("{}")
     command = [sys.executable, "-m", "plow_twin", "analyse", str(tmp_path / "run"), "--watch", "0.1", "--json"]
@@ -210,7 +210,7 @@ def test_no_recording_of_a_folder_is_left_out_unsaid(tmp_path: Path, capsys: pyt
     table = parquet.read_table(out / "runs.parquet")
     assert table.column("lost").to_pylist() == [None, 0, None]
     assert table.column("error").to_pylist()[1:] == [None, "left out: no recording"]
-    assert cli(["analyse", str(tmp_path), "--json", "--quiet"]) == 1  # of the one without its parts
+    assert cli(["analyse", str(tmp_path), "--json", "--quiet"]) == 1  # of the recording without its parts
     assert json.loads(capsys.readouterr().out)["left_out"] == [str(tmp_path / "empty")]
     shutil.copytree(tmp_path / "good", inner := tmp_path / "good" / "inner")
     assert left_out(tmp_path) == [tmp_path / "empty", inner]

@@ -1,4 +1,4 @@
-"""The contact model held against impacts and drops that others measured (`benchmark/data/measured`)."""
+"""The contact model compared with impacts and drops that others measured (`benchmark/data/measured`)."""
 
 from __future__ import annotations
 

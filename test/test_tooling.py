@@ -1,4 +1,4 @@
-"""Promises of the checks: examples that are new each time under stress, versions that are really the lowest."""
+"""Promises of the checks: new examples at each stress run, and really the lowest versions."""
 
 from __future__ import annotations
 

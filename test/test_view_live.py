@@ -1,4 +1,4 @@
-"""A run shown while the node records it: processes of their own, which can stop, fall behind and be ended."""
+"""A live view while the node records: separate processes that can stop, fall behind and be ended."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_a_stopped_viewer_does_not_disturb_the_node_and_catches_up_later(tmp_pat
             node.probe.until(lambda: len(forces) >= 4000, "every publication")
             recorder, output = node.probe.figures("recorder"), node.probe.figures("output")
             assert recorder["lost"] in ("", "0", "{}") and recorder["error"] == "" and output["withheld"] == "0"
-            os.kill(shown.pid, signal.SIGCONT)  # it continues alone: its messages are not taken
+            os.kill(shown.pid, signal.SIGCONT)  # it continues alone, and its messages are not read
             assert node.twin.stop() == 0
         assert written.wait(WAIT_S) == 0
         reader = RunReader(run)

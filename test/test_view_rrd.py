@@ -70,7 +70,7 @@ def curve_names(path: Path) -> dict[str, str]:
 
 
 def journal_around_the_hole(folder: Path) -> list[Sample]:
-    """Return the samples before and after the place where entries are not there."""
+    """Return the samples before and after the place of missing entries."""
     samples = [
         (record.sequence, record.entry)
         for record in RunReader(folder)

@@ -57,7 +57,7 @@ class Services:
             return False, "no snapshot has been taken since configure"
         self._runtime.driver.restore(self._runtime.stamp_ns, self._kept)
         self._changed()
-        return True, f"the motion is that at {self._kept.stamp_ns} ns; the next sample is that of its time, wear stays"
+        return True, f"the motion is that at {self._kept.stamp_ns} ns; the next sample belongs to its time, wear stays"
 
     def acknowledge_alarms(self) -> tuple[bool, str]:
         """Release the latched alarms."""

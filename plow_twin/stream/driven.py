@@ -55,9 +55,9 @@ class Driven(Protocol):
 class Following(Driven, Protocol):
     """A twin that follows measurements; its rows have more columns (`followed` in `plow_twin.solve.state.ROW`)."""
 
-    #: poses and estimates that it has taken in
+    #: number of poses and estimates so far
     added: int
-    #: whether a row that is published by itself gets its intervals, and what was measured acts, with `catch_up` only
+    #: whether, after a single published row, intervals and measurements wait for `catch_up`
     defers: bool
 
     def catch_up(self) -> None:
@@ -80,7 +80,7 @@ class Following(Driven, Protocol):
         """Continue with a single twin from the state of the median twin, without corrections by poses."""
 
     def end_spans(self, ends: NDArray[np.int64], begins: bool) -> None:
-        """Say which rows of the next `advance_rows` are published, and whether their span begins with the first."""
+        """State which rows of the next `advance_rows` are published, and whether their span begins with the first."""
 
     def snapshot_size(self, data: bytes) -> int:
         """Return the length of the snapshot at the beginning of some bytes."""

@@ -42,9 +42,9 @@ Arrival = tuple[int, tuple[float, float, float]]
 
 #: Most model time that one call may catch up when the excitation is silent [ns]: the work of a call stays bounded.
 _LARGEST_HOLD_NS: Final = NS_PER_S
-#: Silence is looked for at least this often [ns]: the policy may change.
+#: Longest time between two checks for silence [ns]: the policy may change.
 _LONGEST_QUIET_NS: Final = NS_PER_S // 10
-#: Most resets by jumps of the clock in that time [ns]: two clocks out of step must not reset the model for ever.
+#: Most resets by jumps of the clock within a time [ns]: two clocks out of step must not reset the model for ever.
 _MOST_RESETS: Final = 5
 _RESET_WINDOW_NS: Final = 10 * NS_PER_S
 
@@ -63,10 +63,10 @@ class StreamState(Enum):
 class Policy:
     """Settings that may change at run time.
 
-    After `excitation_timeout_s` without a sample the model advances by the steady clock, that far behind it, so that a
-    sample late by less is still used. `hold` is `hold` (the last load stays) or `zero` (it falls to zero within the
-    first call); after `hold_limit_s` of it the model stands still. After `failure_limit` failed advances in a row the
-    model is reset (`Failures.wants_restart`); 0: never.
+    After `excitation_timeout_s` without a sample the model follows the steady clock at this distance, so that a sample
+    late by less is still used. `hold` is `hold` (the last load stays) or `zero` (it falls to zero within the first
+    call); after `hold_limit_s` the model stands still. After `failure_limit` failed advances in a row the model is
+    reset (`Failures.wants_restart`); 0: never.
     """
 
     excitation_timeout_s: float = 0.5
@@ -85,7 +85,7 @@ class Driver:
     session, intake, policy
         The session to drive, the judge of the samples, and the rules for silence and failures.
     every_sample : bool
-        Publish after each advance; else only `due` publishes.
+        Publish after each advance; otherwise only `due` publishes.
     """
 
     def __init__(self, session: Session, intake: Intake, policy: Policy, *, every_sample: bool = True) -> None:
@@ -99,11 +99,11 @@ class Driver:
         self.failed = Failures(session.emit)
         self.resets = 0
         self.holds = 0
-        #: samples that were late and have been worked in by going back
+        #: late samples that were worked in by going back
         self.rolled_back = 0
         #: speeds along the face that could not act at their stamps
         self.travel_misplaced = 0
-        #: steady times of the latest resets [ns], and of the latest one refused
+        #: steady times of the latest resets, and of the latest refused reset [ns]
         self._resets_ns: deque[int] = deque()
         self._unsteady_ns: int | None = None
         self._steps = Steps(intake)
@@ -123,10 +123,10 @@ class Driver:
         return self._newest_ns
 
     def samples(self, arrived: Iterable[Arrival], now_ns: int) -> Iterator[Published]:
-        """Judge samples in order of arrival, advance to those that are used, and yield the publications.
+        """Judge samples in order of arrival, advance to the accepted ones, and yield the publications.
 
-        The caller publishes it before it asks for more, so that a recording holds publications in order. A sample whose
-        stamp jumps waits for the next one.
+        The caller publishes each before the next is computed, so that a recording holds publications in order. A sample
+        whose stamp jumps waits for the next one.
         """
         run: list[Sample] = []
         for stamp_ns, wrench in arrived:
@@ -146,8 +146,8 @@ class Driver:
     ) -> Iterator[Published | Series]:
         """Use many samples in order of arrival, stamps (n,) [ns] and wrenches (n, 3), as `samples` does.
 
-        Samples that go on from one to the next are applied at once; the caller journals and publishes a `Series` before
-        it asks for more. All others take the way of `samples`, with the same outcome.
+        Samples that continue each other are applied together; the caller journals and publishes a `Series` before the
+        next is computed. All others go through `samples`, with the same outcome.
         """
         run: list[Sample] = []
         goes_on = self.intake.go_on(stamps, wrench)
@@ -186,7 +186,7 @@ class Driver:
         return not (reached_ns is None or self._steps.waits) and self.intake.goes_on(stamp_ns, wrench, reached_ns)
 
     def _goes_on(self, stamp_ns: int, wrench: tuple[float, float, float]) -> bool:
-        """Accept a sample that is plausible at once; False: it has to be judged."""
+        """Accept a sample that is clearly plausible; False: `judge` must decide."""
         found = self._may_go_on(stamp_ns, wrench)
         if found:
             self.intake.accept(stamp_ns, wrench)
@@ -195,9 +195,9 @@ class Driver:
     def _use_samples(
         self, run: list[Sample], stamp_ns: int, wrench: tuple[float, float, float], now_ns: int
     ) -> Iterator[Published]:
-        """Judge a sample, and add it to those that are applied together, `run`, which are applied first where due."""
+        """Judge a sample, and add it to `run`, the samples applied together; where needed `run` is applied first."""
         late = bool(run) and self._is_late(run[0])
-        # a stamp not after the last one's may be late or a jump back: that is seen once the run is applied
+        # a stamp not after the last one may be late or a jump back, which shows once the run is applied
         if run and not late and stamp_ns <= run[-1].stamp_ns:
             yield from self._use(run, now_ns)
             late = False
@@ -246,7 +246,7 @@ class Driver:
         return self._advance(Hold(stamp_ns), now_ns, StreamState.STALE)
 
     def quiet_ns(self, now_ns: int) -> int:
-        """Return the time for which `silence` need not be called, whatever arrives [ns]."""
+        """Return the time [ns] for which `silence` need not be called, whether samples arrive or not."""
         timeout_ns = round(self.policy.excitation_timeout_s * NS_PER_S)
         left_ns = timeout_ns if self._newest_ns is None else self._received_ns + timeout_ns - now_ns
         return max(0, min(left_ns, _LONGEST_QUIET_NS))
@@ -254,7 +254,7 @@ class Driver:
     def clock_tick(self, stamp_ns: int, now_ns: int) -> Published:
         """Advance under the scene's own loads to the time `stamp_ns` of the node's clock, less the time spent inactive.
 
-        The first call after `resume` only finds out how long that was.
+        The first call after `resume` only measures that time.
         """
         reached_ns = self.session.stamp_ns
         if reached_ns is None:
@@ -269,7 +269,7 @@ class Driver:
         if not verdict.used:
             return NOTHING
         if verdict.resets:
-            # the model restarts, on the clock itself
+            # the model restarts at the time of the clock
             stamp_ns += self._behind_ns
             self._behind_ns = 0
             self.clock.restart()
@@ -278,10 +278,10 @@ class Driver:
         return self._advance(Hold(stamp_ns), now_ns, StreamState.RUNNING)
 
     def travel(self, stamp_ns: int, speed_m_s: float) -> None:
-        """Take over the speed along the face [m/s]; its sign is a direction, which wears alike.
+        """Take over the speed along the face [m/s]; its sign is the direction, wear takes the magnitude.
 
-        A speed whose stamp is further ahead than `jump_forward_s`, or older than every state that is kept, has the
-        stamp of another clock: it acts from the time reached on, and is counted.
+        A speed whose stamp is further ahead than `jump_forward_s`, or older than every kept state, has the stamp of
+        another clock: it acts from the time reached on, and is counted.
         """
         reached_ns, oldest_ns = self.session.stamp_ns, self.session.history.oldest_ns
         if reached_ns is not None:
@@ -297,7 +297,7 @@ class Driver:
         self.session.apply(Parameter(name, value))
 
     def spread(self, stamp_ns: int, deviation: Sequence[float]) -> None:
-        """Journal how well the load is known from a stamp on: deviations of Fx, Fy [N], M [N m]."""
+        """Journal the standard deviations of the load from a stamp on: Fx, Fy [N], M [N m]."""
         self.session.apply(Spread(stamp_ns, tuple(deviation)))
 
     def mark(self, stamp_ns: int, text: str) -> None:
@@ -311,7 +311,7 @@ class Driver:
         return snapshot
 
     def restore(self, stamp_ns: int, snapshot: Snapshot) -> None:
-        """Go back to the motion of a snapshot; the next sample counts at its time, whatever its stamp."""
+        """Return to the motion of a snapshot; the next sample counts at the snapshot's time, with any stamp."""
         self.failed.end()
         self.session.apply(Restore(stamp_ns, snapshot.data))
         self._begin_again()
@@ -319,7 +319,7 @@ class Driver:
         self.clock.restart()
 
     def set_model(self, stamp_ns: int, changes: Mapping[str, float]) -> None:
-        """Go on with other numbers of the scene, given by their keys in its file; all others are the scene's.
+        """Continue with other numbers of the scene, by their keys in its file; all others are the scene's.
 
         Raises
         ------
@@ -348,7 +348,7 @@ class Driver:
         self.clock.restart()
 
     def unsteady(self, now_ns: int) -> bool:
-        """Return whether stamps jumped again and again lately: resets were refused, or many stamps were stray."""
+        """Return whether stamps have jumped repeatedly of late: resets were refused, or many stamps were stray."""
         refused = self._unsteady_ns is not None and now_ns - self._unsteady_ns < _RESET_WINDOW_NS
         return refused or self._steps.unsteady(now_ns)
 
@@ -359,12 +359,12 @@ class Driver:
         self.clock.restart()
 
     def resume(self, now_ns: int) -> None:
-        """Let silence and the clock count from now on: the time spent inactive is not caught up."""
+        """Start silence and clock anew: the time spent inactive is not caught up."""
         self._received_ns = now_ns
         self._resumed = True
 
     def pause(self) -> None:
-        """No sample comes for now: count a sample that waits for the next."""
+        """Count a sample that waits for its successor, because none comes at present."""
         self._steps.end()
 
     def close(self) -> None:
@@ -389,7 +389,7 @@ class Driver:
         return len(self._resets_ns) < _MOST_RESETS
 
     def _restart_model(self, stamp_ns: int, reason: str, now_ns: int | None) -> None:
-        """Reset the model; requests, returns and failures (`now_ns` None) do not count against the limit."""
+        """Reset the model; resets by requests, restores and failures (`now_ns` None) do not count against the limit."""
         if now_ns is not None:
             self._resets_ns.append(now_ns)
         self.failed.end()
@@ -402,7 +402,7 @@ class Driver:
         self.state = StreamState.WAITING
 
     def _use(self, run: list[Sample], now_ns: int) -> Iterator[Published]:
-        """Advance to samples, which are taken out of the list, and yield the publications."""
+        """Advance to samples, removing them from the list, and yield the publications."""
         samples = run.copy()
         run.clear()
         for part in self.session.parts(samples, each=self.every_sample):
@@ -410,11 +410,11 @@ class Driver:
             if len(published.rows):
                 yield published
         if self._newest_ns is None:
-            # after a reset between two samples silence is to be seen
+            # after a reset between two samples silence must be noticed
             self._newest_ns = self.session.stamp_ns
 
     def _apply(self, samples: Sequence[Sample], now_ns: int) -> Published:
-        """Advance to samples that are applied at once, and return the publication."""
+        """Advance to samples that are applied together, and return the publication."""
         applied = self.session.apply_samples(samples, each=self.every_sample)
         self.rolled_back += applied.late
         self._advanced(now_ns)
@@ -442,7 +442,7 @@ class Driver:
         self._counted_ns = reached_ns
 
     def _judge_rows(self, rows: Rows) -> None:
-        """Judge advances to samples, one of which has failed at least."""
+        """Judge advances to samples of which at least one has failed."""
         stamps = (self.session.origin_ns or 0) + np.rint(rows["t"] * NS_PER_S).astype(np.int64)
         for status, stamp_ns in zip(rows["status"].tolist(), stamps.tolist(), strict=True):
             self._judge_advance(status, stamp_ns, StreamState.RUNNING)

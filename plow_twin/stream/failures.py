@@ -1,4 +1,4 @@
-"""Failed advances: counted, journalled by stretches; after some in a row the model restarts."""
+"""Failed advances, counted and journalled by stretches; after some in a row the model restarts."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ class Failures:
         self._emit = emit
         #: failed advances, and stretches of failed advances
         self.count = self.stretches = 0
-        #: why the newest one failed; empty without a failure
+        #: reason of the newest failure; empty without a failure
         self.reason = ""
         #: stamps of the first and the last advance of the newest stretch [ns]
         self.since_ns = self.until_ns = 0
         #: whether the motion restarted after the newest stretch
         self.restarts = False
         self._in_a_row = 0
-        #: length of the stretch before the newest restart, and the stamp of that [ns]
+        #: length of the stretch before the newest restart, and stamp of that restart [ns]
         self._before_ns = 0
         self._restarted_ns: int | None = None
 
@@ -55,9 +55,9 @@ class Failures:
     def wants_restart(self, limit: int) -> bool:
         """Return whether the model should restart, after `limit` failed advances in a row; 0: never.
 
-        Where it failed again at once after a restart, the next one waits twice as long as the stretch before it: the
-        number of restarts grows as the logarithm of the time, and at most half of the time in which the model could
-        move again is lost.
+        Where the model failed again at once after a restart, the next restart waits twice as long as the previous
+        stretch: the number of restarts grows with the logarithm of the time, and at most half of the time in which the
+        model could move is lost.
         """
         if not 0 < limit <= self._in_a_row:
             return False

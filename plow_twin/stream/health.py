@@ -18,7 +18,7 @@ class DurationHistogram:
     """Durations from 1 us to 100 s in bins of equal ratio, 50 to a decade: a quantile is good to 2.4 %."""
 
     def __init__(self) -> None:
-        # a list: one of its items is counted up in a tenth of the time of an array's
+        # a list, because incrementing an item takes a tenth of the time of an array
         self._counts = [0] * _BINS
         self._counted = np.zeros(len(self._counts), np.int64)
         self.largest_s = 0.0
@@ -29,7 +29,7 @@ class DurationHistogram:
         return sum(self._counts)
 
     def add(self, duration_s: float, count: int = 1) -> None:
-        """Count a duration [s]; outside the range it falls into the end bin, a negative one is ignored."""
+        """Count a duration [s]; outside the range it counts in the end bin, a negative duration is ignored."""
         if not duration_s >= 0.0:
             return
         if duration_s > self.largest_s:
@@ -57,7 +57,7 @@ class DurationHistogram:
 
 
 class Periods:
-    """Times between the turns of a loop: how they scatter, and how many whole periods were left out.
+    """Times between the turns of a loop: their scatter, and the number of missed periods.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ class Periods:
         self._before_s = math.nan
 
     def turn(self, now_s: float) -> None:
-        """Take note of a turn at the steady time `now_s` [s]."""
+        """Note a turn at the steady time `now_s` [s]."""
         passed_s, self._before_s = now_s - self._before_s, now_s
         if passed_s >= 0.0:
             self._recent.append(passed_s)

@@ -1,7 +1,7 @@
-"""The last seconds of a session, for late samples: snapshots and all entries since the oldest of them.
+"""The last seconds of a session, for late samples: snapshots, and all entries since the oldest snapshot.
 
 The age at which a sample is too old follows from the journal alone. A call with many samples makes one snapshot, but
-notes the stamps at which single samples would have made theirs, so both have the same limit.
+notes the stamps at which calls with single samples would have made snapshots, so that both have the same limit.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ SNAPSHOTS: Final = 100
 
 
 class History:
-    """Snapshots at intervals, with the samples and speeds since the oldest of them.
+    """Snapshots at intervals, with the samples and speeds since the oldest snapshot.
 
     Parameters
     ----------
@@ -32,9 +32,9 @@ class History:
         self._span_ns = span_ns
         self._spacing_ns = max(1, span_ns // SNAPSHOTS)
         self._snapshots: list[tuple[int, bytes]] = []
-        #: stamps of the first sample in each span: calls of single samples have a snapshot at each
+        #: stamps of the first sample in each span, where calls with single samples have a snapshot
         self._kept_ns: list[int] = []
-        #: largest stamp of these so far: running again up to it discards no state
+        #: largest of these stamps so far: running again up to it discards no state
         self._newest_kept_ns: int | None = None
         self._samples: list[Sample] = []
         self._stamps_ns: list[int] = []
@@ -56,7 +56,7 @@ class History:
 
     @property
     def earliest_ns(self) -> int | None:
-        """Stamp of the earliest state that is kept [ns]: going back ends there or later."""
+        """Stamp of the earliest kept state [ns]: going back ends there or later."""
         return self._snapshots[0][0] if self._snapshots else None
 
     @property
@@ -146,7 +146,7 @@ class History:
         self._travels.insert(place, travel)
 
     def add_snapshot(self, stamp_ns: int, data: bytes, *, kept: bool = True) -> None:
-        """Take in the state at `stamp_ns`; unless it is only due, the stamp is `kept` whatever span it lies in."""
+        """Add the state at `stamp_ns`; with `kept` the stamp is kept in any span."""
         if not self._span_ns:
             return
         if not self._snapshots or self._snapshots[-1][0] < stamp_ns:
@@ -171,7 +171,7 @@ class History:
 
 
 class RecentStamps:
-    """Stamps of a stream whose values need only be sorted: a value late by less than `span_s` can still be used."""
+    """Stamps of a stream whose values only need sorting: a value late by less than `span_s` can still be used."""
 
     def __init__(self, span_s: float) -> None:
         self._span_ns = round(span_s * 1e9)
@@ -183,7 +183,7 @@ class RecentStamps:
         return self._stamps_ns[-1] - self._span_ns if self._stamps_ns else None
 
     def __contains__(self, stamp_ns: int) -> bool:
-        """Return whether that stamp has been there."""
+        """Return whether that stamp has occurred."""
         index = bisect_left(self._stamps_ns, stamp_ns)
         return self._stamps_ns[index : index + 1] == [stamp_ns]
 
@@ -192,7 +192,7 @@ class RecentStamps:
         self._stamps_ns.clear()
 
     def add(self, stamp_ns: int) -> None:
-        """Remember a stamp, and forget those that are too old by now."""
+        """Add a stamp, and drop the stamps that are now too old."""
         insort(self._stamps_ns, stamp_ns)
         if self._stamps_ns[0] < self._stamps_ns[-1] - 2 * self._span_ns:
             del self._stamps_ns[: bisect_left(self._stamps_ns, self._stamps_ns[-1] - self._span_ns)]

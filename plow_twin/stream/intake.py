@@ -1,4 +1,4 @@
-"""Whether an arriving sample is used, and the count of each reason why one was not.
+"""The decision whether an arriving sample is used, and the number of unused samples by reason.
 
 The clock is passed in; the driver reads no clock.
 """
@@ -41,15 +41,16 @@ class Verdict(Enum):
     UNSTAMPED = "unstamped"
     DUPLICATE = "duplicate"
     OUT_OF_ORDER = "out_of_order"
-    #: newer than the last sample, but the model has already passed it, and it is older than all that is remembered
+    #: newer than the last sample, but passed by the model and older than every kept state
     LATE = "late"
     #: behind the time reached, and accepted: it is worked in at its place
     WORKED_IN = "worked_in"
-    #: a value is larger, or changes faster, than it can be
+    #: a value is impossibly large, or changes impossibly fast
     IMPLAUSIBLE = "implausible"
-    #: the stamps jump again and again: the model is not reset each time
+    #: the stamps jump repeatedly: the model is not reset each time
     UNSTEADY = "unsteady"
-    #: the stamp jumped, and the next one went on from before: it was wrong, no step of the sender's clock
+    #: the stamp jumped, and the next one continued from before: the stamp was wrong, and the sender's clock did not
+    #: step
     STRAY = "stray"
     #: names or lengths of the message do not fit the scene
     MALFORMED = "malformed"
@@ -57,10 +58,10 @@ class Verdict(Enum):
     NOT_SELECTED = "not_selected"
     #: came while the node was not active
     INACTIVE = "inactive"
-    #: came before the clock that time is to follow
+    #: came before the first message on /clock
     NO_CLOCK = "without_clock"
 
-    # each is asked some times for each sample: an enumeration's own hash is slow
+    # looked up several times for each sample: an enumeration's own hash is slow
     __hash__ = object.__hash__
 
     def __init__(self, name: str) -> None:
@@ -71,7 +72,7 @@ class Verdict(Enum):
 
 
 def _ignore(verdict: Verdict, stamp_ns: int, values: Sequence[float]) -> None:
-    """Let a sample go that is not used: it is counted."""
+    """Refuse a sample and count it."""
 
 
 class Intake:
@@ -112,9 +113,9 @@ class Intake:
         self._newest_values: Sequence[float] = ()
         #: newest stamp before the last jump [ns]
         self._before_jump_ns: int | None = None
-        #: whether the last sample judged jumped back to the stamps before a jump: those between were wrong
+        #: whether the last judged sample returned to the stamps before a jump: those in between were wrong
         self.returned = False
-        #: samples missing up to the last jump; since then: first stamp, samples used
+        #: samples missing up to the last jump; first stamp and number of used samples since then
         self._missing_before = 0
         self._first_ns = 0
         self._since_first = 0
@@ -126,7 +127,7 @@ class Intake:
 
     @property
     def missing(self) -> int:
-        """Samples that the expected rate asks for, from stamp to stamp, and that have not come; bursts are credited."""
+        """Samples missing at the expected rate, from stamp to stamp; bursts are credited."""
         if self._newest_ns is None or self.expected_rate_hz <= 0.0:
             return self._missing_before
         asked = round((self._newest_ns - self._first_ns) * self.expected_rate_hz / NS_PER_S) + 1
@@ -179,7 +180,7 @@ class Intake:
         return verdict
 
     def jumps(self, stamp_ns: int, reached_ns: int | None = None) -> bool:
-        """Return whether a stamp is a step of the sender's clock away from those before, as `judge` would find."""
+        """Return whether a stamp is a step of the sender's clock away from earlier stamps, as `judge` would find."""
         newest_ns = self._newest_ns if self._newest_ns is not None else reached_ns
         if newest_ns is None or stamp_ns <= 0:
             return False
@@ -191,7 +192,7 @@ class Intake:
         return ahead_ns <= self.jump_forward_s * NS_PER_S and newest_ns - stamp_ns <= self.jump_back_s * NS_PER_S
 
     def goes_on(self, stamp_ns: int, values: Sequence[float], reached_ns: int) -> bool:
-        """Return whether a sample is surely accepted, as most are; False: `jumps` and `judge` have to find out."""
+        """Return whether a sample is surely accepted, as most are; False: otherwise `jumps` and `judge` decide."""
         newest_ns = self._newest_ns
         if newest_ns is None or self.limits is None:
             return False
@@ -201,7 +202,7 @@ class Intake:
         return self.limits.keep(self._newest_values, values, (stamp_ns - newest_ns) * 1e-9)
 
     def go_on(self, stamps_ns: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return of each of many samples after the first whether it `goes_on` once the one before it is accepted."""
+        """Return for each of many samples after the first whether it `goes_on` from an accepted predecessor."""
         if self.limits is None:
             return np.zeros(len(stamps_ns) - 1, bool)
         ahead_ns = np.diff(stamps_ns)

@@ -1,4 +1,4 @@
-"""Entries that the twin accepted, in order of use: a second run repeats the first exactly from them.
+"""Entries that the twin accepted, in order of use, from which a second run repeats the first exactly.
 
 Stamps are integer nanoseconds on the clock of the samples; they are never rounded through a float.
 """
@@ -92,9 +92,10 @@ class Mark:
 
 @dataclass(frozen=True)
 class Failed:
-    """So many `advances` have failed up to `stamp_ns`, in a row that began at `since_ns`; moves nothing.
+    """`advances` advances have failed up to `stamp_ns`, in a row that began at `since_ns`; does not change the motion.
 
-    An entry comes at the first one of a row, and one for all others at its end: the sum of `advances` is their number.
+    There is an entry at the first failure of a row, and one for the others at its end: the sum of `advances` is their
+    number.
     """
 
     stamp_ns: int
@@ -105,7 +106,7 @@ class Failed:
 
 @dataclass(frozen=True)
 class Spread:
-    """The load is known to these standard deviations, Fx, Fy [N] and M [N m], from `stamp_ns` on; moves nothing."""
+    """Standard deviations of the load, Fx, Fy [N] and M [N m], from `stamp_ns` on; do not change the motion."""
 
     stamp_ns: int
     deviation: tuple[float, ...]
@@ -113,7 +114,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter that the model sees has taken `value`."""
+    """A parameter that affects the model has the new `value`."""
 
     name: str
     value: ParameterValue
@@ -133,7 +134,7 @@ class Pose:
 
 @dataclass(frozen=True)
 class PartOfPose:
-    """Of a pose only `components` (0, 1, 2: x, y, theta) were measured, as `values` [m, rad]: kept for the estimate."""
+    """Only the `components` (0, 1, 2: x, y, theta) of a pose were measured: `values` [m, rad], for the estimate."""
 
     stamp_ns: int
     components: tuple[int, ...]
@@ -153,10 +154,10 @@ class Gaps:
 class Unused:
     """`count` messages of `sender` came on the input `topic` and were not used; kept as evidence, moves nothing.
 
-    `reason` is that of the counters `dropped_<reason>`, or `not_followed`, or `lost`: sent and never arrived (a `count`
-    below 0: that many arrived after all). `stamps_ns` and `values` have an item for each message in order of
-    arrival, the first ones only where there were too many at once; an unreadable message has no values and stamp 0.
-    A value need not be finite.
+    `reason` is as in the counters `dropped_<reason>`, or `not_followed`, or `lost`: never arrived (with a negative
+    `count`: arrived after all). `stamps_ns` and `values` have an item for each message in order of arrival, the first
+    ones only where there were too many at once; an unreadable message has no values and stamp 0. A value need not be
+    finite.
     """
 
     topic: str
@@ -169,11 +170,11 @@ class Unused:
 
 @dataclass(frozen=True)
 class Estimated:
-    """An estimate of the window from `start_ns` to before `end_ns` has come.
+    """An estimate of the window from `start_ns` to before `end_ns` is finished.
 
-    The window had so many `samples` of the load and `poses`; the fit began at `guess`, or with a search
-    where that is empty. `shift` is added to the horizontal clearance that the model's wear makes, to its 5 % and its
-    95 % point, then to the vertical one's (6 numbers [m]) from here on. `result` is the whole estimate, JSON.
+    `samples` and `poses` count the window's rows of load and pose; the fit began at `guess`, or with a search if that
+    is empty. From here on `shift` (6 numbers [m]) is added to the horizontal clearance of the model with its wear, to
+    its 5 % and 95 % points, then to the same for the vertical clearance. `result` is the whole estimate, JSON.
     """
 
     start_ns: int

@@ -1,4 +1,4 @@
-"""Largest size and rate of measured values; anything beyond is a fault of the measurement."""
+"""Largest size and rate of measured values; larger ones are faults of the measurement."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Limits:
     fastest: tuple[float, ...]
 
     def exceeded(self, values: Sequence[float]) -> bool:
-        """Return whether a value is larger than it can be."""
+        """Return whether a value is impossibly large."""
         return any(map(gt, map(abs, values), self.largest))
 
     def keep(self, before: Sequence[float], values: Sequence[float], duration_s: float) -> bool:
@@ -40,17 +40,17 @@ class Limits:
         return True
 
     def kept(self, values: NDArray[np.float64], duration_s: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return of each of many rows (n, k) after the first whether it would `keep` after the row before it, (n-1,).
+        """Return for each of many rows (n, k) after the first whether it would `keep` after the row before it, (n-1,).
 
         `duration_s`, shape (n-1,), are the times between them in s.
         """
         within = np.abs(values[1:]) <= np.array(self.largest)
-        with np.errstate(invalid="ignore"):  # between two infinite numbers: not steady
+        with np.errstate(invalid="ignore"):  # between two infinite numbers: counts as too fast
             steady = np.abs(np.diff(values, axis=0)) <= np.array(self.fastest) * duration_s[:, None]
         return np.asarray((within & steady).all(axis=1))
 
     def too_fast(self, before: Sequence[float], values: Sequence[float], duration_s: float) -> bool:
-        """Return whether a value has changed faster than it can."""
+        """Return whether a value has changed impossibly fast."""
         most = [fastest * duration_s for fastest in self.fastest]
         return any(map(gt, map(abs, map(sub, values, before)), most))
 
@@ -58,8 +58,8 @@ class Limits:
 def pose_limits(scene: Scene, displacement: float = 0.0, rate: float = 0.0) -> Limits:
     """Return the limits of x, y [m] and theta [rad] of a measured pose and of their rates; 0: derived from the scene.
 
-    Derived are `largest_displacement`, and that much within a millisecond; an angle may be half a turn, that of a block
-    any, and change by half a turn as fast.
+    Derived are `largest_displacement`, and the same within a millisecond; an angle may be half a turn (of a block, any
+    angle), and change by half a turn in that time.
     """
     displacement = displacement or largest_displacement(scene)
     rate = rate or displacement / _SHORTEST_S
@@ -68,13 +68,13 @@ def pose_limits(scene: Scene, displacement: float = 0.0, rate: float = 0.0) -> L
 
 
 def largest_displacement(scene: Scene) -> float:
-    """Return a displacement in m that no head reaches: half the larger side of the frame, or of a clearance."""
+    """Return a displacement in m that no head reaches: half the largest side of the frame or clearance."""
     frame, clearance = scene.frame, scene.clearance
     return 0.5 * max(frame.width_m, frame.height_m, clearance.horizontal_m, clearance.vertical_m)
 
 
 def value_limits(largest: float, rate: float = 0.0) -> Limits:
-    """Return the limits of one number and of its rate; 0: that much within a millisecond."""
+    """Return the limits of one number and of its rate; 0: the limit of the number within a millisecond."""
     return Limits((largest,), (rate or largest / _SHORTEST_S,))
 
 

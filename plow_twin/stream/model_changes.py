@@ -1,4 +1,4 @@
-"""Numbers of a scene that can change while its twin runs: those that take no other compiled code."""
+"""Numbers of a scene that can change while its twin runs, because they need no other compiled code."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from plow_twin.errors import ArgumentError
 from plow_twin.model.scene import Scene
 from plow_twin.stream.driven import Driven
 
-#: Keys of the scene file, each with the smallest value that is taken.
+#: Keys of the scene file, each with the smallest accepted value.
 CHANGEABLE: Final[Mapping[str, float]] = {
     "clearance.horizontal_m": 0.0,
     "clearance.vertical_m": 0.0,
@@ -48,12 +48,12 @@ def changed_scene(scene: Scene, changes: Mapping[str, float]) -> Scene:
 
 
 def changed_twin(twin: Driven, scene: Scene, changes: Mapping[str, float]) -> Driven:
-    """Return a twin of `scene` with other numbers, like `twin` else, at its scene's initial state.
+    """Return a twin of `scene` with other numbers, otherwise like `twin`, at its scene's initial state.
 
     Raises
     ------
     ArgumentError
-        As `changed_scene`, or the changed scene takes other compiled code, which a live twin has no time for.
+        As `changed_scene`, or the changed scene needs other compiled code, which a live twin has no time to compile.
     """
     found = twin.like(changed_scene(scene, changes))
     if found.signature != twin.signature:

@@ -1,4 +1,4 @@
-"""Publications of the motion: each row sums up all that happened since the row before.
+"""Publications of the motion: each row sums up the motion since the row before.
 
 A publication is a function of the journal alone, so that a replay forms the same publications bit for bit.
 """
@@ -111,7 +111,7 @@ NOTHING: Final = Published(_NO_ROWS, _NO_SLOW)
 
 
 def _numbered_from(slow: Rows, first: int) -> Rows:
-    """Return slow records whose rows are counted from another one."""
+    """Return slow records with row numbers counted from another row."""
     if len(slow):
         slow = slow.copy()
         slow["row"] -= first
@@ -148,8 +148,8 @@ def clearances(scene: Scene, wear_depth: Array) -> Array:
 def prior_points(scene: Scene, wear_depth: Array) -> tuple[Array, Array]:
     """Return the 5 % and 95 % points of the pad depths under the prior of the wear coefficient, shape (8,) each [m].
 
-    Growth is proportional to k_s as long as it is small against the clearance, or what it would be without running-in
-    is. Without wear, or with k_s = 0, both points equal the wear depth.
+    The growth, taken without running-in, is proportional to k_s as long as it is small against the clearance. Without
+    wear, or with k_s = 0, both points equal the wear depth.
     """
     if scene.wear is None or scene.wear.coefficient_m2_n == 0.0:
         return wear_depth, wear_depth
@@ -163,7 +163,7 @@ def prior_points(scene: Scene, wear_depth: Array) -> tuple[Array, Array]:
 
 
 class Outputs:
-    """Sum up advances to publications: peaks, impulses and touches survive any number of advances between two."""
+    """Sum up advances to publications: peaks, impulses and touches of any number of advances are kept."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene, self._publish = scene, _publish()
@@ -176,7 +176,7 @@ class Outputs:
         self._slow_wear_depth = np.zeros(PAIR_COUNT)
         #: stamp from which on the published motion was computed again [ns], while the window is marked as corrected
         self._corrected_ns = 0
-        #: of before that: the window, if it had an advance to show
+        #: the window before that, if it contained an advance
         self._before: Rows | None = None
         #: shift of the clearances and their quantiles by an estimate, as in `CLEARANCE_NAMES`; None without an estimate
         self._shift: Array | None = None
@@ -184,15 +184,15 @@ class Outputs:
     def set_shift(self, shift: Sequence[float]) -> None:
         """Add to the horizontal and the vertical clearance of the model, and to their points, from now on.
 
-        `shift` has 6 numbers [m]: horizontal, its 5 % and 95 % points, vertical, its points. No part of `state`: an
-        estimate stays when late samples are worked in.
+        `shift` has 6 numbers [m]: horizontal, its 5 % and 95 % points, vertical, its points. It is not part of `state`:
+        an estimate stays when late samples are worked in.
         """
         values = np.zeros(len(CLEARANCE_NAMES))
         values[_KNOWN] = shift
         self._shift = values if values.any() else None
 
     def set_scene(self, scene: Scene) -> None:
-        """Speak of a scene with other numbers from here on."""
+        """Use a scene with other numbers from here on."""
         self._scene = scene
 
     def clear_shift(self) -> None:
@@ -342,18 +342,18 @@ class Outputs:
         return np.stack((middle, low, high), axis=1)[:2].ravel()
 
     def state(self) -> bytes:
-        """Return all that determines the numbers of the next publication beside the next advance, exactly."""
+        """Return the exact state that, with the next advance, determines the numbers of the next publication."""
         slow_ns, window = -1 if self._slow_ns is None else self._slow_ns, self._window
         numbers = (window["makes"], window["impulse"], window["peak"], self._slow_wear_depth, np.array([slow_ns]))
         return b"".join(part.tobytes() for part in numbers)
 
     def set_state(self, data: bytes) -> None:
-        """Go on from a state that `state` returned."""
+        """Continue from a state that `state` returned."""
         parts = np.frombuffer(data, np.float64, _STATE_SIZE).reshape(4, PAIR_COUNT)
         self._clear()
         self._window["makes"] = parts[0].view(np.int64)
         self._window["impulse"], self._window["peak"] = parts[1:3]
-        self._window["measured_peak"] = parts[2]  # a part without samples is unknown
+        self._window["measured_peak"] = parts[2]  # without samples the part is unknown
         self._slow_wear_depth = parts[3].copy()
         slow_ns = int(np.frombuffer(data, np.int64, 1, offset=8 * _STATE_SIZE)[0])
         self._slow_ns = None if slow_ns < 0 else slow_ns
@@ -374,6 +374,6 @@ def warm_up() -> None:
 
 @cache
 def _publish() -> Callable[..., int]:
-    """Return `publish` compiled for the types that it is always called with: to look at these takes longer than it."""
+    """Return `publish` compiled for its fixed argument types: checking the types would take longer than the call."""
     rows = np.zeros(1, ROW)
     return for_arguments(publish, (rows, THE_ONE, 0, THE_ONE, rows, 0))

@@ -1,7 +1,7 @@
 """Which of several senders of one input is followed, and how many of its samples never arrived.
 
-A sender numbers its messages from 1 on, as the middleware does for each publisher: a gap in the numbers is loss,
-wherever it happened (on the way, or in a queue that overran), whatever the rate, and bursts change nothing.
+A sender numbers its messages from 1 on, as the middleware does for each publisher: a gap in the numbers is loss, on the
+way or in an overrun queue, at any rate and in bursts.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ _MOST_SENDERS = 64
 
 
 class Senders:
-    """Follow the first sender heard until it has gone or a switch is requested."""
+    """Follow the first sender heard until it disappears or a switch is requested."""
 
     def __init__(self) -> None:
         #: the sender followed; None before the first sample and after it has gone
@@ -32,11 +32,11 @@ class Senders:
         self._other: bytes | None = None
 
     def start(self, present: Collection[bytes]) -> None:
-        """Take note of the senders that were there before: their messages until now are no loss."""
+        """Note the senders that were present before: their messages until now are no loss."""
         self._before = frozenset(present)
 
     def start_late(self, sender: bytes) -> None:
-        """Take note that messages of a sender before the first sample heard may be no loss."""
+        """Note that messages of a sender before the first heard sample need not be loss."""
         self._before |= {sender}
 
     def hear(self, sender: bytes, number: int, count: int = 1) -> bool:
@@ -53,7 +53,7 @@ class Senders:
             self._follow(sender)
         followed = sender == self.followed
         if followed:
-            # a number that comes after all is no loss any more
+            # a message that comes after all is no longer a loss
             self.lost += number - expected if number >= expected else -1 if self.lost else 0
         else:
             self.ignored += count
@@ -62,9 +62,9 @@ class Senders:
         return followed
 
     def alive(self, present: Collection[bytes]) -> None:
-        """Note the present senders; when the followed sender has gone, the next sender heard is followed.
+        """Note the present senders; when the followed sender has disappeared, the next sender heard is followed.
 
-        One that has not been in such a list yet may be on its way into it: it has not gone.
+        A sender that was never in such a list may still be entering it, and has not disappeared.
         """
         gone = self._listed.difference(present)
         self._listed = set(present)
@@ -87,7 +87,7 @@ class Senders:
 
 
 class OneSender:
-    """Follow the first sender heard until it has gone, or has been silent for 10 s while another sends."""
+    """Follow the first sender heard until it disappears, or is silent for 10 s while another sends."""
 
     def __init__(self) -> None:
         #: the sender followed; None before the first message and after it has gone
@@ -108,7 +108,7 @@ class OneSender:
         return True
 
     def alive(self, present: Collection[bytes]) -> None:
-        """Take note of the senders that there are, as of `Senders`."""
+        """Note the present senders, as in `Senders`."""
         if self.followed in self._listed.difference(present):
             self.followed = None
         self._listed = set(present)

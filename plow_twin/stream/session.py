@@ -48,11 +48,11 @@ from plow_twin.stream.outputs import NONE, NOTHING, THE_ONE, Outputs, Published,
 
 #: Advances between digests.
 DIGEST_INTERVAL: Final = 100
-#: Is a stamp known, origin, stamp reached, advances, held, speed along the face, number of speeds to come.
+#: Whether a stamp is known, origin, stamp reached, advances, held, speed along the face, number of waiting speeds.
 _HEADER: Final = struct.Struct("<?qqq?dq")
 _TRAVEL: Final = struct.Struct("<qd")
-#: Largest lead of a pose over the time reached. A bag that is played fast brings poses before their load; a larger lead
-#: comes from another clock.
+#: Largest lead of a pose over the time reached. A bag played fast brings poses before their load; a larger lead comes
+#: from another clock.
 _AHEAD_NS: Final = 3_600_000_000_000
 _WEAR_SIZE: Final = 8 * PAIR_COUNT
 _NO_LOAD: Final = np.zeros((1, 3))
@@ -90,7 +90,7 @@ class Applied(NamedTuple):
 
 
 class Series(NamedTuple):
-    """Samples that have been applied at once, and are not in the journal yet.
+    """Samples that have been applied together, and are not in the journal yet.
 
     Stamps [ns], shape (n,), and wrenches (n, 3); the publications, a row after each sample, or None; the digests,
     and the number of samples before each, shape (m,).
@@ -132,15 +132,15 @@ class _UndoneError(Exception):
 class Session:
     """One run of a twin under a journal.
 
-    The same entries in the same order give the same motion, the same publications (`outputs`) and the same digests, bit
-    for bit, whatever the clock does. Model time is (stamp - origin), the origin being the first stamp.
+    The same entries in the same order give the same motion, publications (`outputs`) and digests, bit for bit, with any
+    clock. Model time is (stamp - origin), the origin being the first stamp.
 
-    Motion and wear are two states: a `Reset` puts back the motion and keeps the wear, only `SetWear` sets it. While the
-    load is held or taken away (`Hold`, `Unload`) nothing wears, since the load is unknown. With the scene's own
-    loads it is known, and a `Hold` is only a time to reach.
+    Motion and wear are two states: a `Reset` restores the initial motion and keeps the wear, which only `SetWear` sets.
+    While the load is held or removed (`Hold`, `Unload`) nothing wears, since the load is unknown. With the scene's own
+    loads the load is known, and a `Hold` only advances the time.
 
     A sample whose stamp lies behind the time reached is late: the session goes back to the newest snapshot before it,
-    works it in and runs again up to the newest sample; motion without samples after that one is dropped.
+    works it in and runs again up to the newest sample; later motion without samples is dropped.
 
     Parameters
     ----------
@@ -170,7 +170,7 @@ class Session:
         self._use(twin)
         #: poses and estimates since the earliest state that is kept
         self._measured: deque[_Measured] = deque()
-        #: poses too far ahead, and those that a late sample would find no more
+        #: poses too far ahead, and poses that a late sample could no longer use
         self.poses_dropped = 0
         self._scene = twin.scene
         #: numbers of the scene that have been changed, by their keys
@@ -207,7 +207,7 @@ class Session:
         self.following = twin if isinstance(twin, Following) else None
 
     def catch_up(self) -> None:
-        """Let a following twin do what its newest row left over, and keep the state that a late sample may need."""
+        """Let a following twin finish the work of its newest row, and save the state that a late sample may need."""
         if self.following is not None:
             self.following.catch_up()
             if self.history.is_due and self.stamp_ns is not None and not self.held:
@@ -225,7 +225,7 @@ class Session:
     def apply(self, entry: Entry) -> Rows | None:
         """Emit one entry, apply it, and return the row of the advance that it made, shape (1,), if it made one.
 
-        `outputs` publishes it when it is asked to. A digest or a loss describes a journal and changes nothing: it
+        `outputs` publishes it on request. A digest or a loss describes a journal and changes nothing: it
         is not emitted again.
 
         Raises
@@ -249,7 +249,7 @@ class Session:
             case SetWear(_, depth):
                 self._on_entry(entry)
                 self._restart(np.array(depth))
-                # the estimate was of other pads
+                # the estimate belongs to other pads
                 self.outputs.clear_shift()
             case Estimated(shift=shift):
                 self._on_entry(entry)
@@ -273,7 +273,7 @@ class Session:
                 self.following.follow_parameters()
                 self._forget()
             case Parameter() | Gaps() | Mark() | Failed() | Spread() | Unused():
-                # acts through the entries that follow it, or on nothing here
+                # takes effect by the entries that follow it, or has no effect here
                 self._on_entry(entry)
             case Snapshot(_, data):
                 self._on_entry(entry)
@@ -286,7 +286,8 @@ class Session:
     def parts(self, samples: Sequence[Sample], *, each: bool = False) -> Iterator[Sequence[Sample]]:
         """Yield the parts of samples for `apply_samples`; each part must be applied before the next.
 
-        Late samples are one part; of others there are as many as the digests allow, or one where `each` is published.
+        Late samples form parts of one; other parts are as long as the digests allow, or one sample where `each` is
+        published.
 
         Raises
         ------
@@ -306,14 +307,15 @@ class Session:
             samples = samples[count:]
 
     def apply_samples(self, samples: Sequence[Sample], *, each: bool = False) -> Applied:
-        """Emit one of the `parts` of samples and apply it; the bits do not depend on their number.
+        """Emit one of the `parts` of samples and apply it; the bits do not depend on the number of parts.
 
         Parameters
         ----------
         samples : sequence of Sample
             At least one.
         each : bool
-            Whether there is a publication after each, and of late ones after the last; else `outputs` sums up.
+            Whether there is a publication after each sample (of late ones, after the last); otherwise `outputs` sums
+            up.
 
         Raises
         ------
@@ -337,7 +339,7 @@ class Session:
         return applied
 
     def apply_series(self, stamps: NDArray[np.int64], wrench: NDArray[np.float64], *, each: bool) -> Series | None:
-        """Apply samples at once, the first not late, without entries: the caller journals the series.
+        """Apply samples together, the first not late, without entries: the caller journals the series.
 
         Parameters
         ----------
@@ -346,7 +348,7 @@ class Session:
         wrench : ndarray, shape (n, 3)
             Fx, Fy [N] and M [N m] at each, finite.
         each : bool
-            Whether there is a publication after each; else `outputs` sums up.
+            Whether there is a publication after each sample; otherwise `outputs` sums up.
 
         Returns
         -------
@@ -388,12 +390,12 @@ class Session:
         taken: NDArray[np.int64] = NONE,
         digest_after: NDArray[np.int64] = NONE,
     ) -> Applied:
-        """Advance to samples: the way of every sample, live or replayed. Nothing is emitted.
+        """Advance to samples; every sample, live or replayed, comes here. Nothing is emitted.
 
         Parameters
         ----------
         stamps : ndarray of int64, shape (n,)
-            Never falling, the first not late [ns].
+            Stamps that never fall, the first not late [ns].
         wrench : ndarray, shape (n, 3)
             Fx, Fy [N] and M [N m] at each.
         rows : ndarray of `ROW`, shape (n,), or None
@@ -427,7 +429,7 @@ class Session:
         taken: NDArray[np.int64],
         digest_after: NDArray[np.int64],
     ) -> Applied:
-        """Advance where speeds along the face are to come, or the load was held until now."""
+        """Advance where speeds along the face wait, or the load was held until now."""
         if not np.isfinite(wrench).all():
             raise ValueError(f"wrench: got {wrench!r}, expected finite numbers")
         resumed, begin, count = self._resume_wear(), 0, len(stamps)
@@ -458,16 +460,16 @@ class Session:
         self._on_entry(entry)
 
     def check_model(self, changes: Mapping[str, float]) -> None:
-        """Raise an `ArgumentError` when the model cannot be changed so while it runs."""
+        """Raise an `ArgumentError` when the model cannot be changed in this way while it runs."""
         self._changed_twin(changes)
 
     def pop_error_estimate(self) -> float:
-        """Return the largest error [m] that `max_evaluations` is estimated to have made since the last call."""
+        """Return the largest estimated error [m] due to `max_evaluations` since the last call."""
         largest, self._largest_error_m = self._largest_error_m, 0.0
         return largest
 
     def renew(self) -> Snapshot:
-        """Return the exact state for a journal that goes on from here, and drop the past."""
+        """Return the exact state for a journal that continues from here, and drop the past."""
         snapshot = self.snapshot()
         self._forget()
         return snapshot
@@ -511,9 +513,9 @@ class Session:
         resumed: bool = False,
         undo: bytes | None = None,
     ) -> Applied:
-        """Advance to samples without other entries between them; `resumed`: the first since a time without samples.
+        """Advance to samples without other entries between them; `resumed`: the first after a time without samples.
 
-        Where an advance fails the twin goes back to the snapshot `undo`, if there is one, with an `_UndoneError`.
+        Where an advance fails the twin returns to the snapshot `undo`, if given, and raises `_UndoneError`.
         """
         origin_ns = self._begin(int(stamps[0])) if self.origin_ns is None else self.origin_ns
         if self.history.is_due and not resumed:
@@ -566,7 +568,7 @@ class Session:
         self._set_speed(travel)
 
     def _is_late(self, stamp_ns: int) -> bool:
-        """Return whether the model has passed a stamp; without a sample there it has passed its own time too."""
+        """Return whether the model has passed a stamp; without a sample at its own time, that time counts as passed."""
         if self.stamp_ns is None or stamp_ns > self.stamp_ns:
             return False
         return stamp_ns < self.stamp_ns or (self.held and self.history.oldest_ns is not None)
@@ -581,7 +583,7 @@ class Session:
     def _work_in(self, stamp_ns: int, late: Sequence[Sample], *travels: Travel) -> Applied:
         """Go back to before a late stamp, and run again with late samples and speeds.
 
-        The next publication covers all from the first stamp worked in since the publication before.
+        The next publication covers the motion from the first stamp worked in since the publication before.
         """
         corrected_ns = self.outputs.correct(stamp_ns, self.history.oldest_ns or 0)
         again = self._rewind(corrected_ns, *travels)
@@ -595,21 +597,22 @@ class Session:
     def _rewind(self, stamp_ns: int, *more: Travel) -> list[Sample]:
         """Go back to the newest snapshot before `stamp_ns`; return the samples after it.
 
-        The speeds after it, and those in `more`, are to come again.
+        The speeds after it, and those in `more`, wait again.
         """
         data, samples, travels = self.history.rewind(stamp_ns)
         advances, pending, slow = self._advances, self._travels, self.outputs.slow_before
         self._restore(data)
         self._advances, self.outputs.slow_before = advances, slow
         if self.following is not None:
-            # each as early as it was known: going back depends on publications, which must not change the motion
+            # each as early as it was known: how far one goes back depends on publications, which must not change the
+            # motion
             measured, self._measured = self._measured, deque()
             for one in measured:
                 if one.number > self.following.added:
                     self._follow(one.stamp_ns, one.entry, one.known)
                 else:
                     self._measured.append(one)
-        # a change due at the snapshot may be applied already, or still to come
+        # a change at the time of the snapshot may have been applied or not
         known = {travel.stamp_ns: travel for travel in (*self._travels, *travels, *pending, *more)}
         self._travels = sorted(known.values(), key=lambda travel: travel.stamp_ns)
         return samples
@@ -634,7 +637,7 @@ class Session:
         return rows
 
     def _move(self, stamps: NDArray[np.int64], wrench: NDArray[np.float64], *, held: bool) -> Rows:
-        """Advance to a stamp, shape (1,), that is no sample's."""
+        """Advance to a stamp, shape (1,), without a sample."""
         assert self.origin_ns is not None
         rows = self._stock.new(1)
         if self.following is not None:
@@ -666,11 +669,11 @@ class Session:
         if not self._wears:
             self._speed = travel.speed_m_s
         elif self.stamp_ns is None:
-            self._use_speed(travel.speed_m_s)  # from the first sample on: nothing goes back before it
+            self._use_speed(travel.speed_m_s)  # from the first sample on, because nothing goes back before it
         elif travel.stamp_ns > self.stamp_ns:
             insort(self._travels, travel, key=lambda item: item.stamp_ns)
         elif oldest_ns is not None and travel.stamp_ns <= oldest_ns:
-            # too old for its place: it acts from the newest sample on, or from the only state kept
+            # too old for its place: acts from the newest sample on, or from the only kept state
             self._set_speed(Travel(oldest_ns if newest_ns is None else newest_ns, travel.speed_m_s))
         elif newest_ns is None or oldest_ns is None or travel.stamp_ns >= newest_ns:
             self._set_speed(travel)
@@ -708,7 +711,7 @@ class Session:
         self._measured.clear()
 
     def _restart(self, wear_depth: NDArray[np.float64]) -> None:
-        """Put the motion back to its initial state."""
+        """Reset the motion to its initial state."""
         self._resume_wear()
         for travel in self._travels:
             self._set_speed(travel)
@@ -736,7 +739,7 @@ class Session:
         self._forget()
 
     def _changed_twin(self, changes: Mapping[str, float]) -> Driven:
-        """Return a twin of other numbers that allows the speeds that are set and to come."""
+        """Return a twin with other numbers that allows the present and the waiting speeds."""
         found = changed_twin(self.twin, self._scene, changes)
         for speed in (self._speed, *(travel.speed_m_s for travel in self._travels)):
             check_travel_speed(found.scene, speed)
@@ -775,7 +778,7 @@ class Session:
         self.origin_ns = self.stamp_ns = None
 
     def _split_twin(self, data: bytes) -> tuple[bytes, dict[str, float]]:
-        """Return the snapshot of the twin, and the changes of the model behind it."""
+        """Return the snapshot of the twin, followed by the changes of the model."""
         size = len(self.twin.snapshot()) if self.following is None else self.following.snapshot_size(data)
         return data[:size], read_changes(data[size:].decode()) if len(data) > size else {}
 

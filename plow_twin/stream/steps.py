@@ -1,4 +1,4 @@
-"""Steps of a sender's clock apart from single wrong stamps: a sample whose stamp jumps waits for the next one."""
+"""Steps of a sender's clock versus single wrong stamps: a sample whose stamp jumps waits for the next sample."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Final
 
 from plow_twin.stream.intake import NS_PER_S, Intake, Verdict
 
-#: As many stray stamps in that time [ns] are no accident any more.
+#: So many stray stamps within a time [ns] are no longer an accident.
 _MOST_STRAYS: Final = 5
 _WINDOW_NS: Final = 10 * NS_PER_S
 
@@ -28,12 +28,12 @@ class Steps:
         self._intake = intake
         #: the latest sample, where its stamp jumped
         self._jumped: Timed | None = None
-        #: when the latest stray stamps were found out [ns]
+        #: times at which the latest stray stamps were found [ns]
         self._strays_ns: deque[int] = deque(maxlen=_MOST_STRAYS)
 
     @property
     def waits(self) -> bool:
-        """Whether a sample is kept back."""
+        """Whether a sample waits."""
         return self._jumped is not None
 
     def settle(
@@ -61,7 +61,7 @@ class Steps:
         return ()
 
     def unopposed(self, now_ns: int, silence_ns: int) -> Timed | None:
-        """Return the waiting sample, once no contradiction has come for so long."""
+        """Return the waiting sample, once nothing has contradicted it for so long."""
         jumped = self._jumped
         if jumped is None or now_ns - jumped[2] <= silence_ns:
             return None
@@ -69,7 +69,7 @@ class Steps:
         return jumped
 
     def end(self) -> None:
-        """Count a sample that still waits: no next one comes."""
+        """Count a sample that still waits, because no next sample comes."""
         jumped, self._jumped = self._jumped, None
         if jumped is not None:
             self._intake.refuse(Verdict.STRAY, *jumped[:2])

@@ -1,4 +1,4 @@
-"""The topics that a live twin sends: one table, from which all that sends, records, compares or lists them follows."""
+"""The topics that a live twin sends: the one table behind sending, recording, comparing and listing them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from plow_twin.stream.outputs import CLEARANCE_NAMES, PAD_NAMES, SLOW, Published
 JOINT_STATE: Final = "sensor_msgs/msg/JointState"
 ODOMETRY: Final = "nav_msgs/msg/Odometry"
 STATUS: Final = "diagnostic_msgs/msg/DiagnosticStatus"
-#: Depth of a publisher's history: a reader that looks once a second at 1 kHz misses no message.
+#: Depth of a publisher's history: a reader that reads once a second at 1 kHz misses no message.
 _DEPTH: Final = 1000
 
 
@@ -59,8 +59,8 @@ class Topic:
     names : tuple of str
         Names in a `JointState`.
     columns : mapping
-        Field of the message to fields of the record that stand in it and how many of their numbers, all in this order.
-        Without columns the message does not follow from a record alone.
+        By field of the message, the fields of the record in it with the count of their numbers, all in order.
+        A message without columns needs more than a record.
     """
 
     name: str
@@ -75,12 +75,12 @@ class Topic:
 
     @property
     def parts(self) -> tuple[tuple[str, int], ...]:
-        """Fields of the record, and how many of their numbers, in the order in which they stand in the message."""
+        """Fields of the record with the count of their numbers, in the order of the message."""
         return tuple(part for parts in self.columns.values() for part in parts)
 
     @property
     def count(self) -> int:
-        """How many numbers of the record stand in a message."""
+        """Count of a message's numbers from the record."""
         return sum(count for _, count in self.parts)
 
     def record_of(self, published: Published) -> NDArray[np.void]:
@@ -184,7 +184,7 @@ TOPICS: Final = (
 
 
 def topics_of(*cadences: Cadence) -> tuple[Topic, ...]:
-    """Return the topics that are sent at one of some cadences, in the order of the table."""
+    """Return the topics with one of these cadences, in the order of the table."""
     return tuple(topic for topic in TOPICS if topic.cadence in cadences)
 
 

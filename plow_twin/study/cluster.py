@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 CONNECT_TIMEOUT_S = 20.0
 #: Time to wait for a cluster without a worker [s]: it may still grow.
 WORKER_TIMEOUT_S = 300.0
-#: Whether there is a worker is looked at that often while no result comes [s].
+#: Time between two checks for a worker while no result comes [s].
 _LOOK_S: Final = 2.0
 
 

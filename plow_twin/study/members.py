@@ -1,4 +1,4 @@
-"""Runs of many scenes, and the figures of each motion that a study can ask for."""
+"""Runs of many scenes, and the statistics of each motion for studies."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Members:
 
     @property
     def failed(self) -> NDArray[np.bool_]:
-        """Which runs did not reach their end, shape (m,)."""
+        """Flags of the runs that did not reach their end, shape (m,)."""
         return np.asarray(self.motions.status != Status.OK)
 
     def at(self, rows: NDArray[np.int64]) -> Members:
@@ -42,5 +42,5 @@ def run_members(
     workers: int | None = None,
     on_done: Callable[[int], None] | None = None,
 ) -> Members:
-    """Run every scene from t = 0 to `t_end` (see `simulate_many`); rows for start and end alone without `output_dt`."""
+    """Run every scene from t = 0 to `t_end` (see `simulate_many`); without `output_dt` rows are start and end."""
     return Members(t_end, simulate_many(scenes, t_end, output_dt or t_end, tol, workers, on_done))

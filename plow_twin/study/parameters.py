@@ -1,6 +1,6 @@
-"""Numbers and words of a scene by path, as they stand in its messages: `contact.stiffness`, `head.com_offset_m[0]`.
+"""Numbers and words of a scene by path, as in its messages: `contact.stiffness`, `head.com_offset_m[0]`.
 
-Loads are called by name: `loads.fx1.phase_rad`. Four paths are no fields of a scene but settings of a study:
+Loads are called by name: `loads.fx1.phase_rad`. Four paths are settings of a study and not fields of a scene:
 
     loads.<name>.sign       sign of the load's force (its first component that is not zero); -1 turns the whole force
     loads.<name>.arm_sign   the same for its point of action
@@ -8,8 +8,8 @@ Loads are called by name: `loads.fx1.phase_rad`. Four paths are no fields of a s
     clearance.scale         factor of both clearances: 1 total, 2 when a published clearance is meant per side
 
 `frame.labels` takes one of eight words, `bottom_right_ccw`: a at the bottom right, then b, c, d counter-clockwise. The
-four act on whatever the other paths have set. `contact.damping` takes the place of a restitution and the reverse. A
-scene without friction has the paths of `friction` too: setting one switches it on.
+four act after the other paths. `contact.damping` takes the place of a restitution and the reverse. A scene without
+friction also has the paths of `friction`: setting one switches friction on.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ WORDS: Final = ("contact.law", "head.rotation", "frame.labels")
 _CORNERS_CCW: Final = ("bottom_right", "top_right", "top_left", "bottom_left")
 _PARTS: Final = ("head", "frame", "clearance", "contact", "gravity", "initial", "wear", "friction", "support")
 _DERIVED: Final = ("sign", "arm_sign", "scale")
-#: What a study starts from where a scene has no friction: without effect.
+#: Starting point of a study where a scene has no friction: without effect.
 _NO_FRICTION: Final = Friction(0.0)
 _INDEX: Final = re.compile(r"(.+)\[(\d+)\]")
 
@@ -78,7 +78,7 @@ def check_path(scene: Scene, path: str) -> str:
     Raises
     ------
     StudyError
-        With the nearest paths and all that there are.
+        With the nearest paths and all existing ones.
     """
     known = parameter_paths(scene)
     if path not in known:
@@ -146,7 +146,7 @@ def with_parameters(scene: Scene, values: Mapping[str, Value]) -> Scene:
 
 
 def label_words() -> dict[str, dict[str, str]]:
-    """Return the eight ways to letter the corners in turn, by the word of each."""
+    """Return the eight ways to letter the corners in turn, by their words."""
     words = {}
     for turn, corners in (("ccw", _CORNERS_CCW), ("cw", _CORNERS_CCW[::-1])):
         for first in range(4):
@@ -161,7 +161,7 @@ def check_word(path: str, word: str) -> str:
     Raises
     ------
     StudyError
-        With the words that can.
+        With the possible words.
     """
     (rotation,) = (spec for spec in fields(Head) if spec.name == "rotation")
     words = {"contact.law": LAWS, "head.rotation": rotation.metadata["choices"], "frame.labels": label_words()}[path]
@@ -171,7 +171,7 @@ def check_word(path: str, word: str) -> str:
 
 
 def is_usable(scene: Scene, values: Mapping[str, Value]) -> bool:
-    """Say whether the scene can be run with these values."""
+    """Return whether the scene can be run with these values."""
     try:
         with_parameters(scene, values)
     except SceneError:
@@ -222,7 +222,7 @@ def _vector(load: Any, field_name: str) -> tuple[float, ...]:
     if field_name == "arm_sign":
         return tuple(load.at_m)
     if isinstance(load, Table):
-        # the sign of a sampled load is its largest force's
+        # the sign of a sampled load is that of its largest force
         return (float(load.wrench[:, :2].flat[abs(load.wrench[:, :2]).argmax()]),)
     return tuple(load.force_n)
 
@@ -247,7 +247,7 @@ def _load(scene: Scene, owner: str) -> Any:
 
 
 def _is_set(key: str, values: Mapping[str, Value], scene: Scene) -> bool:
-    """Say whether the number at a key of `Scene.marks` (loads by index there) is changed by these values."""
+    """Return whether these values change the number at a key of `Scene.marks`, where loads have indexes."""
     match = re.match(r"loads\[(\d+)\]\.(.+)", key)
     path = f"loads.{scene.loads[int(match[1])].name}.{match[2]}" if match else key
     whole = path.partition("[")[0]

@@ -1,4 +1,4 @@
-"""A report on disk: one HTML file that needs no other, and its tables as JSON and CSV."""
+"""A report on disk: one self-contained HTML file, and its tables as JSON and CSV."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def write_html(path: Path, template: str, context: Mapping[str, Any], package: s
 
 
 def embedded_figure(figure: Figure) -> str:
-    """Return a figure of matplotlib as the address of an image that stands in the page itself."""
+    """Return a figure of matplotlib as the data address of an image within the page."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     stream = io.BytesIO()

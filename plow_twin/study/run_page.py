@@ -1,6 +1,6 @@
-"""A run as one HTML file that needs no other file and no network: summary, picture, curves, tables.
+"""A run as one self-contained HTML file: summary, picture, curves, tables.
 
-rerun's own viewer is not in it: its program for browsers alone is larger than a page should be (`docs/recording.md`).
+rerun's viewer is not in it, because its program for browsers is too large for a page (`docs/recording.md`).
 """
 
 from __future__ import annotations
@@ -152,7 +152,7 @@ def _summary(reader: RunReader, curves: RunCurves, log: _Log) -> dict[str, str]:
 
 
 def _by_pad(recording: Recording) -> list[dict[str, str]]:
-    """Return statistics of each pad over the whole run, as texts by column."""
+    """Return the statistics of each pad over the whole run, as texts by column."""
     largest, impulse, touches = np.zeros(PAIR_COUNT), np.zeros(PAIR_COUNT), np.zeros(PAIR_COUNT)
     in_contact, rows, before = np.zeros(PAIR_COUNT), 0, None
     wear: Array | None = None
@@ -183,7 +183,7 @@ def _by_pad(recording: Recording) -> list[dict[str, str]]:
 
 
 def _plots(reader: RunReader, curves: RunCurves) -> list[dict[str, Any]]:
-    """Return title, curves, bands, thresholds and columns of each plot that can be zoomed."""
+    """Return title, curves, bands, thresholds and columns of each plot with zoom."""
     alarms = alarms_of(reader.header.parameters).alarms
     force, clearance = alarms["force"].thresholds, alarms["clearance"].thresholds
     ways = ("horizontal", "vertical")

@@ -9,8 +9,9 @@
     events   steps                      contact changes; steps of the solver
 
 In place of `max` [N]: `mean_in_contact` and `mean_over_time` [N], `impulse` [N s], `time_in_contact` [s], `makes`,
-`wear_depth` [m]. Over several pairs the largest force and the deepest wear count; impulses, times and touches add, and
-means follow from those sums. Corners by the scene's letters or by their names; sets of named corners joined by `+`.
+`wear_depth` [m]. Over several pairs the largest force and the deepest wear count; impulses, times and touches add up,
+and means are computed from these sums. Corners by the scene's letters or by their names; sets of named corners joined
+by `+`.
 """
 
 from __future__ import annotations
@@ -88,7 +89,7 @@ UNITS: Final[Mapping[str, str]] = {
 
 
 def statistics_of(members: Members, scenes: Sequence[Scene], paths: Sequence[str]) -> Array:
-    """Return the statistics of runs, shape (m, paths), NaN where one failed; each scene may letter its own corners."""
+    """Return the statistics of runs, shape (m, paths), NaN for a failed run; each scene may letter its own corners."""
     result = np.full((len(scenes), len(paths)), np.nan)
     groups: dict[tuple[tuple[str, str], ...], list[int]] = {}
     for index in np.flatnonzero(~members.failed).tolist():
@@ -124,7 +125,7 @@ def statistic(scene: Scene, path: str) -> Statistic:
     Raises
     ------
     StudyError
-        With the nearest paths and the kinds there are.
+        With the nearest paths and the existing kinds.
     """
     known = statistics_of_scene(scene)
     # letters of a set in any order

@@ -1,9 +1,9 @@
-"""The folder of a sweep: the question, and the part computed so far.
+"""The folder of a sweep: its arguments, and the part computed so far.
 
     sweep.json          the arguments, and the number of members in a chunk
     chunks/00007.npz    status and statistics of the members of one chunk, and the build that computed them
 
-A chunk is written beside its place, synced and moved there in one step: a killed run loses the chunk under way.
+A chunk is written beside its place, synced and moved there in one step: a killed run loses only the chunk under way.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ class Store:
         return [index for index in range(len(self.chunks)) if self.read(index) is None]
 
     def read(self, index: int) -> tuple[Array, str] | None:
-        """Return a chunk's table and build, or None when it is not there or not whole."""
+        """Return a chunk's table and build, or None when it is missing or incomplete."""
         try:
             with self._path(index).open("rb") as file, np.load(file, allow_pickle=False) as archive:
                 table, build = np.asarray(archive["table"], float), str(archive["build"])

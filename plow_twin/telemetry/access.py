@@ -1,4 +1,4 @@
-"""Where results go, with which credentials: addresses from options, secrets from files or the environment."""
+"""Destinations of results and their credentials: addresses from options, secrets from files or the environment."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ _KEYS: Final = {
 
 
 class AccessError(InputError):
-    """A way out is described wrongly."""
+    """An output is described wrongly."""
 
     def __init__(self, key: str, got: object, expected: str) -> None:
         super().__init__([Problem(key, got, expected)], "telemetry")
 
 
-#: What a topic that is sent to cannot hold.
+#: Characters that a topic for sending cannot have.
 _NO_TOPIC: Final = re.compile(r"[+#\x00-\x1f]|^\$")
 
 
@@ -49,7 +49,7 @@ class WayOut:
     first : dict
         First message to its process.
     may_acknowledge : bool
-        Whether an operator there may acknowledge alarms.
+        Whether an operator at the destination may acknowledge alarms.
     """
 
     name: str
@@ -73,7 +73,7 @@ class Credentials:
         Raises
         ------
         AccessError
-            A section or key is not known, or a value is no text.
+            A section or key is not known, or a value is not a text.
         SceneError
             It is no YAML within the bounds.
         OSError
@@ -124,9 +124,9 @@ class Credentials:
 
 
 def mqtt_out(url: str, credentials: Credentials, *, plain: bool, sparkplug: str = "") -> list[WayOut]:
-    """Return the ways to an MQTT broker, `mqtt[s]://HOST[:PORT]/PREFIX`.
+    """Return the outputs to an MQTT broker, `mqtt[s]://HOST[:PORT]/PREFIX`.
 
-    `sparkplug` is `GROUP/NODE`, or empty; with it JSON is sent only where there is a prefix.
+    `sparkplug` is `GROUP/NODE`, or empty; with it JSON is sent only if there is a prefix.
 
     Raises
     ------
@@ -152,7 +152,7 @@ def mqtt_out(url: str, credentials: Credentials, *, plain: bool, sparkplug: str 
 
 
 def influx_out(url: str, credentials: Credentials, *, plain: bool) -> WayOut:
-    """Return the way to InfluxDB, `http[s]://HOST[:PORT]/ORG/BUCKET`.
+    """Return the output to InfluxDB, `http[s]://HOST[:PORT]/ORG/BUCKET`.
 
     Raises
     ------
@@ -177,7 +177,7 @@ def influx_out(url: str, credentials: Credentials, *, plain: bool) -> WayOut:
 
 
 def opcua_out(url: str, credentials: Credentials, *, plain: bool, acknowledges: bool) -> WayOut:
-    """Return the way to clients of an OPC UA server: `opc.tcp://HOST:PORT` with the address that it listens on.
+    """Return the output to clients of an OPC UA server: `opc.tcp://HOST:PORT` with the address that it listens on.
 
     Raises
     ------

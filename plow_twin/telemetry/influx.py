@@ -16,7 +16,7 @@ from plow_twin.dashboard.link import Link
 from plow_twin.telemetry.values import Group, Newest
 from plow_twin.telemetry.way import State
 
-#: Most points that wait for the database: ten minutes of all groups of numbers at 1 Hz; the oldest go first.
+#: Most points that wait for the database: ten minutes of all groups of numbers at 1 Hz; the oldest are dropped first.
 _WAITING: Final = 2000
 #: Most points in one request.
 _AT_ONCE: Final = 500
@@ -60,7 +60,7 @@ class Influx:
             self.state.lost += 1
 
     async def turn(self) -> None:
-        """Write waiting lines, unless the database has failed just now."""
+        """Write waiting lines, unless the database failed a moment ago."""
         while self._waiting and time.monotonic() >= self._again_s:
             lines = [self._waiting[index] for index in range(min(len(self._waiting), _AT_ONCE))]
             try:

@@ -1,4 +1,4 @@
-"""The ways out of a live twin without ROS."""
+"""The outputs of a live twin without ROS."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from plow_twin.telemetry.outlet import Outlet
 
 
 def open_way(front: BridgeFront, way: WayOut, rate_hz: float, source: str) -> Outlet:
-    """Return a way out of a twin that has not begun to run; raises as `Outlet`."""
+    """Return an output of a twin that has not begun to run; raises as `Outlet`."""
     runtime = front.runtime
     services = Services(runtime, front.changed)
 

@@ -16,11 +16,11 @@ from plow_twin.live.bridge.paho_client import end_of, make_client, refusal, use_
 from plow_twin.telemetry.values import UNITS, Group, Newest
 from plow_twin.telemetry.way import State, TelemetryError
 
-#: Most messages that wait for the broker: ten minutes of all groups of numbers at 1 Hz; the oldest go first.
+#: Most messages that wait for the broker: ten minutes of all groups of numbers at 1 Hz; the oldest are dropped first.
 _WAITING: Final = 2000
-#: Messages that the broker may have without having acknowledged them.
+#: Most messages that the broker has not yet acknowledged.
 _UNACKNOWLEDGED: Final = 20
-#: A broker that is silent for longer than one and a half times this is gone [s].
+#: A broker that is silent for one and a half times this counts as gone [s].
 _KEEPALIVE_S: Final = 10
 
 
@@ -34,7 +34,7 @@ class Message(NamedTuple):
 
 
 class Broker:
-    """A connection to a broker that is made again when it breaks, and a bounded queue before it.
+    """A connection to a broker that is restored when it breaks, with a bounded queue before it.
 
     Parameters
     ----------
@@ -189,7 +189,7 @@ class MqttOut:
         """Do nothing: the connection has a thread."""
 
     async def close(self, patience_s: float) -> None:
-        """Send waiting messages, then that the twin has gone."""
+        """Send waiting messages, then the message that the twin has gone."""
         await self._broker.close(self._gone, patience_s)
 
 

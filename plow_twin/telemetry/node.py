@@ -1,4 +1,4 @@
-"""The ways out of a node: from its topics, by a process beside it; acknowledgements go to its service."""
+"""The outputs of a node: a process beside it reads its topics; acknowledgements go to its service."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def send_node(
     SceneError
         The scene cannot be read.
     TelemetryError, ModuleNotFoundError
-        A way cannot be opened.
+        An output cannot be opened.
     """
     with ExitStack() as opened:
         opened.enter_context(ros())

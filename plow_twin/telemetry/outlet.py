@@ -1,4 +1,4 @@
-"""A way out beside a twin: its process, the feed to it, and its part of the diagnostics."""
+"""An output beside a twin: its process, the feed to it, and its part of the diagnostics."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from plow_twin.live.part import Part
 from plow_twin.telemetry.access import WayOut
 from plow_twin.telemetry.way import TelemetryError
 
-#: How long a process may take to open its way [s]: it only imports its library.
+#: How long a process may take to open its output [s]: it only imports its library.
 _START_S: Final = 60.0
 
 
 class Outlet(Beside):
-    """A running way out; a context that ends it.
+    """A running output; a context that ends it.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ class Outlet(Beside):
 
 
 def _is_there(name: str) -> bool:
-    """Return whether a module can be imported; it is not imported here, but its parents are."""
+    """Return whether a module can be imported, importing only its parents."""
     try:
         return find_spec(name) is not None
     except ModuleNotFoundError:

@@ -1,7 +1,7 @@
-"""The process of one way out: `python -m plow_twin.telemetry.process LINK`; the first message names the way.
+"""The process of one output: `python -m plow_twin.telemetry.process LINK`; the first message names the output.
 
-It takes the updates of a feed one by one. While the receiver does not answer, the way out keeps as many as its own
-bound allows and counts the others; the twin does not wait for any of it.
+It takes the updates of a feed one by one. While the receiver does not answer, the output keeps as many as its bound
+allows and counts the others, without delay to the twin.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from plow_twin.errors import PlowTwinError
 from plow_twin.telemetry.values import Newest
 from plow_twin.telemetry.way import Way
 
-#: Module and class of each way out.
+#: Module and class of each output.
 WAYS: Final = {
     "mqtt": ("plow_twin.telemetry.mqtt", "MqttOut"),
     "sparkplug": ("plow_twin.telemetry.sparkplug", "Sparkplug"),
     "influx": ("plow_twin.telemetry.influx", "Influx"),
     "opcua": ("plow_twin.telemetry.opcua.server", "OpcUaServer"),
 }
-#: How much the process gives way to the twin (`nice`).
+#: Lower priority of the process than the twin (`nice`).
 _NICE: Final = 5
 #: Longest time between two reports [s].
 _REPORT_S: Final = 0.5
-#: How long the receiver has for waiting messages at the end [s].
+#: Time at the end for the receiver to take waiting messages [s].
 _END_S: Final = 2.0
 
 
@@ -82,7 +82,7 @@ async def _run(link: Link, first: dict[str, Any]) -> None:
 
 
 def main() -> None:
-    """Serve the way out whose link is the descriptor given as argument."""
+    """Serve the output whose link is the descriptor given as argument."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(_NICE)
     end = socket.socket(fileno=int(sys.argv[1]))

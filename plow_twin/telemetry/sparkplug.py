@@ -1,4 +1,4 @@
-"""Sparkplug B over MQTT: birth with all metrics, data of those that have changed, death, and rebirth when asked.
+"""Sparkplug B over MQTT: birth with all metrics, data with changed metrics, death, and rebirth on request.
 
 Messages are those of `sparkplug_b.proto` of Eclipse Tahu, made from its published field numbers: the file itself is
 under another licence and does not ship.
@@ -104,7 +104,7 @@ class Sparkplug:
                 self._broker.send(self._numbered("NDATA", payload))
 
     def _news(self, name: str, group: Group) -> Group:
-        """Return a group with the values that are not those sent before."""
+        """Return a group with the values that differ from those sent before."""
         values = {key: value for key, value in group.values.items() if self._sent.get((name, key), self) != value}
         self._sent |= {(name, key): value for key, value in values.items()}
         return group._replace(values=values)
@@ -117,7 +117,7 @@ class Sparkplug:
                 self._broker.send(self._birth())
 
     async def close(self, patience_s: float) -> None:
-        """Say that the node has gone."""
+        """Send the message that the node has gone."""
         await self._broker.close(self._death(), patience_s)
 
     def _born(self) -> list[Message]:
@@ -134,7 +134,7 @@ class Sparkplug:
         return self._numbered("NBIRTH", payload)
 
     def _next_death(self) -> Message:
-        """Return the death of the next connection: the broker knows it before there is a birth."""
+        """Return the death message of the next connection, which the broker gets before a birth."""
         self._connection = (self._connection + 1) % 256
         return self._death()
 

@@ -1,4 +1,4 @@
-"""Values of the outputs: the newest numbers and texts of a twin, in groups with the same names on every way out."""
+"""Values of the outputs: the newest numbers and texts of a twin, in groups with the same names on every output."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ UNITS: Final = {"clearance": "m", "wear": "m", "peaks": "N"}
 
 
 class Group(NamedTuple):
-    """Values that go out together.
+    """Values that are sent together.
 
     Attributes
     ----------
@@ -43,10 +43,11 @@ class Group(NamedTuple):
 
 
 class Newest:
-    """The newest of all groups, from the updates of a feed.
+    """The newest values of all groups, from the updates of a feed.
 
     The groups are `clearance` [m] and `wear` [m] with their 5 % and 95 % points, `peaks` [N] since the update before,
-    `life` (points of the forecast), `flags`, `status` and `alarms`. Each has all of its names from the first update on.
+    `life` (points of the forecast), `flags`, `status` and `alarms`. Each group has all of its names from the first
+    update on.
     """
 
     def __init__(self) -> None:
@@ -57,7 +58,7 @@ class Newest:
         self._held = False
 
     def update(self, update: Mapping[str, Any]) -> dict[str, Group]:
-        """Take in an update; return the groups that it has changed."""
+        """Use an update; return the groups that it has changed."""
         self.not_taken = update.get("not_taken", self.not_taken)
         changed: dict[str, dict[str, Value]] = {}
         if "facts" in update:

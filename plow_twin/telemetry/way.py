@@ -1,4 +1,4 @@
-"""Interface of a way out."""
+"""Interface of an output."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from plow_twin.telemetry.values import Group, Newest
 
 
 class TelemetryError(PlowTwinError):
-    """A way out cannot be opened; the message names it with the expectation."""
+    """An output cannot be opened; the message names it with the expectation."""
 
 
 @dataclass
 class State:
-    """State of a way out.
+    """State of an output.
 
     Attributes
     ----------
@@ -25,7 +25,7 @@ class State:
     sent, lost : int
         Messages (or points, or updates) that the receiver has taken, and those that were dropped.
     trouble : str
-        Why the receiver does not take anything, or empty.
+        Why the receiver does not take anything; empty if it does.
     """
 
     connected: bool = False
@@ -40,7 +40,7 @@ class Way(Protocol):
     state: State
 
     async def open(self, link: Link, newest: Newest) -> None:
-        """Open the way of a machine, of which `newest` has the facts; wishes of operators go back through `link`."""
+        """Open the output of the machine in the facts of `newest`; requests of operators come back through `link`."""
 
     async def send(self, changed: dict[str, Group], newest: Newest) -> None:
         """Send the groups that have changed."""

@@ -41,7 +41,7 @@ class TimeAxis:
 class Curves:
     """Curves with common times: one entity for each column of the rows.
 
-    With `span_ns` a curve keeps the least and the largest value in each such span of stamps: no peak is lost. `rows`
+    With `span_ns` a curve keeps the least and the largest value in each span of stamps, so that no peak is lost. `rows`
     counts the rows added, `sent` the values sent of the first curve. A row without values ends the lines at a gap.
     """
 
@@ -81,7 +81,7 @@ class Curves:
         self._ends.append(np.full(len(stamps), ends))
 
     def flush(self) -> None:
-        """Send what has been collected."""
+        """Send the collected rows."""
         if not self._parts:
             return
         stamps, steps, values = (np.concatenate(part) for part in zip(*self._parts, strict=True))
@@ -101,7 +101,7 @@ class Curves:
             rr.send_columns(entity, indexes, columns, recording=self._stream)
 
     def _spans(self, stamps: Indexes, ends: NDArray[np.bool_]) -> Indexes:
-        """Return for each row the number of its span; the end of a line has a span of its own."""
+        """Return the span number of each row; the end of a line has its own span."""
         spans = stamps // self.span_ns
         after = np.concatenate(([False], ends[:-1]))
         changes: Indexes = np.cumsum((np.diff(spans, prepend=spans[0]) != 0) | ends | after)
@@ -110,7 +110,7 @@ class Curves:
 
 @compiled
 def extremes(spans, values):  # type: ignore[no-untyped-def]
-    """Mark the first least and the first largest value of each column, (n, k), in each run of equal `spans`, (n,)."""
+    """Mark the first smallest and first largest value of each column, (n, k), in each run of equal `spans`, (n,)."""
     count, columns = values.shape
     kept = np.zeros((count, columns), np.bool_)
     for k in range(columns):
@@ -156,7 +156,7 @@ class Batches:
             self.flush()
 
     def flush(self) -> None:
-        """Send what has been collected."""
+        """Send the collected rows."""
         if not self._lengths:
             return
         columns = self._archetype.columns(**self._values).partition(self._lengths)

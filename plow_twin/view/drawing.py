@@ -186,7 +186,7 @@ class Drawing:
         """Write that entries are missing before a batch, and end all lines there."""
         self._sample_ns, self._wrench = None, np.full(3, np.nan)
         self.events.forget()
-        if not isinstance(after.entries.others.get(0), Loss):  # it is an event of its own
+        if not isinstance(after.entries.others.get(0), Loss):  # it is drawn as an event
             text = f"{count} journal entries are not there after this"
             self.events.add(self.stamp_ns, max(self.step, 0), text, "ERROR")
 
@@ -308,14 +308,14 @@ class Drawing:
     def _growth_m(self, numbers: Array) -> Array:
         """Return the growth of the clearances by wear alone [m] with its interval, in the order of `layout.GROWTH`.
 
-        It is the wear of the pads: an estimate or a changed parameter is no wear.
+        It is the wear of the pads, without the effects of estimates and changed parameters.
         """
         new = clearances(self._scene, np.zeros(PAIR_COUNT))[:2]
         best, low, high = (clearances(self._scene, numbers[:, pads])[:, :2] - new for pads in _PAD_POINTS)
         return np.concatenate((best, np.stack((low, high), axis=2).reshape(len(numbers), 4)), axis=1)
 
     def _bands(self, stamps: Indexes, steps: Indexes, numbers: Array) -> None:
-        """Draw the areas between the bounds: curves that change between them, row by row."""
+        """Draw the areas between the bounds as curves that alternate between them, row by row."""
         total = np.concatenate((1e3 * numbers[:, _BOUNDS], 1e6 * self._growth_m(numbers)[:, 2:]), axis=1)
         if self._band_end is not None and len(stamps) and self._band_end[0][0] < stamps[0]:
             ends = zip(self._band_end, (stamps, steps, total), strict=True)

@@ -1,4 +1,4 @@
-"""Curves of any length for a picture: every row, or the least and the largest value in bins of equal width."""
+"""Curves of any length for a picture: every row, or the smallest and the largest value in bins of equal width."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ _MOST_BINS: Final = 700
 class Envelope:
     """Rows of `width` numbers over time, in bounded memory.
 
-    Up to `most_rows` rows are kept as they are. Beyond that, time is divided into bins of one width over the whole
-    span, and each bin keeps the least and the largest value of each column, so that no peak is lost and old rows look
-    like new ones.
+    Up to `most_rows` rows are kept as they are. Beyond that, time is divided into bins of equal width over the whole
+    span, and each bin keeps the smallest and the largest value of each column, so that no peak is lost and old and new
+    rows look alike.
     """
 
     def __init__(self, width: int, most_rows: int = MOST_ROWS, most_bins: int = _MOST_BINS) -> None:
@@ -59,7 +59,7 @@ class Envelope:
     def bands(self, column: int) -> tuple[Array, Array, Array]:
         """Return times [s], least and largest values of a column, shape (n,) each, with NaN between two segments.
 
-        The time of a bin is its middle; least and largest value of a row that is kept are the same.
+        The time of a bin is its middle; a single row has equal smallest and largest values.
         """
         self._merge()
         rows = self._kept
@@ -84,7 +84,7 @@ class Envelope:
             self._bin_s = max(2.0 * float(np.ptp(self._kept.place)) / self._most_bins, 1e-9)
             self._kept = self._kept.binned(self._bin_s)
         self._kept = self._kept.merged()
-        # segments stay apart, however many there are
+        # any number of segments stay apart
         while len(self._kept.place) > self._most_bins and np.ptp(self._kept.place) > 1.0:
             self._bin_s *= 2.0
             self._kept = self._kept.binned(2.0).merged()

@@ -1,4 +1,4 @@
-"""Picture of an estimate: the motion that was fitted, and each quantity with its interval beside its prior."""
+"""Picture of an estimate: the fitted motion, and each quantity with its interval beside its prior."""
 
 from __future__ import annotations
 

@@ -93,7 +93,7 @@ class FaceChart:
             here = self._passes[-1]
 
     def restart(self) -> None:
-        """Continue after a reset: stamps may go back, and speeds ahead of their time act now."""
+        """Continue after a reset: stamps may go back, and waiting speeds act now."""
         for travel in self._coming:
             self._set_speed(travel.speed_m_s)
         self._coming, self._reached_ns = [], None
@@ -127,7 +127,7 @@ class FaceChart:
 
 
 def _halved(one: dict[int, float]) -> dict[int, float]:
-    """Return the forces by pieces twice as long."""
+    """Return the forces for pieces twice as long."""
     found: dict[int, float] = {}
     for piece, force in one.items():
         found[piece // 2] = max(found.get(piece // 2, 0.0), force)

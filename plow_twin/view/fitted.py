@@ -1,4 +1,4 @@
-"""A fit that can be looked at: measured against fitted motion, residuals, and values with intervals beside the prior.
+"""The picture of a fit: measured against fitted motion, residuals, and values with intervals beside the prior.
 
 `plow_twin.view.fitted_file` writes it.
 """
@@ -23,9 +23,9 @@ _SCALE: Final = 1e3
 _COMPONENTS: Final = (("x", "mm"), ("y", "mm"), ("θ", "mrad"))
 #: Characters in a line of the title.
 _LINE: Final = 150
-#: Time between two rows, over the usual time, from which on it is a gap.
+#: Time between two rows, over the usual time, that counts as a gap.
 _GAP: Final = 10.0
-#: Largest distance from the prior's middle that is drawn, in half widths of the prior; values beyond it lie there.
+#: Largest drawn distance from the prior's middle, in half widths of the prior; values beyond it are drawn there.
 _FARTHEST: Final = 2.0
 
 

@@ -1,4 +1,4 @@
-"""Picture of a forecast: the clearances over time, and when the first reaches its limit."""
+"""Picture of a forecast: the clearances over time, and the time at which the first reaches its limit."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def draw_forecast(found: Forecast, path: FilePath, title: str) -> None:
                 xytext=(offset, -10.0),
                 textcoords="offset points",
                 ha=side,
-                bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0},  # over the line of another point
+                bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0},  # above the line of another point
             )
     if plan.stop_h is not None and plan.stop_h <= end:
         right.axvline(plan.stop_h, color="#1b7837", linestyle=":", label="planned stop")

@@ -38,7 +38,7 @@ BAND: Final = tuple(f"{group}/band/{way}" for group in ("clearance", "growth") f
 RESIDUAL: Final = ("residual/x", "residual/y", "residual/theta")
 WEAR: Final = tuple(f"wear/{name}" for name in CLEARANCE_NAMES if name.startswith("pad_"))
 
-#: Views hide bounds at first: bands show the clearances' bounds, and a legend of more than eight names is cut.
+#: Views hide bounds at first, because bands show the clearances' bounds and a legend shows at most eight names.
 _WITHOUT_BOUNDS: Final = (
     "$origin/**",
     *(f"- $origin/{name}" for name in CLEARANCE_NAMES if name.endswith(("/p05", "/p95"))),
@@ -99,7 +99,7 @@ def blueprint(
         active_tab=0,
     )
     curves = rrb.Vertical(
-        # the widest view has the title, which is cut in the others
+        # the title, which is cut in narrower views, stands in the widest
         _plot("force", f"Largest contact force [kN]{title and '; '}{title}"),
         rrb.StateTimelineView(origin=ENTITY, name="Corners that carry force"),
         _plot("load", "Load on the head"),
@@ -114,7 +114,7 @@ def blueprint(
             _plot("wear", "Wear [mm]", rrb.Corner2D.LeftTop, _WITHOUT_BOUNDS),
             active_tab=0,
         ),
-        row_shares=[4.7, 2.2, 2.7, 3.4],  # the lane of the sets fits in a window of 600 pixels too
+        row_shares=[4.7, 2.2, 2.7, 3.4],  # the lane of the sets also fits in a window of 600 pixels
     )
     return rrb.Blueprint(
         rrb.Horizontal(
@@ -165,13 +165,13 @@ def style_curves(stream: rr.RecordingStream) -> None:
 
 
 def band_colors(entity: str) -> list[tuple[int, ...]]:
-    """Return the colours of the first stroke of a band, which the legend shows, and of all others."""
+    """Return the colours of the first stroke of a band, which is that of the legend, and of the other strokes."""
     color = _CLEARANCE_COLORS[entity.rpartition("/")[2]]
     return [(*(part // 2 for part in color), 255), (*color, _BAND_ALPHA)]
 
 
 def style_load(stream: rr.RecordingStream, largest: Iterable[float]) -> None:
-    """Name the curves of the load with their largest values: the axis of a low plot has only powers of ten."""
+    """Name the curves of the load with their largest values, because the axis of a low plot has only powers of ten."""
     for entity, name, unit, color, value in zip(LOAD, *_LOAD_NAMES, _LOAD_COLORS, largest, strict=True):
         named = f"{name}, to {value:.3g} {unit}" if value else f"{name} [{unit}]"
         _style(stream, entity, named, color, AggregationPolicy.MinMax)

@@ -1,4 +1,4 @@
-"""A run shown while it is recorded, by a process of its own that follows the file.
+"""A live view of a run while it is recorded, by a process of its own that follows the file.
 
 The node is independent of it: a slow or closed viewer stops this process alone. Curves are thinned to the least and the
 largest value of each span.

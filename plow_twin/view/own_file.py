@@ -1,4 +1,4 @@
-"""Picture of the first seconds of a user's file, as it will be read: its load, pose and speed."""
+"""Picture of the first seconds of a user's file by the mapping: its load, pose and speed."""
 
 from __future__ import annotations
 

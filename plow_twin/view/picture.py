@@ -28,7 +28,7 @@ _LABEL_ROOM_MM: Final = 50.0
 #: Width of an upright label, as a share of the axes that it stands in.
 _LABEL_WIDTH: Final = 0.015
 _LOAD_NAMES: Final = ("Fx [kN]", "Fy [kN]", "M [kN m]")
-#: Where a clearance comes from, by its state, in the words of the screen.
+#: Origin of a clearance by its state, in the words of the screen.
 _STATES: Final = {
     "prior": "assumed",
     "estimated": "estimated",
@@ -130,7 +130,7 @@ def _draw_instant(upper: Any, lower: Any, section: Section, curves: RunCurves) -
 
 
 def _note_absence(axis: Any, text: str) -> None:
-    """Write a text in place of a drawing."""
+    """Write a text instead of a drawing."""
     axis.text(0.5, 0.5, text, ha="center", va="center", transform=axis.transAxes)
     axis.set(yticks=[])
 
@@ -196,7 +196,7 @@ def _curves(
     only_largest: bool = False,
     gaps: Sequence[tuple[float, float]] = (),
 ) -> None:
-    """Draw curves, or of bins the band between least and largest values; bands of forces would all begin at zero.
+    """Draw curves, or for bins the band between smallest and largest values; bands of forces would all begin at zero.
 
     No line crosses a gap, given by its ends [s].
     """
@@ -216,7 +216,7 @@ def _curves(
 
 
 def _widest(times: NDArray[np.float64], begin: float, end: float) -> int:
-    """Return the place behind the longest step of times [s] that meets a gap; the end where no step does."""
+    """Return the index after the longest step of times [s] that meets a gap; the end if no step does."""
     steps = np.where((times[1:] > begin) & (times[:-1] < end), np.diff(times), 0.0)
     return int(steps.argmax()) + 1 if steps.any() else len(times)
 
@@ -255,7 +255,7 @@ def _clearance(axis: Any, curves: RunCurves) -> None:
 
 
 def _with_interval(value: float, low: float, high: float) -> str:
-    """Return a clearance in mm; a wear of micrometres shows in the third digit, an interval of some mm hides it."""
+    """Return a clearance in mm, with a third digit for wear of micrometres unless an interval of some mm hides it."""
     if high - low < 1e-3:
         return f"{value:.3f} mm"
     return f"{value:.2f} mm ({low:.2f} to {high:.2f})"

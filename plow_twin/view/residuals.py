@@ -15,7 +15,7 @@ _SCALE = 1e3
 
 
 class Residuals:
-    """Compares poses once the model has passed their stamps, linear between two of its rows."""
+    """Compares poses once the model has passed their stamps, interpolating linearly between its rows."""
 
     def __init__(self) -> None:
         self._waiting: list[tuple[int, int, tuple[float, ...]]] = []

@@ -31,7 +31,7 @@ class ViewSummary:
 
     `status` is how the recording ended. `lost` has the counts of its recorder by topic, of parts that are missing or of
     another run, and of samples too late for other scenes. `failed` advances have no forces.
-    Of `rows` of the force curves `curve_rows` were sent.
+    `curve_rows` of the `rows` of the force curves were sent.
     """
 
     path: Path

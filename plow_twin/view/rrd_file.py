@@ -19,7 +19,7 @@ _CHUNK: Final = 1 << 20
 
 
 class RrdFile:
-    """Receives a stream through a pipe and writes it to a file, which is removed unless it is whole.
+    """Receives a stream through a pipe and writes it to a file, which is removed if incomplete.
 
     The SDK's own file sink (0.41) waits forever for a disk that is full: in `save`, `flush` or `disconnect`.
 

@@ -48,7 +48,7 @@ class RunCurves:
 
     Times count from `first_ns`, the first stamp of a sample or message [s]. `held_s` are the stretches computed without
     samples, `failed_s` the times of `failed` advances, which have no forces; `changes` are the instants at which the
-    clearance changed by something else than wear, with the reason.
+    clearance changed for another reason than wear, with the reason.
     """
 
     first_ns: int | None = None
@@ -139,7 +139,7 @@ class RunCurves:
         self._samples(batch.entries.stamp_ns[samples[samples >= done]])
 
     def _samples(self, stamps: NDArray[np.int64]) -> None:
-        """Take in the stamps of samples; the first after the beginning of a held stretch, also a late one, ends it."""
+        """Add the stamps of samples; the first after the beginning of a held stretch, even if late, ends it."""
         if not len(stamps):
             return
         behind = stamps[stamps > (self._held_since_ns or 0)]
@@ -155,7 +155,7 @@ class RunCurves:
         self._held_since_ns = None
 
     def _failed(self, stamp_ns: int, since_ns: int, advances: int) -> None:
-        """Take in the first failed advance of a row, or all others at its end."""
+        """Add the first failed advance of a row, or the others at its end."""
         first = self.first_ns or 0
         self.failed += advances
         if stamp_ns == since_ns:
@@ -169,7 +169,7 @@ class RunCurves:
             self.changes.append(((stamp_ns - self.first_ns) * _NS, reason))
 
     def _last_estimate(self) -> None:
-        """End the clearances with those of an estimate that came after the last publication, at the last stamp."""
+        """Add the clearances of an estimate that came after the last publication, at the last stamp."""
         if self._estimate is None or self._clearance is None or self._newest_ns is None:
             return
         result, values = json.loads(self._estimate[1]), self._clearance.copy()
@@ -191,7 +191,7 @@ class RunCurves:
             self.clearance.add(self._seconds(rows.stamp_ns), values)
             self._clearance = values[-1]
             if self._estimate is not None and rows.sequence[-1] > self._estimate[0]:
-                self._estimate = None  # the publications since have it
+                self._estimate = None  # the publications since then include it
         if "contact_forces" in found and "head_state" in found:
             for instant in _largest(found["contact_forces"], found["head_state"]):
                 if self.instant is None or instant.force.max() > self.instant.force.max():

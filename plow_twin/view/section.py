@@ -30,7 +30,7 @@ _PAD_MM: Final = 60.0
 #: Distance of a label below its place [mm].
 LABEL_MM: Final = 16.0
 
-#: One hue per corner; the pair with the vertical wall in the lighter shade (Okabe and Ito's palette).
+#: One hue per corner, lighter for the pair with the vertical wall (Okabe and Ito's palette).
 _HUES: Final = ((0, 114, 178), (230, 159, 0), (213, 94, 0), (0, 158, 115))
 _LIGHTER: Final = ((86, 180, 233), (240, 228, 66), (255, 158, 105), (110, 220, 185))
 PAIR_COLORS: Final = tuple(color for pair in zip(_HUES, _LIGHTER, strict=True) for color in pair)
@@ -108,8 +108,8 @@ class Section:
     def exaggerated(self, penetration: Array, factor: float) -> tuple[Array, NDArray[np.bool_]]:
         """Return the four walls with gaps `factor` times as wide, shape (4, 2, 2), and which of them touch.
 
-        Walls in the order top, right, bottom, left. Each passes through its two points at the frame's corners, wear
-        included, and ends where it meets the next wall.
+        Walls in the order top, right, bottom, left. Each wall passes through its two points at the frame's corners,
+        wear included, and ends at the next wall.
         """
         places = (0.5 * self.frame * _SIGNS - _OUTWARDS * (_MM * factor * penetration)[:, None]) * _FLIP
         walls = np.array([(0, 2), (3, 5), (4, 6), (7, 1)])
@@ -154,7 +154,7 @@ class Section:
 
 
 def _closed(walls: Array) -> Array:
-    """Return walls (4, 2, 2), each drawn from the wall before to the next one; as they are where these are parallel."""
+    """Return walls (4, 2, 2), each extended to the walls before and after it, unless these are parallel to it."""
     along = walls[:, 1] - walls[:, 0]
     before, along_before = np.roll(walls, 1, axis=0), np.roll(along, 1, axis=0)
     across = _cross(along_before, along)

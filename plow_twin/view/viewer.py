@@ -1,4 +1,4 @@
-"""rerun's viewer as a program: found, started on the loopback address, ended with the process that started it."""
+"""rerun's viewer as a program, started on the loopback address and ended with the process that started it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _START_S: Final = 60.0
 
 
 def viewer_program() -> str:
-    """Return the program of rerun, not the wrapper of the same name, which would outlive the process that stops it.
+    """Return the program of rerun, not the wrapper of that name, whose child would outlive it.
 
     Raises
     ------
@@ -93,7 +93,7 @@ def _address(port: int) -> str:
 def page_address(web_port: int, port: int) -> str:
     """Return the address of the page that shows the data on a port.
 
-    In the dark theme: the cross-section's names are not legible on the light one's labels.
+    It asks for the dark theme, because the light theme's labels make the cross-section's names illegible.
     """
     return f"http://{LOOPBACK}:{web_port}/?url={quote(_address(port), safe='')}&theme=dark"
 

@@ -52,7 +52,7 @@ class WhatIf:
 
     @property
     def lost(self) -> dict[str, int]:
-        """Count of samples that came after the scenes had passed their stamps, by its name in `lost`."""
+        """Number of samples that came after the scenes had passed their stamps, by its name in `lost`."""
         return {"samples_too_late": self._walk.late} if self._walk.late else {}
 
     def add(self, entries: Entries, stamps: Indexes, steps: Indexes) -> None:

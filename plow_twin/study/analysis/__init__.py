@@ -1,1 +1,1 @@
-"""Recordings analysed: predicted against measured, loads of the contacts, other scenes beside it."""
+"""Analysis of recordings: predicted against measured, loads of the contacts, other scenes beside."""

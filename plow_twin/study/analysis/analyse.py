@@ -1,4 +1,4 @@
-"""One recording analysed: a run of ours by its journal, any other through the intake; measured signals beside."""
+"""Analysis of one recording: a run of ours by its journal, any other through the intake, with measured signals."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ _LARGEST: Final = 1e15
 #: Name of the scene in the header of a run.
 _OF_THE_RUN: Final = "of the run"
 _MAP: Final = "map_"
-#: Among the parameters of each run that an analysis has made.
+#: Parameter that marks each run made by an analysis.
 MAPPED_LOAD: Final = f"{_MAP}excitation"
 #: Receives the share of the work done, 0..1.
 OnProgress = Callable[[float], object]
@@ -115,7 +115,8 @@ class Prediction:
     def is_of_longest(self, signal: ThinnedSignal) -> NDArray[np.bool_]:
         """Return for each measured value whether it belongs to the longest stretch.
 
-        That is the one whose stamps hold it; of several, as after a step of the clock back, the one in which it came.
+        A value belongs to the stretch that contains its stamp; if there are several, as after a step of the clock back,
+        to the one in which it arrived.
         """
         at, _ = signal.series()
         if len(self.spans) < 2:
@@ -139,25 +140,25 @@ class Prediction:
 
     @property
     def stride(self) -> int:
-        """One of so many rows of the longest stretch is kept for the signals."""
+        """One in this many rows of the longest stretch is kept for the signals."""
         return self._longer().stride
 
 
 @dataclass
 class Measured:
-    """Measured values by signal, as they came; of very many every second, fourth, ... is kept."""
+    """Measured values by signal, in order of arrival; of very many only every second, fourth, ... is kept."""
 
     signals: dict[str, ThinnedSignal] = field(default_factory=dict)
-    #: the latest of each role: its stretch and its stamp [ns]
+    #: stretch and stamp [ns] of the latest message of each role
     _latest: dict[str, tuple[int, int]] = field(default_factory=dict)
     #: values that are impossible in any unit
     implausible: int = 0
 
     def add(self, role: str, stamp_ns: int, numbers: Mapping[str, float], stretch: int = 0) -> None:
-        """Add the numbers of one message of that stretch; a number that is not finite was not measured."""
+        """Add the numbers of one message of that stretch; a non-finite number was not measured."""
         before, newest = self._latest.get(role, (0, stamp_ns))
         back = newest - stamp_ns > _STEP_NS
-        # its clock has stepped before the load's
+        # its clock has stepped before the clock of the load
         stretch = max(stretch, before + back)
         self._latest[role] = stretch, stamp_ns if back else max(newest, stamp_ns)
         prefix = {"forces": "force_", "gaps": "gap_"}.get(role, "")
@@ -360,7 +361,7 @@ def _walk_own(
     for walker, prediction in zip(walkers, predictions, strict=True):
         walker.on_reset = prediction.restart
     walk = JournalWalk(walkers[:1], walkers[1:], whole=not header.part, same_scene=own)
-    journalled = Measured()  # where the node estimates
+    journalled = Measured()  # if the node estimates
 
     def so_far() -> Analysis:
         losses = Counter({**reader.lost, **reader.lost_parts})
@@ -410,7 +411,7 @@ def _measured_beside(path: Path, mapping: Path | None, node: str) -> tuple[Measu
                 measured.add(name, *found)
         unknown |= source.losses.unknown_types
         for name, count in source.losses.counts.items():
-            if count and (name == "undecodable" or number >= len(places)):  # the run counts the others of its own
+            if count and (name == "undecodable" or number >= len(places)):  # the run itself counts the others
                 unused[name] += count
     return measured, unknown, unused
 
@@ -477,7 +478,7 @@ def _holds_recording(folder: Path) -> bool:
 
 
 def left_out(path: Path) -> list[Path]:
-    """Return the folders in a folder that `expand` leaves out: empty folders, runs beside or inside others."""
+    """Return the folders that `expand` leaves out: empty folders, and runs beside or inside others."""
     if not path.is_dir():
         return []
     folders = [item for item in sorted(path.iterdir()) if item.is_dir()]
@@ -488,7 +489,7 @@ def left_out(path: Path) -> list[Path]:
 
 
 def expand(paths: Sequence[Path]) -> list[Path]:
-    """Return the recordings in some places: a folder that is no recording is replaced by the recordings in it.
+    """Return the recordings at some paths: a folder that is not a recording is replaced by the recordings in it.
 
     Raises
     ------
@@ -517,7 +518,7 @@ def expand(paths: Sequence[Path]) -> list[Path]:
 def counted_once(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
     """Return the recordings without repetitions, and a sentence for each recording that is left out.
 
-    A recording is repeated where its path comes again, or the same run under another path: its random id says so.
+    A recording is repeated if its path, or the random id of its run, occurs again.
     """
     kept: dict[object, Path] = {}
     left: list[str] = []

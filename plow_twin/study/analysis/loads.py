@@ -1,4 +1,4 @@
-"""Loads of the contacts: impacts, forces, duty, cycles, energy and forces along the face, summed batch by batch."""
+"""Loads of the contacts, summed batch by batch: impacts, forces, duty, cycles, energy, forces along the face."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 CYCLE_BINS: Final = 16
 #: Length of a piece of the face [m].
 FACE_BIN_M: Final = 1.0
-#: Bytes of the reversals of one pair that are kept in memory: 131 072 of them, all others on the disk.
+#: Bytes of the reversals of a pair that are kept in memory: 131 072 reversals; the others are on the disk.
 _IN_MEMORY: Final = 2**20
 
 
@@ -45,7 +45,7 @@ class Pass:
 
 
 class Series:
-    """A series of any length that is written once and read from its start as often as asked: on the disk when long."""
+    """A series of any length that is written once and can be read repeatedly from its start; on the disk when long."""
 
     def __init__(self) -> None:
         self._file = tempfile.SpooledTemporaryFile(_IN_MEMORY)  # noqa: SIM115 (goes with this object)
@@ -95,7 +95,7 @@ class LoadTotals:
     _reversals: list[Series] = field(default_factory=lambda: [Series() for _ in range(PAIR_COUNT)])
 
     def restart(self) -> None:
-        """Go on after a reset; the interval across it is not counted."""
+        """Continue after a reset; the interval across it is not counted."""
         self._last = self._worn = None
 
     def add(self, walked: Walked) -> None:
@@ -117,7 +117,7 @@ class LoadTotals:
             self.sets[int(mask)] += int(count)
         for pair, kept in enumerate(self._reversals):
             turning = reversals(rows.peak[:, pair])
-            if turning.any() or kept.last != 0.0:  # of a long time without contact one zero is enough
+            if turning.any() or kept.last != 0.0:  # a single zero suffices for a long time without contact
                 kept.add(turning)
         loss = self._contact_loss(walked, steps)
         self.contact_loss_j += float(loss.sum())
@@ -126,9 +126,9 @@ class LoadTotals:
         self._last = (int(stamps[-1]), *(column[-1].copy() for column in last))
 
     def _contact_loss(self, walked: Walked, steps: Array) -> Array:
-        """Return the energy taken by the contacts between two rows [J]: work of load and gravity less energy gained.
+        """Return the energy taken by the contacts between two rows [J]: work of load and gravity minus energy gained.
 
-        The load's work is its mean times the way; the energy gained is kinetic or stored in the contacts.
+        The load's work is its mean times the distance; the energy gained is kinetic or stored in the contacts.
         """
         now = walked.wrench, walked.rows.q, walked.rows.v, walked.rows.penetration
         first = (column[0] for column in now) if self._last is None else self._last[1:]
@@ -138,7 +138,7 @@ class LoadTotals:
         return np.where(steps > 0.0, work - gain, 0.0)
 
     def _energy(self, q: Array, v: Array, penetration: Array) -> Array:
-        """Return the kinetic energy of the head, its potential one in gravity and the elastic one of contacts [J]."""
+        """Return the head's kinetic energy, its potential energy in gravity, and the elastic energy of contacts [J]."""
         head, gravity = self.scene.head, self.scene.gravity
         theta, omega = q[:, 2], v[:, 2]
         # from the cavity's centre to the centre of mass, in world axes
@@ -178,7 +178,7 @@ class LoadTotals:
     def _wear(self, depth: Array, speed: float, pieces: NDArray[np.int64]) -> None:
         """Add the wear by direction: of the pads, and of the places of the slide that they pass.
 
-        A pad is engaged all the way, a place of the slide only while the pad passes it: for its length.
+        A pad is in contact over the whole distance, a place of the slide only over the length of the pad.
         """
         wear = self.scene.wear
         if wear is None or wear.coefficient_m2_n == 0.0:
@@ -205,7 +205,7 @@ class LoadTotals:
         if self.slide_wear:
             pieces = {piece for _, piece in self.slide_wear}
             total = np.sum(list(self.slide_wear.values()), axis=0) / len(pieces)
-            # as face length to pad length on the whole
+            # in all, in the ratio of pad length to face length
             out["slide_mean_m"] = dict(zip(PAIR_NAMES, total.tolist(), strict=True))
             out["slide_pieces"] = len(pieces)
         return out

@@ -16,7 +16,7 @@ from plow_twin.model.law_modules import load_laws, loaded_laws
 from plow_twin.study.analysis.task import RunTask, run_task
 from plow_twin.study.cluster import completed, connect
 
-#: Receives the share of the recordings that are done.
+#: Receives the share of the recordings done.
 OnProgress = Callable[[float], object]
 _OnDone = Callable[[int, dict[str, Any]], object]
 
@@ -24,7 +24,7 @@ _OnDone = Callable[[int, dict[str, Any]], object]
 def run_many(
     tasks: Sequence[RunTask], *, workers: int, dask: str | None = None, on_progress: OnProgress = lambda share: None
 ) -> list[dict[str, Any]]:
-    """Return the facts of each task, `error` where one failed; those that are stored already are taken.
+    """Return the facts of each task, `error` for a failed one; stored facts are used.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ def run_many(
 def _here(tasks: Sequence[RunTask], waiting: list[int], workers: int, done: _OnDone) -> None:
     while waiting:
         left = _round(tasks, waiting, workers, done)
-        if len(left) == len(waiting):  # one of those that came first has ended its worker: each of them alone
+        if len(left) == len(waiting):  # one of the first tasks has killed its worker: run each of them alone
             left, first = left[workers:], left[:workers]
             for number in first:
                 if _round(tasks, [number], 1, done):
@@ -64,7 +64,7 @@ def _here(tasks: Sequence[RunTask], waiting: list[int], workers: int, done: _OnD
 
 
 def _round(tasks: Sequence[RunTask], waiting: list[int], workers: int, done: _OnDone) -> list[int]:
-    """Run some tasks and return those that were lost: when a worker dies, with all that had not ended."""
+    """Run some tasks and return the lost ones: when a worker dies, all unfinished tasks are lost."""
     left = []
     others = active_children()
     pool = ProcessPoolExecutor(min(workers, len(waiting)), get_context("spawn"), _begin, (loaded_laws(),))
@@ -91,7 +91,7 @@ def _begin(laws: tuple[str, ...]) -> None:
 
 
 def _belong_to_the_caller() -> None:
-    """Leave interrupts to the caller, and end with it, however it ends."""
+    """Leave interrupts to the caller, and end with it in any case."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = parent_process()
     assert parent is not None
@@ -110,6 +110,6 @@ def _on_cluster(tasks: Sequence[RunTask], waiting: list[int], address: str, done
             number = futures[future]
             try:
                 done(number, future.result())
-            except Exception as error:  # whatever became of the worker
+            except Exception as error:  # in any state of the worker
                 path = str(tasks[number].path)
                 done(number, {"run": path, "error": f"{path}: {type(error).__name__}: {error}"})

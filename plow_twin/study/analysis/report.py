@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from plow_twin.study.analysis.analyse import Analysis, Prediction
 
 _MOST_POINTS: Final = 4000
-#: Placeholder of the results of a folder without a recording.
+#: Placeholder for the results of a folder without a recording.
 LEFT_OUT: Final = "left out: no recording"
 
 _PAGE: Final = """<!doctype html>
@@ -182,7 +182,7 @@ def _picture(found: Analysis) -> str:
 
 
 def write_table_of_runs(rows: list[dict[str, Any]], out: Path, left_out: Sequence[Path] = ()) -> None:
-    """Write one row a recording to `runs.parquet`, and one with the reason for each folder that was left out."""
+    """Write to `runs.parquet` a row for each recording, and a row with the reason for each folder left out."""
     flat = []
     for facts in [*rows, *({"run": str(path), "error": LEFT_OUT} for path in left_out)]:
         lost = sum(facts["lost"].values()) if "lost" in facts else None

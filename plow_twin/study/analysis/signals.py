@@ -20,7 +20,7 @@ _MOST_POINTS: Final = 400_000
 
 @dataclass(frozen=True)
 class Comparison:
-    """A signal compared: predicted minus measured.
+    """Comparison of a signal: predicted minus measured.
 
     Attributes
     ----------
@@ -29,9 +29,9 @@ class Comparison:
     bias, rms : float
         Mean and root mean square of predicted minus measured, at equal stamps.
     correlation : float or None
-        Pearson's, at equal stamps; None where a signal does not change.
+        Pearson's correlation, at equal stamps; None where a signal does not change.
     lag_s : float or None
-        Lag of the measurement in s, positive where it is late: the one at which the correlation is largest.
+        Lag of the measurement in s, positive where it is late, at which the correlation is largest.
     rms_aligned : float or None
         Standard deviation of the difference at that lag.
     coherence : float or None
@@ -82,12 +82,12 @@ def _correlation(one: Array, other: Array) -> float | None:
         return None
     one, other = one - one.mean(), other - other.mean()
     size = math.sqrt(float(one @ one) * float(other @ other))
-    # rounding may lead beyond 1
+    # rounding may give more than 1
     return min(1.0, max(-1.0, float(one @ other) / size)) if size > 1e-300 else None
 
 
 def _shifted(t: Array, predicted: Array, times: Array, lag_s: float) -> Array:
-    """Return the prediction as a measurement that is late by `lag_s` shows it; NaN outside its time."""
+    """Return the prediction as seen by a measurement that is late by `lag_s`; NaN outside its time."""
     return _at(times - lag_s, t, predicted)
 
 
@@ -96,14 +96,14 @@ def _at(times: Array, t: Array, predicted: Array) -> Array:
 
 
 def _step(times: Array, span: float) -> float:
-    """Return the usual distance of two stamps [s], not so small as to give too many points; equal stamps count once."""
+    """Return the usual distance of two stamps [s], bounded to limit the points; equal stamps count once."""
     return max(float(np.median(np.diff(np.unique(times)))), span / _MOST_POINTS, 1e-6)
 
 
 def _correlations(longer: Array, shorter: Array) -> Array:
     """Return Pearson's correlation of a series with each piece of a longer one, over the known part of the piece.
 
-    What is known of the longer one, that is not NaN, is one piece itself. -1 where there is too little.
+    The known part of the longer series, without NaN, is contiguous. -1 where there is too little.
     """
     from scipy.signal import correlate
 

@@ -1,4 +1,4 @@
-"""One analysis with its files, as a call that a process of its own can make."""
+"""One analysis with its files, as a call for a process of its own."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _TABLE: Final = re.compile(r"(predicted|clearance|face|slide_wear)(_\d+)?\.parqu
 
 
 def names_apart(paths: Sequence[Path]) -> list[str]:
-    """Return a short name for each recording: as much of its path as distinguishes it from the others."""
+    """Return a short name for each recording: the part of its path that distinguishes it from the others."""
     whole = [path.absolute() for path in paths]
     stems = Counter(path if path.is_dir() else path.with_suffix("") for path in whole)
     parts = [
@@ -54,7 +54,7 @@ class RunTask(Protocol):
         """The recording."""
 
     def stored(self) -> dict[str, Any] | None:
-        """Return the facts where the same work has been done before."""
+        """Return the facts if the same work has been done before."""
 
     def run(self) -> dict[str, Any]:
         """Return the facts."""
@@ -71,11 +71,11 @@ class Task:
     out: Path | None
     #: other contents of the recording's folder, named in the results
     left_out: tuple[Path, ...] = ()
-    #: units of measured numbers by name, beside the mapping's
+    #: units of measured numbers by name, in place of the mapping's
     units: Mapping[str, str] = field(default_factory=dict)
 
     def stored(self) -> dict[str, Any] | None:
-        """Return the facts of this very analysis when its files are there, whole."""
+        """Return the facts of the same analysis if all its files are there."""
         if self.out is None:
             return None
         try:
@@ -91,7 +91,7 @@ class Task:
         Raises
         ------
         RecordingError
-            What this analysis, or one of those beside it, reads from (`inputs`) is among it.
+            A file to remove is an input of this analysis or of one beside it (`inputs`).
         """
         old = self._old()
         self._keep(old, (*self._inputs(), *inputs))
@@ -102,7 +102,7 @@ class Task:
                 path.unlink(missing_ok=True)
 
     def check(self, inputs: Sequence[Path]) -> None:
-        """Raise a `RecordingError` when one of these would be replaced."""
+        """Raise a `RecordingError` when an input would be replaced."""
         self._keep(self._old(), inputs)
 
     def _old(self) -> list[Path]:
@@ -134,7 +134,7 @@ class Task:
             It cannot be made.
         """
         self.clear()
-        asked = self._asked()  # state of the inputs at the start, not at the end
+        asked = self._asked()  # state of the inputs at the start of the analysis
         found = analyse(
             self.path,
             scene=self.scene,
@@ -185,7 +185,7 @@ def _is_ours(file: Path) -> bool:
 
 
 def _state(path: Path, out: Path | None) -> list[Any]:
-    """Return name, sizes and times of a file, or of those in a folder but for the results in `out`."""
+    """Return name, sizes and times of a file, or of the files of a folder, without the results in `out`."""
     files = sorted(path.rglob("*")) if path.is_dir() else [path]
     if out is not None and out.resolve().is_relative_to(path.resolve()):
         results = out.resolve()
@@ -200,7 +200,7 @@ def _is_result(file: Path, out: Path) -> bool:
 
 
 def _measured_near(folder: Path) -> list[Path]:
-    """Return the files and folders in which measurements beside a single part are looked for."""
+    """Return the files and folders that are searched for measurements beside a single part."""
     return [*sorted(folder.glob("*.mcap")), *beside_folders(folder)]
 
 
@@ -221,5 +221,5 @@ def run_task(task: RunTask) -> dict[str, Any]:
         return task.run()
     except PlowTwinError as error:
         return {"run": str(task.path), "error": str(error)}
-    except Exception as error:  # of one recording among many, whatever it is: the others go on
+    except Exception as error:  # any error of one recording among many: the others continue
         return {"run": str(task.path), "error": f"{task.path}: {error!r}"}

@@ -1,4 +1,4 @@
-"""Rows and values in bounded memory: of more than fit, every second, then every fourth, ... is kept."""
+"""Rows and values in bounded memory: of too many only every second, then every fourth, ... is kept."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Thinned:
 
 
 class ThinnedSignal:
-    """Values with their stamps and the number of the stretch in which each came, one at a time."""
+    """Values, added one at a time, with their stamps and the number of the stretch in which each came."""
 
     def __init__(self) -> None:
         self._stamps, self._values, self._stretches = array("q"), array("d"), array("I")

@@ -1,11 +1,11 @@
 """Fit unknowns of a scene to an objective: many independent starts, each global first, then local.
 
-One start: (1) `screen` random points of the unit cube, the best of them become the first population of (2) a
+One start: (1) `screen` random points of the unit cube, the best of which become the first population of (2) a
 differential evolution (Storn and Price, J. Global Optim. 11 (1997) 341; scipy), whose every generation is one ensemble
 of runs; (3) its best point is polished in the unknowns that have a range: least squares (trust region reflective,
 scipy) with a finite-difference Jacobian from one ensemble, then, where the residuals have kinks, Nelder and Mead's
-simplex. Every start draws from a generator of its own, spawned from the seed: the same seed gives the same bits,
-whatever the number of threads.
+simplex. Every start draws from a generator of its own, spawned from the seed: the same seed gives the same bits with
+any number of threads.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Search:
 
 @dataclass(frozen=True)
 class Start:
-    """Where one start has led: its point in the cube, the values there, the objective before and after polishing."""
+    """Result of a start: its point in the cube, the values there, the objective before and after polishing."""
 
     number: int
     point: Array
@@ -58,7 +58,7 @@ class Calibration:
     starts: tuple[Start, ...]
     seed: int
     runs: int
-    #: every point of a last population with its objective, for points that fit almost as well
+    #: every point of a last population with its objective, to find points that fit almost as well
     population: Array = field(repr=False)
     population_objective: Array = field(repr=False)
 
@@ -107,7 +107,7 @@ def calibrate(
         points, values = _evolve(space, objective, rng, search, known, report)
         point, best = polish(space, objective, points[np.argmin(values)], search)
         populations.append((points, values))
-        # a polish that does not help leaves the best of the population
+        # a polish without success keeps the best of the population
         if values.min() < best:
             point, best = points[np.argmin(values)], float(values.min())
         point = space.settled(point)
@@ -142,7 +142,7 @@ def _evolve(
     cut, generation = float(values.max()), [0]
 
     def evaluate(columns: Array) -> Array:
-        # a trial above the worst of the population is never accepted: it need not be run to the end
+        # a trial above the worst of the population is never accepted, and need not be run to the end
         return sums(objective.residuals(space.values_of(np.atleast_2d(columns.T)), cut))
 
     def after(intermediate_result: object) -> None:
@@ -158,7 +158,7 @@ def _evolve(
 
 
 def _screened(space: Space, objective: Objective, points: Array, keep: int) -> Array:
-    """Return the objective of every point; only those are run to the end that can be among the best `keep`."""
+    """Return the objective of every point; only points that can be among the best `keep` are run to the end."""
     batch = max(keep, 64)
     values = np.zeros(0)
     for begin in range(0, len(points), batch):

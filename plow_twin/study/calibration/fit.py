@@ -41,7 +41,7 @@ class TargetRow:
 def fitted_scene(scene: Scene, values: Mapping[str, Value], source: str) -> Scene:
     """Return the scene with the fitted values; every number that they change is marked as reconstructed.
 
-    A number that is as it was keeps its mark, one whose sign alone has changed the source of its size.
+    An unchanged number keeps its mark; a number with only a changed sign keeps the source of its size.
     """
     fit = with_parameters(scene, values)
     marks = dict(fit.marks)
@@ -96,7 +96,7 @@ def target_rows(objective: TargetObjective, values: Mapping[str, Value]) -> list
 
 @dataclass(frozen=True)
 class Fit:
-    """All that a calibration has found."""
+    """The whole result of a calibration."""
 
     scene: Scene
     calibration: Calibration
@@ -104,7 +104,7 @@ class Fit:
     source: str
     identifiability: Identifiability
     clusters: list[Cluster]
-    #: objective of the scene as it stood, None when it lies outside of the unknowns' ranges
+    #: objective of the given scene, None when it lies outside the ranges of the unknowns
     before: float | None
     targets: list[TargetRow]
 

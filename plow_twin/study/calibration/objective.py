@@ -31,7 +31,7 @@ class Objective(Protocol):
     def residuals(self, candidates: Sequence[Values], cut: float = np.inf) -> Array:
         """Return the weighted residuals of m candidates, shape (m, r); the objective is their sum of squares.
 
-        A candidate whose objective is certain to exceed `cut` need not be evaluated to the end.
+        A candidate whose objective surely exceeds `cut` need not be evaluated to the end.
         """
 
 

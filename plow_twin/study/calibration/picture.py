@@ -17,7 +17,7 @@ from plow_twin.view.figures import signed, write_png
 from plow_twin.view.fitted import FittedPicture, FittedValue
 from plow_twin.view.fitted_file import write_fit_picture
 
-#: Residuals beyond it are drawn at it: failed runs have thousands.
+#: Larger residuals are drawn at this value: failed runs have thousands.
 _MOST: Final = 5.0
 
 

@@ -34,12 +34,12 @@ class PoseRecording:
     t: Array
     q: Array
     source: str = ""
-    #: the load that the recording holds, in place of the scene's
+    #: the recorded load in place of the scene's
     load: Table | None = None
 
     @property
     def output_dt(self) -> float:
-        """Distance of the simulated rows in s: the recorded one, not below t_end / 20000."""
+        """Distance of the simulated rows in s: as recorded, but at least t_end / 20000."""
         end = float(self.t[-1])
         step = float(np.median(np.diff(self.t))) if len(self.t) > 1 else end
         return max(min(step, 0.01), end / _MOST_ROWS)
@@ -84,7 +84,7 @@ def load_poses(path: Path) -> PoseRecording:
         raise
     except OSError as error:
         raise StudyError(f"{path}: {error.strerror or error}") from None
-    except (csv.Error, ValueError, AttributeError, MemoryError, BadZipFile, EOFError) as error:  # the last of np.load
+    except (csv.Error, ValueError, AttributeError, MemoryError, BadZipFile, EOFError) as error:  # the last: np.load
         raise StudyError(f"{path}: {error}") from None
     if t.ndim != 1 or q.shape != (len(t), 3) or len(t) < 2:
         raise StudyError(f"{path}: got t {t.shape} and q {q.shape}, expected (n,) and (n, 3) with n >= 2")
@@ -130,7 +130,7 @@ def _require(lacking: list[str], got: list[str]) -> None:
 
 
 def _read_mcap(path: Path) -> tuple[Array, Array, Table | None]:
-    """Read the poses that the node published (`head_state`) and the load samples that it took in."""
+    """Read the poses that the node published (`head_state`) and the load samples that it used."""
     from plow_twin.record.entries import EntryRecord, OutputRecord
     from plow_twin.record.messages import Odometry
     from plow_twin.record.reader import RunReader

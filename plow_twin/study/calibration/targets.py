@@ -41,7 +41,7 @@ _KEYS: Final = {
 
 @dataclass(frozen=True)
 class Target:
-    """One fact to meet; the module explains each kind."""
+    """A target; the module's docstring explains each kind."""
 
     name: str
     kind: str
@@ -89,12 +89,12 @@ class Target:
         return np.asarray(wrong / (self.tolerance * mean))
 
     def met(self, residual: float) -> bool:
-        """Say whether the target is met at this residual."""
+        """Return whether the target is met at this residual."""
         return abs(residual) <= 1.0 if self.kind == "value" else residual <= 1e-9
 
 
 def _wrong_way(s: Array, least: Array) -> Array:
-    """Return the sum of the steps down of a sequence that should rise, and how far it is below the least rise."""
+    """Return the sum of the downward steps of a sequence that should rise, and its shortfall from the least rise."""
     down = np.maximum(0.0, -np.diff(s, axis=1)).sum(axis=1)
     return np.asarray(down + np.maximum(0.0, least - (s[:, -1] - s[:, 0])))
 

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 class Identifiability:
     """Singular values of dr/dz at the optimum over the unknowns with a range (z: places 0..1 of their ranges).
 
-    `weakest` is the direction of the smallest one: the combination of unknowns that the data say least about.
+    `weakest` is the direction of the smallest value: the combination of unknowns that the data determine least.
     """
 
     paths: tuple[str, ...]

@@ -1,1 +1,1 @@
-"""Runs compared with each other: windows of their contacts, and changes that are more than chance."""
+"""Comparison of runs: windows of their contacts, and changes that are more than chance."""

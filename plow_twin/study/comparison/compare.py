@@ -17,7 +17,7 @@ from plow_twin.record.recording import read_recording
 from plow_twin.study.comparison.change import Change, changes, points, with_neighbours
 from plow_twin.study.comparison.windows import FULL, QUANTITIES, Windows, windows_of
 
-#: Stamps before this [ns] are no dates: 1e18 ns is in the year 2001.
+#: Stamps before this [ns] are not dates: 1e18 ns is in the year 2001.
 _DATES_NS: Final = 10**18
 #: Share of a window that may be without messages: rates that differ by less count as equal.
 _MISSING: Final = 1.0 - FULL
@@ -101,7 +101,7 @@ def by_run(name: str, stamp_ns: int) -> str:
 
 
 def by_time(kind: str, shifts: Sequence[time] = SHIFTS, zone: tzinfo = UTC) -> Label:
-    """Return the labels of days, or of shifts that begin at the times `shifts`, in a time zone.
+    """Return a function that labels days, or shifts that begin at the times `shifts`, in a time zone.
 
     Parameters
     ----------
@@ -202,12 +202,12 @@ def _overlapping(windows: Windows, others: Windows) -> np.ndarray[Any, Any]:
         return np.zeros(len(windows.start_ns), bool)
     order = np.argsort(others.start_ns)
     (begins, ends), (starts, stops) = (
-        # what surely has messages of a window
+        # messages that a window surely has
         ((part.start_ns + _MISSING * part.length_ns), (part.start_ns + FULL * part.length_ns))
         for part in (windows, others)
     )
     starts, stops = starts[order], stops[order]
-    before = np.searchsorted(starts, ends) - 1  # the newest of the others that begins before a window's end
+    before = np.searchsorted(starts, ends) - 1  # the newest other window that begins before a window's end
     return np.asarray((before >= 0) & (stops[before] > begins))
 
 

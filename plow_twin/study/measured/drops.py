@@ -1,4 +1,4 @@
-"""Measured drops: where the first flight ends, where the bounces are, and how bands and motions do on them."""
+"""Measured drops: end of the first flight, bounces, and errors of bands and motions."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 #: Half the side of the square in m.
 _HALF: Final = 0.03
-#: An impact: how far the acceleration of z [m/s^2] and of theta [rad/s^2] leaves that of a flight, below which gap [m].
+#: An impact: deviation of the accelerations of z [m/s^2] and theta [rad/s^2] from a flight, and largest gap [m].
 _FALL, _JERK, _TWIST, _NEAR = 9.0, 9.0, 300.0, 0.03
 #: Least rise in m between two separate bounces.
 _RISE: Final = 0.003
@@ -59,7 +59,7 @@ class Drops:
         return enough
 
     def until(self, index: int, bounce: int) -> int:
-        """Return the row before the bounce of that number (from 0), or before the last one there is."""
+        """Return the row before the bounce of that number (from 0), or before the last bounce."""
         return self.bounces[index][min(bounce, len(self.bounces[index]) - 1)]
 
     def inside(self, index: int, bounce: int = 2) -> NDArray[np.bool_]:

@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 #: Semi-axes and radius of gyration in m.
 SEMI_AXES: Final = (0.035, 0.025)
 GYRATION: Final = 0.0192
-#: Stiffness per mass in 1/s^2: place and arms stay during an impact, so it sets the time only.
+#: Stiffness per mass in 1/s^2: as place and arms are constant during an impact, it sets only the duration.
 _STIFFNESS: Final = 1e9
 #: Speed in m/s of approach at which restitutions are given: the middle of the measured speeds.
 USUAL_SPEED: Final = 2.5
@@ -41,12 +41,12 @@ class EllipseContact:
     exponent : float
         n in F = K d^n.
     restitution : float
-        Of an impact at 2.5 m/s without motion along the surface; of a law that has no restitution form its damping
-        number lambda v0, or C over the critical one.
+        Restitution of an impact at 2.5 m/s without motion along the surface; for a law without restitution its damping
+        number lambda v0, or C over the critical damping.
     fall : float
         Power q by which it falls with the speed of approach v, (v / 2.5 m/s)^-q.
     fall_along : float
-        By how much it falls with the speed of the centre of mass along the surface, in s/m.
+        Its fall with the speed of the centre of mass along the surface, in s/m.
     friction : float
         mu.
     slip_speed : float
@@ -90,13 +90,13 @@ def contact_arms(theta: Array) -> tuple[Array, Array]:
 
 
 def impact(before: ArrayLike, contact: EllipseContact = ELLIPSE) -> Array:
-    """Return the state of the ellipse after an impact from the one before.
+    """Return the state of the ellipse after an impact from the state before.
 
     Parameters
     ----------
     before : array_like, shape (n, 6)
-        x, y [m], theta [rad], vx, vy [m/s], omega [rad/s] as measured: y away from the surface; theta and x as they
-        are in the data, where a positive theta turns y towards x.
+        x, y [m], theta [rad], vx, vy [m/s], omega [rad/s] as measured: y away from the surface; theta and x as in the
+        data, where a positive theta turns y towards x.
     contact : EllipseContact
         Numbers of the contact; the fitted ones unless given.
 
@@ -144,7 +144,7 @@ def _states(before: ArrayLike) -> Array:
 
 
 def _to_surface(x: Array, y: Array, tilt: float) -> tuple[Array, Array]:
-    """Resolve vectors in axes of the data along the surface and away from it; also the way back.
+    """Resolve vectors in the data's axes along the surface and away from it; the map is its own inverse.
 
     The data's x runs against the sense in which theta is counter-clockwise.
     """
@@ -181,7 +181,7 @@ def impact_scene(before: ArrayLike) -> Scene:
 
 
 def simulated_impact(before: ArrayLike) -> Array:
-    """Return the states after impacts as `impact` does, each one computed whole by the preset `measured_ellipse`.
+    """Return the states after impacts as `impact` does, each from a whole motion by the preset `measured_ellipse`.
 
     Parameters
     ----------
@@ -206,7 +206,7 @@ def simulated_impact(before: ArrayLike) -> Array:
 
 
 def _numbers(contact: EllipseContact, speed: Array, along: Array, normal_arm: Array) -> tuple[Array, NDArray[np.void]]:
-    """Return lambda of each impact in s/m, and the numbers that all share."""
+    """Return lambda of each impact in s/m, and the numbers common to all."""
     law, wanted = LAWS[contact.law], contact.restitution
     e = np.clip(wanted * (speed / USUAL_SPEED) ** -contact.fall - contact.fall_along * np.abs(along), _LEAST, _LARGEST)
     viscous, damping = 0.0, np.zeros_like(speed)

@@ -20,9 +20,9 @@ RATE_HZ: Final = 250.0
 _DT: Final = 1.0 / RATE_HZ
 #: Steps of the table of damping numbers.
 _NUMBERS: Final = 1000
-#: Touches of a motion that have a scatter of their own.
+#: Number of touches of a motion with a scatter of their own.
 _TOUCHES: Final = 64
-#: Turn in rad beside the flight's within a row, which only an impact makes.
+#: Additional turn in rad within a row that only an impact causes.
 _TURN_IN_A_ROW: Final = 0.1
 #: Least rows of a first flight, for its speeds.
 LEAST_ROWS: Final = 4
@@ -80,7 +80,7 @@ MARKER: Final = Marker(-0.0308, (2.3e-4, 5.2e-4))
 
 @dataclass(frozen=True)
 class Scatter:
-    """Scatter that no parameter explains, as standard deviations.
+    """Scatter beyond the parameters, as standard deviations.
 
     Attributes
     ----------
@@ -146,7 +146,7 @@ def toss(initial: Array, n_rows: int, blocks: NDArray[np.void], scatter: Array |
 
 @dataclass(frozen=True)
 class Flight:
-    """A fitted first flight: state at its last row and how well it is known.
+    """A fitted first flight: state at its last row, with its covariance.
 
     Attributes
     ----------
@@ -155,7 +155,7 @@ class Flight:
     covariance : ndarray, shape (3, 2, 2)
         Of place and rate of x, z, theta there.
     times : ndarray, shape (k,)
-        Times of the rows from the last one on, in s: lost whole rows show by the way made.
+        Times of the rows relative to the last one, in s: lost rows show by the distance covered.
     """
 
     state: Array
@@ -171,7 +171,7 @@ def fit_flight(first_flight: ArrayLike, block: NDArray[np.void] = SQUARE, scatte
     first_flight : array_like, shape (k, 3)
         Rows of x, z [m] and theta [rad] before the first impact.
     block : ndarray of BLOCK, shape ()
-        Gravity and drag are read.
+        Only gravity and drag are used.
     scatter : Scatter
         Errors of a row.
 
@@ -200,7 +200,7 @@ def fit_flight(first_flight: ArrayLike, block: NDArray[np.void] = SQUARE, scatte
 
 
 def _leaves_flight(rows: Array) -> bool:
-    """Return whether the last row comes after an impact: the block turns otherwise, or rises again."""
+    """Return whether the last row comes after an impact: the rate of turning has changed, or the block rises again."""
     t = np.arange(-3.0, 1.0)
     turn = float(np.polyval(np.polyfit(t[:3], rows[-4:-1, 2], 1), t[3]))
     return bool(
@@ -209,7 +209,7 @@ def _leaves_flight(rows: Array) -> bool:
 
 
 def _row_times(rows: Array, gravity: float) -> Array:
-    """Return the times of the rows, 0 at the last one: a row that was lost doubles the way to the next."""
+    """Return the times of the rows, 0 at the last one: a lost row doubles the distance to the next."""
     way = np.hypot(*np.diff(rows[:, :2], axis=0).T)
     steps = np.ones(len(way))
     for _ in range(3):
@@ -262,7 +262,7 @@ def ensemble(
     scatter: Scatter = SCATTER,
     marker: Marker = MARKER,
 ) -> Array:
-    """Return motions that the first flight leaves open, shape (members, n_rows, 3): x, z, theta as they are measured.
+    """Return motions compatible with the first flight, shape (members, n_rows, 3): x, z, theta as measured.
 
     Parameters
     ----------

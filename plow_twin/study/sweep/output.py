@@ -26,7 +26,7 @@ _COUNTS: Final = ("makes", "events", "steps")
 
 
 def write_parquet(table: Table, path: Path) -> None:
-    """Write one row for each member: its parameters, status (0: done), how it ended, the statistics.
+    """Write one row for each member: its parameters, status (0: done), the status in words, the statistics.
 
     The metadata under `plow_twin` is JSON: arguments with the scene as YAML text, package version, builds.
     """
@@ -99,7 +99,7 @@ def _curve(axes: Axes, table: Table, index: int) -> None:
 
 
 def _bracketed(name: str) -> str:
-    """Return the unit of a statistic in brackets, where its words do not end before it."""
+    """Return the unit of a statistic in brackets, unless its words end with the unit."""
     words = statistic_words(name)[0]
     return words[words.index(" [") :] if "," in words and " [" in words else ""
 

@@ -1,4 +1,4 @@
-"""Compute the chunks that a sweep's folder lacks, on this machine or a Dask cluster, by the same code."""
+"""Compute the missing chunks of a sweep's folder, on this machine or a Dask cluster, by the same code."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def run_here(store: Store, workers: int | None = None, on_progress: OnProgress |
 def run_on_cluster(store: Store, address: str, on_progress: OnProgress | None = None) -> Table:
     """Compute the missing chunks on the Dask cluster at `address`, one task each; return the whole table.
 
-    The scheduler gives the tasks of a worker that dies to another one; a result is stored as soon as it arrives.
+    The scheduler gives the tasks of a dead worker to another worker; a result is stored as soon as it arrives.
 
     Raises
     ------
@@ -60,7 +60,7 @@ def run_on_cluster(store: Store, address: str, on_progress: OnProgress | None = 
             try:
                 table, build = future.result()
             except Exception as error:
-                # whatever a worker raised: the stored chunks stay, and the call can be repeated
+                # any error of a worker: the stored chunks stay, and the call can be repeated
                 raise StudyError(f"dask: chunk {index}: {type(error).__name__}: {error}") from error
             store.write(index, table, build)
             done += len(chunks[index])

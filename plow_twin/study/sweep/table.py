@@ -21,7 +21,7 @@ from plow_twin.study.statistics import statistic, statistics_of
 
 Array = NDArray[np.float64]
 
-#: Status of a member whose values no scene can have.
+#: Status of a member with values that are impossible in a scene.
 UNUSABLE: Final = -1
 #: A sweep has at most that many members: the table, and the list of chunks, are held in memory.
 _MOST_MEMBERS: Final = 1_000_000
@@ -63,7 +63,7 @@ def parse_axis(text: str, scene: Scene) -> Axis:
                 raise ValueError
             if int(count) > _MOST_MEMBERS:
                 raise StudyError(f"axis: got {int(count)} values of {path}, expected at most {_MOST_MEMBERS}")
-            # numpy's spacing ends at the bounds exactly
+            # numpy's spacing includes the bounds exactly
             spaced = (np.geomspace if log else np.linspace)(float(low), float(high), int(count))
             values = tuple(map(float, spaced))
     except StudyError:
@@ -117,7 +117,7 @@ class Sweep:
         return {axis.path: axis.values[int(place)] for axis, place in zip(self.axes, places, strict=True)}
 
     def arguments(self) -> dict[str, Any]:
-        """Return all that decides the result, as plain data that JSON keeps."""
+        """Return all inputs of the result, as plain data for JSON."""
         plain: dict[str, Any] = json.loads(json.dumps(asdict(self)))
         return plain
 
@@ -147,7 +147,7 @@ class Table:
         return [int(member) for member in np.flatnonzero(self.status)]
 
     def reason(self, member: int) -> str:
-        """Say how a member ended."""
+        """Return in words how a member ended."""
         status = int(self.status[member])
         if status != UNUSABLE:
             return Status(status).text
@@ -163,7 +163,7 @@ def run_members_of(
 ) -> Array:
     """Compute members, by number; return shape (k, 1 + statistics): status, then the statistics.
 
-    A member has the same bits whichever chunk, thread or machine of the same build computes it.
+    A member has the same bits in any chunk, thread or machine of the same build.
     """
     scene = replace(sweep.scene(), marks={})
     table = np.full((len(members), 1 + len(sweep.statistics)), np.nan)

@@ -1,4 +1,4 @@
-"""Alarms as conditions of OPC UA: raised, acknowledged, over."""
+"""Alarms as conditions of OPC UA: raised, acknowledged, ended."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Condition:
     node_id: ua.NodeId
     level: str = "none"
     acknowledged: bool = True
-    #: time of the newest raise
+    #: time at which the alarm was last raised
     raised: object = None
 
     @property
@@ -50,7 +50,7 @@ class Conditions:
 
     def __init__(self, server: Server, model: Model) -> None:
         self._server, self._model = server, model
-        #: has the twin acknowledge its alarms, and returns whether the request was passed on; None: not allowed
+        #: asks the twin to acknowledge its alarms, and returns whether the request was passed on; None: not allowed
         self.acknowledge: Callable[[], bool] | None = None
         self._conditions: dict[str, Condition] = {}
         self._values: Mapping[str, Value] = {}
@@ -85,7 +85,7 @@ class Conditions:
         self._server.link_method(self._server.get_node(general), self._called)
 
     async def update(self, alarms: Group) -> None:
-        """Take in the alarms, and send an event for each that has changed."""
+        """Update the alarms, and send an event for each that has changed."""
         self._values = values = alarms.values
         for name, condition in self._conditions.items():
             before = condition.level, condition.acknowledged

@@ -21,7 +21,7 @@ _NODESETS: Final = Path(__file__).with_name("nodesets")
 _FILES: Final = ("Opc.Ua.Di", "Opc.Ua.Machinery", "Opc.Ua.Mining.General")
 _DI, _MINING = "http://opcfoundation.org/UA/DI/", "http://opcfoundation.org/UA/Mining/General/"
 _FUNCTIONAL_GROUP, _DEVICE_SET, _EQUIPMENT, _IDENTIFICATION = 1005, 5001, 1002, 1003
-#: Units as OPC UA numbers them (UN/CEFACT, of three characters as one number).
+#: Units by their numbers in OPC UA (UN/CEFACT, three characters as one number).
 _UNITS: Final = {"m": ("MTR", "metre"), "N": ("NEW", "newton")}
 _POINTS: Final = ("p05", "p95")
 _TYPE: Final = "PloughHeadTwinType"
@@ -98,7 +98,7 @@ class Model:
             if name in UNITS and "/" not in key:
                 await instantiate(folder, interval, node_id, browse_name, instantiate_optional=False)
                 node = self._server.get_node(node_id)
-                for point in _POINTS:  # without this the points would belong to the type alone
+                for point in _POINTS:  # without this only the type would have the points
                     await self._server.get_node(self.node_id(f"{begin}.{key}.{point}")).set_modelling_rule(True)
                 await self._set_unit(node, UNITS[name])
             elif name in UNITS:

@@ -37,7 +37,7 @@ _GOOD: Final = ua.StatusCode()
 
 
 class OneUser(UserManager):
-    """Admits one user, or without one everybody that may connect."""
+    """Admits one user, or, without a user, everybody that may connect."""
 
     def __init__(self, user: str, password: str) -> None:
         self._user, self._password = user, password
@@ -52,7 +52,7 @@ class OneUser(UserManager):
 
 
 class OpcUaServer:
-    """A way out that clients come to.
+    """An output to which clients connect.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ class OpcUaServer:
 
 
 def _data(value: Value, group: Group) -> ua.DataValue:
-    """Return a value with its status, and as stamp the time that the model had reached."""
+    """Return a value with its status, stamped with the time that the model had reached."""
     stamp = _EPOCH + timedelta(seconds=group.time_s) if group.time_s else datetime.now(UTC)
     if value is None:
         return ua.DataValue(ua.Variant(), _UNKNOWN, stamp, datetime.now(UTC))
