@@ -8,6 +8,7 @@ import json
 import math
 import os
 import re
+import select
 import signal
 import socket
 import subprocess
@@ -18,7 +19,7 @@ import time
 import tracemalloc
 from bisect import bisect_right
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
+from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout, suppress
 from pathlib import Path
 from typing import Any, cast
 from urllib.request import urlopen
@@ -37,6 +38,7 @@ from plow_twin.live.control import call
 from plow_twin.live.front import BridgeFront
 from plow_twin.live.inputs import Inputs
 from plow_twin.live.load_model import read_load_model
+from plow_twin.live.metrics import Metrics
 from plow_twin.live.part import Part
 from plow_twin.live.service_names import mark_problem
 from plow_twin.live.services import Services
@@ -787,6 +789,27 @@ def test_prometheus_reads_the_numbers_of_the_diagnostics(tmp_path: Path) -> None
         assert len(shown) > 15 and shown <= found.keys(), shown - found.keys()
         assert run_cli(["live", str(path), "--metrics", str(port), "--quiet"]) == 1  # the port is taken
         assert live.stop() == 0
+
+
+def test_readers_of_metrics_that_ask_nothing_are_bounded() -> None:
+    port = _free_port()
+    with Metrics(port) as metrics, ExitStack() as opened:
+        metrics.update("state", (0, "", {"model_time_s": "1.5"}))
+        idle = [opened.enter_context(socket.create_connection(("127.0.0.1", port))) for _ in range(40)]
+        closed: list[socket.socket] = []
+        while len(closed) < 24:
+            closed, _, _ = select.select(idle, [], [], 30.0)
+            assert closed
+        assert len(closed) == 24 and not any(one.recv(1) for one in closed)
+        opened.close()
+        give_up = time.monotonic() + 30.0
+        while True:
+            try:
+                with urlopen(f"http://127.0.0.1:{port}/metrics", timeout=30.0) as page:
+                    assert b"plow_twin_state_model_time_s 1.5" in page.read()
+                break
+            except OSError:  # the server has not seen yet that they have gone
+                assert time.monotonic() < give_up
 
 
 def _expressions(board: dict[str, Any]) -> list[str]:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 import re
+import socket
+import threading
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 from prometheus_client import CollectorRegistry, start_http_server
 from prometheus_client.core import GaugeMetricFamily
@@ -18,6 +20,9 @@ if TYPE_CHECKING:
 
 #: Characters that a name of a metric cannot have.
 _OTHER: Final = re.compile(r"[^a-zA-Z0-9_]")
+#: Most readers at once, and longest wait for one [s].
+_READERS: Final = 16
+_PATIENCE_S: Final = 10.0
 
 
 class MetricsError(PlowTwinError):
@@ -48,6 +53,7 @@ class Metrics:
             self._server, self._thread = start_http_server(port, "127.0.0.1", registry)
         except (OSError, OverflowError) as error:
             raise MetricsError(f"port {port} for metrics cannot be used: {error}") from error
+        _bound(self._server)
 
     def __enter__(self) -> Self:
         return self
@@ -69,6 +75,28 @@ class Metrics:
                 number = _number(text)
                 if number is not None:
                     yield _gauge(f"{name}_{key}", f"{key} of the part {name} of the diagnostics", number)
+
+
+def _bound(server: Any) -> None:
+    """Have a server close readers beyond `_READERS`, and those that ask nothing: each takes a thread and a file."""
+    free = threading.BoundedSemaphore(_READERS)
+    start, serve = server.process_request, server.process_request_thread
+    handler = server.RequestHandlerClass
+    server.RequestHandlerClass = type("Handler", (handler,), {"timeout": _PATIENCE_S})
+
+    def admit(request: socket.socket, address: Any) -> None:
+        if free.acquire(blocking=False):
+            start(request, address)
+        else:
+            server.shutdown_request(request)
+
+    def answer(request: socket.socket, address: Any) -> None:
+        try:
+            serve(request, address)
+        finally:
+            free.release()
+
+    server.process_request, server.process_request_thread = admit, answer
 
 
 def _gauge(name: str, meaning: str, value: float) -> GaugeMetricFamily:
