@@ -12,7 +12,7 @@ class PlowTwinError(Exception):
     """Base of every error that the package raises on purpose."""
 
 
-#: Problems that a message lists.
+#: Largest number of problems in a message.
 _MOST_SHOWN: Final = 50
 
 

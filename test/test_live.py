@@ -512,7 +512,7 @@ def test_an_alarm_is_reported_once_with_value_pad_threshold_and_time_and_acknowl
     # the address of a socket is short, unlike a folder of tests
     path, control = _csv(tmp_path / "load.csv", 5000), Path(tempfile.mkdtemp(dir="/tmp")) / "twin.socket"
     control.touch()
-    assert run_cli(["live", str(path), "--control", str(control)]) == 1  # the existing file is no socket of a twin
+    assert run_cli(["live", str(path), "--control", str(control)]) == 1  # the existing file is not a socket of a twin
     assert "cannot be a socket" in capsys.readouterr().err
     control.unlink()
     thresholds = ("--set", "alarm_force=[20e3,1e9]", "--set", "alarm_duration=0.002")

@@ -321,7 +321,7 @@ def test_the_extra_brings_every_library_that_is_imported(monkeypatch: pytest.Mon
         for requirement in wanted
     }
     names.add("llvmlite")  # of numba, at the version that numba asks for
-    names |= {"pandas", "pyarrow"}  # tables of a recording, only for those who have them
+    names |= {"pandas", "pyarrow"}  # tables of a recording, only if installed
     assert imported - names - sys.stdlib_module_names - {"plow_twin"} == set()
 
 

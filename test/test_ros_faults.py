@@ -439,7 +439,8 @@ rclpy.spin(node)
 
 
 def test_a_subscriber_that_stands_still_does_not_hold_up_the_twin(tmp_path: Path) -> None:
-    # room for all: a machine that does other work may let the twin stand for more than a second, which is no loss here
+    # room for all: a machine that does other work may let the twin stand for more than a second, which is not a loss
+    # here
     with bench(tmp_path, jump_forward=60.0, input_depth=10_000, **RELIABLE_INPUT) as running:
         slow = subprocess.Popen(
             [sys.executable, "-c", SUBSCRIBER.format(namespace=running.namespace)], stdout=subprocess.PIPE

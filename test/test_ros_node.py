@@ -452,7 +452,7 @@ def test_bad_samples_are_dropped_counted_and_never_published(tmp_path: Path) -> 
         send(T0 + 2 * MS, good)  # late, and worked in
         send(T0 + 4 * MS, (1e8, 0.0, 0.0))
         other.publish(JointState(name=["fx1"], effort=[1.0]))
-        # bytes that are no such message
+        # bytes that are not such a message
         for kind, topic in ((TwistStamped, "travel"), (PoseStamped, "head_pose"), (JointState, "gaps")):
             probe.publisher(kind, topic).publish(b"\x00\x01\x00\x00" + b"\xff" * 12)
         send(T0 + 4 * MS, good)

@@ -255,7 +255,7 @@ def test_the_covariance_of_each_pose_goes_into_the_journal_and_the_estimate(tmp_
             taken = [Taken(b"", number, 0, serialize_message(message))]
             front.subscriptions._measured_poses(taken)
         assert front.runtime.inputs.head_pose.counts[Verdict.NON_FINITE] == 2
-        # an empty quaternion is no angle of 0
+        # an empty quaternion is not an angle of 0
         message.pose.pose.orientation.w = 0.0
         front.subscriptions._measured_poses([Taken(b"", 6, 0, serialize_message(message))])
         assert front.runtime.inputs.head_pose.counts[Verdict.MALFORMED] == 1

@@ -1,4 +1,4 @@
-"""The twin: same bits however it is advanced, saved and restored; bad input changes nothing."""
+"""The twin: same bits for any way of advancing, saving and restoring; bad input changes nothing."""
 
 from __future__ import annotations
 

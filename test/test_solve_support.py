@@ -1,4 +1,4 @@
-"""A frame that gives way: two coupled masses in closed form, against references of their own, and off without it."""
+"""A frame on springs: two coupled masses in closed form, against references of their own, and off without it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sweeps: the same bits as single runs, whatever is killed on the way."""
+"""Sweeps: the same bits as single runs, also after kills."""
 
 from __future__ import annotations
 

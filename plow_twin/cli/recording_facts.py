@@ -18,7 +18,7 @@ def read_recording(path: Path) -> tuple[dict[str, Any], bool]:
     Raises
     ------
     RecordingError
-        When the file is no recording.
+        When the file is not a recording.
     """
     reader = RunReader(path)
     first = last = None

@@ -83,7 +83,7 @@ class PageAccess:
         return not is_loopback(self.host) and (_is_address(name) or name in (socket.gethostname(), socket.getfqdn()))
 
     def is_own(self, origin: str | None, host: str) -> bool:
-        """Return whether a connection comes from the page itself, or from a program that is no browser."""
+        """Return whether a connection comes from the page itself, or from a program other than a browser."""
         return origin is None or urlsplit(origin).netloc.lower() == host.lower()
 
 

@@ -31,7 +31,7 @@ class Board:
         self.pages = 0
 
     def add(self, update: dict[str, Any]) -> None:
-        """Take in an update of the feed."""
+        """Add an update of the feed."""
         self.version = version = self.version + 1
         self._updated_s = time.monotonic()
         self._not_taken = update["not_taken"]

@@ -61,22 +61,22 @@ class Motion:
         self.was_held = False
 
     def add_load(self, wrench: Array) -> None:
-        """Take in loads Fx, Fy [N], M [N m], shape (n, 3)."""
+        """Add loads Fx, Fy [N], M [N m], shape (n, 3)."""
         self.load = wrench[-1]
         self.lowest = np.fmin(self.lowest, np.fmin.reduce(wrench))
         self.highest = np.fmax(self.highest, np.fmax.reduce(wrench))
 
     def add_peaks(self, peak: Array) -> None:
-        """Take in the largest forces [N] since the rows before, shape (n, 8)."""
+        """Add the largest forces [N] since the rows before, shape (n, 8)."""
         self.peak = np.maximum(self.peak, peak.max(axis=0))
 
     def add_points(self, low: Array, high: Array) -> None:
-        """Take in the 5 % and 95 % points [N] of the same forces, shape (n, 8) each."""
+        """Add the 5 % and 95 % points [N] of the same forces, shape (n, 8) each."""
         points = np.stack((low.max(axis=0), high.max(axis=0)))
         self.points = points if self.points is None else np.maximum(self.points, points)
 
     def add_rows(self, waiting: list[Published]) -> None:
-        """Take in publications of a twin."""
+        """Add publications of a twin."""
         # column by column: numpy takes thirty times as long to join records
         rows = [published.rows for published in waiting]
         newest = rows[-1][-1]
@@ -92,7 +92,7 @@ class Motion:
             self.set_clearance(slow["clearance"][-1])
 
     def set_clearance(self, values: Array) -> None:
-        """Take in the clearances of a publication [m], in the order of `CLEARANCE_NAMES`."""
+        """Add the clearances of a publication [m], in the order of `CLEARANCE_NAMES`."""
         self.clearance, self.estimate = values, {}
 
     def _clearances(self, values: Array) -> dict[str, float | None]:
@@ -180,7 +180,7 @@ class Feed:
         self.taken = self.not_taken = 0
 
     def publication(self, published: Published) -> None:
-        """Take in a publication of at least one row: it is kept for the next update."""
+        """Add a publication of at least one row: it is kept for the next update."""
         second = int(published.rows["stamp_ns"][-1]) // NS_PER_S
         if self._by_second and second != self._second and self._waiting:
             self.send()
@@ -192,7 +192,7 @@ class Feed:
             self._sum_up()
 
     def part(self, name: str, part: Part) -> None:
-        """Take in a status: the newest of each name counts."""
+        """Add a status: the newest of each name counts."""
         level, message, values = part
         if name == "estimate" and "estimates" not in values:  # not the part of the diagnostics of the same name
             self._sum_up()  # the publications before it
@@ -202,7 +202,7 @@ class Feed:
         self._parts[name] = level, message[:_LONGEST], {key: text[:_LONGEST] for key, text in values.items()}
 
     def event(self, kind: str, text: str, *, done: bool = True, stamp_ns: int | None = None) -> None:
-        """Take in an event, at the stamp reached unless it has another [ns]."""
+        """Add an event, at the stamp reached unless it has another [ns]."""
         at_ns = self.motion.stamp_ns if stamp_ns is None else stamp_ns
         self._events.append({"t": at_ns * 1e-9, "kind": kind, "text": text[:_LONGEST], "done": done})
         del self._events[:-_EVENTS]

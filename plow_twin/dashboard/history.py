@@ -24,7 +24,7 @@ class History:
         self._versions: deque[int] = deque()
 
     def add(self, motion: dict[str, Any], version: int) -> bool:
-        """Take in the motion of an update; True where the stamps have stepped back and the hour is cleared."""
+        """Add the motion of an update; True where the stamps have stepped back and the hour is cleared."""
         second = int(motion["t"])
         stepped_back = bool(self._seconds) and second < self._seconds[-1][0]
         if stepped_back:

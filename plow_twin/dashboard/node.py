@@ -102,7 +102,7 @@ class NodeWatch:
         return {name: value for name, value in zip(_SHOWN, values, strict=False) if value is not None}
 
     def listen(self, feed: Feed, source: str) -> None:
-        """Hand messages from now on over to a feed."""
+        """Pass messages from now on to a feed."""
         self.feed = feed
         best_effort = partial(QoSProfile, reliability=ReliabilityPolicy.BEST_EFFORT)
         self._subscribe(JointState, "contact_forces", best_effort(depth=_NEWEST), self._forces)

@@ -33,7 +33,7 @@ _WAIT_S: Final = 2e-3
 
 
 class RunFeed:
-    """Hands a recording to a feed, second by second of its stamps.
+    """Passes a recording to a feed, second by second of its stamps.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ class RunFeed:
         self._source = header.excitation_source
 
     def add(self, batch: Batch) -> None:
-        """Hand over a batch."""
+        """Pass a batch."""
         rows = rows_by_topic(batch.outputs, self._topics, self._templates)
         stamps_ns, wrench = batch.entries.samples()
         held_ns = []
@@ -134,7 +134,7 @@ def show_run(path: Path, access: PageAccess, stopped: Callable[[], bool], on_ope
     Raises
     ------
     RecordingError
-        It is no recording.
+        It is not a recording.
     DashboardError
         The address cannot be used.
     """

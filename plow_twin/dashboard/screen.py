@@ -20,7 +20,7 @@ class Screen(Beside):
     access
         Address and token.
     facts, answer, load, on_error
-        As of `Feed`.
+        As in `Feed`.
 
     Raises
     ------

@@ -1,7 +1,7 @@
 """The server of the screen, a process of its own: `python -m plow_twin.dashboard.server LINK SOCKET`.
 
-Each page gets newer values once it has taken the update before: a slow page gets fewer updates, a frozen page none, and
-no page waits for another.
+Each page gets newer values once it has taken the update before: a slow page gets fewer updates, a frozen page gets no
+updates, and no page waits for another.
 """
 
 from __future__ import annotations

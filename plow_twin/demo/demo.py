@@ -53,7 +53,7 @@ class Watch:
     reports: int = 0
 
     def receive(self, message: Any) -> None:
-        """Take in one DiagnosticArray."""
+        """Process a DiagnosticArray."""
         for status in message.status:
             part = status.name.partition(": ")[2]
             self.parts[part] = {value.key: value.value for value in status.values}

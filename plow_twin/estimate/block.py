@@ -3,7 +3,7 @@
 Between impacts the block flies: under load and gravity alone, up to drag and errors of the load. The flights before and
 after an impact are extrapolated to the time at which they are nearest to each other. The corner that is deepest at that
 time, toward the wall that pushed, is at the wall, beyond it by its penetration. The places of all impacts are linear in
-the clearances, in the sensor's bias and lever arm, and in how deep the contact gives way. These are estimated together.
+the clearances, in the sensor's bias and lever arm, and in the yield of the contact. These are estimated together.
 The errors of the impacts have a Student-t distribution of unknown scale, so the intervals follow from the impacts'
 scatter.
 

@@ -104,7 +104,7 @@ def bounces(unknowns: Unknowns, poses: Poses) -> bool:
 
 
 def _is_narrow(unknowns: Unknowns, poses: Poses) -> bool:
-    """Return whether the head stops at one place, within the noise: the walls do not give way."""
+    """Return whether the head stops at one place, within the noise: the walls do not yield."""
     q = _whole(poses)
     reach = _reach(unknowns, q)
     return bool(np.median(reach[2] - reach[0]) < max(tuning.NARROW * _reach_noise(unknowns, q), tuning.FITTED))
@@ -331,7 +331,7 @@ class _Drawn:
         numbers: Array = mean + np.concatenate([self.spread.deviation, np.full(3, tuning.HARD_DRAWN[3])]) * drawn
         numbers[0] = np.clip(numbers[0], *np.log(self.spread.bounds))
         if self.unknowns.scene.contact.law in OTHER_LAW.values():
-            # a share of the critical damping of the head's mass, whatever the stiffness
+            # a share of the critical damping of the head's mass, for any stiffness
             critical = self.unknowns.critical_damping(self.unknowns.force / math.exp(numbers[0]))
             numbers[1] = math.log(tuning.LAW_DAMPING[1] * critical) + tuning.LAW_DAMPING[2] * drawn[1]
         return numbers
@@ -430,7 +430,7 @@ def path_deviate(seen: Array, features: Array, drawn: list[Array], measured: Arr
     """Return the distance of the measured path from the drawn motions as a normal deviate; 0 with too few measurements.
 
     Nearby drawn motions are compared with the rest in the same way. This gives the distances of right models,
-    whatever the contact, the noise and the length of the window.
+    for any contact, noise and length of the window.
     """
     # (n, lags, parts); stamps may be late or early: a delayed path counts as the same
     paths = np.array(drawn)

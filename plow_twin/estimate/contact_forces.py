@@ -25,7 +25,7 @@ from plow_twin.solve.compiled_scene import compile_scene
 
 Array = NDArray[np.float64]
 
-#: Guard: beyond it a number is no force [N].
+#: Guard: a larger number is not a force [N].
 _LARGEST = 1e12
 #: Bound: delays at which the motion's forces are compared with those measured, the largest and their distance in s.
 #: Derived: three deviations of the prior of a sensor's delay.

@@ -277,9 +277,9 @@ def under_uncertain_load(
 ) -> Estimate:
     """Return an estimate whose withdrawn clearances are replaced: they allow for an unknown load or angle.
 
-    `result` comes from the load believed; it stays where it has a clearance, or where the comparison finds none. Where
-    the comparison agrees with `fitted`, the result for a machine that differs, the fit was in no false optimum, and
-    both are combined.
+    `result` comes from the load believed; it stays where it has a clearance, or where the comparison finds no
+    clearance. Where the comparison agrees with `fitted`, the result for a machine that differs, the fit was in no false
+    optimum, and both are combined.
     """
     if _known(result) or felt.interval() > tuning.COARSEST:
         return result

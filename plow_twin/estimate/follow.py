@@ -342,7 +342,7 @@ class Follower:
         return end
 
     def _moved(self, worn: Array) -> Array:
-        """Return by how much pads that are worn by `worn` (..., 8) widen the clearances and their points, (..., 6)."""
+        """Return by how much the wear `worn` (..., 8) of the pads widens the clearances and their points, (..., 6)."""
         if self.scene.wear is None:
             return _UNMOVED
         return np.repeat(widening(self.scene, worn), 3, axis=-1)
@@ -441,7 +441,7 @@ class Follower:
         self._add(max(t, known), [t, *np.asarray(q, dtype=np.float64).tolist()])
 
     def add_estimate(self, text: str, t: float) -> None:
-        """Add an estimate, JSON as of `Estimate.as_dict`, that is known from `t` in s on.
+        """Add an estimate, JSON as in `Estimate.as_dict`, that is known from `t` in s on.
 
         It is followed if it has both clearances, or at least one while no estimate is followed. After a withdrawn
         estimate the prior holds again.
@@ -593,7 +593,7 @@ def prior(scene: Scene) -> Estimate:
 
 
 def _whole(found: Estimate, known: Estimate) -> Estimate:
-    """Return an estimate with damping and gains of the prior where it has none of its own."""
+    """Return an estimate, completed by damping and gains of the prior where these are missing."""
     return replace(
         found,
         damping=found.damping or known.damping,

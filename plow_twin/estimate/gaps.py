@@ -23,7 +23,7 @@ from plow_twin.model.scene import Clearance, Scene
 
 Array = NDArray[np.float64]
 
-#: Guard: beyond it a number is no gap [m].
+#: Guard: a larger number is not a gap [m].
 _LARGEST = 1e3
 #: Bound: rounds of reweighting.
 _ROUNDS = 4

@@ -140,7 +140,7 @@ class Load:
 
     @staticmethod
     def of(t: ArrayLike, wrench: ArrayLike, deviation: Deviation = UNSTATED) -> tuple[Load, int]:
-        """Put samples in order of time; return them and how many had to be left out.
+        """Return samples in order of time, and the number of samples left out.
 
         Left out are samples that are not finite, beyond 1e15, or have a repeated stamp.
 

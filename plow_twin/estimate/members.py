@@ -33,7 +33,7 @@ Rows = NDArray[np.void]
 
 #: Bound: seconds of motion that are kept for poses that are late, their delay included.
 LATEST_S: Final = 0.25
-#: Bound: least distance in s of what is kept of the motion.
+#: Bound: smallest distance in s between kept states of the motion.
 _PATH_S: Final = 2e-3
 #: Bound: outlying poses in a row after which they are used: a glitch does not last so long, the head has jumped.
 _MOST_OUTLYING: Final = 5
@@ -241,7 +241,7 @@ class Ensemble:
         self._stand(self._path[-1][1], before._v[from_], before._force(before._depth)[from_])
 
     def stand_about(self, q: Array, v: Array) -> None:
-        """Put the first member to a pose, the others to the same shares of their clearances."""
+        """Move the first member to a pose, the others to the same shares of their clearances."""
         places = q * self._shares(np.broadcast_to(self._room()[0], (len(self.good), 3)))
         force = self._force(self._penetration(places))[:1]
         self._stand(places, np.tile(v, (len(places), 1)), force)
@@ -423,7 +423,7 @@ def _worn(one: Scene, scene: Scene, worn: Array, moved: Array) -> Scene:
 
 
 def widening(scene: Scene, worn: Array) -> Array:
-    """Return by how much pads that are worn by `worn` (..., 8) widen the clearances in m, shape (..., 2)."""
+    """Return by how much the wear `worn` (..., 8) of the pads widens the clearances in m, shape (..., 2)."""
     own = np.array([scene.clearance.horizontal_m, scene.clearance.vertical_m])
     found: Array = clearances(scene, worn)[..., :2] - own
     return found

@@ -204,7 +204,7 @@ class Estimate:
         The clearances in m of a machine with exactly the scene's frame that moves like the measured one, where these
         are known better: twins are drawn from them.
     motion : Motion, optional
-        What was fitted; None where the motion is not known moment by moment. It is no part of `as_dict`.
+        What was fitted; None where the motion is not known moment by moment. It is not part of `as_dict`.
     """
 
     t_start: float

@@ -125,7 +125,7 @@ class Unknowns:
     deviation : ndarray, shape (11,)
         Standard deviations of the prior about it.
     noise : tuple of 3 float
-        Least noise of the sensor that is believed: x, y [m], theta [rad].
+        Smallest noise of the sensor that is believed: x, y [m], theta [rad].
     force : float
         Force F0 in N to which the softness refers.
     """
@@ -246,7 +246,7 @@ def contact_with(contact: Contact, stiffness: float, damping: float | None) -> C
 
 
 def with_other_law(unknowns: Unknowns) -> Unknowns | None:
-    """Return the prior about a scene with the other possible law of its contact, None where there is none."""
+    """Return the prior about a scene with the other possible law of its contact, None without such a law."""
     contact = unknowns.scene.contact
     law = OTHER_LAW.get(contact.law)
     if law is None or contact.exponent != 1.0:

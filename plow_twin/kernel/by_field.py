@@ -18,7 +18,7 @@ def by_field(name: str, present: Callable[..., Any], absent: Callable[..., Any])
     name : str
         The field.
     present, absent : callable
-        Functions of p, and of the same further arguments, that numba compiles.
+        Functions that numba compiles, of p and of the same further arguments.
     """
 
     def choose(p: Any, *more: Any) -> Any:

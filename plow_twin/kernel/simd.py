@@ -195,7 +195,7 @@ def below(typingctx: Any, left: Any, right: Any) -> Any:
 
 @_operation
 def choose(typingctx: Any, bits: Any, there: Any, elsewhere: Any) -> Any:
-    """Return the lanes of `there` whose bit is set, else those of `elsewhere`."""
+    """Return the lanes of `there` whose bit is set, otherwise those of `elsewhere`."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         number = context.cast(builder, arguments[0], signature.args[0], types.int64)

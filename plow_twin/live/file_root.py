@@ -1,4 +1,4 @@
-"""Bounds of the files that parameters may name: anybody on the ROS graph may set parameters."""
+"""Bounds of the files that parameters may name, because anybody on the ROS graph may set parameters."""
 
 from __future__ import annotations
 

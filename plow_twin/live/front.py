@@ -45,7 +45,7 @@ class Watcher(Protocol):
     """Receives each report and each publication."""
 
     def publication(self, published: Published) -> None:
-        """Take in a publication of at least one row."""
+        """Add a publication of at least one row."""
 
     def part(self, name: str, part: Part) -> None:
         """Receive a part of the diagnostics."""
@@ -61,7 +61,7 @@ class BridgeFront:
     mapping
         YAML file of the mapping, or None: recognise columns by name.
     settings, prepared
-        As of `Runtime`.
+        As in `Runtime`.
     say
         Receives status and alarms on change, and the diagnostics once a second.
     on_error

@@ -44,7 +44,7 @@ class Inputs:
     journaled
         Whether messages that are not used are collected for the journal.
     intake
-        Settings of the intake that judges the excitation, as of `Intake`.
+        Settings of the intake that judges the excitation, as in `Intake`.
     """
 
     def __init__(
@@ -160,13 +160,13 @@ class Inputs:
         return followed
 
     def uses_travel(self, stamp_ns: int, speed_m_s: float) -> bool:
-        """Take in a speed along the face; True when it is used."""
+        """Add a speed along the face; True when it is used."""
         if not self._follows("travel", stamp_ns, (speed_m_s,)):
             return False
         return self._judged("travel", self.travel, stamp_ns, (speed_m_s,)).used
 
     def uses_pose(self, stamp_ns: int, pose: tuple[float, float, float], deviation: tuple[float, ...] = ()) -> bool:
-        """Take in a measured pose: x, y [m], theta [rad], and their standard deviations where they are known.
+        """Add a measured pose: x, y [m], theta [rad], and their standard deviations where they are known.
 
         A component that was not measured is NaN, not all of them. True when the pose is used.
         """
@@ -183,7 +183,7 @@ class Inputs:
         return verdict.used
 
     def uses_gaps(self, stamp_ns: int, gaps: Mapping[int, float]) -> bool:
-        """Take in measured gaps [m] by number of their pairs; True when they are used."""
+        """Add measured gaps [m] by number of their pairs; True when they are used."""
         values = tuple(gaps.values())
         if not self._follows("gaps", stamp_ns, values):
             return False

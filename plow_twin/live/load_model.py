@@ -21,7 +21,7 @@ import numpy as np
 
 from plow_twin.record.map_file import LOAD_MODEL, map_error, read_map_file
 
-#: Least speed [m/s] at which the power determines the force of the chain.
+#: Smallest speed [m/s] at which the power determines the force of the chain.
 SLOWEST_M_S: Final = 0.1
 
 Number = tuple[float, float]

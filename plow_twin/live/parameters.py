@@ -555,7 +555,7 @@ def read_parameters(path: Path) -> dict[str, Any]:
 
 
 def read_value(text: str) -> Any:
-    """Return a value read as YAML; a text that is no YAML stays a text."""
+    """Return a value read as YAML; a text that is not YAML stays a text."""
     from plow_twin.scene_file.yaml_text import load_yaml
 
     value, found = load_yaml(text, "value", "a value")

@@ -258,7 +258,7 @@ class Runtime:
         self._send([self.publishing.alarms_now(self.stamp_ns)])
 
     def mark(self, text: str) -> tuple[bool, str]:
-        """Put a text into the journal and have the ring written, if there is one."""
+        """Write a text to the journal, and the ring, if there is one."""
         if (problem := mark_problem(text)) is not None:
             return False, problem
         self.driver.mark(self.stamp_ns, text)
@@ -271,7 +271,7 @@ class Runtime:
         return True, f"the ring in memory goes to {folder}"
 
     def record_status(self, status: DiagnosticStatus) -> None:
-        """Put a published status into the recording."""
+        """Write a published status to the recording."""
         if self.recording and not self._start_due:
             self.recording.message("status", self.stamp_ns, status)
 

@@ -117,7 +117,7 @@ class WearKeeper:
     def _save(self, values: tuple[float, ...]) -> None:
         try:
             if not self._is_claimed():
-                # moved, removed or hidden by a mount: check who has the folder of that name now
+                # moved, removed or hidden by a mount: check which twin has the folder of that name now
                 self.release()
                 self._claim = claim_folder(self.folder)
             found = read_wear(self.folder)
@@ -136,7 +136,7 @@ class WearKeeper:
             self._saved, self.error = values, ""
 
     def _is_claimed(self) -> bool:
-        """Return whether the folder of that name is the one that this twin has claimed."""
+        """Return whether the folder of that name is still the folder that this twin has claimed."""
         try:
             return self._claim is not None and os.path.samestat(os.fstat(self._claim), self.folder.stat())
         except FileNotFoundError:

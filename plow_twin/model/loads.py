@@ -1,7 +1,7 @@
 """Loads of a scene for the solver: harmonics grouped by frequency, and one list of linear pieces.
 
-A load (Fx, Fy) at the constant arm (x, y) in world axes gives M = x Fy - y Fx about the cavity's centre, whatever the
-pose (paper, section 2). Gravity is not a load.
+A load (Fx, Fy) at the constant arm (x, y) in world axes gives M = x Fy - y Fx about the cavity's centre, in any pose
+(paper, section 2). Gravity is not a load.
 """
 
 from __future__ import annotations

@@ -633,7 +633,7 @@ def _check_loads(loads: tuple[Load, ...]) -> Iterator[Problem]:
             yield from _check_table(f"loads[{index}]", load)
 
 
-#: Least time between two samples of a table in s; between closer ones the solver cannot step.
+#: Smallest time between two samples of a table in s; between closer ones the solver cannot step.
 LEAST_SPACING_S: Final = 1e-100
 
 

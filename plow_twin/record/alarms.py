@@ -67,7 +67,7 @@ def alarms_message(alarms: Alarms, node: str, hardware_id: str) -> DiagnosticSta
 def alarm_texts(values: Mapping[str, str], *, own_start: bool = False, newest: bool = False) -> list[str]:
     """Return a sentence for each latched alarm: level, value, pad, threshold and time, with `newest` the value now too.
 
-    `values` are those of `alarms_message`; `own_start` as of `time_text`.
+    `values` are those of `alarms_message`; `own_start` as in `time_text`.
     """
     found = []
     for name, (factor, unit) in _UNITS.items():

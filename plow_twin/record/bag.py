@@ -70,7 +70,7 @@ class BagWriter:
             self.flush()
 
     def flush(self) -> None:
-        """Hand the messages to the operating system; those for which the disk has no room are lost and counted."""
+        """Pass the messages to the operating system; those for which the disk has no room are lost and counted."""
         waiting, self._waiting = self._waiting, Counter()
         try:
             short = shortage(self.folder, _MIN_FREE_BYTES) if waiting else None

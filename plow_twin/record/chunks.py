@@ -31,7 +31,7 @@ DAMAGE_RECORD: Final = "plow_twin_damage"
 MAGIC: Final = b"\x89MCAP0\r\n"
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _METADATA = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x0C
 _ATTACHMENT: Final = 0x09
-#: Endings of the names of tables, which are no recordings.
+#: Endings of the names of tables, which are not recordings.
 _TABLES: Final = (".csv", ".parquet")
 _HEAD: Final = struct.Struct("<BQ")
 _HEAD_SIZE: Final = _HEAD.size
@@ -490,7 +490,7 @@ def open_mcap(path: Path) -> IO[bytes]:
     Raises
     ------
     RecordingError
-        It cannot be read or is no MCAP file.
+        It cannot be read or is not an MCAP file.
     """
     try:
         stream = path.open("rb")

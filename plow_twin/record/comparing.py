@@ -121,7 +121,7 @@ def compare(  # type: ignore[no-untyped-def]
     compared : ndarray of bool
         By kind.
     pieces, piece_ends
-        As of `_pieces`.
+        As in `_pieces`.
     data, fixed, ends
         As in `Templates`.
     different : ndarray of bool, shape (n,)

@@ -1,6 +1,6 @@
 """A recording that is still being written: whether its writer lives, and waiting for more of it.
 
-A writer holds a lock on its file, which the operating system releases however the process ends.
+A writer holds a lock on its file, which the operating system releases at any end of the process.
 """
 
 from __future__ import annotations

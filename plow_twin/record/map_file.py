@@ -40,7 +40,7 @@ UNITS: Final[dict[str, dict[str, float]]] = {
     "power": {"W": 1.0, "kW": 1e3, "MW": 1e6},
     "speed": {"m/s": 1.0, "mm/s": 1e-3, "m/min": 1.0 / 60.0, "km/h": 1.0 / 3.6},
 }
-#: What each number measures.
+#: Quantity of each number.
 QUANTITIES: Final = {
     **{("excitation", name): "force" for name in ("fx", "fy")},
     ("excitation", "m"): "moment",
@@ -131,7 +131,7 @@ def _nodes_as_fields(role: Any, entry: Any) -> Any:
         if own:
             given = rest.get(key)
             rest[key] = {**(given if isinstance(given, dict) else {}), **own}
-        elif isinstance(rest.get(key), dict):  # a single entry for all names; a name without a node gets none
+        elif isinstance(rest.get(key), dict):  # a single entry for all names, except names without a node
             rest[key] = {name: value for name, value in rest[key].items() if name in fields or name not in ROLES[role]}
     return {"stamp": SOURCE_STAMP, "stamp_unit": "ns", **rest, "topic": role, "type": OPCUA, "fields": fields}
 

@@ -113,7 +113,7 @@ class Role:
         return None if stamp_ns is None else stamp_ns + self.clock_offset_ns
 
     def why_unfit(self, arrived: Arrived, *, with_value: bool = False) -> str:
-        """Return why a message does not fit: the topic, and the field or stamp that is no number, with its value."""
+        """Return why a message does not fit: the topic, and the field or stamp that is not a number, with its value."""
         content = arrived.content
         if with_value and content is None:
             count = len(self.message_type.names) if isinstance(self.message_type, Columns) else 0

@@ -142,7 +142,7 @@ class ByteFile(Protocol):
         """Return the bytes written so far."""
 
     def truncate(self, size: int) -> None:
-        """Go back to a size."""
+        """Truncate to a size."""
 
     def sync(self) -> None:
         """Wait for the disk."""
@@ -389,7 +389,7 @@ class UnbufferedFile:
         return self._offset
 
     def truncate(self, size: int) -> None:
-        """Go back to a size."""
+        """Truncate to a size."""
         os.ftruncate(self._descriptor, size)
         os.lseek(self._descriptor, size, os.SEEK_SET)
         self._offset = size

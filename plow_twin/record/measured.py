@@ -64,7 +64,7 @@ class _Rows:
         return self.dropped + len(self._values) // self._columns
 
     def add(self, values: Iterable[float] | Array) -> None:
-        """Take in the numbers of a row, or rows, shape (n, columns)."""
+        """Add the numbers of a row, or rows, shape (n, columns)."""
         if isinstance(values, np.ndarray):
             self._values.frombytes(values.tobytes())
         else:
@@ -73,7 +73,7 @@ class _Rows:
             self._cut()
 
     def table(self) -> Array:
-        """Return the rows, shape (n, columns); none may be added after it."""
+        """Return the rows, shape (n, columns); no row may be added afterwards."""
         self._cut()
         return np.asarray(self._values, dtype=np.float64).reshape(-1, self._columns)
 
@@ -149,8 +149,8 @@ def _table(folder: Path, name: str) -> Path:
 def read_recording(path: Path, scene: Path | None = None, mapping: Path | None = None) -> Measured:
     """Read a run by its journal, or another recording (MCAP, rosbag2's sqlite3, csv) by the mapping.
 
-    The measured pose of a run lies in its journal if the node estimated, else in another recording that is given too,
-    or in its folder `beside`. Times count from the first sample of the load.
+    The measured pose of a run lies in its journal if the node estimated, otherwise in another recording that is given
+    too, or in its folder `beside`. Times count from the first sample of the load.
 
     Raises
     ------

@@ -43,7 +43,7 @@ def _placed(stream: Iterator[T], stamp_ns: StampOf[T]) -> Iterator[tuple[int, in
 
 
 def _is_stray(stamp: int, newest: int, following: int | None) -> bool:
-    """Return whether the next stamp goes on from before and not from this one."""
+    """Return whether the next stamp continues the earlier stamps and not this one."""
     if following is None:
         return False
     back = newest - stamp > _STEP_NS

@@ -135,7 +135,7 @@ def listed_parts(folder: Path) -> list[str]:
     Raises
     ------
     RecordingError
-        It is no metadata of a bag.
+        It is not the metadata of a bag.
     """
     path = folder / "metadata.yaml"
     try:

@@ -33,9 +33,9 @@ from plow_twin.stream.journal import Entry, Loss, Sample
 
 #: Journal entries that may wait for the messages sent after them [entries]: bounds the memory.
 _PENDING: Final = 65_536
-#: Least entries of a batch; outputs of a sixteenth as many chunks make a batch too.
+#: Fewest entries of a batch; outputs of a sixteenth as many chunks make a batch too.
 _LEAST: Final = 8192
-#: Least entries of a batch without outputs, which take most of the memory.
+#: Fewest entries of a batch without outputs, which take most of the memory.
 _LEAST_ALONE: Final = 32_768
 #: Size of a second of a recording of all outputs at 1 kHz [B].
 _BYTES_PER_S: Final = 400_000
@@ -62,7 +62,7 @@ class RunReader:
 
     `path` is the first file. `parts` are the files that are read; `repeated` maps files that repeat a part to the file
     that is read instead; `foreign` maps files of another run to the keys of their headers that differ from most. A part
-    that is no MCAP file counts as a damaged chunk. `missing_parts` counts parts that `metadata.yaml` names, or the
+    that is not an MCAP file counts as a damaged chunk. `missing_parts` counts parts that `metadata.yaml` names, or the
     numbers around them imply, and that the folder lacks. Parts that are removed while others are read are passed over.
 
     With a `tail` a recording is followed while it is written: new parts are read as well, and an empty batch follows
@@ -71,7 +71,7 @@ class RunReader:
     Raises
     ------
     RecordingError
-        There is no such file, or it is no recording of plow_twin.
+        There is no such file, or it is not a recording of plow_twin.
     """
 
     path: Path
@@ -169,7 +169,7 @@ class RunReader:
         return self._headers[file].part if file in self._headers else part_number(file)[0]
 
     def _place_of(self, file: Path) -> tuple[int, bool, str]:
-        """Return the sort key of a file: its number; of two with the same number the one named after it is first."""
+        """Return the sort key of a file: its number; of two with the same number, the file named by the number comes first."""
         named = part_number(file)[0]
         number = self.number(file)
         return number, named != number, file.name
@@ -438,7 +438,7 @@ def read_header(path: Path) -> RunHeader | None:
     Raises
     ------
     RecordingError
-        The file is no MCAP file, or its header cannot be read.
+        The file is not an MCAP file, or its header cannot be read.
     """
     found: list[RunHeader] = []
 

@@ -93,7 +93,7 @@ def replay(
     Raises
     ------
     RecordingError
-        The file is no recording, or its scene or journal cannot be used.
+        The file is not a recording, or its scene or journal cannot be used.
     """
     reader = RunReader(Path(path))
     run = _Replay(reader.header, ReplayReport(reader.path), digests_only or write is not None)
@@ -126,7 +126,7 @@ def following_twin(header: RunHeader, scene: Scene) -> Driven:
 
 
 class _Replay:
-    """The state of one replay: a session, and whether it is where the live one was."""
+    """The state of a replay: a session, and whether its state is that of the live session."""
 
     def __init__(self, header: RunHeader, report: ReplayReport, digests_only: bool) -> None:
         self.digests_only = digests_only
@@ -161,9 +161,9 @@ class _Replay:
         self.topics = {header.topic(name): name for name in PUBLICATION_TOPICS if name not in absent}
         self.next_sequence = 0
         self.in_a_row = 0  # entries before that without a gap
-        self.synced = False  # the session is where the live one was
+        self.synced = False  # the session has the state of the live session
         self.outputs_synced = False  # and so are its windows between two messages
-        self.outputs_whole = True  # no message of the batch under way may be missing unsaid
+        self.outputs_whole = True  # no message of the current batch may be missing without a note
         self.resumed = False  # no advance yet since the state was taken from a snapshot
         self.messages: Mapping[str, Message] | None = None
         self.first_ns: int | None = None
@@ -181,7 +181,7 @@ class _Replay:
         entries = batch.entries
         sent = SentMessages.of(batch.outputs, self.topics)
         count = len(entries)
-        breaks = np.ones(count, bool)  # entries that no run goes on into
+        breaks = np.ones(count, bool)  # entries that end a run of samples
         breaks[1:] = np.diff(entries.sequence) != 1
         digests = entries.digest_at
         behind = digests > 0
@@ -365,7 +365,7 @@ class _Replay:
     def entry(self, record: EntryRecord) -> None:
         """Apply or compare one entry of the journal."""
         if not self.report.entries and self.header.part:
-            self.next_sequence = record.sequence  # the parts before it are not here
+            self.next_sequence = record.sequence  # the earlier parts are missing
             self.alarms.give_up()
         missing = (record.sequence - self.next_sequence) & _SEQUENCE_MASK
         if 0 < (-missing & _SEQUENCE_MASK) <= self.in_a_row:  # the entry is repeated
@@ -423,7 +423,7 @@ class _Replay:
     def _snapshot(self, snapshot: Snapshot) -> None:
         if self.synced and self.outputs_synced:
             self.report.snapshots_compared += 1
-            # the time before it is forgotten, as in the live session when it was journalled
+            # earlier time is forgotten, as in the live session when the snapshot was journalled
             computed = self.session.renew().data
             self._compare("snapshot", snapshot.stamp_ns, "state", _hash(snapshot.data), _hash(computed))
             return

@@ -27,7 +27,7 @@ class RingWriter(RunWriter):
     folder
         Name of the recording; the folder is not made.
     ring_s
-        Least time that is kept [s]; up to an eighth more.
+        Smallest time that is kept [s]; up to an eighth more.
     sync_dumps
         Whether `dump` waits for the disk.
     """
@@ -140,7 +140,7 @@ class MemoryFile:
         return len(self.content)
 
     def truncate(self, size: int) -> None:
-        """Go back to a size."""
+        """Truncate to a size."""
         del self.content[size:]
 
     def sync(self) -> None:

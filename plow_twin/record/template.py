@@ -78,7 +78,7 @@ class Template:
 
 @compiled
 def _fits(buffer: Bytes, start: int, length: int, data: Bytes, fixed: Bytes) -> bool:
-    """Return whether the bytes from `start` on are a message of a template, whatever its numbers."""
+    """Return whether the bytes from `start` on are a message of a template, with any numbers."""
     if length != data.size or start < 0 or start + length > buffer.size:
         return False
     last = length - 8  # the last word may overlap the one before

@@ -23,7 +23,7 @@ _NANOSECONDS: Final = re.compile(r"[.,]\d{6}(\d{1,3})")
 EPOCH_S: Final = 1e9
 #: A time of 0 is at this stamp [ns].
 START_NS: Final = 1_000_000_000
-#: What plain decimal numbers are written with.
+#: Characters of plain decimal numbers.
 OF_NUMBERS: Final = b"0123456789+-.eE "
 #: Dates beyond this are placeholders: many databases write 9999-12-31 for no date.
 _FARTHEST_NS: Final = 4_000_000_000_000_000_000
@@ -52,14 +52,14 @@ def time_ns(value: Any, unit: str = "s") -> int | None:
 
 
 def likely_unit(value: Any) -> str | None:
-    """Return the coarsest unit but seconds in which a number beyond all dates in seconds is a date; else None."""
+    """Return the coarsest unit but seconds in which a number beyond all dates in seconds is a date; otherwise None."""
     if time_ns(value) is not None:
         return None
     return next((unit for unit in STAMP_UNITS if (time_ns(value, unit) or 0) >= EPOCH_S * 1e9), None)
 
 
 def times_ns(texts: Sequence[bytes], unit: str) -> NDArray[np.int64] | None:
-    """Return the stamps [ns] of texts, shape (n,), each as of `time_ns`; None where one is no time."""
+    """Return the stamps [ns] of texts, shape (n,), each as in `time_ns`; None where a text is not a time."""
     try:
         numbers = np.array(list(map(float, texts))) * STAMP_UNITS[unit]
     except ValueError:

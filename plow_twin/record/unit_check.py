@@ -36,13 +36,13 @@ _SLOW_S: Final = 0.5
 _SMOOTH: Final = 0.05
 #: Ploughs travel at 3.6 m/s at most (Caterpillar's GH1600); beyond this [m/s] a speed is in another unit.
 _FASTEST_M_S: Final = 5.0
-#: Stamps of which so many fall are no times; where nearly all fall, the newest row is first.
+#: Stamps of which so many fall are not times; where nearly all fall, the newest row is first.
 _FALLING, _REVERSED = 0.2, 0.9
 #: Units that a time may be in, in s.
 _TIMES: Final = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 #: Spreadsheets count days since 1900: dates of this century lie between these numbers.
 _SHEET_DAYS: Final = (36_525.0, 73_050.0)
-#: Least number of samples for a judgement of their spacing.
+#: Smallest number of samples for a judgement of their spacing.
 _FEW: Final = 20
 _SORT: Final = "sort the rows by time"
 _NAME_TIME: Final = "name the column of the time in a mapping (stamp: NAME)"
@@ -164,7 +164,7 @@ def _stated(doubt: UnitDoubt, roles: Mapping[str, Role]) -> bool:
 
 
 def _usual_magnitude(values: Array, percent: float = 99.0) -> float:
-    """Return the magnitude that one value in a hundred exceeds: an outlier is no evidence of the unit."""
+    """Return the magnitude that one value in a hundred exceeds: an outlier is not evidence of the unit."""
     known = np.abs(values)[np.isfinite(values)]
     return float(np.percentile(known, percent)) if known.size else 0.0
 

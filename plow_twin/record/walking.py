@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 BATCH: Final = 4096
 #: Entries at which a walk stops; late samples are sorted in across all others.
 _ACTING: Final = (Travel, Reset, Loss, Restore, Snapshot, SetModel, SetWear)
-#: Further ones where a motion follows measurements.
+#: Further such entries where a motion follows measurements.
 _FOLLOWED: Final = (Pose, PartOfPose, Estimated, Parameter)
 #: Failed advances in a row after which the model is reset.
 _FAILURE_LIMIT: Final = 10

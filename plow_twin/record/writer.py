@@ -68,7 +68,7 @@ class RunWriter:
     chunk_size
         Bytes [B] of journal and outputs at which their chunks are closed.
     min_free_bytes
-        Least free space on the disk [B], below which `shortage` returns a text.
+        Smallest free space on the disk [B], below which `shortage` returns a text.
     sync
         Whether each flush, and the begin and end of each part, wait for the disk.
     """
@@ -230,7 +230,7 @@ class RunWriter:
             raise
 
     def flush(self) -> None:
-        """Hand all bytes to the operating system: they survive a kill of the process."""
+        """Pass all bytes to the operating system: they survive a kill of the process."""
         self._close_chunks()
         if self._sync:
             self._part.file.sync()

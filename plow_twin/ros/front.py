@@ -41,7 +41,7 @@ class RosFront:
     changed
         Called when the state of the stream may have changed.
     prepared, kept_wear
-        As of `Runtime`.
+        As in `Runtime`.
 
     Raises
     ------

@@ -147,7 +147,7 @@ class Subscriptions:
         self._loop.add(InputQueue(self._node, subscription), self, topic)
 
     def receive(self, topic: str, batch: list[Taken]) -> None:
-        """Receive the messages that were in the queue of an input; every message comes this way.
+        """Receive the messages in the queue of an input; every message passes here.
 
         Gaps in the publishers' numbers are counted first.
         """

@@ -93,14 +93,14 @@ def simulate_many(
     on_progress : callable, optional
         Called with the number of members done, from one thread at a time.
     max_steps : int
-        Steps that each member may take; one that needs more ends with the status `BUDGET`.
+        Steps that each member may take; a member that needs more ends with the status `BUDGET`.
     max_wall_s : float
         Seconds of wall-clock time that all members together may take, compiling counted.
 
     Returns
     -------
     Ensemble
-        Rows and statistics of each member, and its status: one that fails does not stop the others.
+        Rows and statistics of each member, and its status: a failed member does not stop the others.
 
     Raises
     ------

@@ -393,7 +393,7 @@ def contact_sets_of(scene: Scene, totals: Totals) -> dict[str, dict[str, float]]
     labels = [letters.get(corner, corner) for corner in CORNER_NAMES]
     joint = "" if letters else "+"
     senses = {}
-    # the force at a wall turns a block the other way than a cavity about a corner
+    # the force at a wall turns a block in the opposite sense to a cavity about a corner
     order = ("ccw", "cw") if scene.head.carries == "walls" else ("cw", "ccw")
     for sense, times in sorted(zip(order, totals.set_time, strict=True), key=lambda item: item[0]):
         total = times.sum()

@@ -32,7 +32,7 @@ def fits_tangents(compiled: CompiledScene) -> bool:
 
 
 def is_curved(terms: Terms) -> int | None:
-    """Return 1 where the force is not linear in penetration and rate, else None."""
+    """Return 1 where the force is not linear in penetration and rate, otherwise None."""
     return 1 if terms.hysteretic or terms.integer or terms.fraction else None
 
 

@@ -412,7 +412,8 @@ class Twin:
             return None
         if state.step_size < 0.0:
             return np.array(state.frame)
-        # loads of the scene leave a step under way, whose series it is read from; time runs evenly or as a square
+        # under the scene\'s own loads a step is left under way, and the row is read from its series; time runs evenly
+        # or as a square
         used, beta = float(state.elapsed), float(state.beta)
         sigma = 2.0 * used / (state.alpha + math.sqrt(max(state.alpha**2 + 2.0 * beta * used, 0.0)))
         return frame_at(work.frame, int(state.order), sigma)

@@ -26,7 +26,7 @@ def open_csv(path: Path) -> IO[str]:
     OSError
         It cannot be opened.
     csv.Error, ExcessError
-        As of `check_text` and `ParquetLines`.
+        As in `check_text` and `ParquetLines`.
     """
     if is_parquet(path):
         return io.TextIOWrapper(io.BufferedReader(ParquetLines(path)), encoding="utf-8", errors="replace", newline="")

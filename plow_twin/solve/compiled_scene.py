@@ -397,7 +397,7 @@ def _flags(present: dict[str, bool]) -> dict[str, int]:
 
 
 def _harmonics(head: Head, loads: LoadSet) -> tuple[Array, Harmonics | None]:
-    """Return directions and harmonic loads: one direction (no S2) when all forces are parallel, else x and y."""
+    """Return directions and harmonic loads: one direction (no S2) when all forces are parallel, otherwise x and y."""
     if loads.omega.size == 0:
         return np.eye(2), None
     # (h, 2, 3): sine and cosine amplitudes of Fx, Fy, M

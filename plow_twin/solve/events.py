@@ -27,7 +27,8 @@ _ON_THE_WALL = 1e-6
 def _guards(p, state, w, order, penetrating, viscous, ramp) -> None:
     """Write each pair's first guard to `w.guard`.
 
-    off: -d >= 0; on: F / K = d + (C / K) d' >= 0 for Kelvin-Voigt, else d >= 0 or a small penetration; others: d >= 0.
+    off: -d >= 0; on: F / K = d + (C / K) d' >= 0 for Kelvin-Voigt, otherwise d >= 0 or a small penetration; others: d
+    >= 0.
     """
     guard, weights = w.guard, w.per_pair
     for pair in range(PAIR_COUNT):
@@ -191,7 +192,7 @@ def _stays(column, order, h) -> bool:
 
 @kernel()
 def _sooner(state, w, order, best) -> float:
-    """Return where the guard in `w.column[0]` first turns negative before `best`, else `best`."""
+    """Return where the guard in `w.column[0]` first turns negative before `best`, otherwise `best`."""
     column = w.column[0]
     if _stays(column, order, best):
         return best

@@ -1,6 +1,6 @@
 """Friction with stick: the force of sticking corners, and the conditions for slip and stick.
 
-A corner that sticks holds its wall by a spring and a damper from an anchor a along the wall; one that slips drags it:
+A sticking corner holds its wall by a spring and a damper from an anchor a along the wall; a slipping corner drags it:
 
     sticks    T = k (s - a) + c s'      while |T| <= mu_s N
     slips     T = +-mu N                while +-(k s' + c s'') >= mu N'
@@ -103,7 +103,7 @@ def switch_grip(p, state, pair, new) -> None:
     """Let a corner slip or stick."""
     if new == STICKS:
         place, rate = _along(p, pair, state.y)
-        # at a touch Kelvin-Voigt's force acts at once, whatever the rounded depth
+        # at a touch Kelvin-Voigt\'s force acts at once, independent of the rounded depth
         normal = _normal_force(p, state, pair, penetration_of(p, state, pair, state.y))
         _anchor(p, state, pair, state.grip[pair] * p.friction * normal, place, rate)
         state.grip[pair] = 0

@@ -225,7 +225,7 @@ def advance_rows(
     marks, snapshots
         Numbers of advances from 1 on, rising, shape (k,); after each of them the state is copied to `snapshots`, (k,).
     bound
-        As of `_advance`.
+        As in `_advance`.
     pace
         Place at which the call continues.
 

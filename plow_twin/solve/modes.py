@@ -122,7 +122,7 @@ def _start_inside(p, state, pair, energy) -> None:
         number = p.damping_number
         speed = _impact_speed(number, rate, energy * mobility)
         if _falls(p) is not None:
-            # the speed tells the damping, which tells the speed
+            # the speed determines the damping, which determines the speed
             for _ in range(_ROUNDS):
                 number = _damping_number(p, y, pair, speed)
                 speed = _impact_speed(number, rate, energy * mobility)

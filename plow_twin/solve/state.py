@@ -1,7 +1,6 @@
 """Records of the compiled kernels: constants of a scene, dynamic state, scratch space and totals.
 
-Parts that a scene lacks are `None`: the compiled signature then holds `none` in their place, and the code that
-would serve them is not compiled at all.
+Parts that a scene lacks are `None`: the compiled signature then holds `none`, and their code is not compiled.
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ _THERE = 1e-12
 
 @kernel()
 def turn_at(p, state, w, order, best) -> float:
-    """Return where in a step the block reaches 45 degrees before `best`, else `best`."""
+    """Return where in a step the block reaches 45 degrees before `best`, otherwise `best`."""
     if not may_tumble(p):
         return best
     column, angle = w.column[0], named_angle(p, state.y, state.y[THETA])

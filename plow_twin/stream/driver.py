@@ -364,7 +364,7 @@ class Driver:
         self._resumed = True
 
     def pause(self) -> None:
-        """Count a sample that waits for its successor, because none comes at present."""
+        """Count a sample that waits for its successor, because no sample comes at present."""
         self._steps.end()
 
     def close(self) -> None:

@@ -399,9 +399,9 @@ class Session:
         wrench : ndarray, shape (n, 3)
             Fx, Fy [N] and M [N m] at each.
         rows : ndarray of `ROW`, shape (n,), or None
-            Receives the rows; None: no row is read out, and `outputs` gets none.
+            Receives the rows; With None no row is read out or passed to `outputs`.
         taken : ndarray of int64
-            As of `Outputs.add`.
+            As in `Outputs.add`.
         digest_after : ndarray of int64, shape (m,)
             Rising numbers from 1 to n: counts of samples after which a digest is made.
 

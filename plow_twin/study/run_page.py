@@ -41,7 +41,7 @@ def write_run_page(path: Path, out: Path) -> tuple[FileStatus, dict[str, int], i
     Raises
     ------
     RecordingError
-        The file is no recording, or has no row to draw.
+        The file is not a recording, or has no row to draw.
     ModuleNotFoundError
         jinja2 or matplotlib (extra `study`) is not installed.
     """

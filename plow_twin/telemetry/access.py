@@ -75,7 +75,7 @@ class Credentials:
         AccessError
             A section or key is not known, or a value is not a text.
         SceneError
-            It is no YAML within the bounds.
+            It is not YAML within the bounds.
         OSError
             The file cannot be read.
         """

@@ -49,7 +49,7 @@ class Broker:
     waiting
         Most messages that wait while the broker does not answer; the oldest are dropped and counted.
     keeps
-        Whether waiting messages are sent after a break; else they are dropped and counted.
+        Whether waiting messages are sent after a break; otherwise they are dropped and counted.
 
     Raises
     ------
@@ -166,7 +166,7 @@ class MqttOut:
     prefix
         Begin of the topics.
     options
-        As of `Broker`.
+        As in `Broker`.
     """
 
     def __init__(self, prefix: str, **options: Any) -> None:

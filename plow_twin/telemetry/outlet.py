@@ -26,7 +26,7 @@ class Outlet(Beside):
     way
         The way out.
     facts, answer
-        As of `Feed`.
+        As in `Feed`.
     on_error
         Receives in words when the receiver stops and begins to take messages.
 

@@ -73,7 +73,7 @@ class Sparkplug:
     group, node
         Its names in the topics.
     options
-        As of `Broker`.
+        As in `Broker`.
     """
 
     def __init__(self, group: str, node: str, **options: Any) -> None:

@@ -22,7 +22,7 @@ def estimate_picture(
     result
         The estimate.
     prior
-        What was known before, by the names of `QUANTITIES`.
+        The prior, by the names of `QUANTITIES`.
     poses
         The measured poses, which are drawn alone where no motion was fitted.
     labels

@@ -45,7 +45,7 @@ def follow(
     Raises
     ------
     RecordingError
-        The file is no recording.
+        The file is not a recording.
     """
     reader = RunReader(path, Tail(stop))
     scene = reader.header.scene(reader.path)

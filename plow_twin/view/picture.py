@@ -47,7 +47,7 @@ def to_png(path: Path, out: Path) -> tuple[FileStatus, dict[str, int], int]:
     Raises
     ------
     RecordingError
-        The file is no recording, or `out` cannot be written.
+        The file is not a recording, or `out` cannot be written.
     """
     reader = RunReader(path)
     curves = RunCurves.of(reader)

@@ -94,7 +94,7 @@ def to_rrd(
     Raises
     ------
     RecordingError
-        The file is no recording, or `out` cannot be written.
+        The file is not a recording, or `out` cannot be written.
     """
     reader = RunReader(Path(path))
     scene = reader.header.scene(reader.path)

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 _MM: Final = 1000.0
 #: Length of an arrow [mm] per force [N].
 ARROW_MM_PER_N: Final = 7e-4
-#: Least force that is drawn [N].
+#: Smallest force that is drawn [N].
 FAINT_N: Final = 500.0
 #: Distance of the body's outline from the cavity [mm]; a scene has no true outline.
 BODY_MARGIN_MM: Final = 60.0

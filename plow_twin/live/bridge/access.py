@@ -82,7 +82,7 @@ def read_access(url: str, path: Path | None) -> Access:
     Raises
     ------
     InputError
-        The file is no YAML within the bounds, or a key or value is not expected.
+        The file is not YAML within the bounds, or a key or value is not expected.
     OSError
         The file, or that of the password, cannot be read.
     """

@@ -28,7 +28,7 @@ _RESTART = 1000
 _MOST_LOST = 10**9
 #: A 0 or 1 after at least this many messages is a restart, after fewer a late message.
 _FIRST = 10
-#: Least relative change of a deviation of the load that is journalled.
+#: Smallest relative change of a deviation of the load that is journalled.
 _NOTABLE = 0.02
 
 

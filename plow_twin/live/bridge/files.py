@@ -125,13 +125,13 @@ class _Tail:
 
 
 def _open(path: Path) -> Any:
-    """Open a file of lines, or one that stands for lines."""
+    """Open a file of lines, or a Parquet file as lines."""
     return ParquetLines(path) if is_parquet(path) else path.open("rb")
 
 
 @contextmanager
 def _readable(path: Path) -> Iterator[None]:
-    """Turn the errors of files that are no table into those of a source."""
+    """Turn the errors of files that are not a table into those of a source."""
     try:
         yield
     except csv.Error as error:

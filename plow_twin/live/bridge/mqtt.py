@@ -132,7 +132,7 @@ class Mqtt(SourceState):
         self.trouble = self.trouble or f"the connection broke: {end_of(*facts)}; it is tried again"
 
     def _on_message(self, client: Any, data: Any, message: Any) -> None:
-        # one that is too long is not kept: without its text it is unreadable too
+        # a line that is too long is dropped: it counts as unreadable
         payload = message.payload if len(message.payload) <= LONGEST else b""
         if len(self._queue) >= _QUEUE or self._came - self._left + len(payload) > _QUEUED_BYTES:
             self.lost += 1

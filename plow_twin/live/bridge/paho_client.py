@@ -8,7 +8,7 @@ from typing import Any, Final
 
 #: Longest wait before another attempt to connect [s].
 LONGEST_WAIT_S: Final = 30
-#: Least number of a refused subscription, where refusals are numbers.
+#: Smallest number of a refused subscription, where refusals are numbers.
 _REFUSED: Final = 0x80
 
 

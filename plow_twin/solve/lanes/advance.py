@@ -97,7 +97,7 @@ def _begin_sample(s, lanes, lane) -> None:
 
 @kernel()
 def _load_next(s, lanes, lane) -> None:
-    """Put the next twin that waits into a lane."""
+    """Move the next twin that waits into a lane."""
     member = s.queue[s.progress[0]]
     s.progress[0] += 1
     p = s.params[member]

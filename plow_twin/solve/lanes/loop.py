@@ -90,7 +90,7 @@ def _another_method(p, harmonics, extent, flight, rest, state, lanes, lane, w, s
 
 @kernel()
 def _look(members, flight, rest, lanes, lane, w, t_end, budget, in_range) -> int:
-    """Return `OK` where the scene in a lane takes its next step there, else the status it leaves with."""
+    """Return `OK` where the scene in a lane takes its next step there, otherwise the status it leaves with."""
     member = lanes.member[lane]
     p, state = members.params[member], members.states[member]
     if not in_range and not lane_in_range(lanes, p, state, lane):
@@ -143,7 +143,7 @@ def turn(out, first, second) -> None:
 
 @kernel()
 def _part(state, sums, lanes, lane) -> None:
-    """Let clipped pairs that part within a lane's step do so."""
+    """Part the clipped pairs that leave their wall within a lane\'s step."""
     for pair in range(PAIR_COUNT):
         if lanes.parted[pair, lane] < lanes.step[lane]:
             lanes.mode[pair, lane] = OFF

@@ -1,7 +1,7 @@
 """Taylor series of eight scenes side by side, contact modes frozen (equations in `method.series`).
 
 Where the contacts' force is linear in penetration and rate, all acting pairs of a scene are one affine map of the
-state: an order takes twelve Cauchy products, however many pairs act and whichever they are. With lambda d' the force K
+state: an order takes twelve Cauchy products, for any number and choice of acting pairs. With lambda d' the force K
 d (1 + lambda d') is K (d + lambda / 2 (d^2)'): half a product more for each slot, which holds any one acting pair of
 each lane.
 """
@@ -81,7 +81,7 @@ def expand(lanes, w, limit, waves, second, viscous, hysteretic, segments) -> int
     """Write the series of the state; return the order.
 
     Under sampled loads a lane's terms are zero beyond the order at which they vanish over the longest wanted step, so
-    that later orders of other lanes change none of its bits.
+    that later orders of other lanes do not change its bits.
     """
     series, moment = lanes.series, lanes.moment
     zero = exact_splat(0.0)

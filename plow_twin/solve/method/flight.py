@@ -74,7 +74,7 @@ def _reach(p, w, time, leverage) -> float:
 
 @kernel(inline="source")
 def own(parts):
-    """Return 1 where the scene may fly freely, else None."""
+    """Return 1 where the scene may fly freely, otherwise None."""
     return parts.terms.flight
 
 

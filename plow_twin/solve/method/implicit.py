@@ -1,7 +1,7 @@
 """Implicit steps for overdamped contact: collocation at Radau points with the contact modes frozen.
 
 Where damping stops a pair long before its spring moves it, an explicit series is bound by stability: steps of a few
-decay times, however smooth the motion. Radau IIA collocation (Hairer and Wanner, Solving ODEs II, sec. IV.5) is stable
+decay times, even for a smooth motion. Radau IIA collocation (Hairer and Wanner, Solving ODEs II, sec. IV.5) is stable
 there. Its solution is also a polynomial in time: written as a series, it needs no events, output or statistics of its
 own.
 """
@@ -116,7 +116,7 @@ def _implicit_type(size: int) -> np.dtype[np.void]:
             ("matrix", "f8", (size * STAGES, size * STAGES)),
             ("residual", "f8", (size * STAGES,)),
             ("body", "f8", shape),  # body coordinates
-            ("seen", "f8", shape),  # the same as seen from a frame that gives way
+            ("seen", "f8", shape),  # the same as seen from a frame on springs
             ("frame", "f8", shape),  # and that frame, in the lanes of `w.frame`
             ("pairs", "f8", (3, STAGES, PAIR_COUNT)),  # force, law's force (of clipped pairs too), rate, at the nodes
             ("wearing", "f8", (STAGES, PAIR_COUNT)),  # rate of wear at the nodes
@@ -127,7 +127,7 @@ def _implicit_type(size: int) -> np.dtype[np.void]:
 
 
 def new_implicit(support: bool) -> Implicit:
-    """Return nodes, weights and scratch space; `support` for a frame that gives way."""
+    """Return nodes, weights and scratch space; `support` for a frame on springs."""
     implicit = new_record(_implicit_type(6 if support else 3))
     for name, table in zip(("nodes", "weights", "from_values", "from_stages"), _rule(), strict=True):
         implicit[name] = table
@@ -280,7 +280,7 @@ def _places(implicit, h) -> None:
 
 @kernel()
 def _bodies(p, support, state, implicit, i) -> None:
-    """Write the body coordinates at the start (i = 0) or at a node, also as seen from a frame that gives way."""
+    """Write the body coordinates at the start (i = 0) or at a node, also as seen from a frame on springs."""
     z, y = implicit.z[i], implicit.body[i]
     if support is not None:
         seen, frame = implicit.seen[i], implicit.frame[i]
@@ -412,7 +412,7 @@ def _interpolate(values, coefficients, h, out) -> None:
 
 @kernel()
 def _series_seen(support, h, w, implicit):
-    """Return the series of the body coordinates that the pairs depend on; write those of a frame that gives way."""
+    """Return the series of the body coordinates that the pairs depend on; write those of a frame on springs."""
     if support is not None:
         frame, s, seen = implicit.frame, implicit.nodes.size, w.seen
         _interpolate(implicit.seen, implicit.from_values, h, seen)

@@ -12,7 +12,7 @@
      to `w.rate`, `w.force`, up to `state.order`, or else the numbers that `dense_output.evaluate` needs instead;
    - the map of the series' variable sigma to time to `state.alpha`, `state.beta`;
    - to `state.sigma_end` the sigma up to which all of them meet the tolerance;
-   - to `state.ends_at_stop` 1 where the step covers the whole of `span`, else 0;
+   - to `state.ends_at_stop` 1 where the step covers the whole of `span`, otherwise 0;
    - its own flag, if it has one (`in_flight`, `at_rest`).
 4. With False it has written nothing but these fields, its own fields and scratch space.
 5. It moves neither the state, its time and modes nor the totals: an event may end the step sooner, and

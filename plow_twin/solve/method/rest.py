@@ -83,7 +83,7 @@ def _still_as_before(p, acts, harmonics, state, w) -> bool:
 
 @kernel(inline="source")
 def own(parts):
-    """Return 1 where rest can be recognised, else None."""
+    """Return 1 where rest can be recognised, otherwise None."""
     return parts.terms.rest
 
 

@@ -107,7 +107,7 @@ def _answer(p, one, w, gyration):
     along_t = third * x + (b * g - a * h) * y + (a * e - b * d) * t
     size = math.sqrt(abs(along_x) ** 2 + abs(along_y) ** 2 + abs(along_t) ** 2)
     size /= abs(a * first + b * second + c * third)
-    # x K x is at most the work of the harmonic and the inertia on the way
+    # x K x is at most the work of harmonic and inertia along the path
     load = math.sqrt(abs(x) ** 2 + abs(y) ** 2 + abs(t) ** 2)
     return size, math.sqrt(load * size) + om * size
 

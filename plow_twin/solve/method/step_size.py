@@ -131,7 +131,7 @@ def _relatively_accurate(g, order, lacuna, share, sigma) -> float:
 
 @kernel()
 def time_to_separation(p, parts, state, w, span, harmonics, stick):
-    """Return the time until the first pair parts, where the parting shortens steps; else 0.
+    """Return the time until the first pair parts, where the parting shortens steps; otherwise 0.
 
     The root of a short series is enough: the next step corrects its error.
     """

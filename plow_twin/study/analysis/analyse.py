@@ -79,7 +79,7 @@ class Prediction:
     clearance: Thinned = field(default_factory=lambda: Thinned(len(CLEARANCE_NAMES)))
 
     def walked(self, part: Walked) -> None:
-        """Take in a batch."""
+        """Add a batch."""
         self.loads.add(part)
         rows, slow = part.rows, part.published.slow
         first, _ = self.spans.get(self.resets, (int(part.stamp_ns[0]), 0))
@@ -291,7 +291,7 @@ def analyse(
     path
         A run of ours, another recording (MCAP, rosbag2's sqlite3, CSV), or a folder of its parts.
     scene
-        Scene file or preset; needed for other recordings (or `scene.yaml` beside them), else the run's.
+        Scene file or preset; needed for other recordings (or `scene.yaml` beside them), otherwise the run's.
     mapping
         YAML that maps topics to roles.
     units

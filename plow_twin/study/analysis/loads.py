@@ -53,7 +53,7 @@ class Series:
         self.low, self.high, self.last = math.inf, -math.inf, math.nan
 
     def __iter__(self) -> Iterator[float]:
-        """Yield the numbers; none may be added meanwhile."""
+        """Yield the numbers; no number may be added meanwhile."""
         self._file.seek(0)
         while block := self._file.read(_IN_MEMORY):
             yield from np.frombuffer(block).tolist()
@@ -99,7 +99,7 @@ class LoadTotals:
         self._last = self._worn = None
 
     def add(self, walked: Walked) -> None:
-        """Take in some advances."""
+        """Add some advances."""
         self.scene = walked.scene
         rows, stamps = walked.rows, walked.stamp_ns
         self._first_ns = int(stamps[0]) if self._first_ns is None else self._first_ns

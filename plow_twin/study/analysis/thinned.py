@@ -24,7 +24,7 @@ class Thinned:
         self.stride = 1
 
     def add(self, stamp_ns: NDArray[np.int64], values: Array) -> None:
-        """Take in rows, shapes (n,) and (n, columns)."""
+        """Add rows, shapes (n,) and (n, columns)."""
         chosen = slice(-self.rows % self.stride, None, self.stride)
         self._stamps.append(stamp_ns[chosen].copy())
         self._values.append(values[chosen].copy())
@@ -49,7 +49,7 @@ class ThinnedSignal:
         self._came, self._stride = 0, 1
 
     def add(self, stamp_ns: int, value: float, stretch: int = 0) -> None:
-        """Take in a value."""
+        """Add a value."""
         if self._came % self._stride == 0:
             self._stamps.append(stamp_ns)
             self._values.append(value)

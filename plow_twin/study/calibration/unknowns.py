@@ -144,7 +144,7 @@ class Space:
 
 
 def check_usable(space: Space, scene: Scene, trials: int = 100) -> None:
-    """If none of some random points can be run, raise the `SceneError` of the first."""
+    """Raise the `SceneError` of the first of some random points if all fail."""
     points = np.random.default_rng(0).random((trials, space.size))
     if not any(is_usable(scene, values) for values in space.values_of(points)):
         with_parameters(scene, space.values(points[0]))

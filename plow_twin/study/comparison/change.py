@@ -98,7 +98,7 @@ def changes(
     Parameters
     ----------
     before, after
-        Values of the quantities, shape (n, k), and load of the windows of each group, shape (n,), or as of
+        Values of the quantities, shape (n, k), and load of the windows of each group, shape (n,), or as in
         `with_neighbours`, shape (n, 3).
     random
         Source of the draws.

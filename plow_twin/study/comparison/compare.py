@@ -115,7 +115,7 @@ def by_time(kind: str, shifts: Sequence[time] = SHIFTS, zone: tzinfo = UTC) -> L
     Raises
     ------
     RecordingError
-        By the labels: the stamps are no dates.
+        By the labels: the stamps are not dates.
     """
     begins = sorted(shifts)
 

@@ -97,7 +97,7 @@ class _Sums:
     rows: dict[int, Array] = field(default_factory=dict)
 
     def add(self, window: Indexes, values: Array, reduce: Any = np.add) -> None:
-        """Take in values (n, width) of windows (n,), whose numbers do not fall."""
+        """Add values (n, width) of windows (n,), whose numbers do not fall."""
         if not len(window):
             return
         first = np.flatnonzero(np.r_[True, np.diff(window) != 0])
@@ -122,7 +122,7 @@ def windows_of(recording: Recording, window_s: float | None = None) -> Windows:
     Raises
     ------
     RecordingError
-        It is no run of plow_twin, or has no outputs.
+        It is not a run of plow_twin, or has no outputs.
     """
     window_ns = round(1e9 * (window_s or _load_period(recording)))
     peak, moved, contact, load = _Sums(PAIR_COUNT), _Sums(2 * PAIR_COUNT), _Sums(2 * PAIR_COUNT + 1), _Sums(3)

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 _HALF: Final = 0.03
 #: An impact: deviation of the accelerations of z [m/s^2] and theta [rad/s^2] from a flight, and largest gap [m].
 _FALL, _JERK, _TWIST, _NEAR = 9.0, 9.0, 300.0, 0.03
-#: Least rise in m between two separate bounces.
+#: Smallest rise in m between two separate bounces.
 _RISE: Final = 0.003
 
 

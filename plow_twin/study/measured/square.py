@@ -24,7 +24,7 @@ _NUMBERS: Final = 1000
 _TOUCHES: Final = 64
 #: Additional turn in rad within a row that only an impact causes.
 _TURN_IN_A_ROW: Final = 0.1
-#: Least rows of a first flight, for its speeds.
+#: Fewest rows of a first flight, for its speeds.
 LEAST_ROWS: Final = 4
 
 #: Fitted to drops with odd numbers.
@@ -56,7 +56,7 @@ class Marker:
         return self._moved(measured - [0.0, 0.0, self.turn, 0.0, 0.0, 0.0], -1.0)
 
     def measured(self, block: Array) -> Array:
-        """Return the poses or states of the marker, shape (..., 3) or (..., 6), on a block with these."""
+        """Return the poses or states of the marker, shape (..., 3) or (..., 6), on a block in the given poses or states."""
         turned = np.zeros(block.shape[-1])
         turned[2] = self.turn
         return self._moved(block, 1.0) + turned

@@ -30,7 +30,7 @@ _POLICIES: Final = [
     ua.SecurityPolicyType.Aes128Sha256RsaOaep_SignAndEncrypt,
     ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt,
 ]
-#: A number that is not known, and one that was computed without samples.
+#: Status of an unknown number, and of a number computed without samples.
 _UNKNOWN: Final = ua.StatusCode(StatusCodes.BadWaitingForInitialData)
 _HELD: Final = ua.StatusCode(StatusCodes.UncertainLastUsableValue)
 _GOOD: Final = ua.StatusCode()

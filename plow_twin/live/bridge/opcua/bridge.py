@@ -327,7 +327,7 @@ class OpcUa(SourceState):
         return len(new)
 
     def _pass_on(self, now_s: float) -> None:
-        """Hand over the samples that are complete."""
+        """Return the complete samples."""
         log_ns = time.time_ns()
         for topic, samples in self._samples.items():
             for stamp_ns, values in samples.take(now_s):

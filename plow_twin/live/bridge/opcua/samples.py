@@ -42,7 +42,7 @@ class Samples:
         self._incomplete = 0
 
     def add(self, node: str, stamp_ns: int, value: Value, now_s: float) -> None:
-        """Take in a value; the same stamp of a node again is ignored."""
+        """Add a value; the same stamp of a node again is ignored."""
         if stamp_ns == self.newest_ns[node]:
             return
         # the clock of the first value, perhaps that of the starting server, does not bind later values
