@@ -40,7 +40,7 @@ def paper_sample(index: int, first_ns: int = BASE_NS) -> Sample:
 
 
 def paper_entries(count: int) -> list[Entry]:
-    """Samples with one of each other kind of entry between them, and a reset half way."""
+    """Samples with an entry of each other kind in between, and a reset half way."""
     half = count // 2
     entries: list[Entry] = [Parameter("hold", "hold"), *map(paper_sample, range(half))]
     entries.insert(half // 2, Travel(BASE_NS, 2.5))

@@ -373,7 +373,7 @@ def test_a_killed_server_is_reported_once_and_the_twin_continues(tmp_path: Path)
         assert process.stdin is not None
         process.stdin.close()
         process.stdin = None
-        out, err = process.communicate(timeout=60)  # no page is left to wait for
+        out, err = process.communicate(timeout=60)  # no page remains for which the server would wait
     assert process.returncode == 0 and json.loads(out)["input"]["samples_used"] == str(COUNT)
     assert "server of the screen" not in err
 

@@ -175,7 +175,7 @@ def test_contacts_that_are_no_impacts_between_two_poses_determine_nothing(elasti
 
 @pytest.mark.parametrize("too_stiff", [300.0, 30.0])
 def test_a_contact_far_softer_than_believed_leaves_the_clearance_in_its_interval(too_stiff) -> None:
-    """The impacts scatter more than rigid ones would, and the interval is as wide as that."""
+    """The impacts scatter more than rigid impacts would, and the interval is wide accordingly."""
     motion = simulate(guide(1e7), t_end=12.0, output_dt=0.004, tol=1e-6)
     noise = np.random.default_rng(1).normal(0.0, [3e-5, 3e-5, 2e-4], motion.q.shape)
     found = of_guide(motion.t, motion.q + noise, 1e7 * too_stiff)

@@ -53,7 +53,7 @@ def followed(truth: Truth) -> Stretch:
 
 
 def _known(truth: Truth, state: State = State.ESTIMATED) -> Estimate:
-    """An estimate as good as one of ten load periods."""
+    """An estimate with the accuracy of ten load periods."""
     clearance, contact = truth.scene.clearance, truth.scene.contact
     assert contact.damping is not None
     fx, fy, m = (Interval.normal(gain, 0.003) for gain in truth.gain)

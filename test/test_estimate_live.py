@@ -376,7 +376,7 @@ def test_of_a_file_that_ends_the_last_window_is_estimated_or_too_few_data_are_na
         )
         assert found == []
         return
-    last_s = truth.load.t[-1] + 1.0  # stamps of such files are a second later
+    last_s = truth.load.t[-1] + 1.0  # the stamps of times from 0 are moved by a second
     window = found[-1].window
     assert window is not None and window.end_ns == pytest.approx(last_s * 1e9 + 1, abs=1.0)
     assert "Estimate of the window" in shown.out and "horizontal clearance" in shown.out.lower()

@@ -30,7 +30,7 @@ EXAMPLES = 20_000
 FUZZ = settings(
     max_examples=EXAMPLES, deadline=None, suppress_health_check=[*HealthCheck], print_blob=True, database=None
 )
-#: Changes of a file: a place (a share of it), the number of bytes that go, and those that come.
+#: Changes of a file: the place (as a share of the file), the number of removed bytes, and the inserted bytes.
 CHANGES = st.lists(
     st.tuples(st.floats(0.0, 1.0, exclude_max=True), st.integers(0, 64), st.binary(max_size=64)), min_size=1, max_size=8
 )

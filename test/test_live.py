@@ -324,7 +324,7 @@ def test_a_mapping_takes_units_offsets_clocks_and_names_its_faults(tmp_path: Pat
     for wrong in (True, [1], {}, None, 10**400):
         assert read(pose + "stamp: at}", a=wrong, b={"c": 4}, turn=1, at=1) is None
     assert time_ns(1_767_323_045_123_456_789, "ns") == 1_767_323_045_123_456_789
-    assert time_ns(0.5) == 1_500_000_000  # counts from some start: 0 would be no stamp
+    assert time_ns(0.5) == 1_500_000_000  # times from an arbitrary start; a stamp of 0 would count as missing
     assert time_ns("yesterday") is None and time_ns(float("inf")) is None and time_ns(1e300) is None
     # the empty date of many databases, and a date that no stamp can hold
     assert time_ns("9999-12-31") is None and time_ns("2300-01-01T00:00:00") is None and time_ns("0001-01-01") is None

@@ -25,7 +25,7 @@ def penetration(scene: Scene, q: np.ndarray) -> np.ndarray:
 
 
 def distance_sum_excess(scene: Scene, q: np.ndarray, pair: int) -> float:
-    """The paper's test (eq. 2): distances of the corner to the wall and to the one opposite, minus the side between."""
+    """The paper's test (eq. 2): distances of the corner to the wall and to the opposite wall, minus the side."""
     width = scene.frame.width_m + scene.clearance.horizontal_m
     height = scene.frame.height_m + scene.clearance.vertical_m
     x, y, theta = q

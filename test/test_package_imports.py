@@ -147,7 +147,7 @@ def _module_name(path: Path) -> str:
 
 
 def _module_imports(path: Path, modules: set[str]) -> set[str]:
-    """Return the package's modules that one imports: lazily and for the type checker too."""
+    """Return the modules of the package that a module imports, also lazily or for the type checker."""
     found = set()
     for node in _statements(path):
         if isinstance(node, ast.Import):

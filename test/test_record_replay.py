@@ -198,7 +198,7 @@ def test_after_a_damaged_chunk_nothing_is_claimed(run: Run, tmp_path: Path) -> N
     for start, length in spans:  # of the journal, and of the sent messages
         data = bytearray(run.file.read_bytes())
         middle = start + length // 2
-        # one bit alone may stand in a reference to other bytes that are the same
+        # a single flipped bit may lie in a reference to other, equal bytes
         data[middle : middle + 8] = bytes(byte ^ 0xFF for byte in data[middle : middle + 8])
         damaged = tmp_path / "damaged.mcap"
         damaged.write_bytes(data)

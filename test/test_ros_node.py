@@ -54,7 +54,7 @@ MS = 1_000_000
 PAPER = load_scene(scene_path("paper"))
 WEAR = Wear(coefficient_m2_n=1e-14, pad_area_m2=0.015, travel_speed_m_s=2.0)
 
-#: On a busy machine a best-effort input may lose samples; where the test needs all of them it asks for them.
+#: On a busy machine a best-effort input may lose samples; tests that need all samples use a reliable input.
 RELIABLE_INPUT = {"qos_overrides.{ns}/excitation.subscription.reliability": "reliable"}
 
 

@@ -380,7 +380,7 @@ def test_messages_from_before_the_subscription_are_no_loss_whenever_their_publis
         # 21 s of samples, discovered 0.3 s after the subscription
         assert hear(node, b"before", 0.3, *range(4158, 4200), 4203) == 3
         assert node.trigger_cleanup() == node.trigger_configure() == TransitionCallbackReturn.SUCCESS
-        # a second one, an hour later: it sent 60 until it was connected, and three were lost after that
+        # a second publisher, an hour later: it sent 60 messages before it was connected, and three were lost afterwards
         assert hear(node, b"after", 3600.0, 61) == 0
         assert hear(node, b"after", 3600.0, 62) == 60
         assert hear(node, b"after", 3600.0, *range(63, 100), 103) == 63

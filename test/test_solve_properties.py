@@ -223,7 +223,7 @@ def check_energy(
     slack = (1e3 * case.tol + 1e-9) * scale + work_error
     # and it is absolute for speeds below a thousandth of the clearance in a second
     slack += case.tol * length_scale(case.scene) * np.sqrt(2.0 * case.scene.head.mass_kg * kinetic.max())
-    # the tolerance is one of the pose: where the forces push, it is energy
+    # the tolerance is of the pose; under force an error of the pose is energy
     slack += 100.0 * case.tol * length_scale(case.scene) * peak.sum(axis=1).max()
     rise = gain - np.minimum.accumulate(gain)
     assert (rise <= slack).all(), (rise.max() / scale, case.tol, int(rise.argmax()))

@@ -80,7 +80,7 @@ VARIANTS = {
 
 
 def test_an_exponent_that_is_no_integer_keeps_to_the_tolerance_when_separations_are_slow() -> None:
-    """The force left out before a separation is larger for a slower one: a thrown head that its damping slows down."""
+    """The slower a separation, the larger the force left out before it: here of a thrown head slowed by its damping."""
     scene = preset("bench_hc")
     contact = Contact("hunt_crossley", 3e9 * 1e-3**-1.2, 2.2, damping=3.0)
     scene = dataclasses.replace(scene, contact=contact, initial=Initial((0.0, 0.0, 0.0), (-1.1, 0.3, -6.0)))
@@ -93,7 +93,7 @@ def test_an_exponent_that_is_no_integer_keeps_to_the_tolerance_when_separations_
 @pytest.mark.parametrize(
     ("offset", "loads", "contact"),
     [
-        # a table acts as samples do, so other tests have its kernels compiled
+        # a table acts like samples, so other tests have compiled its kernels
         pytest.param((0.0, 0.0), VARIANTS["table"], (6e6, 1.0), id="centred, table"),
         pytest.param((0.05, -0.08), VARIANTS["two directions"], (2e9, 2.0), id="offset, two directions"),
         pytest.param(

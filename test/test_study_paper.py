@@ -259,7 +259,8 @@ def test_the_exact_rigid_body_falls_without_turning(study: PaperStudy) -> None:
     np.testing.assert_array_equal(rotation.results[0].q, study.runs.case.q)
     head, t = study.runs.scene.head, study.runs.case.t[20]
     turned = [float(result.q[20, 2]) for result in rotation.results]
-    # gravity alone: its moment turns the one at once, the other falls about its centre of mass; the loads add t^3
+    # gravity alone: its moment turns the first body at once, the second falls about its centre of mass; the loads add
+    # t^3
     assert turned[0] == pytest.approx(-0.5 * head.mass_kg * 9.81 * 0.255 / head.inertia_kg_m2 * t**2, rel=0.15)
     assert abs(turned[1]) < 0.15 * abs(turned[0])
     values = {entry.what: entry for entry in study.rotation}

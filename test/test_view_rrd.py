@@ -333,7 +333,7 @@ def test_a_long_run_is_thinned_without_losing_a_peak(run: Run, tmp_path: Path) -
     tables = read(thin.path)
     for pair, name in enumerate(PAIR_NAMES):
         values = scalars(tables[f"/force/{name}"])
-        # at most three of each span; where a batch of the file ends, so does a span
+        # at most three of each span; the end of a batch also ends a span
         assert len(values) <= 750 < COUNT and values.max() == efforts[:, pair].max() / 1e3
     assert thin.section_rows < COUNT // 10
 

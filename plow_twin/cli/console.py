@@ -190,7 +190,7 @@ def counts(found: Mapping[str, int]) -> str:
 
 
 def say_end(recording: object, status: str) -> None:
-    """Print on standard error how a recording ended, if not as it should, and the verb that completes it."""
+    """Print on standard error that a recording has no proper end, and the verb that completes it."""
     from plow_twin.record.reader import FileStatus
 
     if status not in (FileStatus.COMPLETE.value, FileStatus.UNREAD.value):
@@ -200,7 +200,7 @@ def say_end(recording: object, status: str) -> None:
 
 
 def say_lost(recording: object, lost: Mapping[str, int]) -> None:
-    """Print the losses of a recording on standard error; how it ended may be one of them."""
+    """Print the losses of a recording, including an early end, on standard error."""
     from plow_twin.record.reader import FileStatus
 
     ends = {status.value for status in FileStatus}

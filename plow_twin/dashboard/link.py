@@ -63,7 +63,7 @@ class Link:
         return found
 
     def close(self) -> None:
-        """Close this end: the other one finds it broken."""
+        """Close this end: the other end finds the link broken."""
         with suppress(OSError):
             self._end.close()
         self.broken = True

@@ -248,8 +248,8 @@ def compare(
 def hidden_by_geometry(unknowns: Unknowns, poses: Poses, period: float, reach: Array) -> tuple[Array, Array]:
     """Return `unseen` and `rounded` of `Bounced`, from the `reach` (2,) of the clearances in m.
 
-    A head that rests touches three corners at one angle. Sides, a scale and corners that change its reach there act
-    like another clearance.
+    A head that rests touches three corners at one angle. Errors of sides, scale and corners change its reach at this
+    angle as another clearance would.
     """
     scene = unknowns.scene
     width, height = (deviation_of(scene, path) for path in _SIDES)
@@ -392,7 +392,8 @@ def _of_other_law(drawn: _Drawn, centre: Array, delay: float, most_work: int) ->
     """Return the likeness of the measured motion to another law, and the log odds of that law.
 
     Goodness of fit does not separate laws with similar motions. A classifier of draws of both laws (Pudlo et al.,
-    Bioinformatics 32 (2016) 859) and the likelihood under each law do, and each finds cases that the other misses.
+    Bioinformatics 32 (2016) 859) and the likelihood under each law separate them; each finds cases that the other
+    misses.
     """
     other, nothing = drawn.of_other_law(), (0.0, -math.inf)
     if other is None:

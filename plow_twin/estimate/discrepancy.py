@@ -364,7 +364,7 @@ class _Linearised:
         return max(1.0, float((z**2 / np.maximum(often, 0.1)).sum() / max(often.sum(), 1.0)))
 
     def named(self, mean: Array, often: Array) -> dict[str, tuple[float, float, float]]:
-        """Return of each quantity the probability that it differs, and the difference with its deviation."""
+        """Return for each quantity the probability that it differs, and the difference with its deviation."""
         deviation = np.sqrt(1.0 / np.diag(self._normal)[SIZE:])
         return {
             name: (float(share), float(value / max(share, 1e-9)), float(spread))

@@ -702,7 +702,7 @@ def _covariance(problem: Problem, fit: Fit, verdict: Verdict, plain: Array) -> A
     One cause scatters all unknowns that move the head, so the mean of their ratios widens all of them; the ratio of one
     unknown, from some tens of swings, would be chance. Linked swings contain it already. The scatter is
     corrected for the unknowns fitted to it. Residuals beyond the noise are correlated for long, so deviations grow with
-    their size, not with its root. The step that the fit would still take is unknown.
+    their size, not with its root. The remaining step of the fit counts as an unknown error.
     """
     size = len(fit.shared)
     covariance: Array = plain * _widened(problem, fit, verdict) + np.outer(fit.left[:size], fit.left[:size])

@@ -240,7 +240,7 @@ class Problem:
         Parameters
         ----------
         turns, push, share : ndarray, optional
-            Turns of the walls in m (4,); as `Forward.run`.
+            Turns of the walls in m (4,), as in `Forward.run`.
         change : callable, optional
             Returns another scene, perhaps with other terms.
 

@@ -227,7 +227,7 @@ def _forecast(
     # also a clearance that is hardly known is not negative
     now = np.maximum(rng.normal(0.0, 1.0, (plan.draws, 2)) * deviation_m, -_LEAST_SHARE * size)
     most = float(coefficient.max() * load.max()) * travel / wear.pad_area_m2
-    # a clearance that is smaller now is further from its limit: the path must be as long
+    # a smaller present clearance is further from its limit, so the path must be longer
     spare = tuple(float(value) for value in -now.min(axis=0))
     limit = (plan.limit_horizontal_m + spare[0], plan.limit_vertical_m + spare[1])
     path = wear_path(scene, limit, most)

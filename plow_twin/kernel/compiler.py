@@ -111,7 +111,7 @@ def _read_only_cache() -> Iterator[None]:
 
 
 def kept(function: Callable[..., Any], **options: Any) -> Any:
-    """Return numba's dispatcher with a cache on disk, which warns if that cannot be written: it works without it."""
+    """Return numba's dispatcher with a cache on disk; if the cache cannot be written, it warns and works without."""
     compiler = numba.njit(cache=True, nogil=True, error_model="numpy", **options)
     try:
         dispatcher = compiler(function)

@@ -269,7 +269,7 @@ class BridgeFront:
 
     def _report(self) -> None:
         self.changed()
-        # sent on change of a level only, but their values are of interest
+        # otherwise sent only when a level changes; here for their values
         self.send(ALARMS, alarms_message(self.runtime.alarms, self.name, self._settings.hardware_id))
         for name, part in self.parts().items():
             self._tell(name, part)

@@ -242,6 +242,6 @@ class Inputs:
 
 
 def _filled(pose: tuple[float, float, float], newest: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Return a pose with the components that were not measured as in the newest one."""
+    """Return a pose, its unmeasured components replaced by those of the newest pose."""
     x, y, theta = (before if math.isnan(value) else value for value, before in zip(pose, newest, strict=True))
     return x, y, theta

@@ -31,7 +31,7 @@ def painleve_coefficients(scene: Scene) -> NDArray[np.float64]:
     """Return for each pair the mu above which its sliding corner can be Painleve's case, shape (8,); inf if it cannot.
 
     A sliding corner is pressed into the wall by its own friction where d'' = -p N with p = 1/m + a^2/I - mu |a b|/I <
-    0, with the arms a and b of N and T about the centre of mass, here at q = 0. Rigid bodies then have no motion or
+    0, with the arms a and b of N and T about the centre of mass, here at q = 0. Rigid bodies then have no solution or
     several; the compliant contact has one: N grows with the rate sqrt(-p K) until the slip has stopped ("impact without
     collision"). Source: Genot and Brogliato, Eur. J. Mech. A 18 (1999) 653.
     """

@@ -35,7 +35,7 @@ def load_laws(names: Iterable[str]) -> None:
         before = set(LAWS)
         try:
             _import_file(Path(key)) if name.endswith(".py") else importlib.import_module(name)
-        except Exception as error:  # in spite of the module
+        except Exception as error:  # also after an error in the module
             raise InputError([Problem("module", name, f"one that can be imported ({error})")], "--laws") from error
         if set(LAWS) == before:
             raise InputError([Problem("module", name, "one that calls plow_twin.add_law")], "--laws")

@@ -512,7 +512,7 @@ def _check_wear(wear: Wear, contact: Contact) -> Iterator[Problem]:
 def fastest_travel(wear: Wear | None, contact: Contact) -> float:
     """Return the largest speed along the face in m/s beside a damping C, A / (k_s C).
 
-    Beyond it a force wears the pad faster than it moves the head: no contact lasts.
+    Beyond it a force wears the pad faster than it moves the head, so that no contact lasts.
     """
     if wear is None or not LAWS[contact.law].additive:
         return math.inf

@@ -54,7 +54,7 @@ _MESSAGE_FIELDS: Final = MESSAGE_HEAD - _HEAD_SIZE
 _COLUMNS: Final = 6
 #: Chunks below that size [B] are scanned together.
 _SMALL: Final = 2**18
-#: The same where the large chunks between them are not opened.
+#: The same size where large chunks between them are not opened.
 _SMALL_ALONE: Final = 2**20
 
 

@@ -40,7 +40,7 @@ class Sent:
         self.counts = np.zeros(_KINDS, np.int64)
         numbers = np.full(advances, -1)
         find_advances(sequence, kind, done, first, self.after, self.counts, numbers)
-        #: advances after which something was sent, and the number of the journal that it has
+        #: advances after which a message was sent, and the sequence number of the message
         self.taken = np.flatnonzero(numbers >= 0)
         self.first_sequence = numbers[self.taken]
         #: publication by advance

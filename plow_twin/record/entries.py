@@ -178,7 +178,7 @@ class Batch:
     damaged: bool = False
 
     def parted(self, places: Sequence[int]) -> Iterator[Batch]:
-        """Yield the batch in pieces that end before each of these entries, whose indexes rise, and the rest."""
+        """Yield the batch in pieces that end before the given entries, whose indexes rise, then the rest."""
         outputs, begin = self.outputs, 0
         for place in places:
             now, outputs = parted_at(outputs, int(self.entries.sequence[place]))

@@ -1,4 +1,4 @@
-"""A recording that is still being written: whether its writer lives, and waiting for more of it.
+"""A recording that is still being written: checks for its writer, and waits for further content.
 
 A writer holds a lock on its file, which the operating system releases at any end of the process.
 """

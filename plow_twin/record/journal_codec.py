@@ -150,7 +150,7 @@ def _from_json(text: str, source: str) -> Entry | Dropped:
 
 
 def _exactly(*kinds: type) -> Callable[[Any], Any]:
-    """Return a reader that accepts only these types, so that 1, 1.0 and True stay apart."""
+    """Return a reader that accepts only these types, so that 1, 1.0 and True are distinguished."""
 
     def read(value: Any) -> Any:
         if type(value) not in kinds:

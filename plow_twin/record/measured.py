@@ -276,7 +276,7 @@ def _collect(
 def _read(path: Path, lost: Counter[str], columns: tuple[str, ...], some: tuple[str, ...] = ()) -> Array:
     """Return the rows of a csv file, NaN for an empty cell; rows that could not be read are counted in `lost`.
 
-    `columns` must be there; of `some` those that are not are NaN.
+    `columns` must be there; missing ones of `some` are NaN.
     """
     header, rows = read_table(path)
     names = list(header.names)

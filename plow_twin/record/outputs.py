@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 REPLAYED: Final = topics_of(Cadence.EACH, Cadence.FOLLOWED, Cadence.SLOW)
 #: Their base names.
 PUBLICATION_TOPICS: Final = tuple(topic.name for topic in REPLAYED)
-#: Those of them that only a twin with `follow: full` has.
+#: The topics among them that only a twin with `follow: full` has.
 FOLLOWED_TOPICS: Final = names_of(Cadence.FOLLOWED)
 
 

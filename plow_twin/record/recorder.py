@@ -311,7 +311,7 @@ class Recorder:
         return item.sequence + np.arange(samples) + np.cumsum(ends)
 
     def publications(self, published: Published, sequence: NDArray[np.int64]) -> bool:
-        """Take publications that no messages were sent of, each after the entry of that number; False when lost."""
+        """Queue publications without sent messages, each after the entry of its number; False when lost."""
         now, count = self._now_ns(), len(published.rows)
         topics = Counter(dict.fromkeys(self._topics_of[False, False], count))
         topics.update(dict.fromkeys(set(self._topics_of[True, False]) - topics.keys(), len(published.slow)))

@@ -119,7 +119,7 @@ def _sink(folder: Path, header: RunHeader) -> RunWriter:
 
 
 def following_twin(header: RunHeader, scene: Scene) -> Driven:
-    """Return a twin that follows its measurements as that of a run did."""
+    """Return a twin that follows its measurements like the twin of a run."""
     from plow_twin.estimate.follow import MEMBERS, follower
 
     return follower(scene, header.follow, int(header.parameters.get("follow_members", MEMBERS)), header.tol)
@@ -501,7 +501,7 @@ class _Replay:
 
 
 def _warm_up(scene: Scene, tol: float, templates: Templates, *, rows: bool) -> None:
-    """Compile the kernels of a replay, so that its time is the time of the work."""
+    """Compile the kernels of a replay beforehand, so that its time does not include compiling."""
     session = Session(Twin(scene, tol=tol, excitation="sampled"))
     stamps = np.arange(1, 3, dtype=np.int64) * 1000
     memory = np.zeros(2, ROW) if rows else None

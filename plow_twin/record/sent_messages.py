@@ -29,7 +29,7 @@ class SentMessages:
     @classmethod
     def of(cls, outputs: list[Outputs], topics: Mapping[str, str]) -> Self:
         """Take messages; `topics` has the base names of those that follow from the motion."""
-        tables = {id(part.topics): _kinds(part.topics, topics) for part in outputs}  # few: parts share their topics
+        tables = {id(part.topics): _kinds(part.topics, topics) for part in outputs}  # few: parts share topics
         sequence = _joined(part.sequence for part in outputs)
         kind = _joined(tables[id(part.topics)][part.messages.channel] for part in outputs)
         begins = np.cumsum([0, *map(len, outputs)])

@@ -56,7 +56,7 @@ class InputCounts:
 def unused_messages(path: Path) -> Iterator[dict[str, Any]]:
     """Yield each message that a run did not use, by its journal: input, sender, reason, stamp, values.
 
-    Messages of which the journal has only the number come last, as one row with a `count` and no stamp.
+    Messages that the journal only counts come last, as one row with a `count` and no stamp.
 
     Raises
     ------

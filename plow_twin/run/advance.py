@@ -31,7 +31,7 @@ class _Column(Generic[Number]):
 
 
 class _View:
-    """Columns that are arrays for one row as well as for many."""
+    """Columns that are arrays even for a single row."""
 
     __slots__ = ("rows",)
 

@@ -60,7 +60,7 @@ class LaneTwins:
     def advance(
         self, times: _Array, wrench: _Array, rows: NDArray[np.void], pace: Pace, alone: Callable[[int, int], None]
     ) -> None:
-        """Advance to all times; `alone` advances one twin to one of them by other methods.
+        """Advance to all times; `alone` advances a twin to one of these times by other methods.
 
         `wrench` and `rows` are as in `Samples`.
         """

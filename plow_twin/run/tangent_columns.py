@@ -21,7 +21,7 @@ _COVERED: Final = {"harmonics", "second", "viscous", "hysteretic", "integer", "f
 def fits_tangents(compiled: CompiledScene) -> bool:
     """Return whether the linearised equations have all terms of a scene; exponents must be integers or 1.5.
 
-    Implicit steps are not among them. A law with a restitution has them compiled only for slow touches, so it
+    Implicit steps are not among them. A law with a restitution has implicit steps compiled only for slow touches, so it
     qualifies.
     """
     terms, contact = compiled.parts.terms, compiled.scene.contact

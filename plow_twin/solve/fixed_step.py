@@ -72,7 +72,7 @@ def _runge_kutta(p, acts, state, t, dt, z, trial, k, load) -> None:
 
 @kernel()
 def end_coarsely(p, parts, state, totals, target, bound) -> int:
-    """Bring the state to `target` by the bound's few Runge-Kutta steps; estimate the error. Returns a `Status`.
+    """Bring the state to `target` by the few Runge-Kutta steps of `bound`; estimate the error. Returns a `Status`.
 
     The estimate is the difference of the two middle stages, |k2 - k3| dt / 3, one order below the method's, with errors
     of the velocity multiplied by the remaining time. Where a pair has touched or parted within a step, the uncertain

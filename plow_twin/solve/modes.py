@@ -33,9 +33,9 @@ from plow_twin.solve.state import (
     Y,
 )
 
-#: Share of the release penetration, and of the speed that leads there, that counts as zero.
+#: Share of the release penetration, and of the speed that reaches it, that counts as zero.
 _SHALLOW = 1e-3
-#: Rounds in which the damping of an impact under way and its speed are found from each other.
+#: Rounds of the iteration between damping and speed of an impact under way.
 _ROUNDS = 8
 #: Halvings of a bracket: to the last bit of a double.
 _BISECTIONS = 60
@@ -131,7 +131,7 @@ def _start_inside(p, state, pair, energy) -> None:
 
 @kernel()
 def mode_inside(p, state, pair):
-    """Return the mode of a pair that penetrates, and note on which side of its ramp's end it is."""
+    """Return the mode of a penetrating pair, and note on which side of the ramp\'s end it is."""
     penetration, rate = penetration_and_rate(p, state, pair)
     state.beyond_ramp[pair] = 1 if penetration > p.ramp else 0
     if law_force(p, state, pair, penetration, rate) < 0.0:

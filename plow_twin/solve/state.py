@@ -279,7 +279,7 @@ WORK: Final = np.dtype(
         ("rest", "f8", (4, 6)),  # place, rates and load at rest (`solve.method.rest`)
         ("hessian", "f8", (3, 3)),
         ("term_size", "f8", (_ROWS,)),  # size of each order as a velocity
-        ("decay", "f8", (1,)),  # rate in 1/s at which damping decays, 0 where it does not bound steps
+        ("decay", "f8", (1,)),  # decay rate in 1/s of the damping, 0 where it does not bound steps
         ("switch", "i8", (PAIR_COUNT,)),  # modes that pairs take at the step's end, -1 for no change
         ("inverse", "f8", (_ROWS + 2,)),  # 1/k
         ("damping", "f8", (3, 3)),  # by rate, at rest under harmonics

@@ -111,7 +111,7 @@ NOTHING: Final = Published(_NO_ROWS, _NO_SLOW)
 
 
 def _numbered_from(slow: Rows, first: int) -> Rows:
-    """Return slow records with row numbers counted from another row."""
+    """Return slow records with row numbers relative to another row."""
     if len(slow):
         slow = slow.copy()
         slow["row"] -= first

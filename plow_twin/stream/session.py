@@ -286,7 +286,7 @@ class Session:
     def parts(self, samples: Sequence[Sample], *, each: bool = False) -> Iterator[Sequence[Sample]]:
         """Yield the parts of samples for `apply_samples`; each part must be applied before the next.
 
-        Late samples form parts of one; other parts are as long as the digests allow, or one sample where `each` is
+        Each late sample is a part; other parts are as long as the digests allow, or one sample where `each` is
         published.
 
         Raises

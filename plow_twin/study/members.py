@@ -28,7 +28,7 @@ class Members:
         return np.asarray(self.motions.status != Status.OK)
 
     def at(self, rows: NDArray[np.int64]) -> Members:
-        """Return the members of these numbers."""
+        """Return the members with these numbers."""
         names = [spec.name for spec in fields(Ensemble) if spec.name != "t"]
         part = {name: getattr(self.motions, name)[rows] for name in names}
         return Members(self.duration_s, replace(self.motions, **part))

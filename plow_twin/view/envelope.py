@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Indexes = NDArray[np.int64]
 
-#: Rows up to which a curve keeps each of them.
+#: Largest number of rows of which a curve keeps every one.
 MOST_ROWS: Final = 8000
 #: Most bins, about one for each pixel of an axis: narrower bins would show beats with the load's period.
 _MOST_BINS: Final = 700
@@ -47,7 +47,7 @@ class Envelope:
             self._merge()
 
     def break_line(self) -> None:
-        """Draw no line from the rows so far to those that follow."""
+        """End the lines here: the following rows begin new lines."""
         self._segment += 1
 
     @property

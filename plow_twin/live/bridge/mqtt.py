@@ -51,7 +51,7 @@ class Mqtt(SourceState):
         #: whether messages marked as retained are older than the subscription
         self._from_before = True
         self._queue: deque[tuple[str, bytes, int, bool]] = deque()
-        #: bytes of payloads that came into the queue, and that left it: each changed by one thread
+        #: bytes of payloads that entered and that left the queue, each changed by one thread only
         self._came = self._left = 0
         self._arrived = threading.Event()
         self._answer = threading.Event()

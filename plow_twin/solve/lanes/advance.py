@@ -327,8 +327,8 @@ def advance_lanes(s, viscous, hysteretic, rest, order, eight, work, budget, iter
     """Advance the twins in the queue through all samples, eight at a time; return False where `iterations` are used up.
 
     `eight` and `work`, (1,), are lanes and scratch space. `budget` are the steps that an advance to a sample may take.
-    Where one fails the twin stays as it was, and its time goes on. A twin at rest leaves its lane before the advance
-    (`Samples.other`).
+    Where an advance fails the twin keeps its state, and its time continues. A twin at rest leaves its lane before the
+    advance (`Samples.other`).
     """
     s, lanes, w = _unowned_samples(s), eight[0], work[0]
     for _ in range(iterations):

@@ -1,6 +1,6 @@
 """The first event of each lane's step.
 
-Few guards can turn negative within a step. Each lane lists its own; in each round all lanes search one of theirs. A
+Few guards can turn negative within a step. Each lane lists its guards; in each round every lane searches one of them. A
 clipped pair that parts changes no force and ends no step; the rest of the step is searched for its next touch.
 """
 
@@ -110,7 +110,7 @@ def _write_guard(lanes, rows, of_depth, of_rate, constant, guard, order, h):
 
 @kernel()
 def _choose_guards(lanes, at, hysteretic):
-    """Choose the next guard of each lane that has one; return bits for these lanes, and for those with a new touch."""
+    """Choose the next guard of each lane, if any; return bits for lanes with a guard, and with a new touch."""
     bits = again = 0
     for lane in range(WIDTH):
         lanes.guarded[at, lane] = -1

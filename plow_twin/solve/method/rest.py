@@ -22,7 +22,7 @@ from plow_twin.solve.state import OMEGA, ON, VX, VY
 
 #: Share of the tolerances that the motion left out may reach.
 _SHARE = 1e-3
-#: Factor by which a pair must be deeper, or farther away, than that.
+#: Factor over that distance by which a pair must be deeper, or farther away.
 _MARGIN = 10.0
 #: Smallest such depth in m, for the difference quotients of the stiffness.
 _DEEP = 1e-7

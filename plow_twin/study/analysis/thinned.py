@@ -15,7 +15,7 @@ MOST_ROWS: Final = 1_000_000
 
 
 class Thinned:
-    """Rows of some columns with their stamps; `rows` came, one in `stride` is kept."""
+    """Rows of some columns with their stamps; Of `rows` received rows one in `stride` is kept."""
 
     def __init__(self, columns: int) -> None:
         self._stamps: list[NDArray[np.int64]] = [np.zeros(0, np.int64)]

@@ -66,7 +66,7 @@ def _title(found: Comparison) -> str:
 
 
 def _write_windows(found: Comparison, path: Path) -> None:
-    """Write a row group for each group, so that only one is in memory twice."""
+    """Write a row group for each group, so that only one group is in memory twice."""
     import pyarrow as pa
     import pyarrow.parquet
 

@@ -56,7 +56,7 @@ class Marker:
         return self._moved(measured - [0.0, 0.0, self.turn, 0.0, 0.0, 0.0], -1.0)
 
     def measured(self, block: Array) -> Array:
-        """Return the poses or states of the marker, shape (..., 3) or (..., 6), on a block in the given poses or states."""
+        """Return the poses or states of the marker, shape (..., 3) or (..., 6), from those of the block."""
         turned = np.zeros(block.shape[-1])
         turned[2] = self.turn
         return self._moved(block, 1.0) + turned

@@ -30,7 +30,8 @@ from plow_twin.record.sources import Arrived, TopicType
 #: Most samples that wait to be read; further ones are counted as lost, except samples of the history.
 _QUEUE: Final = 100_000
 _PORTS: Final = {"opc.tcp": 4840}
-#: Values with one stamp come in one message or in two that follow each other; the rest is for a busy machine [s].
+#: Wait for the values of a stamp [s], which come in one message or two successive ones; includes an allowance for a
+#: busy machine.
 _WAIT_S: Final = 5e-3 * PUBLISHING_MS
 #: The history is read in pieces of this length [ns].
 _PIECE_NS: Final = 10_000_000_000
@@ -217,7 +218,7 @@ class OpcUa(SourceState):
         self._held_back = None
 
     async def _take(self, values: list[tuple[int, Any]], lost: bool) -> None:
-        """Take values of the subscription, after those that were lost before them."""
+        """Use values of the subscription, after reading the values lost before them."""
         if self._held_back is not None:
             self._held_back.append((values, lost))
             return

@@ -23,7 +23,7 @@ from plow_twin.live.bridge.source import BridgeError
 PUBLISHING_MS: Final = 10.0
 #: Values of a node that the server is asked to keep between two messages: 1 s at 10 kHz.
 _QUEUE: Final = 10_000
-#: Interval [s] at which a server without news reports; after three of them in silence it counts as gone.
+#: Interval [s] at which a server without news reports; after three silent intervals it counts as gone.
 _KEEPALIVE_S: Final = 2.0
 #: The server keeps a subscription for so long without its client [s].
 _LIFETIME_S: Final = 60.0

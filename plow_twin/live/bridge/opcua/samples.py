@@ -6,7 +6,7 @@ from bisect import insort
 from collections.abc import Sequence
 from typing import Final
 
-#: A value that is not to be used; it reads as not measured.
+#: Stands for a value that is not used and counts as not measured.
 NOT_MEASURED: Final = ""
 Value = float | str
 #: Most stamps that wait for values.
