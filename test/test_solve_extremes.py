@@ -27,7 +27,7 @@ from plow_twin import (
     simulate,
 )
 
-#: A load that moves nothing, so that the presets\' kernels are used again, without compiling kernels without loads.
+#: A load that moves nothing, so that the presets' kernels are used again, without compiling kernels without loads.
 PRESETS_TERMS = (Harmonic("nothing to speak of", (1e-9, 0.0), 2.0),)
 
 

@@ -15,7 +15,6 @@ from plow_twin.errors import InputError, Problem
 
 #: Name of the environment variable of the token, used without a file.
 TOKEN_VARIABLE: Final = "PLOW_TWIN_DASHBOARD_TOKEN"
-DEFAULT: Final = "127.0.0.1:8070"
 #: Fewest characters of a token.
 _SHORTEST: Final = 16
 

@@ -343,7 +343,7 @@ class Runtime:
         if name in MODEL:
             self.driver.set_model(self.stamp_ns, model_changes(settings))
             self._front.changed()
-        elif not isinstance(value, tuple):  # a list takes effect by its service and that service\'s journal entry
+        elif not isinstance(value, tuple):  # a list takes effect by its service and that service's journal entry
             self.driver.parameter(name, value)
 
     def _set_limits(self, settings: Settings) -> None:

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import math
 import struct
-from array import array
 from collections.abc import Sequence
 from typing import Final
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
-from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 
 from plow_twin.record import messages as plain
@@ -20,7 +18,6 @@ Read = tuple[int, tuple[float, ...], bool, bool]
 #: A message that cannot be read.
 UNREADABLE: Final[Read] = (0, (), False, False)
 
-_QUANTITIES: Final = ("position", "velocity", "effort")
 #: Stamp and length of the publication's name, then force and torque; big endian and little endian.
 _WRENCH_LAYOUTS: Final = tuple((struct.Struct(f"{order}iII"), struct.Struct(f"{order}6d")) for order in "><")
 
@@ -70,13 +67,3 @@ def ros_status(status: plain.DiagnosticStatus) -> DiagnosticStatus:
         hardware_id=status.hardware_id,
         values=values,
     )
-
-
-def ros_joint_state(message: plain.JointState) -> JointState:
-    """Return the ROS message of named numbers."""
-    found = JointState(name=list(message.name))
-    found.header.frame_id = message.frame_id
-    set_stamp(found.header, message.stamp_ns)
-    for quantity in _QUANTITIES:
-        setattr(found, quantity, array("d", getattr(message, quantity).tobytes()))
-    return found

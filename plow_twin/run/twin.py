@@ -412,7 +412,7 @@ class Twin:
             return None
         if state.step_size < 0.0:
             return np.array(state.frame)
-        # under the scene\'s own loads a step is left under way, and the row is read from its series; time runs evenly
+        # under the scene's own loads a step is left under way, and the row is read from its series; time runs evenly
         # or as a square
         used, beta = float(state.elapsed), float(state.beta)
         sigma = 2.0 * used / (state.alpha + math.sqrt(max(state.alpha**2 + 2.0 * beta * used, 0.0)))

@@ -103,7 +103,7 @@ def switch_grip(p, state, pair, new) -> None:
     """Let a corner slip or stick."""
     if new == STICKS:
         place, rate = _along(p, pair, state.y)
-        # at a touch Kelvin-Voigt\'s force acts at once, independent of the rounded depth
+        # at a touch Kelvin-Voigt's force acts at once, independent of the rounded depth
         normal = _normal_force(p, state, pair, penetration_of(p, state, pair, state.y))
         _anchor(p, state, pair, state.grip[pair] * p.friction * normal, place, rate)
         state.grip[pair] = 0

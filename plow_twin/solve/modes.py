@@ -131,7 +131,7 @@ def _start_inside(p, state, pair, energy) -> None:
 
 @kernel()
 def mode_inside(p, state, pair):
-    """Return the mode of a penetrating pair, and note on which side of the ramp\'s end it is."""
+    """Return the mode of a penetrating pair, and note on which side of the ramp's end it is."""
     penetration, rate = penetration_and_rate(p, state, pair)
     state.beyond_ramp[pair] = 1 if penetration > p.ramp else 0
     if law_force(p, state, pair, penetration, rate) < 0.0:

@@ -18,7 +18,6 @@ from plow_twin.model.geometry import STATE_SIZE
 from plow_twin.model.pairs import PAIR_COUNT
 
 Array = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 #: Highest order of the series; the tolerance decides how many terms are used.
 MAX_ORDER: Final = 30

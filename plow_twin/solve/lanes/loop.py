@@ -143,7 +143,7 @@ def turn(out, first, second) -> None:
 
 @kernel()
 def _part(state, sums, lanes, lane) -> None:
-    """Part the clipped pairs that leave their wall within a lane\'s step."""
+    """Part the clipped pairs that leave their wall within a lane's step."""
     for pair in range(PAIR_COUNT):
         if lanes.parted[pair, lane] < lanes.step[lane]:
             lanes.mode[pair, lane] = OFF
