@@ -55,6 +55,22 @@ def test_colcon_build_gives_the_layout_of_ros2_run(options: list[str], tmp_path:
     assert "expected_rate" in start("twin --ros-args -p expected_rate:=-1.0", code=2)
 
 
+#: Files in which ROS is used, and the linters of ament with our width and form of docstrings.
+OF_ROS = ("launch", "plow_twin/ros", "plow_twin/demo", "setup.py")
+LINTERS = (
+    ("ament_xmllint", "package.xml", "config"),
+    ("ament_flake8", "--linelength", "120", *OF_ROS),
+    ("ament_pep257", "--convention", "numpy", "--add-ignore", "D105", "D107", "D205", "D400", "D401", "--", *OF_ROS),
+)
+
+
+@pytest.mark.parametrize("words", LINTERS, ids=[words[0] for words in LINTERS])
+def test_the_linters_of_ament_find_nothing_in_what_ros_sees(words: tuple[str, ...]) -> None:
+    if shutil.which(words[0]) is None:
+        pytest.skip(f"{words[0]} is not installed")
+    run(*words, cwd=ROOT)
+
+
 def test_one_version_and_one_licence_everywhere() -> None:
     package = ElementTree.parse(ROOT / "package.xml").getroot()
     version = package.findtext("version")
