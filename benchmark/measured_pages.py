@@ -42,12 +42,14 @@ def measured_drops() -> str:
         score = "{:.1f} mm, {:.1f} mm, {:.2f} rad".format(*one["crps_median"])
         distance = [f"{mm:.1f} mm, {rad:.2f} rad" for mm, rad in zip(one["distance_mm"], one["angle_rad"], strict=True)]
         rows.append([name, *distance, *coverage, score])
-    held = _part("square_held_out")
-    pairs = zip(held["distance_mm"], held["angle_rad"], strict=True)
-    rows.insert(
-        1, ["the first, fitted to the other half of the drops", *(f"{mm:.1f} mm, {rad:.2f} rad" for mm, rad in pairs)]
-    )
-    rows[1] += [""] * (len(rows[0]) - len(rows[1]))
+    others = {
+        "the first, fitted to the other half of the drops": "square_held_out",
+        "preset `measured_square`, by the solver": "square_preset",
+    }
+    for place, (name, part) in enumerate(others.items(), 1):
+        one = _part(part)
+        pairs = zip(one["distance_mm"], one["angle_rad"], strict=True)
+        rows.insert(place, [name, *(f"{mm:.1f} mm, {rad:.2f} rad" for mm, rad in pairs), "", "", ""])
     counts = next(iter(_part("square").values()))["drops"]
     head = ["block", *(f"off over {n} ({count} drops)" for n, count in zip((1, 2, 3), counts, strict=True))]
     return _lines([*head, "inside after bounce 1", "after bounce 2", "median CRPS of x, z, theta"], rows)
@@ -74,8 +76,11 @@ def measured_table() -> str:
         f"{found['rms_mm']:.2f} mm",
         f"{found['half_width_mm']:.2f} mm",
         f"{found['coverage']:.2f}",
+        f"{found['within_half_mm']:.2f}",
+        f"{found['within_half_mm_or_rough']:.2f}",
     ]
-    return _lines(["estimated", "error, median", "RMS", "half width of the 90 % interval", "coverage"], [row])
+    head = ["estimated", "error, median", "RMS", "half width of the 90 % interval", "coverage"]
+    return _lines([*head, "within 0.5 mm", "within, or rough"], [row])
 
 
 FIGURES: dict[str, Callable[[], str]] = {

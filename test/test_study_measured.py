@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from plow_twin import Clearance, Contact, Frame, Friction, Gravity, Head, Initial, Scene, simulate
+from plow_twin import Initial, load_scene, simulate
 from plow_twin.errors import ArgumentError
 from plow_twin.study.measured import bands, impact
 from plow_twin.study.measured.drops import Drops
@@ -81,29 +81,40 @@ def test_central_impact_of_the_ellipse_returns_its_restitution() -> None:
     assert (after[1] == before[1]).all()
 
 
-def test_tossed_block_moves_as_the_solver_s_block_that_carries_corners() -> None:
-    mass, side, mu, e, stiffness = 1.0, 0.06, 0.2, 0.6, 3e6
-    sharp = SQUARE.copy()
+def test_tossed_block_moves_as_the_preset_computed_by_the_solver(drops) -> None:
+    scene = load_scene("measured_square")
+    contact, friction, radius = scene.contact, scene.friction, scene.frame.corner_radius_m
+    assert friction is not None and friction.stick_stiffness_n_m and friction.stick_damping_n_s_m and radius
+    assert contact.restitution and contact.restitution_fall and contact.restitution_mass_power
+    block, fall, power = SQUARE.copy(), contact.restitution_fall, contact.restitution_mass_power
     for name, value in dict(
-        half=0.5 * side, radius=0.0, gyration=side / 6**0.5, table=-1.0, stiffness=stiffness, tangential=0.7,
-        tangential_damping=0.05, restitution=e, restitution_fall=0.0, friction=mu, friction_fall=0.0, drag=0.0,
-        spin_drag=0.0,
+        half=0.5 * scene.frame.width_m - radius, radius=radius, gyration=scene.head.inertia_kg_m2**0.5, table=0.0,
+        stiffness=contact.stiffness, tangential=friction.stick_stiffness_n_m / contact.stiffness,
+        tangential_damping=0.5 * friction.stick_damping_n_s_m / friction.stick_stiffness_n_m**0.5,
+        # of an impact of 1 m/s, whose mass counts beside that of a square's edge
+        restitution=contact.restitution * (1.5**power * (contact.restitution_speed_m_s or 1.0)) ** fall,
+        restitution_fall=fall, mass_power=power, friction=friction.coefficient, friction_fall=0.0,
+        gravity=scene.gravity.acceleration_m_s2, drag=0.0, spin_drag=0.0,
     ).items():  # fmt: skip
-        sharp[name] = value
-    spring = 0.7 * stiffness
-    scene = Scene(
-        Head(mass, mass * side**2 / 6.0, carries="corners"),
-        Frame(side, side),
-        Clearance(2.0 - side, 2.0 - side),
-        Contact("exact_restitution", stiffness=stiffness, restitution=e),
-        Gravity(),
-        initial=Initial(q=(0.0, -0.85, 0.3), v=(0.4, 0.0, 6.0)),
-        friction=Friction(mu, stick_stiffness_n_m=spring, stick_damping_n_s_m=0.1 * spring**0.5),
-    )
-    found = toss(np.array([[0.0, -0.85, 0.3, 0.4, 0.0, 6.0]]), 76, np.array([sharp], sharp.dtype))[0, :, :3]
-    solved = simulate(scene, t_end=0.3, output_dt=0.004, tol=1e-8)
-    np.testing.assert_allclose(found[:, :2], solved.q[:, :2], atol=2e-3)
-    np.testing.assert_allclose(found[:, 2], solved.q[:, 2], atol=0.05)
+        block[name] = value
+    far, apart = [], []
+    for index in drops.usable()[::8]:
+        first, until = int(drops.flight_rows[index]) - 1, drops.until(index, 1)
+        measured = drops.pose[index, first:until]
+        x, z, theta, *rates = MARKER.state_of_block(fit_flight(drops.pose[index, : first + 1]).state)
+        if z < radius + float(block["half"]) * (abs(np.cos(theta)) + abs(np.sin(theta))):
+            continue  # extrapolated into the table, where a scene starts in the midst of an impact
+        start = Initial((x, z - 1.0, theta), (rates[0], rates[1], rates[2]))
+        solved = simulate(replace(scene, initial=start), t_end=len(measured) / 250.0, output_dt=0.004).q
+        found = toss(np.array([[x, z, theta, *rates]]), len(solved), np.array([block], block.dtype))[0, :, :3]
+        apart.append(np.abs(found[:20] - solved[:20] - [0.0, 1.0, 0.0]).max(axis=0))
+        off = MARKER.measured(solved + np.array([0.0, 1.0, 0.0]))[: len(measured), :2] - measured[:, :2]
+        far.append(np.hypot(*off.T).mean())
+    # fixed steps against exact events: impacts enlarge the difference
+    assert (np.max(apart, axis=0) < [2e-3, 2e-3, 0.1]).all()
+    assert (np.median(apart, axis=0) < [4e-4, 3e-4, 0.03]).all()
+    # rigid impacts are off by 10 mm
+    assert np.median(far) < 9e-3, far
 
 
 def test_flight_is_fitted_to_its_measured_rows(drops) -> None:

@@ -17,6 +17,7 @@ import numpy as np
 import rerun as rr
 
 from plow_twin import Initial, Scene, load_scene, simulate
+from plow_twin.model.geometry import corner_radius, outline
 from plow_twin.study.measured import bands
 from plow_twin.study.measured.drops import Drops
 from plow_twin.study.measured.square import MARKER, RATE_HZ, fit_flight
@@ -60,23 +61,21 @@ def main() -> None:
 
 
 def write_rrd(path: Path, scene: Scene, measured: np.ndarray, simulated: np.ndarray) -> None:
-    """Write both bodies in mm, y downwards, a row each 4 ms; the simulated one has its corners at the arcs' centres."""
+    """Write both bodies in mm, y downwards, a row each 4 ms."""
     stream = rr.RecordingStream("plow_twin")
     stream.save(str(path))
     table = rr.LineStrips2D([[[-800.0, 0.0], [800.0, 0.0]]], colors=[(128, 128, 128)])
     stream.log("table", table, static=True)
     bodies = (
-        ("measured", measured, SIDE, (213, 94, 0)),
-        ("simulated", simulated, scene.frame.width_m, (0, 114, 178)),
+        ("measured", measured, outline(np.full(2, SIDE), 0.0), (213, 94, 0)),
+        ("simulated", simulated, outline(np.full(2, scene.frame.width_m), corner_radius(scene)), (0, 114, 178)),
     )
-    corners = np.array([[-0.5, 0.5], [0.5, 0.5], [0.5, -0.5], [-0.5, -0.5], [-0.5, 0.5]])
     for row in range(min(len(measured), len(simulated))):
         stream.set_time("t", duration=row / RATE_HZ)
-        for name, poses, side, color in bodies:
+        for name, poses, body, color in bodies:
             x, z, theta = poses[row]
             turn = np.array([[np.cos(theta), np.sin(theta)], [-np.sin(theta), np.cos(theta)]])
-            outline = 1e3 * (side * corners @ turn + [x, z]) * [1.0, -1.0]
-            stream.log(name, rr.LineStrips2D([outline], colors=[color]))
+            stream.log(name, rr.LineStrips2D([1e3 * (body @ turn + [x, z]) * [1.0, -1.0]], colors=[color]))
     stream.flush()
 
 

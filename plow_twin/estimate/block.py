@@ -89,7 +89,7 @@ def estimate_block(scene: Scene, load: Load, poses: Poses, known: Estimate) -> E
     """Estimate the clearances around a block from the places of its impacts.
 
     Where an axis has impacts on one wall only, the poses count as measured from the middle of the axis. A clearance
-    whose deviation exceeds half of the prior's is not observable.
+    whose deviation exceeds half of the prior's is not observable; above 1 mm it is rough.
 
     Parameters
     ----------
@@ -121,13 +121,17 @@ def estimate_block(scene: Scene, load: Load, poses: Poses, known: Estimate) -> E
         share = float(deviation[axis]) / max(before.deviation, 1e-300)
         observed = share < tuning.OBSERVED_SHARE
         clearances.append(Interval.normal(value[axis], deviation[axis]).above(0.0) if observed else before)
-        states.append(State.ESTIMATED if observed else unseen)
+        fine = float(deviation[axis]) <= tuning.OBSERVED
+        states.append((State.ESTIMATED if fine else State.ROUGH) if observed else unseen)
         counts = ", ".join(f"{number} impacts on the {wall} wall" for wall, number in count.items())
         if not observed:
             most = f"{tuning.OBSERVED_SHARE:.0%}"
             reasons.append(f"{name}: {counts} leave {share:.0%} of the prior's deviation, expected at most {most}")
         elif not all(count.values()):
             reasons.append(f"{name}: {counts}: the poses are taken to be measured from the middle")
+        if observed and not fine:
+            got = f"a deviation of {1e3 * float(deviation[axis]):.3g} mm, expected at most {1e3 * tuning.OBSERVED:g} mm"
+            reasons.append(f"{name}: rough, {counts} leave {got}")
     bias = [Interval.normal(*pair) for pair in zip(value[_BIAS], deviation[_BIAS], strict=True)]
     restitution = {"restitution": float(np.median([one.restitution for one in met]))} if met else {}
     return replace(

@@ -29,7 +29,7 @@ class State(Enum):
     """Reliability of a value."""
 
     ESTIMATED = "estimated"
-    ROUGH = "rough"  #: the machine differs from the model: an interval that allows for it
+    ROUGH = "rough"  #: the machine differs from the model, or the data leave more than 1 mm open
     NOT_OBSERVABLE = "not_observable"  #: the motion does not determine it: the prior, with its interval
     PRIOR = "prior"  #: not measured
     WITHDRAWN = "withdrawn"  #: the sensor is broken, or the data contradict themselves or every motion of the model
