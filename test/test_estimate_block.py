@@ -36,10 +36,10 @@ def unknown_table(off: float) -> Scene:
     return replace(SQUARE, clearance=clearance, marks=marks)
 
 
-def of_drop(drops: Drops, index: int, off: float = 0.0) -> Estimate:
+def of_drop(drops: Drops, index: int, off: float = 0.0, scene: Scene | None = None) -> Estimate:
     pose = drops.pose[index] - [0.0, 1.0, 0.0]
     t = np.arange(len(pose)) / 250.0
-    return estimate(unknown_table(off), Load(t[[0, -1]], np.zeros((2, 3))), Poses(t, pose))
+    return estimate(scene or unknown_table(off), Load(t[[0, -1]], np.zeros((2, 3))), Poses(t, pose))
 
 
 def test_height_of_the_table_follows_from_measured_drops(drops) -> None:
@@ -62,9 +62,18 @@ def test_height_of_the_table_follows_from_measured_drops(drops) -> None:
 
 
 def test_walls_that_are_never_met_are_not_observable(drops) -> None:
-    found = of_drop(drops, 0)
+    scene = unknown_table(0.0)
+    stiffness, width = scene.marks["contact.stiffness"], scene.marks["clearance.horizontal_m"]
+    stated = {
+        "contact.stiffness": replace(stiffness, deviation=1e6),
+        "clearance.horizontal_m": replace(width, deviation=2e-3),
+    }
+    found = of_drop(drops, 0, scene=replace(scene, marks={**scene.marks, **stated}))
     assert found.horizontal_state is State.NOT_OBSERVABLE
     assert found.horizontal.mean == SQUARE.clearance.horizontal_m
+    # the deviations that the scene states
+    assert found.horizontal.deviation == pytest.approx(2e-3)
+    assert found.stiffness is not None and found.stiffness.deviation == pytest.approx(1e6, rel=0.05)
     assert any("0 impacts on the right wall" in reason for reason in found.reasons)
 
 

@@ -106,7 +106,7 @@ def estimate_window(
     if scene.head.carries == "corners":
         span = (float(load.t[0]), float(load.t[-1]))
         poses = poses.between(span[0], span[1] + 1e-9)
-        return estimate_block(scene, load, poses, prior_of(Unknowns(scene), span, lost)), ()
+        return estimate_block(scene, load, poses, prior_of(Unknowns.stated(scene, load, poses), span, lost)), ()
     units = Units.of(scene, load)
     if units == Units():
         return _estimate(scene, load, poses, lost, guess, gaps, forces)
