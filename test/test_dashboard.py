@@ -15,14 +15,16 @@ import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
+from unittest.mock import MagicMock
 from urllib.parse import urlsplit
 
 import browser
 import numpy as np
 import pytest
 from commands import plow_twin_here, started
-from record_support import PAPER_AMPLITUDE
+from record_support import PAPER_AMPLITUDE, paper_sample, record_run
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
@@ -30,6 +32,7 @@ from plow_twin.dashboard.access import PageAccess
 from plow_twin.dashboard.feed import Feed
 from plow_twin.dashboard.history import SPAN_S, History
 from plow_twin.dashboard.link import Link, pair
+from plow_twin.dashboard.run import RunFeed
 from plow_twin.dashboard.screen import Screen
 from plow_twin.record.entries import EntryRecord
 from plow_twin.record.reader import RunReader
@@ -37,7 +40,7 @@ from plow_twin.record.recording import read_recording
 from plow_twin.record.replay import replay
 from plow_twin.scene_file import dump_scene, load_scene
 from plow_twin.solve.state import ROW, WITH_INTERVALS
-from plow_twin.stream.journal import Digest, Mark, Parameter
+from plow_twin.stream.journal import Digest, Mark, Parameter, Pose, Unused
 from plow_twin.stream.outputs import CLEARANCE_NAMES, NOTHING, SLOW, Published
 
 TOKEN = "a token of the screen"
@@ -403,6 +406,24 @@ def test_a_recording_is_shown_while_it_is_written_and_afterwards_and_nothing_can
     assert told["facts"]["can_ask"] is False and told["input"][2]["samples_used"] == str(COUNT)
     assert told["alarms"][2]["force_place"] and told["motion"]["clearance"]["vertical"] == pytest.approx(0.03)
     assert max(max(row[1:9]) for row in seconds.values()) == pytest.approx(peaks[:, 16:].max(), rel=1e-6)
+
+
+def test_a_recording_s_inputs_are_counted_by_name(tmp_path: Path) -> None:
+    samples = [paper_sample(index) for index in range(20)]
+    poses = [Pose(sample.stamp_ns, (0.0, 0.0, 0.0)) for sample in samples[:7]]
+    unused = [Unused("head_pose", "", "late", 2, (), ()), Unused("excitation", "", "repeated", 3, (), ())]
+    run = record_run(tmp_path / "run", [*samples, *poses, *unused])
+    parts: dict[str, Any] = {}
+    reader = RunReader(run.folder)
+    feed = cast(Feed, SimpleNamespace(part=parts.__setitem__, motion=MagicMock(), event=None, send=lambda: True))
+    shown = RunFeed(feed, reader.header, lambda: False)
+    for batch in reader.batches():
+        shown.add(batch)
+    counted = {name: value for name, value in parts["input"][2].items() if value != "0"}
+    assert counted == {
+        "source": "excitation", "samples_used": "20", "dropped_repeated": "3",
+        "head_pose_used": "7", "head_pose_dropped": "2",
+    }  # fmt: skip
 
 
 #: Text of the page, read by scripts in it.

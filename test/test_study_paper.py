@@ -67,6 +67,7 @@ def test_the_command_leaves_a_report_its_table_and_the_run(tmp_path: Path, capsy
     images = re.findall(r'src="data:image/png;base64,([^"]+)"', html)
     files = [(out / "figures" / f"{name}.png").read_bytes() for name in FIGURES]
     assert [base64.b64decode(image) for image in images] == files
+    assert all(re.search(rb"Title\0[^\0]+; scene paper, 20\d\d-\d\d-\d\d", file) for file in files)
     assert not re.search(r'(src|href)="(?!data:)', html)  # no resource outside of the file
 
     document = json.loads((out / "table.json").read_text())

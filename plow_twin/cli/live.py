@@ -61,7 +61,12 @@ _FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 @click.option("--set", "given", multiple=True, metavar="NAME=VALUE", help="One parameter; may be repeated.")
 @click.option("--record", type=click.Path(path_type=Path, file_okay=False), help="Folder for the recording.")
 @click.option("--follow", is_flag=True, help="Continue while the files grow.")
-@click.option("--seconds", type=POSITIVE, default=None, help="Stop after so long [s].")
+@click.option(
+    "--seconds",
+    type=POSITIVE,
+    default=None,
+    help="Stop so long [s] after the start of the twin, whether samples come or not.",
+)
 @click.option(
     "--user",
     default="",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final
@@ -22,8 +21,9 @@ from plow_twin.record.header import RunHeader
 from plow_twin.record.outputs import publication_templates
 from plow_twin.record.reader import RunReader
 from plow_twin.record.rows import Rows, rows_by_topic
+from plow_twin.record.unused import InputCounts
 from plow_twin.stream.intake import NS_PER_S
-from plow_twin.stream.journal import Hold, Mark, Unused
+from plow_twin.stream.journal import Hold, Mark
 from plow_twin.stream.topics import Cadence, names_of
 
 #: The topics whose messages are decoded one by one.
@@ -50,8 +50,7 @@ class RunFeed:
         self._templates = publication_templates(header.frame_id, header.child_frame_id)
         self._topics = {header.topic(name): name for name in self._templates}
         self._slow = {header.topic(name): name for name in _SLOW}
-        self._counts = Counter({"samples_used": 0})
-        self._source = header.excitation_source
+        self._inputs = InputCounts(header.excitation_source)
 
     def add(self, batch: Batch) -> None:
         """Pass a batch."""
@@ -63,12 +62,8 @@ class RunFeed:
                 held_ns.append(entry.stamp_ns)
             elif isinstance(entry, Mark):
                 self._feed.event("mark", entry.text, stamp_ns=entry.stamp_ns)
-            elif isinstance(entry, Unused):
-                lost = "samples_lost" if entry.reason == "lost" else f"dropped_{entry.reason}"
-                self._counts[lost if entry.topic == self._source else f"{entry.topic}_dropped"] += entry.count
-        self._counts["samples_used"] += len(stamps_ns)
-        counted = {name: str(count) for name, count in self._counts.items()}
-        self._feed.part("input", (0, "", {"source": self._source, **counted}))
+        self._inputs.add(batch.entries)
+        self._feed.part("input", (0, "", {"source": self._inputs.source, **self._counted()}))
         loads, held = Rows(stamps_ns, stamps_ns, wrench), np.array(held_ns, np.int64)
         arrays = [loads.stamp_ns, held, *(found.stamp_ns for found in rows.values())]
         for second in np.unique(np.concatenate(arrays) // NS_PER_S).tolist():
@@ -78,6 +73,16 @@ class RunFeed:
             while not (self._feed.send() or self._stopped()):
                 time.sleep(_WAIT_S)
         self._say(batch)  # an estimate replaces the clearances before it
+
+    def _counted(self) -> dict[str, str]:
+        """Return the counts of the inputs so far, named as in the diagnostics of the twin."""
+        others = self._inputs.facts()
+        own = others.pop(self._inputs.source, {})
+        counted = {"samples_used": own.pop("used", 0), "samples_lost": own.pop("lost", 0)}
+        counted |= {f"dropped_{reason}": count for reason, count in own.items()}
+        for name, found in others.items():
+            counted |= {f"{name}_used": found.pop("used", 0), f"{name}_dropped": sum(found.values())}
+        return {name: str(count) for name, count in counted.items()}
 
     def _second(self, rows: dict[str, Rows], loads: Rows) -> None:
         motion = self._feed.motion

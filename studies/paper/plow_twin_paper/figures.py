@@ -26,15 +26,15 @@ class Picture:
     here: str
 
 
-def draw_all(runs: PaperRuns, folder: Path, on_progress: Callable[[float], object]) -> list[Picture]:
-    """Draw every figure into a folder as PNG and return them in the order of the paper."""
+def draw_all(runs: PaperRuns, scene: str, folder: Path, on_progress: Callable[[float], object]) -> list[Picture]:
+    """Draw every figure into a folder as PNG and return them in the order of the paper; `scene` is a name."""
     from plow_twin_paper.style import save
 
     found = []
     plans = _plans(runs)
     for index, (name, heading, paper, here, draw) in enumerate(plans):
         path = folder / f"{name}.png"
-        save(draw(), path)
+        save(draw(), path, heading, scene)
         found.append(Picture(path, heading, paper, here))
         on_progress((index + 1) / len(plans))
     return found
@@ -104,13 +104,13 @@ def _falls(runs: PaperRuns) -> str:
     return f"Not monotonic between the marks: the deepest falls below a value reached before are {listed} kN."
 
 
-def draw_rotation(runs: PaperRuns, folder: Path) -> Picture | None:
+def draw_rotation(runs: PaperRuns, scene: str, folder: Path) -> Picture | None:
     """Draw the comparison of the head's rotation; None when gravity has no arm."""
     from plow_twin_paper.figures_trends import rotation_figure
     from plow_twin_paper.style import save
 
     if runs.rotation is None:
         return None
-    path = folder / "paper_rotation.png"
-    save(rotation_figure(runs.rotation), path)
-    return Picture(path, "Constant moment and exact rigid body", "", "")
+    path, heading = folder / "paper_rotation.png", "Constant moment and exact rigid body"
+    save(rotation_figure(runs.rotation), path, heading, scene)
+    return Picture(path, heading, "", "")

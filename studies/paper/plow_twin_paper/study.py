@@ -112,8 +112,8 @@ def study_paper(
     found = compare(scene, t_end, workers, lambda share: on_progress(0.2 * share))
     figures = out / "figures"
     figures.mkdir(parents=True, exist_ok=True)
-    pictures = draw_all(found.runs, figures, lambda share: on_progress(0.2 + 0.2 * share))
-    rotation_picture = draw_rotation(found.runs, figures)
+    pictures = draw_all(found.runs, name, figures, lambda share: on_progress(0.2 + 0.2 * share))
+    rotation_picture = draw_rotation(found.runs, name, figures)
     recorded = record(scene, t_end, out / "run", lambda share: on_progress(0.4 + 0.6 * share)) if recording else None
     study = replace(
         found,

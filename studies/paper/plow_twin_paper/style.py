@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -47,7 +48,9 @@ def sheet(width: float, height: float) -> Iterator[Figure]:
         yield Figure(figsize=(width, height), layout="constrained")
 
 
-def save(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG."""
+def save(figure: Figure, path: Path, heading: str, scene: str) -> None:
+    """Write a figure as PNG, with heading, scene and date above its own title."""
+    title = f"{heading}; scene {scene}, {datetime.now(UTC):%Y-%m-%d}"
+    figure.suptitle("\n".join(filter(None, (title, figure.get_suptitle()))), fontsize=10)
     with whole_file(path) as stream:
-        figure.savefig(stream, dpi=_DPI, facecolor="white", format="png")
+        figure.savefig(stream, dpi=_DPI, facecolor="white", format="png", metadata={"Title": title})

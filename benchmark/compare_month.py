@@ -1,0 +1,83 @@
+"""Time and memory of `compare` over a month: `python benchmark/compare_month.py FOLDER [--days 30] [--rate 5]`.
+
+Ten minutes are computed once; each day's run repeats them with its own stamps. The number of windows, which the memory
+grows with, is that of a month at any rate.
+"""
+
+from __future__ import annotations
+
+import resource
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import click
+import numpy as np
+
+from plow_twin.record.header import RunHeader
+from plow_twin.record.walking import Walked, Walker
+from plow_twin.record.writer import RunWriter
+from plow_twin.run.twin import Twin
+from plow_twin.scene_file import dump_scene, load_scene
+from plow_twin.stream.outputs import Published
+from plow_twin.stream.session import Session
+
+_BEGIN_NS = 1_796_083_200 * 10**9  # 2026-12-01
+_DAY_S, _SPAN_S = 86_400, 600
+
+
+def write_days(folder: Path, days: int, rate_hz: float) -> None:
+    """Write a run for each day that is not there yet."""
+    scene = load_scene("paper")
+    count = round(_SPAN_S * rate_hz)
+    stamps = np.round(1e9 / rate_hz * np.arange(count)).astype(np.int64)
+    seconds = stamps * 1e-9
+    swing = np.sin(2.0 * seconds) * np.interp(seconds, np.arange(0.0, 2.0 * _SPAN_S, np.pi), _heights())
+    wrench = swing[:, None] * np.array([32_000.0, -11_000.0, -45_495.0])
+    found: list[Walked] = []
+    Walker(Session(Twin(scene, excitation="sampled")), found.append).samples(stamps, wrench, stamps)
+    published = Published.joined([part.published for part in found])
+    header = RunHeader(dump_scene(scene), parameters={"scene": "paper"})
+    for day in range(days):
+        place = folder / f"day_{day:02}"
+        if place.exists():
+            continue
+        writer = RunWriter(place, header, 2**20, 0)
+        for number in range(_DAY_S // _SPAN_S):
+            shift = _BEGIN_NS + (day * _DAY_S + number * _SPAN_S) * 10**9
+            rows, slow = published.rows.copy(), published.slow.copy()
+            rows["stamp_ns"] += shift
+            slow["stamp_ns"] += shift
+            sequence = number * count + np.arange(count)
+            writer.write_samples(sequence, stamps + shift, stamps + shift, wrench)
+            writer.write_publications(sequence, stamps + shift, Published(rows, slow))
+        writer.close({})
+
+
+def _heights() -> np.ndarray:
+    """Return the height of the load in each of its periods."""
+    return np.random.default_rng(1).normal(1.0, 0.08, len(np.arange(0.0, 2.0 * _SPAN_S, np.pi)))
+
+
+@click.command()
+@click.argument("folder", type=click.Path(path_type=Path))
+@click.option("--days", default=30, show_default=True)
+@click.option("--rate", default=5.0, show_default=True, help="Samples of the load a second.")
+@click.option("--workers", default=1, show_default=True)
+def main(folder: Path, days: int, rate: float, workers: int) -> None:
+    """Write the runs and compare them by day."""
+    write_days(folder, days, rate)
+    runs = [str(folder / f"day_{day:02}") for day in range(days)]
+    command = [sys.executable, "-m", "plow_twin", "compare", *runs, "--by", "day", "--workers", str(workers), "--quiet"]
+    begin = time.monotonic()
+    subprocess.run([*command, "--out", str(folder / "out")], check=True)
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    click.echo(
+        f"{days} days of {round(_DAY_S * rate)} samples: {used.ru_utime + used.ru_stime:.0f} s of CPU, "
+        f"{time.monotonic() - begin:.0f} s, largest process {used.ru_maxrss / 1024:.0f} MiB"
+    )
+
+
+if __name__ == "__main__":
+    main()
