@@ -160,3 +160,19 @@ def test_dates_that_cannot_be_read_and_stamps_that_fall_are_named(tmp_path: Path
     (tmp_path / "own.csv").write_text(f"t,fx,fy,m\n{rows}")
     with pytest.raises(UnitError, match="rows from the newest to the oldest: sort the rows by time"):
         guess_columns(tmp_path / "own.csv", PAPER, {}, {})
+
+
+@pytest.mark.parametrize(
+    ("zone", "said"), [("", "by its name; dates without a zone count as UTC"), ("+01:00", "by its name")]
+)
+def test_dates_without_a_zone_and_cells_without_a_number_are_mentioned(tmp_path: Path, zone: str, said: str) -> None:
+    rows = [f"2026-01-02T03:04:{index:02}.5{zone},{'nan' if index % 3 else 1e3},-1e3,2e3" for index in range(30)]
+    file = tmp_path / "own.csv"
+    file.write_text("\n".join(["t,fx,fy,m", *rows]) + "\n")
+    because = guess_columns(file, PAPER, {}, {}).because
+    assert because == {
+        "t": said,
+        "fx": "by its name; 20 of 30 cells have no number",
+        "fy": "by its name",
+        "m": "by its name",
+    }

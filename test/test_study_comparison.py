@@ -26,7 +26,7 @@ from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record.messages import JointState
 from plow_twin.record.recording import read_recording
 from plow_twin.stream.journal import Parameter, Sample
-from plow_twin.study.comparison.change import Change, changes, with_neighbours
+from plow_twin.study.comparison.change import Change, Drawn, changes, with_neighbours
 from plow_twin.study.comparison.compare import Comparison, by_time, compare
 from plow_twin.study.comparison.windows import QUANTITIES, windows_of
 
@@ -82,7 +82,7 @@ def change(
     before: tuple[np.ndarray, np.ndarray], after: tuple[np.ndarray, np.ndarray], random: Any, draws: int = 300
 ) -> Change | None:
     """The change of one quantity."""
-    return changes((before[0][:, None], before[1]), (after[0][:, None], after[1]), random, draws)[0]
+    return changes(*(Drawn(values[:, None], load, random, draws) for values, load in (before, after)))[0]
 
 
 def test_of_fifty_cells_judged_together_chance_takes_none_for_a_change_in_nineteen_tables_of_twenty() -> None:
@@ -90,9 +90,10 @@ def test_of_fifty_cells_judged_together_chance_takes_none_for_a_change_in_ninete
     tables, found_again = [], 0
     for _ in range(60):
         groups = [(random.gamma(4.0, 25e3, (60, 50)), random.normal(1.0, 0.05, 60)) for _ in range(2)]
-        tables.append([cell.verdict for cell in changes(*groups, random, draws=200) if cell is not None])
+        drawn = [Drawn(*group, random, draws=200) for group in groups]
+        tables.append([cell.verdict for cell in changes(*drawn) if cell is not None])
         groups[1][0][:, 7] *= 1.8  # a single true change among them is still seen
-        cell = changes(*groups, random, draws=200)[7]
+        cell = changes(drawn[0], Drawn(*groups[1], random, draws=200))[7]
         found_again += cell is not None and cell.verdict == "machine"
     assert sum(any(verdict != "chance" for verdict in table) for table in tables) <= 7
     assert found_again >= 57

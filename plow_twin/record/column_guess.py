@@ -90,6 +90,10 @@ class Guess:
         return text
 
 
+#: The zone at the end of a date with time.
+_ZONE: Final = re.compile(r"([Zz]|:\d\d([.,]\d+)?[+-]\d\d(:?\d\d)?)$")
+
+
 def guess_columns(path: Path, scene: Scene, columns: Mapping[str, str], units: Mapping[str, str]) -> Guess:
     """Guess the meanings of a CSV or Parquet file's columns, from its first 20,000 rows, or two million cells.
 
@@ -136,6 +140,8 @@ def guess_columns(path: Path, scene: Scene, columns: Mapping[str, str], units: M
             raise RecordingError(
                 f"{path}: {name}: got {texts[0]!r} in the column {column}, expected numbers as -1199.7"
             )
+        if missing := int(np.isnan(numbers[column]).sum()):
+            guess.because[name] += f"; {missing} of {len(cells)} cells have no number"
     left = [name for name in guess.names if name not in guess.columns.values() and name != guess.time]
     for _, name in _NEEDED:
         if ("excitation", name) not in guess.columns:
@@ -191,6 +197,8 @@ def _find_time(
         if stamps and np.isnan(guess.stamps_s).all():
             got = f"{rows[0][index]!r} in the column {guess.time}"
             raise RecordingError(f"{guess.path}: t: got {got}, expected a number or a date as 2026-01-02T03:04:05.678Z")
+        if not all(_ZONE.search(row[index].strip()) for row in rows):
+            guess.because["t"] += "; dates without a zone count as UTC"
         return
     header = _unit_of(guess.time)
     newest = float(np.nanmax(np.abs(found)))

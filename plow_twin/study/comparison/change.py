@@ -1,4 +1,4 @@
-"""Comparison of groups of windows: distributions, changes with intervals, and the load's share in them."""
+"""Groups of windows beside each other: distributions, changes with intervals, and the load's share in them."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ Array = NDArray[np.float64]
 
 #: Draws of the bootstrap: the 2.5 % point of an interval is then known to 0.5 % of probability.
 _DRAWS: Final = 1000
-#: Smallest number of windows that can separate chance from change.
+#: Least number of windows that can separate chance from change.
 FEWEST: Final = 8
-#: Smallest variation of the load within groups, over its mean, that shows how a quantity follows it.
+#: Least variation of the load within groups, over its mean, that shows how a quantity follows it.
 _LEAST_VARIATION: Final = 0.01
 #: Loads of two groups that differ by less than this share count as equal.
 _EQUAL_LOAD: Final = 0.01
@@ -26,9 +26,9 @@ _USUAL: Final = (5.0, 95.0)
 _LEVEL: Final = 0.05
 #: Windows drawn at once [windows]: bounds the memory.
 _AT_ONCE: Final = 2**21
-#: Means of equal numbers differ by rounding, by less than this share.
+#: Means of equal numbers differ by rounding, less than by this share.
 _ROUNDING: Final = 1e-12
-#: A window that starts within this many lengths counts as the next one.
+#: A window whose start follows within this many lengths is the next one.
 _NEXT: Final = 1.5
 
 
@@ -59,7 +59,7 @@ class Change:
 
     @property
     def verdict(self) -> str:
-        """`chance`, or the cause of a change beyond chance: `machine`, `load`, or `load or machine`."""
+        """`chance`, or the cause of a change that is more: `machine`, `load`, or `load or machine`."""
         if self.chance > _LEVEL:
             return "chance"
         if self.machine_chance is None:
@@ -76,7 +76,7 @@ def points(values: Array) -> dict[str, float]:
 def with_neighbours(load: Array, start_ns: NDArray[np.int64]) -> Array:
     """Return the load of each window, of the one before and of the one after, shape (n, 3).
 
-    Where a neighbour is missing, the window's own load takes its place. A window cuts through changes of the load,
+    Where there is no such neighbour, the window's own load takes its place. A window cuts through changes of the load,
     and the head's motion remembers the load before: the slope over a window's own load alone is not the effect of a
     lasting change, the sum of the slopes over all three is.
     """
@@ -87,52 +87,24 @@ def with_neighbours(load: Array, start_ns: NDArray[np.int64]) -> Array:
     return np.column_stack((load, np.append(load[:1], before), np.append(after, load[-1:])))
 
 
-def changes(
-    before: tuple[Array, Array], after: tuple[Array, Array], random: np.random.Generator, draws: int = _DRAWS
-) -> list[Change | None]:
-    """Return the changes of quantities between two groups of windows, None where there are too few windows.
-
-    Means are compared by a bootstrap over windows. At equal load the part that follows the load is subtracted, by the
-    slopes over the load's variation within the groups (analysis of covariance).
+class Drawn:
+    """Moments of a group: of its windows, then of each draw from them.
 
     Parameters
     ----------
-    before, after
-        Values of the quantities, shape (n, k), and load of the windows of each group, shape (n,), or as in
-        `with_neighbours`, shape (n, 3).
+    values
+        Quantities of the windows, shape (n, k).
+    load
+        Their load, shape (n,), or as of `with_neighbours`, shape (n, 3).
     random
         Source of the draws.
-
-    References
-    ----------
-    Benjamini, Hochberg (1995), Controlling the false discovery rate, J. R. Stat. Soc. B 57.
-    """
-    width, fewest = before[0].shape[1], min(len(before[0]), len(after[0]))
-    if fewest < FEWEST:
-        return [None] * width
-    known = np.flatnonzero(before[0].mean(axis=0) > 0.0)
-    first, second = (
-        _Drawn(values[:, known], load.reshape(len(load), -1), random, draws) for values, load in (before, after)
-    )
-    found = _tested(second.mean - first.mean, first.mean, fewest)
-    at_equal_load = None
-    if not _apart(before[1], after[1]):
-        rest = _at_equal_load(first, second)
-        left = np.isfinite(rest[:, 0])
-        if left[0] and left[1:].mean() >= 0.9:
-            at_equal_load = _tested(rest[left], first.mean[left], fewest)
-    result: list[Change | None] = [None] * width
-    for place, cell in enumerate(known.tolist()):
-        machine = (None,) * 4 if at_equal_load is None else (part[place].item() for part in at_equal_load)
-        result[cell] = Change(*(part[place].item() for part in found), *machine)
-    return result
-
-
-class _Drawn:
-    """Moments of a group: of its windows, then of each draw from them.
+    draws
+        Their number.
 
     Attributes
     ----------
+    usual : ndarray, shape (2,)
+        Points of the loads between which most lie.
     size : int
         Windows of a draw.
     mean : ndarray, shape (draws + 1, k)
@@ -143,8 +115,10 @@ class _Drawn:
         Covariance of the loads with each other and with the quantities.
     """
 
-    def __init__(self, values: Array, load: Array, random: np.random.Generator, draws: int) -> None:
+    def __init__(self, values: Array, load: Array, random: np.random.Generator, draws: int = _DRAWS) -> None:
+        load = load.reshape(len(load), -1)
         self.size, width = load.shape
+        self.usual = np.percentile(load[:, 0], _USUAL)
         whole = np.hstack((load, values))
         usual = whole.mean(axis=0)
         centred = whole - usual
@@ -165,6 +139,35 @@ class _Drawn:
         self.within = second - offset[:, :width, None] * offset[:, None, :]
 
 
+def changes(before: Drawn, after: Drawn) -> list[Change | None]:
+    """Return the changes of some quantities between two groups of windows, None where there are too few.
+
+    Means are compared by a bootstrap over windows. At equal load: less the part that follows the load, by the slopes
+    over the load's variation within the groups (analysis of covariance).
+
+    References
+    ----------
+    Benjamini, Hochberg (1995), Controlling the false discovery rate, J. R. Stat. Soc. B 57.
+    """
+    result: list[Change | None] = [None] * before.mean.shape[1]
+    fewest = min(before.size, after.size)
+    known = np.flatnonzero(before.mean[0] > 0.0)
+    if fewest < FEWEST:
+        return result
+    mean = before.mean[:, known]
+    found = _tested(after.mean[:, known] - mean, mean, fewest)
+    at_equal_load = None
+    if not _apart(before, after):
+        rest = _at_equal_load(before, after)[:, known]
+        left = np.isfinite(rest[:, 0]) if len(known) else np.zeros(len(rest), bool)
+        if left[0] and left[1:].mean() >= 0.9:
+            at_equal_load = _tested(rest[left], mean[left], fewest)
+    for place, cell in enumerate(known.tolist()):
+        machine = (None,) * 4 if at_equal_load is None else (part[place].item() for part in at_equal_load)
+        result[cell] = Change(*(part[place].item() for part in found), *machine)
+    return result
+
+
 def _tested(differences: Array, mean: Array, fewest: int) -> tuple[Array, Array, Array, Array]:
     """Return share, low, high and adjusted chance of each difference; the first row is the value, the others draws.
 
@@ -179,15 +182,14 @@ def _tested(differences: Array, mean: Array, fewest: int) -> tuple[Array, Array,
     return share, low, high, false_discovery_control(chance) if len(chance) else chance
 
 
-def _apart(before: Array, after: Array) -> bool:
+def _apart(before: Drawn, after: Drawn) -> bool:
     """Return whether the loads of two groups differ and do not overlap."""
-    first, second = (load.reshape(len(load), -1)[:, 0] for load in (before, after))
-    (low, high), (other_low, other_high) = (np.percentile(load, _USUAL) for load in (first, second))
-    differ = abs(second.mean() - first.mean()) >= _EQUAL_LOAD * first.mean()
-    return bool(differ and (low > other_high or other_low > high))
+    first, second = before.load[0, 0], after.load[0, 0]
+    differ = abs(second - first) >= _EQUAL_LOAD * first
+    return bool(differ and (before.usual[0] > after.usual[1] or after.usual[0] > before.usual[1]))
 
 
-def _at_equal_load(before: _Drawn, after: _Drawn) -> Array:
+def _at_equal_load(before: Drawn, after: Drawn) -> Array:
     """Return the differences of the means at the first group's load, NaN where the load hardly varies."""
     usual, difference = before.load[:, 0], after.load - before.load
     changed = np.abs(difference[:, 0]) >= _EQUAL_LOAD * usual

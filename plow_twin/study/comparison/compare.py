@@ -14,7 +14,7 @@ import numpy as np
 from plow_twin.errors import RecordingError
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record.recording import read_recording
-from plow_twin.study.comparison.change import Change, changes, points, with_neighbours
+from plow_twin.study.comparison.change import Change, Drawn, changes, points, with_neighbours
 from plow_twin.study.comparison.windows import FULL, QUANTITIES, Windows, windows_of
 
 #: Stamps before this [ns] are not dates: 1e18 ns is in the year 2001.
@@ -182,9 +182,9 @@ def compare(
     (reference, first), *others = found.groups.items()
     loads = {group: with_neighbours(windows.load[:, 0], windows.start_ns) for group, windows in found.groups.items()}
     random = np.random.default_rng(seed)
-    before = _cells(first)
+    before = Drawn(_cells(first), loads[reference], random)
     for group, windows in others:
-        cells = iter(changes((before, loads[reference]), (_cells(windows), loads[group]), random))
+        cells = iter(changes(before, Drawn(_cells(windows), loads[group], random)))
         found.changes[group] = {pair: {quantity: next(cells) for quantity in QUANTITIES} for pair in PAIR_NAMES}
         found.clearance_changes[group] = {axis: next(cells) for axis in ("horizontal", "vertical")}
     return found

@@ -66,7 +66,9 @@ class Windows:
     rate_hz: Array
 
     def chosen(self, which: NDArray[np.bool_]) -> Windows:
-        """Return some of the windows, by a mask (n,)."""
+        """Return some of the windows, by a mask (n,); all of them without a copy."""
+        if which.all():
+            return self
         return Windows(
             self.start_ns[which],
             {name: values[which] for name, values in self.pairs.items()},
@@ -78,7 +80,9 @@ class Windows:
 
     @classmethod
     def joined(cls, parts: Sequence[Windows]) -> Windows:
-        """Return the windows of several runs as one."""
+        """Return the windows of several runs as one; those of one run without a copy."""
+        if len(parts) == 1:
+            return parts[0]
         return cls(
             np.concatenate([part.start_ns for part in parts]),
             {name: np.concatenate([part.pairs[name] for part in parts]) for name in QUANTITIES},
