@@ -1,4 +1,6 @@
-"""Time and memory of `compare` over a month: `python benchmark/compare_month.py FOLDER [--days 30] [--rate 5]`.
+"""Time and memory of `compare` over a month: `python benchmark/compare_month.py FOLDER`.
+
+With `--hours 0.5 --rate 100 --verb analyse` those of `analyse` over many short runs.
 
 Ten minutes are computed once; each day's run repeats them with its own stamps. The number of windows, which the memory
 grows with, is that of a month at any rate.
@@ -27,7 +29,7 @@ _BEGIN_NS = 1_796_083_200 * 10**9  # 2026-12-01
 _DAY_S, _SPAN_S = 86_400, 600
 
 
-def write_days(folder: Path, days: int, rate_hz: float) -> None:
+def write_days(folder: Path, days: int, hours: float, rate_hz: float) -> None:
     """Write a run for each day that is not there yet."""
     scene = load_scene("paper")
     count = round(_SPAN_S * rate_hz)
@@ -44,7 +46,7 @@ def write_days(folder: Path, days: int, rate_hz: float) -> None:
         if place.exists():
             continue
         writer = RunWriter(place, header, 2**20, 0)
-        for number in range(_DAY_S // _SPAN_S):
+        for number in range(round(3600 * hours / _SPAN_S)):
             shift = _BEGIN_NS + (day * _DAY_S + number * _SPAN_S) * 10**9
             rows, slow = published.rows.copy(), published.slow.copy()
             rows["stamp_ns"] += shift
@@ -63,18 +65,21 @@ def _heights() -> np.ndarray:
 @click.command()
 @click.argument("folder", type=click.Path(path_type=Path))
 @click.option("--days", default=30, show_default=True)
-@click.option("--rate", default=5.0, show_default=True, help="Samples of the load a second.")
+@click.option("--hours", default=24.0, show_default=True, help="Length of a day's run.")
+@click.option("--rate", default=1.0, show_default=True, help="Samples of the load a second.")
+@click.option("--verb", type=click.Choice(["compare", "analyse"]), default="compare", show_default=True)
 @click.option("--workers", default=1, show_default=True)
-def main(folder: Path, days: int, rate: float, workers: int) -> None:
-    """Write the runs and compare them by day."""
-    write_days(folder, days, rate)
+def main(folder: Path, days: int, hours: float, rate: float, verb: str, workers: int) -> None:
+    """Write the runs, and compare them by day or analyse them."""
+    write_days(folder, days, hours, rate)
     runs = [str(folder / f"day_{day:02}") for day in range(days)]
-    command = [sys.executable, "-m", "plow_twin", "compare", *runs, "--by", "day", "--workers", str(workers), "--quiet"]
+    command = [sys.executable, "-m", "plow_twin", verb, *runs, "--workers", str(workers), "--quiet"]
+    command += ["--by", "day"] if verb == "compare" else []
     begin = time.monotonic()
     subprocess.run([*command, "--out", str(folder / "out")], check=True)
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     click.echo(
-        f"{days} days of {round(_DAY_S * rate)} samples: {used.ru_utime + used.ru_stime:.0f} s of CPU, "
+        f"{days} runs of {round(3600 * hours * rate)} samples: {used.ru_utime + used.ru_stime:.0f} s of CPU, "
         f"{time.monotonic() - begin:.0f} s, largest process {used.ru_maxrss / 1024:.0f} MiB"
     )
 

@@ -16,6 +16,7 @@ from zoneinfo import ZoneInfo
 import numpy as np
 import pyarrow.parquet
 import pytest
+from figure_checks import check_figure, kept_figures
 from record_support import BASE_NS, STEP_NS, Run, paper_sample, record_run
 
 from plow_twin import load_scene
@@ -28,6 +29,7 @@ from plow_twin.record.recording import read_recording
 from plow_twin.stream.journal import Parameter, Sample
 from plow_twin.study.comparison.change import Change, Drawn, changes, with_neighbours
 from plow_twin.study.comparison.compare import Comparison, by_time, compare
+from plow_twin.study.comparison.report import _figure
 from plow_twin.study.comparison.windows import QUANTITIES, windows_of
 
 SECONDS = 8
@@ -186,13 +188,7 @@ def test_a_folder_of_runs_is_compared_and_its_picture_has_the_dates(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    titles: list[str] = []
-
-    def keep(figure: Any) -> str:
-        titles.append(figure.axes[0].get_title())
-        return ""
-
-    monkeypatch.setattr("plow_twin.study.comparison.report.embedded_figure", keep)
+    figures = kept_figures(monkeypatch)
     arguments = ["compare", str(runs[0].folder.parent), "--window", "0.5", "--out", str(tmp_path), "--json"]
     with ExitStack() as opened:
         if dask:
@@ -203,7 +199,16 @@ def test_a_folder_of_runs_is_compared_and_its_picture_has_the_dates(
             arguments += ["--dask", cluster.scheduler_address]
         assert cli([*arguments, "--workers", "1"]) == 0
     assert list(json.loads(capsys.readouterr().out)["groups"]) == ["monday", "tuesday"]
-    assert titles[0].startswith("Largest contact forces; 2027-01-15 08:00:00 UTC to 2027-01-15 08:00:07 UTC")
+    windows = windows_of(read_recording(runs[0].folder), 0.5)
+    month = _figure(Comparison({f"2026-12-{day:02}": windows for day in range(1, 31)}, {}))
+    for figure in (figures[0], month):
+        check_figure(figure)
+    assert [line.get_label() for line in month.axes[0].lines[::2]] == list(PAIR_NAMES)
+    assert (
+        figures[0]
+        .get_suptitle()
+        .startswith("Largest contact forces; 2027-01-15 08:00:00 UTC to 2027-01-15 08:00:07 UTC")
+    )
 
 
 def test_one_group_and_a_run_without_outputs_are_refused(

@@ -215,10 +215,10 @@ class BridgeFront:
         if estimation is not None and not (estimation.count or self._bridge.ends):
             found.append("no estimate was made: the run ended before the first")
         jumps = counts[Verdict.JUMP_BACK]
-        if jumps and self._bridge.ends:
+        if jumps:
             found.append(
                 f"the stamps jumped back ({jumps}), and the motion was reset: is it local time, where summer time "
-                "ends? Expected UTC, or stamps with their offset"
+                "ends, or was a clock set? Expected UTC, or stamps with their offset"
             )
         return found
 

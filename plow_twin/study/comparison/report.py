@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import ExitStack
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -14,7 +14,16 @@ from plow_twin.record.durable import whole_file
 from plow_twin.study.comparison.compare import Comparison
 from plow_twin.study.comparison.windows import QUANTITIES
 from plow_twin.study.report import embedded_figure, write_html, write_json
-from plow_twin.view.figures import date_text
+from plow_twin.view.figures import date_text, legend_beside
+from plow_twin.view.section import PAIR_COLORS
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: Groups whose boxes can be told apart; names that have room beside each other, and their length: that of a date.
+_MOST_BOXES: Final = 6
+_MOST_LABELS: Final = 12
+_WIDEST: Final = 10
 
 
 def write_comparison(found: Comparison, lost: dict[str, Any], out: Path) -> None:
@@ -28,18 +37,28 @@ def write_comparison(found: Comparison, lost: dict[str, Any], out: Path) -> None
     out.mkdir(parents=True, exist_ok=True)
     facts = found.facts()
     write_json(out / "compare.json", {**facts, "lost": lost})
-    context = {"facts": facts, "lost": lost, "picture": _picture(found), "pairs": PAIR_NAMES, "units": QUANTITIES}
+    context = {
+        "facts": facts,
+        "lost": lost,
+        "picture": embedded_figure(_figure(found)),
+        "pairs": PAIR_NAMES,
+        "units": QUANTITIES,
+    }
     write_html(out / "compare.html", "compare.html.j2", context)
     _write_windows(found, out / "windows.parquet")
 
 
-def _picture(found: Comparison) -> str:
-    """Return the distributions of the peaks by pair and group as an embedded PNG."""
+def _figure(found: Comparison) -> Figure:
+    """Return the distributions of the peaks by pair and group."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 4.5), layout="constrained")
     axis = figure.add_subplot()
     count = len(found.groups)
+    axis.set_ylabel("largest force in a window [kN]")
+    if count > _MOST_BOXES:
+        _lines(axis, found)
+        return figure
     for number, (name, windows) in enumerate(found.groups.items()):
         places = np.arange(len(PAIR_NAMES)) + (number - 0.5 * (count - 1)) * 0.8 / count
         drawn = axis.boxplot(
@@ -49,11 +68,28 @@ def _picture(found: Comparison) -> str:
         for box in drawn["boxes"]:
             box.set_facecolor(f"C{number % 10}")
         axis.plot([], [], color=f"C{number % 10}", lw=6, label=name)
-    axis.set_xticks(range(len(PAIR_NAMES)), PAIR_NAMES, rotation=20, ha="right")
-    axis.set_ylabel("largest force in a window [kN]")
-    axis.set_title(f"{_title(found)}\nBox: quartiles and median of the windows; whiskers: 5 % and 95 %", fontsize=10)
-    axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    return embedded_figure(figure)
+    axis.set_xticks(range(len(PAIR_NAMES)), [name.replace("_", "\n") for name in PAIR_NAMES])
+    figure.suptitle(f"{_title(found)}\nBox: quartiles and median of the windows; whiskers: 5 % and 95 %", fontsize=10)
+    legend_beside(axis)
+    return figure
+
+
+def _lines(axis: Any, found: Comparison) -> None:
+    """Draw the median and the 95 % point of each pair's peaks over the groups; so many boxes would overlap."""
+    peaks = [windows.pairs["peak"] / 1e3 for windows in found.groups.values()]
+    places = np.arange(len(peaks))
+    median, high = (np.array([np.percentile(values, point, axis=0) for values in peaks]) for point in (50.0, 95.0))
+    for pair, name in enumerate(PAIR_NAMES):
+        color = tuple(part / 255 for part in PAIR_COLORS[pair])
+        axis.plot(places, median[:, pair], color=color, label=name)
+        axis.plot(places, high[:, pair], color=color, ls=":", lw=1.0)
+    shown = places[:: 1 + len(places) // _MOST_LABELS]
+    names = [list(found.groups)[place].replace(" ", "\n") for place in shown]  # a shift has date and time
+    slanted = max(len(line) for name in names for line in name.split("\n")) > _WIDEST
+    axis.set_xticks(shown, names, rotation=30 if slanted else 0, ha="right" if slanted else "center", fontsize=8)
+    axis.set_ylim(bottom=0.0)
+    axis.figure.suptitle(f"{_title(found)}\nLine: median of the windows; dotted: 95 %", fontsize=10)
+    legend_beside(axis)
 
 
 def _title(found: Comparison) -> str:
