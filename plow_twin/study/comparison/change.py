@@ -1,4 +1,4 @@
-"""Groups of windows beside each other: distributions, changes with intervals, and the load's share in them."""
+"""Comparison of groups of windows: distributions, changes with intervals, and the load's share in them."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ Array = NDArray[np.float64]
 
 #: Draws of the bootstrap: the 2.5 % point of an interval is then known to 0.5 % of probability.
 _DRAWS: Final = 1000
-#: Least number of windows that can separate chance from change.
+#: Smallest number of windows that can separate chance from change.
 FEWEST: Final = 8
-#: Least variation of the load within groups, over its mean, that shows how a quantity follows it.
+#: Smallest variation of the load within groups, over its mean, that shows how a quantity follows it.
 _LEAST_VARIATION: Final = 0.01
 #: Loads of two groups that differ by less than this share count as equal.
 _EQUAL_LOAD: Final = 0.01
@@ -26,9 +26,9 @@ _USUAL: Final = (5.0, 95.0)
 _LEVEL: Final = 0.05
 #: Windows drawn at once [windows]: bounds the memory.
 _AT_ONCE: Final = 2**21
-#: Means of equal numbers differ by rounding, less than by this share.
+#: Means of equal numbers differ by rounding, by less than this share.
 _ROUNDING: Final = 1e-12
-#: A window whose start follows within this many lengths is the next one.
+#: A window that starts within this many lengths counts as the next one.
 _NEXT: Final = 1.5
 
 
@@ -59,7 +59,7 @@ class Change:
 
     @property
     def verdict(self) -> str:
-        """`chance`, or the cause of a change that is more: `machine`, `load`, or `load or machine`."""
+        """`chance`, or the cause of a change beyond chance: `machine`, `load`, or `load or machine`."""
         if self.chance > _LEVEL:
             return "chance"
         if self.machine_chance is None:
@@ -76,7 +76,7 @@ def points(values: Array) -> dict[str, float]:
 def with_neighbours(load: Array, start_ns: NDArray[np.int64]) -> Array:
     """Return the load of each window, of the one before and of the one after, shape (n, 3).
 
-    Where there is no such neighbour, the window's own load takes its place. A window cuts through changes of the load,
+    Where a neighbour is missing, the window's own load takes its place. A window cuts through changes of the load,
     and the head's motion remembers the load before: the slope over a window's own load alone is not the effect of a
     lasting change, the sum of the slopes over all three is.
     """
@@ -140,10 +140,10 @@ class Drawn:
 
 
 def changes(before: Drawn, after: Drawn) -> list[Change | None]:
-    """Return the changes of some quantities between two groups of windows, None where there are too few.
+    """Return the changes of quantities between two groups of windows, None where there are too few windows.
 
-    Means are compared by a bootstrap over windows. At equal load: less the part that follows the load, by the slopes
-    over the load's variation within the groups (analysis of covariance).
+    Means are compared by a bootstrap over windows. At equal load the part that follows the load is subtracted, by the
+    slopes over the load's variation within the groups (analysis of covariance).
 
     References
     ----------
