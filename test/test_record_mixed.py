@@ -322,7 +322,7 @@ def _mixed(folder: Path, seed: int, **more: Any) -> None:
     assert not any(frame.rows["force"].max() > 1e12 for frame in live.front.frames)
 
 
-@pytest.mark.parametrize("seed", [*range(20), 2002])  # 2002: a step seems to end a rounding error behind a sample
+@pytest.mark.parametrize("seed", [*range(20), 2002])  # 2002: a step ends just after a sample
 def test_a_replay_gives_the_messages_of_any_mix(seed: int, tmp_path: Path) -> None:
     _mixed(tmp_path, seed)
 

@@ -162,7 +162,7 @@ def test_damping_beyond_double_precision_or_the_model_is_refused(damping: float)
 
 
 def test_a_start_inside_a_wall_leaves_as_from_the_middle_of_an_impact() -> None:
-    """At rest at depth d it leaves at e v0 of the impact that turns back at d; undamped at d sqrt(2 K / m)."""
+    """Released at depth d it leaves with e v0 of the impact that turns back at d; undamped with d sqrt(2 K / m)."""
     depth, stiffness, mass = 1e-3, 1e9, 2430.0
     for e in (1.0, 0.4):
         contact = Contact("exact_restitution", stiffness, restitution=e)

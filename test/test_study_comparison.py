@@ -136,7 +136,7 @@ def test_a_lasting_change_of_a_load_that_windows_cut_through_is_the_load_s() -> 
     np.testing.assert_array_equal(
         with_neighbours(np.array([1.0, 2.0, 3.0]), np.array([0, 10, 90])), [[1, 1, 2], [2, 1, 2], [3, 3, 3]]
     )
-    # no slope holds far beyond the loads that it comes from
+    # a slope does not hold far beyond its loads
     load = random.normal(1.0, 0.02, 40)
     apart = change((1e5 * load**2, load), (1.4e5 * load**2, 1.4 * load), random, draws=100)
     assert apart is not None and apart.verdict == "load or machine"

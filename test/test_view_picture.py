@@ -34,7 +34,7 @@ def figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
 def test_an_hour_of_load_fills_the_same_band_everywhere() -> None:
     envelope = Envelope(1)
     times = np.arange(72_000) / 20.0
-    for part in np.array_split(times, 300):  # as batches of a recording come
+    for part in np.array_split(times, 300):  # as in the batches of a recording
         envelope.add(part, np.sin(2.0 * part)[:, None])
     at, least, largest = envelope.bands(0)
     assert 300 <= len(at) <= 700

@@ -1,11 +1,10 @@
 """Clearances around a block (`carries: corners`) from its impacts: where two flights meet, a corner meets its wall.
 
 Between impacts the block flies: under load and gravity alone, up to drag and errors of the load. The flights before and
-after an impact are extrapolated to the time at which they are nearest to each other. The corner that is deepest at that
-time, toward the wall that pushed, is at the wall, beyond it by its penetration. The places of all impacts are linear in
-the clearances, in the sensor's bias and lever arm, and in the yield of the contact. These are estimated together.
-The errors of the impacts have a Student-t distribution of unknown scale, so the intervals follow from the impacts'
-scatter.
+after an impact are extrapolated to the time at which they are nearest to each other. At that time the deepest corner in
+the direction of the push is at the wall, or beyond it by the penetration. The places of all impacts are linear in the
+clearances, in the sensor's bias and lever arm, and in the yield of the contact. These are estimated together. The
+errors of the impacts have a Student-t distribution of unknown scale, so the intervals follow from the impacts' scatter.
 
 Reference: Lange, Little and Taylor, J. Am. Stat. Assoc. 84 (1989) 881 (Student-t errors by reweighting).
 """

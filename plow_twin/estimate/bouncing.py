@@ -126,7 +126,7 @@ def bias_of_hard(unknowns: Unknowns, poses: Poses) -> Array:
     """Return the bias of a sensor behind a hard contact, x and y in m, theta in rad; zeros where the contact is soft.
 
     Both corners that touch a hard wall find it at the same place; a biased theta shows two places. The bias is that
-    with which the farthest reaches lie closest together. A bias of y turns with the head into its reach along x.
+    with which the farthest reaches lie closest together. When the head turns, a bias of y adds to its reach along x.
     """
     q = _whole(poses)
     bias = np.zeros(3)

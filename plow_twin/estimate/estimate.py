@@ -275,7 +275,7 @@ def under_uncertain_load(
     period: float,
     fitted: tuple[Problem, Fit] | None = None,
 ) -> Estimate:
-    """Return an estimate whose withdrawn clearances are replaced: they allow for an unknown load or angle.
+    """Return an estimate with its withdrawn clearances replaced by values that allow for an unknown load or angle.
 
     `result` comes from the load believed; it stays where it has a clearance, or where the comparison finds no
     clearance. Where the comparison agrees with `fitted`, the result for a machine that differs, the fit was in no false
@@ -743,7 +743,7 @@ def _groups(
 ) -> dict[str, tuple[Interval, State]]:
     """Return the clearance of each group of pads; not observable where the motion does not determine it.
 
-    `untested` flags, by axis, clearances that no predicted motion tests: their groups are not known better than they.
+    `untested` has, by axis, the clearances that no predicted motion tests: their groups are not known better.
     `added` is the covariance beyond the fit's; `shared` are unknowns and differences from the model.
     """
     out = {}

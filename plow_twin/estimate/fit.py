@@ -267,7 +267,7 @@ class Problem:
     def cost(self, point: Point, variance: Array) -> float:
         """Return twice the negative logarithm of the posterior: Huber's function of the residuals and the prior.
 
-        A measurement outside the swings costs nothing beyond a perfect fit.
+        A measurement that a point does not reach costs 1, the expected cost of a measurement that fits.
         """
         z = np.abs(point.residual) / np.sqrt(variance)
         loss = huber_loss(z)

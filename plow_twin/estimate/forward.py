@@ -94,7 +94,7 @@ class Forward:
         times : ndarray, shape (n,)
             Times of the rows in s, rising within each run and not before its start.
         depth : ndarray, shape (8,), optional
-            Distance in m by which each pad lies further out than by the clearances.
+            Outward displacement of each pad in m, in addition to the clearances.
         push : ndarray, shape (3,), optional
             A constant load added to the believed load, in N, N, N m.
         share : ndarray, shape (8,), optional

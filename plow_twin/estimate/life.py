@@ -32,7 +32,7 @@ _TRACE_M = 1e-12
 _FINER = 16
 #: Bound: steps of a path.
 _MOST_STEPS = 400
-#: Guard: smaller clearances count as this one, in m: a path from zero would have no end.
+#: Guard: smallest clearance in m of a path, because a path from zero would not end.
 _LEAST_CLEARANCE = 1e-3
 
 

@@ -149,7 +149,7 @@ class Ensemble:
         self._newest = whole[:, -1]
 
     def settle(self) -> None:
-        """Copy rates, wear and penetration from the newest rows; only when they are needed."""
+        """Copy rates, wear and penetration from the newest rows; called only when they are needed."""
         rows, self._newest = self._newest, None
         if rows is not None:
             self._v, self.worn, self._depth = rows["v"].copy(), rows["wear_depth"].copy(), rows["penetration"].copy()

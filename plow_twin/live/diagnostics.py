@@ -445,7 +445,7 @@ _TROUBLE: Final = (
 
 
 def _refused(intake: Intake) -> int:
-    """Return how many messages were not used while they could have been."""
+    """Return the number of unused messages, without those that came before the node could use them."""
     away = intake.counts[Verdict.INACTIVE] + intake.counts[Verdict.NO_CLOCK]
     return intake.arrived - intake.used - away
 

@@ -179,7 +179,7 @@ def _read(path: Path) -> tuple[Guess, list[list[str]]]:
 def _find_time(
     guess: Guess, rows: Sequence[Sequence[str]], numbers: Mapping[str, Array], given: str, unit: str
 ) -> None:
-    """Find the column of the time, by its name or because it alone rises; and its unit, where the numbers show it."""
+    """Find the column of the time, by its name or as the only rising one, and its unit, if the numbers show it."""
     alike = [name for name in guess.names if re.fullmatch(_TIME, _plain(name))]
     rising = [name for name, found in numbers.items() if len(found) > 2 and (np.diff(found) > 0.0).all()]
     choices = [given] if given else alike or rising

@@ -21,8 +21,8 @@ _JUMP_NS: Final = 10_000_000_000
 def merged(streams: Iterable[Iterator[T]], stamp_ns: StampOf[T]) -> Iterator[T]:
     """Yield the messages of all streams by their stamps, each stream in its own order.
 
-    A message without a stamp stays where it is in its stream, and so does a single wrong stamp. After a step of the
-    clock back a stream waits until all others have come to theirs.
+    A message without a stamp stays where it is in its stream, and so does a single wrong stamp. After a step back of
+    its clock, a stream waits until the other streams have reached their steps.
     """
     for _, _, arrived in heapq.merge(*(_placed(stream, stamp_ns) for stream in streams), key=lambda item: item[:2]):
         yield arrived

@@ -14,7 +14,8 @@ from plow_twin.stream.topics import JOINT_STATE, Cadence, Topic, names_of, topic
 
 Array = NDArray[np.float64]
 
-#: The topics whose messages each publication has, or those with intervals or a slow part: they follow from the journal.
+#: The topics with a message in each publication, or in publications with intervals or a slow part; all follow from the
+#: journal.
 REPLAYED: Final = topics_of(Cadence.EACH, Cadence.FOLLOWED, Cadence.SLOW)
 #: Their base names.
 PUBLICATION_TOPICS: Final = tuple(topic.name for topic in REPLAYED)

@@ -153,7 +153,7 @@ def _check_tolerance(tol: float) -> None:
 class _Shared:
     """Results that scenes share, computed once for each set of objects that they depend on.
 
-    With `most` only the newest so many are kept.
+    With `most` only that number of the newest are kept.
     """
 
     def __init__(self, most: float = math.inf) -> None:

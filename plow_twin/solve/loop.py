@@ -284,7 +284,7 @@ def interrupt_step(p, parts, state, w, totals) -> None:
 def lay_out_again(p, parts, state, w) -> None:
     """Compute the step under way once more after a restore: its series are not part of the state.
 
-    Only under the scene's own loads is a step left under way, and then nothing bounds it.
+    A step is left under way only under the scene's own loads, where no stop time ends it.
     """
     if state.at_rest == 1:
         write_rest(p, state, w)

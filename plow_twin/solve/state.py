@@ -217,7 +217,7 @@ _STATE_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("events_at_once", "i8"),  # events so far at one instant
     ("piece", "i8"),  # of the sampled load
     ("ends_at_stop", "i8"),  # 1 where the step ends at `stop_time`
-    ("refused", "i8"),  # implicit steps that were too short since a contact changed
+    ("refused", "i8"),  # failed attempts at implicit steps since a contact changed
     ("refused_before", "i8"),  # the same before the step under way was laid out
     ("in_flight", "i8"),  # 1 during a step of free flight
     ("at_rest", "i8"),  # 1 during a step of rest

@@ -98,7 +98,7 @@ class Published(NamedTuple):
 
     @classmethod
     def joined(cls, parts: Sequence[Published]) -> Published:
-        """Return several as one."""
+        """Return several publications as one."""
         if len(parts) == 1:
             return parts[0]
         begins = np.cumsum([0, *(len(part.rows) for part in parts)]).tolist()

@@ -286,8 +286,8 @@ class Session:
     def parts(self, samples: Sequence[Sample], *, each: bool = False) -> Iterator[Sequence[Sample]]:
         """Yield the parts of samples for `apply_samples`; each part must be applied before the next.
 
-        Each late sample is a part; other parts are as long as the digests allow, or one sample where `each` is
-        published.
+        From a late sample on, the rest is one part; other parts are as long as the digests allow, or one sample where
+        `each` is published.
 
         Raises
         ------

@@ -27,7 +27,7 @@ class Residuals:
         Parameters
         ----------
         poses
-            Poses and their places among the entries, which `steps` belong to.
+            Poses, and their indexes among the entries, to which `steps` belong.
         head
             Rows of `head_state`.
         """

@@ -1,7 +1,7 @@
 """Many live twins under sampled loads in lanes: each goes from sample to sample and writes a row at each.
 
-Under a load that is sampled often a step ends at the next sample, long before its series stops being accurate: a series
-ends where its terms vanish over that step (`series.expand`).
+Under a frequently sampled load a step ends at the next sample, long before its series loses accuracy, so a series is
+cut where its terms vanish over that step (`series.expand`).
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ from plow_twin.kernel.simd import below, choose, exact_row, exact_splat, fused, 
 
 #: Largest angle for which the product of the number of quarter turns and the first part of pi / 2 is exact.
 _LARGEST = 1e5
-#: Added and taken away again it rounds to a whole number.
+#: Adding and subtracting this number rounds to a whole number.
 _ROUNDS = 6755399441055744.0
 #: pi / 2 in three parts, the first two of 33 bits (fdlibm, e_rem_pio2.c).
 _QUARTERS = (0.6366197723675814, 1.57079632673412561417, 6.07710050630396597660e-11, 2.02226624879595063154e-21)

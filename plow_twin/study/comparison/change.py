@@ -20,7 +20,7 @@ FEWEST: Final = 8
 _LEAST_VARIATION: Final = 0.01
 #: Loads of two groups that differ by less than this share count as equal.
 _EQUAL_LOAD: Final = 0.01
-#: Points of the loads of two groups that must overlap: no slope holds far beyond the loads that it comes from [%].
+#: Percentiles between which the loads of two groups must overlap [%]: a slope does not hold far beyond its loads.
 _USUAL: Final = (5.0, 95.0)
 #: Probability below which a change is more than chance.
 _LEVEL: Final = 0.05
