@@ -26,6 +26,7 @@ from plow_twin.live.bridge.opcua.bridge import OpcUa
 from plow_twin.live.bridge.opcua.link import Revised
 from plow_twin.live.bridge.opcua.samples import NOT_MEASURED, Samples
 from plow_twin.live.bridge.source import BridgeError
+from plow_twin.live.diagnostics import SOURCE_KEYS
 from plow_twin.record.entries import EntryRecord
 from plow_twin.record.mapping import read_map
 from plow_twin.record.reader import RunReader
@@ -220,6 +221,7 @@ def test_samples_come_with_the_sources_stamps_and_bad_values_are_counted(server:
         level, said, facts = bridge.part()
         assert (facts["bad"], facts["uncertain"], facts["breaks"]) == ("1", "1", "0") and bridge.lost == 0
         assert facts["publishing_ms"] == "10" and (level, said) == (0, "")
+        assert facts.keys() == SOURCE_KEYS.keys()
 
 
 def test_a_lost_message_is_seen_by_its_number_and_filled_from_the_history(server: Plant, roles: Any) -> None:

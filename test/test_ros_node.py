@@ -34,7 +34,7 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from websockets.sync.client import connect
 
-from plow_twin.live.diagnostics import KEYS, STATUS_KEYS
+from plow_twin.live.diagnostics import KEYS, SOURCE_KEYS, STATUS_KEYS
 from plow_twin.model.loads import compile_loads
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.model.scene import Scene, Wear
@@ -798,4 +798,4 @@ def test_the_documentation_names_every_topic_parameter_and_key() -> None:
     for file, made in (("twin.yaml", yaml_text()), ("diagnostics.yaml", keys_text())):
         assert f"<!-- file: config/{file} -->" in text
         assert (ROOT / "config" / file).read_text(encoding="utf-8") == made
-    assert yaml.safe_load(keys_text()) == {"status": STATUS_KEYS, **KEYS}
+    assert yaml.safe_load(keys_text()) == {"status": STATUS_KEYS, **KEYS, "source": SOURCE_KEYS}

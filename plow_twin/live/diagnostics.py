@@ -142,10 +142,33 @@ STATUS_KEYS: Final[dict[str, str]] = {
 }
 
 
+#: Keys of the part `source`, which a connection to an OPC UA server adds, and their meanings.
+SOURCE_KEYS: Final[dict[str, str]] = {
+    "server": "address",
+    "connected": "whether the subscription exists",
+    "publishing_ms": "granted interval of messages [ms]",
+    "sampling_ms": "granted interval of samples [ms]",
+    "queue": "granted length of the queue of a node",
+    "values": "values received",
+    "bad": "values with a bad status, not used",
+    "uncertain": "values with an uncertain status, not used",
+    "not_numbers": "values that are not numbers, not used",
+    "unstamped": "values without a stamp, not used",
+    "notifications_lost": "missing messages",
+    "overflows": "values before which the server's queue overflowed",
+    "breaks": "broken connections",
+    "breaks_filled": "breaks filled by the history",
+    "values_filled": "values from the history",
+    "history_strays": "values of the history from other times than requested",
+    "unfilled_s": "time without values [s]",
+    "no_history": "reason why the history cannot be read",
+}
+
+
 def keys_text() -> str:
     """Return the meaning of every key of `status` and of each part of `/diagnostics`, as YAML."""
     lines = ["# Keys of `status` and of the parts of /diagnostics."]
-    for part, keys in {"status": STATUS_KEYS, **KEYS}.items():
+    for part, keys in {"status": STATUS_KEYS, **KEYS, "source": SOURCE_KEYS}.items():
         lines += [f"{part}:", *(f'  {key}: "{text}"' for key, text in keys.items())]
     return "\n".join(lines) + "\n"
 
