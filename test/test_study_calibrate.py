@@ -94,7 +94,7 @@ def test_the_same_seed_gives_the_same_bits_on_any_number_of_threads() -> None:
 
 def test_an_unseen_parameter_is_reported_as_such() -> None:
     scene = with_parameters(preset("paper"), {"contact.impact_speed_floor_m_s": 2e-3})
-    # a constant damping does not use the floor: the recording cannot say anything about it
+    # a constant damping does not use the floor, so the recording does not determine it
     unknowns = Space(
         tuple(parse_unknown(text, scene) for text in (RANGES[0], "contact.impact_speed_floor_m_s=1e-4:1e-2"))
     )

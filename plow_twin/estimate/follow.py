@@ -229,7 +229,7 @@ class Follower:
         return found
 
     def failure(self, status: int) -> str:
-        """Return the reason why the newest failed advance failed."""
+        """Return the reason of the newest failed advance."""
         return self._ensemble.first.failure(status)
 
     def like(self, scene: Scene) -> Follower:

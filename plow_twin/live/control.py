@@ -87,7 +87,7 @@ class Control:
             try:
                 self._socket.sendto(json.dumps({"success": done, "message": message}).encode(), client or b"")
             except OSError:
-                continue  # the page has gone, or does not read
+                continue  # the client has gone, or does not read
 
     def _answer(self, data: bytes) -> tuple[bool, str]:
         try:

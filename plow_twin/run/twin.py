@@ -381,7 +381,7 @@ class Twin:
         return depth
 
     def failure(self, status: int) -> str:
-        """Return the reason why the newest failed advance failed.
+        """Return the reason of the newest failed advance.
 
         Parameters
         ----------
