@@ -507,7 +507,7 @@ def test_with_sync_flushed_data_survive_a_loss_of_power(tmp_path: Path) -> None:
             else:
                 synced.append((rest[1], int(rest[0])))
                 flushes += index >= 0
-                before = index if flushes == 3 else before  # waited for by the flush after this one at the latest
+                before = index if flushes == 3 else before  # the next flush at the latest waits for it
             if flushes == 5:
                 process.kill()
     # a loss of power may leave only that

@@ -160,7 +160,7 @@ class _Replay:
         absent = FOLLOWED_TOPICS if header.follow != "full" else ()
         self.topics = {header.topic(name): name for name in PUBLICATION_TOPICS if name not in absent}
         self.next_sequence = 0
-        self.in_a_row = 0  # entries before that without a gap
+        self.in_a_row = 0  # number of entries without a gap up to the next one
         self.synced = False  # the session has the state of the live session
         self.outputs_synced = False  # and so are its windows between two messages
         self.outputs_whole = True  # no message of the current batch may be missing without a note

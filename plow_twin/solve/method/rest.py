@@ -20,7 +20,7 @@ from plow_twin.solve.method.equilibrium import held, stiffer_than, stiffness_at,
 from plow_twin.solve.method.small_harmonics import EVALUATIONS, stays_at_rest, without_harmonics
 from plow_twin.solve.state import OMEGA, ON, VX, VY
 
-#: Share of the tolerances that the motion left out may reach.
+#: Largest share of the tolerances for the omitted motion.
 _SHARE = 1e-3
 #: Factor over that distance by which a pair must be deeper, or farther away.
 _MARGIN = 10.0
