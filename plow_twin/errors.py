@@ -12,6 +12,8 @@ class PlowTwinError(Exception):
     """Base of every error that the package raises on purpose."""
 
 
+#: Longest value that is shown whole [characters].
+_LONGEST_SHOWN: Final = 500
 #: Largest number of problems in a message.
 _MOST_SHOWN: Final = 50
 
@@ -49,7 +51,10 @@ class Problem:
     expected: str
 
     def __str__(self) -> str:
-        return f"{self.key}: got {self.got!r}, expected {self.expected}"
+        got = repr(self.got)
+        if len(got) > _LONGEST_SHOWN:
+            got = f"{got[:_LONGEST_SHOWN]}... ({len(got)} characters)"
+        return f"{self.key}: got {got}, expected {self.expected}"
 
 
 class InputError(PlowTwinError, ValueError):

@@ -10,11 +10,16 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any, Final
 
+from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.duration import Infinite
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.exceptions import ParameterException
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import LivelinessPolicy, QoSCompatibility, QoSProfile, qos_check_compatible
+from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock
 
@@ -24,13 +29,21 @@ LOOK_S: Final = 0.2
 _UNNAMED: Final = "_NODE_NAME_UNKNOWN_"
 #: Period of the warning about a wrong time on `/clock` [s].
 _SAY_AGAIN_S: Final = 5.0
+#: Numbers of the types of parameters.
+_TYPES: Final = frozenset(kind.value for kind in Parameter.Type)
 
 
 class WithoutEvents(Node):
     """A node that asks for no events of the middleware, neither for its own topics nor for those that rclpy makes.
 
-    A time before 0 on `/clock`, with which rclpy would end the program, is ignored with a warning.
+    A time before 0 on `/clock` and parameters that rclpy cannot read, with which it would end the program, are refused.
     """
+
+    def create_service(self, srv_type: Any, srv_name: str, callback: Callable[..., Any], **options: Any) -> Service:
+        """As rclpy's."""
+        if srv_type in (SetParameters, SetParametersAtomically):
+            callback = partial(_set_parameters, callback)
+        return super().create_service(srv_type, srv_name, callback, **options)
 
     def create_publisher(self, *arguments: Any, **options: Any) -> Publisher:
         """As rclpy's."""
@@ -54,6 +67,23 @@ class WithoutEvents(Node):
             self.get_logger().error(text, throttle_duration_sec=_SAY_AGAIN_S)
         else:
             take(message)
+
+
+def _set_parameters(callback: Callable[..., Any], request: Any, response: Any) -> Any:
+    """Answer a request to set parameters; one that rclpy cannot read is refused as a whole."""
+    wrong = [f"{one.name}: got type {one.value.type}" for one in request.parameters if one.value.type not in _TYPES]
+    reason = f"{'; '.join(wrong)}; expected one of {min(_TYPES)} to {max(_TYPES)}"
+    if not wrong:
+        try:
+            return callback(request, response)
+        except (ValueError, TypeError, ParameterException) as error:
+            reason = str(error)
+    refused = SetParametersResult(successful=False, reason=reason)
+    if hasattr(response, "results"):
+        response.results = [refused] * len(request.parameters)
+    else:
+        response.result = refused
+    return response
 
 
 class Connections:

@@ -33,6 +33,18 @@ def descriptor(spec: Field[Any]) -> ParameterDescriptor:
     return message
 
 
+def _converted(parameter: Parameter) -> Parameter:
+    """Return a parameter with its value in the type of the table, where it can be converted.
+
+    An empty list stays as it came: without its type rclpy takes it for bytes, and then refuses it.
+    """
+    if parameter.name not in SPECS or parameter.type_ is Parameter.Type.NOT_SET:
+        return parameter
+    value = parameters.coerce(parameter.name, parameter.value)
+    is_converted = isinstance(value, float | tuple) and value != ()
+    return Parameter(parameter.name, value=value) if is_converted else parameter
+
+
 class ParameterServer:
     """Declare all parameters on a node and hold their current values in `settings`.
 
@@ -87,12 +99,7 @@ class ParameterServer:
         found = parameters.problems({parameter.name: parameter.value for parameter in asked})
         if found:
             self._node.get_logger().warning(str(parameters.ParameterError(found, "parameters refused")))
-        return [
-            Parameter(parameter.name, value=parameters.coerce(parameter.name, parameter.value))
-            if parameter.name in SPECS and parameter.type_ is not Parameter.Type.NOT_SET
-            else parameter
-            for parameter in asked
-        ]
+        return [_converted(parameter) for parameter in asked]
 
     def _check(self, asked: list[Parameter]) -> SetParametersResult:
         values = {parameter.name: parameter.value for parameter in asked}
