@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -145,10 +146,17 @@ def test_bands_are_ordered_start_narrow_and_repeat(drops) -> None:
     assert ensemble(flight, 30, members=7).shape == (7, 30, 3)
 
 
-@pytest.mark.parametrize("wrong", [np.zeros((3, 3)), np.zeros((8, 2)), np.full((8, 3), np.nan)])
-def test_bad_rows_of_a_flight_are_named(wrong: np.ndarray) -> None:
-    with pytest.raises(ArgumentError, match="first_flight"):
-        bands(wrong, 10)
+def test_bad_rows_of_a_flight_are_named(drops) -> None:
+    flight = drops.pose[0, : drops.flight_rows[0]]
+    wrong: list[Any] = [np.zeros((3, 3)), np.zeros((8, 2)), np.full((8, 3), np.nan), [], [["a", "b", "c"]] * 5]
+    # a whole drop that ends at rest, a place below the table, millimetres
+    wrong += [drops.pose[0], flight - [0.0, 1.0, 0.0], flight * [1e3, 1e3, 1.0]]
+    for rows in wrong:
+        with pytest.raises(ArgumentError, match="first_flight"):
+            bands(rows, 10)
+    for count in (0, 20_000, 50.5, "50", np.nan):
+        with pytest.raises(ArgumentError, match="n_rows"):
+            bands(flight, count)  # type: ignore[arg-type]
 
 
 def test_bad_numbers_of_an_impact_are_named() -> None:
@@ -159,8 +167,11 @@ def test_bad_numbers_of_an_impact_are_named() -> None:
     with pytest.raises(ArgumentError, match=r"before\[1\].*nan"):
         impact(np.array([[0.0] * 6, [0.0] * 5 + [np.nan]]))
     assert impact(np.zeros((0, 6))).shape == (0, 6)
-    with pytest.raises(ArgumentError, match="n_rows"):
-        bands(np.zeros((8, 3)), 0)
+    with pytest.raises(ArgumentError, match=r"before\[0\].*rates below"):
+        impact([[0.0, 0.0, 0.3, 1e200, -1e200, 1e200]])
+    for name, number in (("restitution", np.nan), ("stick_stiffness", -1.0), ("friction", np.inf)):
+        with pytest.raises(ArgumentError, match=f"contact.{name}"):
+            impact(np.ones((1, 6)), replace(ELLIPSE, **{name: number}))
 
 
 def test_marker_is_turned_as_the_angles_at_rest_show(drops) -> None:

@@ -26,6 +26,8 @@ _STIFFNESS: Final = 1e9
 #: Speed in m/s of approach at which restitutions are given: the middle of the measured speeds.
 USUAL_SPEED: Final = 2.5
 _LEAST, _LARGEST = 0.05, 0.98
+#: Bound: rate in m/s or rad/s that no measured body has.
+_FASTEST: Final = 1e4
 #: Gap in m at which a whole impact starts, and time in s in which it is over: 13 half periods of the contact.
 _GAP, _WHOLE = 1e-9, 40.0 / _STIFFNESS**0.5
 
@@ -114,6 +116,9 @@ def impact(before: ArrayLike, contact: EllipseContact = ELLIPSE) -> Array:
     states = _states(before)
     if contact.law not in LAWS:
         raise ArgumentError(f"contact.law: got {contact.law!r}, expected one of {', '.join(LAWS)}")
+    for name in ("exponent", "restitution", "fall", "fall_along", "friction", "slip_speed", "stick_stiffness"):
+        if not 0.0 <= getattr(contact, name) < np.inf:
+            raise ArgumentError(f"contact.{name}: got {getattr(contact, name)!r}, expected a finite number >= 0")
     along, up = _to_surface(states[:, 3], states[:, 4], contact.tilt)
     normal_arm, tangential_arm = contact_arms(states[:, 2] - contact.tilt)
     slip, speed = along - states[:, 5] * tangential_arm, -(up + states[:, 5] * normal_arm)
@@ -137,9 +142,12 @@ def _states(before: ArrayLike) -> Array:
         raise ArgumentError(f"before: {error}, expected finite numbers of shape (n, 6)") from None
     if states.ndim != 2 or states.shape[1] != 6:
         raise ArgumentError(f"before: got shape {states.shape}, expected finite numbers of shape (n, 6)")
-    if not np.isfinite(states).all():
-        row = int(np.flatnonzero(~np.isfinite(states).all(axis=1))[0])
-        raise ArgumentError(f"before[{row}]: got {states[row].tolist()}, expected finite numbers")
+    fit = np.isfinite(states).all(axis=1) & (np.abs(states[:, 3:]) < _FASTEST).all(axis=1)
+    if not fit.all():
+        row = int(np.flatnonzero(~fit)[0])
+        raise ArgumentError(
+            f"before[{row}]: got {states[row].tolist()}, expected finite numbers, rates below {_FASTEST:g}"
+        )
     return states
 
 

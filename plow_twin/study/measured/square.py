@@ -26,6 +26,8 @@ _TOUCHES: Final = 64
 _TURN_IN_A_ROW: Final = 0.1
 #: Fewest rows of a first flight, for its speeds.
 LEAST_ROWS: Final = 4
+#: Bound: most rows of bands, 4 s; a block rests after one. Speed in m/s that no drop has.
+_MOST_ROWS, _FASTEST = 1000, 100.0
 
 #: Fitted to drops with odd numbers.
 SQUARE: Final = np.array(
@@ -178,9 +180,12 @@ def fit_flight(first_flight: ArrayLike, block: NDArray[np.void] = SQUARE, scatte
     Raises
     ------
     ArgumentError
-        For fewer than four rows, or numbers that are not finite.
+        For fewer than four rows, numbers that are not finite, or no flight above the table.
     """
-    rows = np.array(first_flight, dtype=np.float64)
+    try:
+        rows = np.array(first_flight, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ArgumentError(f"first_flight: {error}, expected rows x, z, theta") from None
     if rows.ndim != 2 or rows.shape[1] != 3 or len(rows) < LEAST_ROWS or not np.isfinite(rows).all():
         raise ArgumentError(
             f"first_flight: got shape {rows.shape}, expected finite rows x, z, theta, at least {LEAST_ROWS} of them"
@@ -189,6 +194,12 @@ def fit_flight(first_flight: ArrayLike, block: NDArray[np.void] = SQUARE, scatte
     while len(rows) > LEAST_ROWS and _leaves_flight(rows):
         rows = rows[:-1]
     times = _row_times(rows, float(block["gravity"]))
+    fastest = float(np.abs(np.diff(rows[:, :2], axis=0)).max()) * RATE_HZ
+    if not (-times[0] < 2.0 * len(rows) * _DT and rows[:, 1].min() > 0.0 and fastest < _FASTEST):
+        raise ArgumentError(
+            f"first_flight: got {len(rows)} rows from z = {rows[0, 1]:.4g} to {rows[-1, 1]:.4g} m, at most "
+            f"{fastest:.4g} m/s, expected a flight above the table at {RATE_HZ:g} Hz, below {_FASTEST:g} m/s"
+        )
     state, covariance = np.zeros(6), np.zeros((3, 2, 2))
     noise = (scatter.place, scatter.place, scatter.angle)
     for j, drag in enumerate((block["drag"], block["drag"], block["spin_drag"])):
@@ -320,7 +331,7 @@ def bands(first_flight: ArrayLike, n_rows: int) -> Array:
     ArgumentError
         For fewer than four rows of flight, numbers that are not finite, or no requested row.
     """
-    if n_rows < 1:
-        raise ArgumentError(f"n_rows: got {n_rows!r}, expected at least 1")
+    if not isinstance(n_rows, int | np.integer) or not 1 <= n_rows <= _MOST_ROWS:
+        raise ArgumentError(f"n_rows: got {n_rows!r}, expected an integer from 1 to {_MOST_ROWS}")
     points: Array = np.quantile(ensemble(first_flight, n_rows), [0.05, 0.5, 0.95], axis=0).swapaxes(0, 1)
     return points
