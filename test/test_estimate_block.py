@@ -135,9 +135,18 @@ def test_command_estimates_a_drop(drops, tmp_path) -> None:
     t = np.arange(len(pose)) / 250.0
     (tmp_path / "scene.yaml").write_text(dump_scene(unknown_table(0.003)), encoding="utf-8")
     np.savetxt(tmp_path / "pose.csv", np.column_stack([t, pose]), delimiter=",", header="t,x,y,theta", comments="")
-    np.savetxt(tmp_path / "load.csv", [[0, 0, 0, 0], [0.8, 0, 0, 0]], delimiter=",", header="t,fx,fy,m", comments="")
-    done = run_command("estimate", str(tmp_path), "--json")
+    load = np.column_stack([t, np.zeros((len(t), 3))])
+    np.savetxt(tmp_path / "load.csv", load, delimiter=",", header="t,fx,fy,m", comments="")
+    out = tmp_path / "out"
+    more = ("--forces", "20", "--follow", "--follow-members", "20", "--out", str(out))
+    done = run_command("estimate", str(tmp_path), "--json", *more)
     assert done.returncode == 0, done.stderr
+    for name, count in (("forces.csv", 24), ("followed.csv", 30)):
+        names = (out / name).read_text(encoding="utf-8").splitlines()[0].split(",")
+        rows = np.loadtxt(out / name, delimiter=",", skiprows=1)
+        assert rows.shape[1] == 1 + count and np.isfinite(rows).all()
+        met = {column for column, values in zip(names, rows.T, strict=True) if "left" in column and values.any()}
+        assert met and all("bottom_left_bottom" in column for column in met)
     found = json.loads(done.stdout)
     assert found["vertical"]["state"] in ("estimated", "rough")
     assert abs(0.5 * (found["vertical"]["mean_m"] - SQUARE.clearance.vertical_m)) < 2e-3

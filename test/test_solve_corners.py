@@ -234,3 +234,15 @@ def test_twins_with_walls_and_with_corners_share_no_compiled_code(radius: float 
         ends = [twin.advance(0.3).q for twin in twins]
         np.testing.assert_allclose(ends[scenes.index(corners)], expected, atol=1e-9)
         assert twins[0].signature != twins[1].signature
+
+
+def test_strongly_damped_block_sinks_in_as_deep_as_its_weight_presses() -> None:
+    """Two corners of an overdamped contact creep to the static depth in implicit steps."""
+    stiffness, start = 1e4, -WALL + 0.5 * SIDE
+    damped = Contact("kelvin_voigt", stiffness=stiffness, damping=4e4)
+    scene = block(contact=damped, initial=Initial((0.0, start, 0.0), (0.0, 0.0, 0.0)), friction=None)
+    found = simulate(scene, t_end=60.0, output_dt=1.0)
+    # C x' = m g / 2 - K x for each corner, but for the first m / 2 C = 13 us
+    depth = 0.5 * MASS * 9.81 / stiffness * (1.0 - np.exp(-found.t * stiffness / 4e4))
+    np.testing.assert_allclose(start - found.q[:, 1], depth, atol=2e-7)
+    assert found.solver["steps"] < 2000
