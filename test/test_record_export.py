@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
+import itertools
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -15,6 +18,7 @@ import plow_twin
 from plow_twin.cli.app import run as cli
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record.messages import JointState
+from plow_twin.record.recording import Batched, Table
 from plow_twin.stream.journal import PartOfPose, Pose
 
 COUNT = 600
@@ -92,12 +96,24 @@ def test_an_export_is_the_recording_and_overwrites_nothing(
 
 
 def test_an_export_of_a_cut_recording_says_so_and_of_a_place_that_takes_nothing_too(
-    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(run.file.read_bytes()[: run.file.stat().st_size // 2])
     assert cli(["export", str(cut), "--to", "csv", "--out", str(tmp_path / "tables"), "--quiet"]) == 3
     assert "truncated" in capsys.readouterr().err and (tmp_path / "tables" / "excitation.csv").is_file()
+    read, calls = Table.arrow_batch, itertools.count()
+
+    def full(table: Table, part: Batched) -> Any:
+        if next(calls) > 2:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return read(table, part)
+
+    monkeypatch.setattr(Table, "arrow_batch", full)
+    assert cli(["export", str(run.folder), "--to", "parquet", "--out", str(tmp_path / "none"), "--quiet"]) == 1
+    assert "cannot be written: No space left" in capsys.readouterr().err
+    assert not list((tmp_path / "none").iterdir())  # nothing that looks like a whole table
+    monkeypatch.undo()
     (tmp_path / "file").write_text("")
     assert cli(["export", str(run.folder), "--to", "csv", "--out", str(tmp_path / "file" / "x"), "--quiet"]) == 1
     assert "cannot be written" in capsys.readouterr().err

@@ -256,6 +256,8 @@ def _exported_tables(recording: Recording, kind: str, out: Path) -> dict[str, in
     import pyarrow.csv
     import pyarrow.parquet
 
+    from plow_twin.record.durable import whole_file
+
     out.mkdir(parents=True, exist_ok=True)
     counts: dict[str, int] = {}
     writers: dict[str, Any] = {}
@@ -265,7 +267,8 @@ def _exported_tables(recording: Recording, kind: str, out: Path) -> dict[str, in
                 table = recording[name]
                 if name not in writers:
                     make = pyarrow.csv.CSVWriter if kind == "csv" else pyarrow.parquet.ParquetWriter
-                    writers[name] = opened.enter_context(make(str(out / f"{name}.{kind}"), table.arrow_schema()))
+                    stream = opened.enter_context(whole_file(out / f"{name}.{kind}"))
+                    writers[name] = opened.enter_context(make(stream, table.arrow_schema()))
                 writers[name].write_batch(table.arrow_batch(part))
                 counts[name] = counts.get(name, 0) + len(part.stamp_ns)
     return counts
