@@ -507,7 +507,7 @@ def settings(values: Mapping[str, Any]) -> Settings:
     if found:
         raise ParameterError(found)
     made = Settings(**{name: coerce(name, value) for name, value in values.items() if name in SPECS})
-    found = [*outside(made), *_unknown_services(made)]
+    found = [*outside(made), *_unknown_services(made), *_swapped_thresholds(made)]
     if bool(made.opcua_server) != bool(made.opcua_map):
         found.append(Problem("opcua_map", made.opcua_map, "a mapping to nodes, together with opcua_server"))
     if found:
@@ -525,6 +525,16 @@ def _unknown_services(given: Settings) -> list[Problem]:
     return (
         [Problem("services_off", ", ".join(unknown_names), f"some of {', '.join(SERVICES)}")] if unknown_names else []
     )
+
+
+def _swapped_thresholds(given: Settings) -> list[Problem]:
+    """Name the alarms whose error would come before their warning."""
+    alarms = {name: getattr(given, name) for name in SPECS if name.startswith("alarm_")}
+    return [
+        Problem(name, list(pair), "the warning's threshold, then the larger one of the error")
+        for name, pair in alarms.items()
+        if isinstance(pair, tuple) and pair[0] > pair[1] > 0.0
+    ]
 
 
 def model_changes(given: Settings) -> dict[str, float]:
