@@ -29,6 +29,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     end = BASE_NS + 400 * STEP_NS
     entries: list[Entry] = [paper_sample(index) for index in range(400)]
     entries += [Estimated(BASE_NS, end, 400, 40, (), (0.0,) * 6, ESTIMATE), Mark(end, "knocks </script> there")]
+    entries.append(Mark(end, "alarm: force"))
     entries += [paper_sample(index) for index in range(400, 900)]
     run = record_run(folder / "monday", entries, parameters={"alarm_force": [1e5, 1.5e5]})
     assert run_cli(["view", str(run.folder), "--html", str(folder / "monday.html"), "--quiet"]) == 0
@@ -46,6 +47,7 @@ def test_its_tables_are_those_of_the_run(made: tuple[Path, Path]) -> None:
         assert cells[1] == f"{peaks[-1, pair] - peaks[0, pair]:.0f}"
     assert "26.10 (25.90 to 26.30), estimated" in text and "not observable" in text
     assert "rests &lt;too&gt; long" in text and "knocks &lt;/script&gt; there" in text
+    assert "<td>alarm: force</td>" in text and "<td>mark: knocks" in text
     assert "No loss was counted." in text and page.stat().st_size < 10e6
 
 
