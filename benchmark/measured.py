@@ -24,9 +24,12 @@ from rigid_square import rigid_toss, two_at_once
 from scipy.optimize import minimize
 
 from plow_twin import Initial, simulate
+from plow_twin.estimate import tuning
+from plow_twin.estimate.block import impacts
 from plow_twin.estimate.estimate import estimate
 from plow_twin.estimate.measurements import Load, Poses
 from plow_twin.estimate.result import State
+from plow_twin.estimate.start import noise_level
 from plow_twin.model.contact_laws import LAWS
 from plow_twin.scene_file import load_scene
 from plow_twin.solve.rounded_block import toss_blocks
@@ -270,6 +273,16 @@ def sharp() -> np.ndarray:
     return block
 
 
+def without_drag() -> np.ndarray:
+    """Return a block of the outline of the preset `measured_square`, which has no drag and a constant friction."""
+    frame, block = load_scene("measured_square").frame, SQUARE.copy()
+    block["radius"] = frame.corner_radius_m
+    block["half"] = 0.5 * frame.width_m - float(block["radius"])
+    for name in ("table", "friction_fall", "drag", "spin_drag"):
+        block[name] = 0.0
+    return block
+
+
 #: Numbers of the block that are fitted with the marker; the stiffness and gravity are not.
 FITTED = (
     "half", "radius", "gyration", "table", "restitution", "restitution_fall", "friction", "friction_fall", "mass_power",
@@ -277,6 +290,11 @@ FITTED = (
 )  # fmt: skip
 
 
+#: Numbers of the preset `measured_square` that are fitted to motions.
+PRESET_FITTED = (
+    "gyration", "stiffness", "restitution", "restitution_fall", "mass_power", "friction", "tangential",
+    "tangential_damping", "gravity",
+)  # fmt: skip
 #: Largest difference of two first flights that are nearly the same: angle [rad], rates [m/s, m/s, rad/s].
 NEAR_TWINS = (0.05, 0.15, 0.15, 1.5)
 #: Two corners hit at once within this time in s.
@@ -343,26 +361,28 @@ class Square:
             found[name] = [round(1e3 * median, 1) for median in medians]
         return found
 
-    def fit(self, chosen: np.ndarray, rounds: int = 3) -> tuple[np.ndarray, Marker]:
+    def fit(
+        self, chosen: np.ndarray, start: np.ndarray, names: tuple[str, ...], rounds: int = 3
+    ) -> tuple[np.ndarray, Marker]:
         """Fit block and marker to the chosen drops: bounded distances over one bounce, and less those over two."""
 
         def numbers(x: np.ndarray) -> tuple[np.ndarray, Marker]:
-            block = SQUARE.copy()
-            for name, value in zip(FITTED, x[3:], strict=True):
+            block = start.copy()
+            for name, value in zip(names, x[3:], strict=True):
                 block[name] = value
             return block, Marker(float(x[0]), (float(x[1]), float(x[2])))
 
         def cost(x: np.ndarray) -> float:
             block, marker = numbers(x)
-            if min(block[name] for name in FITTED if name != "table") <= 0.0:
+            if min(block[name] for name in names if name != "table") <= 0.0:
                 return 9.0
             (one, angle), (two, _) = (self.errors(block, marker, chosen, bounces).T for bounces in (1, 2))
             distance = sum(share * (d / (1.0 + d / 0.02)).mean() for share, d in ((1.0, one), (0.3, two)))
             return float(1e3 * distance + 0.3 * np.minimum(angle, 1.0).mean())
 
         # angle and heights at rest give the marker to begin with
-        x = np.array([-0.0335, 3.4e-4, 5.2e-4, *(float(SQUARE[name]) for name in FITTED)])
-        step = np.array([0.005, 3e-4, 3e-4, *(0.12 * abs(float(SQUARE[name])) + 1e-4 for name in FITTED)])
+        x = np.array([-0.0335, 3.4e-4, 5.2e-4, *(float(start[name]) for name in names)])
+        step = np.array([0.005, 3e-4, 3e-4, *(0.12 * abs(float(start[name])) + 1e-4 for name in names)])
         for turn in range(rounds):
             options = dict(maxfev=900, adaptive=True, initial_simplex=np.vstack([x, x + np.diag(step / (1 + turn))]))
             x = minimize(cost, x, method="Nelder-Mead", options=options).x
@@ -405,16 +425,16 @@ class Square:
                 apart.append(float(np.hypot(*(one - other).T).mean()))
         return {"pairs": len(apart), "distance_mm": round(1e3 * float(np.median(apart)), 1)}
 
-    def held_out(self) -> dict[str, Any]:
+    def held_out(self, start: np.ndarray = SQUARE, names: tuple[str, ...] = FITTED) -> dict[str, Any]:
         """Fit to either half and return the errors on the other one over 1, 2, 3 bounces."""
         half = np.random.default_rng(1).permutation(len(self.usable)) % 2
         far: list[list[np.ndarray]] = [[], [], []]
         fitted = []
         for one in (0, 1):
-            block, marker = self.fit(np.flatnonzero(half != one))
+            block, marker = self.fit(np.flatnonzero(half != one), start, names)
             for bounces in (1, 2, 3):
                 far[bounces - 1].append(self.errors(block, marker, np.flatnonzero(half == one), bounces))
-            numbers = {name: round(float(block[name]), 6) for name in FITTED}
+            numbers = {name: round(float(block[name]), 6) for name in names}
             fitted.append({**numbers, "turn": round(marker.turn, 4), "lever": np.round(marker.lever, 6).tolist()})
         return {**medians([np.concatenate(one) for one in far]), "fitted": fitted}
 
@@ -502,6 +522,30 @@ def of_table(drops: Drops) -> dict[str, Any]:
     }
 
 
+def of_heights(drops: Drops) -> dict[str, Any]:
+    """Return how the table's height differs from drop to drop, by the heights at rest and of impacts."""
+    square, t = load_scene("measured_square"), np.arange(drops.pose.shape[1]) / RATE_HZ
+    nothing = Load(t[[0, -1]], np.zeros((2, 3)))
+    places, rests, hits = [], [], []
+    for pose in drops.pose:
+        motion = MARKER.state_of_block(np.concatenate([pose, np.zeros_like(pose)], axis=1))[:, :3] - [0.0, 1.0, 0.0]
+        end = motion[-12:]
+        found, _ = impacts(square, nothing, Poses(t, motion), noise_level(motion))
+        below = [one.deeper - one.distance for one in found if one.wall == "bottom" and one.gained < tuning.GAINED]
+        if len(below) and np.ptp(end[:, 1]) < 1e-3 and np.ptp(end[:, 2]) < 5e-3 and end[:, 1].mean() < -0.967:
+            places.append(end[:, 0].mean())
+            rests.append(end[:, 1].mean())
+            hits.append(np.median(below))
+    slope = np.polyfit(places, rests, 1)[0]
+    return {
+        "drops": len(rests),
+        "rest_deviation_mm": round(1e3 * float(np.std(rests)), 2),
+        "impact_deviation_mm": round(1e3 * float(np.std(hits)), 2),
+        "correlation": round(float(np.corrcoef(rests, hits)[0, 1]), 2),
+        "slope_mm_per_m": round(1e3 * float(slope), 1),
+    }
+
+
 def plot(results: dict[str, Any], drops: Drops) -> None:
     """Draw errors by law, a drop with its band, and coverage by bounce."""
     import matplotlib
@@ -575,10 +619,11 @@ def main() -> None:
         print({name: results[name] for name in results if name.startswith("square_")}, flush=True)
     if chosen.only in (None, "fit"):
         results["square_held_out"] = Square(drops).held_out()
-        print(results["square_held_out"], flush=True)
+        results["square_preset_held_out"] = Square(drops).held_out(without_drag(), PRESET_FITTED)
+        print(results["square_held_out"], results["square_preset_held_out"], flush=True)
     if chosen.only in (None, "table"):
-        results["table"] = of_table(drops)
-        print(results["table"], flush=True)
+        results["table"], results["heights"] = of_table(drops), of_heights(drops)
+        print(results["table"], results["heights"], flush=True)
     if chosen.only in (None, "ellipse"):
         results["ellipse"] = by_law(Impacts())
     RESULTS.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
