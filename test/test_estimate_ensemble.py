@@ -13,6 +13,7 @@ from plow_twin.estimate.answer import followed
 from plow_twin.estimate.forces import ForceEnsemble, ForcesError, draw_scenes, forces_of
 from plow_twin.estimate.measurements import Load
 from plow_twin.estimate.result import Interval, State
+from plow_twin.estimate.unknowns import CORRELATED
 
 
 def test_forces_have_intervals_that_hold_peaks_and_impulses() -> None:
@@ -57,7 +58,7 @@ def test_a_thinned_load_gives_the_same_forces(noise: float) -> None:
 
 def test_members_are_drawn_with_the_estimate_s_correlation() -> None:
     truth, result = known()[0]
-    matrix = np.eye(7)
+    matrix = np.eye(len(CORRELATED))
     matrix[0, 2] = matrix[2, 0] = -0.8
     drawn = replace(result, correlation=tuple(map(tuple, matrix.tolist())))
     scenes, gains = draw_scenes(truth.nominal, drawn, 2000, np.random.default_rng(1))

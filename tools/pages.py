@@ -1,4 +1,4 @@
-"""Write what comes from results or code, the tables of the pages and two files of `config`: `python tools/pages.py`.
+"""Write what comes from results or code, the tables of the pages and files of `config`: `python tools/pages.py`.
 
 A page marks the place of a table by `<!-- made: NAME -->` and `<!-- end -->`; the text between is replaced by what
 `TABLES[NAME]` returns.
@@ -19,6 +19,7 @@ import reference  # noqa: E402
 
 from plow_twin.live.diagnostics import keys_text  # noqa: E402
 from plow_twin.live.parameters import yaml_text  # noqa: E402
+from plow_twin.stream.topics import TOPICS  # noqa: E402
 
 PAGES = (
     ROOT / "README.md",
@@ -34,12 +35,22 @@ def renewed(text: str) -> str:
     return _BLOCK.sub(lambda block: f"{block[1]}\n{TABLES[block[2]]().strip()}\n\n{block[3]}", text)
 
 
+def with_topics(policy: str) -> str:
+    """Return the policy of SROS2 whose twin may publish the topics of the table."""
+    names = "".join(f"            <topic>{topic.name}</topic>\n" for topic in TOPICS)
+    first, last = '<topics publish="ALLOW">\n', "            <topic>markers</topic>"
+    begin = policy.index(first, policy.index('<enclave path="/plow_twin/twin">')) + len(first)
+    return policy[:begin] + names + policy[policy.index(last, begin) :]
+
+
 def main() -> None:
-    """Rewrite the pages, the file of parameters and that of the keys of diagnostics."""
+    """Rewrite the pages, the file of parameters, that of the keys of diagnostics, and the policy of SROS2."""
     for page in PAGES:
         page.write_text(renewed(page.read_text(encoding="utf-8")), encoding="utf-8")
     (ROOT / "config" / "twin.yaml").write_text(yaml_text(), encoding="utf-8")
     (ROOT / "config" / "diagnostics.yaml").write_text(keys_text(), encoding="utf-8")
+    policy = ROOT / "config" / "sros2" / "policy.xml"
+    policy.write_text(with_topics(policy.read_text(encoding="utf-8")), encoding="utf-8")
 
 
 if __name__ == "__main__":

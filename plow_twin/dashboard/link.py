@@ -14,7 +14,7 @@ _ROOM: Final = 1 << 18
 
 
 class Link:
-    """One end of the way; each message is a JSON object.
+    """One end of the link; each message is a JSON object.
 
     Parameters
     ----------

@@ -49,7 +49,7 @@ class ContactForces:
     def of(t: ArrayLike, force: ArrayLike) -> tuple[ContactForces, int]:
         """Return rows in order of time, and the number of rows left out.
 
-        Left out are rows without a finite stamp or any force, with a force beyond 1e12 N, or with a repeated stamp.
+        Rows are left out if their stamp is not finite or repeated, if they have no force, or a force beyond 1e12 N.
 
         Raises
         ------

@@ -73,7 +73,7 @@ class Graded:
 
     Attributes
     ----------
-    shared, covariance : ndarray, shape (11,), (11, 11)
+    shared, covariance : ndarray, shape (SIZE,), (SIZE, SIZE)
         The shared unknowns.
     differs : dict of str to (float, float, float)
         Of each further quantity the probability that it differs from the scene, and the difference: mean and

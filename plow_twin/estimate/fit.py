@@ -75,7 +75,7 @@ class Window:
 class Point:
     """One set of unknowns with its runs.
 
-    shared, states : (11,), (s, 6)
+    shared, states : (SIZE,), (s, 6)
     swing : (n,) swing of each pose, -1 outside of all swings
     residual : (n, 3) measured minus predicted; NaN where not measured
     rate : (n, 3) predicted rates
@@ -129,13 +129,13 @@ class Piece:
 class Fit:
     """The best point, its covariance and the residuals.
 
-    covariance : (11, 11) of the shared unknowns
+    covariance : (SIZE, SIZE) of the shared unknowns
     factor : the factorised normal equations of all unknowns
     noise : (3,) standard deviation of the measurements
     variance : (n, 3) variance of each measurement as weighted
     jitter : (n, 3) variance that cannot be predicted
     linear : its Jacobians
-    left : (11 + 6 s,) the remaining step, linearised; zero at an optimum
+    left : (SIZE + 6 s,) the remaining step, linearised; zero at an optimum
     gain_left : reduction of the cost by that step
     """
 
@@ -166,12 +166,12 @@ class Fit:
 
     @property
     def shared(self) -> Array:
-        """The shared unknowns, shape (11,)."""
+        """The shared unknowns, shape (SIZE,)."""
         return self.point.shared
 
     @property
     def deviation(self) -> Array:
-        """Standard deviations of the shared unknowns, shape (11,)."""
+        """Standard deviations of the shared unknowns, shape (SIZE,)."""
         deviation: Array = np.sqrt(np.diag(self.covariance))
         return deviation
 

@@ -37,7 +37,7 @@ _STATE_STEPS = np.array([1e-5, 1e-5, 5e-5, 2e-4, 2e-4, 1.4e-3])
 class JointFit:
     """Result of the joint fit of poses and contact forces.
 
-    shared, covariance : (11,), (11, 11); None where the forces were not used
+    shared, covariance : (SIZE,), (SIZE, SIZE); None where the forces were not used
     model, sensor : reasons against the model and against the sensor
     """
 
@@ -50,7 +50,7 @@ class JointFit:
 
 @dataclass(frozen=True, eq=False)
 class _Place:
-    """A set of unknowns: shared (11,), states (s, 6), delay of the forces in s, logarithms of the gains (k,)."""
+    """A set of unknowns: shared (SIZE,), states (s, 6), delay of the forces in s, logarithms of the gains (k,)."""
 
     shared: Array
     states: Array

@@ -17,7 +17,7 @@ from plow_twin.errors import PlowTwinError
 from plow_twin.estimate import tuning
 from plow_twin.estimate.measurements import Load
 from plow_twin.estimate.result import NORMAL_P95, Estimate, Interval, State
-from plow_twin.estimate.unknowns import contact_with
+from plow_twin.estimate.unknowns import CORRELATED, DAMPING, GAIN, SOFTNESS, contact_with
 from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
 from plow_twin.model.scene import Clearance, Scene
 from plow_twin.run.batch import TwinBatch
@@ -167,22 +167,22 @@ def forces_of(
 
 def draw_scenes(scene: Scene, found: Estimate, members: int, rng: np.random.Generator) -> tuple[list[Scene], Array]:
     """Return scenes drawn from an estimate, and the gains of their loads, shape (m, 3)."""
-    white = rng.standard_normal((members, 7))
+    white = rng.standard_normal((members, len(CORRELATED)))
     if found.correlation is not None:
-        white = white @ np.linalg.cholesky(np.array(found.correlation) + 1e-9 * np.eye(7)).T
+        white = white @ np.linalg.cholesky(np.array(found.correlation) + 1e-9 * np.eye(len(CORRELATED))).T
     horizontal, vertical = (
         np.maximum(_normal(value, white[:, index]), _LEAST_SHARE * value.mean)
         for index, value in enumerate(found.apparent or (found.horizontal, found.vertical))
     )
-    stiffness = np.exp(_normal(_logarithm(found.stiffness), -white[:, 2]))
+    stiffness = np.exp(_normal(_logarithm(found.stiffness), -white[:, SOFTNESS]))
     restitution = scene.contact.restitution is not None
     damping = np.zeros(members)
     if found.damping is not None:
         value = found.damping if restitution else _logarithm(found.damping)
-        damping = _normal(value, white[:, 3])
+        damping = _normal(value, white[:, DAMPING])
         damping = np.clip(damping, 1e-3, 0.999) if restitution else np.exp(damping)
     gains = [
-        np.ones(members) if value is None else _normal(value, white[:, 4 + index])
+        np.ones(members) if value is None else _normal(value, white[:, GAIN.start + index])
         for index, value in enumerate((found.gain_fx, found.gain_fy, found.gain_m))
     ]
     scenes = []

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from plow_twin.estimate import tuning
 from plow_twin.estimate.forces import FEWEST, draw_scenes, quantiles
 from plow_twin.estimate.result import Estimate, Interval, State
+from plow_twin.estimate.unknowns import QUANTITIES
 from plow_twin.model.geometry import penetration_rows, states_of
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import DOF_NAMES, Clearance, Gravity, Scene, fastest_travel
@@ -434,19 +435,10 @@ def middle_of(scene: Scene, known: Estimate) -> tuple[Scene, Array]:
     if known.horizontal_state is State.PRIOR:
         return replace(scene, loads=(), wear=None), np.ones(3)
 
-    def point(value: Interval) -> Interval:
-        return Interval(value.mean, value.mean, value.mean)
+    def point(value: Interval | None) -> Interval | None:
+        return None if value is None else Interval(value.mean, value.mean, value.mean)
 
-    middle = replace(
-        known,
-        apparent=None,
-        horizontal=point(known.horizontal),
-        vertical=point(known.vertical),
-        stiffness=point(known.stiffness),
-        damping=known.damping and point(known.damping),
-        gain_fx=known.gain_fx and point(known.gain_fx),
-        gain_fy=known.gain_fy and point(known.gain_fy),
-        gain_m=known.gain_m and point(known.gain_m),
-    )
+    points: dict[str, Any] = {one.name: point(getattr(known, one.name)) for one in QUANTITIES}
+    middle = replace(known, apparent=None, **points)
     scenes, gain = draw_scenes(scene, middle, 1, np.random.default_rng(0))
     return scenes[0], gain[0]

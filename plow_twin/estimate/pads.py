@@ -79,7 +79,7 @@ def turned(problem: Problem, found: Fit) -> tuple[Problem, Fit] | None:
 
 
 def of_turns(problem: Problem, found: Fit) -> Array:
-    """Return the covariance of the shared unknowns due to walls that may be turned, shape (11, 11).
+    """Return the covariance of the shared unknowns due to walls that may be turned, shape (SIZE, SIZE).
 
     If only one of two facing pads is touched, the distance of the others is unknown.
     """

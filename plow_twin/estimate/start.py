@@ -133,7 +133,7 @@ def noise_level(q: Array) -> Array:
 
 
 def first_vectors(problem: Problem, most: int) -> list[Array]:
-    """Return the most promising starts of the shared unknowns, shape (11,) each, best first.
+    """Return the most promising starts of the shared unknowns, shape (SIZE,) each, best first.
 
     For each of several stiffnesses and dampings the clearances are set so that the simulated range of motion is the
     measured one, and the delay so that the motions agree best.

@@ -89,7 +89,7 @@ DELAY: Final = _place("delay")
 SIZE: Final = len(QUANTITIES)
 #: Places of the quantities that move the head.
 MOVING: Final = tuple(place for place, quantity in enumerate(QUANTITIES) if quantity.step is not None)
-#: Standard deviations of the displacements that probe predictability, shape (11,).
+#: Standard deviations of the displacements that probe predictability, shape (SIZE,).
 PROBES: Final = np.array([quantity.probe for quantity in QUANTITIES])
 #: Names in the published correlation; softness is the penetration under a force.
 CORRELATED: Final = tuple("softness" if place == SOFTNESS else QUANTITIES[place].name for place in MOVING)
@@ -122,7 +122,7 @@ class Unknowns:
     ----------
     scene : Scene
         The nominal scene.
-    deviation : ndarray, shape (11,)
+    deviation : ndarray, shape (SIZE,)
         Standard deviations of the prior about it.
     noise : tuple of 3 float
         Smallest noise of the sensor that is believed: x, y [m], theta [rad].
@@ -158,7 +158,7 @@ class Unknowns:
         return bool(contact.damping) or (contact.restitution is not None and 0.0 < contact.restitution < 1.0)
 
     def nominal(self) -> Array:
-        """Return the vector of the nominal scene, shape (11,)."""
+        """Return the vector of the nominal scene, shape (SIZE,)."""
         contact, clearance = self.scene.contact, self.scene.clearance
         vector = np.zeros(SIZE)
         vector[[GX, GY]] = clearance.horizontal_m, clearance.vertical_m
@@ -170,7 +170,7 @@ class Unknowns:
         return vector
 
     def deviations(self) -> Array:
-        """Return the prior's standard deviations, shape (11,); the damping of a law without it is fixed."""
+        """Return the prior's standard deviations, shape (SIZE,); the damping of a law without it is fixed."""
         deviations = self.deviation.copy()
         if not self.damped:
             deviations[DAMPING] = 1e-6

@@ -291,7 +291,7 @@ def _changes(problem: Problem, fit: Fit, columns: NDArray[np.intp]) -> Iterator[
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Information and score of the shared unknowns in one swing, its starting state eliminated: (11, 11), (11,)."""
+    """Information (SIZE, SIZE) and score (SIZE,) of the shared unknowns in a swing, its starting state eliminated."""
 
     normal: Array
     score: Array
@@ -311,7 +311,7 @@ def swing_blocks(problem: Problem, fit: Fit) -> list[Block]:
 
 
 def sandwich(problem: Problem, fit: Fit, precision: Array) -> Array:
-    """Return the covariance of the shared unknowns that the scatter of the swings' scores gives, shape (11, 11).
+    """Return the covariance of the shared unknowns that the scatter of the swings' scores gives, shape (SIZE, SIZE).
 
     Reference: White, Econometrica 50 (1982) 1: maximum likelihood of misspecified models.
     """

@@ -85,6 +85,8 @@ class Publishing:
         Receives the sent messages, if the run is recorded.
     on_alarm
         Receives a text when an alarm is latched.
+    catch_up
+        Computes a publication's intervals after its forces have been sent, where intervals come later.
     """
 
     def __init__(
@@ -94,6 +96,7 @@ class Publishing:
         alarms: Alarms,
         recording: Recording | None,
         on_alarm: Callable[[str], object],
+        catch_up: Callable[[], object] | None = None,
     ) -> None:
         self._front, self.alarms, self.recording, self._on_alarm = front, alarms, recording, on_alarm
         self._head = settings.hardware_id
@@ -114,8 +117,7 @@ class Publishing:
         #: stamp of the sample of a series whose alarms are being reported [ns]
         self.series_ns: int | None = None
         self._newest: Rows | None = None
-        #: computes a publication's intervals after its forces have been sent, where intervals come later
-        self.catch_up: Callable[[], object] | None = None
+        self._catch_up = catch_up
         #: receives each publication, if there is an observer
         self.watch: Callable[[Published], object] | None = None
 
@@ -153,8 +155,8 @@ class Publishing:
         if self.received_ns:
             self.latency.add((time.monotonic_ns() - self.received_ns) * 1e-9)
         yield from sent[1:]
-        if self.catch_up is not None and self._messages is not None:
-            self.catch_up()
+        if self._catch_up is not None and self._messages is not None:
+            self._catch_up()
             intervals = self._messages.intervals(published)
             yield from intervals
             sent += intervals

@@ -120,13 +120,17 @@ class Runtime:
                 made.callback(self.recording.close)
             self.estimation = self._estimate()
             made.pop_all()
-        self.publishing = Publishing(front, settings, self.alarms, self.recording, self.mark)
         session = Session(
             prepared.twin,
             on_entry=self._journal(),
             rollback_span_s=settings.rollback_span,
             wear_depth=depth,
         )
+        catch_up = None
+        if session.following is not None:
+            session.following.defers = front.sends_motion
+            catch_up = session.catch_up
+        self.publishing = Publishing(front, settings, self.alarms, self.recording, self.mark, catch_up)
         self.inputs = Inputs(
             front,
             self.source,
@@ -139,9 +143,6 @@ class Runtime:
             limits=limits(settings, self.scene),
         )
         every_sample = settings.publish_mode == "on_sample"
-        if session.following is not None:
-            session.following.defers = front.sends_motion
-            self.publishing.catch_up = session.catch_up
         self.driver = Driver(session, self.inputs.intake, policy(settings), every_sample=every_sample)
         self._set_limits(settings)
 

@@ -73,7 +73,7 @@ def live_estimates(reader: RunReader) -> Iterator[LiveEstimate]:
 
 
 def left_by(reader: RunReader) -> tuple[Scene, Estimated | None]:
-    """Return the scene at the end of a run, with its wear and changed numbers, and the newest estimate of its pads."""
+    """Return the scene at the end of a run (its wear, its changed numbers) and the newest estimate of the pads."""
     scene, newest = reader.header.scene(reader.path), None
     depth, changes = None, dict[str, float]()
     for batch in reader.batches(outputs=False):

@@ -12,15 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.errors import RecordingError
-from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.model.scene import Scene
 from plow_twin.record.entries import Batch
 from plow_twin.record.header import RunHeader
-from plow_twin.record.outputs import publication_templates
+from plow_twin.record.outputs import REPLAYED, publication_templates
 from plow_twin.record.reader import FileStatus, RunReader
 from plow_twin.record.rows import Rows, rows_by_topic
 from plow_twin.stream.journal import PartOfPose, Pose, whole_pose
-from plow_twin.stream.outputs import CLEARANCE_NAMES, PAD_NAMES
+from plow_twin.stream.topics import JOINT_STATE, Topic
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -30,21 +29,25 @@ Array = NDArray[np.float64]
 Indexes = NDArray[np.int64]
 
 _POSE: Final = ("x", "y", "theta")
+#: Names of quantities that the record calls otherwise.
+_NAMES: Final = {"makes": "touches"}
 
 
-def _by_pair(*quantities: str) -> tuple[str, ...]:
-    return tuple(f"{pair}/{quantity}" for quantity in quantities for pair in PAIR_NAMES)
+def _columns_of(topic: Topic) -> tuple[str, ...]:
+    """Return the columns of the table of a topic: its names, `<name>/<quantity>` where it has several for each."""
+    if topic.type != JOINT_STATE:
+        return *_POSE, "velocity_x", "velocity_y", "omega"
+    if len(topic.columns) == 1:
+        return topic.names
+    quantities = (parts[0][0] for parts in topic.columns.values())
+    return tuple(f"{name}/{_NAMES.get(quantity, quantity)}" for quantity in quantities for name in topic.names)
 
 
 #: Columns of each table. The first two hold inputs of the twin, the others its outputs.
 COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
     "excitation": ("fx", "fy", "m"),
     "head_pose": _POSE,
-    "contact_forces": _by_pair("penetration", "rate", "force"),
-    "contact_peaks": _by_pair("touches", "impulse", "peak"),
-    "head_state": (*_POSE, "velocity_x", "velocity_y", "omega"),
-    "clearance": CLEARANCE_NAMES,
-    "wear_rate": PAD_NAMES,
+    **{topic.name: _columns_of(topic) for topic in REPLAYED},
 }
 
 

@@ -390,7 +390,7 @@ class Session:
         taken: NDArray[np.int64] = NONE,
         digest_after: NDArray[np.int64] = NONE,
     ) -> Applied:
-        """Advance to samples; every sample, live or replayed, comes here. Nothing is emitted.
+        """Advance to samples of a journal. Nothing is emitted.
 
         Parameters
         ----------

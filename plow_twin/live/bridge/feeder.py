@@ -24,7 +24,7 @@ from plow_twin.stream.intake import Intake, Verdict
 
 #: A larger fall or rise of the numbers is believed if the next number continues it: the sender has restarted.
 _RESTART = 1000
-#: Most samples lost between two messages: a day at 10 kHz.
+#: Largest number of samples lost between two messages: a day at 10 kHz.
 _MOST_LOST = 10**9
 #: A 0 or 1 after at least this many messages is a restart, after fewer a late message.
 _FIRST = 10

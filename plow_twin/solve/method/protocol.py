@@ -8,8 +8,9 @@
 2. It returns True when it has laid out the step, False to leave it to the next method. The last method, the Taylor
    series, returns False only where the motion is not finite.
 3. With True it has written
-   - the series of state and penetration to `w.series`, `w.penetration`, and while `penetrating` those of rate and force
-     to `w.rate`, `w.force`, up to `state.order`, or else the numbers that `dense_output.evaluate` needs instead;
+   - up to `state.order` the series of state and penetration to `w.series`, `w.penetration`, and, while `penetrating`,
+     those of rate and force to `w.rate`, `w.force`; a method without series writes the numbers that
+     `dense_output.evaluate` needs;
    - the map of the series' variable sigma to time to `state.alpha`, `state.beta`;
    - to `state.sigma_end` the sigma up to which all of them meet the tolerance;
    - to `state.ends_at_stop` 1 where the step covers the whole of `span`, otherwise 0;
