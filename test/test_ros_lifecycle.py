@@ -177,6 +177,7 @@ def test_a_request_beside_a_cleanup_is_answered_and_the_node_lives(tmp_path: Pat
 
 def test_all_bad_parameters_are_named_at_once(tmp_path: Path) -> None:
     given = ["excitation_source:=drum", "tolerance:=.nan", "jump_back:=-3", "input_depth:=5.5", "autostart:=1"]
+    given += [r'frame_id:="a\x1b[2J"', f"child_frame_id:={'h' * 5000}"]
     settings = [word for item in given for word in ("-p", item)]
     twin = Process("plow_twin.ros.main", ["--ros-args", *settings], tmp_path / "twin.log")
     assert twin.wait() == 2
@@ -188,8 +189,11 @@ def test_all_bad_parameters_are_named_at_once(tmp_path: Path) -> None:
         ("jump_back", "-3"),
         ("input_depth", "5.5"),
         ("autostart", "1"),
+        ("frame_id", r"'a\x1b[2J'"),
+        ("child_frame_id", "'hhh"),
     ):
-        assert f"{name}: got {got}, expected " in said
+        assert f"{name}: got {got}" in said
+    assert said.count("expected one line of at most 4096 characters") == 2 and len(said) < 4000
     assert "expected a number from 0 to 3600 [s]" in said
     assert "Traceback" not in said
 

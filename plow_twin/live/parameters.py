@@ -423,6 +423,10 @@ MODEL: Final[Mapping[str, str]] = {
 SPECS: Final[Mapping[str, Field[Any]]] = {spec.name: spec for spec in fields(Settings)}
 #: A number that YAML 1.1, in ROS launch files, reads as a text: its mantissa has no point.
 _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+#: Longest text [characters]: that of a path.
+_LONGEST: Final = 4096
+#: No control character, which a terminal would obey.
+_ONE_LINE: Final = r"^[^\x00-\x1f\x7f-\x9f]*\Z"
 #: Declared by rclpy itself.
 _FOREIGN: Final = ("use_sim_time", "start_type_description_service")
 
@@ -459,7 +463,7 @@ def expected(spec: Field[Any]) -> str:
         return _range(f"{len(spec.default)} numbers", spec)
     if "unit" in spec.metadata:
         return _range("an integer" if isinstance(spec.default, int) else "a number", spec)
-    return "true or false" if isinstance(spec.default, bool) else "a text"
+    return "true or false" if isinstance(spec.default, bool) else f"one line of at most {_LONGEST} characters"
 
 
 def _range(kind: str, spec: Field[Any]) -> str:
@@ -486,7 +490,9 @@ def _property(spec: Field[Any]) -> dict[str, Any]:
     if "choices" in spec.metadata:
         return {"enum": list(spec.metadata["choices"]), **words}
     if "unit" not in spec.metadata:
-        return {"type": "boolean" if isinstance(spec.default, bool) else "string", **words}
+        if isinstance(spec.default, bool):
+            return {"type": "boolean", **words}
+        return {"type": "string", "maxLength": _LONGEST, "pattern": _ONE_LINE, **words}
     bounds = {"minimum": spec.metadata["low"], "maximum": spec.metadata["high"]}
     if isinstance(spec.default, tuple):
         count = len(spec.default)
