@@ -69,6 +69,8 @@ def test_walls_that_are_never_met_are_not_observable(drops) -> None:
         "clearance.horizontal_m": replace(width, deviation=2e-3),
     }
     found = of_drop(drops, 0, scene=replace(scene, marks={**scene.marks, **stated}))
+    # no wall tells a bias from a clearance alone
+    assert found.bias_x is None and found.bias_y is None and found.bias_theta is not None
     assert found.horizontal_state is State.NOT_OBSERVABLE
     assert found.horizontal.mean == SQUARE.clearance.horizontal_m
     # the deviations that the scene states

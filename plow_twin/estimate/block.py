@@ -87,8 +87,8 @@ class Impact:
 def estimate_block(scene: Scene, load: Load, poses: Poses, known: Estimate) -> Estimate:
     """Estimate the clearances around a block from the places of its impacts.
 
-    Where an axis has impacts on one wall only, the poses count as measured from the middle of the axis. A clearance
-    whose deviation exceeds half of the prior's is not observable; above 1 mm it is rough.
+    Where an axis has impacts on one wall only, the poses count as measured from its middle, and its bias is None. A
+    clearance whose deviation exceeds half of the prior's is not observable; above 1 mm it is rough.
 
     Parameters
     ----------
@@ -115,6 +115,7 @@ def estimate_block(scene: Scene, load: Load, poses: Poses, known: Estimate) -> E
     met, reasons = _on_walls(scene, [one for one in found if one.gained < tuning.GAINED], known)
     value, deviation = _solve(scene, met, known, level)
     clearances, states = [], []
+    bias: list[Interval | None] = [Interval.normal(*pair) for pair in zip(value[_BIAS], deviation[_BIAS], strict=True)]
     for axis, (name, before) in enumerate((("horizontal", known.horizontal), ("vertical", known.vertical))):
         count = {wall: sum(one.wall == wall for one in met) for wall, (its, _) in WALLS.items() if its == axis}
         share = float(deviation[axis]) / max(before.deviation, 1e-300)
@@ -123,6 +124,8 @@ def estimate_block(scene: Scene, load: Load, poses: Poses, known: Estimate) -> E
         fine = float(deviation[axis]) <= tuning.OBSERVED
         states.append((State.ESTIMATED if fine else State.ROUGH) if observed else unseen)
         counts = ", ".join(f"{number} impacts on the {wall} wall" for wall, number in count.items())
+        if not all(count.values()):
+            bias[axis] = None
         if not observed:
             most = f"{tuning.OBSERVED_SHARE:.0%}"
             reasons.append(f"{name}: {counts} leave {share:.0%} of the prior's deviation, expected at most {most}")
@@ -131,7 +134,6 @@ def estimate_block(scene: Scene, load: Load, poses: Poses, known: Estimate) -> E
         if observed and not fine:
             got = f"a deviation of {1e3 * float(deviation[axis]):.3g} mm, expected at most {1e3 * tuning.OBSERVED:g} mm"
             reasons.append(f"{name}: rough, {counts} leave {got}")
-    bias = [Interval.normal(*pair) for pair in zip(value[_BIAS], deviation[_BIAS], strict=True)]
     restitution = {"restitution": float(np.median([one.restitution for one in met]))} if met else {}
     return replace(
         known,
