@@ -31,7 +31,7 @@ with warnings.catch_warnings():
 
 ROOT = Path(__file__).resolve().parent.parent
 #: Long enough for the solver's first compilation on a slow machine [s].
-START_S = 100.0
+START_S = 200.0
 #: Long enough for discovery on a machine that does other work [s].
 WAIT_S = 60.0
 #: Twice the longest time of a stop: three processes share two cores [s].
