@@ -221,6 +221,22 @@ def test_one_group_and_a_run_without_outputs_are_refused(
     bare = record_run(tmp_path / "bare", [Parameter("hold", "hold"), *map(paper_sample, range(99))], frame_every=10**9)
     assert cli(["compare", str(runs[0].folder), str(bare.folder), "--workers", "1"]) == 1
     assert "bare: got no contact_peaks" in capsys.readouterr().err
+    assert cli(["compare", str(bare.folder), "--workers", "1"]) == 1
+    assert "got 0 groups of windows, expected two or more" in capsys.readouterr().err
+
+
+def test_stray_files_beside_runs_are_named_and_the_runs_compared(
+    runs: tuple[Run, Run], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for run in runs:
+        shutil.copytree(run.folder, tmp_path / run.folder.name)
+    (tmp_path / "load.csv").write_text("t,fx,fy,m\n")
+    (tmp_path / "cut.mcap").write_bytes(next(runs[0].folder.glob("*.mcap")).read_bytes()[:20])
+    assert cli(["compare", str(tmp_path), "--window", "0.5", "--workers", "1", "--json"]) == 3
+    printed = capsys.readouterr()
+    assert list(json.loads(printed.out)["groups"]) == ["monday", "tuesday"]
+    for said in (f"{tmp_path / 'load.csv'}: left out", f"left out: {tmp_path / 'cut.mcap'}"):
+        assert said in printed.err
 
 
 def test_the_same_run_under_two_paths_counts_once(

@@ -215,10 +215,26 @@ def test_no_recording_of_a_folder_is_left_out_unsaid(tmp_path: Path, capsys: pyt
     shutil.copytree(tmp_path / "good", inner := tmp_path / "good" / "inner")
     assert left_out(tmp_path) == [tmp_path / "empty", inner]
     shutil.copy(tmp_path / "good" / "good_0.mcap", tmp_path / "stray.mcap")
-    assert left_out(tmp_path) == [tmp_path / "good"]
-    assert cli(["analyse", str(tmp_path), "--json", "--quiet", "--out", str(out)]) == 0
-    assert json.loads(capsys.readouterr().out)["left_out"] == [str(tmp_path / "good")]
-    assert str(tmp_path / "good") in (out / "report.html").read_text()
+    (tmp_path / "load.csv").write_text("t,fx,fy,m\n")
+    shutil.rmtree(tmp_path / "gone")
+    strays = [tmp_path / "empty", tmp_path / "load.csv", inner]
+    assert expand([tmp_path]) == [tmp_path / "good", tmp_path / "stray.mcap"] and left_out(tmp_path) == strays
+    assert cli(["analyse", str(tmp_path), "--json", "--quiet"]) == 0
+    printed = capsys.readouterr()
+    assert json.loads(printed.out)["left_out"] == list(map(str, strays))
+    assert "stray.mcap: left out: the same run as" in printed.err
+    assert cli(["analyse", str(tmp_path / "good"), "--json", "--quiet", "--out", str(out)]) == 0
+    assert json.loads(capsys.readouterr().out)["left_out"] == [str(inner)]
+    assert str(inner) in (out / "report.html").read_text()
+
+
+def test_tables_with_their_analysis_beside_them_stay_one_recording(tmp_path: Path) -> None:
+    (tmp_path / "load.csv").write_text("t,fx,fy,m\n")
+    record_run(tmp_path / "run", map(paper_sample, range(10)))
+    assert expand([tmp_path]) == [tmp_path / "run"]
+    assert expand([tmp_path], [(tmp_path / "run").resolve()]) == [tmp_path]
+    (tmp_path / "analysis.json").write_text("{}")
+    assert expand([tmp_path]) == [tmp_path] and left_out(tmp_path) == [tmp_path / "run"]
 
 
 def test_a_run_that_was_killed_before_its_header_is_repeated(runs: Path, tmp_path: Path) -> None:

@@ -73,7 +73,7 @@ def analyse(
         if len(recordings) != 1:
             raise click.UsageError(f"--watch: got {len(recordings)} recordings, expected one")
         return _watched(Task(recordings[0], scene_file, mapping, further, out, units=units), watch, as_json, quiet)
-    found, left = _found(recordings, out)
+    found, left = found_recordings(recordings, out)
     many = len(found) > 1 or found != list(recordings)
     for option, given in (("--dask", dask), ("--workers", workers)):
         if given is not None and not many:
@@ -101,7 +101,7 @@ def analyse(
     return FAILED if failed else DONE_WITH_LOSS if lossy else DONE
 
 
-def _found(recordings: Sequence[Path], out: Path | None) -> tuple[list[Path], tuple[Path, ...]]:
+def found_recordings(recordings: Sequence[Path], out: Path | None = None) -> tuple[list[Path], tuple[Path, ...]]:
     """Return the recordings at paths and in folders; name the items in folders that are not recordings."""
     from plow_twin.study.analysis.analyse import counted_once, expand, left_out
 
@@ -110,10 +110,11 @@ def _found(recordings: Sequence[Path], out: Path | None) -> tuple[list[Path], tu
             raise click.BadParameter(f"{path}: does not exist", param_hint="RUN...")
     # results of an earlier analysis are not named
     results_before = () if out is None else (out.resolve(), (out / "run").resolve())
-    left = {item: path for path in recordings for item in left_out(path) if item.resolve() not in results_before}
+    left = {item: path for path in recordings for item in left_out(path, results_before)}
+    left = {item: path for item, path in left.items() if item.resolve() not in results_before}
     for item, path in left.items():
         say_error(f"plow-twin: {item}: left out: no recording of {path}")
-    found, repeated = counted_once(expand(recordings))
+    found, repeated = counted_once(expand(recordings, results_before))
     for sentence in repeated:
         say_error(f"plow-twin: {sentence}")
     return found, tuple(left)

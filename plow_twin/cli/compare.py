@@ -55,20 +55,15 @@ def compare(
     quiet: bool,
 ) -> int:
     """Compare runs, or folders of runs, with the first: peaks, impacts, contact, impulse, dissipation, wear."""
-    from plow_twin.study.analysis.analyse import counted_once, expand
+    from plow_twin.cli.analyse import found_recordings
     from plow_twin.study.analysis.many import run_many
     from plow_twin.study.analysis.task import names_apart
     from plow_twin.study.comparison.change import FEWEST
     from plow_twin.study.comparison.compare import WindowsTask
     from plow_twin.study.comparison.compare import compare as compared
 
-    for path in recordings:
-        if not path.exists():
-            raise click.BadParameter(f"{path}: does not exist", param_hint="RUN...")
     label = _label(by, shifts, zone)
-    found, repeated = counted_once(expand(recordings))
-    for sentence in repeated:
-        say_error(f"plow-twin: {sentence}")
+    found, _ = found_recordings(recordings)
     tasks = [WindowsTask(path, window) for path in found]
     with progress("reading", quiet or as_json) as on_progress:
         results = run_many(tasks, workers=workers or os.cpu_count() or 1, dask=dask, on_progress=on_progress)

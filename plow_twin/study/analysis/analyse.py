@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import math
 import time
 from collections import Counter
@@ -473,23 +474,40 @@ def _writer(out: Path, prediction: Prediction, roles: Mapping[str, Role]) -> Any
     return RunWriter(out / "run", header, chunk_size=2**20, min_free_bytes=64 * 1024 * 1024)
 
 
-def _holds_recording(folder: Path) -> bool:
-    return folder.is_dir() and any(any(folder.glob(pattern)) for pattern in ("*.mcap", "*.db3", "*.csv"))
+_KINDS: Final = ("*.mcap", "*.db3", "*.csv")
 
 
-def left_out(path: Path) -> list[Path]:
-    """Return the folders that `expand` leaves out: empty folders, and runs beside or inside others."""
+def _holds(folder: Path, kinds: Sequence[str] = _KINDS) -> bool:
+    return folder.is_dir() and any(any(folder.glob(pattern)) for pattern in kinds)
+
+
+def _is_recording(folder: Path, results: Sequence[Path]) -> bool:
+    """Return whether a folder is one recording: its files are parts of one, or no runs lie in folders beside them."""
+    if not _holds(folder):
+        return False
+    if (folder / "metadata.yaml").is_file() or any(folder.glob(f"{glob.escape(folder.name)}_*")):
+        return True
+    if (folder / "analysis.json").is_file():  # the run beside it is its result
+        results = [*results, (folder / "run").resolve()]
+    runs = [item for item in folder.iterdir() if _holds(item, _KINDS[:2]) and item.resolve() not in results]
+    return not set(runs) - set(beside_folders(folder))
+
+
+def left_out(path: Path, results: Sequence[Path] = ()) -> list[Path]:
+    """Return the items that `expand` leaves out: empty folders, tables beside runs, and runs inside others."""
     if not path.is_dir():
         return []
     folders = [item for item in sorted(path.iterdir()) if item.is_dir()]
-    if _holds_recording(path):
-        return [item for item in folders if _holds_recording(item) and item not in beside_folders(path)]
+    if _is_recording(path, results):
+        return [item for item in folders if _holds(item) and item not in beside_folders(path)]
     empty = [item for item in folders if not any(item.iterdir())]
-    return empty + [one for item in folders if _holds_recording(item) for one in left_out(item)]
+    return empty + sorted(path.glob("*.csv")) + [one for item in folders if _holds(item) for one in left_out(item)]
 
 
-def expand(paths: Sequence[Path]) -> list[Path]:
+def expand(paths: Sequence[Path], results: Sequence[Path] = ()) -> list[Path]:
     """Return the recordings at some paths: a folder that is not a recording is replaced by the recordings in it.
+
+    `results` are folders of an earlier analysis, which are no recordings.
 
     Raises
     ------
@@ -498,14 +516,14 @@ def expand(paths: Sequence[Path]) -> list[Path]:
     """
     found: list[Path] = []
     for path in paths:
-        if not path.is_dir() or any(any(path.glob(pattern)) for pattern in ("*.mcap", "*.db3", "*.csv")):
+        if not path.is_dir() or _is_recording(path, results):
             found.append(path)
             continue
         inside = [
             item
             for item in sorted(path.iterdir())
             # a recording whose parts are missing counts too: its analysis names them
-            if item.suffix in (".mcap", ".db3") or _holds_recording(item) or (item / "metadata.yaml").is_file()
+            if item.suffix in (".mcap", ".db3") or _holds(item) or (item / "metadata.yaml").is_file()
         ]
         if not inside and any(path.glob(f"*{SUFFIX}")):  # beside recordings it is the result of an analysis
             inside = [path]

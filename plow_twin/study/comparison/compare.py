@@ -175,7 +175,8 @@ def compare(
             parts.setdefault(group, []).append(chosen)
             names.setdefault(group, []).append(name)
     if len(parts) < 2:
-        raise RecordingError(f"got {len(parts)} group of windows ({', '.join(parts)}), expected two or more")
+        got = f"1 group of windows ({next(iter(parts))})" if parts else "0 groups of windows"
+        raise RecordingError(f"got {got}, expected two or more")
     found = Comparison({group: Windows.joined(chosen) for group, chosen in parts.items()}, names)
     found.scenes = sorted({name for name, _ in scenes.values() if name})
     found.notes = notes + _rates_apart(runs) + _scenes_apart(scenes)
