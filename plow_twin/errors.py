@@ -139,7 +139,7 @@ class ExcessError(RecordingError):
 
 
 class UnitError(RecordingError):
-    """Measured numbers look as if they were in another unit; the message names them and how to state the unit."""
+    """A unit is unknown, or numbers look as if they were in another one; the message says how to state the unit."""
 
 
 class TakenError(RecordingError):

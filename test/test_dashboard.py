@@ -172,6 +172,23 @@ def test_an_address_that_cannot_be_offered_is_refused(
     assert done.returncode == 2 and expected in done.stderr and (not token or token not in done.stderr)
 
 
+def test_options_of_a_screen_without_the_screen_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "load.csv").write_text("t,fx,fy,m\n0,1,2,3\n0.001,1,2,3\n")
+    done = plow_twin_here("live", tmp_path / "load.csv", "--scene", "paper", "--listen", "127.0.0.1:0")
+    assert done.returncode == 2 and "--listen: got no --dashboard" in done.stderr
+
+
+def test_a_screen_that_waits_for_a_file_says_so(tmp_path: Path) -> None:
+    file = tmp_path / "load.csv"
+    command = [sys.executable, "-m", "plow_twin", "live", str(file), *OPTIONS, "--follow", "--dashboard"]
+    pipes = dict.fromkeys(("stdout", "stderr"), subprocess.PIPE)
+    with started([*command, "--listen", "127.0.0.1:0"], **pipes) as process:
+        assert "the page comes with it" in _said(process, f"plow-twin: {file}: its first line is waited for")
+        file.write_text("t,fx,fy,m\n")
+        assert _said(process, "screen: ").split()[1].startswith("http://127.0.0.1:")
+        process.kill()
+
+
 def test_names_that_others_may_own_are_not_answered_to() -> None:
     here, beyond = PageAccess("127.0.0.1", 8070), PageAccess("0.0.0.0", 8070, TOKEN)
     assert all(here.answers_to(name) for name in ("localhost:8070", "127.0.0.1:8070", "[::1]:8070"))

@@ -74,11 +74,13 @@ def test_an_unknown_name_and_a_unit_of_another_quantity_are_named(
     path = _write(tmp_path / "load.csv", {})
     for option, expected in (
         ("fz=kN", "unit of fz: got an unknown name, expected one of fx, fy, m, t, theta, x, y"),
+        ("Fx=kN", "unit of Fx: got an unknown name"),
+        ("fx=kn", "unit of fx: got 'kn', expected one of N, kN, MN"),
         ("fx=mm", "unit of fx: got 'mm', expected one of N, kN, MN"),
         ("t=min", "unit of t: got 'min', expected one of"),
         ("fx", "got 'fx', expected NAME=UNIT"),
     ):
-        assert cli(["live", str(path), "--unit", option, "--quiet"]) != 0
+        assert cli(["live", str(path), "--unit", option, "--quiet"]) == 2
         assert expected in capsys.readouterr().err
 
 

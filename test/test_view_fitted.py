@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from scenes import preset
 
 from plow_twin import simulate
 from plow_twin.estimate.estimate import priors
+from plow_twin.estimate.result import Motion
 from plow_twin.estimate.unknowns import QUANTITIES
 from plow_twin.view.estimate import estimate_picture
 from plow_twin.view.fitted import FittedPicture, FittedValue
@@ -51,6 +53,14 @@ def test_its_picture_has_words_and_units_and_nothing_over_the_data(picture: Fitt
     labels = {axis.get_ylabel() for axis in figure.axes}
     assert {"x [mm]", "y [mm]", "θ [mrad]", "residual\n[mm]", "residual\n[mrad]"} <= labels
     assert "model ok, sensor ok" in figure.get_suptitle()
+
+
+def test_without_a_fit_the_residuals_say_so(picture: FittedPicture) -> None:
+    nothing = np.full_like(picture.motion.measured, np.nan)
+    figure = replace(picture, motion=Motion(picture.motion.t, picture.motion.measured, nothing)).figure()
+    below = [axis for axis in figure.axes if axis.get_ylabel().startswith("residual")]
+    assert [[text.get_text() for text in axis.texts] for axis in below] == [["no fit"]] * 3
+    assert not any(axis.lines or axis.get_legend() or axis.get_yticks().size for axis in below)
 
 
 def test_its_rerun_file_has_the_same_numbers(picture: FittedPicture, tmp_path: Path) -> None:

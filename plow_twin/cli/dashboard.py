@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
 from plow_twin.cli.console import DONE, say_error
 
@@ -48,6 +49,17 @@ def access_of(options: dict[str, Any]) -> PageAccess:
     access = PageAccess.of(options["listen"], options["token_file"])
     listening(access).close()
     return access
+
+
+def access_if_shown(options: dict[str, Any]) -> PageAccess | None:
+    """Return the access to the screen, or None without `--dashboard`, which its other options need."""
+    if options["dashboard"]:
+        return access_of(options)
+    context = click.get_current_context()
+    for name in ("listen", "token_file"):
+        if context.get_parameter_source(name) is ParameterSource.COMMANDLINE:
+            raise click.UsageError(f"--{name.replace('_', '-')}: got no --dashboard, expected it beside")
+    return None
 
 
 def say_where(screen: Screen, access: PageAccess) -> None:

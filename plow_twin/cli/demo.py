@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from plow_twin.cli.console import POSITIVE, quiet_option
-from plow_twin.cli.dashboard import access_of, access_options, dashboard_option
+from plow_twin.cli.dashboard import access_if_shown, access_options, dashboard_option
 
 
 @click.command(
@@ -37,9 +37,8 @@ def demo(speed: str, seconds: float, out: Path, quiet: bool, dashboard: bool, **
     """Run the twin on the paper's load: a publisher process and a node with its recorder."""
     from plow_twin.demo.demo import run_demo
 
-    if not dashboard:
+    if access_if_shown({**options, "dashboard": dashboard}) is None:
         return run_demo(speed, seconds, out, quiet)
-    access_of(options)
     token = options["token_file"]
     shown = ["--listen", options["listen"], *(("--token-file", str(token)) if token is not None else ())]
     return run_demo(speed, seconds, out, quiet, shown)

@@ -26,7 +26,7 @@ from plow_twin.cli.console import (
     show_facts,
     unit_option,
 )
-from plow_twin.cli.dashboard import access_of, access_options, dashboard_option, say_where, stay
+from plow_twin.cli.dashboard import access_if_shown, access_options, dashboard_option, say_where, stay
 from plow_twin.cli.live_report import Report
 from plow_twin.cli.telemetry import telemetry_options, ways_of
 
@@ -118,7 +118,7 @@ def _live(
     report = Report(lines=lines, quiet=quiet, stamp_ns=lambda: front.runtime.stamp_ns)
     try:
         settings = _settings(options)
-        access = access_of(options) if options["dashboard"] else None
+        access = access_if_shown(options)
         ways = ways_of(options)
         bridge = _bridge(source, options, settings.expected_rate)
         for refused in apply_realtime(settings):
@@ -283,7 +283,7 @@ def _settings(options: dict[str, Any]) -> Settings:
 
 
 def _bridge(source: str, options: dict[str, Any], rate_hz: float) -> Bridge:
-    from plow_twin.live.bridge.files import Files, StandardInput, is_pattern
+    from plow_twin.live.bridge.files import Files, StandardInput
     from plow_twin.live.bridge.source import BridgeError
 
     if "://" in source:
@@ -314,9 +314,11 @@ def _bridge(source: str, options: dict[str, Any], rate_hz: float) -> Bridge:
     if not paths:
         kinds = ".csv" if options["follow"] else ".csv or .parquet"
         raise BridgeError(f"{path}: got a folder without {kinds}, expected some")
-    if options["follow"] and not (paths[0].exists() or (is_pattern(path) and any(path.parent.glob(path.name)))):
-        say_error(f"plow-twin: {path}: is not there yet, it is waited for")
-    return Files(paths, follow=options["follow"])
+    files = Files(paths, follow=options["follow"])
+    page = "; the page comes with it, and its address is printed then" if options["dashboard"] else ""
+    for missing in files.awaited() if options["follow"] else ():
+        say_error(f"plow-twin: {missing}: its first line is waited for{page}")
+    return files
 
 
 def _tables(folder: Path, *, growing: bool) -> list[Path]:

@@ -118,7 +118,7 @@ def guess_columns(path: Path, scene: Scene, columns: Mapping[str, str], units: M
     known = {key[1]: key for key in _NAMES}
     unknown = [name for name in (*columns, *units) if name not in known and name != "t"]
     if unknown:
-        raise RecordingError(f"column or unit of {unknown[0]}: expected one of t, {', '.join(known)}")
+        raise UnitError(f"column or unit of {unknown[0]}: expected one of t, {', '.join(known)}")
     numbers = {
         name: np.array([_number(row[index]) for row in rows])
         for index, name in enumerate(guess.names)
@@ -215,7 +215,7 @@ def _find_units(guess: Guess, numbers: Mapping[str, Array], scene: Scene, given:
         unit = given.get(key[1]) or _unit_of(column)
         known = UNITS[QUANTITIES[key]]
         if given.get(key[1]) and unit not in known:
-            raise RecordingError(f"unit of {key[1]}: got {unit!r}, expected one of {', '.join(known)}")
+            raise UnitError(f"unit of {key[1]}: got {unit!r}, expected one of {', '.join(known)}")
         if unit in known:
             guess.units[key[1]] = unit
             guess.because[key[1]] += f", {unit} as stated" if key[1] in given else f", {unit} in its name"

@@ -13,7 +13,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.errors import RecordingError
+from plow_twin.errors import UnitError
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record.map_file import (
     LOAD_MODEL,
@@ -355,24 +355,24 @@ def with_units(roles: Mapping[str, Role], units: Mapping[str, str]) -> dict[str,
 
     Raises
     ------
-    RecordingError
+    UnitError
         No role has a number of that name, or the unit measures something else.
     """
     changed = dict(roles)
     for name, unit in units.items():
         if name == "t":
             if unit not in STAMP_UNITS:
-                raise RecordingError(f"unit of t: got {unit!r}, expected one of {', '.join(STAMP_UNITS)}")
+                raise UnitError(f"unit of t: got {unit!r}, expected one of {', '.join(STAMP_UNITS)}")
             changed = {key: replace(role, stamp_unit=unit, stamp_unit_is_stated=True) for key, role in changed.items()}
             continue
         having = [key for key, role in roles.items() if name in role.fields]
         if not having:
             there = sorted({field for role in roles.values() for field in role.fields} | {"t"})
-            raise RecordingError(f"unit of {name}: got an unknown name, expected one of {', '.join(there)}")
+            raise UnitError(f"unit of {name}: got an unknown name, expected one of {', '.join(there)}")
         for key in having:
             known = UNITS[QUANTITIES[key, name]]
             if unit not in known:
-                raise RecordingError(f"unit of {name}: got {unit!r}, expected one of {', '.join(known)}")
+                raise UnitError(f"unit of {name}: got {unit!r}, expected one of {', '.join(known)}")
             changed[key] = replace(changed[key], factor={**changed[key].factor, name: known[unit]})
     return changed
 

@@ -116,14 +116,18 @@ class FittedPicture:
         else:
             above.plot([], [], color="tab:blue", label="no fitted motion")
         above.set_ylabel(f"{name} [{unit}]")
+        legend_beside(above)
+        below.set_ylabel(f"residual\n[{unit}]")
+        if not np.isfinite(residual).any():
+            below.text(0.5, 0.5, "no fit", transform=below.transAxes, ha="center", va="center", color="0.4")
+            below.set_yticks([])
+            return
         below.plot(motion.t, residual, ".", ms=1.5, color="tab:red", label="measured − fitted")
         below.axhline(0.0, color="0.4", lw=0.6)
         if self.noise is not None:
             half = 1.645 * _SCALE * self.noise[number]
             below.axhspan(-half, half, color="0.88", lw=0.0, zorder=0, label="90 % of the\nsensor's noise")
-        below.set_ylabel(f"residual\n[{unit}]")
-        for axis in (above, below):
-            legend_beside(axis)
+        legend_beside(below)
 
     def _values(self, axis: Any) -> None:
         """Draw each value on the scale of its prior, its numbers beside it."""

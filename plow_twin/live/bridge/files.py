@@ -255,6 +255,10 @@ class Files(SourceState):
             found[tail.topic] = columns_of(str(tail.path), columns or ())
         return found
 
+    def awaited(self) -> list[Path]:
+        """Return the files, or patterns, of which no whole line is there yet."""
+        return [tail.path for tail in self._tails if tail.columns(grows=not self.ends) is None]
+
     def start(self, topics: list[str], stamp_ns: StampOf[Arrived] | None = None) -> None:
         """Begin to read the files of these topics."""
         self._tails = [tail for tail in self._tails if tail.topic in topics]
