@@ -270,6 +270,10 @@ def test_the_senders_own_numbers_show_loss_repetition_and_a_new_start(tmp_path: 
     lines = [
         json.dumps({"time": 1000 + index, "load": {"f": [index, 2, 3]}, "n": n}) for index, n in enumerate(numbers)
     ]
+    # messages of others between them have no number, and take none from the next message; nor do two damaged ones
+    lines[150], lines[151] = '{"n": 152, "load"', '{"n"'
+    for place, other in ((60, '{"hello": 1}'), (40, "garbage"), (20, '{"n": "x", "status": 3}')):
+        lines.insert(place, other)
     path = tmp_path / "plough.csv"
     # an unreadable message before the first number does not count as number 1
     path.write_text("\n".join(["{}", "nothing", *lines, '{"n": 60, "load"']) + "\n", encoding="utf-8")
@@ -280,8 +284,8 @@ def test_the_senders_own_numbers_show_loss_repetition_and_a_new_start(tmp_path: 
     )
     values = _run(path, mapping, limit_force=1e9, limit_force_rate=1e12)["input"][2]
     # 10 between 99 and 110, 2 between 49 and 52
-    assert (values["samples_lost"], values["dropped_duplicate"], values["dropped_malformed"]) == ("12", "1", "3")
-    assert int(values["samples_used"]) == len(numbers) - 1
+    assert (values["samples_lost"], values["dropped_duplicate"], values["dropped_malformed"]) == ("12", "1", "8")
+    assert int(values["samples_used"]) == len(numbers) - 3
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ from test_live import ROOT, _live
 from plow_twin.live.bridge.access import Access
 from plow_twin.live.bridge.opcua.bridge import OpcUa
 from plow_twin.live.bridge.opcua.link import Revised
-from plow_twin.live.bridge.opcua.samples import NOT_MEASURED, Samples
+from plow_twin.live.bridge.opcua.samples import FAR_NS, NOT_MEASURED, Samples
 from plow_twin.live.bridge.source import BridgeError
 from plow_twin.live.diagnostics import SOURCE_KEYS
 from plow_twin.record.entries import EntryRecord
@@ -181,6 +181,17 @@ def test_values_of_a_stamp_are_a_sample_and_unchanged_fields_stay() -> None:
     assert samples.take_incomplete() == 1
     samples.add("b", 40, 9.0, 9.0)  # sent again
     assert samples.take(99.0) == []
+    # a single stamp far ahead moves nothing; the clock has moved where the next one stays there
+    samples.add("a", 41 + FAR_NS, 1.0, 9.0)
+    samples.add("b", 50, 3.0, 9.0)
+    samples.add("a", 50, 2.0, 9.0)
+    assert samples.take(10.5) == [(50, {"a": 2.0, "b": 3.0}), (41 + FAR_NS, {"a": 1.0, "b": 3.0})]
+    assert set(samples.newest_ns.values()) == {50}
+    samples.add("a", 60 + FAR_NS, 4.0, 11.0)
+    samples.add("b", 60 + FAR_NS, 5.0, 11.0)
+    assert samples.take(11.0) == [(60 + FAR_NS, {"a": 4.0, "b": 5.0})]
+    samples.add("a", 70 + FAR_NS, 6.0, 11.0)
+    assert samples.take(13.0) == [(70 + FAR_NS, {"a": 6.0, "b": 5.0})]
     samples = Samples(["a", "b"], wait_s=1.0)
     samples.begin("a", 5, 1.0)
     samples.add("b", 7, 2.0, 0.0)
@@ -287,7 +298,15 @@ def test_a_break_without_history_is_a_loss(server: Plant, roles: Any) -> None:
     with _bridge(server, roles) as bridge:
         server.do("rows", _rows(start_ns, 0, 10))
         _until(bridge, lambda found: start_ns + 9 * MS in _stamps(found))
+        # a single stamp of a year ahead is passed on, and the break is no shorter for it
+        year_ns = start_ns + 31_536_000 * 1000 * MS
+        server.do("rows", _rows(year_ns, 9, 10), keep=False)
+        _until(bridge, lambda found: year_ns + 9 * MS in _stamps(found))
         server.cut()
+        while bridge.connected:
+            time.sleep(0.01)
+        broken = bridge.part()[2]
+        assert broken["breaks"] == "1" and float(broken["unfilled_s"]) > 0.0
         server.do("rows", _rows(start_ns, 10, 20), keep=False)
         server.mend()
         _until(bridge, lambda found: start_ns + 19 * MS in _stamps(found))

@@ -168,15 +168,18 @@ class BridgeFront:
         """Feed the twin until the source ends, a stop is requested, or time is up; return the losses in words."""
         runtime, bridge = self.runtime, self._bridge
         lost: list[str] = []
+        broken = ""
         try:
             self._feeder.begin(chain.from_iterable(self._first))
             runtime.start()
             runtime.activate()
             self._loop(stop_asked, time.monotonic() + seconds)
+            if isinstance(bridge, Reporting) and not (bridge.connected or bridge.finished):
+                broken = f"not connected at the end: {bridge.trouble}"
         finally:
             bridge.close()
             lost = runtime.close()
-        return [*self._not_read(stop_asked()), *diagnostics.failures(runtime), *lost]
+        return [*([broken] if broken else []), *self._not_read(stop_asked()), *diagnostics.failures(runtime), *lost]
 
     def _not_read(self, stopped: bool) -> list[str]:
         """Return in words which input never came or was not read."""

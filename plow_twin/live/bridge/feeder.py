@@ -66,6 +66,9 @@ class Feeder:
         #: why the first unreadable load was refused; empty: all were read
         self.unfit = ""
         self._number = 0
+        #: messages without a number since the last one with a number, each taken for the next number; and how many of
+        #: all such messages turned out to have none
+        self._assumed = self._unnumbered = 0
         #: number of the newest message, where it does not continue those before
         self._odd: int | None = None
         #: whether the sender numbers its messages
@@ -206,9 +209,16 @@ class Feeder:
         """Return sender, message number (counted here where the message has no number), and whether it came before."""
         number = role.number(arrived) if role.sequence else None
         if number is None:
-            # unreadable or not numbered: the next number
-            number = self._number + 1
-        elif not self._counts:
+            # unreadable or not numbered: the next number, until a message comes with that number
+            self._assumed += 1
+            self._number += 1
+            return self._name, self._number + self._unnumbered, False
+        assumed, self._assumed = self._assumed, 0
+        if self._counts and 0 <= self._number - number < assumed:
+            self._unnumbered += self._number - number + 1
+            self._number, self._odd = number, None
+            return self._name, number + self._unnumbered, False
+        if not self._counts:
             self._counts = True
             if self._number:  # the messages before had no numbers
                 self._begin_anew()
@@ -219,7 +229,7 @@ class Feeder:
         else:  # taken for the next number until the next message decides
             self._odd, number = number, self._number + 1
         again, self._number = number == self._number, number
-        return self._name, number, again
+        return self._name, number + self._unnumbered, again
 
     def _goes_on(self, number: int) -> bool:
         """Return whether a number continues the numbers before, or the single odd number just before it."""
@@ -237,6 +247,7 @@ class Feeder:
     def _begin_anew(self) -> None:
         """Count the following messages as those of another sender."""
         self._sender += 1
+        self._assumed = self._unnumbered = 0
         self._runtime.inputs.senders.start([self._name])
         self._runtime.inputs.senders.alive([self._name])
 

@@ -37,6 +37,8 @@ _WAIT_S: Final = 5e-3 * PUBLISHING_MS
 _PIECE_NS: Final = 10_000_000_000
 #: Longest delay of one node's values after the values of another [ns].
 _OVERLAP_NS: Final = 1_000_000_000
+#: A stamp beyond the system's time by more [ns] is no end of a break.
+_AHEAD_NS: Final = 86_400_000_000_000
 #: Longest delay of a sent value in the server's history [s].
 _HISTORY_LAG_S: Final = 5.0
 #: First wait before another attempt to connect, and the longest [s].
@@ -110,6 +112,8 @@ class OpcUa(SourceState):
         self._link: Link | None = None
         #: values that come while the history is read
         self._held_back: list[tuple[list[tuple[int, Any]], bool]] | None = None
+        #: steady time at which the connection broke [s]; None while it is connected
+        self._broken_s: float | None = None
         #: why the history of this connection cannot be read; empty if it may be
         self._no_history = ""
         logging.getLogger("asyncua").addHandler(logging.NullHandler())
@@ -155,7 +159,10 @@ class OpcUa(SourceState):
         if revised is not None:
             values |= {key: f"{value:g}" for key, value in asdict(revised).items()}
             complaint = revised.complaint(self._sampling_ms)
-        values |= {key: f"{value:g}" for key, value in asdict(self._counts).items()}
+        counts = asdict(self._counts)
+        if self._broken_s is not None:
+            counts["unfilled_s"] += time.monotonic() - self._broken_s
+        values |= {key: f"{value:g}" for key, value in counts.items()}
         values["no_history"] = self._no_history
         said = self.trouble or complaint
         return int(bool(said)), said, values
@@ -176,6 +183,9 @@ class OpcUa(SourceState):
                 self.trouble = self._words(error)
             finally:
                 wait_s = _FIRST_WAIT_S if self.connected else wait_s
+                if self.connected and not self._stop.is_set():
+                    self._broken_s = time.monotonic()
+                    self._counts.breaks += 1
                 self.connected, self._held_back = False, None
                 await link.close()
             if not (self._waits or self._answer.is_set()):  # the first attempt decides whether the twin starts
@@ -186,15 +196,14 @@ class OpcUa(SourceState):
 
     async def _follow(self, link: Link) -> None:
         """Read one connection until it breaks or a stop is requested."""
-        again = self._answer.is_set()
         self._held_back, self._no_history, self._link = [], "", link
         self._revised = await link.open()
         self._uris = self._uris or link.uris
         self.connected, self.trouble = True, ""
         self._answer.set()
-        if again:
-            self._counts.breaks += 1
-            self._counts.breaks_filled += await self._fill(await self._first_values())
+        if self._broken_s is not None:
+            values, self._broken_s = await self._first_values(), None
+            self._counts.breaks_filled += await self._fill(values)
         await self._release()
         while not self._stop.is_set() and not link.trouble:
             await asyncio.sleep(_WAIT_S)
@@ -259,13 +268,13 @@ class OpcUa(SourceState):
     def _newest_ns(self, number: int) -> int:
         return self._samples[self._topics_of[number][0]].newest_ns[self._nodes[number]]
 
-    def _add(self, number: int, value: Any, now_s: float) -> None:
+    def _add(self, number: int, value: Any, now_s: float, *, is_asked: bool = False) -> None:
         found = reading(value, self._by_server(number), self._counts)
         if found is not None:
             for topic in self._topics_of[number]:
                 samples, node = self._samples[topic], self._nodes[number]
                 if samples.newest_ns[node] or topic == "travel":  # a speed holds until the next one
-                    samples.add(node, *found, now_s)
+                    samples.add(node, *found, now_s, is_asked=is_asked)
                 else:
                     samples.begin(node, *found)
 
@@ -274,7 +283,7 @@ class OpcUa(SourceState):
         ends_ns: dict[int, int] = {}
         for number, value in up_to:
             found = reading(value, self._by_server(number), Counts())
-            if found is not None:
+            if found is not None and found[0] < time.time_ns() + _AHEAD_NS:
                 ends_ns.setdefault(number, found[0])
         if not self._no_history:
             try:
@@ -321,7 +330,7 @@ class OpcUa(SourceState):
         self._counts.values_filled += len(new)
         now_s = time.monotonic()
         for number, value in new:
-            self._add(number, value, now_s)
+            self._add(number, value, now_s, is_asked=True)
         self._pass_on(float("-inf"))
         while len(self._queue) > _QUEUE // 2:
             await asyncio.sleep(0.01)
