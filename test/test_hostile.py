@@ -14,6 +14,9 @@ import pytest
 from hostile_files import MADE
 from hostile_files import run as recorded
 
+from plow_twin.live.bridge.access import password
+from plow_twin.live.bridge.files import Files
+from plow_twin.live.bridge.source import BridgeError
 from plow_twin.scene_file.validation import MOST_PROBLEMS
 from plow_twin.scene_file.yaml_text import (
     DEEPEST,
@@ -299,3 +302,22 @@ def test_names_and_texts_of_a_file_do_nothing_to_a_terminal(tmp_path: Path) -> N
         written = _on_a_terminal(*arguments, folder=tmp_path)
         assert not any(acting in written for acting in ("\x1b]", "\x1b[2J", "\x07", "\u202e")), (arguments, written)
         assert all(text in written for text in shown), (arguments, written)
+
+
+@pytest.mark.parametrize("content", ["x" * 70_000, "\0\0", "p\x1b[2Jw"])
+def test_a_file_that_holds_no_password_is_named_and_not_shown(tmp_path: Path, content: str) -> None:
+    path = tmp_path / "secret"
+    path.write_text(content)
+    with pytest.raises(BridgeError, match=f"^{path}: expected a password, at most 65535 printable bytes") as refused:
+        password(path, "MQTT")
+    assert content[:2] not in str(refused.value).removeprefix(str(path))
+    path.write_text("s3cret\r\nmore")
+    assert password(path, "MQTT") == "s3cret"
+
+
+@pytest.mark.parametrize(("count", "got"), [(20_000, "got 20004 columns"), (100_000, "more than 262144 bytes")])
+def test_a_header_too_wide_is_refused_before_a_row_is_read(tmp_path: Path, count: int, got: str) -> None:
+    path = tmp_path / "wide.csv"
+    path.write_text("t,fx,fy,m," + ",".join(f"c{i}" for i in range(count)) + "\n0,1,2,3" + ",0" * count + "\n")
+    with pytest.raises(BridgeError, match=got):
+        Files([path], follow=False).topics()

@@ -15,6 +15,8 @@ from plow_twin.live.bridge.source import BridgeError
 from plow_twin.scene_file.yaml_text import read_yaml
 
 #: Keys of a file of credentials that name files.
+#: Longest password in an MQTT packet [B].
+_LONGEST_PASSWORD: Final = 65_535
 _FILES: Final = ("ca", "certificate", "key", "user_certificate", "user_key", "password_file")
 
 
@@ -70,10 +72,26 @@ def is_loopback(host: str) -> bool:
 
 
 def password(path: Path | None, source: str) -> str:
-    """Return the first line of a file, or the variable PLOW_TWIN_`source`_PASSWORD."""
+    """Return the first line of a file, or the variable PLOW_TWIN_`source`_PASSWORD.
+
+    Raises
+    ------
+    BridgeError
+        The line is longer than a broker takes, or no text.
+    OSError
+        The file cannot be read.
+    """
     if path is None:
         return os.environ.get(f"PLOW_TWIN_{source}_PASSWORD", "")
-    return path.read_text(encoding="utf-8").partition("\n")[0]
+    with path.open("rb") as file:
+        line = file.readline(_LONGEST_PASSWORD + 2).removesuffix(b"\n").removesuffix(b"\r")
+    try:
+        text = line.decode()
+    except UnicodeDecodeError:
+        text = "\0"
+    if len(line) > _LONGEST_PASSWORD or not text.isprintable():
+        raise BridgeError(f"{path}: expected a password, at most {_LONGEST_PASSWORD} printable bytes, on line 1")
+    return text
 
 
 def read_access(url: str, path: Path | None) -> Access:

@@ -20,7 +20,7 @@ from plow_twin.live.bridge.table import Table
 from plow_twin.record.merging import StampOf, merged
 from plow_twin.record.sources import Arrived, TopicType, columns_of
 from plow_twin.record.times import NO_TIME
-from plow_twin.scene_file.csv_rows import check_text
+from plow_twin.scene_file.csv_rows import MOST_COLUMNS, check_text
 from plow_twin.scene_file.parquet_lines import ParquetLines, is_parquet
 
 #: Most bytes read from a source at once.
@@ -61,7 +61,11 @@ class _Tail:
                     check_text(line)
                     if grows and not line.endswith(b"\n") and len(line) < _BLOCK:
                         break
+                    if len(line) == _BLOCK:
+                        raise csv.Error(f"got a first line of more than {_BLOCK} bytes, expected a header")
                     rows.read(line)
+                    if len(rows.columns or ()) > MOST_COLUMNS:
+                        raise csv.Error(f"got {len(rows.columns or ())} columns, expected at most {MOST_COLUMNS}")
         except FileNotFoundError:
             return None
         return rows.columns
