@@ -24,6 +24,8 @@ from PIL import Image
 from record_support import Run, paper_sample, record_run, rewrite
 
 from plow_twin.cli.app import run as cli
+from plow_twin.stream.intake import NS_PER_S
+from plow_twin.stream.journal import Entry, Mark
 
 SAMPLES = 600
 
@@ -134,6 +136,17 @@ def test_a_recording_with_counted_loss_ends_with_3_in_every_verb(tmp_path: Path)
         done = plow_twin_here(verb, lossy.folder)
         assert done.returncode == 3, f"{verb}: {done.stderr}"
         assert "lost" in done.stdout + done.stderr
+
+
+def test_the_duration_is_that_of_the_advances_in_info_and_doctor(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    end_ns = paper_sample(99).stamp_ns
+    entries: list[Entry] = [*map(paper_sample, range(100)), Mark(end_ns + 60 * NS_PER_S, "long after")]
+    folder = record_run(tmp_path / "run", entries).folder
+    for verb, key in (("info", "duration_s"), ("doctor", "span_s")):
+        assert cli([verb, str(folder), "--json"]) == 0
+        assert json.loads(capsys.readouterr().out)[key] == pytest.approx(0.099)
 
 
 def test_info_counts_the_content_of_a_recording(run: Run) -> None:

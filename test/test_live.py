@@ -881,6 +881,34 @@ def test_failed_advances_are_no_success_in_any_view_of_a_run(
     assert replay(run).exit_code == 0
 
 
+def test_a_silence_in_a_file_is_named_in_every_view_and_no_loss(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, run, page = _csv(tmp_path / "load.csv", 2000), tmp_path / "run", tmp_path / "run.html"
+    rows = path.read_text(encoding="utf-8").splitlines()
+    path.write_text("\n".join(rows[:301] + rows[1001:1201] + rows[1701:]), encoding="utf-8")
+    assert run_cli(["live", str(path), "--scene", "paper", "--record", str(run), "--json"]) == 0
+    shown = capsys.readouterr()
+    named = "1.202 s without samples, in 2 stretches, the longest from 0.299 s to 1.000 s after the first"
+    assert named in shown.err
+    counted = json.loads(shown.out)["input"]
+    assert (counted["silences"], counted["silent_s"], counted["holds"]) == ("2", "1.202", "0")
+    assert run_cli(["info", str(run), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["without_samples"] == {
+        "count": 2,
+        "total_s": pytest.approx(1.202),
+        "longest_from_s": pytest.approx(0.299),
+    }
+    curves = RunCurves.of(RunReader(run))
+    assert np.allclose(curves.held_s, [(0.299, 1.0), (1.199, 1.7)])
+    for envelope in (curves.force, curves.load, curves.clearance):
+        assert np.isnan(envelope.bands(0)[0]).sum() == 2
+    assert run_cli(["view", str(run), "--html", str(page)]) == 0
+    text = page.read_text(encoding="utf-8")
+    assert named in text and "No loss was counted" not in text
+
+
 @pytest.mark.parametrize(("given", "said"), [("follow=full", True), ("follow=parameters", False)])
 def test_a_file_that_ends_is_read_at_the_pace_of_the_twins_that_follow_and_this_is_said(
     given: str, said: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]

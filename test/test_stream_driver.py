@@ -19,11 +19,26 @@ from plow_twin.stream.journal import Digest, Entry, Failed, Hold, Reset, Sample,
 from plow_twin.stream.limits import excitation_limits
 from plow_twin.stream.outputs import Published
 from plow_twin.stream.session import Session
+from plow_twin.stream.silences import Silences
 
 SCENE = load_scene(scene_path("paper"))
 T0 = 1_795_000_000_000_000_000
 MS = NS_PER_S // 1000
 LOAD = (32e3, 0.0, -45e3)
+
+
+def test_silences_are_counted_alike_one_by_one_and_together_and_none_by_late_samples_or_across_a_reset() -> None:
+    stamps = T0 + MS * np.array([0, 400, 1100, 600, 1150, 2000, 2001])
+    single, many = Silences(0.5), Silences(0.5)
+    for stamp in stamps.tolist():
+        single.add_one(stamp)
+    found = [(index, (begin - T0) // MS, (end - T0) // MS) for index, begin, end in many.add(stamps)]
+    assert found == [(2, 400, 1100), (5, 1150, 2000)]
+    assert single.facts() == many.facts()
+    longest = "the longest from 1.150 s to 2.000 s after the first"
+    assert single.text() == f"1.550 s without samples, in 2 stretches, {longest}"
+    many.restart()
+    assert many.add(stamps[-1:] + 3600 * NS_PER_S) == [] and many.count == 2
 
 
 def _some(published: Published) -> Published | None:

@@ -7,6 +7,7 @@ from typing import Any
 
 from plow_twin.record.entries import EntryRecord
 from plow_twin.record.reader import FileStatus, RunReader
+from plow_twin.record.run_time import RunTime
 from plow_twin.record.unused import InputCounts
 from plow_twin.stream.journal import Failed
 
@@ -21,20 +22,20 @@ def read_recording(path: Path) -> tuple[dict[str, Any], bool]:
         When the file is not a recording.
     """
     reader = RunReader(path)
-    first = last = None
     inputs, failed = InputCounts(reader.header.excitation_source), 0
+    run_time = RunTime(reader.header.parameters)
     for record in reader:
-        first = record.log_time_ns if first is None else first
-        last = record.log_time_ns
         if isinstance(record, EntryRecord):
             inputs.add_entry(record.entry)
+            run_time.add_entry(record.entry)
             failed += record.entry.advances if isinstance(record.entry, Failed) else 0
     header = reader.header
     facts: dict[str, Any] = {
         "file": str(reader.path),
         "status": reader.status.value,
         "stop_reason": reader.stop_reason,
-        "duration_s": 0.0 if first is None or last is None else (last - first) * 1e-9,
+        "duration_s": run_time.span_s,
+        "without_samples": run_time.silences.facts(),
         "messages": dict(sorted(reader.counts.items())),
         "inputs": inputs.facts(),
         "failed_advances": failed,

@@ -61,6 +61,8 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "jumps_forward": "stamps that stepped by more than the parameter jump_back or jump_forward",
         "out_of_plane": "samples used in spite of components outside the plane",
         "holds": "advances under the hold policy",
+        "silences": "stretches between two stamps that are longer than excitation_timeout, whether held or not",
+        "silent_s": "length of all of them [s]",
         "travel_used": "messages used",
         "travel_dropped": "messages dropped",
         "travel_misplaced": "speeds that act from the time reached: their stamps are of another clock",
@@ -304,6 +306,7 @@ class Health:
         peak, wait_s = inputs.pop_queue_peak()
         values = {key: str(counted[key]) for key in KEYS["input"] if key in counted} | {
             "source": runtime.source,
+            "silent_s": f"{runtime.driver.silences.total_ns * 1e-9:.3f}" if counted["silences"] else "0",
             "newest_sample_age_s": "" if age_s is None else f"{age_s:.3f}",
             "samples_lost": str(inputs.senders.lost),
             "samples_not_followed": str(inputs.senders.ignored),

@@ -198,7 +198,7 @@ class BridgeFront:
         return []
 
     def causes(self) -> list[str]:
-        """Return in words likely causes of samples that were not used or that reset the motion."""
+        """Return in words likely causes of samples that were not used or that reset the motion, and silences."""
         counts, found = self.runtime.driver.intake.counts, []
         many = _MANY * max(1, sum(counts.values()))
         if self._feeder.unfit:
@@ -217,6 +217,8 @@ class BridgeFront:
         estimation = self.runtime.estimation
         if estimation is not None and not (estimation.count or self._bridge.ends):
             found.append("no estimate was made: the run ended before the first")
+        if silence := self.runtime.driver.silences.text():
+            found.append(silence)
         jumps = counts[Verdict.JUMP_BACK]
         if jumps:
             found.append(

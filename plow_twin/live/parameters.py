@@ -246,7 +246,7 @@ class Settings:
         0.01,
         3600.0,
         Effect.NOW,
-        "silence after which the excitation counts as stale; unused under use_sim_time",
+        "silence after which the excitation counts as stale; only counted in files and under use_sim_time",
     )
     hold_policy: str = _choice(
         "hold", ("hold", "zero"), Effect.NOW, "load while the excitation is stale: the last load, or zero"

@@ -31,6 +31,7 @@ from plow_twin.record.metadata_yaml import (
     write_metadata,
 )
 from plow_twin.record.reader import FileStatus, RunReader, run_parts
+from plow_twin.record.run_time import RunTime
 from plow_twin.record.unused import InputCounts
 from plow_twin.stream.journal import Digest, Failed, Sample, Snapshot
 
@@ -79,6 +80,7 @@ class RunReport:
     inputs: dict[str, dict[str, int]] = field(default_factory=dict)
     #: advances that failed: their samples have no forces
     failed_advances: int = 0
+    #: as `duration_s` in the facts of a recording
     span_s: float = 0.0
     problems: list[str] = field(default_factory=list)
 
@@ -125,12 +127,13 @@ def examine(path: Path) -> RunReport:
     report.metadata_yaml = (reader.path.parent / "metadata.yaml").is_file()
     report.parts = [_part(part) for part in reader.parts]
     expected: int | None = None if reader.header.part else 0
-    first = last = None
+    run_time = RunTime(reader.header.parameters)
     in_a_row = 0  # entries before the expected one without a gap
     inputs = InputCounts(reader.header.excitation_source)
     for batch in reader.batches(outputs=False):
         entries = batch.entries
         inputs.add(entries)
+        run_time.add(entries)
         report.failed_advances += sum(entry.advances for entry in entries.rest.values() if isinstance(entry, Failed))
         for index, sequence in enumerate(entries.sequence.tolist()):
             if expected is not None and 0 < expected - sequence <= in_a_row:
@@ -142,12 +145,9 @@ def examine(path: Path) -> RunReport:
             expected = sequence + 1
             entry = None if entries.sample[index] else entries.others[index]
             report.entries[Sample.__name__ if entry is None else type(entry).__name__] += 1
-            if entry is None:
-                stamp = int(entries.stamp_ns[index])
-                first, last = stamp if first is None else first, stamp
     report.lost = dict(reader.lost)
     report.inputs = inputs.facts()
-    report.span_s = 0.0 if first is None or last is None else (last - first) * 1e-9
+    report.span_s = run_time.span_s
     report.status = reader.status.value
     report.layout_version = _layout(reader)
     _name_problems(report, reader)

@@ -35,6 +35,7 @@ from plow_twin.stream.journal import (
 )
 from plow_twin.stream.outputs import NOTHING, Published, Rows
 from plow_twin.stream.session import Series, Session
+from plow_twin.stream.silences import Silences
 from plow_twin.stream.steps import Steps
 
 #: Stamp [ns] and wrench (Fx, Fy [N], M [N m]) of a sample that has arrived.
@@ -106,6 +107,7 @@ class Driver:
         #: steady times of the latest resets, and of the latest refused reset [ns]
         self._resets_ns: deque[int] = deque()
         self._unsteady_ns: int | None = None
+        self.silences = Silences(policy.excitation_timeout_s)
         self._steps = Steps(intake)
         self.clock = Intake(jump_back_s=intake.jump_back_s, jump_forward_s=intake.jump_forward_s)
         self._received_ns = 0
@@ -132,6 +134,7 @@ class Driver:
         for stamp_ns, wrench in arrived:
             if self.every_sample and not run and self._goes_on(stamp_ns, wrench):  # as nearly always
                 self._newest_ns, self._received_ns, self._zeroed = stamp_ns, now_ns, False
+                self.silences.add_one(stamp_ns)
                 published = self._apply([Sample(stamp_ns, wrench)], now_ns)
                 if len(published.rows):
                     yield published
@@ -172,6 +175,7 @@ class Driver:
                 newest_ns, newest = stamps.item(end - 1), tuple(wrench[end - 1].tolist())
                 self.intake.accept(newest_ns, newest, end - place)
                 self._newest_ns, self._received_ns, self._zeroed = newest_ns, now_ns, False
+                self.silences.add(stamps[here])
                 self._advanced(now_ns)
                 self.failed.end()
                 self.state = StreamState.RUNNING
@@ -213,6 +217,7 @@ class Driver:
             self._restart_model(stamp_ns, verdict.value, None if self.intake.returned else now_ns)
         if self._newest_ns is None or stamp_ns > self._newest_ns:
             self._newest_ns = stamp_ns
+        self.silences.add_one(stamp_ns)
         self._received_ns, self._zeroed = now_ns, False
         insort(run, Sample(stamp_ns, wrench), key=_stamp)
 
@@ -399,6 +404,7 @@ class Driver:
 
     def _begin_again(self) -> None:
         self._newest_ns = self._counted_ns = None
+        self.silences.restart()
         self.state = StreamState.WAITING
 
     def _use(self, run: list[Sample], now_ns: int) -> Iterator[Published]:
@@ -480,6 +486,7 @@ def counters(driver: Driver) -> dict[str, int]:
         "jumps_forward": intake.counts[Verdict.JUMP_FORWARD],
         "out_of_plane": intake.out_of_plane,
         "holds": driver.holds,
+        "silences": driver.silences.count,
         "travel_misplaced": driver.travel_misplaced,
         "resets": driver.resets,
         "solver_failures": driver.failed.count,

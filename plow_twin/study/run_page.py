@@ -56,6 +56,7 @@ def write_run_page(path: Path, out: Path) -> tuple[FileStatus, dict[str, int], i
         "picture": picture,
         "pads": _by_pad(read_recording(path)),
         "lost": lost,
+        "silences": curves.silences,
         "log": log,
         "most_rows": _MOST_ROWS,
         "plots": _plots(reader, curves),

@@ -16,6 +16,7 @@ from plow_twin.record.entries import Batch, Holes
 from plow_twin.record.outputs import publication_templates
 from plow_twin.record.reader import RunReader
 from plow_twin.record.rows import Rows, rows_by_topic
+from plow_twin.record.run_time import RunTime
 from plow_twin.stream.journal import Estimated, Failed, Hold, Reset, SetModel, SetWear, Unload
 from plow_twin.stream.outputs import CLEARANCE_NAMES
 from plow_twin.view.envelope import Envelope
@@ -46,9 +47,9 @@ class Instant(NamedTuple):
 class RunCurves:
     """Largest forces [kN], load [kN, kN m] and clearances [mm] over time, and the instant of the largest force.
 
-    Times count from `first_ns`, the first stamp of a sample or message [s]. `held_s` are the stretches computed without
-    samples, `failed_s` the times of `failed` advances, which have no forces; `changes` are the instants at which the
-    clearance changed for another reason than wear, with the reason.
+    Times count from `first_ns`, the first stamp of a sample or message [s]. `held_s` are the stretches without samples,
+    under the hold policy or a straight line of the load, `failed_s` the times of `failed` advances, which have no
+    forces; `changes` are the instants at which the clearance changed for another reason than wear, with the reason.
     """
 
     first_ns: int | None = None
@@ -60,6 +61,8 @@ class RunCurves:
     peak: float = 0.0
     held_s: list[tuple[float, float]] = field(default_factory=list)
     failed_s: list[tuple[float, float]] = field(default_factory=list)
+    #: all stretches without samples, in words
+    silences: str = ""
     failed: int = 0
     changes: list[tuple[float, str]] = field(default_factory=list)
     #: states of the newest clearances, as in the status of the twin
@@ -73,22 +76,27 @@ class RunCurves:
 
     @classmethod
     def of(cls, reader: RunReader) -> RunCurves:
-        """Read a whole recording; no line crosses missing entries or a reset."""
+        """Read a whole recording; no line crosses missing entries, a reset or a silence."""
         curves = cls()
+        run_time = RunTime(reader.header.parameters)
         templates = publication_templates(reader.header.frame_id, reader.header.child_frame_id)
         topics = {reader.header.topic(name): name for name in templates}
         holes = Holes()
         for batch in reader.batches():
             missing = holes.find(batch.entries)
             resets = {index for index, entry in batch.entries.others.items() if isinstance(entry, Reset)}
-            places = sorted(resets | set(missing))
+            silent = {index: (begin, end) for index, begin, end in run_time.add(batch.entries)[:_MOST_MARKS]}
+            places = sorted(resets | set(missing) | set(silent))
             for place, part in zip((None, *places), batch.parted(places), strict=True):
-                if place is not None:
+                if place in resets or place in missing:
                     curves._break_lines()
+                elif place is not None:
+                    curves._bridged(*silent[place])
                 curves._entries(part)
                 curves._messages(rows_by_topic(part.outputs, topics, templates))
         curves._end_of_held(curves._newest_ns)
         curves._last_estimate()
+        curves.silences = run_time.silences.text()
         return curves
 
     @property
@@ -153,6 +161,13 @@ class RunCurves:
         if len(self.held_s) < _MOST_MARKS:
             self.held_s.append(((self._held_since_ns - first) * _NS, (stamp_ns - first) * _NS))
         self._held_since_ns = None
+
+    def _bridged(self, begin_ns: int, end_ns: int) -> None:
+        """End the lines at a silence that no entry holds, of the first ones."""
+        if self._held_since_ns is None and len(self.held_s) < _MOST_MARKS:
+            self._held_since_ns = begin_ns
+            self._end_of_held(end_ns)
+            self._break_lines()
 
     def _failed(self, stamp_ns: int, since_ns: int, advances: int) -> None:
         """Add the first failed advance of a row, or the others at its end."""

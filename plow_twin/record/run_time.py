@@ -1,0 +1,74 @@
+"""The time that a run covers, by its journal: its span, and its stretches without samples."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from plow_twin.record.entries import Entries
+from plow_twin.record.journal_codec import Dropped
+from plow_twin.stream.driver import Policy
+from plow_twin.stream.journal import Entry, Hold, Loss, Parameter, Reset, Restore, Sample, SetWear, Unload
+from plow_twin.stream.silences import Silences
+
+_TIMEOUT = "excitation_timeout"
+
+
+class RunTime:
+    """Collects the time of a run; takes its entries in order.
+
+    Parameters
+    ----------
+    parameters
+        The parameters of the run.
+    """
+
+    def __init__(self, parameters: Mapping[str, Any]) -> None:
+        self.silences = Silences(float(parameters.get(_TIMEOUT, Policy.excitation_timeout_s)))
+        self._span_ns = 0
+        self._reached_ns: int | None = None
+
+    @property
+    def span_s(self) -> float:
+        """Time from the first advance to the last, without steps of the clock at resets [s]."""
+        return self._span_ns * 1e-9
+
+    def add(self, entries: Entries) -> list[tuple[int, int, int]]:
+        """Take entries; return the silences that end in them: index of the ending sample, begin and end [ns]."""
+        found, done = [], 0
+        samples = np.flatnonzero(entries.sample)
+        for index, entry in [*sorted(entries.rest.items()), (len(entries), None)]:
+            here = samples[np.searchsorted(samples, done) : np.searchsorted(samples, index)]
+            if len(here):
+                stamps = entries.stamp_ns[here]
+                self._reach(int(stamps[0]))
+                self._reach(int(stamps.max()))
+                found += [(int(here[place]), begin, end) for place, begin, end in self.silences.add(stamps)]
+            done = index
+            if entry is not None:
+                self.add_entry(entry)
+        return found
+
+    def add_entry(self, entry: Entry | Dropped) -> None:
+        """Take one entry."""
+        match entry:
+            case Sample(stamp_ns):
+                self._reach(stamp_ns)
+                self.silences.add_one(stamp_ns)
+            case Hold(stamp_ns) | Unload(stamp_ns):
+                self._reach(stamp_ns)
+            case Reset() | SetWear() | Restore():
+                self._reached_ns = None
+                self.silences.restart()
+            case Loss():  # samples came there
+                self.silences.restart()
+            case Parameter(name, value) if name == _TIMEOUT:
+                self.silences.timeout_s = float(value)
+
+    def _reach(self, stamp_ns: int) -> None:
+        if self._reached_ns is None:
+            self._reached_ns = stamp_ns
+        self._span_ns += max(0, stamp_ns - self._reached_ns)
+        self._reached_ns = max(self._reached_ns, stamp_ns)

@@ -1,0 +1,89 @@
+"""Stretches without samples, by the stamps."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.stream.intake import NS_PER_S
+
+Indexes = NDArray[np.int64]
+
+
+class Silences:
+    """Counts stretches between the stamps of two samples that are longer than the timeout of the excitation.
+
+    The motion goes on there, under the hold policy or on a straight line of the load to the next sample.
+
+    Parameters
+    ----------
+    timeout_s
+        Longest time between two samples [s] that is no silence; it may change.
+    """
+
+    def __init__(self, timeout_s: float) -> None:
+        self.timeout_s = timeout_s
+        self.count = 0
+        #: length of all stretches [ns]
+        self.total_ns = 0
+        #: begin and end of the longest stretch [ns]
+        self.longest_ns = (0, 0)
+        self._first_ns: int | None = None
+        self._newest_ns: int | None = None
+
+    def add(self, stamps_ns: Indexes) -> list[tuple[int, int, int]]:
+        """Take the stamps of samples, shape (n,) [ns]; return the silences that end at them.
+
+        Each has the index of the sample that ends it, its begin and its end [ns]. A late sample ends none.
+        """
+        if not len(stamps_ns):
+            return []
+        newest_ns = self._begin(int(stamps_ns[0]))
+        reached = np.maximum.accumulate(np.concatenate((np.array([newest_ns]), stamps_ns)))
+        self._newest_ns = int(reached[-1])
+        ends = np.flatnonzero(np.diff(reached) > self.timeout_s * NS_PER_S)
+        found = list(zip(ends.tolist(), reached[ends].tolist(), reached[ends + 1].tolist(), strict=True))
+        for _, begin_ns, end_ns in found:
+            self._count(begin_ns, end_ns)
+        return found
+
+    def add_one(self, stamp_ns: int) -> None:
+        """Take the stamp of one sample [ns]."""
+        newest_ns = self._begin(stamp_ns)
+        if stamp_ns > newest_ns:
+            if stamp_ns - newest_ns > self.timeout_s * NS_PER_S:
+                self._count(newest_ns, stamp_ns)
+            self._newest_ns = stamp_ns
+
+    def restart(self) -> None:
+        """Continue after a reset: the time across it is no silence."""
+        self._newest_ns = None
+
+    def text(self) -> str:
+        """Return the silences in words, with times since the first sample; empty without one."""
+        if not self.count:
+            return ""
+        begin_s, end_s = ((at - (self._first_ns or 0)) * 1e-9 for at in self.longest_ns)
+        where = f"from {begin_s:.3f} s to {end_s:.3f} s after the first"
+        if self.count > 1:
+            where = f"in {self.count} stretches, the longest {where}"
+        return f"{self.total_ns * 1e-9:.3f} s without samples, {where}"
+
+    def facts(self) -> dict[str, int | float]:
+        """Return number and length [s] of all stretches, and the begin of the longest, since the first sample [s]."""
+        begin_s = (self.longest_ns[0] - (self._first_ns or 0)) * 1e-9
+        return {"count": self.count, "total_s": self.total_ns * 1e-9, "longest_from_s": begin_s} if self.count else {}
+
+    def _begin(self, stamp_ns: int) -> int:
+        """Return the newest stamp, which is the given one at the start [ns]."""
+        if self._first_ns is None:
+            self._first_ns = stamp_ns
+        if self._newest_ns is None:
+            self._newest_ns = stamp_ns
+        return self._newest_ns
+
+    def _count(self, begin_ns: int, end_ns: int) -> None:
+        self.count += 1
+        self.total_ns += end_ns - begin_ns
+        if end_ns - begin_ns > self.longest_ns[1] - self.longest_ns[0]:
+            self.longest_ns = begin_ns, end_ns
