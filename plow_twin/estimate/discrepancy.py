@@ -55,9 +55,9 @@ STATED: Final = {
     "contact.exponent": 0.02,
     "friction.coefficient": 0.01,
 }
-#: Step: of the stiffness of a wall, and of a constant load in half its range.
+#: Step: of the stiffness of a wall, and of a constant load as a share of half the load's range.
 _WALL_STEP, _PUSH_STEP = 0.02, 5e-3
-#: Guard: least error of the load, in half its range.
+#: Guard: least error of the load, as a share of half the load's range.
 _LEAST_PUSH = 1e-5
 #: Bound: rounds of expectation and maximisation, between which the noise is tempered.
 _ROUNDS = (8, 5, 3)
@@ -360,7 +360,7 @@ class _Linearised:
     def surprise(self, mean: Array, often: Array) -> float:
         """Return the mean square of the differences in deviations of their prior, at least 1; above 1: not linear."""
         z = mean[SIZE:] * np.sqrt(self._precision[SIZE:])
-        # mean over the draws in which it differs
+        # for each quantity, the mean over the draws in which the quantity differs
         return max(1.0, float((z**2 / np.maximum(often, 0.1)).sum() / max(often.sum(), 1.0)))
 
     def named(self, mean: Array, often: Array) -> dict[str, tuple[float, float, float]]:

@@ -278,8 +278,8 @@ def under_uncertain_load(
     """Return an estimate with its withdrawn clearances replaced by values that allow for an unknown load or angle.
 
     `result` comes from the load believed; it stays where it has a clearance, or where the comparison finds no
-    clearance. Where the comparison agrees with `fitted`, the result for a machine that differs, the fit was in no false
-    optimum, and both are combined.
+    clearance. `fitted` is the fit of a machine that differs. Where the comparison agrees with this fit, the fit was not
+    caught in a false optimum, and both are combined.
     """
     if _known(result) or felt.interval() > tuning.COARSEST:
         return result

@@ -141,7 +141,8 @@ def _save_or_warn(cache: Any) -> None:
 def for_arguments(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Callable[..., Any]:
     """Return an entry compiled for the types of these arguments; a call of it does not look at types.
 
-    For calls whose types never change: numba takes longer to inspect nested tuples and records than a sample takes.
+    It serves calls whose types never change: numba needs more time to inspect nested tuples and records than the twin
+    needs for a sample.
     """
     compile_for = getattr(function, "compile", None)
     if compile_for is None:

@@ -53,7 +53,8 @@ class Tail:
     def more(self, stream: IO[bytes], size: int) -> bool:
         """Wait until a file is longer than `size` [B]; False when its writer has ended."""
         while True:
-            alive = is_claimed(stream.fileno())  # asked before the size: the last bytes of a writer that ends are read
+            # asked before the size, so that the last bytes of a writer that ends are read too
+            alive = is_claimed(stream.fileno())
             if os.fstat(stream.fileno()).st_size > size:
                 return True
             self.stopped = self._stop()

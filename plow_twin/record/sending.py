@@ -41,8 +41,8 @@ class Messages:
     def write(self, published: Published) -> tuple[tuple[str, memoryview], ...]:
         """Return topic and bytes of the messages of a publication of one row, in the order in which they are sent.
 
-        Those with intervals are not part of it: `intervals`. The bytes stay until the next call. Without a message
-        where a number is not finite.
+        `intervals` returns the messages with intervals. The bytes stay until the next call. The result is empty where
+        a number is not finite.
         """
         rows, slow = published
         if not self._each.fill(rows) or (len(slow) and not self._slow.fill(slow)):

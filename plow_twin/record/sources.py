@@ -38,7 +38,8 @@ _COMPUTED: Final = """
     UNION ALL SELECT 1 FROM pragma_table_xinfo('messages') WHERE hidden
     UNION ALL SELECT 1 FROM pragma_table_xinfo('topics') WHERE hidden LIMIT 1
 """
-#: Errors of sqlite3 with a damaged file: its own, messages that are not UTF-8, cells of impossible length.
+#: Errors that sqlite3 raises for a damaged file; the last two stand for text that is not UTF-8, and for cells of
+#: impossible length.
 _SQLITE_ERRORS: Final = (sqlite3.Error, UnicodeDecodeError, MemoryError)
 
 

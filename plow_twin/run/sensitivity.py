@@ -33,7 +33,7 @@ DISPLACEMENT: Final = 1e-7
 _LEAST_DISPLACEMENT: Final = 1e-10
 SHADOW_TOLERANCE: Final = 1e-12
 _STRETCHES: Final = 200
-#: Change of a parameter that is not a length, as a share of it.
+#: Change of a parameter that is not a length, as a share of the parameter's value.
 _RELATIVE_CHANGE: Final = 1e-6
 #: Smallest distance from walls at the beginning of a stretch, in displacements. If this leaves too small a
 #: displacement, the previous stretch is continued, at most so often in a row.

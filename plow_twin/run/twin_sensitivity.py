@@ -27,7 +27,7 @@ from plow_twin.solve.state import Status
 
 Array = NDArray[np.float64]
 
-#: Length of a stretch in s; it ends sooner if a shadow is that many displacements away.
+#: Length of a stretch in s; distance of a shadow, in displacements, at which a stretch ends sooner.
 _STRETCH_S, _FAR = 0.1, 100.0
 #: Longest stretch in s, where a contact prevents a new one.
 _LONGEST_S = 0.5

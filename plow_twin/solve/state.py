@@ -164,7 +164,7 @@ _OPTION_FIELDS: Final[dict[str, list[tuple[Any, ...]]]] = {
     "rounded": [("roll", "f8")],  # distance of a rounded corner along its wall by the angle [m]
     "falling": [  # a restitution that falls with the impact
         ("damping_numbers", "f8", (RESTITUTIONS + 1,)),  # e D(e) on a grid from 0 to 1
-        ("restitution", "f8"),  # of impacts up to `fall_speed`
+        ("restitution", "f8"),  # its value for impacts no faster than `fall_speed`
         ("fall", "f8"),  # power by which it falls
         ("fall_speed", "f8"),  # in m/s
         ("fall_mass", "f8"),  # power of the effective mass
@@ -329,7 +329,7 @@ ROW: Final = np.dtype(
         ("twist", "f8", (3,)),  # rates along the head's own axes [m/s], about z [rad/s]
         # written where the motion follows measurements: 5 % and 95 % points over the drawn twins; peak and impulse
         # since the publication before; clearances [m] with their points
-        ("followed", "i8"),  # `FOLLOWED` with clearances, `WITH_INTERVALS` with all fields
+        ("followed", "i8"),  # `FOLLOWED`: clearances are filled; `WITH_INTERVALS`: all fields are filled
         *((f"{name}_{end}", "f8", (PAIR_COUNT,)) for name in ("force", "peak", "impulse") for end in ("low", "high")),
         ("known_clearance", "f8", (6,)),  # horizontal, its points, vertical, its points
     ]

@@ -170,7 +170,7 @@ class Session:
         self._use(twin)
         #: poses and estimates since the earliest state that is kept
         self._measured: deque[_Measured] = deque()
-        #: poses too far ahead, and poses that a late sample could no longer use
+        #: number of poses too far ahead of the load, and of poses removed from `_measured` because it was full
         self.poses_dropped = 0
         self._scene = twin.scene
         #: numbers of the scene that have been changed, by their keys

@@ -131,7 +131,7 @@ def mqtt_out(url: str, credentials: Credentials, *, plain: bool, sparkplug: str 
     Raises
     ------
     AccessError, OSError
-        The address or a name cannot be used, or a file of the credentials.
+        The address, a name or a file of the credentials cannot be used.
     """
     expected = "mqtt[s]://HOST:PORT/PREFIX"
     host, port, prefix, tls = _address("--mqtt-out", url, ("mqtt", "mqtts"), expected, plain=plain)

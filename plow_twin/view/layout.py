@@ -99,7 +99,7 @@ def blueprint(
         active_tab=0,
     )
     curves = rrb.Vertical(
-        # the title, which is cut in narrower views, stands in the widest
+        # the widest view shows the title; a narrower view would cut it
         _plot("force", f"Largest contact force [kN]{title and '; '}{title}"),
         rrb.StateTimelineView(origin=ENTITY, name="Corners that carry force"),
         _plot("load", "Load on the head"),

@@ -168,7 +168,7 @@ def _draw_section(axis: Any, section: Section, instant: Instant, curves: RunCurv
 
 
 def _y_upwards(axis: Any) -> None:
-    """Label y upwards: the section has y downwards as the viewer has."""
+    """Label y upwards: the data of the section, as those of the viewer, have y downwards."""
     axis.invert_yaxis()
     axis.yaxis.set_major_formatter(lambda y, _: signed(0.0 - y, "g"))
 

@@ -102,7 +102,7 @@ def read_access(url: str, path: Path | None) -> Access:
     InputError
         The file is not YAML within the bounds, or a key or value is not expected.
     OSError
-        The file, or that of the password, cannot be read.
+        The YAML file or the password's file cannot be read.
     """
     if path is None:
         return Access(url, password=password(None, "OPCUA"))

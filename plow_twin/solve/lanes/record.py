@@ -64,7 +64,7 @@ LANES: Final = np.dtype(
         ("gained", "f8", (2, WIDTH)),  # of one slot: impulse over the step, peak
         ("sum", "f8", (4, WIDTH)),  # integrals of cosine, sine, X, Y over the step, less their values at its start
         ("harmonic", "f8", (10, WIDTH)),  # one load: frequency, sine, cosine, amplitudes of S1, S2, M; phase
-        ("size", "f8", (2, WIDTH)),  # of the last two orders as velocities
+        ("size", "f8", (2, WIDTH)),  # the terms of the last two orders, as velocities
         ("step", "f8", _LANES_OF),  # step size in s
         ("accurate", "f8", _LANES_OF),  # step size before an event ends the step
         ("stop", "f8", _LANES_OF),  # time at which a step must end
@@ -109,7 +109,8 @@ _COVERED: Final = {"harmonics", "second", "viscous", "hysteretic", "flight", "re
 def fits_lanes(compiled: CompiledScene, *, sampled: bool = False) -> bool:
     """Return whether the lanes take the steps of a scene.
 
-    Its exponent is 1, it has no other term than damping and harmonics or samples, and no `Options`.
+    The lanes take a scene whose exponent is 1, whose only terms are damping and harmonics (or samples), and which sets
+    no `Options`.
     """
     parts = compiled.parts._replace(terms=compiled.parts.terms._replace(segments=None)) if sampled else compiled.parts
     there = (name for name, term in zip(Terms._fields, parts.terms, strict=True) if term is not None)

@@ -53,7 +53,7 @@ STAGES = 9
 #: A contact is overdamped where its dampers act this many times faster than its springs; the same ratio decides at
 #: compile time whether a scene can need implicit steps.
 OVERDAMPED_RATIO = 20.0
-#: Explicit steps, bound by stability, that an implicit step must replace: it costs as much.
+#: An implicit step costs as much as this many explicit steps; it is worth its cost where stability would need more.
 _WORTH = 30.0
 #: Share of the tolerance that an implicit step may spend, in shares of a step of the series: it replaces many.
 _GAIN = 100.0

@@ -72,12 +72,12 @@ def before_sticking(p, state, w, order, sigma) -> float:
 
 @kernel()
 def before_pushing_again(p, state, w, order, sigma, integer, fraction) -> float:
-    """Return the part of `sigma` over which the ramped force of clipped pairs, which does not act yet, is accurate.
+    """Return the part of `sigma` over which the series of the ramped force of clipped pairs is accurate.
 
-    Only a guard depends on this force, so no other check shortens a step for it. It uses the root test of the motion on
-    the velocity that the force would give. The acting share of C is a cubic, whose series ends after the penetration's,
-    and a force d^n has its branch point where the pair parts. The motion's own terms may have ended early: the test
-    uses the orders that exist.
+    This force does not act yet: only a guard depends on it, so no other check shortens a step for it. The root test of
+    the motion is applied to the velocity that the force would give. The acting share of C is a cubic, whose series ends
+    after the penetration's, and a force d^n has its branch point where the pair parts. The motion's own terms may have
+    ended early: the test uses the orders that exist.
     """
     least, share = np.inf, math.log(p.threshold[p.order] / p.threshold[0]) / order
     for pair in range(PAIR_COUNT):

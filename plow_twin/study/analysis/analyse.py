@@ -47,7 +47,7 @@ _COLUMNS: Final = (
     *(f"force_{name}" for name in PAIR_NAMES),
     *(f"gap_{name}" for name in PAIR_NAMES),
 )
-#: Tolerance of a run that is made of another recording.
+#: Tolerance of the run that the analysis computes from a recording that is no run.
 _TOLERANCE: Final = 1e-9
 #: A measured stamp older than the newest one by more than this [ns] is a step of its clock.
 _STEP_NS: Final = 1_000_000_000

@@ -91,7 +91,7 @@ def _begin(laws: tuple[str, ...]) -> None:
 
 
 def _belong_to_the_caller() -> None:
-    """Leave interrupts to the caller, and end with it in any case."""
+    """Ignore interrupts, which the caller handles, and end this process when the caller's process ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = parent_process()
     assert parent is not None

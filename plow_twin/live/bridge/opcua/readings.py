@@ -29,7 +29,7 @@ class Counts:
     unstamped: int = 0
     #: messages that are missing in the server's numbering, and were not sent again
     notifications_lost: int = 0
-    #: values before which the server's queue overflowed
+    #: values that the server marked: its queue overflowed before them
     overflows: int = 0
     breaks: int = 0
     breaks_filled: int = 0
