@@ -187,7 +187,7 @@ def _history(path: Path) -> History:
     Raises
     ------
     LifeError
-        When it cannot be used.
+        When the history cannot be used.
     """
     import numpy as np
 

@@ -296,7 +296,7 @@ class _Spread:
 
 
 class _Drawn:
-    """Draws of one law: features, targets, changes and the observed motions, until these are cleared."""
+    """Draws of one law: features, targets, changes, and the observed motions until they are cleared."""
 
     def __init__(
         self, forward: Forward, unknowns: Unknowns, eye: MotionFeatures, spread: _Spread, rng: np.random.Generator

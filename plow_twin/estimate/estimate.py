@@ -54,7 +54,7 @@ MOST_PERIODS, MOST_SPAN_S = 20.0, 60.0
 _LONGEST_S = 600.0
 #: Derived: normal deviate that a right model exceeds in one of a hundred cases, to two digits.
 MOST_OTHER_LAW = round(float(ndtri(0.99)), 2)
-#: Derived: 95 % point of a half-normal distribution, in its deviations.
+#: Derived: 95 % point of a half-normal distribution, in standard deviations of the normal distribution.
 _HALF_NORMAL_P95 = float(ndtri(0.975))
 #: Guard: logarithms of the penetrations in m that a contact can have.
 _LN_PENETRATIONS = (math.log(1e-9), math.log(0.12))
@@ -743,8 +743,8 @@ def _groups(
 ) -> dict[str, tuple[Interval, State]]:
     """Return the clearance of each group of pads; not observable where the motion does not determine it.
 
-    `untested` has, by axis, the clearances that no predicted motion tests: their groups are not known better.
-    `added` is the covariance beyond the fit's; `shared` are unknowns and differences from the model.
+    `untested` has, by axis, the clearances that no predicted motion tests: the clearance of a group along this axis is
+    not known better. `added` is the covariance beyond the fit's; `shared` are unknowns and differences from the model.
     """
     out = {}
     for name, (value, deviation) in by_group(problem, fit, widened).items():

@@ -394,7 +394,7 @@ class Health:
         return (ERROR if found.error else WARN if trouble else OK), trouble or "estimating", values
 
     def follow(self, runtime: Runtime) -> Part:
-        """Return the state of following the machine."""
+        """Return how the twin follows the machine, as a part of the diagnostics."""
         follower, reduced = runtime.follower, runtime.reduced
         values = dict.fromkeys(KEYS["follow"], "")
         values["follow"] = "off" if follower is None else "full" if follower.steered else "parameters"

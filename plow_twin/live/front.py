@@ -204,7 +204,9 @@ class BridgeFront:
         if self._feeder.unfit:
             found.append(f"{counts[Verdict.MALFORMED]} malformed; the first: {self._feeder.unfit}")
         if counts[Verdict.DUPLICATE] > many:
-            found.append(f"{counts[Verdict.DUPLICATE]} samples came twice, by stamp or number: have the times too few digits?")
+            found.append(
+                f"{counts[Verdict.DUPLICATE]} samples came twice, by stamp or number: have the times too few digits?"
+            )
         if counts[Verdict.NON_FINITE] > many:
             found.append(f"{counts[Verdict.NON_FINITE]} loads have a number that is not finite (nan or inf)")
         if counts[Verdict.IMPLAUSIBLE] > many:

@@ -423,7 +423,7 @@ MODEL: Final[Mapping[str, str]] = {
 SPECS: Final[Mapping[str, Field[Any]]] = {spec.name: spec for spec in fields(Settings)}
 #: A number that YAML 1.1, in ROS launch files, reads as a text: its mantissa has no point.
 _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
-#: Longest text [characters]: that of a path.
+#: Longest text [characters]; no path on Linux is longer.
 _LONGEST: Final = 4096
 #: No control character, which a terminal would obey.
 _ONE_LINE: Final = r"^[^\x00-\x1f\x7f-\x9f]*\Z"

@@ -17,7 +17,7 @@ class Timer:
         self.restart()
 
     def restart(self) -> None:
-        """Restart: the next call is due in a period."""
+        """Restart the timer: the next call is due after one period."""
         self.due = time.monotonic() + self._period_s
 
     def look(self) -> None:

@@ -350,7 +350,7 @@ class Scene:
     Raises
     ------
     SceneError
-        When it cannot be used; lists every problem.
+        When the scene cannot be used; the error lists every problem.
     """
 
     head: Head

@@ -23,7 +23,7 @@ from plow_twin.stream.outputs import Published
 ALARMS: Final = "alarms"
 #: Parameter name of an acknowledgement in the journal.
 ACKNOWLEDGED: Final = "alarms_acknowledged"
-#: Factor and unit of each quantity in words.
+#: For each quantity, the unit in which an alarm's text gives it, with the factor from SI.
 _UNITS: Final = {
     "force": (1e-3, "kN"),
     "clearance": (1e3, "mm"),

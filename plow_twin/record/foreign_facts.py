@@ -54,8 +54,8 @@ def foreign_facts(path: Path, mapping: Path | None, units: Mapping[str, str]) ->
     Returns
     -------
     facts : dict
-        Topics with their types; by role the topic, messages, those that do not fit, span [s], rate [Hz], and the least
-        and the largest value of each number in SI.
+        Topics with their types; for each role its topic, the numbers of messages and of messages that do not fit, span
+        [s], rate [Hz], and the least and the largest value of each number in SI.
     lossy : bool
         Whether something could not be read.
 

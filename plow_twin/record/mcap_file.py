@@ -406,7 +406,7 @@ class UnbufferedFile:
             return False
 
     def close(self) -> None:
-        """Close it; more calls do nothing."""
+        """Close the file; further calls do nothing."""
         if self._open:
             self._open = False
             os.close(self._descriptor)

@@ -169,7 +169,7 @@ class RunReader:
         return self._headers[file].part if file in self._headers else part_number(file)[0]
 
     def _place_of(self, file: Path) -> tuple[int, bool, str]:
-        """Return the sort key of a file: its number; of two with one number, the file named by it comes first."""
+        """Return the sort key of a file: its number, then whether its name lacks this number."""
         named = part_number(file)[0]
         number = self.number(file)
         return number, named != number, file.name

@@ -212,7 +212,7 @@ def _largest_force(scene: Scene) -> float:
 
 
 def _spacing(stamps_s: Array, load: Array) -> list[UnitDoubt]:
-    """Doubt stamps that are far apart for a load (n, k) that changes smoothly from one to the next."""
+    """Doubt the unit of stamps that are too far apart for a load (n, k) that changes smoothly between them."""
     if len(stamps_s) < _FEW:
         return []
     steps = np.diff(stamps_s)

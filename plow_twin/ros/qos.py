@@ -21,7 +21,7 @@ def sensor_input(depth: int) -> QoSProfile:
 
 
 def offered(topic: Topic) -> QoSProfile:
-    """Return the quality of service of an output: reliable, the rest as its table says."""
+    """Return the quality of service of an output: it is reliable; depth and durability come from its `Topic`."""
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
         depth=topic.depth,

@@ -172,7 +172,7 @@ class _Shared:
         return found
 
 
-#: Of the scenes compiled last: studies vary some parts of a scene and keep the others.
+#: Parts of the scenes compiled last, to be used again: studies vary some parts of a scene and keep the others.
 _LATELY: Final = _Shared(64)
 
 

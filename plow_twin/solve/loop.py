@@ -306,7 +306,7 @@ def lay_out_again(p, parts, state, w) -> None:
 def _rows_in_flight(p, harmonics, flight, state, w, t, i, q, v, penetration, force):
     """Fill the rows within a step of free flight from row i on; return the first row after it.
 
-    Separate from `integrate`, whose loop over rows is a tenth faster without the branch.
+    This is no branch of `integrate`, because the loop over rows there is a tenth faster without the branch.
     """
     if flight is not None:
         t0, y, rate = state.step_start, np.empty(8), np.empty(8)

@@ -49,8 +49,8 @@ class Verdict(Enum):
     IMPLAUSIBLE = "implausible"
     #: the stamps jump repeatedly: the model is not reset each time
     UNSTEADY = "unsteady"
-    #: the stamp jumped, and the next one continued from before: the stamp was wrong, and the sender's clock did not
-    #: step
+    #: the stamp jumped, and the next stamp continued from the stamps before the jump: this one was wrong, and the
+    #: sender's clock did not step
     STRAY = "stray"
     #: names or lengths of the message do not fit the scene
     MALFORMED = "malformed"

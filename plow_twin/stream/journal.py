@@ -155,9 +155,8 @@ class Unused:
     """`count` messages of `sender` came on the input `topic` and were not used; kept as evidence, moves nothing.
 
     `reason` is as in the counters `dropped_<reason>`, or `not_followed`, or `lost`: never arrived (with a negative
-    `count`: arrived after all). `stamps_ns` and `values` have an item for each message in order of arrival, the first
-    ones only where there were too many at once; an unreadable message has no values and stamp 0. A value need not be
-    finite.
+    `count`: arrived after all). `stamps_ns` and `values` have an item for each message in order of arrival; of too many
+    messages at once, they have the first. An unreadable message has no values and stamp 0. A value need not be finite.
     """
 
     topic: str

@@ -170,7 +170,7 @@ def _payload(groups: Mapping[str, Group], *, with_units: bool) -> Any:
 
 
 def _typed(value: Value) -> tuple[int, str, Any]:
-    """Return number of the data type, field of the message and content for a value."""
+    """Return for a value: the number of its data type, the message's field that holds it, and the field's content."""
     if value is None:
         return _DOUBLE_TYPE, "is_null", True
     if isinstance(value, str):

@@ -58,11 +58,11 @@ _AT_SAMPLE: Final = 7
 class Samples(NamedTuple):
     """The samples that twins are advanced through, and the progress of each twin."""
 
-    params: NDArray[np.void]  #: of all twins, shape (m,)
+    params: NDArray[np.void]  #: parameters of all twins, shape (m,)
     states: NDArray[np.void]
     saved: NDArray[np.void]  #: states of the scenes in the lanes at the sample before, shape (8,)
     totals: NDArray[np.void]  #: touches since then of the scenes in the lanes, shape (8,)
-    times: NDArray[np.float64]  #: of the samples, shape (n,)
+    times: NDArray[np.float64]  #: times of the samples, shape (n,)
     wrench: NDArray[np.float64]  #: per mass and inertia, the last sample first, shape (m, n + 1, 3)
     rows: NDArray[np.void]  #: shape (m, n)
     place: NDArray[np.int64]  #: samples that each twin has passed, shape (m,)

@@ -66,7 +66,10 @@ def _later(series, order, h):
 
 @kernel()
 def _list_off(lanes, order) -> None:
-    """List the guards of pairs that are off, unless the first terms and bounds of the rest prove that they stay off."""
+    """List the guards of pairs that are off.
+
+    A guard is left out if its first terms, with bounds of the later terms, prove that the pair stays off.
+    """
     h, series, cosine, sine = exact_row(lanes.step, 0), lanes.series, lanes.series[COS], lanes.series[SIN]
     x, y = series[X], series[Y]
     later_c, later_s = _later(cosine, order, h), _later(sine, order, h)

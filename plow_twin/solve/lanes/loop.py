@@ -39,7 +39,7 @@ class Members(NamedTuple):
     params: NDArray[np.void]
     states: NDArray[np.void]
     totals: NDArray[np.void]
-    harmonics: NDArray[np.void]  #: of all scenes, one after the other
+    harmonics: NDArray[np.void]  #: harmonics of all scenes, one scene after the other
     extent: NDArray[np.int64]  #: where the harmonics of each scene begin, and their number
     status: NDArray[np.int64]
     first: NDArray[np.int64]  #: rows written
@@ -188,7 +188,7 @@ def end_of(lanes, lane):
 
 @kernel()
 def complete(p, state, sums, lanes, lane, hysteretic) -> None:
-    """Move a lane to the end of its step: time, counts and modes; its state has been moved."""
+    """Move the time, counts and modes of a lane to the end of its step; its state is there already."""
     begin, parted = lanes.time[lane], False
     state.steps += 1
     state.evaluations += lanes.orders[lane]

@@ -72,7 +72,7 @@ def load_poses(path: Path) -> PoseRecording:
     Raises
     ------
     StudyError
-        When it cannot be read or its rows cannot be used.
+        When the file cannot be read or its rows cannot be used.
     """
     readers: dict[str, Callable[[Path], tuple[Array, Array, Table | None]]]
     readers = {".csv": _read_csv, ".parquet": _read_csv, ".npz": _read_npz, ".mcap": _read_mcap}

@@ -146,7 +146,7 @@ def load_targets(path: Path, scene: Scene) -> TargetSet:
     Raises
     ------
     StudyError
-        When it cannot be read or used; lists every problem.
+        When the file cannot be read or used; the error lists every problem.
     """
     raw, found = read_yaml(path, "target", "version, t_end, targets")
     problems = [str(problem) for problem in found]

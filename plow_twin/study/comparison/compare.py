@@ -1,4 +1,4 @@
-"""Runs in groups, by run, day or shift, and each group beside the first: `compare`."""
+"""The comparison of runs: `compare` groups them by run, day or shift, and compares each group with the first."""
 
 from __future__ import annotations
 

@@ -280,7 +280,7 @@ def ensemble(
     first_flight : array_like, shape (k, 3)
         Rows of x, z [m] and theta [rad] at 250 Hz before the first impact.
     n_rows : int
-        Rows from the first of these on.
+        Number of rows to return, counted from the first row of `first_flight`.
     members, seed : int
         How many motions; of the draws.
     block : ndarray of BLOCK, shape ()
@@ -319,7 +319,7 @@ def bands(first_flight: ArrayLike, n_rows: int) -> Array:
     first_flight : array_like, shape (k, 3)
         Rows of x, z [m] and theta [rad] at 250 Hz before the first impact.
     n_rows : int
-        Rows from the first of these on.
+        Number of rows to return, counted from the first row of `first_flight`.
 
     Returns
     -------
