@@ -23,6 +23,7 @@ from plow_twin import load_scene
 from plow_twin.cli import compare as compare_verb
 from plow_twin.cli.app import run as cli
 from plow_twin.cli.console import PlainConsole
+from plow_twin.errors import RecordingError
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record.messages import JointState
 from plow_twin.record.recording import read_recording
@@ -73,6 +74,22 @@ def test_a_window_without_a_message_of_the_clearance_has_that_of_its_neighbours(
     windows = windows_of(read_recording(runs[0].folder), 0.05)
     scene = load_scene("paper").clearance
     np.testing.assert_allclose(windows.clearance, [[scene.horizontal_m, scene.vertical_m]] * len(windows.start_ns))
+
+
+def test_windows_with_a_stretch_without_samples_are_left_out_and_named(runs: tuple[Run, Run], tmp_path: Path) -> None:
+    # with 97 % of its messages in the first case, the window counts as full
+    for first, end, timeout in ((4100, 4130, 0.02), (4100, 5200, 0.5)):
+        samples = (paper_sample(index) for index in range(SECONDS * 1000) if not first <= index < end)
+        run = record_run(tmp_path / str(end), samples, parameters={"excitation_timeout": timeout})
+        windows = windows_of(read_recording(run.folder), 1.0)
+        begins = (windows.start_ns - BASE_NS) // 10**9
+        left_out = {first // 1000, end // 1000}
+        assert set(range(SECONDS)) - set(begins.tolist()) == left_out and windows.silent == len(left_out)
+        found = compare([("monday", windows_of(read_recording(runs[0].folder), 1.0)), ("tuesday", windows)])
+        assert f"tuesday: {windows.silent} windows left out: a stretch without samples is in them" in found.notes
+    with pytest.raises(RecordingError, match="in each window"):
+        samples = (paper_sample(600 * index) for index in range(12))
+        windows_of(read_recording(record_run(tmp_path / "rare", samples).folder), 1.0)
 
 
 def test_the_window_is_the_period_of_the_load(runs: tuple[Run, Run]) -> None:

@@ -45,7 +45,7 @@ class Comparison:
     scenes : list of str
         Names of the scenes of all runs.
     notes : list of str
-        Doubts about the runs: times that several runs have, sample rates that differ.
+        Doubts about the runs: stretches without samples, times that several runs have, sample rates that differ.
     """
 
     groups: dict[str, Windows]
@@ -162,6 +162,8 @@ def compare(
     notes: list[str] = []
     runs = list(runs)
     for name, windows in runs:
+        if windows.silent:
+            notes.append(f"{name}: {windows.silent} windows left out: a stretch without samples is in them")
         labels = np.array([label(name, stamp) for stamp in windows.start_ns.tolist()])
         for group in dict.fromkeys(labels.tolist()):
             chosen = windows.chosen(labels == group)

@@ -13,6 +13,7 @@ from plow_twin.errors import RecordingError
 from plow_twin.estimate.measurements import Load
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.record.recording import Batched, Recording
+from plow_twin.record.run_time import RunTime
 from plow_twin.stream.outputs import CLEARANCE_NAMES, PAD_NAMES
 
 Array = NDArray[np.float64]
@@ -56,6 +57,8 @@ class Windows:
         Their lengths [ns].
     rate_hz : ndarray, shape (n,)
         Samples of the load a second.
+    silent : int
+        Windows left out because of a stretch without samples.
     """
 
     start_ns: Indexes
@@ -64,6 +67,7 @@ class Windows:
     clearance: Array
     length_ns: Indexes
     rate_hz: Array
+    silent: int = 0
 
     def chosen(self, which: NDArray[np.bool_]) -> Windows:
         """Return some of the windows, by a mask (n,); all of them without a copy."""
@@ -126,12 +130,12 @@ def windows_of(recording: Recording, window_s: float | None = None) -> Windows:
     Raises
     ------
     RecordingError
-        It is not a run of plow_twin, or has no outputs.
+        It is not a run of plow_twin, has no outputs, or each window has a stretch without samples.
     """
     window_ns = round(1e9 * (window_s or _load_period(recording)))
     peak, moved, contact, load = _Sums(PAIR_COUNT), _Sums(2 * PAIR_COUNT), _Sums(2 * PAIR_COUNT + 1), _Sums(3)
     slow, slow_count = _Sums(2), _Sums(1)
-    messages = _Sums(1)
+    messages, silences, silent_ns = _Sums(1), RunTime(recording.header.parameters).silences, list[tuple[int, int]]()
     touches: Array | None = None
     newest: tuple[Indexes, Array] | None = None
     pads: dict[int, tuple[Array, Array]] = {}
@@ -141,6 +145,7 @@ def windows_of(recording: Recording, window_s: float | None = None) -> Windows:
             if (np.diff(window) < 0).any():
                 part, window = _risen(part, window)
             if name == "excitation":
+                silent_ns += [(begin, end) for _, begin, end in silences.add(part.stamp_ns)]
                 force2, moment2 = (part.values[:, :2] ** 2).sum(axis=1), part.values[:, 2] ** 2
                 load.add(window, np.column_stack((force2, moment2, np.ones(len(window)))))
             elif name == "contact_peaks":
@@ -172,7 +177,17 @@ def windows_of(recording: Recording, window_s: float | None = None) -> Windows:
                 f"{recording.path}: got no {name}, expected a run with outputs: plow-twin replay --write"
             )
     full = FULL * float(np.median([row[0] for row in messages.rows.values()]))
-    numbers = sorted(number for number, row in messages.rows.items() if row[0] >= full)
+    # the messages at the end of a silence are of the whole silence
+    known, silent = np.array(sorted(messages.rows)), set[int]()
+    for begin, end in silent_ns:
+        first, last = np.searchsorted(known, begin // window_ns), np.searchsorted(known, end // window_ns, side="right")
+        silent.update(known[first:last].tolist())
+    numbers = sorted(number for number, row in messages.rows.items() if row[0] >= full and number not in silent)
+    if not numbers:
+        raise RecordingError(
+            f"{recording.path}: got a stretch without samples in each window, expected some without: "
+            "excitation_timeout is the longest time between samples that is none"
+        )
     seconds = window_ns * 1e-9
     sums, touched = moved.of(numbers), contact.of(numbers)
     squares = load.of(numbers)
@@ -191,6 +206,7 @@ def windows_of(recording: Recording, window_s: float | None = None) -> Windows:
         _between(slow, slow_count, numbers),
         np.full(len(numbers), window_ns, np.int64),
         squares[:, 2] / seconds,
+        len(silent),
     )
 
 
