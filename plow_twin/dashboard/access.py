@@ -64,7 +64,7 @@ class PageAccess:
         return cls(host, port, token)
 
     def admits(self, token: object) -> bool:
-        """Return whether a token is right, in a time that does not depend on how much of it is."""
+        """Return whether a token is right, in a time that does not depend on the number of right characters."""
         given = token if isinstance(token, str) else ""
         return hmac.compare_digest(given.encode("utf-8", "replace"), self.token.encode())
 

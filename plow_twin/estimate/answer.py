@@ -49,7 +49,7 @@ class Answer:
 
     @property
     def text(self) -> str:
-        """All of it as JSON."""
+        """The whole answer as JSON."""
         return json.dumps({**self.estimate.as_dict(), **self.also}, allow_nan=False)
 
 

@@ -43,7 +43,7 @@ WALLS: Final = {
 _FLIGHT_ROWS: Final = (4, 9)
 #: Derived: degrees of freedom of the Student-t likelihood, the value that Lange et al. recommend.
 _FREEDOM: Final = 4.0
-#: Bound: scales of it on the grid, and rounds of reweighting for each.
+#: Bound: scales of the likelihood on the grid, and rounds of reweighting for each scale.
 _SCALES, _ROUNDS = 40, 30
 #: Definition: places in the vector of the linear problem: clearances, bias of x, y and theta, lever arm, penetration
 #: over that with the scene's stiffness.

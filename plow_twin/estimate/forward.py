@@ -20,7 +20,7 @@ from plow_twin.solve.state import EVENT, SEGMENT, TOTALS, Parts, Status, new_rec
 
 Array = NDArray[np.float64]
 
-#: Bound: steps that one run may take for each second of motion, and beside them; rows of its log.
+#: Bound: a run may take so many steps for each second of motion, and so many more; rows of the log of a run.
 _STEPS_PER_SECOND, _STEPS = 20_000, 2_000
 _LOG_SIZE = 4096
 #: Bound: steps of the series that cost as much as an implicit one.

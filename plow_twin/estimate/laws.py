@@ -23,8 +23,8 @@ _LEAST = 1e-9
 #: Definition: parameters that enter to the third power (penetration, damping), and parameters whose effect depends on
 #: them (clearances).
 _CURVED, _CHANGING = (0, 1), (5, 6)
-#: Bound: steps to the likeliest parameters (Levenberg-Marquardt), damping of the first step, gain that ends them. Step:
-#: of their difference quotients.
+#: Bound: steps to the likeliest parameters (Levenberg-Marquardt), damping of the first step, gain that ends the steps.
+#: Step: of the difference quotients by the parameters.
 _STEPS, _DAMPED, _ENOUGH, _SMALL = 30, 1e-2, 1e-2, 1e-4
 
 

@@ -137,7 +137,7 @@ class Inputs:
         return False
 
     def lost_at_first(self, sender: bytes, more: int) -> bool:
-        """Count `more` samples of a sender as lost before its first one; False when it is not the one followed."""
+        """Count `more` samples of a sender as lost before its first sample; False unless this sender is followed."""
         if sender != self.senders.followed:
             return False
         self.senders.lost += more

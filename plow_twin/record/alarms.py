@@ -86,7 +86,7 @@ def alarm_texts(values: Mapping[str, str], *, own_start: bool = False, newest: b
 
 
 class AlarmCheck:
-    """Compute the alarms of a run again, and compare each message of them with the one recorded.
+    """Compute the alarms of a run again, and compare each of their messages with the recorded message.
 
     Alarms depend on every publication since the start of the run: after a missing one they cannot be compared.
     """

@@ -136,7 +136,7 @@ class ByteFile(Protocol):
     """Destination of a recording's bytes: a file or memory."""
 
     def write(self, data: bytes) -> None:
-        """Write all of it."""
+        """Write all bytes of `data`."""
 
     def tell(self) -> int:
         """Return the bytes written so far."""
@@ -376,7 +376,7 @@ class UnbufferedFile:
         self._open = True
 
     def write(self, data: bytes) -> None:
-        """Write all of it."""
+        """Write all bytes of `data`."""
         view = memoryview(data)
         while view:
             with naming(self._path):

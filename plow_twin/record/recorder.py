@@ -552,7 +552,7 @@ class _SeriesItem(NamedTuple):
 
     @property
     def keys(self) -> Mapping[str, int]:
-        """Keys of the losses with it."""
+        """Topics that lose messages if this item is lost, with the number of these messages."""
         return {JOURNAL: len(self.series.stamps) + len(self.series.digests)}
 
     def write(self, writer: RunWriter) -> None:
@@ -599,7 +599,7 @@ class _EntryItem(NamedTuple):
 
     @property
     def keys(self) -> tuple[str, ...]:
-        """Keys of the losses with it."""
+        """Topics that lose a message if this item is lost."""
         return (JOURNAL,)
 
     def write(self, writer: RunWriter) -> None:
@@ -617,7 +617,7 @@ class _OutputItem(NamedTuple):
 
     @property
     def keys(self) -> tuple[str, ...]:
-        """Keys of the losses with it."""
+        """Topics that lose a message if this item is lost."""
         return (self.topic,)
 
     def write(self, writer: RunWriter) -> None:

@@ -132,7 +132,7 @@ class MemoryFile:
         self.content = bytearray()
 
     def write(self, data: bytes) -> None:
-        """Write all of it."""
+        """Write all bytes of `data`."""
         self.content += data
 
     def tell(self) -> int:

@@ -27,7 +27,7 @@ def find_run(path: Path, wait_s: float, stop: Callable[[], bool] = lambda: False
 
 
 def running_run(path: Path, wait_s: float, stop: Callable[[], bool] = lambda: False) -> Path | None:
-    """Return the recording at `path`, or the one beside it (`<path>_2`, ...), that is being written.
+    """Return the recording that is being written at `path` or beside it (`<path>_2`, ...).
 
     None when no recording is written within `wait_s` [s], or before `stop` is true.
     """

@@ -79,7 +79,7 @@ def about_mass(p, c, s, load):
 
 @kernel()
 def accelerate(p, acts, frozen, state, t, z, load, out) -> None:
-    """Write the rate of z = (x, y, theta, vx, vy, omega), or with a support of the z of `support.to_world_both`.
+    """Write the rate of z = (x, y, theta, vx, vy, omega); with a support, z is that of `support.to_world_both`.
 
     `acts` is an `Acting`. `frozen`: the pairs that are on act by their law, also where it would pull; otherwise the
     pairs that penetrate push.

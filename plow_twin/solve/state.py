@@ -260,7 +260,7 @@ WORK: Final = np.dtype(
         ("frame", "f8", _WIDE),  # a frame on springs (`solve.support`)
         ("frame_left", "f8", (3, *_WIDE)),  # factors of its Cauchy products
         ("frame_right", "f8", (3, *_WIDE)),
-        ("seen", "f8", _WIDE),  # implicit steps: the head as seen from it
+        ("seen", "f8", _WIDE),  # implicit steps: the head as seen from the frame
         ("frame_sum", "f8", (PAIR_COUNT,)),
         ("grip", "f8", (3, PAIR_COUNT)),  # friction with stick: force per normal force, place and slip rate
         ("per_pair", "f8", (9, PAIR_COUNT)),  # masks and sums of the eight pairs
@@ -406,7 +406,7 @@ EVENT: Final = np.dtype([("time", "f8"), ("pair", "i8"), ("mode_from", "i8"), ("
 PACE: Final = np.dtype(
     [
         ("slice", "i8"),  # steps of a slice
-        ("left", "i8"),  # of it
+        ("left", "i8"),  # steps left of the slice
         ("row", "i8"),  # the next advance, members one after the other
         ("underway", "i8"),  # 1 where the advance has begun
         ("mark", "i8"),  # the next mark

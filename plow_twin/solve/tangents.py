@@ -10,8 +10,8 @@ rate, phi and psi, and the contacts' force f = (fx, fy) in head axes, each colum
 
 with n the row of a penetration for X and Y, de its change by a clearance, dtau the change of the contacts' moment with
 the angle. The factors are series that the step has: each order is a sum of Cauchy products, eight columns side by side.
-At a touch the force jumps by C d' (Kelvin-Voigt): a column that touches dd / d' sooner has received the impulse C dd by
-then. All other changes of contact leave the force continuous.
+At a touch the force jumps by C d' (Kelvin-Voigt). The motion displaced by a column touches earlier by dd / d', and has
+received the impulse C dd when the motion itself touches. All other changes of contact leave the force continuous.
 """
 
 from __future__ import annotations

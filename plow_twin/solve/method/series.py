@@ -150,7 +150,7 @@ def _damp(p, elastic, w, k, elastic_k, rate, viscous, hysteretic, ramp):
 
 @kernel(fast=True, inline="code")
 def _ramp(p, w, k) -> None:
-    """Write order k of the share of C that acts to `w.ramp[2]`: constant for pairs beyond the ramp."""
+    """Write to `w.ramp[2]` order k of the acting share of C, which is constant for pairs beyond the ramp."""
     set_row(w.ramp[0], k, _multiply(w.penetration, w.penetration, k))
     set_row(w.ramp[1], k, _multiply(w.ramp[0], w.penetration, k))
     within = row(w.per_pair, RAMPS)

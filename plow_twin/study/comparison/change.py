@@ -74,7 +74,7 @@ def points(values: Array) -> dict[str, float]:
 
 
 def with_neighbours(load: Array, start_ns: NDArray[np.int64]) -> Array:
-    """Return the load of each window, of the one before and of the one after, shape (n, 3).
+    """Return the load of each window, of the window before and of the window after, shape (n, 3).
 
     Where a neighbour is missing, the window's own load takes its place. A window cuts through changes of the load,
     and the head's motion remembers the load before: the slope over a window's own load alone is not the effect of a

@@ -59,7 +59,7 @@ class Drops:
         return enough
 
     def until(self, index: int, bounce: int) -> int:
-        """Return the row before the bounce of that number (from 0), or before the last bounce."""
+        """Return the row before bounce number `bounce` (from 0), or before the last bounce if there are fewer."""
         return self.bounces[index][min(bounce, len(self.bounces[index]) - 1)]
 
     def inside(self, index: int, bounce: int = 2) -> NDArray[np.bool_]:
