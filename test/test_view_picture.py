@@ -18,7 +18,7 @@ from record_support import BASE_NS, STEP_NS, paper_sample, record_run
 
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.record.messages import JointState
-from plow_twin.record.reader import RunReader
+from plow_twin.record.reader import FileStatus, RunReader
 from plow_twin.stream.journal import Entry, Estimated, Hold, SetModel
 from plow_twin.view.envelope import Envelope
 from plow_twin.view.picture import run_figure, to_png
@@ -140,12 +140,27 @@ def test_every_force_of_the_instant_shown_has_its_arrow_and_its_value_inside_the
         assert x[0] < at[0] < x[1] and y[0] < at[1] < y[1] and math.isfinite(at[0])
 
 
-def test_the_title_has_run_scene_and_date_and_thresholds_are_drawn(tmp_path: Path, figures: list[Figure]) -> None:
+def test_the_title_has_run_scene_and_date_and_thresholds_are_drawn(
+    tmp_path: Path, figures: list[Figure], monkeypatch: pytest.MonkeyPatch
+) -> None:
     alarms = {"alarm_force": [1.2e5, 1.5e5], "alarm_clearance": [0.031, 0.0], "scene": "paper"}
     run = record_run(tmp_path / "monday", map(paper_sample, range(300)), parameters=alarms)
     to_png(run.folder, tmp_path / "run.png")
     title = figures[0].get_suptitle()
-    assert title.startswith(f"{tmp_path.name}/monday, scene paper, 20") and " UTC" in title
+    start = f"{tmp_path.name}/monday, scene paper, 20"
+    assert title.startswith(start) and " UTC" in title
+    reader = RunReader(run.folder)
+    curves = RunCurves.of(reader)
+    lost = dict.fromkeys(("journal", "/contact_forces", "/contact_peaks", "/head_state", "/clearance", "/status"), 1000)
+    monkeypatch.setattr(RunReader, "lost", property(lambda _: lost))
+    monkeypatch.setattr(RunReader, "lost_parts", property(lambda _: {"missing_parts": 2}))
+    reader.status = FileStatus.STOPPED_EARLY
+    check_figure(figure := run_figure(reader, curves))
+    title, losses = figure.get_suptitle().split("\n")
+    assert title.startswith(start) and title.endswith(FileStatus.STOPPED_EARLY.value)
+    assert losses == "6000 messages lost on 6 topics, lost missing parts: 2"
+    extent = figure._suptitle.get_window_extent()  # type: ignore[attr-defined]
+    assert extent.x0 >= 0.0 and extent.x1 <= figure.bbox.x1
     drawn = {
         (axis.get_ylabel().split()[0], line.get_label()): line.get_ydata()[0]
         for axis in figures[0].axes

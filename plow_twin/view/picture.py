@@ -92,7 +92,7 @@ def run_figure(reader: RunReader, curves: RunCurves) -> Figure:
         if axis.get_legend_handles_labels()[0]:
             legend_beside(axis)
     clearance.set_xlabel("\n".join(("time since the first stamp [s]", "; ".join(_meanings(curves)))).rstrip())
-    figure.suptitle(_title(reader, curves, {**reader.lost, **reader.lost_parts}))
+    figure.suptitle(_title(reader, curves))
     return figure
 
 
@@ -106,16 +106,19 @@ def _meanings(curves: RunCurves) -> list[str]:
     ]
 
 
-def _title(reader: RunReader, curves: RunCurves, lost: dict[str, int]) -> str:
-    """Return run, scene, date and end of the recording."""
+def _title(reader: RunReader, curves: RunCurves) -> str:
+    """Return run, scene, date and end of the recording; a second line has the losses."""
     parts = ["/".join(reader.path.absolute().parent.parts[-2:])]
     parts.append(scene_and_date(reader, curves.first_ns))
-    losses = [f"lost {name.replace('_', ' ')}: {count}" for name, count in lost.items()]
+    losses = [f"lost {name.replace('_', ' ')}: {count}" for name, count in reader.lost_parts.items()]
+    if reader.lost:
+        where = next(iter(reader.lost)) if len(reader.lost) == 1 else f"{len(reader.lost)} topics"
+        losses.insert(0, f"{sum(reader.lost.values())} messages lost on {where}")
     if curves.failed:
         losses.append(f"{curves.failed} advances failed: no forces")
     if reader.status is not FileStatus.COMPLETE or not losses:
-        losses.insert(0, reader.status.value)
-    return ", ".join(parts + losses)
+        parts.append(reader.status.value)
+    return "\n".join(filter(None, (", ".join(parts), ", ".join(losses))))
 
 
 def _draw_instant(upper: Any, lower: Any, section: Section, curves: RunCurves) -> None:
