@@ -253,6 +253,21 @@ def states_of(scene: Scene, states: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.array([state_of(scene, row[:3], row[3:]) for row in states]).reshape(-1, STATE_SIZE)
 
 
+def largest_angle(scene: Scene) -> float:
+    """Return the angle in rad to which the frame can turn in an unworn cavity, at most 45 degrees.
+
+    A frame at an angle is as wide and as high as its corners, or the arcs of its corners, reach.
+    """
+    radius = corner_radius(scene)
+    sides = np.array([[scene.frame.width_m], [scene.frame.height_m]])
+    angles = np.linspace(0.0, 0.25 * math.pi, 4096)
+    core = sides - 2.0 * radius
+    extents = core * np.cos(angles) + core[::-1] * np.sin(angles) + 2.0 * radius
+    cavity = sides + np.array([[scene.clearance.horizontal_m], [scene.clearance.vertical_m]])
+    inside = np.append((extents <= cavity).all(axis=0), False)
+    return float(angles[max(0, int(np.argmin(inside)) - 1)])
+
+
 def length_scale(scene: Scene) -> float:
     """Return the length in m that a tolerance refers to: the smallest clearance that is not negligible.
 

@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.errors import UnitError
+from plow_twin.model.geometry import largest_angle
 from plow_twin.model.loads import compile_loads
 from plow_twin.model.scene import Scene
+from plow_twin.record.map_file import UNITS
 from plow_twin.record.mapping import Role, readings
 from plow_twin.record.sources import Arrived
 from plow_twin.record.times import START_NS
@@ -30,6 +32,10 @@ _BROKEN_SHARE: Final = 1e-4
 _SMALLER: Final = {"kN": 1.0, "MN": 1e-3}
 #: An angle beyond this [rad] leaves the model, which ends at 45 degrees.
 _LARGEST_ANGLE_RAD: Final = 0.25 * np.pi
+#: A swing so many times the angle that the clearance allows is in degrees: wear and pressed contacts allow less.
+_BEYOND_CLEARANCE: Final = 3.0
+#: Pads that give way turn a head farther than a narrow clearance does: a swing up to this [rad] is believed.
+_BELIEVED_SWING_RAD: Final = 0.1
 #: Stamps further apart than this [s] cannot follow a load that changes smoothly from one to the next.
 _SLOW_S: Final = 0.5
 #: A load is smooth when it changes by less than this share of its range between two samples, in the median.
@@ -75,7 +81,9 @@ class UnitDoubt:
     @property
     def remedy(self) -> str:
         """How to state the unit."""
-        return self.advice or "state the unit: " + " ".join(f"--unit {name}={self.likely}" for name in self.names)
+        return self.advice or "state the unit: " + " ".join(
+            f"--unit {name}={self.likely.replace(' ', '')}" for name in self.names
+        )
 
 
 def unit_doubts(
@@ -95,7 +103,8 @@ def unit_doubts(
     magnitudes = {key: _usual_magnitude(np.asarray(found, float)) for key, found in values.items()}
     load = [values["excitation", name] for name in ("fx", "fy", "m") if ("excitation", name) in values]
     spacing = _spacing(np.asarray(load_stamps_s, float), np.array(load, float).T) if load else []
-    return [*_load(magnitudes, scene), *_pose(magnitudes, scene), *_travel(values), *spacing]
+    angle = _angle(np.asarray(values.get(("head_pose", "theta"), ()), float), scene)
+    return [*_load(magnitudes, scene), *_lengths(magnitudes, scene), *angle, *_travel(values), *spacing]
 
 
 def small_thresholds(thresholds: Sequence[float], scene: Scene) -> str:
@@ -150,8 +159,8 @@ def check_poses(t: Array, q: Array, scene: Scene, source: object) -> None:
     UnitError
         It names the numbers and their values.
     """
-    magnitudes = {("head_pose", name): _usual_magnitude(q[:, place]) for place, name in enumerate(("x", "y", "theta"))}
-    doubts = [*_pose(magnitudes, scene), *_spacing(t, q)]
+    magnitudes = {("head_pose", name): _usual_magnitude(q[:, place]) for place, name in enumerate(("x", "y"))}
+    doubts = [*_lengths(magnitudes, scene), *_angle(q[:, 2], scene), *_spacing(t, q)]
     if doubts:
         remedy = doubts[0].advice or "convert the file to SI"
         raise UnitError(f"{source}: {'; '.join(map(str, doubts))}: {remedy}")
@@ -170,27 +179,49 @@ def _usual_magnitude(values: Array, percent: float = 99.0) -> float:
 
 
 def _load(magnitudes: Mapping[tuple[str, str], float], scene: Scene) -> list[UnitDoubt]:
-    """Doubt the forces together: one component alone may well be small."""
+    """Doubt the forces together, as one component alone may well be small, and the moment beside them."""
     found = [magnitudes[key] for key in (("excitation", "fx"), ("excitation", "fy")) if key in magnitudes]
     usual = _largest_force(scene)
     largest = max(found, default=0.0)
+    doubts = []
     for unit, size in _SMALLER.items():
         if _BROKEN_SHARE * size * usual < largest < _IDLE_SHARE * size * usual:
             expected = f"some {usual:.2g} N as in the scene"
-            return [UnitDoubt("excitation", ("fx", "fy"), f"{largest:.3g}", expected, unit)]
-    return []
+            doubts = [UnitDoubt("excitation", ("fx", "fy"), f"{largest:.3g}", expected, unit)]
+            largest *= UNITS["force"][unit]
+    usual_moment = float(compile_loads(scene.loads).largest()[2])
+    # a small load has a small moment too
+    beside = usual_moment * min(1.0, largest / usual) if usual else 0.0
+    moment = magnitudes.get(("excitation", "m"), 0.0)
+    if _BROKEN_SHARE * beside < moment < _IDLE_SHARE * beside:
+        expected = f"some {beside:.2g} N m beside such forces, as in the scene"
+        doubts.append(UnitDoubt("excitation", ("m",), f"{moment:.3g}", expected, "kN m"))
+    return doubts
 
 
-def _pose(magnitudes: Mapping[tuple[str, str], float], scene: Scene) -> list[UnitDoubt]:
+def _angle(theta: Array, scene: Scene) -> list[UnitDoubt]:
+    """Doubt angles beyond the model, or whose swing about their middle no clearance allows."""
+    largest = _usual_magnitude(theta)
+    if scene.head.carries == "corners" or not 0.0 < largest < np.degrees(_LARGEST_ANGLE_RAD):
+        return []
+    # the zero of a sensor is not the head's
+    low, high = np.percentile(theta[np.isfinite(theta)], (0.5, 99.5))
+    swing = 0.5 * float(high - low)
+    allowed = max(_BELIEVED_SWING_RAD, _BEYOND_CLEARANCE * largest_angle(scene))
+    if largest > _LARGEST_ANGLE_RAD:
+        found, expected = f"{largest:.3g}", f"less than {_LARGEST_ANGLE_RAD:.3g} rad"
+    elif swing > allowed:
+        found, expected = f"a swing by {swing:.3g} to either side", f"at most {allowed:.2g} rad in this clearance"
+    else:
+        return []
+    return [UnitDoubt("head_pose", ("theta",), found, expected, "deg", True)]
+
+
+def _lengths(magnitudes: Mapping[tuple[str, str], float], scene: Scene) -> list[UnitDoubt]:
     doubts = []
     most = largest_displacement(scene)
     for (role, name), largest in magnitudes.items():
-        if role == "head_pose" and name == "theta":
-            tumbles = scene.head.carries == "corners"
-            if not tumbles and _LARGEST_ANGLE_RAD < largest < np.degrees(_LARGEST_ANGLE_RAD):
-                expected = f"less than {_LARGEST_ANGLE_RAD:.3g} rad"
-                doubts.append(UnitDoubt(role, (name,), f"{largest:.3g}", expected, "deg", True))
-        elif role in ("head_pose", "gaps") and most < largest < 1e3 * most:
+        if (role == "gaps" or (role == "head_pose" and name != "theta")) and most < largest < 1e3 * most:
             expected = f"less than half the frame or the clearance, {most:.3g} m"
             doubts.append(UnitDoubt(role, (name,), f"{largest:.3g}", expected, "mm", True))
     return doubts
