@@ -15,6 +15,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
+import yaml
 
 from plow_twin.cli.app import run as cli
 from plow_twin.errors import RecordingError, UnitError
@@ -99,6 +100,21 @@ def test_undecided_columns_end_with_the_option_that_states_them(
     for columns, units, wrong in (({"fx": "z"}, {}, "got 'z'"), ({"fz": "a"}, {}, "fz"), ({}, {"fx": "lbf"}, "lbf")):
         with pytest.raises(RecordingError, match=wrong):
             guess_columns(file, PAPER, stated | columns, units)
+
+
+def test_loads_far_too_large_for_the_scene_are_refused_before_a_file_is_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = _file(tmp_path / "own.csv", "t;fx [kN];fy [kN];m [kN m];x", step=1e-3, size=1.0)
+    command = ["setup", str(file), "--scene", "paper", "--out", str(tmp_path / "out")]
+    assert cli(command) == 2
+    said = capsys.readouterr().err
+    assert "fx: got 2.97e+07 N" in said and not (tmp_path / "out").exists()
+    options = [option for option in ("fx=N", "fy=N", "m=Nm") if f"--unit {option}" in said]
+    assert len(options) == 3
+    assert cli([*command, *(part for option in options for part in ("--unit", option))]) == 0
+    written = yaml.safe_load((tmp_path / "out" / "map.yaml").read_text())["excitation"]["unit"]
+    assert written == {"fx": "N", "fy": "N", "m": "Nm"}
 
 
 def _in_terminal(folder: Path, *said: bytes) -> tuple[int, str]:

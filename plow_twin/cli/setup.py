@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING
 import click
 
 from plow_twin.cli.console import DONE, output_console, quiet_option, say_error, table, unit_option
+from plow_twin.errors import UnitError
 
 if TYPE_CHECKING:
+    from plow_twin.model.scene import Scene
     from plow_twin.record.column_guess import Guess
 
 
@@ -45,6 +47,8 @@ def setup(file: Path, scene: str | None, given: tuple[str, ...], units: dict[str
             )  # fmt: skip
         columns[name] = click.prompt(f"Column of {name}", type=click.Choice(choices or guess.names))
         guess = guess_columns(file, nominal, columns, units)
+    if scene is not None:
+        _check_sizes(guess, nominal, units)
     written = _write(guess, scene, out)
     if not quiet:
         _show(guess)
@@ -53,6 +57,18 @@ def setup(file: Path, scene: str | None, given: tuple[str, ...], units: dict[str
         where = scene or str(out / "scene.yaml")
         click.echo(f"next: plow-twin live {file} --map {out / 'map.yaml'} --scene {where} --record runs/first")
     return DONE
+
+
+def _check_sizes(guess: Guess, scene: Scene, stated: dict[str, str]) -> None:
+    """Refuse loads that are too large for the scene; warn of those whose unit the user states."""
+    from plow_twin.record.unit_check import large_loads
+
+    large = large_loads(guess.values, guess.units, scene)
+    wrong = [text for name, text in large.items() if name not in stated]
+    if wrong:
+        raise UnitError(f"{guess.path}: {'; '.join(wrong)}")
+    for text in large.values():
+        say_error(f"plow-twin: {guess.path}: {text}")
 
 
 def _write(guess: Guess, scene: str | None, out: Path) -> list[Path]:

@@ -14,11 +14,11 @@ from plow_twin.errors import UnitError
 from plow_twin.model.geometry import largest_angle
 from plow_twin.model.loads import compile_loads
 from plow_twin.model.scene import Scene
-from plow_twin.record.map_file import UNITS
+from plow_twin.record.map_file import QUANTITIES, UNITS
 from plow_twin.record.mapping import Role, readings
 from plow_twin.record.sources import Arrived
 from plow_twin.record.times import START_NS
-from plow_twin.stream.limits import largest_displacement
+from plow_twin.stream.limits import excitation_limits, largest_displacement
 
 Array = NDArray[np.float64]
 _START_S: Final = START_NS * 1e-9
@@ -114,6 +114,34 @@ def small_thresholds(thresholds: Sequence[float], scene: Scene) -> str:
     if not small:
         return ""
     return f"alarm_force: got {small[0]:g} N, expected some {usual:.2g} N as in the scene; is it in kN?"
+
+
+def large_loads(values: Mapping[tuple[str, str], Array], units: Mapping[str, str], scene: Scene) -> dict[str, str]:
+    """Return by name the loads that a live twin would not use, and in words why and which unit would fit.
+
+    Parameters
+    ----------
+    values
+        Numbers in SI, by role and name.
+    units
+        Units that they were in, by name; SI where missing.
+    scene
+        More than one number in a hundred is beyond the `excitation_limits` of its loads.
+    """
+    found = {}
+    for name, most in zip(("fx", "fy", "m"), excitation_limits(scene).largest, strict=True):
+        key = "excitation", name
+        largest = _usual_magnitude(values.get(key, np.zeros(0)))
+        if not 0.0 < most < largest:
+            continue
+        known = UNITS[QUANTITIES[key]]
+        si = next(iter(known))
+        raw = largest / known[units.get(name, si)]
+        likely = next((unit for unit, factor in reversed(known.items()) if raw * factor <= most), "")
+        remedy = f"state the unit: --unit {name}={likely.replace(' ', '')}" if likely else "is it this machine's scene?"
+        expected = f"at most {most:.2g} {si}, ten times the scene's"
+        found[name] = f"{name}: got {largest:.3g} {si}, expected {expected}: {remedy}"
+    return found
 
 
 def check_units(messages: Iterable[Arrived], roles: Mapping[str, Role], scene: Scene, source: object) -> None:

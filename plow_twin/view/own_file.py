@@ -10,6 +10,8 @@ import numpy as np
 from plow_twin.record.column_guess import Guess
 
 _SHOWN_S: Final = 10.0
+#: Prefixes of newtons by the size of a load.
+_PREFIXES: Final = (("M", 1e6), ("k", 1e3))
 
 
 def draw_own_file(guess: Guess, path: Path) -> Path:
@@ -17,8 +19,11 @@ def draw_own_file(guess: Guess, path: Path) -> Path:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
+    load = [("excitation", name) for name in ("fx", "fy", "m")]
+    largest = max(float(np.nanmax(np.abs(guess.values[key]), initial=0.0)) for key in load)
+    prefix, size = next(((prefix, size) for prefix, size in _PREFIXES if largest >= size), ("", 1.0))
     shown = [
-        ("load [kN, kN m]", 1e-3, [("excitation", name) for name in ("fx", "fy", "m")]),
+        (f"load [{prefix}N, {prefix}N m]", 1.0 / size, load),
         ("position [mm], angle [mrad]", 1e3, [("head_pose", name) for name in ("x", "y", "theta")]),
         ("speed [m/s]", 1.0, [("travel", "speed")]),
     ]
