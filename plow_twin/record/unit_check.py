@@ -217,9 +217,10 @@ def _load(magnitudes: Mapping[tuple[str, str], float], scene: Scene) -> list[Uni
             expected = f"some {usual:.2g} N as in the scene"
             doubts = [UnitDoubt("excitation", ("fx", "fy"), f"{largest:.3g}", expected, unit)]
             largest *= UNITS["force"][unit]
-    usual_moment = float(compile_loads(scene.loads).largest()[2])
+    if largest < _IDLE_SHARE * usual:
+        return doubts
     # a small load has a small moment too
-    beside = usual_moment * min(1.0, largest / usual) if usual else 0.0
+    beside = float(compile_loads(scene.loads).largest()[2]) * min(1.0, largest / usual) if usual else 0.0
     moment = magnitudes.get(("excitation", "m"), 0.0)
     if _BROKEN_SHARE * beside < moment < _IDLE_SHARE * beside:
         expected = f"some {beside:.2g} N m beside such forces, as in the scene"
