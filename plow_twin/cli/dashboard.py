@@ -52,7 +52,7 @@ def access_of(options: dict[str, Any]) -> PageAccess:
 
 
 def access_if_shown(options: dict[str, Any]) -> PageAccess | None:
-    """Return the access to the screen, or None without `--dashboard`, which its other options need."""
+    """Return the access to the screen, or None without `--dashboard`; other options of the screen are then refused."""
     if options["dashboard"]:
         return access_of(options)
     context = click.get_current_context()

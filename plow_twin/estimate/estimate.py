@@ -277,8 +277,8 @@ def under_uncertain_load(
 ) -> Estimate:
     """Return an estimate with its withdrawn clearances replaced by values that allow for an unknown load or angle.
 
-    `result` comes from the load believed; it stays where it has a clearance, or where the comparison finds no
-    clearance. `fitted` is the fit of a machine that differs. Where the comparison agrees with this fit, the fit was not
+    `result` comes from the load believed. It is returned unchanged if it has a clearance, or if the comparison finds
+    none. `fitted` is the fit of a machine that differs. Where the comparison agrees with this fit, the fit was not
     caught in a false optimum, and both are combined.
     """
     if _known(result) or felt.interval() > tuning.COARSEST:

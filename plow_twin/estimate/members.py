@@ -36,7 +36,7 @@ Rows = NDArray[np.void]
 LATEST_S: Final = 0.25
 #: Bound: smallest distance in s between kept states of the motion.
 _PATH_S: Final = 2e-3
-#: Bound: outlying poses in a row after which they are used: a glitch does not last so long, the head has jumped.
+#: Bound: outlying poses in a row after which they are used. A glitch does not last so long: the head has jumped.
 _MOST_OUTLYING: Final = 5
 _THETA: Final = DOF_NAMES.index("theta")
 #: Derived: places of c, s, X, Y in the solver's state.
@@ -125,9 +125,9 @@ class Ensemble:
     def advance_others(
         self, t: Array, wrench: Array, rows: Rows, wanted: NDArray[np.bool_], ends: NDArray[np.bool_]
     ) -> None:
-        """Advance the other members to the time of the first, whose rows are given; write intervals to those `wanted`.
+        """Advance the other members to the time of the first member, whose rows are given.
 
-        A span of peaks and impulses ends with each of `ends`.
+        The rows that are `wanted` get intervals. A span of peaks and impulses ends with each row of `ends`.
         """
         parts = [_bytes(rows[None])]
         if self.others is not None:

@@ -30,7 +30,7 @@ class Feed:
     roles: dict[str, Role]
     measured: Callable[[str, int, dict[str, float]], object]
     intake: Intake = field(default_factory=Intake)
-    #: messages that were not used, by reason; the intake counts the load's too
+    #: number of messages that were not used, by reason; the intake also counts the load's
     unfit: Counter[str] = field(default_factory=Counter)
     #: whether the first walker's journal gets the measured poses, which move nothing
     with_poses: bool = False

@@ -150,7 +150,7 @@ def _information(folder: Path) -> Any:
 
 
 def _parsed(read: tuple[Any, list[Problem]]) -> Any:
-    """Return a document that was read; raises `RecordingError` for one with problems."""
+    """Return a document that was read; raises `RecordingError` if the document has problems."""
     document, problems = read
     if problems:
         raise RecordingError(f"{problems[0]}")

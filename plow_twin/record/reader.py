@@ -137,7 +137,7 @@ class RunReader:
 
     @property
     def missing_parts(self) -> int:
-        """Number of parts that `metadata.yaml` names, or the numbers around them imply, and that the folder lacks."""
+        """Number of parts that the folder lacks: named in `metadata.yaml`, or implied by the numbers of other parts."""
         if not self._place.is_dir():
             return 0
         there = {self.number(file) for file in self.parts}
@@ -448,7 +448,7 @@ def read_header(path: Path) -> RunHeader | None:
 
     for _ in ChunkReader(path, on_metadata):
         break
-    if not found:  # other programs that rewrite a file put it last
+    if not found:  # programs that rewrite a file put this record last
         for name, record in metadata_records(path):
             on_metadata(name, record)
     return found[0] if found else None

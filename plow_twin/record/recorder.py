@@ -571,7 +571,10 @@ class _SeriesItem(NamedTuple):
 
 
 class _PublicationsItem(NamedTuple):
-    """Publications on their way to the file, each after the entry of its number; `keys` are lost with them."""
+    """Publications on their way to the file, each written after the journal entry with its number.
+
+    `keys` are the topics that lose messages if this item is lost, with the number of these messages.
+    """
 
     sequence: NDArray[np.int64]
     log_time_ns: int

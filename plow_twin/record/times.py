@@ -79,7 +79,7 @@ def times_ns(texts: Sequence[bytes], unit: str) -> NDArray[np.int64] | None:
 
 
 def time_text(stamp_ns: int, *, own_start: bool = False) -> str:
-    """Return a stamp as a date, or below `EPOCH_S` in seconds; `own_start`: as it stood there, before `time_ns`."""
+    """Return a stamp as a date, or below `EPOCH_S` in seconds; `own_start` undoes the shift by `time_ns`."""
     if stamp_ns < EPOCH_S * 1e9:
         return f"{(stamp_ns - (START_NS if own_start else 0)) * 1e-9:.3f} s"
     date = datetime.fromtimestamp(stamp_ns // 10**9, UTC)

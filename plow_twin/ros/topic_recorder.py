@@ -238,7 +238,9 @@ def record_topics(
 
 
 def schema_of(message_type: str) -> str:
-    """Return the `ros2msg` text of a type with the types that it uses: from its package, otherwise of ROS 2 Jazzy.
+    """Return the `ros2msg` text of a type and of the types that it uses.
+
+    The texts come from the type's package, or, where it is not installed, are those of ROS 2 Jazzy.
 
     Raises
     ------

@@ -40,7 +40,7 @@ class Acting(NamedTuple):
 
 @kernel(inline="source")
 def acting(parts):
-    """Return these arguments for a scene."""
+    """Return the `Acting` of a scene from its parts."""
     terms = parts.terms
     return Acting(parts.harmonics, parts.segments, terms.offset, terms.free, terms.slip, terms.stick, terms.support)
 

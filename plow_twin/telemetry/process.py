@@ -1,7 +1,7 @@
 """The process of one output: `python -m plow_twin.telemetry.process LINK`; the first message names the output.
 
-It takes the updates of a feed one by one. While the receiver does not answer, the output keeps as many as its bound
-allows and counts the others, without delay to the twin.
+It takes the updates of a feed one by one. While the receiver does not answer, the output keeps as many
+updates as its bound allows and counts the others, without delay to the twin.
 """
 
 from __future__ import annotations

@@ -145,7 +145,8 @@ def _readable(path: Path) -> Iterator[None]:
 class _Dated:
     """The files of a pattern, as one topic under the pattern's name.
 
-    When followed, the newest file comes first, then each new file; the file before is still read beside it.
+    When followed, the topic begins with the newest file and continues with each new file. Beside a new file, the file
+    before it is still read.
     """
 
     def __init__(self, pattern: Path) -> None:

@@ -1,4 +1,4 @@
-"""Analysis of one recording: a run of ours by its journal, any other through the intake, with measured signals."""
+"""Analysis of one recording: a run's journal is computed again, the load of any other recording passes the intake."""
 
 from __future__ import annotations
 
