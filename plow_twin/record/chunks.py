@@ -490,7 +490,7 @@ def open_mcap(path: Path) -> IO[bytes]:
     Raises
     ------
     RecordingError
-        It cannot be read or is not an MCAP file.
+        The file cannot be read or is not an MCAP file.
     """
     try:
         stream = path.open("rb")

@@ -100,7 +100,7 @@ class Recording:
         Raises
         ------
         RecordingError
-            It cannot be used here.
+            This version of plow_twin cannot use the scene.
         """
         return self.header.scene(self.path)
 

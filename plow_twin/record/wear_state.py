@@ -63,7 +63,7 @@ def read_wear(folder: Path) -> bytes | None:
     Raises
     ------
     WearStateError
-        It cannot be read.
+        The file cannot be read.
     """
     path = folder / FILE_NAME
     try:
@@ -80,7 +80,7 @@ def parse_wear(content: bytes, path: Path, head: str, scene: Scene) -> tuple[flo
     Raises
     ------
     WearStateError
-        It is damaged, or belongs to another head or scene.
+        The content is damaged, or belongs to another head or scene.
     """
     state = _parse(content, path)
     for name, got, expected in (("head", state.head, head), ("scene", state.scene, scene_identity(scene))):

@@ -337,9 +337,9 @@ def make_folder(folder: Path) -> None:
     Raises
     ------
     TakenError
-        It is not empty.
+        The folder is not empty.
     RecordingError
-        It cannot be made.
+        The folder cannot be made.
     """
     if not _is_free(folder):
         raise TakenError(f"{folder}: exists already, expected a new or empty folder for the recording")

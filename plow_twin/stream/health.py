@@ -42,7 +42,7 @@ class DurationHistogram:
         return self._quantile(np.array(self._counts), share)
 
     def recent(self, share: float) -> float:
-        """Return these figures since the last call of this method."""
+        """Return the same quantile of the durations since the last call of this method."""
         counts = np.array(self._counts)
         before, self._counted = self._counted, counts
         return self._quantile(counts - before, share)

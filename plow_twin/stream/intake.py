@@ -210,7 +210,7 @@ class Intake:
         return near & self.limits.kept(values, ahead_ns * 1e-9)
 
     def accept(self, stamp_ns: int, values: Sequence[float], count: int = 1) -> None:
-        """Count a sample that `goes_on`, or the last of `count` of them."""
+        """Count a sample that `goes_on`, or `count` such samples of which this is the last."""
         self.returned = False
         self.counts[Verdict.ACCEPTED] += count
         self._since_first += count

@@ -75,7 +75,7 @@ class Credentials:
         AccessError
             A section or key is not known, or a value is not a text.
         SceneError
-            It is not YAML within the bounds.
+            The file is not YAML within the bounds.
         OSError
             The file cannot be read.
         """
@@ -105,7 +105,7 @@ class Credentials:
         Raises
         ------
         AccessError
-            It is not there.
+            The file is not there.
         """
         name = self.text(section, key)
         if not name:

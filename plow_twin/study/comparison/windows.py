@@ -32,7 +32,7 @@ QUANTITIES: Final[Mapping[str, str]] = {
 _PERIOD_SPAN_S: Final = 60.0
 #: Length of a window where the load has no period [s].
 _NO_PERIOD_S: Final = 10.0
-#: Smallest share of a full window's messages; with fewer a window is left out, as cut by an end or a gap.
+#: Smallest share of a full window's messages; a window with fewer messages is left out: an end or a gap cuts it.
 FULL: Final = 0.9
 _PADS: Final = np.array([CLEARANCE_NAMES.index(name) for name in PAD_NAMES])
 _TOTALS: Final = np.array([CLEARANCE_NAMES.index(name) for name in ("horizontal", "vertical")])
