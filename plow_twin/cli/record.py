@@ -50,7 +50,7 @@ def record(
         raise click.BadParameter(
             f"got {exclude!r}, expected a regular expression: {error}", param_hint="--exclude"
         ) from None
-    os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)  # of ROS from wheels: folder of message definitions
+    os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)  # for ROS from wheels: folder of message definitions
     from plow_twin.cli.interruption import interruptible
     from plow_twin.record.reader import RunReader
     from plow_twin.record.running import running_run

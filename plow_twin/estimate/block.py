@@ -346,7 +346,7 @@ def _meeting(scene: Scene, inertia: Array, flights: list[Array], room: float) ->
         return None
     mass = 1.0 / (1.0 / inertia[0] + arm**2 / inertia[2])
     energy = (inertia * v**2).sum(axis=1)
-    # of a rounded corner, the centre of its arc
+    # a rounded corner is represented by the centre of its arc
     distance = float(normal @ (q[:2] + corner)) + geometry.corner_radius(scene)
     turned = np.array([c * normal[0] + s * normal[1], -s * normal[0] + c * normal[1]])
     deeper = _deeper(scene, mass, before, after)

@@ -257,7 +257,7 @@ class Ensemble:
         return np.divide(self._room(), room, out=np.ones_like(room), where=room > 0.0)
 
     def _stand(self, q: Array, v: Array, force: Array, which: NDArray[np.int64] | None = None) -> None:
-        """Move members to poses, or to places nearer the middle where a pair would bear more than a force, (m, 8)."""
+        """Move members to poses, but only so far from the middle that no pair bears more than its `force`, (m, 8)."""
         low, high = np.zeros(len(q)), np.ones(len(q))
         free = self._allowed(q, force)
         low[free] = 1.0

@@ -102,7 +102,7 @@ def power_terms(base: NDArray[np.float64], power: NDArray[np.float64], k: int, e
 
 @kernel(fast=True, inline="code")
 def root_terms(newest: Any, root: NDArray[np.float64], k: int) -> Any:
-    """Return coefficient k >= 1 of the square roots of eight series, times 2 root[0]; `newest` are the series' own.
+    """Return coefficient k >= 1 of the square roots of eight series, times 2 root[0]; `newest` are the b_k.
 
     Recurrence  2 r_0 r_k = b_k - sum_{j=1}^{k-1} r_j r_{k-j},  half of whose terms are equal in pairs.
     """

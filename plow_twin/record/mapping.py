@@ -203,7 +203,7 @@ def _at(content: Mapping[str, Any], path: str) -> Any | None:
 def _plain_number(value: Any) -> float | None:
     """Return a number of CSV or JSON, NaN for an empty cell, or None for any other value."""
     if isinstance(value, str):
-        value = value.strip()  # of signs too that `float` does not take
+        value = value.strip()  # also removes signs that `float` does not take
         if not value:
             return math.nan
         if not NUMBER.fullmatch(value):

@@ -152,8 +152,8 @@ class _Replay:
         if excitation == "sampled":
             _warm_up(scene, header.tol, self.templates, rows=not digests_only)
         self.sink: RunWriter | None = None
-        self.rows = np.zeros(0, ROW)  # of the last run of samples
-        self.published: Published | None = None  # of the last run of samples; its last row may have messages to come
+        self.rows = np.zeros(0, ROW)  # rows of the last run of samples
+        self.published: Published | None = None  # from the last run of samples; messages of its last row may follow
         self.session = Session(
             twin, header.origin_ns, rollback_span_s=float(header.parameters.get("rollback_span", 0.0))
         )

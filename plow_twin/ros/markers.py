@@ -69,7 +69,7 @@ class Markers:
         ]
         normal = np.stack([NORMAL_X, NORMAL_Y], axis=1)
         along = np.stack([-NORMAL_Y, NORMAL_X], axis=1) * 0.1 * self._scale
-        side = -1.0 if self._scene.head.carries == "corners" else 1.0  # of the force on the head
+        side = -1.0 if self._scene.head.carries == "corners" else 1.0  # sign of the force on the head
         # a pad is drawn at the place where its corner meets the wall
         for pair in range(PAIR_COUNT):
             depth, force = float(row["wear_depth"][pair]), float(row["force"][pair])

@@ -24,7 +24,7 @@ def start_ros(arguments: Sequence[str] | None) -> None:
     Raises
     ------
     RosArgumentsError
-        They cannot be used.
+        The arguments cannot be used.
     """
     import rclpy
     from rclpy.signals import SignalHandlerOptions

@@ -141,7 +141,7 @@ _PARAM_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("stick_stiffness", "f8"),
     ("stick_damping", "f8"),
     ("frame_mobility", "f8", (3,)),  # 1/m, 1/m, 1/I of a frame on springs, otherwise 0
-    ("frame_stiffness", "f8", (3,)),  # of its support, per mass and inertia
+    ("frame_stiffness", "f8", (3,)),  # stiffness of the frame's support, per mass and inertia
     ("frame_damping", "f8", (3,)),
     ("order", "i8"),
     ("lacuna", "i8"),  # orders in a row that may vanish while the series goes on
@@ -193,29 +193,29 @@ def params_type(options: Options) -> np.dtype[np.void]:
 _STATE_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("y", "f8", (STATE_SIZE,)),  # body coordinates at the step's start
     ("damping_factor", "f8", (PAIR_COUNT,)),  # lambda of each pair in s/m
-    ("wear_depth", "f8", (PAIR_COUNT,)),  # of each pad in m
+    ("wear_depth", "f8", (PAIR_COUNT,)),  # wear depth of each pad in m
     ("mode", "i8", (PAIR_COUNT,)),
     ("beyond_ramp", "i8", (PAIR_COUNT,)),  # 1 where the penetration is beyond the ramp
     ("step_start", "f8"),
     ("elapsed", "f8"),  # time into the step under way
-    ("step_size", "f8"),  # of the step under way, negative without one
+    ("step_size", "f8"),  # size of the step under way, negative without a step
     ("sigma_end", "f8"),  # the series' variable at the step's end
     ("alpha", "f8"),  # time runs as t = alpha sigma + beta sigma^2 / 2
     ("beta", "f8"),
     ("stop_time", "f8"),  # where a step must end: a sample, a knot of the load, the end of the run
     ("last_step_size", "f8"),
-    ("touch_time", "f8"),  # of the last touch
+    ("touch_time", "f8"),  # time of the last touch
     ("time", "f8"),  # the present time, bit for bit as the caller gave it
-    ("implicit_size", "f8"),  # of the next implicit step
+    ("implicit_size", "f8"),  # size of the next implicit step
     ("decay_times", "f8"),  # that have passed in overdamped contact since a contact changed
     ("implicit_size_before", "f8"),  # both before the step under way was laid out
     ("decay_times_before", "f8"),
-    ("order", "i8"),  # of the series of the step under way
+    ("order", "i8"),  # order of the series of the step under way
     ("event_pair", "i8"),  # the pair whose event ends the step, or -1
     ("event_mode", "i8"),  # the mode that follows
     ("touching", "i8"),  # a bit for each pair that touches at the step's start and needs the root of time
     ("events_at_once", "i8"),  # events so far at one instant
-    ("piece", "i8"),  # of the sampled load
+    ("piece", "i8"),  # piece of the sampled load
     ("ends_at_stop", "i8"),  # 1 where the step ends at `stop_time`
     ("refused", "i8"),  # failed attempts at implicit steps since a contact changed
     ("refused_before", "i8"),  # the same before the step under way was laid out
@@ -223,7 +223,7 @@ _STATE_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("at_rest", "i8"),  # 1 during a step of rest
     # counted since the start
     ("steps", "i8"),
-    ("evaluations", "i8"),  # of the equations of motion; an order of a series counts as one
+    ("evaluations", "i8"),  # evaluations of the equations of motion; an order of a series counts as one
     ("events", "i8"),
     ("guard_roots", "i8"),  # guards whose roots were searched for
     ("recoveries", "i8"),  # times that modes flipped at one instant
@@ -284,7 +284,7 @@ WORK: Final = np.dtype(
         ("damping", "f8", (3, 3)),  # by rate, at rest under harmonics
         ("rub", "f8", (6, *_WIDE)),  # wear: s' / v, way per travel, force times it; running-in and its factors
         ("binomial", "f8", (_ROWS, _ROWS)),  # 1 / C(order, k)
-        ("beyond", "f8", (3,)),  # of the newest advance out of range: angle [rad], largest penetration [m], its pair
+        ("beyond", "f8", (3,)),  # newest advance out of range: angle [rad], largest penetration [m], its pair
     ]
 )
 

@@ -45,17 +45,17 @@ _OF_PAIRS: Final = (PAIR_COUNT, _ROWS, WIDTH)
 COLUMNS: Final = np.dtype(
     [
         ("series", "f8", (6, _ROWS, WIDTH)),
-        ("depth", "f8", _OF_PAIRS),  # of pairs that act: change of penetration, of its rate, of force
+        ("depth", "f8", _OF_PAIRS),  # pairs that act: change of penetration, of its rate, of force
         ("rate", "f8", _OF_PAIRS),
         ("force", "f8", _OF_PAIRS),
         ("load", "f8", (3, _ROWS, WIDTH)),  # change of the load per mass and inertia, world axes
         ("now", "f8", (6, WIDTH)),  # displacements at the step's start, along head axes
         ("factor", "f8", _EIGHT),  # change of each pair's lambda
-        ("edge", "f8", _EIGHT),  # of its penetration, by a clearance
-        ("constant", "f8", (3, WIDTH)),  # of the steady load
+        ("edge", "f8", _EIGHT),  # derivative of its penetration by a clearance
+        ("constant", "f8", (3, WIDTH)),  # derivative of the steady load
         ("stiffness", "f8", (WIDTH,)),
         ("viscous", "f8", (WIDTH,)),
-        ("number", "f8", (WIDTH,)),  # of D in lambda = D / v0
+        ("number", "f8", (WIDTH,)),  # derivative of D in lambda = D / v0
         ("loaded", "i8"),  # 1 where a column changes a load
     ]
 )

@@ -49,8 +49,8 @@ class Verdict(Enum):
     IMPLAUSIBLE = "implausible"
     #: the stamps jump repeatedly: the model is not reset each time
     UNSTEADY = "unsteady"
-    #: the stamp jumped, and the next stamp continued from the stamps before the jump: this one was wrong, and the
-    #: sender's clock did not step
+    #: the stamp jumped, and the next stamp continued from the stamps before the jump: the stamp of this sample was
+    #: wrong, and the sender's clock did not step
     STRAY = "stray"
     #: names or lengths of the message do not fit the scene
     MALFORMED = "malformed"
@@ -172,7 +172,7 @@ class Intake:
             return verdict
         if self._newest_ns is None or verdict.resets:
             self._missing_before, self._first_ns, self._since_first = self.missing, stamp_ns, 0
-            # stamps within the jump may not be returned to
+            # after a return, no later sample returns to the wrong stamps
             self._before_jump_ns = None if self.returned else self._newest_ns
         self._since_first += 1
         if self._newest_ns is None or verdict.resets or stamp_ns > self._newest_ns:

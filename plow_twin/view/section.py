@@ -56,7 +56,7 @@ class Section:
     #: name of the fixed body; with a support the section is drawn in its axes
     frame_name: str = "frame (fixed)"
     is_block: bool = False
-    #: of the frame's, or the block's, corners
+    #: radius of the corners of the frame or of the block
     radius: float = 0.0
 
     @classmethod

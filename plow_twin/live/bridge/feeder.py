@@ -87,7 +87,7 @@ class Feeder:
         inputs.senders.alive([self._name])
 
     def begin(self, messages: Iterable[Arrived]) -> None:
-        """Begin the time of a source with its own time at the first message that the following one continues."""
+        """Begin the time of a source that has its own time, at the first message whose successor continues its time."""
         read = (role.read(arrived) for arrived in messages for _, role in self._by_topic.get(arrived.topic, ()))
         stamps = (found[0] for found in read if found is not None)
         back_ns = round(self._runtime.settings.jump_back * 1e9)

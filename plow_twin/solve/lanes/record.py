@@ -41,7 +41,7 @@ LANES: Final = np.dtype(
         ("arms", "f8", (PAIR_COUNT, 2, WIDTH)),  # arm: factors of cosine and sine
         ("ratio", "f8", _PAIRS),  # C / K of pairs that are on
         ("factor", "f8", _PAIRS),  # lambda
-        ("gear", "f8", (PAIR_COUNT, 8, WIDTH)),  # of each slot's pairs: rows, arms, lambda
+        ("gear", "f8", (PAIR_COUNT, 8, WIDTH)),  # for each slot's pairs: rows, arms, lambda
         ("chosen", "f8", (8, WIDTH)),  # one guard of each lane: rows, factors of d and d', further constant
         ("along", "f8", (2, 6, WIDTH)),  # higher orders of the forces, by c, s, X or Y and their rates
         ("turn", "f8", (2, 8, WIDTH)),  # and of the factors in the moment, by c, s, X, Y and their rates
@@ -60,8 +60,8 @@ LANES: Final = np.dtype(
         ("viscous", "f8", _LANES_OF),
         ("half_cavity", "f8", _LANES_OF),
         ("y", "f8", (COMPONENTS, WIDTH)),  # state at the step's start
-        ("change", "f8", (COMPONENTS, WIDTH)),  # of the state over the step
-        ("gained", "f8", (2, WIDTH)),  # of one slot: impulse over the step, peak
+        ("change", "f8", (COMPONENTS, WIDTH)),  # change of the state over the step
+        ("gained", "f8", (2, WIDTH)),  # one slot: impulse over the step, peak
         ("sum", "f8", (4, WIDTH)),  # integrals of cosine, sine, X, Y over the step, less their values at its start
         ("harmonic", "f8", (10, WIDTH)),  # one load: frequency, sine, cosine, amplitudes of S1, S2, M; phase
         ("size", "f8", (2, WIDTH)),  # the terms of the last two orders, as velocities

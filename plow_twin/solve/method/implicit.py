@@ -112,7 +112,7 @@ def _implicit_type(size: int) -> np.dtype[np.void]:
             ("z", "f8", (STAGES + 1, 2 * size)),  # state at the start and at the nodes
             ("rate", "f8", (2, 2 * size)),  # rates for a difference
             ("accelerations", "f8", (STAGES, size)),
-            ("jacobians", "f8", (STAGES, 2, size, size)),  # of the accelerations, by place and by velocity
+            ("jacobians", "f8", (STAGES, 2, size, size)),  # derivatives of the accelerations by place and by velocity
             ("matrix", "f8", (size * STAGES, size * STAGES)),
             ("residual", "f8", (size * STAGES,)),
             ("body", "f8", shape),  # body coordinates
