@@ -509,7 +509,7 @@ class _Near:
         return beta[0], targets - self.basis @ beta
 
     def left_over(self, targets: Array) -> tuple[Array, Array]:
-        """Return the same with cross-validated residuals: each draw predicted without itself."""
+        """Return the result of `regress` with cross-validated residuals: each draw is predicted without itself."""
         value, error = self.regress(targets)
         left: Array = error / (1.0 - np.minimum(self.leverage, 0.9))[:, None]
         return value, left

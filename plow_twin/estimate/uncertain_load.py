@@ -159,7 +159,7 @@ def _with_angle(seen: MotionFeatures, felt: Load, unknowns: Unknowns, poses: Pos
 
 
 def _without_angle(seen: MotionFeatures, felt: Load, unknowns: Unknowns, poses: Poses) -> _Look:
-    """Return the same where only x and y were measured, with the head's range in place of the walls."""
+    """Return the look at the motion where only x and y were measured: the head's range replaces the walls."""
     nominal, deviations = unknowns.nominal(), unknowns.deviations()
 
     def features(q: Array) -> Array:

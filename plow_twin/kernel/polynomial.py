@@ -78,7 +78,7 @@ def first_root(g: Array, n: int, h: float, w) -> float:
 
 @kernel()
 def first_root_within(g: Array, n: int, h: float, w) -> float:
-    """Return the same as `first_root` from the Bernstein coefficients in `w.halves[0]`.
+    """Return the root that `first_root` finds, from the Bernstein coefficients in `w.halves[0]`.
 
     An interval without a negative Bernstein coefficient has no root; one sign change means one root; every other
     interval is halved, and its left half searched first.

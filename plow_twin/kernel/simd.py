@@ -78,7 +78,7 @@ def row(typingctx: Any, array: Any, index: Any) -> Any:
 
 @_operation
 def exact_row(typingctx: Any, array: Any, index: Any) -> Any:
-    """Return the same as `ExactLanes`."""
+    """Return the result of `row` or `splat` as `ExactLanes`."""
     return exact_lanes(array, index), _load
 
 
@@ -112,7 +112,7 @@ def splat(typingctx: Any, value: Any) -> Any:
 
 @_operation
 def exact_splat(typingctx: Any, value: Any) -> Any:
-    """Return the same as `ExactLanes`."""
+    """Return the result of `row` or `splat` as `ExactLanes`."""
     return exact_lanes(value), _splat
 
 

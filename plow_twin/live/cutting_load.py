@@ -63,7 +63,7 @@ class Face:
 
         In a turn the speed falls linearly to zero and rises to the other side; half of it belongs to each pass.
         """
-        # the turn lies within the face, whose end is reached in the middle of the turn
+        # the head turns within the face and reaches its end in the middle of the turn
         steady = (self.length_m - 0.5 * self.speed_m_s * self.turn_s) / self.speed_m_s
         period = steady + self.turn_s
         number = np.floor(t / period).astype(np.int64)

@@ -42,7 +42,7 @@ _SLOW_S: Final = 0.5
 _SMOOTH: Final = 0.05
 #: Ploughs travel at 3.6 m/s at most (Caterpillar's GH1600); beyond this [m/s] a speed is in another unit.
 _FASTEST_M_S: Final = 5.0
-#: Stamps of which so many fall are not times; where nearly all fall, the newest row is first.
+#: Share of falling stamps above which they are no times; share above which the rows begin with the newest.
 _FALLING, _REVERSED = 0.2, 0.9
 #: Units that a time may be in, in s.
 _TIMES: Final = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}

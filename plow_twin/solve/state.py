@@ -317,7 +317,7 @@ ROW: Final = np.dtype(
         ("steps", "i8"),
         ("status", "i8"),
         ("error_estimate", "f8"),
-        # where the row is published (`solve.totals.publish`), touches are all so far, impulse and peak since the
+        # in a published row (`solve.totals.publish`) touches count from the beginning, impulse and peak from the
         # publication before
         ("stamp_ns", "i8"),
         ("samples", "i8"),  # advances since then that ended at a sample

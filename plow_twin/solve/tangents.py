@@ -51,7 +51,7 @@ COLUMNS: Final = np.dtype(
         ("load", "f8", (3, _ROWS, WIDTH)),  # change of the load per mass and inertia, world axes
         ("now", "f8", (6, WIDTH)),  # displacements at the step's start, along head axes
         ("factor", "f8", _EIGHT),  # change of each pair's lambda
-        ("edge", "f8", _EIGHT),  # derivative of its penetration by a clearance
+        ("edge", "f8", _EIGHT),  # derivative of each pair's penetration by a clearance
         ("constant", "f8", (3, WIDTH)),  # derivative of the steady load
         ("stiffness", "f8", (WIDTH,)),
         ("viscous", "f8", (WIDTH,)),

@@ -267,7 +267,7 @@ def penetration_at(rows, c, s, x, y):
 
 @kernel(inline="code")
 def linear_at(rows, c, s, x, y):
-    """Return the same without the constant: of later orders, of rates."""
+    """Return the penetrations without their constant, as for later orders and for rates."""
     return fused(
         exact_row(rows, 0), c, fused(exact_row(rows, 1), s, fused(exact_row(rows, 2), x, exact_row(rows, 3) * y))
     )

@@ -30,7 +30,7 @@ Label = Callable[[str, int], str]
 
 @dataclass
 class Comparison:
-    """Groups of windows in order of their labels' first appearance, and the changes from the first to each other.
+    """Groups of windows in order of their labels' first appearance, and the change from the first to every other group.
 
     Attributes
     ----------
@@ -139,7 +139,7 @@ def compare(
     seed: int = 0,
     scenes: Mapping[str, tuple[str, str]] = MappingProxyType({}),
 ) -> Comparison:
-    """Return the groups of some runs, and the changes from the first group to each other.
+    """Return the groups of some runs, and the change from the first group to every other group.
 
     Parameters
     ----------
