@@ -57,11 +57,15 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
 def test_an_analysis_of_runs_without_measurements_shows_the_model_and_no_empty_table(
     run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    other = shutil.copytree(run.folder, tmp_path / "other")
-    assert cli(["analyse", str(run.folder), str(other), "--workers", "1", "--out", str(tmp_path / "out")]) == 0
-    said = capsys.readouterr().out
-    assert said.count("Contacts computed") == 1 and "plow-twin compare" in said
-    assert "bias" not in said and said.count("no measured values to compare") == 2
+    copy, made = shutil.copytree(run.folder, tmp_path / "copy"), tmp_path / "again"
+    assert cli(["replay", str(run.folder), "--write", str(made), "--quiet"]) == 0
+    capsys.readouterr()
+    given = [str(run.folder), str(copy), str(made)]
+    assert cli(["analyse", *given, "--workers", "1", "--out", str(tmp_path / "out")]) == 0
+    said = capsys.readouterr()
+    assert f"{copy}: left out: the same run as {run.folder}" in said.err
+    assert said.out.count("Contacts computed") == 1 and "plow-twin compare" in said.out
+    assert "bias" not in said.out and said.out.count("no measured values to compare") == 2
 
 
 def test_replay_of_an_untouched_recording_ends_with_0(run: Run) -> None:

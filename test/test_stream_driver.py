@@ -28,17 +28,31 @@ LOAD = (32e3, 0.0, -45e3)
 
 
 def test_silences_are_counted_alike_one_by_one_and_together_and_none_by_late_samples_or_across_a_reset() -> None:
-    stamps = T0 + MS * np.array([0, 400, 1100, 600, 1150, 2000, 2001])
+    stamps = T0 + MS * np.array([0, 40, 1100, 600, 1150, 2000, 2001])
     single, many = Silences(0.5), Silences(0.5)
     for stamp in stamps.tolist():
         single.add_one(stamp)
     found = [(index, (begin - T0) // MS, (end - T0) // MS) for index, begin, end in many.add(stamps)]
-    assert found == [(2, 400, 1100), (5, 1150, 2000)]
+    assert found == [(2, 40, 1100), (5, 1150, 2000)]
     assert single.facts() == many.facts()
-    longest = "the longest from 1.150 s to 2.000 s after the first"
-    assert single.text() == f"1.550 s without samples, in 2 stretches, {longest}"
+    longest = "the longest from 0.040 s to 1.100 s after the first"
+    assert single.text() == f"1.910 s without samples, in 2 stretches, {longest}"
     many.restart()
     assert many.add(stamps[-1:] + 3600 * NS_PER_S) == [] and many.count == 2
+
+
+def test_a_log_with_long_intervals_is_silent_only_where_it_stops() -> None:
+    random = np.random.default_rng(0)
+    stamps = T0 + np.cumsum(random.integers(900, 1100, 200)) * MS
+    stamps[60:] += 30 * NS_PER_S
+    stamps[150:] += 60 * NS_PER_S
+    single, parts = Silences(0.5), Silences(0.5)
+    for stamp in stamps.tolist():
+        single.add_one(stamp)
+    for part in np.split(stamps, [1, 7, 60, 61, 150]):
+        parts.add(part)
+    assert single.count == 2 and single.facts() == parts.facts()
+    assert single.longest_ns == (stamps[149], stamps[150])
 
 
 def _some(published: Published) -> Published | None:

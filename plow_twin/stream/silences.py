@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.stream.intake import NS_PER_S
 
 Indexes = NDArray[np.int64]
+#: A stretch is a silence from so many times the interval before it on: a log each minute is not silent.
+_LONGER: Final = 5
 
 
 class Silences:
     """Counts stretches between the stamps of two samples that are longer than the timeout of the excitation.
 
+    They are longer than five times the interval before them too.
     The motion goes on there, under the hold policy or on a straight line of the load to the next sample.
 
     Parameters
@@ -30,6 +35,8 @@ class Silences:
         self.longest_ns = (0, 0)
         self._first_ns: int | None = None
         self._newest_ns: int | None = None
+        #: the newest interval between samples that is no silence [ns]
+        self._interval_ns: int | None = None
 
     def add(self, stamps_ns: Indexes) -> list[tuple[int, int, int]]:
         """Take the stamps of samples, shape (n,) [ns]; return the silences that end at them.
@@ -41,17 +48,34 @@ class Silences:
         newest_ns = self._begin(int(stamps_ns[0]))
         reached = np.maximum.accumulate(np.concatenate((np.array([newest_ns]), stamps_ns)))
         self._newest_ns = int(reached[-1])
-        ends = np.flatnonzero(np.diff(reached) > self.timeout_s * NS_PER_S)
-        found = list(zip(ends.tolist(), reached[ends].tolist(), reached[ends + 1].tolist(), strict=True))
-        for _, begin_ns, end_ns in found:
-            self._count(begin_ns, end_ns)
+        intervals = np.diff(reached)
+        moved = np.flatnonzero(intervals)
+        found, done = list[tuple[int, int, int]](), 0
+        for place in np.flatnonzero(intervals[moved] > self.timeout_s * NS_PER_S).tolist():
+            if place > done:
+                self._interval_ns = int(intervals[moved[place - 1]])
+            end = int(moved[place])
+            if self._is_silence(int(intervals[end])):
+                found.append((end, int(reached[end]), int(reached[end + 1])))
+                self._count(*found[-1][1:])
+            done = place + 1
+        if done < len(moved):
+            self._interval_ns = int(intervals[moved[-1]])
         return found
+
+    def _is_silence(self, interval_ns: int) -> bool:
+        """Return whether an interval is a silence; otherwise it is the newest one that is not."""
+        before_ns = self._interval_ns
+        is_long = before_ns is not None and interval_ns > max(self.timeout_s * NS_PER_S, _LONGER * before_ns)
+        if not is_long:
+            self._interval_ns = interval_ns
+        return is_long
 
     def add_one(self, stamp_ns: int) -> None:
         """Take the stamp of one sample [ns]."""
         newest_ns = self._begin(stamp_ns)
         if stamp_ns > newest_ns:
-            if stamp_ns - newest_ns > self.timeout_s * NS_PER_S:
+            if self._is_silence(stamp_ns - newest_ns):
                 self._count(newest_ns, stamp_ns)
             self._newest_ns = stamp_ns
 
