@@ -61,7 +61,7 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "jumps_forward": "stamps that stepped by more than the parameter jump_back or jump_forward",
         "out_of_plane": "samples used in spite of components outside the plane",
         "holds": "advances under the hold policy",
-        "silences": "stretches between two stamps longer than excitation_timeout and five intervals before, whether held or not",
+        "silences": "stretches longer than excitation_timeout and five times the interval before, whether held or not",
         "silent_s": "length of all of them [s]",
         "travel_used": "messages used",
         "travel_dropped": "messages dropped",
