@@ -61,7 +61,7 @@ class History:
 
 
 def _joined(before: list[Any], now: list[Any]) -> list[Any]:
-    """Return a second merged with later values of it: extremes of peaks and loads, the newest clearances."""
+    """Merge a second with later values of the same second: extremes of peaks and loads, the newest clearances."""
     largest = [_extreme(max, *pair) for pair in zip(before[1:9], now[1:9], strict=True)]
     lowest = [_extreme(min, *pair) for pair in zip(before[9:12], now[9:12], strict=True)]
     highest = [_extreme(max, *pair) for pair in zip(before[12:15], now[12:15], strict=True)]

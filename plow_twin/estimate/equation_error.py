@@ -36,7 +36,7 @@ Array = NDArray[np.float64]
 _WALL: Final = np.argmax(np.stack(WALLS), axis=0)
 #: Bound: Gauss-Newton steps; a step in m below which they end, and the longest one.
 _STEPS, _SMALL, _LONGEST = 8, 2e-5, 3e-3
-#: Guard: shortest distance of rows in s, and fewest in half of a function.
+#: Guard: shortest distance of rows in s, and fewest rows in half of a test function.
 _SHORTEST, _FEWEST = 5e-3, 3
 #: Derived: scale of the stiffness in N/m that gives its column the size of the others.
 _UNIT = 1e7

@@ -51,7 +51,7 @@ TOLERANCE_RANGE = (1e-13, 1e-1)
 STEP_SHARE = 3e-4
 #: Largest error of a step, as a share of the length scale: fewer steps suffice to exceed a loose tolerance.
 LARGEST_STEP_ERROR = 1e-6
-#: The same for exponents that are not integers: near a branch point the remainder of a series falls more slowly.
+#: `STEP_SHARE` for exponents that are not integers: near a branch point the remainder of a series falls more slowly.
 STEP_SHARE_FRACTION = 1e-6
 #: Mode changes at one instant after which the solver steps past it.
 MAX_EVENTS_AT_ONCE = 64

@@ -186,7 +186,7 @@ class Alarms:
         self.raised: list[str] = []
 
     def feed(self, published: Published) -> Iterator[int]:
-        """Judge publications; yield the number of each row that has changed a level, right after it.
+        """Judge publications; yield the number of each row that has changed a level, right after this row was judged.
 
         Rows without a sample are not judged.
         """

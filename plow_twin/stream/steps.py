@@ -26,7 +26,7 @@ class Steps:
 
     def __init__(self, intake: Intake) -> None:
         self._intake = intake
-        #: the latest sample, where its stamp jumped
+        #: the latest sample, if its stamp jumped
         self._jumped: Timed | None = None
         #: times at which the latest stray stamps were found [ns]
         self._strays_ns: deque[int] = deque(maxlen=_MOST_STRAYS)

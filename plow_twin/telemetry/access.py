@@ -157,7 +157,7 @@ def influx_out(url: str, credentials: Credentials, *, plain: bool) -> WayOut:
     Raises
     ------
     AccessError, OSError
-        The address cannot be used, or a file of the credentials.
+        The address or a file of the credentials cannot be used.
     """
     expected = "http[s]://HOST:PORT/ORG/BUCKET"
     host, port, path, encrypted = _address("--influx", url, ("http", "https"), expected, plain=plain)
@@ -182,7 +182,7 @@ def opcua_out(url: str, credentials: Credentials, *, plain: bool, acknowledges: 
     Raises
     ------
     AccessError, OSError
-        The address cannot be used, or a file of the credentials.
+        The address or a file of the credentials cannot be used.
     """
     expected = "opc.tcp://HOST:PORT"
     files = {key: credentials.file("opcua", key) for key in ("certificate", "key", "trusted")}

@@ -261,7 +261,7 @@ class Files(SourceState):
         return found
 
     def awaited(self) -> list[Path]:
-        """Return the files, or patterns, of which no whole line is there yet."""
+        """Return the files, or patterns, that do not yet have a whole line."""
         return [tail.path for tail in self._tails if tail.columns(grows=not self.ends) is None]
 
     def start(self, topics: list[str], stamp_ns: StampOf[Arrived] | None = None) -> None:

@@ -67,7 +67,7 @@ class PoseRecording:
 
 
 def load_poses(path: Path) -> PoseRecording:
-    """Read t, x, y, theta of .csv or .parquet, the same or q of shape (n, 3) of .npz, or .mcap of this package.
+    """Read t, x, y, theta of .csv, .parquet or .npz (there q of shape (n, 3) too), or an .mcap of this package.
 
     Raises
     ------
