@@ -1,6 +1,6 @@
 """Messages of fixed length as bytes with holes for their numbers: made once, filled in or compared many at a time.
 
-A message whose texts do not change differs from the next one of its kind in the stamp and in some float64 only. CDR
+A message whose texts do not change differs from the next message of its kind only in the stamp and some float64. CDR
 keeps them at fixed places, which are found by encoding the message once with numbers that occur nowhere else.
 """
 

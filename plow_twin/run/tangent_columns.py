@@ -39,7 +39,7 @@ def is_curved(terms: Terms) -> int | None:
 def columns_beside(
     compiled: CompiledScene, changed: Sequence[tuple[CompiledScene, float]]
 ) -> tuple[NDArray[np.void], _Array, _Array]:
-    """Return columns for the state's displacements and for scenes in which a number is larger by a change.
+    """Return columns for the state's displacements and for scenes that each have one number increased.
 
     Returns
     -------

@@ -168,7 +168,7 @@ _OPTION_FIELDS: Final[dict[str, list[tuple[Any, ...]]]] = {
         ("fall", "f8"),  # power by which it falls
         ("fall_speed", "f8"),  # in m/s
         ("fall_mass", "f8"),  # power of the effective mass
-        ("fall_along", "f8"),  # by the speed along the wall in s/m
+        ("fall_along", "f8"),  # rate at which it falls with the speed along the wall, in s/m
     ],
 }
 

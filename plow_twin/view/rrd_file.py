@@ -31,7 +31,7 @@ class RrdFile:
     Raises
     ------
     RecordingError
-        The file cannot be opened; by `check` and at the end: it cannot be written.
+        The file cannot be opened. `check` and the end raise it if the file cannot be written.
     """
 
     def __init__(self, path: Path) -> None:

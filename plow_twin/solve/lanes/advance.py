@@ -148,7 +148,7 @@ def _fail(s, lanes, lane, code) -> None:
 def _tell(lanes, reached, viscous, hysteretic) -> None:
     """Write pose, rates, penetrations, their rates and forces of all lanes to `lanes.out` and `lanes.told`.
 
-    The force at the sample raises the peak where one was `reached`.
+    The force at the sample raises the peak where a sample was `reached`.
     """
     for i in range(COMPONENTS):
         set_row(lanes.out, i, exact_row(lanes.y, i))
