@@ -88,8 +88,10 @@ def test_windows_with_a_stretch_without_samples_are_left_out_and_named(runs: tup
         found = compare([("monday", windows_of(read_recording(runs[0].folder), 1.0)), ("tuesday", windows)])
         assert f"tuesday: {windows.silent} windows left out: a stretch without samples is in them" in found.notes
     with pytest.raises(RecordingError, match="in each window"):
-        samples = (paper_sample(600 * index) for index in range(12))
-        windows_of(read_recording(record_run(tmp_path / "rare", samples).folder), 1.0)
+        samples = (paper_sample(1000 * second + index) for second in range(SECONDS) for index in range(10))
+        windows_of(read_recording(record_run(tmp_path / "bursts", samples).folder), 1.0)
+    samples = (paper_sample(600 * index) for index in range(12))
+    assert not windows_of(read_recording(record_run(tmp_path / "slow", samples).folder), 1.0).silent
 
 
 def test_the_window_is_the_period_of_the_load(runs: tuple[Run, Run]) -> None:

@@ -231,6 +231,9 @@ def _show(results: list[dict[str, Any]], many: bool, as_json: bool, quiet: bool,
     if good:
         _show_contacts(console, good)
     for facts in good:
+        if "without_samples" in facts:
+            said = f"{facts['run']}: {facts['without_samples']}; the load is a straight line there"
+            console.print(said, highlight=False, soft_wrap=True)
         if not facts["signals"]:
             console.print(
                 f"{facts['run']}: no measured values to compare with the model",

@@ -31,10 +31,12 @@ from plow_twin.run.twin import Twin
 from plow_twin.scene_file import dump_scene, load_scene
 from plow_twin.scene_file.parquet_lines import SUFFIX
 from plow_twin.scene_file.presets import scene_path
+from plow_twin.stream.driver import Policy
 from plow_twin.stream.intake import Intake
 from plow_twin.stream.journal import Loss, Pose, Reset, Restore, SetWear
 from plow_twin.stream.outputs import CLEARANCE_NAMES
 from plow_twin.stream.session import Session
+from plow_twin.stream.silences import Silences
 from plow_twin.study.analysis.loads import LoadTotals
 from plow_twin.study.analysis.signals import Comparison, compare
 from plow_twin.study.analysis.thinned import Thinned, ThinnedSignal
@@ -76,12 +78,15 @@ class Prediction:
     #: first and last stamp [ns] of each stretch that has rows, by its number
     spans: dict[int, tuple[int, int]] = field(default_factory=dict)
     _longest_number: int = 0
+    #: stretches without samples, in which the load is a straight line
+    silences: Silences = field(default_factory=lambda: Silences(Policy.excitation_timeout_s))
     #: clearance under `CLEARANCE_NAMES`, of all stretches without a reset
     clearance: Thinned = field(default_factory=lambda: Thinned(len(CLEARANCE_NAMES)))
 
     def walked(self, part: Walked) -> None:
         """Add a batch."""
         self.loads.add(part)
+        self.silences.add(part.stamp_ns)
         rows, slow = part.rows, part.published.slow
         first, _ = self.spans.get(self.resets, (int(part.stamp_ns[0]), 0))
         self.spans[self.resets] = first, int(part.stamp_ns[-1])
@@ -104,6 +109,7 @@ class Prediction:
     def restart(self) -> None:
         """Begin a new stretch: the stamps may go back."""
         self.loads.restart()
+        self.silences.restart()
         self._longest_number = self.longest_number
         self.longest, self.present = self._longer(), Thinned(len(_COLUMNS))
         self.resets += 1
@@ -238,6 +244,8 @@ class Analysis:
         outside = {name: prediction.outside(signal) for name, signal in self.measured.signals.items()}
         if any(outside.values()):
             facts["outside"] = {name: count for name, count in outside.items() if count}
+        if prediction.silences.count:
+            facts["without_samples"] = prediction.silences.text()
         if len(prediction.spans) > 1:
             facts["stretches"] = len(prediction.spans)
             left = {

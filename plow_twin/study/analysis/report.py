@@ -41,6 +41,7 @@ th:first-child,td:first-child,.long{text-align:left}img{max-width:100%}</style><
 <td>{{ number(s.correlation) }}</td><td>{{ number(s.lag_s) }}</td><td>{{ number(s.rms_aligned) }}</td>
 <td>{{ number(s.coherence) }}</td></tr>{% endfor %}</table>
 {% else %}<p>Nothing was measured.</p>{% endif %}
+{% if part.without_samples %}<p>{{ part.without_samples }}; the load is a straight line there.</p>{% endif %}
 {% if part.stretches %}<p>Resets part the run into {{ part.stretches }} stretches: signals are of the longest one;
 measured values of others: {{ part.not_compared or "none" }}.</p>{% endif %}
 {% if part.outside %}<p>Measured values outside the time of the load, not compared: {{ part.outside }}.</p>{% endif %}
