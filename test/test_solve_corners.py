@@ -147,7 +147,7 @@ GUIDED = block(
     "changes",
     [
         pytest.param({}, id="stick"),
-        pytest.param({"friction": None, "loads": ()}, id="smooth and free"),
+        pytest.param({"friction": None, "loads": ()}, id="smooth and free", marks=pytest.mark.stress),
         pytest.param({"friction": None}, id="smooth", marks=pytest.mark.stress),
         pytest.param({"loads": ()}, id="free", marks=pytest.mark.stress),
     ],

@@ -145,6 +145,7 @@ def test_rounded_corners_move_the_same_by_fixed_steps_a_live_twin_and_a_batch(ca
     assert np.abs(alone.q - run.q[-1]).max() > 1e-4
 
 
+@pytest.mark.stress  # four kernels of its own
 def test_rounded_corners_hold_with_implicit_steps_and_wear() -> None:
     """A damper that outweighs its spring, and pads that wear by sliding: the balance of energy still closes."""
     damped = in_guide(

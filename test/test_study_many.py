@@ -86,7 +86,7 @@ def test_a_killed_worker_loses_nothing_and_a_second_call_uses_finished_chunks(ru
     assert other.stored() is None
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.stress)])
 def test_an_interrupt_ends_the_call_and_its_workers_at_once(number: signal.Signals, tmp_path: Path) -> None:
     for run in range(2):  # some minutes of work each
         (tmp_path / "runs" / f"r{run}").mkdir(parents=True)
