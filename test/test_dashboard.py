@@ -492,6 +492,7 @@ def test_a_browser_shows_the_twin_takes_names_as_text_and_fetches_nothing_from_e
     scene = tmp_path / f"{name.replace('/', '')}.yaml"
     scene.write_text(dump_scene(load_scene("paper")))
     given = ("--scene", scene, "--set", f"hardware_id={name}", "--token-file", tmp_path / "token")
+    given += ("--record", tmp_path / "run")  # a mark is refused without one
     (tmp_path / "token").write_text(TOKEN + "\n")
     with _twin(*given) as (process, said), ExitStack() as opened:
         url = said.partition("#")[0]
@@ -514,8 +515,8 @@ def test_a_browser_shows_the_twin_takes_names_as_text_and_fetches_nothing_from_e
         page.evaluate("document.getElementById('mark-text').value = \"<img src=x onerror='window.fooled=1'>\"")
         page.evaluate("document.querySelector('#mark button').click()")
         page.evaluate("document.getElementById('acknowledge').click()")
-        found = seen(lambda found: "acknowledge" in found["events"] and "was" not in found["alarms"])
-        assert name in found["events"] and not found["fooled"]
+        found = seen(lambda found: "acknowledge" in found["events"] and name in found["events"])
+        assert "was" not in found["alarms"] and not found["fooled"]
         assert page.evaluate("location.hash + location.search") == ""
         _stopped(process)
         seen(lambda found: "ended" in found["banner"] or "lost" in found["banner"])

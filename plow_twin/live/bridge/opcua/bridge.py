@@ -37,10 +37,12 @@ _WAIT_S: Final = 5e-3 * PUBLISHING_MS
 _PIECE_NS: Final = 10_000_000_000
 #: Longest delay of one node's values after the values of another [ns].
 _OVERLAP_NS: Final = 1_000_000_000
-#: A stamp beyond the system's time by more [ns] is no end of a break.
+#: A stamp beyond the system's time by more [ns] begins and ends no break.
 _AHEAD_NS: Final = 86_400_000_000_000
 #: Longest delay of a sent value in the server's history [s].
 _HISTORY_LAG_S: Final = 5.0
+#: Longest wait for the first values of a subscription [s], which a server sends at once.
+_FIRST_VALUES_S: Final = 10.0
 #: First wait before another attempt to connect, and the longest [s].
 _FIRST_WAIT_S: Final = 1.0
 _LONGEST_WAIT_S: Final = 30.0
@@ -213,7 +215,7 @@ class OpcUa(SourceState):
 
     async def _first_values(self) -> list[tuple[int, Any]]:
         """Return the first values of the new subscription: the history is read up to them."""
-        give_up = time.monotonic() + 1.0
+        give_up = time.monotonic() + _FIRST_VALUES_S
         while not self._held_back and time.monotonic() < give_up:
             await asyncio.sleep(0.01)
         return self._held_back[0][0] if self._held_back else []
@@ -268,13 +270,15 @@ class OpcUa(SourceState):
     def _newest_ns(self, number: int) -> int:
         return self._samples[self._topics_of[number][0]].newest_ns[self._nodes[number]]
 
-    def _add(self, number: int, value: Any, now_s: float, *, is_asked: bool = False) -> None:
+    def _add(self, number: int, value: Any, now_s: float) -> None:
         found = reading(value, self._by_server(number), self._counts)
         if found is not None:
             for topic in self._topics_of[number]:
                 samples, node = self._samples[topic], self._nodes[number]
-                if samples.newest_ns[node] or topic == "travel":  # a speed holds until the next one
-                    samples.add(node, *found, now_s, is_asked=is_asked)
+                if found[0] > time.time_ns() + _AHEAD_NS:
+                    samples.add_stray(node, *found, now_s)
+                elif samples.newest_ns[node] or topic == "travel":  # a speed holds until the next one
+                    samples.add(node, *found, now_s)
                 else:
                     samples.begin(node, *found)
 
@@ -330,7 +334,7 @@ class OpcUa(SourceState):
         self._counts.values_filled += len(new)
         now_s = time.monotonic()
         for number, value in new:
-            self._add(number, value, now_s, is_asked=True)
+            self._add(number, value, now_s)
         self._pass_on(float("-inf"))
         while len(self._queue) > _QUEUE // 2:
             await asyncio.sleep(0.01)

@@ -9,8 +9,6 @@ from typing import Final
 #: Stands for a value that is not used and counts as not measured.
 NOT_MEASURED: Final = ""
 Value = float | str
-#: A value this much after the newest of its node [ns] is believed if the next one stays there.
-FAR_NS: Final = 10_000_000_000
 #: Most stamps that wait for values.
 _MOST_WAITING: Final = 10_000
 
@@ -20,7 +18,6 @@ class Samples:
 
     A server does not resend an unchanged value: a node without a value at a stamp keeps the value before.
     A stamp is complete when each node has a value there or at a later stamp; otherwise it waits for `wait_s`.
-    A single stamp far ahead is passed on and changes nothing else.
 
     Parameters
     ----------
@@ -41,19 +38,14 @@ class Samples:
         #: nodes of which only the value before the first sample has come
         self._begun: set[str] = set()
         self._released_ns = 0
-        #: stamp far ahead that the next stamp may confirm [ns]; such samples, and the values of the newest of them
-        self._far_ns: int | None = None
+        #: samples of stamps that no value can have
         self._strays: dict[int, tuple[float, dict[str, Value]]] = {}
-        self._stray_values: dict[str, Value] = {}
         #: late stamps that were dropped because the other values of that time had been used
         self._incomplete = 0
 
-    def add(self, node: str, stamp_ns: int, value: Value, now_s: float, *, is_asked: bool = False) -> None:
-        """Add a value; the same stamp of a node again is ignored. `is_asked`: of the history, in the time asked for."""
+    def add(self, node: str, stamp_ns: int, value: Value, now_s: float) -> None:
+        """Add a value; the same stamp of a node again is ignored."""
         if stamp_ns == self.newest_ns[node]:
-            return
-        if not (is_asked or self._is_believed(node, stamp_ns)):
-            self._strays.setdefault(stamp_ns, (now_s, {}))[1].setdefault(node, value)
             return
         # the clock of the first value, perhaps that of the starting server, does not bind later values
         self.newest_ns[node] = stamp_ns if node in self._begun else max(stamp_ns, self.newest_ns[node])
@@ -63,19 +55,9 @@ class Samples:
             self._waiting[stamp_ns] = (now_s, {})
         self._waiting[stamp_ns][1].setdefault(node, value)
 
-    def _is_believed(self, node: str, stamp_ns: int) -> bool:
-        """Return whether a stamp is near the newest ones, or near the stamp far ahead that came just before it."""
-        newest_ns, far_ns = max(self.newest_ns.values()), self._far_ns
-        if far_ns == stamp_ns:
-            return False
-        self._far_ns = None
-        if not newest_ns or node in self._begun or stamp_ns <= newest_ns + FAR_NS:
-            return True
-        if far_ns is not None and stamp_ns >= far_ns - FAR_NS:
-            self._held |= self._stray_values
-            return True
-        self._far_ns = stamp_ns
-        return False
+    def add_stray(self, node: str, stamp_ns: int, value: Value, now_s: float) -> None:
+        """Add a value whose stamp no value can have: its sample is passed on and changes nothing else."""
+        self._strays.setdefault(stamp_ns, (now_s, {}))[1].setdefault(node, value)
 
     def begin(self, node: str, stamp_ns: int, value: Value) -> None:
         """Take the value that a node had before the first sample, to complete that sample."""
@@ -97,16 +79,15 @@ class Samples:
         return found + self._take_strays(now_s)
 
     def _take_strays(self, now_s: float) -> list[tuple[int, dict[str, Value]]]:
-        """Return the samples far ahead that no longer wait at `now_s`."""
+        """Return the samples of such stamps that no longer wait at `now_s`."""
         due = sorted(
             stamp_ns
             for stamp_ns, (arrived_s, values) in self._strays.items()
-            if len(values) == len(self.newest_ns) or now_s - arrived_s > self._wait_s or len(self._strays) > 1
+            if len(values) == len(self.newest_ns) or now_s - arrived_s > self._wait_s
         )
         found = []
         for stamp_ns in due:
-            self._stray_values = self._strays.pop(stamp_ns)[1]
-            values = self._held | self._stray_values
+            values = self._held | self._strays.pop(stamp_ns)[1]
             if len(values) == len(self.newest_ns):
                 found.append((stamp_ns, values))
         return found
