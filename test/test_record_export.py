@@ -79,6 +79,9 @@ def test_an_export_is_the_recording_and_overwrites_nothing(
     recording = plow_twin.read_recording(run.folder)
     for name in recording.names:
         stamps, values = recording[name].numpy()
+        if not len(stamps):  # the run did not follow its machine
+            assert name in ("force_intervals", "peak_intervals") and not (out / f"{name}.{kind}").exists()
+            continue
         if kind == "npz":
             with np.load(out) as found:
                 np.testing.assert_array_equal(found[f"{name}/stamp_ns"], stamps)
