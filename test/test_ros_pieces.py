@@ -41,6 +41,7 @@ def test_the_policy_allows_exactly_the_names_of_the_node(tmp_path: Path) -> None
     with bench(tmp_path, lifecycle="active") as running:
         name, node, ns = ("plow_twin", running.namespace), running.probe.node, running.namespace
         optional = {f"{ns}/{topic}" for topic in (*OUTPUTS, "markers")} | {"/tf"}
+        running.probe.until(lambda: name in node.get_node_names_and_namespaces(), "the twin")
         running.probe.until(lambda: node.get_service_names_and_types_by_node(*name), "the services of the twin")
         running.probe.pause(1.0)
         sent = {topic for topic, _ in node.get_publisher_names_and_types_by_node(*name)}

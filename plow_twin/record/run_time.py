@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -35,11 +35,14 @@ class RunTime:
         """Time from the first advance to the last, without steps of the clock at resets [s]."""
         return self._span_ns * 1e-9
 
-    def add(self, entries: Entries) -> list[tuple[int, int, int]]:
-        """Take entries; return the silences that end in them: index of the ending sample, begin and end [ns]."""
+    def add(self, entries: Entries, missing: Collection[int] = ()) -> list[tuple[int, int, int]]:
+        """Take entries; return the silences that end in them: index of the ending sample, begin and end [ns].
+
+        Entries before those numbered `missing` are missing: samples may have been there.
+        """
         found, done = [], 0
         samples = np.flatnonzero(entries.sample)
-        for index, entry in [*sorted(entries.rest.items()), (len(entries), None)]:
+        for index in [*sorted({*entries.rest, *missing}), len(entries)]:
             here = samples[np.searchsorted(samples, done) : np.searchsorted(samples, index)]
             if len(here):
                 stamps = entries.stamp_ns[here]
@@ -47,8 +50,10 @@ class RunTime:
                 self._reach(int(stamps.max()))
                 found += [(int(here[place]), begin, end) for place, begin, end in self.silences.add(stamps)]
             done = index
-            if entry is not None:
-                self.add_entry(entry)
+            if index in missing:
+                self.silences.restart()
+            if index in entries.rest:
+                self.add_entry(entries.rest[index])
         return found
 
     def add_entry(self, entry: Entry | Dropped) -> None:
