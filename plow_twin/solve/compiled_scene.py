@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
@@ -158,7 +159,7 @@ class _Shared:
 
     def __init__(self, most: float = math.inf) -> None:
         self._most = most
-        self._known: dict[tuple[Any, ...], tuple[Any, Any]] = {}
+        self._known: OrderedDict[tuple[Any, ...], tuple[Any, Any]] = OrderedDict()
 
     def of(self, compute: Callable[..., _Found], *sources: object) -> _Found:
         """Return `compute` of the sources; computed only once for the same objects."""
@@ -167,7 +168,7 @@ class _Shared:
         if known is None:
             known = self._known[key] = sources, compute(*sources)  # the sources stay, and keep their identity
             if len(self._known) > self._most:
-                self._known.pop(next(iter(self._known)), None)
+                self._known.popitem(last=False)
         found: _Found = known[1]
         return found
 
