@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from plow_twin.record.entries import EntryRecord
 from plow_twin.record.reader import FileStatus, RunReader
 from plow_twin.record.run_time import RunTime
 from plow_twin.record.unused import InputCounts
@@ -24,11 +23,10 @@ def read_recording(path: Path) -> tuple[dict[str, Any], bool]:
     reader = RunReader(path)
     inputs, failed = InputCounts(reader.header.excitation_source), 0
     run_time = RunTime(reader.header.parameters)
-    for record in reader:
-        if isinstance(record, EntryRecord):
-            inputs.add_entry(record.entry)
-            run_time.add_entry(record.entry)
-            failed += record.entry.advances if isinstance(record.entry, Failed) else 0
+    for batch in reader.batches():
+        inputs.add(batch.entries)
+        run_time.add(batch.entries)
+        failed += sum(entry.advances for entry in batch.entries.rest.values() if isinstance(entry, Failed))
     header = reader.header
     facts: dict[str, Any] = {
         "file": str(reader.path),

@@ -14,8 +14,10 @@ from plow_twin.model.scene import DOF_NAMES
 from plow_twin.record.mapping import Role, readings
 from plow_twin.record.sources import Arrived
 from plow_twin.record.walking import BATCH, Walker
+from plow_twin.stream.driver import Policy
 from plow_twin.stream.intake import Intake, Verdict
 from plow_twin.stream.journal import PartOfPose, Pose, Reset, Travel
+from plow_twin.stream.silences import Silences
 from plow_twin.stream.steps import Steps
 
 
@@ -34,6 +36,8 @@ class Feed:
     unfit: Counter[str] = field(default_factory=Counter)
     #: whether the first walker's journal gets the measured poses, which move nothing
     with_poses: bool = False
+    #: stretches without samples, in which the load is a straight line
+    silences: Silences = field(default_factory=lambda: Silences(Policy.excitation_timeout_s))
     _poses: list[Pose | PartOfPose] = field(default_factory=list)
     _stamps: list[int] = field(default_factory=list)
     _wrench: list[tuple[float, float, float]] = field(default_factory=list)
@@ -77,6 +81,7 @@ class Feed:
         """Begin a new stretch: no load is interpolated over missing messages."""
         self._steps.end()
         self.flush()
+        self.silences.restart()
         if self._reached_ns is not None:
             for walker in self.walkers:
                 walker.apply(Reset(self._reached_ns, "loss"))
@@ -107,6 +112,7 @@ class Feed:
             return
         if verdict.resets:
             self.flush()
+            self.silences.restart()
             for walker in self.walkers:
                 walker.apply(Reset(stamp_ns, verdict.value), max(0, log_time_ns))
         self._reached_ns = stamp_ns
@@ -127,6 +133,7 @@ class Feed:
         stamps, wrench = np.array(self._stamps, np.int64), np.array(self._wrench)
         times = np.array(self._log_times, np.int64)
         self._stamps, self._wrench, self._log_times = [], [], []
+        self.silences.add(stamps)
         for walker in self.walkers:
             walker.samples(stamps, wrench, times)
 

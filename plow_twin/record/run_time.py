@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from plow_twin.record.entries import Entries
+from plow_twin.record.entries import Entries, Holes
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.stream.driver import Policy
-from plow_twin.stream.journal import Entry, Hold, Loss, Parameter, Reset, Restore, Sample, SetWear, Unload
+from plow_twin.stream.journal import Entry, Hold, Loss, Parameter, Reset, Restore, SetWear, Unload
 from plow_twin.stream.silences import Silences
 
 _TIMEOUT = "excitation_timeout"
@@ -27,6 +27,7 @@ class RunTime:
 
     def __init__(self, parameters: Mapping[str, Any]) -> None:
         self.silences = Silences(float(parameters.get(_TIMEOUT, Policy.excitation_timeout_s)))
+        self._holes = Holes()
         self._span_ns = 0
         self._reached_ns: int | None = None
 
@@ -35,12 +36,12 @@ class RunTime:
         """Time from the first advance to the last, without steps of the clock at resets [s]."""
         return self._span_ns * 1e-9
 
-    def add(self, entries: Entries, missing: Collection[int] = ()) -> list[tuple[int, int, int]]:
+    def add(self, entries: Entries) -> list[tuple[int, int, int]]:
         """Take entries; return the silences that end in them: index of the ending sample, begin and end [ns].
 
-        Entries before those numbered `missing` are missing: samples may have been there.
+        A stretch with missing entries is no silence: samples may have been there.
         """
-        found, done = [], 0
+        found, done, missing = [], 0, self._holes.find(entries)
         samples = np.flatnonzero(entries.sample)
         for index in [*sorted({*entries.rest, *missing}), len(entries)]:
             here = samples[np.searchsorted(samples, done) : np.searchsorted(samples, index)]
@@ -53,15 +54,11 @@ class RunTime:
             if index in missing:
                 self.silences.restart()
             if index in entries.rest:
-                self.add_entry(entries.rest[index])
+                self._add_entry(entries.rest[index])
         return found
 
-    def add_entry(self, entry: Entry | Dropped) -> None:
-        """Take one entry."""
+    def _add_entry(self, entry: Entry | Dropped) -> None:
         match entry:
-            case Sample(stamp_ns):
-                self._reach(stamp_ns)
-                self.silences.add_one(stamp_ns)
             case Hold(stamp_ns) | Unload(stamp_ns):
                 self._reach(stamp_ns)
             case Reset() | SetWear() | Restore():

@@ -85,7 +85,7 @@ class RunCurves:
         for batch in reader.batches():
             missing = holes.find(batch.entries)
             resets = {index for index, entry in batch.entries.others.items() if isinstance(entry, Reset)}
-            silent = {index: (begin, end) for index, begin, end in run_time.add(batch.entries, missing)[:_MOST_MARKS]}
+            silent = {index: (begin, end) for index, begin, end in run_time.add(batch.entries)[:_MOST_MARKS]}
             places = sorted(resets | set(missing) | set(silent))
             for place, part in zip((None, *places), batch.parted(places), strict=True):
                 if place in resets or place in missing:

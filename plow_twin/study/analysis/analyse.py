@@ -24,6 +24,7 @@ from plow_twin.record.importing import Feed
 from plow_twin.record.mapping import UNFIT, Role, messages_of, read_map, readings, roles_by_source, with_units
 from plow_twin.record.reader import FileStatus, RunReader, mcap_path, own_run, read_header
 from plow_twin.record.replay import following_twin
+from plow_twin.record.run_time import RunTime
 from plow_twin.record.sources import open_source, packed
 from plow_twin.record.unit_check import check_units
 from plow_twin.record.walking import JournalWalk, Walked, Walker
@@ -31,7 +32,6 @@ from plow_twin.run.twin import Twin
 from plow_twin.scene_file import dump_scene, load_scene
 from plow_twin.scene_file.parquet_lines import SUFFIX
 from plow_twin.scene_file.presets import scene_path
-from plow_twin.stream.driver import Policy
 from plow_twin.stream.intake import Intake
 from plow_twin.stream.journal import Loss, Pose, Reset, Restore, SetWear
 from plow_twin.stream.outputs import CLEARANCE_NAMES
@@ -78,15 +78,12 @@ class Prediction:
     #: first and last stamp [ns] of each stretch that has rows, by its number
     spans: dict[int, tuple[int, int]] = field(default_factory=dict)
     _longest_number: int = 0
-    #: stretches without samples, in which the load is a straight line
-    silences: Silences = field(default_factory=lambda: Silences(Policy.excitation_timeout_s))
     #: clearance under `CLEARANCE_NAMES`, of all stretches without a reset
     clearance: Thinned = field(default_factory=lambda: Thinned(len(CLEARANCE_NAMES)))
 
     def walked(self, part: Walked) -> None:
         """Add a batch."""
         self.loads.add(part)
-        self.silences.add(part.stamp_ns)
         rows, slow = part.rows, part.published.slow
         first, _ = self.spans.get(self.resets, (int(part.stamp_ns[0]), 0))
         self.spans[self.resets] = first, int(part.stamp_ns[-1])
@@ -109,7 +106,6 @@ class Prediction:
     def restart(self) -> None:
         """Begin a new stretch: the stamps may go back."""
         self.loads.restart()
-        self.silences.restart()
         self._longest_number = self.longest_number
         self.longest, self.present = self._longer(), Thinned(len(_COLUMNS))
         self.resets += 1
@@ -187,6 +183,8 @@ class Analysis:
     input: dict[str, int]
     losses: dict[str, int]
     unknown_types: dict[str, str]
+    #: stretches without samples, in which the load is a straight line
+    silences: Silences
     wall_s: float = 0.0
     #: other folders there: empty, or with recordings of their own
     left_out: tuple[Path, ...] = ()
@@ -233,6 +231,7 @@ class Analysis:
             "with": [{"scene": other.name, **self._prediction(other)} for other in others],
             "input": self.input,
             "lost": self.lost,
+            **({"without_samples": self.silences.text()} if self.silences.count else {}),
             "skipped_topics": self.unknown_types,
             **({"left_out": list(map(str, self.left_out))} if self.left_out else {}),
             "wall_s": self.wall_s,
@@ -244,8 +243,6 @@ class Analysis:
         outside = {name: prediction.outside(signal) for name, signal in self.measured.signals.items()}
         if any(outside.values()):
             facts["outside"] = {name: count for name, count in outside.items() if count}
-        if prediction.silences.count:
-            facts["without_samples"] = prediction.silences.text()
         if len(prediction.spans) > 1:
             facts["stretches"] = len(prediction.spans)
             left = {
@@ -371,6 +368,7 @@ def _walk_own(
         walker.on_reset = prediction.restart
     walk = JournalWalk(walkers[:1], walkers[1:], whole=not header.part, same_scene=own)
     journalled = Measured()  # if the node estimates
+    run_time = RunTime(header.parameters)
 
     def so_far() -> Analysis:
         losses = Counter({**reader.lost, **reader.lost_parts})
@@ -383,11 +381,13 @@ def _walk_own(
         measured, unknown, unused = _measured_beside(path, mapping, header.node)
         measured.signals = journalled.signals | measured.signals
         losses.update(unused)
-        return Analysis(reader.path, "run", predictions, measured, {"samples_used": walk.used}, dict(losses), unknown)
+        used = {"samples_used": walk.used}
+        return Analysis(reader.path, "run", predictions, measured, used, dict(losses), unknown, run_time.silences)
 
     for batch in reader.batches(outputs=False):
         stretch = predictions[0].resets
         walk.add(batch.entries)
+        run_time.add(batch.entries)
         for _, entry in sorted(batch.entries.others.items()):
             stretch += isinstance(entry, Reset | Loss | SetWear | Restore)
             if isinstance(entry, Pose):
@@ -470,7 +470,8 @@ def _walk_other(
     if writer is not None:
         writer.close({})
     counted = {"samples_in": intake.arrived, "samples_used": intake.used, **dropped}
-    return Analysis(path, "other", predictions, measured, counted, losses, dict(source.losses.unknown_types))
+    unknown = dict(source.losses.unknown_types)
+    return Analysis(path, "other", predictions, measured, counted, losses, unknown, feed.silences)
 
 
 def _writer(out: Path, prediction: Prediction, roles: Mapping[str, Role]) -> Any:

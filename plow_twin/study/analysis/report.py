@@ -29,6 +29,7 @@ table{border-collapse:collapse;margin:1em 0}td,th{border:1px solid #ccc;padding:
 th:first-child,td:first-child,.long{text-align:left}img{max-width:100%}</style></head><body>
 <h1>{{ facts.run }}</h1>
 <p>{{ facts.kind }}; {{ facts.input.samples_used }} samples used, {{ "%.1f" | format(facts.loads.duration_s) }} s.
+{% if facts.without_samples %}{{ facts.without_samples }}; the load is a straight line there.{% endif %}
 {% if facts.lost %}Lost: {{ facts.lost }}.{% endif %}
 {% if facts.left_out %}Left out, no part of this recording: {{ facts.left_out | join(", ") }}.{% endif %}
 {% if facts.skipped_topics %}Topics passed over: {{ facts.skipped_topics }}.{% endif %}</p>
@@ -41,7 +42,6 @@ th:first-child,td:first-child,.long{text-align:left}img{max-width:100%}</style><
 <td>{{ number(s.correlation) }}</td><td>{{ number(s.lag_s) }}</td><td>{{ number(s.rms_aligned) }}</td>
 <td>{{ number(s.coherence) }}</td></tr>{% endfor %}</table>
 {% else %}<p>Nothing was measured.</p>{% endif %}
-{% if part.without_samples %}<p>{{ part.without_samples }}; the load is a straight line there.</p>{% endif %}
 {% if part.stretches %}<p>Resets part the run into {{ part.stretches }} stretches: signals are of the longest one;
 measured values of others: {{ part.not_compared or "none" }}.</p>{% endif %}
 {% if part.outside %}<p>Measured values outside the time of the load, not compared: {{ part.outside }}.</p>{% endif %}
