@@ -12,7 +12,7 @@ from figure_checks import check_figure, kept_figures
 from record_support import paper_sample, record_run
 from scenes import ROOT, preset
 
-from plow_twin import simulate
+from plow_twin import simulate, simulate_many
 from plow_twin.cli.app import run
 from plow_twin.model.scene import Mark
 from plow_twin.scene_file import dump_scene, load_scene
@@ -22,7 +22,6 @@ from plow_twin.study.calibration.pose_recording import PoseRecording, load_poses
 from plow_twin.study.calibration.targets import Target, TargetSet, load_targets
 from plow_twin.study.calibration.uniqueness import identifiability, near_optimal
 from plow_twin.study.calibration.unknowns import Space, parse_unknown
-from plow_twin.study.members import run_members
 from plow_twin.study.parameters import StudyError, with_parameters
 from plow_twin.study.statistics import statistic
 
@@ -107,7 +106,7 @@ def test_an_unseen_parameter_is_reported_as_such() -> None:
 def figures(seconds: float) -> TargetSet:
     """Return figures of the true motion as a paper might publish them: forces, means, shares, impulses."""
     true = with_parameters(preset("paper"), TRUTH)
-    members = run_members([true], seconds)
+    members = simulate_many([true], seconds, seconds)
     paths = [
         f"{kind}.{sense}.{corner}"
         for kind in ("max", "mean_in_contact", "impulse")

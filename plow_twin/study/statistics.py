@@ -17,6 +17,7 @@ by `+`.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, replace
 from functools import partial
 from itertools import combinations
 from typing import Final
@@ -26,12 +27,13 @@ from numpy.typing import NDArray
 
 from plow_twin.model.pairs import CORNER_NAMES, PAIR_NAMES, STOPS_COUNTER_CLOCKWISE
 from plow_twin.model.scene import Scene
-from plow_twin.study.members import Members
+from plow_twin.run.ensemble import Ensemble
+from plow_twin.solve.state import Status
 from plow_twin.study.parameters import StudyError, nearest_of
 
 Array = NDArray[np.float64]
 #: From m runs to the statistic of each, shape (m,).
-Statistic = Callable[[Members], Array]
+Statistic = Callable[[Ensemble], Array]
 
 SENSES: Final = ("ccw", "cw")
 
@@ -44,33 +46,33 @@ def _sum(array: Array, columns: list[int]) -> Array:
     return total
 
 
-def _max(members: Members, pairs: list[int]) -> Array:
-    return np.asarray(members.motions.peak[:, pairs].max(axis=1))
+def _max(members: Ensemble, pairs: list[int]) -> Array:
+    return np.asarray(members.peak[:, pairs].max(axis=1))
 
 
-def _mean_in_contact(members: Members, pairs: list[int]) -> Array:
-    impulse, time = _sum(members.motions.impulse, pairs), _sum(members.motions.time_in_contact, pairs)
+def _mean_in_contact(members: Ensemble, pairs: list[int]) -> Array:
+    impulse, time = _sum(members.impulse, pairs), _sum(members.time_in_contact, pairs)
     return np.asarray(np.divide(impulse, time, out=np.zeros_like(impulse), where=time > 0.0))
 
 
-def _mean_over_time(members: Members, pairs: list[int]) -> Array:
-    return np.asarray(_impulse(members, pairs) / members.duration_s)
+def _mean_over_time(members: Ensemble, pairs: list[int]) -> Array:
+    return np.asarray(_impulse(members, pairs) / members.t[-1])
 
 
-def _impulse(members: Members, pairs: list[int]) -> Array:
-    return _sum(members.motions.impulse, pairs)
+def _impulse(members: Ensemble, pairs: list[int]) -> Array:
+    return _sum(members.impulse, pairs)
 
 
-def _time_in_contact(members: Members, pairs: list[int]) -> Array:
-    return _sum(members.motions.time_in_contact, pairs)
+def _time_in_contact(members: Ensemble, pairs: list[int]) -> Array:
+    return _sum(members.time_in_contact, pairs)
 
 
-def _makes(members: Members, pairs: list[int]) -> Array:
-    return _sum(members.motions.makes.astype(np.float64), pairs)
+def _makes(members: Ensemble, pairs: list[int]) -> Array:
+    return _sum(members.makes.astype(np.float64), pairs)
 
 
-def _wear_depth(members: Members, pairs: list[int]) -> Array:
-    return np.asarray(members.motions.wear_depth[:, pairs].max(axis=1))
+def _wear_depth(members: Ensemble, pairs: list[int]) -> Array:
+    return np.asarray(members.wear_depth[:, pairs].max(axis=1))
 
 
 _OF_PAIRS: Final[Mapping[str, Callable[..., Array]]] = {
@@ -88,14 +90,16 @@ UNITS: Final[Mapping[str, str]] = {
 }  # fmt: skip
 
 
-def statistics_of(members: Members, scenes: Sequence[Scene], paths: Sequence[str]) -> Array:
+def statistics_of(members: Ensemble, scenes: Sequence[Scene], paths: Sequence[str]) -> Array:
     """Return the statistics of runs, shape (m, paths), NaN for a failed run; each scene may letter its own corners."""
     result = np.full((len(scenes), len(paths)), np.nan)
+    names = [spec.name for spec in fields(Ensemble) if spec.name != "t"]
     groups: dict[tuple[tuple[str, str], ...], list[int]] = {}
-    for index in np.flatnonzero(~members.failed).tolist():
+    for index in np.flatnonzero(members.status == Status.OK).tolist():
         groups.setdefault(tuple(sorted(scenes[index].frame.labels.items())), []).append(index)
     for rows in groups.values():
-        part, known = members.at(np.array(rows)), statistics_of_scene(scenes[rows[0]])
+        part = replace(members, **{name: getattr(members, name)[rows] for name in names})
+        known = statistics_of_scene(scenes[rows[0]])
         for column, path in enumerate(paths):
             result[rows, column] = (known.get(path) or statistic(scenes[rows[0]], path))(part)
     return result
@@ -114,8 +118,8 @@ def statistics_of_scene(scene: Scene) -> Mapping[str, Statistic]:
         for count in (1, 2, 3, 4):
             masks = [mask for mask in range(1, 16) if mask.bit_count() == count]
             known[f"contact_points.{sense}.{count}"] = partial(_share, row=row, masks=masks)
-    known["events"] = lambda members: members.motions.events.astype(np.float64)
-    known["steps"] = lambda members: members.motions.steps.astype(np.float64)
+    known["events"] = lambda members: members.events.astype(np.float64)
+    known["steps"] = lambda members: members.steps.astype(np.float64)
     return known
 
 
@@ -175,11 +179,11 @@ def _sets(scene: Scene) -> dict[str, int]:
     }
 
 
-def _set_time(members: Members, row: int, mask: int) -> Array:
-    return np.asarray(members.motions.set_time[:, row, mask])
+def _set_time(members: Ensemble, row: int, mask: int) -> Array:
+    return np.asarray(members.set_time[:, row, mask])
 
 
-def _share(members: Members, row: int, masks: list[int]) -> Array:
-    times = members.motions.set_time[:, row]
+def _share(members: Ensemble, row: int, masks: list[int]) -> Array:
+    times = members.set_time[:, row]
     total, part = _sum(times, list(range(16))), _sum(times, masks)
     return np.asarray(np.divide(part, total, out=np.zeros_like(part), where=total > 0.0))

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from plow_twin.errors import SceneError
 from plow_twin.model.geometry import half_diagonal, length_scale
 from plow_twin.model.scene import Scene
+from plow_twin.run.ensemble import simulate_many
+from plow_twin.solve.state import Status
 from plow_twin.study.calibration.pose_recording import PoseRecording
 from plow_twin.study.calibration.targets import FAILED_RESIDUAL, TargetSet
-from plow_twin.study.members import run_members
 from plow_twin.study.parameters import Value, with_parameters
 from plow_twin.study.statistics import statistics_of
 
@@ -87,7 +88,8 @@ class TargetObjective:
                 places.append((row, column))
         if not scenes:
             return
-        members = run_members(scenes, self.targets.t_end_s, self.targets.tol, workers=self.workers)
+        t_end = self.targets.t_end_s
+        members = simulate_many(scenes, t_end, t_end, self.targets.tol, self.workers)
         self.runs += len(scenes)
         statistics = statistics_of(members, scenes, paths)
         for place, numbers in zip(places, statistics, strict=True):
@@ -125,7 +127,7 @@ class RecordingObjective:
     def motion(self, candidate: Values) -> Array:
         """Return the poses of a candidate at the recorded times, shape (n, 3)."""
         scene, recording = with_parameters(self.scene, candidate), self.recording
-        members = run_members([scene], float(recording.t[-1]), self.tol, recording.output_dt, self.workers)
+        members = simulate_many([scene], float(recording.t[-1]), recording.output_dt, self.tol, self.workers)
         return np.asarray(recording.sampled(members)[0])
 
     def residuals(self, candidates: Sequence[Values], cut: float = np.inf) -> Array:
@@ -142,10 +144,10 @@ class RecordingObjective:
             places.append(index)
         if scenes:
             t_end, dt = float(self.recording.t[-1]), self.recording.output_dt
-            members = run_members(scenes, t_end, self.tol, dt, self.workers)
+            members = simulate_many(scenes, t_end, dt, self.tol, self.workers)
             self.runs += len(scenes)
             scale = np.array([1.0, 1.0, half_diagonal(self.scene)]) / length_scale(self.scene) / np.sqrt(rows)
             errors = (self.recording.sampled(members) - self.recording.q) * scale
-            sound = ~members.failed
+            sound = members.status == Status.OK
             result[np.array(places)[sound]] = errors[sound].reshape(int(sound.sum()), rows)
         return result

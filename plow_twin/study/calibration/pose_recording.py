@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from plow_twin.errors import ExcessError
 from plow_twin.model.scene import Table
+from plow_twin.run.ensemble import Ensemble
 from plow_twin.scene_file.csv_rows import csv_rows, open_csv
-from plow_twin.study.members import Members
 from plow_twin.study.parameters import StudyError
 
 Array = NDArray[np.float64]
@@ -44,19 +44,19 @@ class PoseRecording:
         step = float(np.median(np.diff(self.t))) if len(self.t) > 1 else end
         return max(min(step, 0.01), end / _MOST_ROWS)
 
-    def sampled(self, members: Members) -> Array:
+    def sampled(self, members: Ensemble) -> Array:
         """Return the simulated poses at the recorded times, shape (m, n, 3), by cubic Hermite interpolation."""
-        t = members.motions.t
+        t = members.t
         right = np.clip(np.searchsorted(t, self.t), 1, len(t) - 1)
         left = right - 1
         h = t[right] - t[left]
         s = ((self.t - t[left]) / h)[:, None]
         h = h[:, None]
         q0, q1, v0, v1 = (
-            members.motions.q[:, left],
-            members.motions.q[:, right],
-            members.motions.v[:, left],
-            members.motions.v[:, right],
+            members.q[:, left],
+            members.q[:, right],
+            members.v[:, left],
+            members.v[:, right],
         )
         return np.asarray(
             (1.0 + 2.0 * s) * (1.0 - s) ** 2 * q0

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from plow_twin.errors import SceneError
 from plow_twin.model.scene import Scene
+from plow_twin.run.ensemble import simulate_many
 from plow_twin.scene_file import loads_scene
 from plow_twin.solve.state import Status
-from plow_twin.study.members import run_members
 from plow_twin.study.parameters import WORDS, StudyError, Value, check_path, check_word, with_parameters
 from plow_twin.study.statistics import statistic, statistics_of
 
@@ -177,8 +177,8 @@ def run_members_of(
         rows.append(row)
     if not scenes:
         return table
-    result = run_members(scenes, sweep.t_end_s, sweep.tol, workers=workers, on_done=on_done)
-    table[rows, 0] = result.motions.status
+    result = simulate_many(scenes, sweep.t_end_s, sweep.t_end_s, sweep.tol, workers, on_done)
+    table[rows, 0] = result.status
     table[rows, 1:] = statistics_of(result, scenes, sweep.statistics)
     return table
 
