@@ -334,6 +334,30 @@ def test_a_broker_gets_all_groups_with_tls_and_says_when_the_twin_has_died(broke
         subscriber.close()
 
 
+def test_a_run_that_ends_while_its_broker_is_gone_is_no_success(tmp_path: Path) -> None:
+    (tmp_path / "map.yaml").write_text(MAP.replace(", sequence: n", ""))
+    port, client, broker = _free_port(), make_client("", clean=True), ExitStack()
+    broker.enter_context(_open_broker(tmp_path, port))
+
+    def connected(heard: dict[str, dict[str, Any]]) -> bool:
+        return "status" in heard and heard["status"]["values"]["publishers_excitation"] == 1
+
+    with broker, _live(f"mqtt://127.0.0.1:{port}", "--map", str(tmp_path / "map.yaml")) as live:
+        live.until(connected, "connected")
+        client.connect("127.0.0.1", port)
+        client.loop_start()
+        sample = {"t": time.time(), "force": {"x": 1.0, "y": 1.0}, "moment": 1.0}
+        client.publish("plough/load", json.dumps(sample).encode(), qos=1).wait_for_publish(30.0)
+        live.until_count("samples_used", 1)
+        client.disconnect()
+        client.loop_stop()
+        broker.close()
+        live.until(lambda heard: not connected(heard), "the broker is gone")
+        live.process.terminate()
+        said = live.process.communicate(timeout=60.0)[1].decode()
+    assert live.process.returncode == 3 and "not connected at the end: the connection broke" in said, said
+
+
 def test_a_missing_broker_is_reported_and_costs_the_twin_nothing(tmp_path: Path) -> None:
     path, runs = _csv(tmp_path / "load.csv", 2000), [tmp_path / "alone", tmp_path / "with"]
     url = f"mqtt://127.0.0.1:{_free_port()}/plough"

@@ -174,7 +174,7 @@ class BridgeFront:
             runtime.start()
             runtime.activate()
             self._loop(stop_asked, time.monotonic() + seconds)
-            if isinstance(bridge, Reporting) and not (bridge.connected or bridge.finished):
+            if not (bridge.connected or bridge.finished):
                 broken = f"not connected at the end: {bridge.trouble}"
         finally:
             bridge.close()
