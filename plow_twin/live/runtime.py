@@ -335,7 +335,6 @@ class Runtime:
         """Take over a parameter that takes effect at once."""
         self.settings = settings
         self.driver.policy = policy(settings)
-        self.driver.silences.timeout_s = settings.excitation_timeout
         self.driver.intake.limits = limits(settings, self.scene)
         self._set_limits(settings)
         for intake in (self.driver.intake, self.driver.clock):

@@ -92,6 +92,7 @@ class Driver:
     def __init__(self, session: Session, intake: Intake, policy: Policy, *, every_sample: bool = True) -> None:
         self.session = session
         self.intake = intake
+        self.silences = Silences(policy.excitation_timeout_s)
         self.policy = policy
         self.every_sample = every_sample
         self.real_time = RealTimeFactor()
@@ -107,7 +108,6 @@ class Driver:
         #: steady times of the latest resets, and of the latest refused reset [ns]
         self._resets_ns: deque[int] = deque()
         self._unsteady_ns: int | None = None
-        self.silences = Silences(policy.excitation_timeout_s)
         self._steps = Steps(intake)
         self.clock = Intake(jump_back_s=intake.jump_back_s, jump_forward_s=intake.jump_forward_s)
         self._received_ns = 0
@@ -118,6 +118,16 @@ class Driver:
         #: delay of the stamps of the scene's own loads behind the clock [ns]: time spent inactive
         self._behind_ns = 0
         self._resumed = False
+
+    @property
+    def policy(self) -> Policy:
+        """What happens without samples; a new one acts at once."""
+        return self._policy
+
+    @policy.setter
+    def policy(self, policy: Policy) -> None:
+        self._policy = policy
+        self.silences.timeout_s = policy.excitation_timeout_s
 
     @property
     def newest_ns(self) -> int | None:
