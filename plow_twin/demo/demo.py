@@ -132,11 +132,14 @@ def _run(
     speed: str, seconds: float, folder: Path, console: Console, quiet: bool, screen: list[str] | None
 ) -> tuple[Watch, int]:
     """Run the processes to their end; return the node's last figures and the number of samples sent."""
+    from plow_twin.demo.excitation_publisher import QUEUE
+
     node = [
         *("plow_twin.ros.main", "--ros-args", "-p", f"scene:={_worn_scene(folder)}"),
         *("-p", f"record_path:={(folder / 'run').resolve()}", "-p", f"expected_rate:={_RATE_HZ}"),
-        # the demo's own publisher is reliable: no sample is lost when the machine is busy
+        # publisher and reader keep every sample of the run: none is lost when the machine is busy
         *("-p", "qos_overrides./excitation.subscription.reliability:=reliable"),
+        *("-p", f"input_depth:={QUEUE}"),
         # the last sample is followed by the stop, not by the hold policy
         *("-p", "excitation_timeout:=60.0", "-p", f"use_sim_time:={str(speed == 'fast').lower()}"),
     ]
@@ -308,10 +311,10 @@ def _view(folder: Path) -> Path | None:
 
 def _losses(watch: Watch, sent: int, summary: RunSummary) -> dict[str, int]:
     """Return all counted loss of the run."""
-    published = int(watch.number("output", "published"))
+    published, missed = int(watch.number("output", "published")), int(watch.number("input", "messages_lost"))
     return {
-        "sent, not used": sent - int(watch.number("input", "samples_used")),
-        "lost by the middleware": int(watch.number("input", "messages_lost")),
+        "lost by the middleware": missed,
+        "received, not used": sent - missed - int(watch.number("input", "samples_used")),
         "not published": int(watch.number("output", "withheld")),
         "published, not recorded": published - summary.frames,
         "failed advances": int(watch.number("state", "solver_failures")),

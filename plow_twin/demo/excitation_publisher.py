@@ -49,6 +49,8 @@ from plow_twin.stream.intake import NS_PER_S
 FIRST_STAMP_NS: Final = NS_PER_S
 #: Samples that may be under way in `fast`.
 WINDOW: Final = 200
+#: Samples that a reliable reader may be behind before samples are lost: 100 s at 1 kHz.
+QUEUE: Final = 100_000
 #: Samples between two messages on /clock.
 _CLOCK_EVERY: Final = 10
 #: Time between two messages on travel [s].
@@ -88,10 +90,10 @@ class ExcitationPublisher(WithoutEvents):
         self._executor.add_node(self)
         self._message = WrenchStamped()
         self._message.header.frame_id = "slide_frame"
-        self._samples = self.create_publisher(WrenchStamped, "excitation", QoSProfile(depth=1000))
+        self._samples = self.create_publisher(WrenchStamped, "excitation", QoSProfile(depth=QUEUE))
         self._travel = None if plan.speed is None else self.create_publisher(TwistStamped, "travel", 100)
         self._twist = TwistStamped()
-        self._poses = None if plan.pose is None else self.create_publisher(PoseStamped, "head_pose", 1000)
+        self._poses = None if plan.pose is None else self.create_publisher(PoseStamped, "head_pose", QUEUE)
         self._pose = PoseStamped()
         self._pose.header.frame_id = "slide_frame"
         self._twin_reads = False
