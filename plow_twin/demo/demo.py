@@ -30,6 +30,7 @@ from plow_twin.scene_file import dump_scene, load_scene
 
 DONE, FAILED, DONE_WITH_LOSS = 0, 1, 3
 #: Compiling the solver for the first time takes some 20 s on a small machine [s].
+#: Longest wait for a start that compiles, or for the estimate, on a busy machine [s].
 _START_TIMEOUT_S: Final = 300.0
 _STOP_TIMEOUT_S: Final = 10.0
 _RATE_HZ: Final = 1000.0
@@ -161,11 +162,11 @@ def _run(
         watch, spin = opened.enter_context(_watching())
         twin = opened.enter_context(_process(node, folder / "node.log"))
         task = bar.add_task("compiling the solver", total=None)
-        _until(lambda: watch.text("state", "lifecycle") == "active", spin, twin, _START_TIMEOUT_S)
+        _until("active node", lambda: watch.text("state", "lifecycle") == "active", spin, twin, _START_TIMEOUT_S)
         if screen is not None:
             command = ["plow_twin", "dashboard", "--ros", *screen]
             shown = opened.enter_context(_process(command, folder / "screen.log"))
-            _until(lambda: "screen: " in shown.output(), spin, shown, _START_TIMEOUT_S)
+            _until("screen", lambda: "screen: " in shown.output(), spin, shown, _START_TIMEOUT_S)
             console.print(shown.output(), highlight=False, markup=False)
         bar.update(task, description="running", total=seconds, completed=0.0)
         with _process([*publisher, "--rate", repr(_RATE_HZ)], folder / "publisher.log") as source:
@@ -173,9 +174,13 @@ def _run(
             sent = int(json.loads(source.output().splitlines()[-1])["sent"])
         if estimating:
             bar.update(task, description="estimating", total=None)
-            _until(lambda: watch.number("estimate", "estimates") or watch.text("estimate", "error"), spin, twin, 120.0)
+            _until(
+                "estimate",
+                lambda: watch.number("estimate", "estimates") or watch.text("estimate", "error"),
+                spin, twin, _START_TIMEOUT_S,
+            )  # fmt: skip
         reports = watch.reports
-        _until(lambda: watch.reports > reports, spin, twin, _STOP_TIMEOUT_S)
+        _until("report of the node", lambda: watch.reports > reports, spin, twin, _STOP_TIMEOUT_S)
         twin.stop()
     return watch, sent
 
@@ -196,13 +201,14 @@ def _follow(source: Child, twin: Child, watch: Watch, spin: Any, bar: Progress, 
     source.check(allowed=(0, 3))
 
 
-def _until(reached: Any, spin: Any, twin: Child, timeout_s: float) -> None:
+def _until(name: str, reached: Any, spin: Any, twin: Child, timeout_s: float) -> None:
+    """Wait for a thing, by its name; raise `DemoError` after the time limit or when the process has ended."""
     give_up = time.monotonic() + timeout_s
     while not reached():
         spin()
         twin.check()
         if time.monotonic() > give_up:
-            raise DemoError(f"the node did not get there within {timeout_s:g} s\n{twin.output()}")
+            raise DemoError(f"no {name} within {timeout_s:g} s\n{twin.output()}")
 
 
 class Child:
