@@ -20,7 +20,7 @@ _SHORTEST: Final = 16
 
 
 class DashboardError(InputError):
-    """The screen cannot be offered as requested."""
+    """The screen cannot be served as requested."""
 
     def __init__(self, key: str, got: object, expected: str) -> None:
         super().__init__([Problem(key, got, expected)], "dashboard")
@@ -69,9 +69,9 @@ class PageAccess:
         return hmac.compare_digest(given.encode("utf-8", "replace"), self.token.encode())
 
     def answers_to(self, host: str) -> bool:
-        """Return whether the page answers to a name, as in `Host`: not to names that others may own.
+        """Return whether the page answers to a name in `Host`: it refuses names that others may own.
 
-        Otherwise their page could point its name to this address and read the screen (DNS rebinding).
+        Otherwise the owner of a name could point it to this address and read the screen (DNS rebinding).
         """
         try:
             name = urlsplit(f"//{host}").hostname or ""
@@ -87,7 +87,7 @@ class PageAccess:
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether a host is this machine's own."""
+    """Return whether a host is this machine's loopback address."""
     return host == "localhost" or (_is_address(host) and ip_address(host).is_loopback)
 
 

@@ -1,4 +1,4 @@
-"""A process beside a twin, at the other end of a link; no trouble of the process affects the twin."""
+"""A process beside a twin, connected by a link; a fault of the process does not affect the twin."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Beside:
     module
         Module that is run; its arguments are the descriptor of the link, then `descriptors`.
     first
-        First message; it carries secrets, because others can read a command line.
+        First message; it carries the secrets, because other users can read a command line.
     descriptors
         Further descriptors for the process.
     """
@@ -31,7 +31,7 @@ class Beside:
         self.link, theirs = pair()
         with theirs:
             numbers = (theirs.fileno(), *descriptors)
-            # a session of its own: Ctrl-C is for the twin, whose end also ends the process
+            # a session of its own, so that Ctrl-C reaches only the twin; the end of the twin also ends the process
             self.process = subprocess.Popen(
                 [sys.executable, "-m", module, *map(str, numbers)],
                 stdin=subprocess.DEVNULL,

@@ -52,7 +52,7 @@ class Board:
         news.set()
 
     def since(self, version: int) -> dict[str, Any]:
-        """Return the updates after `number`, the last that a page has received; 0: all."""
+        """Return the values newer than `version`, the newest that a page has received; 0: all."""
         found: dict[str, Any] = {
             "version": self.version,
             "age": round(time.monotonic() - self._updated_s, 2),

@@ -1,4 +1,4 @@
-"""Facts of a machine for the page: its cross-section, its pads, the thresholds of its alarms."""
+"""Facts about a machine for the page: its cross-section, its pads, the thresholds of its alarms."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""The feed of a process beside a twin: it sums up publications and sends the sums at a fixed rate, if there is room.
+"""The feed of a process beside a twin: it sums up publications and sends the sums at a fixed rate.
 
-An update that is not taken is not queued: its peaks and all newest values stay for the next update.
+An update without room is not queued: its peaks and all newest values go into the next update.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Motion:
         self.penetration = np.full(PAIR_COUNT, np.nan)
         self.force = np.full(PAIR_COUNT, np.nan)
         self.clearance: Array | None = None
-        #: the newest estimate, until clearances are published after it, and the newest status
+        #: the newest estimate, until newer clearances are published, and the newest status
         self.estimate: Mapping[str, str] = {}
         self.status: Mapping[str, str] = {}
         self.load = _NO_LOAD
@@ -67,7 +67,7 @@ class Motion:
         self.highest = np.fmax(self.highest, np.fmax.reduce(wrench))
 
     def add_peaks(self, peak: Array) -> None:
-        """Add the largest forces [N] since the rows before, shape (n, 8)."""
+        """Add the largest forces [N], each since the previous row, shape (n, 8)."""
         self.peak = np.maximum(self.peak, peak.max(axis=0))
 
     def add_points(self, low: Array, high: Array) -> None:
@@ -96,9 +96,9 @@ class Motion:
         self.clearance, self.estimate = values, {}
 
     def _clearances(self, values: Array) -> dict[str, float | None]:
-        """Return the newest clearances by name: published ones, or those of a later estimate.
+        """Return the newest clearances by name: as published, or as in a later estimate.
 
-        An estimate may be the last message: a file has ended, or the machine stands.
+        An estimate may be the last message, if a file has ended or the machine has stopped.
         """
         found = {name: number(value) for name, value in zip(CLEARANCE_NAMES, values.tolist(), strict=True)}
         for axis in [axis for axis in ("horizontal", "vertical") if self.status.get(axis) in _KNOWN_STATES]:
@@ -136,18 +136,18 @@ class Feed:
     link
         The way to its process.
     facts
-        What is known of the machine (`facts.facts_of`).
+        Facts about the machine (`facts.facts_of`).
     answer
         Carries out an operator's request, `acknowledge` or `mark` with a text; returns success and a text.
         None: no request is possible.
     load
-        Returns the newest load Fx, Fy [N], M [N m] that is known with a publication, shape (3,).
+        Returns the load Fx, Fy [N], M [N m] at the newest publication, shape (3,).
     on_error
         Receives the reason when the feed has ended.
     process, consequence
         Name of the process, and the consequence of its end.
     by_second
-        Give each second of stamps an update, also where samples come faster than their time, as from a file.
+        Send an update for each second of stamps even if samples arrive faster than in real time, as from a file.
     """
 
     def __init__(
@@ -194,8 +194,8 @@ class Feed:
     def part(self, name: str, part: Part) -> None:
         """Add a status: the newest of each name counts."""
         level, message, values = part
-        if name == "estimate" and "estimates" not in values:  # not the part of the diagnostics of the same name
-            self._sum_up()  # the publications before it
+        if name == "estimate" and "estimates" not in values:  # the part of the diagnostics has the same name
+            self._sum_up()  # publications before the estimate
             self.motion.estimate = values
         elif name == "status":
             self.motion.status = values
@@ -227,7 +227,7 @@ class Feed:
                 self._do(asked)
 
     def send(self) -> bool:
-        """Send an update; Without room it is counted, and the result is False."""
+        """Send an update; without room, count it and return False."""
         self._sum_up()
         update: dict[str, Any] = {**self._news, "not_taken": self.not_taken}
         if self._parts:

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 #: Seconds of stamps that are kept.
 SPAN_S: Final = 3600
-#: The numbers of a second beside its time, in the order in which they are sent.
+#: The clearances of a second, in the order in which they are sent.
 _CLEARANCES: Final = tuple(f"{name}{point}" for name in ("horizontal", "vertical") for point in ("", "/p05", "/p95"))
 
 
@@ -24,7 +24,7 @@ class History:
         self._versions: deque[int] = deque()
 
     def add(self, motion: dict[str, Any], version: int) -> bool:
-        """Add the motion of an update; True where the stamps have stepped back and the hour is cleared."""
+        """Add the motion of an update; return whether the stamps stepped back, which clears the hour."""
         second = int(motion["t"])
         stepped_back = bool(self._seconds) and second < self._seconds[-1][0]
         if stepped_back:

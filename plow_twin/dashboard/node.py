@@ -45,7 +45,7 @@ _SHOWN: Final = (
 )  # fmt: skip
 #: How long a service may take to answer [s].
 _PATIENCE_S: Final = 5.0
-#: Queue depth of topics whose newest message alone counts, and of topics whose messages all count.
+#: Queue depth of topics of which only the newest message is needed, and of topics of which all are.
 _NEWEST, _ALL = 1, 1000
 
 
@@ -194,7 +194,7 @@ class NodeWatch:
 
 @contextmanager
 def ros() -> Iterator[None]:
-    """Take part in the ROS graph, without ROS's own handling of signals."""
+    """Join the ROS graph, without ROS's own handling of signals."""
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     try:
         yield

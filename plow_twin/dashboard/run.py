@@ -28,7 +28,7 @@ from plow_twin.stream.topics import Cadence, names_of
 
 #: The topics whose messages are decoded one by one.
 _SLOW: Final = names_of(Cadence.ESTIMATE, Cadence.CHANGE)
-#: How long the feed waits for room [s]; a file, unlike a live run, is not delayed by that.
+#: How long the feed waits for room [s]; unlike a live run, a file may wait.
 _WAIT_S: Final = 2e-3
 
 
@@ -118,7 +118,7 @@ def _within(rows: Rows, second: int) -> Rows:
 
 
 def pose_of(numbers: Array) -> Array:
-    """Return x, y [m], theta [rad] of the numbers of a message on `head_state`."""
+    """Return x, y [m], theta [rad] from the numbers of a `head_state` message."""
     return np.array([numbers[0], numbers[1], 2.0 * np.arctan2(numbers[2], numbers[3])])
 
 
@@ -139,7 +139,7 @@ def show_run(path: Path, access: PageAccess, stopped: Callable[[], bool], on_ope
     Raises
     ------
     RecordingError
-        It is not a recording.
+        The path is not a recording.
     DashboardError
         The address cannot be used.
     """

@@ -1,7 +1,7 @@
 """The server of the screen, a process of its own: `python -m plow_twin.dashboard.server LINK SOCKET`.
 
-Each page gets newer values once it has taken the update before: a slow page gets fewer updates, a frozen page gets no
-updates, and no page waits for another.
+Each page gets newer values once it has received the last update: a slow page gets fewer updates, a frozen page gets
+none, and no page waits for another.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from plow_twin.dashboard.link import Link
 PAGE: Final = Path(__file__).with_name("page")
 #: Most pages at once; a further one is refused.
 MOST_PAGES: Final = 50
-#: How long a page may take for an update, or to send its token, before it is closed [s].
+#: Time after which a page is closed that has not received an update, or not sent its token [s].
 _PATIENCE_S: Final = 20.0
 #: Longest time without a message to a page, and shortest time between two requests of a page [s].
 _WORD_S, _WISH_S = 1.0, 0.2
@@ -113,7 +113,7 @@ class Pages:
             self._board.pages -= 1
 
     async def _is_admitted(self, socket: WebSocket) -> bool:
-        """Ask for the token; a wrong one costs a second."""
+        """Ask for the token; a wrong token costs a second."""
         wish = await asyncio.wait_for(_wish(socket), _PATIENCE_S)
         if self._access.admits(wish.get("token")):
             return True
@@ -155,7 +155,7 @@ class Pages:
 
 
 async def _wish(socket: WebSocket) -> dict[str, Any]:
-    """Return the next request of a page; None where it cannot be read."""
+    """Return the next request of a page; empty if it cannot be read."""
     try:
         found = json.loads(await socket.receive_text())
     except (ValueError, KeyError):

@@ -19,7 +19,7 @@ from plow_twin.stream.journal import Estimated
 
 Array = NDArray[np.float64]
 
-#: The newest seconds that are compared: a load period of the paper.
+#: Length of the compared end of a run [s]: a load period of the paper.
 COMPARED_S: Final = 3.2
 
 
@@ -34,7 +34,7 @@ class Comparison:
     error : dict of str to float
         RMS of the difference from the true forces over their RMS, by `nominal` and `followed`.
     estimates_s : list of float
-        Times of the run in s at which an estimate came.
+        Times of the run in s at which an estimate was made.
     since_s : float
         Time of the run in s from which on the forces are compared.
     """

@@ -29,16 +29,15 @@ from plow_twin.model.scene import Mark, Provenance, Wear
 from plow_twin.scene_file import dump_scene, load_scene
 
 DONE, FAILED, DONE_WITH_LOSS = 0, 1, 3
-#: Compiling the solver for the first time takes some 20 s on a small machine [s].
-#: Longest wait for a start that compiles, or for the estimate, on a busy machine [s].
+#: Longest wait for the estimate, or for a start that compiles the solver, on a busy machine [s].
 _START_TIMEOUT_S: Final = 300.0
 _STOP_TIMEOUT_S: Final = 10.0
 _RATE_HZ: Final = 1000.0
-#: Clearance of the head with the synthetic sensor beyond that of the scene [mm].
+#: Excess clearance of the synthetic machine over the scene [mm].
 _SENSOR_MM: Final = 1.5
 #: Shortest demo with an estimate, and the estimate's window and interval [s].
 _ESTIMATED_S, _WINDOW_S, _INTERVAL_S = 15.0, 14.0, 3.0
-#: The run has failed after so long without progress [s].
+#: Time without progress after which the run counts as failed [s].
 _STUCK_S: Final = 30.0
 
 
@@ -75,11 +74,11 @@ def run_demo(speed: str, seconds: float, out: Path, quiet: bool, screen: list[st
     Parameters
     ----------
     speed
-        `real`: at the machine's clock; `fast`: under /clock, as fast as the machine goes.
+        `real`: by the system's clock; `fast`: under /clock, as fast as possible.
     seconds
         Machine time to run [s].
     out
-        Folder in which the run gets a new folder: recording, view, logs.
+        Folder in which the run makes a new folder for recording, view and logs.
     quiet
         No progress and no table.
 
@@ -110,7 +109,7 @@ def run_demo(speed: str, seconds: float, out: Path, quiet: bool, screen: list[st
 
 
 def _set_environment(folder: Path) -> None:
-    """Keep the demo's processes on this machine and in a domain of their own."""
+    """Confine the demo's processes to this machine and to a domain of their own."""
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     # domains above 101 share their ports with outgoing connections
     os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
@@ -141,7 +140,7 @@ def _run(
         # publisher and reader keep every sample of the run: none is lost when the machine is busy
         *("-p", "qos_overrides./excitation.subscription.reliability:=reliable"),
         *("-p", f"input_depth:={QUEUE}"),
-        # the last sample is followed by the stop, not by the hold policy
+        # after the last sample comes the stop, not the hold policy
         *("-p", "excitation_timeout:=60.0", "-p", f"use_sim_time:={str(speed == 'fast').lower()}"),
     ]
     publisher = ["plow_twin.demo.excitation_publisher", "--speed", speed, "--seconds", repr(seconds)]
@@ -194,7 +193,7 @@ def _follow(source: Child, twin: Child, watch: Watch, spin: Any, bar: Progress, 
         now = watch.number("state", "model_time_s")
         if now > reached:
             moved, reached = time.monotonic(), now
-        # before the first sample the publisher starts, slowly on a busy machine
+        # before the first sample the publisher starts, which is slow on a busy machine
         elif time.monotonic() - moved > (patience := _STUCK_S if reached else _START_TIMEOUT_S):
             raise DemoError(f"no progress for {patience:g} s at model time {reached:g} s\n{twin.output()}")
         bar.update(task, completed=reached)
@@ -236,13 +235,13 @@ class Child:
         return self._log.read_text(errors="replace").strip()
 
     def check(self, allowed: tuple[int, ...] = ()) -> None:
-        """Raise `DemoError` when the process has ended with a code that is not allowed."""
+        """Raise `DemoError` if the process has ended with a code that is not allowed."""
         code = self._process.poll()
         if code is not None and code not in allowed:
             raise DemoError(f"{self._name} ended with code {code}\n{self.output()}")
 
     def stop(self) -> None:
-        """Ask for a clean stop; raise `DemoError` without one."""
+        """Ask for a clean stop; raise `DemoError` if the process does not stop cleanly."""
         if self.running:
             self._process.send_signal(signal.SIGINT)
         try:
@@ -252,7 +251,7 @@ class Child:
         self.check(allowed=(0,))
 
     def end(self) -> None:
-        """Terminate the process, and kill it if it goes on."""
+        """Terminate the process, and kill it if it continues."""
         if self.running:
             self._process.terminate()
             try:
@@ -402,7 +401,7 @@ def _force_table(summary: RunSummary) -> Table:
 
 
 def program(name: str, module: str) -> str:
-    """Return the command that starts a program of this environment from the present folder, on PATH or not."""
+    """Return the command that starts a program of this environment from the present folder, with or without PATH."""
     beside = Path(sys.executable).with_name(name)
     path, arguments = (beside, []) if beside.exists() else (Path(sys.executable), ["-m", module])
     relative = os.path.relpath(path)

@@ -5,8 +5,8 @@ measurement of known truth.
 
 With `--cutting` it adds a stochastic cutting load and publishes the speed along the face on `travel`.
 
-`real` sends each sample at its time on a grid of the steady clock, a late one at once, without leaving any out. `fast`
-publishes `/clock`, and runs ahead of the twin's `contact_peaks` by a bounded number of samples.
+`real` sends each sample at its time on a grid of the steady clock; a late sample is sent at once, and none is left out.
+`fast` publishes `/clock`, and runs ahead of the twin's `contact_peaks` by a bounded number of samples.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from plow_twin.stream.intake import NS_PER_S
 
 #: Stamp of the first sample under /clock [ns]: zero would count as unstamped.
 FIRST_STAMP_NS: Final = NS_PER_S
-#: Samples that may be under way in `fast`.
+#: Largest number of unanswered samples in `fast`.
 WINDOW: Final = 200
 #: Samples that a reliable reader may be behind before samples are lost: 100 s at 1 kHz.
 QUEUE: Final = 100_000
@@ -58,7 +58,7 @@ _TRAVEL_S: Final = 0.1
 #: Rate of the synthetic sensor, and its noise [m, m, rad].
 _POSE_HZ: Final = 100.0
 _POSE_NOISE: Final = np.array([5e-4, 5e-4, 2e-3])
-#: Time without an answer after which the samples under way count as lost [s].
+#: Time without an answer after which unanswered samples count as lost [s].
 _STALL_S: Final = 2.0
 #: CDR of a message that begins with a stamp: 4 bytes of encapsulation, then sec and nanosec.
 _STAMP: Final = struct.Struct("<4xiI")
@@ -66,7 +66,7 @@ _STAMP: Final = struct.Struct("<4xiI")
 
 @dataclass(frozen=True)
 class Plan:
-    """Samples to send: `wrench` (n, 3) Fx, Fy [N], M [N m], one row each `period_ns`; `speed` (n,) [m/s] of travel.
+    """Samples to send: `wrench` (n, 3) Fx, Fy [N], M [N m], one row every `period_ns`; `speed` (n,) [m/s] of travel.
 
     `pose` (m, 3) x, y [m], theta [rad] is the output of a synthetic sensor, one row with every `pose_every`-th sample.
     """
@@ -232,12 +232,12 @@ def _parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--scene", default="paper", help="scene file or preset whose loads are sent")
     parser.add_argument("--rate", type=float, default=1000.0, help="samples per second of machine time [Hz]")
     parser.add_argument("--seconds", type=float, default=20.0, help="machine time [s]")
-    parser.add_argument("--speed", choices=("real", "fast"), default="real", help="by the clock, or as fast as it goes")
+    parser.add_argument("--speed", choices=("real", "fast"), default="real", help="by the clock, or at full speed")
     parser.add_argument("--wait", type=float, default=60.0, help="longest wait for an active twin [s]")
     parser.add_argument(
-        "--sensor", type=float, metavar="MM", help="send head_pose of a head in a guide wider by that [mm], synthetic"
+        "--sensor", type=float, metavar="MM", help="synthetic head_pose of a head in a guide wider by this [mm]"
     )
-    group = parser.add_argument_group("cutting load", "added to the scene's loads; the speed goes out on travel")
+    group = parser.add_argument_group("cutting load", "added to the scene's loads; the speed is published on travel")
     group.add_argument("--cutting", type=float, metavar="N", help="mean force into the face, along x [N]")
     group.add_argument("--lateral", type=float, default=0.0, metavar="N", help="deviation of the force along y [N]")
     group.add_argument("--at", type=float, nargs=2, default=(0.0, 0.0), metavar="M", help="point of action x y [m]")

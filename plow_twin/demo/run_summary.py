@@ -30,7 +30,8 @@ class RunSummary:
     Attributes
     ----------
     largest, mean_in_contact : ndarray, shape (8,)
-        Largest force, and impulse over the time in contact, which each touch makes uncertain by a sample interval [N].
+        Largest force, and impulse over the time in contact [N]; each touch makes that time uncertain by a sample
+        interval.
     makes : ndarray, shape (8,)
         Number of makes.
     contact_sets : dict

@@ -92,7 +92,7 @@ class CuttingLoad:
     force_n : float
         Mean cutting force along x [N], its sign the direction.
     lateral_n : float
-        Standard deviation of the lateral force along y [N], normal distributed.
+        Standard deviation of the lateral force along y [N], normally distributed.
     at_m : tuple of float
         Point of action from the cavity's centre [m]: M = x Fy - y Fx.
     variation : float

@@ -25,10 +25,10 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "compile_s": "time of compiling or loading the solver [s]",
         "model_time_s": "model time since configure [s]",
         "real_time_factor": "model seconds per second",
-        "real_time_factor_mean": "the same since the first advance",
+        "real_time_factor_mean": "model seconds per second since the first advance",
         "solver_failures": "failed advances",
         "coarse_advances": "advances cut short by max_evaluations",
-        "error_estimate_m": "their largest estimated error of the pose [m]",
+        "error_estimate_m": "largest estimated pose error of these advances [m]",
         "resets": "resets of the model",
         "wear_saved": "folder that keeps the wear",
         "wear_error": "reason why the wear could not be saved",
@@ -37,13 +37,13 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "source": "excitation source",
         "samples_in": "samples that arrived",
         "samples_used": "samples to which the model was advanced",
-        "rolled_back": "late samples among them",
+        "rolled_back": "late samples among the samples used",
         "newest_sample_age_s": "the node's time minus the stamp of the newest sample used [s]",
         "samples_missing": "samples missing at expected_rate, by gaps in the stamps",
         "samples_lost": "samples of the followed publisher that never arrived, by its numbering",
         "samples_not_followed": "messages of publishers that are not followed",
         "queue_peak": "most samples in the input queue",
-        "queue_wait_ms": "longest wait there [ms]",
+        "queue_wait_ms": "longest wait in the input queue [ms]",
         "messages_lost": "messages of all inputs that never arrived",
         "dropped_non_finite": "a number is not finite",
         "dropped_unstamped": "the stamp is zero or negative",
@@ -61,8 +61,8 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "jumps_forward": "stamps that stepped by more than the parameter jump_back or jump_forward",
         "out_of_plane": "samples used in spite of components outside the plane",
         "holds": "advances under the hold policy",
-        "silences": "stretches longer than excitation_timeout and five times the interval before, whether held or not",
-        "silent_s": "length of all of them [s]",
+        "silences": "silences longer than excitation_timeout and five times the previous interval, whether held or not",
+        "silent_s": "total length of these silences [s]",
         "travel_used": "messages used",
         "travel_dropped": "messages dropped",
         "travel_misplaced": "speeds that act from the time reached: their stamps are of another clock",
@@ -102,18 +102,18 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "window_age_s": "the node's time minus the end of the newest window [s]",
         "wall_s": "time that the newest estimate took [s]",
         "reasons": "reasons why model or sensor is suspect",
-        "error": "reason of its end",
+        "error": "reason why the estimation has ended",
     },
     "follow": {
         "follow": "off, parameters or full",
-        "source": "numbers of the model: prior or estimate",
+        "source": "source of the model's numbers: prior or estimate",
         "members": "twins that are advanced",
         "members_lost": "twins that have left the model's range since the last pose",
         "poses_used": "measured poses that have moved the twins",
         "poses_outlying": "poses left out as too far from their predictions",
-        "poses_dropped": "poses dropped: over an hour ahead of the load, or too many wait",
-        "taken_over": "times that the twins were drawn anew: by an estimate, its withdrawal or a change of the machine",
-        "reduced": "1 where the twins did not keep up and the parameters alone follow",
+        "poses_dropped": "poses dropped: over an hour ahead of the load, or too many waiting",
+        "taken_over": "number of redraws of the twins: by an estimate, its withdrawal or a change of the machine",
+        "reduced": "1 if the twins did not keep up and only the parameters follow",
     },
     "recorder": {
         "recording": "file being written",
@@ -216,7 +216,7 @@ def summary(lifecycle: str, reason: str, runtime: Runtime | None, preparing: boo
     others = runtime.inputs.other_senders()
     troubles = [
         (ERROR, runtime.unsteady, "the stamps jump again and again: samples are dropped"),
-        (ERROR, values["recorder"] == "trouble", "the recording has lost something or has stopped"),
+        (ERROR, values["recorder"] == "trouble", "the recording has lost data or has stopped"),
         (ERROR, bool(runtime.wear_error), runtime.wear_error),
         (WARN, estimation is not None and bool(estimation.error), estimation.error if estimation else ""),
         (
@@ -224,7 +224,7 @@ def summary(lifecycle: str, reason: str, runtime: Runtime | None, preparing: boo
             estimation is not None and bool(estimation.reasons),
             "; ".join(estimation.reasons if estimation else ()),
         ),
-        (WARN, runtime.reduced, "the twins that follow did not keep up: the parameters alone follow"),
+        (WARN, runtime.reduced, "the following twins did not keep up: only the parameters follow"),
         (OK, runtime.clock == "paused", "/clock is paused"),
         (WARN, runtime.without_clock, "use_sim_time is set and nothing has come on /clock"),
         (WARN, bool(others), f"another publisher of {', '.join(others)} sends too and is not followed"),
@@ -471,7 +471,7 @@ _TROUBLE: Final = (
 
 
 def _refused(intake: Intake) -> int:
-    """Return the number of unused messages, without those that came before the node could use them."""
+    """Return the number of unused messages, except messages that came before the node could use them."""
     away = intake.counts[Verdict.INACTIVE] + intake.counts[Verdict.NO_CLOCK]
     return intake.arrived - intake.used - away
 

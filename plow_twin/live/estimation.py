@@ -83,7 +83,7 @@ class Estimation:
 
     @property
     def shortage(self) -> str:
-        """Why no estimate was made; empty: one was, or the source has not ended."""
+        """Why no estimate was made; empty: an estimate was made, or the source has not ended."""
         return "" if self.count else self._worker.ended or ""
 
     @property
@@ -195,7 +195,7 @@ def message_of(found: Found, frame_id: str) -> plain.JointState:
 
 
 def forces_message(found: Found, frame_id: str) -> plain.JointState:
-    """Return the message of the forces of a window's end, as `contact_peaks` has them; empty without forces."""
+    """Return the message of the forces at a window's end, in the form of `contact_peaks`; empty without forces."""
     names: list[str] = []
     peaks: list[float] = []
     impulses: list[float] = []
@@ -230,7 +230,7 @@ def forecast_message(found: Found, frame_id: str) -> plain.JointState:
 
 
 def asked_of(settings: Settings) -> Asked:
-    """Return the answers beside the estimate that the parameters ask for."""
+    """Return which results besides the estimate the parameters ask for."""
     horizontal, vertical = settings.forecast_limits
     plan = None
     if horizontal or vertical:
@@ -248,11 +248,11 @@ def problems(settings: Settings, scene: Scene) -> list[Problem]:
     """Return contradictions among the parameters of the estimate, and between them and the scene."""
     found = []
     if settings.excitation_source == "scene":
-        found.append(Problem("estimate", True, "false where excitation_source is scene: no load comes"))
+        found.append(Problem("estimate", True, "false with excitation_source scene: no load arrives"))
     if scene.support is not None:
         found.append(Problem("estimate", True, "false where the scene has a support: the fit does not know its place"))
     if settings.follows != "off" and settings.max_evaluations:
-        expected = "0 where follow is not off: the work of the twins that follow has no bound"
+        expected = "0 unless follow is off: the work of the following twins has no bound"
         found.append(Problem("max_evaluations", settings.max_evaluations, expected))
     limits = settings.forecast_limits
     if any(limits) and not all(limits):

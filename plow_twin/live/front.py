@@ -59,7 +59,7 @@ class BridgeFront:
     bridge
         Source of the samples.
     mapping
-        YAML file of the mapping, or None: recognise columns by name.
+        YAML file of the mapping; None: columns are recognised by name.
     settings, prepared
         As in `Runtime`.
     say
@@ -67,7 +67,7 @@ class BridgeFront:
     on_error
         Receives errors in words; may be called from another thread.
     units
-        Units by name (fx, ..., t) in place of the mapping's.
+        Units by name (fx, ..., t) that replace the mapping's.
 
     Raises
     ------
@@ -214,7 +214,7 @@ class BridgeFront:
             force = "" if most is None else f" (forces to {most.largest[0]:.3g} N, by {most.fastest[0]:.3g} N/s)"
             found.append(
                 f"{counts[Verdict.IMPLAUSIBLE]} loads are larger or change faster than plausible{force}: "
-                "is the unit of load or time another one? Else set limit_force and its like"
+                "is the unit of load or time another one? Otherwise set limit_force and related limits"
             )
         estimation = self.runtime.estimation
         if estimation is not None and not (estimation.count or self._bridge.ends):
@@ -224,8 +224,8 @@ class BridgeFront:
         jumps = counts[Verdict.JUMP_BACK]
         if jumps:
             found.append(
-                f"the stamps jumped back ({jumps}), and the motion was reset: is it local time, where summer time "
-                "ends, or was a clock set? Expected UTC, or stamps with their offset"
+                f"the stamps jumped back ({jumps}), and the motion was reset: is it local time "
+                "at the end of summer time, or was a clock set? Expected UTC, or stamps with their offset"
             )
         return found
 
@@ -306,7 +306,7 @@ def roles_of(
     Raises
     ------
     BridgeError, RecordingError
-        The mapping cannot be used, or lacks the load although the excitation's `source` is this one.
+        The mapping cannot be used, or lacks the load that `source`, the parameter `excitation_source`, requires.
     """
     if source == "tool_forces":
         raise BridgeError("excitation_source: got 'tool_forces', expected 'excitation' or 'scene' without ROS")

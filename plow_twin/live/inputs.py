@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 
 #: The inputs, as topics are named.
 TOPICS: Final = ("excitation", "tool_forces", "travel", "head_pose", "gaps")
-#: Those besides the load.
+#: Inputs besides the load.
 OPTIONAL: Final = ("travel", "head_pose", "gaps")
 #: Time after its last sample for which another sender counts as present [ns].
 _OTHER_SENDER_NS: Final = 3_000_000_000
-#: An optional input that has been heard counts as silent after so long [ns].
+#: Time after which an optional input that was heard counts as silent [ns].
 _SILENT_NS: Final = 10_000_000_000
 
 
@@ -118,9 +118,9 @@ class Inputs:
         return peak
 
     def wanted(self, sender: bytes, number: int, stamp_ns: int, values: Sequence[float], fits: bool = True) -> bool:
-        """Note that message `number` (from 1) of a sender has come; False, and counted, when it is not used.
+        """Note message `number` (from 1) of a sender; if it is not used, count it and return False.
 
-        `fits` : whether a sample could be made of it; `values` are all its numbers.
+        `fits` states whether it can be read as a sample; `values` are all its numbers.
         """
         lost = self.senders.lost
         followed = self.senders.hear(sender, number)
@@ -160,7 +160,7 @@ class Inputs:
         return followed
 
     def uses_travel(self, stamp_ns: int, speed_m_s: float) -> bool:
-        """Add a speed along the face; True when it is used."""
+        """Add a speed along the face; return whether it is used."""
         if not self._follows("travel", stamp_ns, (speed_m_s,)):
             return False
         return self._judged("travel", self.travel, stamp_ns, (speed_m_s,)).used
@@ -168,12 +168,12 @@ class Inputs:
     def uses_pose(self, stamp_ns: int, pose: tuple[float, float, float], deviation: tuple[float, ...] = ()) -> bool:
         """Add a measured pose: x, y [m], theta [rad], and their standard deviations where they are known.
 
-        A component that was not measured is NaN, not all of them. True when the pose is used.
+        A component that was not measured is NaN; a pose of three NaN is refused. Return whether the pose is used.
         """
         if not self._follows("head_pose", stamp_ns, (*pose, *deviation)):
             return False
         missing = [math.isnan(value) for value in pose]
-        # a component that was not measured is within the limits
+        # a component that was not measured cannot exceed the limits
         judged = pose if all(missing) else _filled(pose, self._newest_pose)
         verdict = self._judged("head_pose", self.head_pose, stamp_ns, (*judged, *deviation), self._poses)
         if verdict.used and verdict is not Verdict.WORKED_IN:
@@ -183,7 +183,7 @@ class Inputs:
         return verdict.used
 
     def uses_gaps(self, stamp_ns: int, gaps: Mapping[int, float]) -> bool:
-        """Add measured gaps [m] by number of their pairs; True when they are used."""
+        """Add measured gaps [m] by number of their pairs; return whether they are used."""
         values = tuple(gaps.values())
         if not self._follows("gaps", stamp_ns, values):
             return False
@@ -199,7 +199,7 @@ class Inputs:
         """Return whether a gap is impossibly large, or has changed impossibly fast since the newest gap of its pair."""
         limits = self._gap_limits
         if limits is None or not all(map(math.isfinite, gaps.values())):
-            return False  # a value that is not a number has its own reason
+            return False  # a value that is not a number is refused for a reason of its own
         for pair, gap in gaps.items():
             before_ns, before = self._newest_gaps.get(pair, (stamp_ns, gap))
             passed_s = (stamp_ns - before_ns) * 1e-9

@@ -2,10 +2,10 @@
 
 The drive pulls the chain with C = efficiency P / v (or C is measured). Without the drag of chain and plough, the
 cutting force along the face is Z = C - idle. The coal gives a second value: Z = specific_force * depth *
-resistance(position). The two are averaged by their variances. The force into the face is Fx = push_ratio Z, the lateral
-one Fy = lateral_ratio Z, both at one point of the head: M = x Fy - y Fx. All coefficients have a standard deviation,
-which propagates to the result. They are measured at a machine, by idle runs and weighing, and have no defaults, because
-the paper publishes no values.
+resistance(position). The mean of the two is weighted by their inverse variances. The force into the face is Fx =
+push_ratio Z, the lateral one Fy = lateral_ratio Z, both at one point of the head: M = x Fy - y Fx. All coefficients
+have a standard deviation, which propagates to the result. They are measured at a machine, by idle runs and weighing,
+and have no defaults, because the paper publishes no values.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class LoadModel:
         if not opinions:
             return None
         deviations = [max(deviation, 1.0) for _, deviation in opinions]
-        # relative to the smallest: numbers of any size reach the check that refuses them
+        # relative to the smallest deviation: huge numbers do not overflow here, and a later check refuses them
         smallest = min(deviations)
         shares = [smallest / deviation for deviation in deviations]
         total = sum(share * share for share in shares)
@@ -125,7 +125,7 @@ def read_load_model(path: Path | None) -> LoadModel | None:
     Raises
     ------
     MapError
-        It cannot be used; the message names key, value got and value expected.
+        The load model cannot be used; the message names key, value got and value expected.
     """
     entry = None if path is None else read_map_file(path).get(LOAD_MODEL)
     if path is None or entry is None:

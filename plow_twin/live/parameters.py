@@ -67,7 +67,7 @@ class Settings:
         "", Effect.START, "services that are refused, separated by commas, e.g. set_wear,acknowledge_alarms"
     )
     opcua_server: str = _plain(
-        "", Effect.START, "OPC UA server, opc.tcp://HOST:PORT, in the place of the topics of some inputs; empty: none"
+        "", Effect.START, "OPC UA server, opc.tcp://HOST:PORT, that replaces the topics of some inputs; empty: none"
     )
     opcua_map: str = _plain("", Effect.START, "YAML file that gives the nodes of opcua_server for these inputs")
     opcua_access: str = _plain(
@@ -125,7 +125,7 @@ class Settings:
         0.0,
         600.0,
         Effect.CONFIGURE,
-        "largest age of a late sample that is worked in, against the newest; 0: late samples are dropped",
+        "largest age, relative to the newest sample, at which a late sample is used; 0: late samples are dropped",
     )
     estimate: bool = _plain(
         False,
@@ -155,8 +155,8 @@ class Settings:
         "full",
         ("off", "parameters", "full"),
         Effect.CONFIGURE,
-        "with `estimate`, what follows the machine: nothing, the numbers of the model by each estimate, or the motion "
-        "too, by each measured pose, with intervals of the forces",
+        "with `estimate`: off: nothing follows the machine; parameters: each estimate sets the numbers of "
+        "the model; full: each measured pose also corrects the motion, with intervals of the forces",
     )
     follow_members: int = _number(
         128, "twins", 20, 4096, Effect.CONFIGURE, "number of twins with follow: full; each costs the same"
@@ -246,13 +246,13 @@ class Settings:
         0.01,
         3600.0,
         Effect.NOW,
-        "silence after which the excitation counts as stale; only counted in files and under use_sim_time",
+        "silence after which the excitation counts as stale; in files and under use_sim_time it is only counted",
     )
     hold_policy: str = _choice(
         "hold", ("hold", "zero"), Effect.NOW, "load while the excitation is stale: the last load, or zero"
     )
     hold_limit: float = _number(
-        60.0, "s", 0.0, 86400.0, Effect.NOW, "silence beyond the timeout after which the model stands still"
+        60.0, "s", 0.0, 86400.0, Effect.NOW, "silence beyond the timeout after which the model stops"
     )
     limit_force: float = _number(
         0.0,
@@ -425,7 +425,7 @@ SPECS: Final[Mapping[str, Field[Any]]] = {spec.name: spec for spec in fields(Set
 _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 #: Longest text [characters]; no path on Linux is longer.
 _LONGEST: Final = 4096
-#: No control character, which a terminal would obey.
+#: One line without control characters, which a terminal would obey.
 _ONE_LINE: Final = r"^[^\x00-\x1f\x7f-\x9f]*\Z"
 #: Declared by rclpy itself.
 _FOREIGN: Final = ("use_sim_time", "start_type_description_service")
@@ -534,7 +534,7 @@ def _unknown_services(given: Settings) -> list[Problem]:
 
 
 def _swapped_thresholds(given: Settings) -> list[Problem]:
-    """Name the alarms whose error would come before their warning."""
+    """Return a problem for each alarm whose error threshold is below its warning threshold."""
     alarms = {name: getattr(given, name) for name in SPECS if name.startswith("alarm_")}
     return [
         Problem(name, list(pair), "the warning's threshold, then the larger one of the error")
@@ -544,7 +544,7 @@ def _swapped_thresholds(given: Settings) -> list[Problem]:
 
 
 def model_changes(given: Settings) -> dict[str, float]:
-    """Return the numbers of the scene that parameters change, by their keys there."""
+    """Return the numbers of the scene that parameters change, by their keys in the scene."""
     values = {key: getattr(given, name) for name, key in MODEL.items()}
     return {key: value for key, value in values.items() if value != -1.0}
 

@@ -21,7 +21,7 @@ from plow_twin.stream.session import Series
 if TYPE_CHECKING:
     from plow_twin.live.recording import Recording
 
-#: Base name of the topic, and the message, as bytes where it is made of the record of a publication.
+#: Base name of the topic, and the message: bytes if it is made from the record of a publication.
 Outgoing = tuple[str, memoryview | Message]
 
 
@@ -86,7 +86,7 @@ class Publishing:
     on_alarm
         Receives a text when an alarm is latched.
     catch_up
-        Computes a publication's intervals after its forces have been sent, where intervals come later.
+        Computes a publication's intervals after its forces have been sent, if intervals come later.
     """
 
     def __init__(
@@ -108,7 +108,7 @@ class Publishing:
             self._messages = Messages(*frames, intervals=settings.follows == "full")
         self.latency = DurationHistogram()
         self.age = DurationHistogram()
-        #: publications, and those that were not published because a number was not finite
+        #: publications, and publications withheld because a number was not finite
         self.published = self.withheld = 0
         #: publications computed without a sample, and publications after late samples have been worked in
         self.held_frames = self.corrected_frames = 0

@@ -1,6 +1,6 @@
 """A live twin without its transport, and the way of one sample through it: intake, twin, publication, recording.
 
-A front brings samples and sends messages: the ROS node or `plow-twin live`. This module does not depend on which.
+A front, either the ROS node or `plow-twin live`, brings samples and sends messages; this module depends on neither.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _CATCH_UP_S: Final = 0.002
 _LOOK_FOR_CLOCK_HZ: Final = 20.0
 #: Rate at which unused messages are journalled [Hz].
 _UNUSED_HZ: Final = 5.0
-#: The following twins do not keep up if samples waited this long [s] in this many seconds in a row.
+#: The following twins do not keep up if samples wait this long [s] in each of this many successive seconds.
 _LONGEST_WAIT_S, _WAITING_SECONDS = 0.5, 5
 
 
@@ -86,11 +86,11 @@ class Runtime:
         self.compile_s = prepared.compile_s
         #: turns of the loop that publishes at a fixed rate or follows the clock; None: samples set the pace
         self.periods = _periods(settings)
-        #: why time stands still: `waiting` for the first `/clock`, or `paused`; empty: it runs
+        #: state of the clock: `waiting` for the first `/clock`, `paused` or `running`
         self.clock = "running"
         #: whether another node publishes under the names of this twin's outputs
         self.others_publish = False
-        #: whether the parameters alone follow because all twins did not keep up
+        #: whether only the parameters follow, because the twins did not keep up
         self.reduced = False
         self._waiting_seconds = 0
         self._clock_before_ns = 0
@@ -228,12 +228,12 @@ class Runtime:
         return self.inputs.residual(q) if q is not None else None
 
     def newest_sample_age_s(self) -> float | None:
-        """Return the present time minus the stamp of the newest sample used [s], or None before one."""
+        """Return the present time minus the stamp of the newest sample used [s], or None before the first."""
         newest_ns = self.driver.newest_ns
         return None if newest_ns is None else (self._front.now_ns() - newest_ns) * 1e-9
 
     def estimate_age_s(self) -> float | None:
-        """Return the present time minus the end of the newest estimate's window [s], or None before one."""
+        """Return the present time minus the end of the newest estimate's window [s], or None before the first."""
         end_ns = self.estimation.end_ns if self.estimation else None
         return None if end_ns is None else (self._front.now_ns() - end_ns) * 1e-9
 
@@ -332,7 +332,7 @@ class Runtime:
         return periodic
 
     def parameter(self, name: str, value: Any, settings: Settings) -> None:
-        """Take over a parameter that takes effect at once."""
+        """Apply a parameter that takes effect at once."""
         self.settings = settings
         self.driver.policy = policy(settings)
         self.driver.intake.limits = limits(settings, self.scene)
@@ -340,11 +340,11 @@ class Runtime:
         for intake in (self.driver.intake, self.driver.clock):
             intake.jump_back_s, intake.jump_forward_s = settings.jump_back, settings.jump_forward
         if self._start_due:
-            return  # the journal is empty yet
+            return  # the journal is still empty
         if name in MODEL:
             self.driver.set_model(self.stamp_ns, model_changes(settings))
             self._front.changed()
-        elif not isinstance(value, tuple):  # a list takes effect by its service and that service's journal entry
+        elif not isinstance(value, tuple):  # a list takes effect by its service, which journals it
             self.driver.parameter(name, value)
 
     def _set_limits(self, settings: Settings) -> None:
@@ -401,7 +401,7 @@ class Runtime:
             self._front.send(topic, message)
 
     def silence(self) -> float:
-        """Go on without samples once they are overdue; return the time [s] before which they cannot be."""
+        """Continue without samples once they are overdue; return the time [s] before which they cannot be overdue."""
         holds, now_ns = self.driver.holds, time.monotonic_ns()
         published = self.driver.silence(now_ns)
         if len(published.rows) or self.driver.holds != holds:
@@ -412,7 +412,7 @@ class Runtime:
         return self.driver.quiet_ns(now_ns) * 1e-9
 
     def clock_tick(self) -> None:
-        """Go on under the scene's own loads."""
+        """Continue under the scene's own loads."""
         if self.periods and self.settings.publish_mode != "fixed_rate":
             self.periods.turn(time.monotonic())
         if self._start_due:
@@ -495,7 +495,7 @@ class Runtime:
             self._front.changed()
 
     def _look_for_lag(self) -> None:
-        """Follow by the parameters alone if the twins do not keep up."""
+        """Let only the parameters follow if the twins do not keep up."""
         waited_s, self.inputs.wait_s = self.inputs.wait_s, 0.0
         self._waiting_seconds = self._waiting_seconds + 1 if waited_s > _LONGEST_WAIT_S else 0
         if self._waiting_seconds == _WAITING_SECONDS and not self.reduced and not self._start_due:
@@ -546,7 +546,7 @@ class Runtime:
         assert self.recording is not None
         renewed = self.recording.renew(self.driver.session)
         if renewed and self.estimation and self.estimation.entry and self.driver.session.following is None:
-            # not in the snapshot of a twin, but in that of a follower
+            # the snapshot of a twin lacks the estimate; the snapshot of a follower has it
             self.recording.journal(self.estimation.entry)
 
 

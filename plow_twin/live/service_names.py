@@ -20,7 +20,7 @@ MOST_MARK: Final = 200
 
 
 def mark_problem(text: str) -> str | None:
-    """Return the fault of the text of a mark; None where nothing is."""
+    """Return the fault in the text of a mark, or None."""
     if not text.strip() or len(text) > MOST_MARK:
         return f"text of a mark: got {len(text.strip())} characters, expected 1 to {MOST_MARK}"
     if not text.isprintable():

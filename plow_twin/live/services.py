@@ -49,7 +49,7 @@ class Services:
     def snapshot(self) -> tuple[bool, str]:
         """Journal the exact state and keep it for `restore`."""
         self._kept = self._runtime.driver.snapshot()
-        return True, f"the state at {self._kept.stamp_ns} ns is kept and stands in the journal"
+        return True, f"the state at {self._kept.stamp_ns} ns is kept and journalled"
 
     def restore(self) -> tuple[bool, str]:
         """Return to the motion of the kept snapshot."""

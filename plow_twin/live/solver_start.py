@@ -18,7 +18,7 @@ from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream import outputs
 from plow_twin.stream.driven import Driven
 
-#: Longest time for which a request to stop is not seen [s].
+#: Interval of checks for a request to stop [s].
 _LOOK_S: Final = 0.05
 _started: list[Future[Prepared]] = []
 

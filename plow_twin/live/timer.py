@@ -1,4 +1,4 @@
-"""Something done at intervals of a steady clock."""
+"""A call repeated at intervals of a steady clock."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 
 class Timer:
-    """Call `do` each `period_s`; missed calls are left out, and the phase is kept.
+    """Call `do` every `period_s`; missed calls are left out, and the phase is kept.
 
     `do` may return the time [s] before which it need not be called.
     """

@@ -73,7 +73,7 @@ class WearKeeper:
         self.error = ""
 
     def load(self, kept: KeptWear | None = None) -> tuple[float, ...] | None:
-        """Return the depths [m] to go on with, or None without any.
+        """Return the depths [m] to continue with, or None.
 
         They come from the file, unless `kept` depths could not replace that file.
 
@@ -124,7 +124,8 @@ class WearKeeper:
             if found not in (None, *self._own):
                 raise WearStateError(
                     f"{self.folder / FILE_NAME} is not the file that this twin has read or written and is left as it "
-                    "is: clean up and configure to go on with its wear, or move it away to have that of this twin saved"
+                    "is: clean up and configure to continue with its wear, or move it away to save the wear of "
+                    "this twin"
                 )
             content = wear_content(WearState(self._head, self._identity, values))
             self._own = (content,) if found is None else (found, content)

@@ -1,4 +1,4 @@
-"""The publishers and subscribers at the other end of a node's topics, from the ROS graph.
+"""The publishers and subscribers that share a node's topics, from the ROS graph.
 
 The middleware offers events for this purpose. The node requests none, because rmw_fastrtps can deadlock: it takes two
 locks in one order when an event is requested or taken, and in the other order when one arises (ros2/rmw_fastrtps#890).
@@ -25,7 +25,7 @@ from rosgraph_msgs.msg import Clock
 
 #: Period of the look-up [s].
 LOOK_S: Final = 0.2
-#: Name of a node whose topics are discovered before the node itself (rmw_dds_common: they come by two messages).
+#: Name of a node whose topics are discovered before the node itself (rmw_dds_common sends both in separate messages).
 _UNNAMED: Final = "_NODE_NAME_UNKNOWN_"
 #: Period of the warning about a wrong time on `/clock` [s].
 _SAY_AGAIN_S: Final = 5.0
@@ -36,7 +36,7 @@ _TYPES: Final = frozenset(kind.value for kind in Parameter.Type)
 class WithoutEvents(Node):
     """A node that asks for no events of the middleware, neither for its own topics nor for those that rclpy makes.
 
-    A time before 0 on `/clock` and parameters that rclpy cannot read, with which it would end the program, are refused.
+    A time before 0 on `/clock`, and parameters that rclpy cannot read, would end the program; this node refuses them.
     """
 
     def create_service(self, srv_type: Any, srv_name: str, callback: Callable[..., Any], **options: Any) -> Service:
@@ -63,14 +63,14 @@ class WithoutEvents(Node):
 
     def _take_clock(self, take: Callable[[Clock], None], message: Clock) -> None:
         if message.clock.sec < 0:
-            text = f"/clock: got {message.clock.sec} s, expected a time from 0 on: it is passed over"
+            text = f"/clock: got {message.clock.sec} s, expected a time from 0 on: it is ignored"
             self.get_logger().error(text, throttle_duration_sec=_SAY_AGAIN_S)
         else:
             take(message)
 
 
 def _set_parameters(callback: Callable[..., Any], request: Any, response: Any) -> Any:
-    """Answer a request to set parameters; one that rclpy cannot read is refused as a whole."""
+    """Answer a request to set parameters; a request that rclpy cannot read is refused as a whole."""
     wrong = [f"{one.name}: got type {one.value.type}" for one in request.parameters if one.value.type not in _TYPES]
     reason = f"{'; '.join(wrong)}; expected one of {min(_TYPES)} to {max(_TYPES)}"
     if not wrong:
@@ -87,7 +87,7 @@ def _set_parameters(callback: Callable[..., Any], request: Any, response: Any) -
 
 
 class Connections:
-    """The other ends of a node's topics; each that cannot connect is reported once.
+    """The peers on a node's topics; each peer that cannot connect is reported once.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ class Connections:
         self._unnamed: set[tuple[str, bytes]] = set()
 
     def publishers(self, subscription: Subscription) -> tuple[list[Any], int]:
-        """Return the publishers that a subscription can receive from, and how many new ones cannot connect."""
+        """Return the publishers that a subscription can receive from, and the number of new ones that cannot."""
         topic, found = subscription.topic_name, []
         kind, refused = type_name(subscription.msg_type), 0
         for publisher in self._node.get_publishers_info_by_topic(topic):
@@ -140,7 +140,7 @@ def type_name(message_class: Any) -> str:
 
 
 def _in_full(own: QoSProfile) -> QoSProfile:
-    """Return one of the node's own profiles as requested, with its defaults resolved as in the graph."""
+    """Return one of the node's own profiles with its defaults resolved as in the graph."""
     return QoSProfile(
         depth=own.depth,
         reliability=own.reliability,

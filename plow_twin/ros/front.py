@@ -1,4 +1,4 @@
-"""The live twin on ROS 2: topics, timers and answers around a runtime."""
+"""The live twin on ROS 2: the topics, timers and services of a runtime."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ class RosFront:
         loop.start()
 
     def _draw(self, settings: Settings, made: ExitStack) -> None:
-        """Publish markers; without them their messages are not imported."""
+        """Publish markers, if requested; only then their message types are imported."""
         from plow_twin.ros.markers import Markers
 
         markers = Markers(self._node, settings, self.runtime.scene)
@@ -194,4 +194,4 @@ class RosFront:
         return self._lost
 
     def _inputs_failed(self, error: Exception) -> None:
-        self.say_error(f"the inputs are read no more: {''.join(traceback.format_exception(error))}")
+        self.say_error(f"the inputs are no longer read: {''.join(traceback.format_exception(error))}")

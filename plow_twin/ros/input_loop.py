@@ -1,7 +1,7 @@
 """A thread that empties the input queues as messages arrive, and runs timers by a steady clock.
 
 An executor of rclpy makes a task of each message, and rclpy's events executor checks its timers only when no message
-waits: at 10 kHz, 95 % of its tasks found a queue that the task before had emptied, and nothing was published.
+waits. At 10 kHz, 95 % of its tasks found a queue that an earlier task had emptied, and nothing was published.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class InputLoop:
     turns
         Keeps it apart from the executor's thread.
     on_error
-        Called with the error that ended the thread, which is kept in `error` too.
+        Called with the error that ended the thread; `error` keeps it too.
     """
 
     def __init__(self, turns: Turns, on_error: Callable[[Exception], None]) -> None:
@@ -96,7 +96,7 @@ class InputLoop:
         self._look_again()
 
     def every(self, period_s: float, do: Callable[[], float | None]) -> None:
-        """Call a function each `period_s` while the timers run; to be called before the start."""
+        """Call a function every `period_s` while the timers run; to be called before the start."""
         self._timers.append(Timer(period_s, do))
 
     def start(self) -> None:

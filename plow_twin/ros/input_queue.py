@@ -1,4 +1,4 @@
-"""The queue of one input, emptied at once; each message has its publisher and the publisher's sequence number.
+"""The queue of one input, read in batches; each message has its publisher and the publisher's sequence number.
 
 The C interface below rclpy gives both, and signals new messages through an eventfd, which needs neither executor nor
 interpreter. The subscription is removed from `Node._subscriptions`, so that no executor takes from the queue as well.
@@ -54,8 +54,8 @@ _NOTHING_TAKEN: Final = 401
 def _count_up() -> ctypes.c_void_p:
     """Return `eventfd_write(fd, count)` as a callback of rcl.
 
-    rcl passes the user data, here the number of the eventfd, and the number of new messages: the arguments of
-    `eventfd_write` in their order.
+    rcl passes the user data, which is the descriptor of the eventfd, and the number of new messages: exactly the
+    arguments of `eventfd_write`.
     """
     return ctypes.cast(ctypes.CDLL(None).eventfd_write, ctypes.c_void_p)
 
@@ -101,8 +101,8 @@ class InputQueue:
     def pop(self, most: int, *, all_there_are: bool = False) -> tuple[list[Taken], bool]:
         """Return up to `most` waiting messages in order of arrival, and whether there are more.
 
-        It takes as many messages as were signalled, or `most` with `all_there_are`: reading an empty queue costs a
-        fifth of a sample's time.
+        It tries to take as many messages as were signalled, or `most` with `all_there_are`: reading an empty queue
+        costs a fifth of the time of a sample.
         """
         try:
             signs = os.eventfd_read(self.fd)
@@ -111,7 +111,7 @@ class InputQueue:
         self._signs += signs
         wanted = most if all_there_are else min(most, self._signs)
         taken = self._taken(wanted)
-        # after an overrun of the queue there were more notifications than messages
+        # an overrun of the queue leaves more notifications than messages
         self._signs = max(0, self._signs - len(taken)) if len(taken) == wanted else 0
         return taken, self._signs > 0 or (all_there_are and len(taken) == most)
 

@@ -18,7 +18,7 @@ _SPIN_S: Final = 0.1
 
 
 def make_executor() -> Executor:
-    """Return the events executor if rclpy has it: it takes a third of the work per message."""
+    """Return the events executor if rclpy has it: it does a third of the work per message."""
     try:
         from rclpy.experimental.events_executor import EventsExecutor
     except ImportError:
@@ -52,7 +52,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(arguments: Sequence[str] | None, stop: StopSignals) -> int:
-    # after the handlers: a stop during these imports must not end in a traceback
+    # imported after the handlers are set: a stop during these imports must not end in a traceback
     import rclpy.utilities
 
     from plow_twin.live.parameters import ParameterError
@@ -73,7 +73,7 @@ def _run(arguments: Sequence[str] | None, stop: StopSignals) -> int:
         while not stop.stopped and rclpy.utilities.ok():
             if starting and node.prepared:
                 starting = False
-                if node.lifecycle == "unconfigured":  # a lifecycle manager may have been quicker
+                if node.lifecycle == "unconfigured":  # a lifecycle manager may have configured it already
                     node.start()
             executor.spin_once(timeout_sec=_SPIN_S)
         executor.remove_node(node)

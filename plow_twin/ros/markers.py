@@ -1,4 +1,4 @@
-"""Markers for RViz: walls of the cavity, frame, worn pads and forces as markers, and the head's pose on /tf."""
+"""Markers for RViz (walls of the cavity, frame, worn pads and forces), and the head's pose on /tf."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _GREY: Final = (0.6, 0.6, 0.6)
 _BLUE: Final = (0.3, 0.55, 0.9)
 _ORANGE: Final = (0.9, 0.6, 0.1)
 _RED: Final = (0.9, 0.2, 0.2)
-#: Width of lines and arrows as shares of the frame's height, and length of an arrow for a force of the head's weight.
+#: Width of lines and arrows, and length of an arrow for a force of the head's weight, as shares of the frame's height.
 _LINE: Final = 0.015
 _ARROW: Final = 0.5
 
@@ -88,7 +88,7 @@ class Markers:
             self._transforms(self._settings, stamp_ns, q)
 
     def close(self) -> None:
-        """Take the publishers off the node."""
+        """Remove the publishers from the node."""
         self._node.destroy_publisher(self._publisher)
         if self._transforms is not None:
             self._node.destroy_publisher(self._transforms.publisher)

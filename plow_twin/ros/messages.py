@@ -18,7 +18,7 @@ Read = tuple[int, tuple[float, ...], bool, bool]
 #: A message that cannot be read.
 UNREADABLE: Final[Read] = (0, (), False, False)
 
-#: Stamp and length of the publication's name, then force and torque; big endian and little endian.
+#: Stamp and length of the name of the frame, then force and torque; big endian and little endian.
 _WRENCH_LAYOUTS: Final = tuple((struct.Struct(f"{order}iII"), struct.Struct(f"{order}6d")) for order in "><")
 
 
@@ -30,7 +30,7 @@ def stamp_ns(header: Header) -> int:
 def deviations(covariance: Sequence[float]) -> tuple[float, ...]:
     """Return the standard deviations of x, y [m] and theta [rad] of a covariance, row-major 6 x 6.
 
-    A negative variance gives NaN: such a message is not used. Empty if all are 0, which means unknown.
+    A negative variance gives NaN, so that the message is not used. Empty if all are 0, which means unknown.
     """
     variances = [float(covariance[7 * axis]) for axis in (0, 1, 5)]
     found = tuple(math.sqrt(variance) if variance >= 0.0 else math.nan for variance in variances)
@@ -45,12 +45,12 @@ def set_stamp(header: Header, stamp: int) -> None:
 def read_wrench(data: bytes) -> Read:
     """Decode the CDR bytes of a `WrenchStamped`: Fx, Fy [N] and M [N m].
 
-    One sample costs a tenth of the time of rclpy's own message objects.
+    This takes a tenth of the time of rclpy's own message objects.
     """
     try:
         start, numbers = _WRENCH_LAYOUTS[data[1] & 1]
         seconds, nanoseconds, length = start.unpack_from(data, 4)
-        # numbers of 8 bytes are aligned to 8, counted from behind the 4 bytes of the encapsulation
+        # numbers of 8 bytes are aligned to 8, counted from the end of the 4 bytes of encapsulation
         fx, fy, fz, mx, my, mz = numbers.unpack_from(data, 4 + (start.size + length + 7) // 8 * 8)
     except (struct.error, IndexError):
         return UNREADABLE

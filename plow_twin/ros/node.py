@@ -41,8 +41,8 @@ class TwinNode(WithoutEvents, LifecycleNode):
     """The twin on ROS 2.
 
     Takes the keyword arguments of `rclpy.node.Node`, so that several can live in one process and executor. Code that
-    creates a node calls `start`, which does what `autostart` does in the program. `stop_asked` is polled while the
-    solver is compiled.
+    creates a node calls `start`, as the program does with `autostart`. `stop_asked` is polled while the solver is
+    compiled.
 
     Raises
     ------
@@ -71,7 +71,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
         self._status = self.create_publisher(DiagnosticStatus, "status", OUTPUTS["status"])
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", DIAGNOSTICS)
         for name in SERVICES:
-            # never destroyed: a request that waits while its service is destroyed ends rclpy's executor
+            # never destroyed: a waiting request to a destroyed service would end rclpy's executor
             self.create_service(Trigger, f"~/{name}", partial(self._answer, name))
         # steady clock: reports continue while /clock is paused
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -100,7 +100,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
 
     @property
     def prepared(self) -> bool:
-        """Whether configuring need not wait for the compiler."""
+        """Whether the solver is compiled, so that configuring does not wait."""
         return self._preparation is None or self._preparation.done
 
     def _take_preparation(self) -> Preparation:
@@ -114,7 +114,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
         return self.trigger_configure() == done and self.trigger_activate() == done
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Load the scene, compile the solver, open the recording, make all topics; fails with a reason."""
+        """Load the scene, compile the solver, open the recording, make all topics; on failure `reason` states why."""
         settings = self._table.settings
         try:
             self.prepare()
@@ -134,7 +134,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Take samples from now on."""
         super().on_activate(state)
-        # objects alive now live long: the garbage collector need not visit them while samples arrive
+        # present objects live long: the garbage collector need not visit them while samples arrive
         gc.collect()
         gc.freeze()
         self._configured().activate()
@@ -164,7 +164,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
 
     def release(self) -> None:
         """Release everything and close the recording; can be called at any time."""
-        # a frozen runtime, part of reference cycles, would never be freed
+        # a frozen runtime is part of reference cycles and would never be freed
         gc.unfreeze()
         front, self._front = self._front, None
         if front is None:
@@ -244,11 +244,11 @@ class TwinNode(WithoutEvents, LifecycleNode):
     def _publish_diagnostics(self) -> None:
         if self._front is not None:
             if self._front.error is not None:
-                raise self._front.error  # like an error of any callback, it ends the program, with the reason
+                raise self._front.error  # it ends the program with the reason, like an error of any callback
             self._connections.look_for_subscribers(self.publishers)
             self._front.look_for_others()
         elif self.lifecycle == "unconfigured" and not self.reason:
-            # so that a manager that configures later, perhaps another scene, need not wait for the compiler
+            # a manager that configures later, perhaps with another scene, need not wait for the compiler
             self.prepare()
         runtime = self.runtime
         if runtime is not None and runtime.without_clock and self._reports % _SAY_AGAIN == 0:

@@ -22,7 +22,7 @@ from plow_twin.record.sources import Arrived
 
 
 class OpcUaInput:
-    """A server's nodes as the queue of some inputs, with their receiver.
+    """The nodes of a server as the queue of some inputs, and the receiver of these inputs.
 
     It waits for the server at the start and after a break.
 
@@ -31,7 +31,7 @@ class OpcUaInput:
     runtime
         The live twin; its parameters name server, mapping and credentials.
     front
-        Sends the messages that follow.
+        Sends the resulting messages.
     warn
         Called with each trouble of the connection, in words.
 

@@ -34,9 +34,9 @@ def descriptor(spec: Field[Any]) -> ParameterDescriptor:
 
 
 def _converted(parameter: Parameter) -> Parameter:
-    """Return a parameter with its value in the type of the table, where it can be converted.
+    """Return a parameter with its value converted to the type in the table, if possible.
 
-    An empty list stays as it came: without its type rclpy takes it for bytes, and then refuses it.
+    An empty list is not converted: without its type rclpy would take it for bytes and refuse it.
     """
     if parameter.name not in SPECS or parameter.type_ is Parameter.Type.NOT_SET:
         return parameter
@@ -48,8 +48,8 @@ def _converted(parameter: Parameter) -> Parameter:
 class ParameterServer:
     """Declare all parameters on a node and hold their current values in `settings`.
 
-    The node must have `automatically_declare_parameters_from_overrides=True`: the given values are then seen before any
-    type check, so that an integer can stand for a double and one message can name all bad values.
+    The node must have `automatically_declare_parameters_from_overrides=True`: the given values are then read before any
+    type check, so that a double can be given as an integer, and one message can name all bad values.
 
     Parameters
     ----------

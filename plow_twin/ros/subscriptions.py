@@ -44,7 +44,7 @@ class Subscriptions:
     runtime
         Takes the samples.
     front
-        Sends the messages that follow.
+        Sends the resulting messages.
     loop, turns
         The thread that takes the messages, and the lock that keeps it apart from the executor's.
     elsewhere
@@ -73,7 +73,7 @@ class Subscriptions:
         #: number of the next message, by topic and publisher
         self._following: dict[tuple[str, bytes], int] = {}
         self._since_ns = time.time_ns()  # when the excitation was subscribed to
-        #: publishers of the excitation unknown at that time: first message, and losses counted before this message
+        #: publishers of the excitation that were unknown then: first message, and losses counted before this message
         self._appeared: dict[bytes, tuple[Taken, int]] = {}
         self._before: frozenset[bytes] = frozenset()
         self._pose = PoseWithCovarianceStamped if runtime.poses_have_covariance else PoseStamped
@@ -95,7 +95,7 @@ class Subscriptions:
             self._inputs.refused_publishers += refused
             self._inputs.publishers |= {topic: len(publishers) for topic, publishers in present.items()}
             for topic in present:
-                self.look_for_senders(topic)  # again: messages may have been taken since
+                self.look_for_senders(topic)  # repeated, because messages may have been taken since
         self._front.changed()
 
     def look_for_senders(self, topic: str) -> None:
@@ -185,7 +185,7 @@ class Subscriptions:
             self._not_selected(topic, batch)
 
     def _count_before_first(self, batch: list[Taken]) -> None:
-        """Count messages sent before the first one received, by publishers that began after the subscription.
+        """Count messages that publishers, begun after the subscription, sent before the first received message.
 
         Discovery takes time: a publisher that is new to the node may have been sending for long. Its rate shows
         whether it began before the subscription.
@@ -264,7 +264,7 @@ class Subscriptions:
             with_covariance = self._pose is PoseWithCovarianceStamped
             pose = message.pose.pose if with_covariance else message.pose
             turn, stamp = pose.orientation, stamp_ns(message.header)
-            if turn.z == turn.w == 0.0:  # no rotation about z: never filled in, or upside down
+            if turn.z == turn.w == 0.0:  # no rotation about z: the field was never filled, or the head is upside down
                 self._inputs.head_pose.refuse(Verdict.MALFORMED, stamp, (pose.position.x, pose.position.y))
                 continue
             theta = 2.0 * math.atan2(turn.z, turn.w)

@@ -67,13 +67,13 @@ class TopicRecorder:
 
     def __init__(self, node: Node, writer: BagWriter, wanted: Callable[[str], bool]) -> None:
         self._node, self._writer, self._wanted = node, writer, wanted
-        #: by topic: its type, its number in the file, and the qualities of service that are subscribed to
+        #: type, number in the file, and subscribed qualities of service, by topic
         self._topics: dict[str, tuple[str, int, set[_Quality]]] = {}
         #: for each known publisher, the subscription that takes its messages
         self._taken_as: dict[tuple[str, bytes], _Quality] = {}
         self._turns = Turns()
         self._loop = InputLoop(self._turns, lambda error: None)
-        #: reason by topic that is not recorded
+        #: reason for each topic that is not recorded
         self.skipped: dict[str, str] = {}
         #: messages sent but never received, by the publishers' sequence numbers
         self.missed: dict[str, int] = {}
@@ -101,7 +101,7 @@ class TopicRecorder:
                     self.skipped[name] = f"{', '.join(types)}: {error}"
 
     def _subscribe(self, name: str, types: Sequence[str], publishers: Sequence[Any]) -> None:
-        """Subscribe with each quality of service that publishers of a topic offer, as they appear."""
+        """Subscribe with each quality of service that the publishers of a topic offer, when a publisher appears."""
         if name not in self._topics:
             if len(types) != 1:
                 raise LookupError("expected one type")
@@ -245,7 +245,7 @@ def schema_of(message_type: str) -> str:
     Raises
     ------
     LookupError
-        Neither exists.
+        The type is unknown to both.
     """
     from ament_index_python.packages import get_package_share_directory
 
@@ -271,7 +271,7 @@ _BUILT_IN: Final = re.compile(r"(bool|byte|char|float32|float64|u?int(8|16|32|64
 
 
 def _used(text: str, package: str) -> list[str]:
-    """Return the types of the fields of a message that are messages."""
+    """Return the message types among the types of a message's fields."""
     used = []
     for line in text.splitlines():
         kind = line.split("#")[0].strip().partition(" ")[0].partition("[")[0]

@@ -24,7 +24,7 @@ _KEYS: Final = {
 
 
 class AccessError(InputError):
-    """An output is described wrongly."""
+    """The description of an output is wrong."""
 
     def __init__(self, key: str, got: object, expected: str) -> None:
         super().__init__([Problem(key, got, expected)], "telemetry")
@@ -36,7 +36,7 @@ _NO_TOPIC: Final = re.compile(r"[+#\x00-\x1f]|^\$")
 
 @dataclass(frozen=True)
 class WayOut:
-    """One way out.
+    """An output: its address, its modules, its options.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class WayOut:
     modules : tuple of str
         Modules that its process needs.
     first : dict
-        First message to its process.
+        First message to its process, with its options.
     may_acknowledge : bool
         Whether an operator at the destination may acknowledge alarms.
     """
@@ -222,7 +222,7 @@ def _broker_options(host: str, port: int, credentials: Credentials, *, tls: bool
 def _address(
     option: str, url: str, schemes: tuple[str, ...], expected: str, *, plain: bool
 ) -> tuple[str, int, str, bool]:
-    """Return host, port, path and whether it is encrypted (the last of the schemes)."""
+    """Return host, port, path, and whether the connection is encrypted (the last of the schemes)."""
     try:
         parts = urlsplit(url)
         port = parts.port or _PORTS.get(parts.scheme, 0)

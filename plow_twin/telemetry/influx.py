@@ -20,7 +20,7 @@ from plow_twin.telemetry.way import State
 _WAITING: Final = 2000
 #: Most points in one request.
 _AT_ONCE: Final = 500
-#: Longest wait for an answer [ms], first wait before another attempt and the longest [s].
+#: Longest wait for an answer [ms]; first and longest wait before another attempt [s].
 _ANSWER_MS: Final = 5000
 _FIRST_WAIT_S: Final = 1.0
 _LONGEST_WAIT_S: Final = 30.0
@@ -34,9 +34,9 @@ class Influx:
     url
         Address of the database.
     org, bucket, token
-        Where the points go, and the right to write there.
+        Destination of the points, and the permission to write there.
     ca
-        Authority that its certificate is checked against; None: the system's.
+        Authority for checking its certificate; None: the system's authorities.
     """
 
     def __init__(self, url: str, org: str, bucket: str, token: str, ca: str | None) -> None:
@@ -47,7 +47,7 @@ class Influx:
         self._wait_s, self._again_s = 0.0, 0.0
 
     async def open(self, link: Link, newest: Newest) -> None:
-        """Do nothing: each request connects by itself."""
+        """Do nothing: each request opens its own connection."""
 
     async def send(self, changed: dict[str, Group], newest: Newest) -> None:
         """Queue the groups that have changed."""
@@ -97,7 +97,7 @@ class Influx:
 
 
 def line_of(name: str, group: Group, head: str) -> str:
-    """Return a group as a line of InfluxDB's protocol; empty: no value is known."""
+    """Return a group as a line of InfluxDB's protocol, or an empty text if no value is known."""
     point = Point(f"plow_twin_{name}")
     if head:
         point = point.tag("head", head)

@@ -20,12 +20,12 @@ from plow_twin.telemetry.way import State, TelemetryError
 _WAITING: Final = 2000
 #: Most messages that the broker has not yet acknowledged.
 _UNACKNOWLEDGED: Final = 20
-#: A broker that is silent for one and a half times this counts as gone [s].
+#: A broker that is silent for 1.5 times this counts as gone [s].
 _KEEPALIVE_S: Final = 10
 
 
 class Message(NamedTuple):
-    """A message; a late subscriber gets the retained one."""
+    """A message; if it is retained, later subscribers receive it too."""
 
     topic: str
     payload: bytes
@@ -43,9 +43,9 @@ class Broker:
     tls
         Files `ca`, `certificate` and `key`, or None: not encrypted.
     will
-        Returns the broker's message for a break of the next connection.
+        Returns the message that the broker sends when the next connection breaks.
     on_connected
-        Returns the messages that go before all waiting ones, once the broker has accepted.
+        Returns the messages to send before all waiting messages once the broker has accepted.
     waiting
         Most messages that wait while the broker does not answer; the oldest are dropped and counted.
     keeps
@@ -54,7 +54,7 @@ class Broker:
     Raises
     ------
     TelemetryError
-        A file of TLS cannot be used.
+        A TLS file cannot be used.
     """
 
     def __init__(
@@ -86,12 +86,12 @@ class Broker:
             try:
                 use_tls(self.client, tls["ca"], tls["certificate"], tls["key"])
             except (OSError, ValueError) as error:
-                raise TelemetryError(f"{host}:{port}: the files of TLS cannot be used: {error}") from error
+                raise TelemetryError(f"{host}:{port}: the TLS files cannot be used: {error}") from error
         self.client.on_connect, self.client.on_disconnect = self._connected, self._disconnected
         self.client.on_connect_fail, self.client.on_publish = self._failed, self._published
 
     def open(self) -> None:
-        """Connect in the background, again and again."""
+        """Connect in the background, and reconnect after each break."""
         self.client.connect_async(*self._address, keepalive=_KEEPALIVE_S)
         self.client.loop_start()
 
@@ -149,7 +149,7 @@ class Broker:
                 self.state.lost += len(self._unacknowledged)
                 self._unacknowledged.clear()
             self._set_will()
-        self.state.trouble = self.state.trouble or f"the connection broke: {end_of(*facts)}; it is tried again"
+        self.state.trouble = self.state.trouble or f"the connection broke: {end_of(*facts)}; reconnecting"
 
     def _published(self, client: Any, data: Any, number: int, *facts: Any) -> None:
         with self.lock:
@@ -164,7 +164,7 @@ class MqttOut:
     Parameters
     ----------
     prefix
-        Begin of the topics.
+        Beginning of the topics.
     options
         As in `Broker`.
     """
@@ -189,7 +189,7 @@ class MqttOut:
         """Do nothing: the connection has a thread."""
 
     async def close(self, patience_s: float) -> None:
-        """Send waiting messages, then the message that the twin has gone."""
+        """Send waiting messages, then the message that the twin is offline."""
         await self._broker.close(self._gone, patience_s)
 
 

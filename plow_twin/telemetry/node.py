@@ -31,9 +31,9 @@ def send_node(
     namespace, name
         Of the node.
     scene
-        Its scene, where that cannot be read here under the name it has there.
+        Its scene, if the node's name for the scene cannot be read on this machine.
     ways
-        Where the results go; each has a process and a listener of its own.
+        The outputs; each has its own process and its own listener.
     rate_hz
         Updates a second [Hz].
     wait_s
@@ -41,7 +41,7 @@ def send_node(
     stopped
         Whether to end.
     on_error
-        Receives in words when a receiver stops and begins to take messages.
+        Receives in words when a receiver stops or resumes taking messages.
 
     Raises
     ------

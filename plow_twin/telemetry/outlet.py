@@ -14,7 +14,7 @@ from plow_twin.live.part import Part
 from plow_twin.telemetry.access import WayOut
 from plow_twin.telemetry.way import TelemetryError
 
-#: How long a process may take to open its output [s]: it only imports its library.
+#: How long a process may take to open its output [s], in which it only imports its library.
 _START_S: Final = 60.0
 
 
@@ -24,16 +24,16 @@ class Outlet(Beside):
     Parameters
     ----------
     way
-        The way out.
+        The output.
     facts, answer
         As in `Feed`.
     on_error
-        Receives in words when the receiver stops and begins to take messages.
+        Receives in words when the receiver stops or resumes taking messages.
 
     Raises
     ------
     TelemetryError
-        The way cannot be opened.
+        The output cannot be opened.
     ModuleNotFoundError
         Its library is not installed.
     """

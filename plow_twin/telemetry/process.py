@@ -1,7 +1,7 @@
 """The process of one output: `python -m plow_twin.telemetry.process LINK`; the first message names the output.
 
-It takes the updates of a feed one by one. While the receiver does not answer, the output keeps as many
-updates as its bound allows and counts the others, without delay to the twin.
+It takes the updates of a feed one by one. While the receiver does not answer, the output keeps as many updates as its
+bound allows and counts the others; the twin is never delayed.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def _report(way: Way) -> dict[str, Any]:
 
 
 async def serve(link: Link, way: Way, newest: Newest) -> None:
-    """Pass on updates until the other end asks for the end, or has gone."""
+    """Pass on updates until the twin requests the end or has gone."""
     sent, ends = _report(way), False
     link.send(sent)
     while not (ends or link.broken):

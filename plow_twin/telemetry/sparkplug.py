@@ -1,7 +1,7 @@
 """Sparkplug B over MQTT: birth with all metrics, data with changed metrics, death, and rebirth on request.
 
-Messages are those of `sparkplug_b.proto` of Eclipse Tahu, made from its published field numbers: the file itself is
-under another licence and does not ship.
+Messages are those of `sparkplug_b.proto` of Eclipse Tahu, made from its published field numbers, because the file
+itself has another licence and is not included.
 
 References
 ----------
@@ -24,7 +24,7 @@ from plow_twin.telemetry.values import UNITS, Group, Newest, Value
 _UINT64, _STRING, _UINT32, _BOOL = 4, 9, 13, 8
 _DOUBLE, _MESSAGE = 1, 11
 _OPTIONAL, _REPEATED = 1, 3
-#: Name, number and type of the fields that are used, and the message in it.
+#: Name, number and type of each field used, and the message type of a nested field.
 _FIELDS: Final = {
     "Payload": (
         ("timestamp", 1, _UINT64, ""), ("metrics", 2, _MESSAGE, "Metric"), ("seq", 3, _UINT64, ""),
@@ -40,7 +40,7 @@ _FIELDS: Final = {
 }  # fmt: skip
 #: Numbers of the data types of metrics.
 _INT32, _UINT64_TYPE, _DOUBLE_TYPE, _BOOLEAN, _TEXT = 3, 8, 10, 11, 12
-#: Metrics that the protocol asks for.
+#: Metrics that the protocol requires.
 BIRTH_NUMBER: Final = "bdSeq"
 REBIRTH: Final = "Node Control/Rebirth"
 
@@ -57,7 +57,7 @@ def _messages() -> tuple[Any, Any]:
                 added.type_name = f".plow_twin.sparkplug.{of}"
     pool = descriptor_pool.DescriptorPool()
     pool.Add(file)
-    # from protobuf 4.22 on; before that, a method of a factory
+    # a function since protobuf 4.22, a method of a factory before
     class_of = getattr(message_factory, "GetMessageClass", None) or message_factory.MessageFactory(pool).GetPrototype
     return tuple(class_of(pool.FindMessageTypeByName(f"plow_twin.sparkplug.{name}")) for name in ("Payload", "Metric"))
 
@@ -78,14 +78,14 @@ class Sparkplug:
 
     def __init__(self, group: str, node: str, **options: Any) -> None:
         self._topic = f"spBv1.0/{group}/{{}}/{node}"
-        #: number of the next message, and that of the connection in birth and death
+        #: number of the next message, and number of the connection in birth and death
         self._number = 0
         self._connection = -1
         self._rebirth = False
         self._newest = Newest()
         #: newest value of each metric that was sent
         self._sent: dict[tuple[str, str], Value] = {}
-        # messages of a break are not sent: the birth after it has all newest values
+        # messages of a break are not sent: the next birth has all newest values
         self._broker = Broker(will=self._next_death, on_connected=self._born, keeps=False, **options)
         self._broker.client.on_message = self._asked
         self.state = self._broker.state
@@ -104,7 +104,7 @@ class Sparkplug:
                 self._broker.send(self._numbered("NDATA", payload))
 
     def _news(self, name: str, group: Group) -> Group:
-        """Return a group with the values that differ from those sent before."""
+        """Return a group with the values that differ from the values sent last."""
         values = {key: value for key, value in group.values.items() if self._sent.get((name, key), self) != value}
         self._sent |= {(name, key): value for key, value in values.items()}
         return group._replace(values=values)
@@ -117,7 +117,7 @@ class Sparkplug:
                 self._broker.send(self._birth())
 
     async def close(self, patience_s: float) -> None:
-        """Send the message that the node has gone."""
+        """Send the node's death message."""
         await self._broker.close(self._death(), patience_s)
 
     def _born(self) -> list[Message]:
@@ -170,7 +170,7 @@ def _payload(groups: Mapping[str, Group], *, with_units: bool) -> Any:
 
 
 def _typed(value: Value) -> tuple[int, str, Any]:
-    """Return for a value: the number of its data type, the message's field that holds it, and the field's content."""
+    """Return the number of a value's data type, the field of the message that holds it, and the field's content."""
     if value is None:
         return _DOUBLE_TYPE, "is_null", True
     if isinstance(value, str):

@@ -1,4 +1,4 @@
-"""Values of the outputs: the newest numbers and texts of a twin, in groups with the same names on every output."""
+"""Values of the outputs: the newest numbers and texts of a twin, in groups that have the same names on every output."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Group(NamedTuple):
 class Newest:
     """The newest values of all groups, from the updates of a feed.
 
-    The groups are `clearance` [m] and `wear` [m] with their 5 % and 95 % points, `peaks` [N] since the update before,
+    The groups are `clearance` [m] and `wear` [m] with their 5 % and 95 % points, `peaks` [N] since the last update,
     `life` (points of the forecast), `flags`, `status` and `alarms`. Each group has all of its names from the first
     update on.
     """
@@ -96,7 +96,7 @@ class Newest:
 
 
 def _unknown(names: list[str]) -> dict[str, dict[str, Value]]:
-    """Return all groups before anything is known."""
+    """Return all groups with unknown values."""
     by_pair: dict[str, Value] = {f"{name}{point}": None for point in _POINTS for name in names}
     axes: dict[str, Value] = {f"{axis}{point}": None for point in _POINTS for axis in ("horizontal", "vertical")}
     return {

@@ -23,9 +23,9 @@ class State:
     connected : bool
         Whether the receiver answers.
     sent, lost : int
-        Messages (or points, or updates) that the receiver has taken, and those that were dropped.
+        Numbers of messages (or points, or updates) that the receiver has taken, and that were dropped.
     trouble : str
-        Why the receiver does not take anything; empty if it does.
+        Why the receiver takes no messages; empty if it does.
     """
 
     connected: bool = False
@@ -35,18 +35,18 @@ class State:
 
 
 class Way(Protocol):
-    """One way out."""
+    """An output."""
 
     state: State
 
     async def open(self, link: Link, newest: Newest) -> None:
-        """Open the output of the machine in the facts of `newest`; requests of operators come back through `link`."""
+        """Open the output for the machine in the facts of `newest`; requests of operators arrive through `link`."""
 
     async def send(self, changed: dict[str, Group], newest: Newest) -> None:
         """Send the groups that have changed."""
 
     async def turn(self) -> None:
-        """Do pending work; called twice a second at least."""
+        """Do pending work; called at least twice a second."""
 
     async def close(self, patience_s: float) -> None:
         """Send waiting messages within `patience_s` [s], and close."""

@@ -1,4 +1,4 @@
-"""Rows collected into columns: rerun logs 20 thousand rows at once at the cost of a single row."""
+"""Rows collected into columns: for rerun, logging 20 thousand rows at once costs as much as logging one row."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ RUN_TIME: Final = "run_time"
 
 
 class TimeAxis:
-    """The timelines of all curves; the time of the run counts from the stamp `first_ns`."""
+    """The timelines of all curves; the run's time counts from the stamp `first_ns`."""
 
     def __init__(self) -> None:
         self.first_ns: int | None = None
@@ -51,7 +51,7 @@ class Curves:
         self.span_ns = span_ns
         self.entities = tuple(entities)
         self._parts: list[tuple[Indexes, Indexes, Array]] = []
-        self._ends: list[NDArray[np.bool_]] = []  # for each row of each part: whether the lines end there
+        self._ends: list[NDArray[np.bool_]] = []  # for each row of each part, whether the lines end there
         self._last: tuple[Indexes, Indexes] | None = None
         self._waiting = self.rows = self.sent = 0
 
@@ -101,7 +101,7 @@ class Curves:
             rr.send_columns(entity, indexes, columns, recording=self._stream)
 
     def _spans(self, stamps: Indexes, ends: NDArray[np.bool_]) -> Indexes:
-        """Return the span number of each row; the end of a line has its own span."""
+        """Return the number of each row's span; a row at which a line ends has its own span."""
         spans = stamps // self.span_ns
         after = np.concatenate(([False], ends[:-1]))
         changes: Indexes = np.cumsum((np.diff(spans, prepend=spans[0]) != 0) | ends | after)

@@ -14,7 +14,7 @@ from plow_twin.view.columns import Array, Batches, Indexes, TimeAxis
 ENTITY: Final = "contact_set"
 FREE: Final = "free"
 Color = tuple[int, int, int]
-#: Colours of: no contact, a stopped counter-clockwise rotation, a stopped clockwise rotation, both.
+#: Colours for no contact, a stopped counter-clockwise rotation, a stopped clockwise rotation, and both.
 _COLORS: Final[tuple[Color, ...]] = ((235, 235, 235), (86, 180, 233), (240, 160, 60), (204, 121, 167))
 _CCW_BITS: Final = int((STOPS_COUNTER_CLOCKWISE.astype(np.int64) << np.arange(PAIR_COUNT)).sum())
 
@@ -31,7 +31,7 @@ def masks_of(force: Array) -> Indexes:
 
 
 class ContactSets:
-    """Write each change of the set; of a thinned run the first change in each span of stamps [ns] and the last set."""
+    """Write each change of the set; of a thinned run only the first change and the last set in each span [ns]."""
 
     def __init__(self, stream: rr.RecordingStream, axis: TimeAxis, labels: tuple[str, ...], span_ns: int) -> None:
         self._names = tuple(label or name for label, name in zip(labels, CORNER_NAMES, strict=True))
@@ -99,7 +99,7 @@ class ContactSets:
             self._end_span((self._at + 1) * self._span_ns)
 
     def end(self) -> None:
-        """End the lane: the set is unknown from here on."""
+        """End the lane: from here on the set is unknown."""
         if self._last is not None:
             self._states.add(*self._last, state=[])
         self._before = self._at = self._last = self._left = None

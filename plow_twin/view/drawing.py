@@ -32,21 +32,21 @@ from plow_twin.view.residuals import Residuals
 from plow_twin.view.section import ARROW_MM_PER_N, LABEL_MM, LOAD_COLOR, PAIR_COLORS, Section
 from plow_twin.view.what_if import WhatIf
 
-#: Largest distance of stamps from the recorder's clock [ns]; beyond it they are on another clock and have no age.
+#: Largest distance of stamps from the recorder's clock [ns]; stamps beyond it have another clock and no age.
 _LARGEST_AGE_NS: Final = 3_600_000_000_000
 _GREY: Final = (150, 155, 165)
 _WHITE: Final = (235, 235, 235)
 _TOUCHING: Final = (240, 140, 40)
 _PADS: Final = np.array([name.startswith("pad_") for name in CLEARANCE_NAMES])
 _BEST_PADS: Final = np.array([name in PAD_NAMES for name in CLEARANCE_NAMES])
-#: Columns of the pads' depths, of their 5 % and of their 95 % points.
+#: Columns of the pads' depths, of their 5 % points, and of their 95 % points.
 _PAD_POINTS: Final = [[CLEARANCE_NAMES.index(f"{name}{point}") for name in PAD_NAMES] for point in ("", "/p05", "/p95")]
 _BOUNDS: Final = [
     CLEARANCE_NAMES.index(f"{way}/{point}") for way in ("horizontal", "vertical") for point in ("p05", "p95")
 ]
 #: Rows of a band for each message of a clearance, unless curves are thinned.
 _BAND_ROWS: Final = 10
-#: Interval at which the chart of forces along the face is drawn [ns].
+#: Interval at which the chart of forces along the face is redrawn [ns].
 _FACE_NS: Final = 1_000_000_000
 
 
@@ -186,7 +186,7 @@ class Drawing:
         """Write that entries are missing before a batch, and end all lines there."""
         self._sample_ns, self._wrench = None, np.full(3, np.nan)
         self.events.forget()
-        if not isinstance(after.entries.others.get(0), Loss):  # it is drawn as an event
+        if not isinstance(after.entries.others.get(0), Loss):  # a loss is drawn as an event
             text = f"{count} journal entries are not there after this"
             self.events.add(self.stamp_ns, max(self.step, 0), text, "ERROR")
 
@@ -247,7 +247,7 @@ class Drawing:
         for index in sorted(entries.others):
             self._back(samples[: np.searchsorted(samples, index)], stamps, steps)
             entry, stamp_ns = entries.others[index], int(stamps[index])
-            if not hasattr(entry, "stamp_ns"):  # at the stamp reached
+            if not hasattr(entry, "stamp_ns"):  # drawn at the stamp reached
                 reached = np.flatnonzero(advance[:index])
                 stamp_ns = int(stamps[reached[-1]]) if reached.size else self.stamp_ns
             self.events.entry(stamp_ns, max(int(steps[index]), 0), entry, self.header.excitation_source)
@@ -259,7 +259,7 @@ class Drawing:
 
     @staticmethod
     def _loads(entries: Entries, advance: NDArray[np.bool_], before: Array) -> Array:
-        """Return the load at the end of each advance, (n, 3): of its sample, held, or NaN."""
+        """Return the load at the end of each advance, (n, 3): its sample, the held load, or NaN."""
         places = np.flatnonzero(advance)
         loads = np.where(entries.sample[places, None], entries.wrench[places], 0.0)
         for row in np.flatnonzero(~entries.sample[places]).tolist():
@@ -308,14 +308,14 @@ class Drawing:
     def _growth_m(self, numbers: Array) -> Array:
         """Return the growth of the clearances by wear alone [m] with its interval, in the order of `layout.GROWTH`.
 
-        It is the wear of the pads, without the effects of estimates and changed parameters.
+        This growth is the wear of the pads; estimates and changed parameters do not affect it.
         """
         new = clearances(self._scene, np.zeros(PAIR_COUNT))[:2]
         best, low, high = (clearances(self._scene, numbers[:, pads])[:, :2] - new for pads in _PAD_POINTS)
         return np.concatenate((best, np.stack((low, high), axis=2).reshape(len(numbers), 4)), axis=1)
 
     def _bands(self, stamps: Indexes, steps: Indexes, numbers: Array) -> None:
-        """Draw the areas between the bounds as curves that alternate between them, row by row."""
+        """Draw the areas between the bounds as curves that alternate between the bounds, row by row."""
         total = np.concatenate((1e3 * numbers[:, _BOUNDS], 1e6 * self._growth_m(numbers)[:, 2:]), axis=1)
         if self._band_end is not None and len(stamps) and self._band_end[0][0] < stamps[0]:
             ends = zip(self._band_end, (stamps, steps, total), strict=True)
@@ -374,7 +374,7 @@ class Drawing:
             self._drawn_face_ns = self.stamp_ns
 
     def _section(self, contact: Rows, head: Rows, steps: Indexes, loads: Array) -> None:
-        """Draw the first instant in each span with forces and pose of one publication."""
+        """In each span, draw the first instant that has forces and pose of the same publication."""
         at = np.minimum(np.searchsorted(contact.sequence, head.sequence), len(contact) - 1)
         spans = head.stamp_ns // round(1e9 / self.section_hz)
         for row in np.flatnonzero(contact.stamp_ns[at] == head.stamp_ns).tolist():
@@ -442,7 +442,7 @@ class Drawing:
             part.flush()
 
     def finish(self, reader: RunReader) -> None:
-        """Write how the recording ended and the missing parts, and send the collected rows."""
+        """Write how the recording ended and which parts are missing, and send the collected rows."""
         self._write_statuses()
         self.face.draw(self.stamp_ns, max(self.step, 0))
         self.contact_sets.finish()

@@ -1,4 +1,4 @@
-"""Curves of any length for a picture: every row, or the smallest and the largest value in bins of equal width."""
+"""Curves of any length for a picture: every row, or the smallest and largest value in each bin of equal width."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Indexes = NDArray[np.int64]
 
-#: Largest number of rows of which a curve keeps every one.
+#: Largest number of rows up to which a curve keeps every row.
 MOST_ROWS: Final = 8000
 #: Most bins, about one for each pixel of an axis: narrower bins would show beats with the load's period.
 _MOST_BINS: Final = 700
@@ -47,7 +47,7 @@ class Envelope:
             self._merge()
 
     def break_line(self) -> None:
-        """End the lines here: the following rows begin new lines."""
+        """End the lines here; the next rows begin new lines."""
         self._segment += 1
 
     @property
@@ -84,7 +84,7 @@ class Envelope:
             self._bin_s = max(2.0 * float(np.ptp(self._kept.place)) / self._most_bins, 1e-9)
             self._kept = self._kept.binned(self._bin_s)
         self._kept = self._kept.merged()
-        # any number of segments stay apart
+        # segments always stay apart, however many there are
         while len(self._kept.place) > self._most_bins and np.ptp(self._kept.place) > 1.0:
             self._bin_s *= 2.0
             self._kept = self._kept.binned(2.0).merged()

@@ -24,7 +24,7 @@ def estimate_picture(
     prior
         The prior, by the names of `QUANTITIES`.
     poses
-        The measured poses, which are drawn alone where no motion was fitted.
+        The measured poses; without a fitted motion, only they are drawn.
     labels
         Name with unit of each quantity.
     title

@@ -60,7 +60,7 @@ class Events:
                 self.add(stamp_ns, step, f"parameter {name} = {value}")
             case Failed(stamp_ns, since_ns, advances, reason):
                 self.failed += advances
-                more = "an advance failed" if stamp_ns == since_ns else f"{advances} more advances failed after it"
+                more = "an advance failed" if stamp_ns == since_ns else f"{advances} more advances failed after this"
                 self.add(stamp_ns, step, f"{more}: {reason}", "ERROR")
             case Mark(_, text):
                 self.add(stamp_ns, step, f"mark: {text}", "WARN")
@@ -85,7 +85,7 @@ class Events:
             self.add(int(stamps[row]), int(steps[row]), text)
 
     def forget(self) -> None:
-        """Count touches from the next row on: the rows before it are unknown."""
+        """Count touches from the next row on, because earlier rows are unknown."""
         self._makes_before = None
 
     def status(self, stamp_ns: int, step: int, message: DiagnosticStatus) -> None:

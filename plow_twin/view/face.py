@@ -16,10 +16,10 @@ from plow_twin.view.columns import Array, Batches, Indexes, TimeAxis
 #: Size of the chart in the units of its view.
 WIDTH: Final = 300.0
 HEIGHT: Final = 90.0
-#: First length of a piece of the face [m]; it doubles when there are more than `_MOST_PIECES`.
+#: First length of a piece of the face [m]; it doubles when there are more than `_MOST_PIECES` pieces.
 _PIECE_M: Final = 0.1
 _MOST_PIECES: Final = 600
-#: Number of passes that are drawn; the newest is bright.
+#: Number of passes drawn; the newest is bright.
 _MOST_PASSES: Final = 8
 _AXIS: Final = (110, 115, 125)
 _NEWEST: Final = (240, 160, 60)
@@ -56,7 +56,7 @@ class FaceChart:
             self._set_speed(travel.speed_m_s)
 
     def _set_speed(self, speed_m_s: float) -> None:
-        """Change the speed; another direction begins a pass."""
+        """Change the speed; a new direction begins a new pass."""
         direction = math.copysign(1.0, speed_m_s) if speed_m_s else 0.0
         if direction and self._direction and direction != self._direction:
             self._passes.append({})
@@ -93,7 +93,7 @@ class FaceChart:
             here = self._passes[-1]
 
     def restart(self) -> None:
-        """Continue after a reset: stamps may go back, and waiting speeds act now."""
+        """Continue after a reset: stamps may go back, and waiting speeds take effect now."""
         for travel in self._coming:
             self._set_speed(travel.speed_m_s)
         self._coming, self._reached_ns = [], None

@@ -1,4 +1,4 @@
-"""Figures as PNG files, and the parts that all of them share."""
+"""Writing figures as PNG files, and parts that all figures share."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from plow_twin.record.reader import RunReader
 
-#: The sign of negative numbers as matplotlib writes it on its axes.
+#: The minus sign that matplotlib writes on its axes.
 MINUS: Final = "\N{MINUS SIGN}"
 
 
@@ -38,7 +38,7 @@ def write_png(figure: Figure, path: Path) -> None:
 
 
 def legend_beside(axis: Any, **options: Any) -> None:
-    """Put the legend beside the axes: over the data it would hide some."""
+    """Put the legend beside the axes, where it hides no data."""
     axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=7, **options)
 
 
@@ -51,13 +51,13 @@ def scene_and_date(reader: RunReader, first_ns: int | None = None) -> str:
     """Return scene and date of a recording for a title; `first_ns` is its first stamp where that is known."""
     scene = reader.header.parameters.get("scene")
     parts = [f"scene {Path(scene).name}"] if isinstance(scene, str) and scene else []
-    # stamps that count from a start of their own have no date
+    # stamps that count from an arbitrary start have no date
     date = date_text(reader.began_ns() if first_ns is None else first_ns)
     return ", ".join([*parts, date or f"file of {date_text(reader.path.stat().st_mtime_ns)}"])
 
 
 def date_text(stamp_ns: int | None) -> str:
-    """Return the date of a stamp for a title; empty for a stamp that counts from its own start."""
+    """Return the date of a stamp for a title; empty for a stamp that counts from an arbitrary start."""
     if stamp_ns is None or stamp_ns < EPOCH_S * 1e9:
         return ""
     return datetime.fromtimestamp(stamp_ns // 10**9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")

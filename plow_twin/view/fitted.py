@@ -25,7 +25,7 @@ _COMPONENTS: Final = (("x", "mm"), ("y", "mm"), ("θ", "mrad"))
 _LINE: Final = 150
 #: Time between two rows, over the usual time, that counts as a gap.
 _GAP: Final = 10.0
-#: Largest drawn distance from the prior's middle, in half widths of the prior; values beyond it are drawn there.
+#: Largest drawn distance from the prior's middle, in half widths of the prior; values farther away are drawn at it.
 _FARTHEST: Final = 2.0
 
 
@@ -33,8 +33,8 @@ _FARTHEST: Final = 2.0
 class FittedValue:
     """A value with its interval, and its prior, each as middle, low, high in the unit of the label.
 
-    `prior` is None where there is no prior; `note` is its state, or another short word; `is_log` says
-    whether its place in the prior is measured in the logarithm.
+    `prior` may be None; `note` is the state of the value, or another short word; `is_log` states whether its place in
+    the prior is measured in the logarithm.
     """
 
     label: str
@@ -70,10 +70,10 @@ class FittedValue:
 
 @dataclass(frozen=True)
 class FittedPicture:
-    """Everything in the picture of a fit.
+    """The content of the picture of a fit.
 
-    `noise` is the standard deviation of the measured x, y [m], theta [rad] where it is known. The prior is named by
-    `prior_name` beside each value, `prior_meaning` explains it.
+    `noise` is the standard deviation of the measured x, y [m], theta [rad] where it is known. `prior_name` names the
+    prior beside each value, and `prior_meaning` explains it.
     """
 
     title: str
@@ -149,7 +149,7 @@ class FittedPicture:
 
 
 def _broken(t: Array, values: Array) -> tuple[Array, Array]:
-    """Return a curve with NaN where far more time passes than between two rows: no line crosses a gap."""
+    """Return a curve with NaN in each gap, which is much longer than the usual interval, so that no line crosses it."""
     there = np.isfinite(values)
     t, values = t[there], values[there]
     steps = np.diff(t)

@@ -1,4 +1,4 @@
-"""The picture of a fit as a file: a PNG, or for rerun measured points, fitted motion, residuals, and a table."""
+"""The picture of a fit as a PNG, or as a file for rerun: measured points, fitted motion, residuals, a table."""
 
 from __future__ import annotations
 

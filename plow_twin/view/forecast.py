@@ -18,7 +18,7 @@ _COLOURS = ("#1f4e9c", "#d62728")
 
 
 def draw_forecast(found: Forecast, path: FilePath, title: str) -> None:
-    """Write a PNG: P10, P50 and P90 of both clearances over time, and the probability that a limit is reached."""
+    """Draw P10, P50 and P90 of both clearances over time, and the probability that a limit is reached, into a PNG."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13.0, 4.8), layout="constrained", dpi=110)
@@ -26,14 +26,14 @@ def draw_forecast(found: Forecast, path: FilePath, title: str) -> None:
     left, right = figure.subplots(1, 2)
     plan = found.plan
     reached = found.hours[np.isfinite(found.hours)]
-    # limits that are reached already leave no span to show
+    # limits that have already been reached leave no span to show
     last = 1.3 * float(np.quantile(reached, 0.95)) if len(reached) else 0.0
     end = min(plan.horizon_h, last) if last > 0.0 else plan.horizon_h
     hours = np.linspace(0.0, end, _MOMENTS)
     growing = 1e3 * found.clearances(hours)
     limits = (plan.limit_horizontal_m, plan.limit_vertical_m)
     for axis, (name, limit, colour) in enumerate(zip(("horizontal", "vertical"), limits, _COLOURS, strict=True)):
-        # infinite for a limit that is reached already
+        # infinite for a limit that has already been reached
         low, middle, high = np.minimum(growing[:, :, axis], 1e3 * limit)
         middle[~np.isfinite(growing[1, :, axis])] = np.nan
         left.fill_between(hours, low, high, color=colour, alpha=0.2, linewidth=0.0)
@@ -54,7 +54,7 @@ def draw_forecast(found: Forecast, path: FilePath, title: str) -> None:
                 xytext=(offset, -10.0),
                 textcoords="offset points",
                 ha=side,
-                bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0},  # above the line of another point
+                bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0},  # covers the line of another point
             )
     if plan.stop_h is not None and plan.stop_h <= end:
         right.axvline(plan.stop_h, color="#1b7837", linestyle=":", label="planned stop")

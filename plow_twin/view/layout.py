@@ -22,7 +22,7 @@ from plow_twin.view.section import ARROW_MM_PER_N, LOAD_COLOR, PAD_MM_PER_MM, PA
 
 FORCE: Final = tuple(f"force/{name}" for name in PAIR_NAMES)
 FORCE_AT_STAMP: Final = tuple(f"force_at_stamp/{name}" for name in PAIR_NAMES)
-#: Bounds of the forces at the stamps, of a twin that follows its machine.
+#: Bounds of the forces at the stamps, for a twin that follows its machine.
 FORCE_BOUNDS: Final = tuple(f"force_interval/{name}/{point}" for point in ("p05", "p95") for name in PAIR_NAMES)
 POSE: Final = ("pose/x", "pose/y", "pose/theta")
 MEASURED: Final = ("pose/measured/x", "pose/measured/y", "pose/measured/theta")
@@ -32,13 +32,13 @@ AGE: Final = ("quality/sample_age_ms",)
 INTERVAL: Final = ("quality/sample_interval_ms",)
 TOTAL: Final = tuple(f"clearance/{name}" for name in CLEARANCE_NAMES if not name.startswith("pad_"))
 GROWTH: Final = tuple(f"growth/{name}" for name in CLEARANCE_NAMES if not name.startswith("pad_"))
-#: Areas between the bounds of a clearance: each is a curve that alternates between them. Their names sort before
-#: the clearances' bands, which are therefore drawn above.
+#: Areas between the bounds of a clearance: each is a curve that alternates between them. Their names sort before the
+#: names of the clearances, so that the clearances are drawn above the bands.
 BAND: Final = tuple(f"{group}/band/{way}" for group in ("clearance", "growth") for way in ("horizontal", "vertical"))
 RESIDUAL: Final = ("residual/x", "residual/y", "residual/theta")
 WEAR: Final = tuple(f"wear/{name}" for name in CLEARANCE_NAMES if name.startswith("pad_"))
 
-#: Views hide bounds at first, because bands show the clearances' bounds and a legend shows at most eight names.
+#: Views hide the bounds at first: bands already show the clearances' bounds, and a legend shows at most eight names.
 _WITHOUT_BOUNDS: Final = (
     "$origin/**",
     *(f"- $origin/{name}" for name in CLEARANCE_NAMES if name.endswith(("/p05", "/p95"))),
@@ -65,10 +65,10 @@ _CLEARANCE_COLORS: Final = {"horizontal": (86, 180, 233), "vertical": (240, 160,
 def blueprint(
     section: Section, exaggerate: float, what_if: bool = False, followed: bool = False, *, title: str = ""
 ) -> rrb.Blueprint:
-    """Return the arrangement: the cross-sections beside the curves, the events and data quality below.
+    """Return the arrangement: cross-sections beside the curves, with events and data quality below.
 
-    With `what_if` the view of other scenes is in front; with `followed` there are intervals of the forces. `title` goes
-    with the name of the forces.
+    With `what_if` the view of other scenes is in front; with `followed` there are intervals of the forces. `title` is
+    appended to the name of the forces.
     """
     half_x, half_y = (float(half) for half in section.half_view)
     picture = rrb.Spatial2DView(
@@ -114,7 +114,7 @@ def blueprint(
             _plot("wear", "Wear [mm]", rrb.Corner2D.LeftTop, _WITHOUT_BOUNDS),
             active_tab=0,
         ),
-        row_shares=[4.7, 2.2, 2.7, 3.4],  # the lane of the sets also fits in a window of 600 pixels
+        row_shares=[4.7, 2.2, 2.7, 3.4],  # the lane of the sets fits even in a window of 600 pixels
     )
     return rrb.Blueprint(
         rrb.Horizontal(
@@ -137,7 +137,7 @@ def _plot(
 
 
 def style_curves(stream: rr.RecordingStream) -> None:
-    """Give the curves their colours, names and the reduction that keeps peaks when many points share a pixel."""
+    """Give the curves colours, names, and a reduction that keeps peaks when many points share a pixel."""
     for entities in (FORCE, FORCE_AT_STAMP, PENETRATION):
         for entity, name, color in zip(entities, PAIR_NAMES, PAIR_COLORS, strict=True):
             _style(stream, entity, name, color, AggregationPolicy.MinMax)
@@ -156,7 +156,7 @@ def style_curves(stream: rr.RecordingStream) -> None:
         _style(stream, entity, name, color, AggregationPolicy.MinMax)
     for entity in BAND:
         _style(stream, entity, "90 % interval", None, AggregationPolicy.MinMax, _BAND_WIDTH)
-    for entity in (*TOTAL, *GROWTH, *WEAR):  # bounds of an interval are thinner than their value
+    for entity in (*TOTAL, *GROWTH, *WEAR):  # bounds are thinner than the value between them
         base, _, bound = entity.partition("/")[2].partition("/")
         base = base.removeprefix("pad_")
         color = _CLEARANCE_COLORS.get(base) or PAIR_COLORS[PAIR_NAMES.index(base)]
@@ -165,13 +165,13 @@ def style_curves(stream: rr.RecordingStream) -> None:
 
 
 def band_colors(entity: str) -> list[tuple[int, ...]]:
-    """Return the colours of the first stroke of a band, which is that of the legend, and of the other strokes."""
+    """Return the colours of a band: of its first stroke, which the legend shows too, and of the other strokes."""
     color = _CLEARANCE_COLORS[entity.rpartition("/")[2]]
     return [(*(part // 2 for part in color), 255), (*color, _BAND_ALPHA)]
 
 
 def style_load(stream: rr.RecordingStream, largest: Iterable[float]) -> None:
-    """Name the curves of the load with their largest values, because the axis of a low plot has only powers of ten."""
+    """Name the curves of the load with their largest values, as a low plot labels only powers of ten."""
     for entity, name, unit, color, value in zip(LOAD, *_LOAD_NAMES, _LOAD_COLORS, largest, strict=True):
         named = f"{name}, to {value:.3g} {unit}" if value else f"{name} [{unit}]"
         _style(stream, entity, named, color, AggregationPolicy.MinMax)
@@ -207,7 +207,7 @@ def _style(
 def about(scene: Scene, header: RunHeader, source: Path) -> str:
     """Return a description of the run and of the picture in Markdown."""
     contact = scene.contact
-    frame = "fixed frame" if scene.support is None else "frame, on springs, from which all is seen here,"
+    frame = "fixed frame" if scene.support is None else "frame, on springs, to which this picture is fixed,"
     return f"""# {source.name}
 
 The head ({scene.head.mass_kg:g} kg) moves about the {frame} of the guide

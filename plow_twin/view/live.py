@@ -1,7 +1,7 @@
-"""A live view of a run while it is recorded, by a process of its own that follows the file.
+"""A live view of a run while it is recorded, in a separate process that follows the file.
 
-The node is independent of it: a slow or closed viewer stops this process alone. Curves are thinned to the least and the
-largest value of each span.
+The node does not depend on this process: a slow or closed viewer stops only this process. Curves are thinned to the
+least and the largest value of each span.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from plow_twin.view.section import Section
 
 #: Rate of the spans in which a curve keeps two values [Hz]: an hour of all curves takes some 200 MB in the viewer.
 CURVE_HZ: Final = 25.0
-#: Rates of the cross-section [Hz]: live, and for the part recorded before the start.
+#: Rates of the cross-section [Hz]: live, and for the part that was recorded before the view started.
 SECTION_HZ: Final = 20.0
 _SECTION_HZ_BEFORE: Final = 1.0
 

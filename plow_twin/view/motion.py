@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class NotebookFigure(Figure):
-    """A figure that a notebook shows by itself, without pyplot and its global state."""
+    """A figure that a notebook displays without pyplot and its global state."""
 
     def _repr_png_(self) -> bytes:
         stream = io.BytesIO()

@@ -1,4 +1,4 @@
-"""Picture of the first seconds of a user's file by the mapping: its load, pose and speed."""
+"""Picture of the first seconds of a user's file as the mapping reads it: load, pose and speed."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from plow_twin.record.column_guess import Guess
 
 _SHOWN_S: Final = 10.0
-#: Prefixes of newtons by the size of a load.
+#: SI prefixes of newtons, each with its factor.
 _PREFIXES: Final = (("M", 1e6), ("k", 1e3))
 
 

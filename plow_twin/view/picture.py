@@ -23,9 +23,9 @@ from plow_twin.view.section import PAIR_COLORS, Section
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: Room about the end of an arrow for its label [mm].
+#: Room around the end of an arrow for its label [mm].
 _LABEL_ROOM_MM: Final = 50.0
-#: Width of an upright label, as a share of the axes that it stands in.
+#: Width of an upright label as a share of its axes.
 _LABEL_WIDTH: Final = 0.015
 _LOAD_NAMES: Final = ("Fx [kN]", "Fy [kN]", "M [kN m]")
 #: Origin of a clearance by its state, in the words of the screen.
@@ -42,7 +42,7 @@ def to_png(path: Path, out: Path) -> tuple[FileStatus, dict[str, int], int]:
     """Draw a recording into a PNG; return how the recording ended, counts of its losses, and failed advances.
 
     No line crosses missing entries or a reset. A long run is drawn as the envelope of its curves: the least and the
-    largest value in bins of one width.
+    largest value in bins of equal width.
 
     Raises
     ------
@@ -107,7 +107,7 @@ def _meanings(curves: RunCurves) -> list[str]:
 
 
 def _title(reader: RunReader, curves: RunCurves) -> str:
-    """Return run, scene, date and end of the recording; a second line has the losses."""
+    """Return run, scene, date, and how the recording ended; a second line states the losses."""
     parts = ["/".join(reader.path.absolute().parent.parts[-2:])]
     parts.append(scene_and_date(reader, curves.first_ns))
     losses = [f"lost {name.replace('_', ' ')}: {count}" for name, count in reader.lost_parts.items()]
@@ -152,7 +152,7 @@ def _draw_section(axis: Any, section: Section, instant: Instant, curves: RunCurv
             sideways = abs(vector[0]) > abs(vector[1])
             side = "center" if not sideways else "left" if vector[0] > 0.0 else "right"
             axis.annotate(text, origin + 1.1 * vector, color=color, ha=side, va="center", fontsize=8)
-        # the limits of the axes follow the ends of the arrows, not the annotations
+        # annotations do not widen the limits of the axes; these points do
         axis.update_datalim(
             np.concatenate([origins + 1.1 * vectors + side for side in (-_LABEL_ROOM_MM, _LABEL_ROOM_MM)])
         )
@@ -171,13 +171,13 @@ def _draw_section(axis: Any, section: Section, instant: Instant, curves: RunCurv
 
 
 def _y_upwards(axis: Any) -> None:
-    """Label y upwards: the data of the section, as those of the viewer, have y downwards."""
+    """Label y upwards: in the data of the section, as in the viewer, y points downwards."""
     axis.invert_yaxis()
     axis.yaxis.set_major_formatter(lambda y, _: signed(0.0 - y, "g"))
 
 
 def _draw_gaps(axis: Any, penetration: NDArray[np.float64]) -> None:
-    """Draw the gap of each pair as a bar, and its penetration to the other side."""
+    """Draw a bar for each pair: to one side its gap, to the other its penetration."""
     places = np.arange(len(PAIR_NAMES))
     colors = ["tab:orange" if value > 0.0 else "0.6" for value in penetration]
     bars = axis.barh(places, 1e3 * penetration, color=colors)
@@ -199,9 +199,9 @@ def _curves(
     only_largest: bool = False,
     gaps: Sequence[tuple[float, float]] = (),
 ) -> None:
-    """Draw curves, or for bins the band between smallest and largest values; bands of forces would all begin at zero.
+    """Draw curves, or for bins the band from the smallest to the largest value, unless `only_largest`.
 
-    No line crosses a gap, given by its ends [s].
+    Bands of forces would all begin at zero. No line crosses a gap; `gaps` has the ends of each [s].
     """
     axis.set_ylabel(label)
     if not rows:
@@ -219,7 +219,7 @@ def _curves(
 
 
 def _widest(times: NDArray[np.float64], begin: float, end: float) -> int:
-    """Return the index after the longest step of times [s] that meets a gap; the end if no step does."""
+    """Return the index after the longest step of times [s] that overlaps a gap, or the end if none does."""
     steps = np.where((times[1:] > begin) & (times[:-1] < end), np.diff(times), 0.0)
     return int(steps.argmax()) + 1 if steps.any() else len(times)
 
@@ -232,7 +232,7 @@ def _thresholds(axis: Any, thresholds: Thresholds, factor: float) -> None:
 
 
 def _clearance(axis: Any, curves: RunCurves) -> None:
-    """Draw both clearances with their intervals, and the changes by other causes than wear."""
+    """Draw both clearances with their intervals, and mark changes that are not wear."""
     axis.set_ylabel("clearance with its\n90 % interval [mm]")
     if not curves.clearance:
         _note_absence(axis, "not in the recording")
@@ -258,7 +258,7 @@ def _clearance(axis: Any, curves: RunCurves) -> None:
 
 
 def _with_interval(value: float, low: float, high: float) -> str:
-    """Return a clearance in mm, with a third digit for wear of micrometres unless an interval of some mm hides it."""
+    """Return a clearance in mm: with three digits without an interval, otherwise with two and the interval."""
     if high - low < 1e-3:
         return f"{value:.3f} mm"
     return f"{value:.2f} mm ({low:.2f} to {high:.2f})"

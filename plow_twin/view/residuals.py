@@ -27,7 +27,7 @@ class Residuals:
         Parameters
         ----------
         poses
-            Poses, and their indexes among the entries, to which `steps` belong.
+            Poses, and their indexes among the entries; `steps` has an element for each entry.
         head
             Rows of `head_state`.
         """

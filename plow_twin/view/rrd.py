@@ -17,7 +17,7 @@ from plow_twin.view.figures import scene_and_date
 from plow_twin.view.rrd_file import RrdFile
 from plow_twin.view.section import Section
 
-#: Most rows of a curve that is not thinned.
+#: Largest number of rows of a curve that is not thinned.
 MOST_ROWS: Final = 200_000
 #: Rate of the cross-section [Hz]; curves keep every row.
 SECTION_HZ: Final = 100.0
@@ -29,9 +29,9 @@ _BYTES_PER_ROW: Final = 400
 class ViewSummary:
     """Content of a .rrd: first stamp, rows of the curves, instants of the cross-section, events.
 
-    `status` is how the recording ended. `lost` has the counts of its recorder by topic, of parts that are missing or of
-    another run, and of samples too late for other scenes. `failed` advances have no forces.
-    `curve_rows` of the `rows` of the force curves were sent.
+    `status` is how the recording ended. `lost` has the recorder's counts by topic, the counts of missing parts and of
+    parts of another run, and the count of samples too late for other scenes. `failed` advances have no forces. Of the
+    `rows` of the force curves, `curve_rows` were sent.
     """
 
     path: Path
@@ -46,7 +46,7 @@ class ViewSummary:
 
     @classmethod
     def of(cls, path: Path, drawing: Drawing, reader: RunReader) -> ViewSummary:
-        """Sum up a drawing."""
+        """Return the summary of a drawing."""
         force = drawing.force
         return cls(
             path,
@@ -84,8 +84,8 @@ def to_rrd(
     exaggerate
         Factor of the width of the clearance in the second cross-section; None: chosen by its size.
     most_rows
-        Rows of a curve, and a twentieth of them of the cross-section, beyond which a long run is thinned: a curve keeps
-        the least and the largest value of each span, so that no peak is lost.
+        Largest number of rows of a curve (of the cross-section: a twentieth of it). A longer run is thinned: a curve
+        keeps the least and the largest value of each span, so that no peak is lost.
     others
         Other scenes, by name, whose forces under the load of the run are drawn too.
     on_progress

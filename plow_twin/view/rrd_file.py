@@ -19,7 +19,7 @@ _CHUNK: Final = 1 << 20
 
 
 class RrdFile:
-    """Receives a stream through a pipe and writes it to a file, which is removed if incomplete.
+    """Receives a stream through a pipe and writes it to a file; an incomplete file is removed.
 
     The SDK's own file sink (0.41) waits forever for a disk that is full: in `save`, `flush` or `disconnect`.
 
@@ -57,7 +57,7 @@ class RrdFile:
             self._stream.disconnect()
         os.close(self._inlet)
         self._writer.join()
-        if (error is not None or self.failed) and self.path.is_file():  # no device
+        if (error is not None or self.failed) and self.path.is_file():  # not a device
             self.path.unlink()
         if error is None:
             self.check()
@@ -87,5 +87,5 @@ class RrdFile:
                     shutil.copyfileobj(outlet, self._file, _CHUNK)
             except OSError as error:
                 self._error = error
-                while outlet.read(_CHUNK):  # otherwise the stream would wait
+                while outlet.read(_CHUNK):  # without a reader the stream would wait
                     pass

@@ -30,7 +30,7 @@ _CLEARANCE_COLUMNS: Final = np.array(
 _NS: Final = 1e-9
 #: States of a clearance that the measurements determine.
 _KNOWN_STATES: Final = ("estimated", "rough")
-#: Events and held stretches beyond this number would cover the picture.
+#: Most events and held stretches that are drawn; more would cover the picture.
 _MOST_MARKS: Final = 40
 
 
@@ -47,9 +47,10 @@ class Instant(NamedTuple):
 class RunCurves:
     """Largest forces [kN], load [kN, kN m] and clearances [mm] over time, and the instant of the largest force.
 
-    Times count from `first_ns`, the first stamp of a sample or message [s]. `held_s` are the stretches without samples,
-    under the hold policy or a straight line of the load, `failed_s` the times of `failed` advances, which have no
-    forces; `changes` are the instants at which the clearance changed for another reason than wear, with the reason.
+    Times [s] count from `first_ns`, the first stamp of a sample or message. `held_s` are the stretches without samples,
+    bridged by the hold policy or by a straight line of the load. `failed_s` are the times of `failed` advances, which
+    have no forces. `changes` are the instants at which the clearance changed for a reason other than wear, with the
+    reason.
     """
 
     first_ns: int | None = None
@@ -57,7 +58,7 @@ class RunCurves:
     load: Envelope = field(default_factory=lambda: Envelope(3))
     clearance: Envelope = field(default_factory=lambda: Envelope(len(_CLEARANCE_COLUMNS)))
     instant: Instant | None = None
-    #: largest peak of all pairs, between the stamps too [kN]; 0 without peaks
+    #: largest peak of all pairs, also between the stamps [kN]; 0 without peaks
     peak: float = 0.0
     held_s: list[tuple[float, float]] = field(default_factory=list)
     failed_s: list[tuple[float, float]] = field(default_factory=list)
@@ -70,7 +71,7 @@ class RunCurves:
     _estimated: bool = False
     _held_since_ns: int | None = None
     _newest_ns: int | None = None
-    #: number of the newest estimate's entry, its result, and the newest clearances that were published
+    #: number of the newest estimate's entry, and its result
     _estimate: tuple[int, str] | None = None
     _clearance: Array | None = None
 
@@ -147,7 +148,7 @@ class RunCurves:
         self._samples(batch.entries.stamp_ns[samples[samples >= done]])
 
     def _samples(self, stamps: NDArray[np.int64]) -> None:
-        """Add the stamps of samples; the first after the beginning of a held stretch, even if late, ends it."""
+        """Add the stamps of samples; the first sample after the beginning of a held stretch, even if late, ends it."""
         if not len(stamps):
             return
         behind = stamps[stamps > (self._held_since_ns or 0)]
@@ -163,14 +164,14 @@ class RunCurves:
         self._held_since_ns = None
 
     def _bridged(self, begin_ns: int, end_ns: int) -> None:
-        """End the lines at a silence that no entry holds, of the first ones."""
+        """End the lines at a silence without a journal entry, and mark it, while there are few marks."""
         if self._held_since_ns is None and len(self.held_s) < _MOST_MARKS:
             self._held_since_ns = begin_ns
             self._end_of_held(end_ns)
             self._break_lines()
 
     def _failed(self, stamp_ns: int, since_ns: int, advances: int) -> None:
-        """Add the first failed advance of a row, or the others at its end."""
+        """Add the first failed advance of a series, or, at the series' end, the others."""
         first = self.first_ns or 0
         self.failed += advances
         if stamp_ns == since_ns:
@@ -206,7 +207,7 @@ class RunCurves:
             self.clearance.add(self._seconds(rows.stamp_ns), values)
             self._clearance = values[-1]
             if self._estimate is not None and rows.sequence[-1] > self._estimate[0]:
-                self._estimate = None  # the publications since then include it
+                self._estimate = None  # publications since then include the estimate
         if "contact_forces" in found and "head_state" in found:
             for instant in _largest(found["contact_forces"], found["head_state"]):
                 if self.instant is None or instant.force.max() > self.instant.force.max():

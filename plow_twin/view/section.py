@@ -21,7 +21,7 @@ _MM: Final = 1000.0
 ARROW_MM_PER_N: Final = 7e-4
 #: Smallest force that is drawn [N].
 FAINT_N: Final = 500.0
-#: Distance of the body's outline from the cavity [mm]; a scene has no true outline.
+#: Distance of the body's drawn outline from the cavity [mm]; a scene states no outline.
 BODY_MARGIN_MM: Final = 60.0
 
 #: Drawn depth of a pad [mm] per wear depth [mm], and its length [mm].
@@ -73,19 +73,19 @@ class Section:
 
     @property
     def half_view(self) -> Array:
-        """Half width and height that show the body and the arrows of the largest forces, shape (2,)."""
+        """Half width and half height that show the body and the arrows of the largest forces, shape (2,)."""
         return 0.5 * self.cavity + BODY_MARGIN_MM + 70.0
 
     def frame_strip(self) -> Array:
-        """Outline of the frame, or of the cavity about a block, shape (5, 2), or more points for rounded corners."""
+        """Outline of the frame, or of the cavity around a block, shape (5, 2); rounded corners have more points."""
         return (outline(self.cavity, 0.0) if self.is_block else outline(self.frame, self.radius)) * _FLIP
 
     def corners(self, pose: Iterable[float] = (0.0, 0.0, 0.0)) -> Array:
         """Corners of the frame, or of a block at a pose, in the order of `CORNER_NAMES`, shape (4, 2).
 
-        A block's corners are named by their place: beyond 45 degrees the names have turned.
+        A block's corners are named by their place, so beyond 45 degrees each corner has another name.
         """
-        # in the middle of an arc
+        # to the middle of the arc
         within = self.radius * (1.0 - math.sqrt(0.5))
         corners = ((0.5 * self.frame - within) * _SIGNS)[::2]
         if not self.is_block:
@@ -118,13 +118,14 @@ class Section:
     def pads(self, wear_depth_mm: Array) -> tuple[Array, Array, Array]:
         """Return centres, half sizes and places of labels of the bars inside the frame that show the wear of its pads.
 
-        A bar lies along the wall that its pair touches, from the corner on. Each has shape (8, 2).
+        A bar lies along the wall that its pair touches, beginning at the corner. Each array has shape (8, 2).
         """
         corners = 0.5 * self.frame * _SIGNS
         along = _SIGNS - _OUTWARDS
         depth = np.minimum(PAD_MM_PER_MM * wear_depth_mm, 0.25 * self.frame.min())[:, None]
         middles = (corners - 0.5 * depth * _OUTWARDS - (0.5 * _PAD_MM + 12.0) * along) * _FLIP
-        # inside the frame, away from the walls: two rows at a corner, the vertical wall's nearer the centre
+        # labels are inside the frame, away from the walls, in two rows at a corner; the vertical wall's row is nearer
+        # the centre
         inwards = np.stack((np.full(PAIR_COUNT, 0.5), np.where(np.abs(_OUTWARDS[:, 0]) > 0.5, 0.26, 0.64)), axis=1)
         labels = corners * inwards * _FLIP - [0.0, LABEL_MM]
         return middles, 0.5 * (depth * np.abs(_OUTWARDS) + _PAD_MM * np.abs(along)), labels
@@ -148,13 +149,13 @@ class Section:
         return self.corners(pose)[drawn // 2], vectors, drawn
 
     def corner_radii(self, force: Array) -> Array:
-        """Radius of each corner's mark [mm]: larger where the corner carries force, shape (4,)."""
+        """Radius of each corner's mark [mm], shape (4,): larger if the corner carries force."""
         total = force.reshape(PAIR_COUNT // 2, 2).sum(axis=1)
         return np.where(total >= FAINT_N, 7.0, 3.0)
 
 
 def _closed(walls: Array) -> Array:
-    """Return walls (4, 2, 2), each extended to the walls before and after it, unless these are parallel to it."""
+    """Return walls (4, 2, 2), each extended to its neighbours unless they are parallel to it."""
     along = walls[:, 1] - walls[:, 0]
     before, along_before = np.roll(walls, 1, axis=0), np.roll(along, 1, axis=0)
     across = _cross(along_before, along)

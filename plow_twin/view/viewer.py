@@ -26,7 +26,7 @@ _START_S: Final = 60.0
 
 
 def viewer_program() -> str:
-    """Return the program of rerun, not the wrapper of that name, whose child would outlive it.
+    """Return rerun's program itself: the child of the wrapper with the same name would outlive the wrapper.
 
     Raises
     ------
@@ -65,14 +65,14 @@ def start_viewer(*, web_port: int | None = None, options: Sequence[str] = ()) ->
     Raises
     ------
     RecordingError
-        It is not installed or does not answer.
+        The viewer is not installed or does not answer.
     """
     port, web_port = free_port(), None if web_port is None else page_port(web_port)
     command = [viewer_program(), "--bind", LOOPBACK, "--port", str(port), "--memory-limit", _MEMORY, *options]
     if web_port is not None:
         command += ["--serve-web", "--web-viewer-port", str(web_port), "--server-memory-limit", _MEMORY]
     bound = shutil.which("setpriv")
-    if bound is not None:  # it is killed with this process
+    if bound is not None:  # the viewer is killed with this process
         command = [bound, "--pdeathsig", "KILL", *command]
     environment = {"RUST_LOG": "warn", **os.environ}
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, env=environment)

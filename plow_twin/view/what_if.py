@@ -1,4 +1,4 @@
-"""Largest contact forces of other scenes under the load of a run, beside the run's."""
+"""Largest contact forces of other scenes under the load of a run, beside the run's own."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class WhatIf:
     Raises
     ------
     RecordingError
-        The run was under the loads of its scene: its journal has no load.
+        The run was under the loads of its scene, so its journal has no load.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class WhatIf:
 
     @property
     def lost(self) -> dict[str, int]:
-        """Number of samples that came after the scenes had passed their stamps, by its name in `lost`."""
+        """Number of samples that came after the scenes had passed their stamps, under its key in `lost`."""
         return {"samples_too_late": self._walk.late} if self._walk.late else {}
 
     def add(self, entries: Entries, stamps: Indexes, steps: Indexes) -> None:

@@ -14,9 +14,9 @@ from plow_twin.errors import InputError, Problem
 from plow_twin.live.bridge.source import BridgeError
 from plow_twin.scene_file.yaml_text import read_yaml
 
-#: Keys of a file of credentials that name files.
 #: Longest password in an MQTT packet [B].
 _LONGEST_PASSWORD: Final = 65_535
+#: Keys of a file of credentials that name files.
 _FILES: Final = ("ca", "certificate", "key", "user_certificate", "user_key", "password_file")
 
 
@@ -24,10 +24,10 @@ _FILES: Final = ("ca", "certificate", "key", "user_certificate", "user_key", "pa
 class Access:
     """Address and credentials.
 
-    `url` is `SCHEME://HOST:PORT`; without a host it is this machine. `user` and `password` may be empty. `ca` is the
-    authority, or the certificate itself, that the other side's certificate is checked against; `certificate` and `key`
-    identify this side, `user_certificate` and `user_key` its user in the place of name and password. `plain` allows a
-    connection to another machine without encryption. `client_id` names the session at a broker.
+    `url` is `SCHEME://HOST:PORT`; a missing host means this machine. `user` and `password` may be empty. `ca` names the
+    trusted authority, or the other side's certificate itself; `certificate` and `key` identify this side;
+    `user_certificate` and `user_key` identify its user instead of name and password. `plain` allows a connection to
+    another machine without encryption. `client_id` names the session at a broker.
     """
 
     url: str
@@ -77,7 +77,7 @@ def password(path: Path | None, source: str) -> str:
     Raises
     ------
     BridgeError
-        The line is longer than a broker takes, or no text.
+        The line is longer than a broker accepts, or is not text.
     OSError
         The file cannot be read.
     """

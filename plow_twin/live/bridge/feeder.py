@@ -22,11 +22,11 @@ from plow_twin.record.sources import Arrived
 from plow_twin.stream.driver import Arrival
 from plow_twin.stream.intake import Intake, Verdict
 
-#: A larger fall or rise of the numbers is believed if the next number continues it: the sender has restarted.
+#: A larger jump of the numbers means that the sender has restarted, if the next number continues it.
 _RESTART = 1000
 #: Largest number of samples lost between two messages: a day at 10 kHz.
 _MOST_LOST = 10**9
-#: A 0 or 1 after at least this many messages is a restart, after fewer a late message.
+#: Number 0 or 1 after at least this many messages means a restart; after fewer it is a late message.
 _FIRST = 10
 #: Smallest relative change of a deviation of the load that is journalled.
 _NOTABLE = 0.02
@@ -42,7 +42,7 @@ class Feeder:
     runtime
         The live twin.
     send
-        Sends a message that follows.
+        Sends each resulting message.
     model
         Model of the load from the drive's signals; None: the load is measured.
     """
@@ -60,23 +60,23 @@ class Feeder:
         self._by_topic: dict[str, list[tuple[str, Role]]] = {}
         for name, role in roles.items():
             self._by_topic.setdefault(role.topic, []).append((name, role))
-        #: time of a source with its own time [ns]: the newest stamp, unless it lies alone far ahead
+        #: time of a source with its own time [ns]: the newest stamp, except a single stamp far ahead
         self.newest_ns = 0
         self._far_ahead_ns: int | None = None
         #: why the first unreadable load was refused; empty: all were read
         self.unfit = ""
         self._number = 0
-        #: messages without a number since the last one with a number, each taken for the next number; and how many of
-        #: all such messages turned out to have none
+        #: unnumbered messages since the last number, each assumed to have the next number; and how many of all these
+        #: assumptions were wrong
         self._assumed = self._unnumbered = 0
-        #: number of the newest message, where it does not continue those before
+        #: number of the newest message if it does not continue the earlier numbers
         self._odd: int | None = None
         #: whether the sender numbers its messages
         self._counts = False
         self._sender = 0
         self._source = next((role.topic for name, role in roles.items() if name in ("excitation", "drive")), "")
         inputs = runtime.inputs
-        #: whether samples need not be published one after the other: a source with its own time is read
+        #: whether samples can be published together, because the source has its own time
         self._at_once = runtime.reads_at_once
         self._optional: dict[str, Intake] = {
             "travel": inputs.travel,
@@ -87,7 +87,7 @@ class Feeder:
         inputs.senders.alive([self._name])
 
     def begin(self, messages: Iterable[Arrived]) -> None:
-        """Begin the time of a source that has its own time, at the first message whose successor continues its time."""
+        """Set the time of a source that has its own time, at the first message whose successor continues its time."""
         read = (role.read(arrived) for arrived in messages for _, role in self._by_topic.get(arrived.topic, ()))
         stamps = (found[0] for found in read if found is not None)
         back_ns = round(self._runtime.settings.jump_back * 1e9)
@@ -124,7 +124,7 @@ class Feeder:
             self._send(topic, message)
 
     def _feed_table(self, table: Table) -> bool:
-        """Process lines as a table; without effect and False where the load cannot be read in this way."""
+        """Process lines as a table; return False, without effect, if the load cannot be read in this way."""
         roles, inputs = self._by_topic.get(table.topic, []), self._runtime.inputs
         role = next((role for name, role in roles if name == "excitation"), None)
         if role is None or role.sequence or not (self._at_once and inputs.active):
@@ -147,7 +147,7 @@ class Feeder:
         return True
 
     def _follow_times(self, stamps: NDArray[np.int64]) -> None:
-        """Advance to the times of samples, as `_follow_time` of each."""
+        """Advance to the times of samples, as `_follow_time` does for each."""
         newest = np.maximum.accumulate(np.append(self.newest_ns, stamps))
         jump_ns = round(self._runtime.settings.jump_forward * 1e9)
         if self.newest_ns and self._far_ahead_ns is None and (stamps <= newest[:-1] + jump_ns).all():
@@ -199,17 +199,17 @@ class Feeder:
         wrench, deviation = load
         absurd = intake.limits is not None and intake.limits.exceeded(wrench)
         if absurd or not all(map(math.isfinite, (*wrench, *deviation))):
-            return [(stamp_ns, wrench)]  # it will not be used, nor its deviation
+            return [(stamp_ns, wrench)]  # neither the sample nor its deviation will be used
         if any(abs(new - old) > _NOTABLE * max(new, old) for new, old in zip(deviation, self._deviation, strict=True)):
             self._deviation = deviation
             self._runtime.driver.spread(stamp_ns, deviation)
         return [(stamp_ns, wrench)]
 
     def _numbered(self, role: Role, arrived: Arrived) -> tuple[bytes, int, bool]:
-        """Return sender, message number (counted here where the message has no number), and whether it came before."""
+        """Return sender, message number (counted here if the message has none), and whether the message came before."""
         number = role.number(arrived) if role.sequence else None
         if number is None:
-            # unreadable or not numbered: the next number, until a message comes with that number
+            # unreadable or not numbered: assume the next number, until a message has that number
             self._assumed += 1
             self._number += 1
             return self._name, self._number + self._unnumbered, False
@@ -220,19 +220,19 @@ class Feeder:
             return self._name, number + self._unnumbered, False
         if not self._counts:
             self._counts = True
-            if self._number:  # the messages before had no numbers
+            if self._number:  # earlier messages had no numbers
                 self._begin_anew()
         elif number == self._odd:
             return self._name, number, True
         elif self._goes_on(number):
             self._odd = None
-        else:  # taken for the next number until the next message decides
+        else:  # assume the next number until the next message decides
             self._odd, number = number, self._number + 1
         again, self._number = number == self._number, number
         return self._name, number + self._unnumbered, again
 
     def _goes_on(self, number: int) -> bool:
-        """Return whether a number continues the numbers before, or the single odd number just before it."""
+        """Return whether a number continues the earlier numbers, or the single odd number before it."""
         odd, before = self._odd, self._number
         if odd is not None and abs(number - odd) < abs(number - before):
             if not before < odd <= before + _MOST_LOST:
@@ -256,7 +256,7 @@ class Feeder:
         inputs.arriving = (name, arrived.topic.encode())
         if found is None:
             intake.refuse(Verdict.MALFORMED)
-        elif arrived.retained and name != "travel":  # a speed holds until the next one
+        elif arrived.retained and name != "travel":  # a speed applies until the next speed
             intake.refuse(Verdict.INACTIVE, found[0], tuple(found[1].values()))
         elif not role.plausible(found[1]):
             intake.refuse(Verdict.IMPLAUSIBLE, found[0], tuple(found[1].values()))

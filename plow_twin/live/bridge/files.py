@@ -36,7 +36,7 @@ STDIN_TOPIC: Final = "stdin"
 
 @dataclass
 class _Tail:
-    """One file, read as far as it goes; a file that was cut or replaced is read from its beginning again."""
+    """One file, read to its present end; a file that was cut or replaced is read again from its beginning."""
 
     path: Path
     #: by default the name of the file without its ending
@@ -53,7 +53,7 @@ class _Tail:
         self.topic = self.topic or self.path.stem
 
     def columns(self, *, grows: bool) -> list[str] | None:
-        """Return the columns by the first line, which must be whole if the file `grows`; None without file or line."""
+        """Return the columns in the first line, which must be complete if the file `grows`; None without a line."""
         rows = Rows()
         try:
             with _readable(self.path), _open(self.path) as stream:
@@ -135,7 +135,7 @@ def _open(path: Path) -> Any:
 
 @contextmanager
 def _readable(path: Path) -> Iterator[None]:
-    """Turn the errors of files that are not a table into those of a source."""
+    """Turn errors of files that are not tables into `BridgeError`."""
     try:
         yield
     except csv.Error as error:
@@ -145,8 +145,8 @@ def _readable(path: Path) -> Iterator[None]:
 class _Dated:
     """The files of a pattern, as one topic under the pattern's name.
 
-    When followed, the topic begins with the newest file and continues with each new file. Beside a new file, the file
-    before it is still read.
+    When followed, the topic begins with the newest file and continues with each new file. The previous file is still
+    read beside the new file.
     """
 
     def __init__(self, pattern: Path) -> None:
@@ -250,7 +250,7 @@ class Files(SourceState):
         self._size = self._done = 0
 
     def topics(self) -> dict[str, TopicType]:
-        """Return columns by topic, by the first line of each file; a followed one is waited for."""
+        """Return the columns of each topic from the first line of its file; wait for the line of a followed file."""
         found: dict[str, TopicType] = {}
         for tail in self._tails:
             columns = tail.columns(grows=not self.ends)
@@ -338,7 +338,7 @@ def is_pattern(path: Path) -> bool:
 
 
 def _sent_ns(row: Arrived, stamp_ns: StampOf[Arrived] | None) -> int | None:
-    """Return the stamp in a row; the time of reading is not its time."""
+    """Return the stamp in a row, or None: the time of reading is no substitute."""
     return None if stamp_ns is None else stamp_ns(Arrived(row.topic, NO_TIME, row.content))
 
 
@@ -348,7 +348,7 @@ class StandardInput(SourceState):
     Raises
     ------
     BridgeError
-        It is closed.
+        Standard input is closed.
     """
 
     def __init__(self, descriptor: int = 0) -> None:

@@ -20,7 +20,7 @@ from plow_twin.live.bridge.source import LONGEST, BridgeError, SourceState, read
 from plow_twin.record.merging import StampOf
 from plow_twin.record.sources import Arrived
 
-#: Most messages, and bytes of them, that wait to be read; further ones are counted as lost.
+#: Largest number of messages that wait to be read, and of their bytes; messages beyond it are counted as lost.
 _QUEUE: Final = 100_000
 _QUEUED_BYTES: Final = 2**26
 _PORTS: Final = {"mqtt": 1883, "mqtts": 8883}
@@ -51,7 +51,7 @@ class Mqtt(SourceState):
         #: whether messages marked as retained are older than the subscription
         self._from_before = True
         self._queue: deque[tuple[str, bytes, int, bool]] = deque()
-        #: bytes of payloads that entered and that left the queue, each changed by one thread only
+        #: bytes of payloads that entered and left the queue; only one thread changes each count
         self._came = self._left = 0
         self._arrived = threading.Event()
         self._answer = threading.Event()
@@ -102,7 +102,7 @@ class Mqtt(SourceState):
             try:
                 use_tls(client, access.ca, access.certificate, access.key)
             except (OSError, ValueError) as error:
-                raise BridgeError(f"{access.url}: the files of TLS cannot be used: {error}") from error
+                raise BridgeError(f"{access.url}: the TLS files cannot be used: {error}") from error
         client.on_connect, client.on_disconnect = self._on_connect, self._on_disconnect
         client.on_subscribe, client.on_message = self._on_subscribe, self._on_message
         return client
@@ -112,7 +112,7 @@ class Mqtt(SourceState):
             self.trouble = f"refused: {refused}"
             self._answer.set()
             return
-        # in a resumed session, brokers may also mark messages that they kept for it as retained
+        # in a resumed session, brokers may also mark messages as retained that they kept for the session
         resumed = is_resumed(flags)
         self._from_before = not resumed
         if self._subscribed and resumed:
@@ -129,7 +129,7 @@ class Mqtt(SourceState):
 
     def _on_disconnect(self, client: Any, data: Any, *facts: Any) -> None:
         self.connected = False
-        self.trouble = self.trouble or f"the connection broke: {end_of(*facts)}; it is tried again"
+        self.trouble = self.trouble or f"the connection broke: {end_of(*facts)}; reconnecting"
 
     def _on_message(self, client: Any, data: Any, message: Any) -> None:
         # a line that is too long is dropped: it counts as unreadable

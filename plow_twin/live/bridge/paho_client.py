@@ -13,7 +13,7 @@ _REFUSED: Final = 0x80
 
 
 def make_client(client_id: str, *, clean: bool) -> Any:
-    """Return a client of MQTT 3.1.1 that connects again at growing intervals; `clean`: without a session that lasts."""
+    """Return a client of MQTT 3.1.1 that connects again at growing intervals; `clean`: without a lasting session."""
     from paho.mqtt import client as paho
 
     interface = getattr(paho, "CallbackAPIVersion", None)  # from 2.0 on

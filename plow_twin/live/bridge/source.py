@@ -75,7 +75,7 @@ class SourceState:
 
 @runtime_checkable
 class Reporting(Protocol):
-    """A source with figures of its own."""
+    """A source with its own part of the diagnostics."""
 
     def part(self) -> Part:
         """Return level, message and values for the part `source` of the diagnostics."""
@@ -143,7 +143,7 @@ class Rows:
         return columns_of(source, self.columns or ())
 
     def of_another_file(self) -> Rows:
-        """Return the parser of the file that replaces this one: by its own header, or by this header if it has none."""
+        """Return a parser for the file that replaces this one; without a header that file has the present header."""
         rows = Rows()
         rows._before = self.columns
         return rows
@@ -152,7 +152,7 @@ class Rows:
         """Return the content of a line: None if it is unreadable, False for a header or an empty line."""
         if line is None:
             return None
-        line = line.strip(b"\r \xef\xbb\xbf")  # not tabs: empty cells may stand between them
+        line = line.strip(b"\r \xef\xbb\xbf")  # keep tabs: they may separate empty cells
         if not line.strip() or line.startswith(b"#"):
             return False
         if self.columns is None and (self._json or line.startswith(b"{")):

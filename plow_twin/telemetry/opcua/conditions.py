@@ -56,7 +56,7 @@ class Conditions:
         self._values: Mapping[str, Value] = {}
 
     async def build(self, names: Mapping[str, list[float]]) -> None:
-        """Make a condition of each alarm that has thresholds, warning and error, by its name."""
+        """Make a condition for each alarm that has thresholds (warning and error), by its name."""
         alarms = self._server.get_node(self._model.nodes["alarms/message"])
         folder = await alarms.get_parent()
         assert folder is not None

@@ -1,4 +1,4 @@
-"""The information model: the type of a plough head's twin, a kind of mining equipment, and its instance."""
+"""The information model: the type of a plough head's twin (a kind of mining equipment) and its instance."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from plow_twin.telemetry.values import UNITS, Group
 #: Namespace of the types and the instance.
 NAMESPACE: Final = "https://plow-twin.readthedocs.io/opcua"
 _NODESETS: Final = Path(__file__).with_name("nodesets")
-#: Listed so that each builds on those before it.
+#: Listed so that each builds only on earlier files.
 _FILES: Final = ("Opc.Ua.Di", "Opc.Ua.Machinery", "Opc.Ua.Mining.General")
 _DI, _MINING = "http://opcfoundation.org/UA/DI/", "http://opcfoundation.org/UA/Mining/General/"
 _FUNCTIONAL_GROUP, _DEVICE_SET, _EQUIPMENT, _IDENTIFICATION = 1005, 5001, 1002, 1003
@@ -45,7 +45,7 @@ class Model:
         self.device: Node
 
     async def build(self, groups: Mapping[str, Group], facts: Mapping[str, Any]) -> None:
-        """Make the types and the instance for groups with all of their names."""
+        """Make the types and the instance for groups that have all of their names."""
         for name in _FILES:
             await self._server.import_xml(str(_NODESETS / f"{name}.NodeSet2.xml"))
         self._index = await self._server.register_namespace(NAMESPACE)
@@ -98,7 +98,7 @@ class Model:
             if name in UNITS and "/" not in key:
                 await instantiate(folder, interval, node_id, browse_name, instantiate_optional=False)
                 node = self._server.get_node(node_id)
-                for point in _POINTS:  # without this only the type would have the points
+                for point in _POINTS:  # otherwise only the type would have the points
                     await self._server.get_node(self.node_id(f"{begin}.{key}.{point}")).set_modelling_rule(True)
                 await self._set_unit(node, UNITS[name])
             elif name in UNITS:

@@ -37,7 +37,7 @@ _GOOD: Final = ua.StatusCode()
 
 
 class OneUser(UserManager):
-    """Admits one user, or, without a user, everybody that may connect."""
+    """Admits one user or, without a user, every client that may connect."""
 
     def __init__(self, user: str, password: str) -> None:
         self._user, self._password = user, password
@@ -45,7 +45,7 @@ class OneUser(UserManager):
     def get_user(
         self, iserver: Any, username: str | None = None, password: str | None = None, certificate: Any = None
     ) -> User | None:
-        """Return the user with the right to read, or None."""
+        """Return the user, with permission to read, or None."""
         given = zip((self._user, self._password), (username or "", password or ""), strict=True)
         right = all([hmac.compare_digest(own.encode(), found.encode("utf-8", "replace")) for own, found in given])
         return User(UserRole.User, username) if right or not self._user else None
@@ -61,7 +61,7 @@ class OpcUaServer:
     certificate, key
         Files that identify the server; with them all connections are signed and encrypted.
     trusted
-        Folder of the certificates of clients, or of their authorities, that are admitted; None: all.
+        Folder with certificates of the admitted clients or of their authorities; None: all clients.
     user, password
         The only user; empty: clients need no name.
     acknowledges
@@ -120,7 +120,7 @@ class OpcUaServer:
         self.state.sent += 1
 
     async def turn(self) -> None:
-        """Note whether a client is there."""
+        """Note whether a client is connected."""
         listening = self._server.bserver
         self.state.connected = bool(listening is not None and listening.clients)
 

@@ -27,7 +27,7 @@ from plow_twin.record.mapping import Role
 from plow_twin.record.merging import StampOf
 from plow_twin.record.sources import Arrived, TopicType
 
-#: Most samples that wait to be read; further ones are counted as lost, except samples of the history.
+#: Most samples that wait to be read; samples beyond these are counted as lost, except samples of the history.
 _QUEUE: Final = 100_000
 _PORTS: Final = {"opc.tcp": 4840}
 #: Wait for the values of a stamp [s], which come in one message or two successive ones; includes an allowance for a
@@ -37,7 +37,7 @@ _WAIT_S: Final = 5e-3 * PUBLISHING_MS
 _PIECE_NS: Final = 10_000_000_000
 #: Longest delay of one node's values after the values of another [ns].
 _OVERLAP_NS: Final = 1_000_000_000
-#: A stamp beyond the system's time by more [ns] begins and ends no break.
+#: A stamp that is further ahead of the system's time than this [ns] neither begins nor ends a break.
 _AHEAD_NS: Final = 86_400_000_000_000
 #: Longest delay of a sent value in the server's history [s].
 _HISTORY_LAG_S: Final = 5.0
@@ -62,7 +62,7 @@ class OpcUa(SourceState):
     connect_s
         Longest wait for the first connection [s].
     waits
-        Whether `start` returns before the first connection, which is tried again like later ones.
+        Whether `start` returns before the first connection, which is then retried like later connections.
     on_arrival
         Called, from another thread, when samples have arrived.
 
@@ -116,7 +116,7 @@ class OpcUa(SourceState):
         self._held_back: list[tuple[list[tuple[int, Any]], bool]] | None = None
         #: steady time at which the connection broke [s]; None while it is connected
         self._broken_s: float | None = None
-        #: why the history of this connection cannot be read; empty if it may be
+        #: why the history of this connection cannot be read; empty if it can
         self._no_history = ""
         logging.getLogger("asyncua").addHandler(logging.NullHandler())
 
@@ -181,7 +181,7 @@ class OpcUa(SourceState):
             link = Link(self._access, self.host, self._ids, self._uris, self._sampling_ms, self._take, self._counts)
             try:
                 await self._follow(link)
-            except Exception as error:  # a malformed answer ends in any error of the library
+            except Exception as error:  # a malformed answer can raise any error of the library
                 self.trouble = self._words(error)
             finally:
                 wait_s = _FIRST_WAIT_S if self.connected else wait_s
@@ -211,7 +211,7 @@ class OpcUa(SourceState):
             await asyncio.sleep(_WAIT_S)
             self._pass_on(time.monotonic())
         if link.trouble:
-            self.trouble = f"the connection broke: {link.trouble}; it is tried again"
+            self.trouble = f"the connection broke: {link.trouble}; reconnecting"
 
     async def _first_values(self) -> list[tuple[int, Any]]:
         """Return the first values of the new subscription: the history is read up to them."""
@@ -260,7 +260,7 @@ class OpcUa(SourceState):
         return found is not None and found[0] <= end_ns
 
     def _is_known(self, number: int, value: Any) -> bool:
-        """Return whether the history had a value; a value from long before is new: the server's clock was set back."""
+        """Return whether the history had a value; a much older value is new: the server's clock was set back."""
         found = reading(value, self._by_server(number), Counts())
         return found is not None and 0 <= self._newest_ns(number) - found[0] < _PIECE_NS
 
@@ -277,13 +277,13 @@ class OpcUa(SourceState):
                 samples, node = self._samples[topic], self._nodes[number]
                 if found[0] > time.time_ns() + _AHEAD_NS:
                     samples.add_stray(node, *found, now_s)
-                elif samples.newest_ns[node] or topic == "travel":  # a speed holds until the next one
+                elif samples.newest_ns[node] or topic == "travel":  # a speed applies until the next speed
                     samples.add(node, *found, now_s)
                 else:
                     samples.begin(node, *found)
 
     async def _fill(self, up_to: list[tuple[int, Any]]) -> bool:
-        """Fill the gap between the newest values and these from the history; return whether it is complete."""
+        """Fill the gap before these values from the history; return whether the gap is complete."""
         ends_ns: dict[int, int] = {}
         for number, value in up_to:
             found = reading(value, self._by_server(number), Counts())
@@ -341,7 +341,7 @@ class OpcUa(SourceState):
         return len(new)
 
     def _pass_on(self, now_s: float) -> None:
-        """Return the complete samples."""
+        """Queue the complete samples."""
         log_ns = time.time_ns()
         for topic, samples in self._samples.items():
             for stamp_ns, values in samples.take(now_s):
@@ -377,7 +377,7 @@ def _check_encryption(access: Access, host: str) -> None:
     if bool(access.user_certificate) != bool(access.user_key):
         raise BridgeError("user: expected --user-cert and --user-key together")
     if access.user_certificate and (access.user or not all(given)):
-        raise BridgeError("user: --user-cert stands for --user, and needs --tls-cert, --tls-key and --tls-ca")
+        raise BridgeError("user: --user-cert replaces --user, and needs --tls-cert, --tls-key and --tls-ca")
     if not any(given) and not access.plain and not is_loopback(host):
         raise BridgeError(
             f"{access.url}: got another machine without certificates, expected --tls-cert or this machine"

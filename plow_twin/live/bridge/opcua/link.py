@@ -25,9 +25,9 @@ PUBLISHING_MS: Final = 10.0
 _QUEUE: Final = 10_000
 #: Interval [s] at which a server without news reports; after three silent intervals it counts as gone.
 _KEEPALIVE_S: Final = 2.0
-#: The server keeps a subscription for so long without its client [s].
+#: Time for which the server keeps a subscription without its client [s].
 _LIFETIME_S: Final = 60.0
-#: Messages that are asked for again at once.
+#: Most lost messages that are requested again at once.
 _MOST_AGAIN: Final = 100
 #: Longest wait for an answer [s].
 _ANSWER_S: Final = 10.0
@@ -72,7 +72,7 @@ class Link:
     nodes
         Identifiers of the nodes.
     uris
-        Namespaces of the server when the numbers in these identifiers held; empty: they hold now.
+        Namespaces of the server to which the numbers in these identifiers refer; empty: the present namespaces.
     sampling_ms
         Requested sampling interval [ms]; 0: the server's fastest.
     take
@@ -95,7 +95,7 @@ class Link:
         #: namespaces of the server, by number
         self.uris = list(uris)
         self._sampling_ms, self._take, self._counts = sampling_ms, take, counts
-        # a server that answers late is not gone
+        # a late answer does not mean that the server has gone
         self._client = Client(access.url, timeout=_ANSWER_S, watchdog_intervall=3.0 * _KEEPALIVE_S)
         _bound(self._client)
         if access.user:
@@ -140,7 +140,7 @@ class Link:
         if uri is None:
             uri = uris[node.NamespaceIndex] if node.NamespaceIndex < len(uris) else None
         if uri is None:
-            return node  # the server says that it does not know it
+            return node  # the server then reports an unknown node
         if uri not in self.uris:
             raise BridgeError(f"node: got namespace {uri}, expected one of the server: {', '.join(self.uris)}")
         return ua.NodeId(node.Identifier, ua.Int16(self.uris.index(uri)), node.NodeIdType)
@@ -184,7 +184,7 @@ class Link:
                 if result.ContinuationPoint:
                     newest = values[-1].SourceTimestamp or values[-1].ServerTimestamp if values else None
                     if newest is None or newest <= reached[number] or len(found) > _MOST_HISTORY:
-                        raise UaError("history: got an answer that leads to no end")
+                        raise UaError("history: got an endless answer")
                     reached[number] = newest
                     more.append(
                         (number, ua.HistoryReadValueId(read.NodeId, ContinuationPoint=result.ContinuationPoint))
@@ -205,7 +205,7 @@ class Link:
         granted = await self._client.uaclient.create_subscription(asked, self._on_publish)
         self._subscription = granted.SubscriptionId
         self._keepalive_s = granted.RevisedPublishingInterval * granted.RevisedMaxKeepAliveCount * 1e-3
-        # each stamp is a value, for samples are made of values with one stamp
+        # report an unchanged value with a new stamp too: a sample is made of values with the same stamp
         by_stamp = ua.DataChangeFilter(Trigger=ua.DataChangeTrigger.StatusValueTimestamp)
         results = await self._monitor(range(len(self._nodes)), by_stamp)
         refused = [
@@ -287,7 +287,7 @@ class Link:
 
 
 def _bound(client: Client) -> None:
-    """Have a client disconnect from a server that sends messages without end: asyncua keeps any size."""
+    """Make a client disconnect from a server that sends oversized messages: asyncua accepts any size."""
     connection = client.uaclient
     make = connection._make_protocol
 

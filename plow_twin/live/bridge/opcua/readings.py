@@ -14,7 +14,7 @@ _FARTHEST_NS: Final = 4_000_000_000_000_000_000
 _MICROSECOND: Final = timedelta(microseconds=1)
 _SEVERITY: Final = 0xC0000000
 _UNCERTAIN: Final = 0x40000000
-#: Bits of a status: values before this one were dropped from the server's queue.
+#: Bits of a status: the server's queue dropped values before this one.
 _OVERFLOW: Final = 0x00000480
 
 
@@ -71,7 +71,7 @@ def reading(data: Any, by_server: bool, counts: Counts) -> tuple[int, Value] | N
 
 
 def _stamp_ns(time: datetime | None, picoseconds: int | None) -> int | None:
-    """Return a time [ns], which OPC UA resolves to 100 ns, and from there on in units of 10 ps."""
+    """Return a time [ns]: OPC UA gives it in units of 100 ns, and the remainder in units of 10 ps."""
     if time is None:
         return None
     time = time if time.tzinfo else time.replace(tzinfo=UTC)

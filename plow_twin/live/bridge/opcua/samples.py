@@ -16,8 +16,8 @@ _MOST_WAITING: Final = 10_000
 class Samples:
     """Samples of one role: the values of its nodes at one stamp.
 
-    A server does not resend an unchanged value: a node without a value at a stamp keeps the value before.
-    A stamp is complete when each node has a value there or at a later stamp; otherwise it waits for `wait_s`.
+    A server does not resend an unchanged value: a node without a value at a stamp keeps its last value. A stamp is
+    complete when each node has a value there or at a later stamp; otherwise it waits for `wait_s`.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ class Samples:
         #: nodes of which only the value before the first sample has come
         self._begun: set[str] = set()
         self._released_ns = 0
-        #: samples of stamps that no value can have
+        #: samples with impossible stamps
         self._strays: dict[int, tuple[float, dict[str, Value]]] = {}
         #: late stamps that were dropped because the other values of that time had been used
         self._incomplete = 0
@@ -56,7 +56,7 @@ class Samples:
         self._waiting[stamp_ns][1].setdefault(node, value)
 
     def add_stray(self, node: str, stamp_ns: int, value: Value, now_s: float) -> None:
-        """Add a value whose stamp no value can have: its sample is passed on and changes nothing else."""
+        """Add a value with an impossible stamp: its sample is passed on and changes nothing else."""
         self._strays.setdefault(stamp_ns, (now_s, {}))[1].setdefault(node, value)
 
     def begin(self, node: str, stamp_ns: int, value: Value) -> None:
@@ -74,12 +74,12 @@ class Samples:
             values = self._waiting.pop(stamp_ns)[1] if late else self._with_held(stamp_ns)
             if len(values) == len(self.newest_ns):
                 found.append((stamp_ns, values))
-            else:  # without all values at the start is not a loss
+            else:  # a sample that lacks values at the start is not a loss
                 self._incomplete += late
         return found + self._take_strays(now_s)
 
     def _take_strays(self, now_s: float) -> list[tuple[int, dict[str, Value]]]:
-        """Return the samples of such stamps that no longer wait at `now_s`."""
+        """Return the samples with impossible stamps that no longer wait at `now_s`."""
         due = sorted(
             stamp_ns
             for stamp_ns, (arrived_s, values) in self._strays.items()

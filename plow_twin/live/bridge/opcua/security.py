@@ -85,7 +85,7 @@ def _read(path: Path) -> x509.Certificate:
 
 
 def _check_trust(server: x509.Certificate, trusted: x509.Certificate, host: str, access: Access) -> None:
-    """Raise a `BridgeError` unless the certificate is the trusted one, or of that authority and for this host."""
+    """Raise a `BridgeError` unless the trusted certificate is the server's, or issued the server's for this host."""
     now = datetime.now(UTC)
     if not server.not_valid_before_utc <= now <= server.not_valid_after_utc:
         raise BridgeError(
@@ -119,7 +119,7 @@ def _hosts(certificate: x509.Certificate) -> list[str]:
 
 
 def _application_uri(certificate: x509.Certificate, otherwise: str) -> str:
-    """Return the name of this application in its certificate: servers compare the two."""
+    """Return the application's name in the certificate, which servers compare with the name that it states."""
     names = _names(certificate)
     uris = names.get_values_for_type(x509.UniformResourceIdentifier) if names else []
     return uris[0] if uris else otherwise
