@@ -1,6 +1,6 @@
 """Memory that an analysis takes for a run of some hours: `python benchmark/analysis_memory.py [HOURS]`.
 
-Rows at 1 kHz are computed once and taken in again and again, as a `--watch` that goes on would.
+Rows at 1 kHz are computed once and fed in repeatedly, as in a long `--watch`.
 """
 
 from __future__ import annotations

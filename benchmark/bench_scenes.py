@@ -1,4 +1,4 @@
-"""The two bench scenes with their reference trajectories, and their constants for solvers that know no `Scene`."""
+"""The two bench scenes with their reference trajectories, and their constants for solvers that take no `Scene`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from plow_twin.model.geometry import half_diagonal
 from plow_twin.scene_file import load_scene
 
 ROOT = Path(__file__).resolve().parent.parent
-#: The reference on a 1 ms grid is not shipped; where it lies beside the project it is used.
+#: The reference on a 1 ms grid is not included; it is used if it lies beside the project.
 FINE_REFERENCE = ROOT.parent / "shared" / "reference"
 NAMES = ("kv", "hc")
 T_END = 20.0
@@ -40,7 +40,7 @@ def reference_poses(name: str) -> tuple[Array, float]:
 
 
 def on_grid(name: str, output_dt: float) -> tuple[Array, int]:
-    """Return reference poses on a grid that the output contains, and the stride of the output's rows to it."""
+    """Return reference poses on a grid that the output contains, and the number of output rows per grid row."""
     q, dt = reference_poses(name)
     if dt <= output_dt:
         return q[:: round(output_dt / dt)], 1
@@ -55,7 +55,7 @@ def constants(scene: Scene) -> Array:
     Raises
     ------
     ValueError
-        For a scene with anything but one harmonic load in phase with sin.
+        The loads are not exactly one harmonic in phase with sin.
     """
     if len(scene.loads) != 1 or not isinstance(scene.loads[0], Harmonic) or scene.loads[0].phase_rad != 0.0:
         raise ValueError(f"loads: got {scene.loads!r}, expected one Harmonic without phase")

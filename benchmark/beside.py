@@ -19,7 +19,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "benchmark" / "results" / "beside.md"
-#: Only features of both commits: runs as in README.
+#: Uses only features of both commits: runs as in README.
 _WORK = """
 import json, sys, time
 import numpy as np
@@ -58,7 +58,7 @@ print(json.dumps(found))
 
 
 def measure(tree: Path, cache: str) -> dict[str, float]:
-    """Return the times in s of each case, by a process of its own."""
+    """Return the time of each case in s, measured in a separate process."""
     environment = os.environ | {"PYTHONPATH": str(tree), "NUMBA_CACHE_DIR": cache}
     done = subprocess.run(
         [sys.executable, "-c", _WORK, str(tree)], cwd=tree, env=environment, capture_output=True, text=True, check=True

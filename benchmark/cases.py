@@ -67,7 +67,7 @@ class Case:
 
 #: A case stops being repeated once its runs have taken this long together.
 TIME_PER_CASE_S = 1.0
-#: Below it the first run is a warm-up that does not count; above it neither start nor cache matters.
+#: A first run shorter than this is a warm-up and does not count; in a longer run start and cache do not matter.
 WARM_UP_BELOW_S = 0.05
 #: Runs as short as this are repeated whether or not anything depends on them.
 SHORT_S = 0.02
@@ -77,10 +77,10 @@ Choose = Callable[[Sequence[Row]], set[int]]
 def measure(
     cases: Sequence[Case], repeats: int, advance: Callable[[str], None], choose: Choose | None = None
 ) -> list[Row]:
-    """Run every case once, then those that matter `repeats` times in turn.
+    """Run every case once, then the chosen cases in turn, up to `repeats` runs each.
 
-    Taking turns lets a change of the machine's speed meet all of them alike. `choose` returns the indices of the cases
-    on which a figure depends; without it all matter.
+    Taking turns spreads a change of the machine's speed evenly over the cases. `choose` returns the indices of the
+    cases on which a figure depends; without it all cases are chosen.
     """
     rows = [case.row for case in cases]
     ready: dict[int, Callable[[], Sample]] = {}

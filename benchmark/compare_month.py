@@ -1,9 +1,9 @@
 """Time and memory of `compare` over a month: `python benchmark/compare_month.py FOLDER`.
 
-With `--hours 0.5 --rate 100 --verb analyse` those of `analyse` over many short runs.
+With `--hours 0.5 --rate 100 --verb analyse`, those of `analyse` over many short runs.
 
-Ten minutes are computed once; each day's run repeats them with its own stamps. The number of windows, which the memory
-grows with, is that of a month at any rate.
+Ten minutes are computed once; each day's run repeats them with its own stamps. The number of windows, on which the
+memory depends, is that of a month at any rate.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _DAY_S, _SPAN_S = 86_400, 600
 
 
 def write_days(folder: Path, days: int, hours: float, rate_hz: float) -> None:
-    """Write a run for each day that is not there yet."""
+    """Write a run for each missing day."""
     scene = load_scene("paper")
     count = round(_SPAN_S * rate_hz)
     stamps = np.round(1e9 / rate_hz * np.arange(count)).astype(np.int64)

@@ -35,7 +35,7 @@ def version() -> str:
 
 
 def prepare(p: Array, law: str, method: str, roots: bool, rtol: float, output_dt: float) -> Callable[[], Sample]:
-    """Prepare one setting; each call starts the process, which times its run without its start."""
+    """Prepare one setting; each call starts the process, which times its run but not its start."""
     executable = program()
     numbers = " ".join(repr(float(number)) for number in p)
 

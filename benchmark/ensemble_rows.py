@@ -21,7 +21,7 @@ SECTION = "ensemble"
 BATCH = f"{HEYOKA}, batch"
 COLUMNS, ROWS = 40, 25
 PAIRS = f"kv, {COLUMNS * ROWS} clearance pairs"
-#: From loose to tight; the first at which every pair is within `LISTED` is timed with care.
+#: From loose to tight; the first tolerance at which every pair is within `LISTED` is timed repeatedly.
 TOLERANCES = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5, 3e-6, 1e-6)
 _BATCH_TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
 EXACT = 1e-12
@@ -42,9 +42,9 @@ def clearance_pairs(columns: int, rows: int) -> list[Scene]:
 
 
 def ensemble_rows(columns: int, rows: int, lean_steps: Sequence[float], repeats: int, notify: Notify) -> Iterator[Row]:
-    """Yield one run at each tolerance down to the one that all pairs need, which is timed, peers, and a list.
+    """Yield a row for each tolerance down to the one that all pairs need, rows of the peers, and listed pairs.
 
-    Peers with `lean_steps` only.
+    The peers run only with `lean_steps`.
     """
     scenes = clearance_pairs(columns, rows)
     name = f"kv, {len(scenes)} clearance pairs"
@@ -103,7 +103,7 @@ def _member_errors(scenes: Sequence[Scene], q: Array, exact: Array) -> Array:
 
 
 def _amplification(scenes: Sequence[Scene], exact: Array) -> Array:
-    """Return how much a displacement at t = 0 has grown at most, the larger of one along x and one along theta."""
+    """Return the largest growth of a displacement at t = 0, along x or along theta."""
     growth = np.zeros(len(scenes))
     for axis in (0, 2):
         moved = []
@@ -124,7 +124,7 @@ def _member_row(scene: Scene, tol: float, error: float, growth: float) -> Row:
 
 
 def _heyoka_rows(name: str, scenes: Sequence[Scene], exact: Array, notify: Notify) -> Iterator[Row]:
-    """Yield heyoka in batches from loose to tight, down to the first tolerance that all pairs need."""
+    """Yield heyoka in batches from loose to tight, until a tolerance makes all pairs accurate enough."""
     pairs = np.array([[scene.clearance.horizontal_m, scene.clearance.vertical_m] for scene in scenes])
     for tol in _BATCH_TOLERANCES:
         notify(f"ensemble heyoka in batches tol={tol:g}")

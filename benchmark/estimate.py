@@ -1,11 +1,12 @@
-"""The estimate on fresh synthetic truths, by group: errors, coverage, width, flags; beside the range of motion.
+"""The estimate on fresh synthetic truths, by group: errors, coverage, width and flags, compared with the range of
+motion.
 
     python benchmark/estimate.py --truths 50 --seed 5000          # all groups
     python benchmark/estimate.py --group plain --group hard --truths 20
 
-Each truth is written as soon as it is done, and what the file holds already is not run again: a long benchmark can be
-stopped, and gone on with. Thresholds of `plow_twin/estimate/tuning.py` were set on other seeds; the table of
-the pages is made by `tools/pages.py` from the seeds of `estimate_pages.TRUTHS`.
+Each truth is written as soon as it is done, and truths in the file are not run again: a long benchmark can be stopped
+and continued. Thresholds of `plow_twin/estimate/tuning.py` were set on other seeds; the table of the pages is made by
+`tools/pages.py` from the seeds of `estimate_pages.TRUTHS`.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ def run_one(name: str, seed: int, periods: float | None = None) -> dict[str, Any
     group = GROUPS[name]
     try:
         truth = draw(group if periods is None else type(group)(**{**vars(group), "periods": periods}), seed)
-    except SolverError as error:  # a wall that jumps through the head: no such machine
+    except SolverError as error:  # a wall has jumped through the head: such a machine does not exist
         return {"group": name, "seed": seed, "not_drawn": str(error)}
     begin = time.process_time()
     result = estimate(truth.nominal, truth.load, truth.poses, forces=truth.forces)
@@ -130,7 +131,7 @@ def main(groups: tuple[str, ...], truths: int, seed: int, periods: float | None,
     done = {(row["group"], row["seed"]) for row in rows}
     names = groups or tuple(GROUPS)
     seeds = range(seed, seed + truths)
-    # truth by truth: stopped early, all groups are as large
+    # truth by truth, so that a run that is stopped early leaves groups of equal size
     for number in seeds:
         for name in names:
             if (name, number) not in done:

@@ -2,8 +2,8 @@
 
     python benchmark/estimate_live.py
 
-The load comes at 1 kHz: harmonic, harmonic with 1 % of white noise, and another value each sample. The first window is
-estimated from nothing, the others from the one before, as the node does.
+The load comes at 1 kHz: harmonic, harmonic with 1 % of white noise, and random in each sample. The first window is
+estimated without a start, each later window from the previous estimate, as in the node.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from plow_twin.estimate.measurements import Load
 from plow_twin.estimate.window import Windows
 
 WINDOW_S, INTERVAL_S = 32.0, 10.0
-#: Windows are as a node forms them; two later ones are measured.
+#: Length of the data [s]: windows form as in a node, and two later windows are measured.
 _END_S = 55.0
 
 
 def shares(truth: Truth, load: Load, members: int) -> list[float]:
-    """Return the share of a core that each window took."""
+    """Return the share of a core that each window takes."""
     windows, found = Windows(WINDOW_S, INTERVAL_S, 2.0), []
     guess: Guess = ()
     poses = iter(zip(truth.poses.t, truth.poses.q, strict=True))

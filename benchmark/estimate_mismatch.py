@@ -1,11 +1,11 @@
-"""The estimate on machines that differ from the model: how often it answers, how far off, whether its intervals hold.
+"""The estimate on machines that differ from the model: how often it gives a result, its errors, its coverage.
 
     python benchmark/estimate_mismatch.py --truths 8 --seed 80000              # all kinds
     python benchmark/estimate_mismatch.py --kind friction_05 --truths 4
 
-Each kind differs in one respect, mildly; `several` in most of them. The truth comes from `mismatched_machine.py`,
-whose equations and integrator are not those of the project. Each truth is written as soon as it is done, and a truth
-that the file holds is not run again.
+Each kind differs mildly in one respect, `several` in most respects. The truth comes from `mismatched_machine.py`, whose
+equations and integrator are not those of the project. Each truth is written as soon as it is done, and truths in the
+file are not run again.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _FINE = 1e-3
 _COMMON_DEPTH = 8e-3
 #: Largest pose in rad (or m) of a head that has not jumped through a wall.
 _LARGEST_TURN = 0.6
-#: States with which a clearance is published as found; an interval below `USEFUL_M` is useful.
+#: States in which the estimated clearance is published; an interval below `USEFUL_M` is useful.
 PUBLISHED = {"estimated", "rough"}
 USEFUL_M = 4e-3
 
@@ -54,20 +54,20 @@ class Kind:
     periods: float = 10.0
     noise_m: float = 5e-4
     rate_hz: float = 100.0
-    #: shape of the load believed: paper, cutting (paper and broad band), pressed, chatter, vertical
+    #: shape of the given load: paper, cutting (paper and broad band), pressed, chatter, vertical
     shape: str = "paper"
     gain: float = 0.05
-    #: of each load component's range: correlated error, third harmonic, constant
+    #: shares of each load component's range: correlated error, third harmonic, constant
     correlated: float = 0.0
     harmonic: float = 0.0
     constant: float = 0.0
-    #: the load is believed as averages over so many s, or sampled each so many s
+    #: the given load consists of averages over this many s, or of samples every this many s
     averaged_s: float = 0.0
     sampled_s: float = 0.01
     friction: float = 0.0
     exponent: float = 1.0
     walls: float = 0.0
-    #: true over believed mass and inertia, and excess of the true frame size over the believed one in m
+    #: true over assumed mass and inertia, and excess of the true over the assumed frame size in m
     mass: float = 0.0
     inertia: float = 0.0
     frame_m: float = 0.0
@@ -231,7 +231,7 @@ def _true_scene(kind: Kind, nominal: Scene, rng: np.random.Generator) -> Scene:
 
 
 def _by_wall(rng: np.random.Generator) -> Array:
-    """Return a number of each pair, -1 or 1, the same for both pads of a wall, and not the same for all walls."""
+    """Return -1 or 1 for each pair: equal for both pads of a wall, but not for all walls."""
     signs: Array = rng.permutation([-1.0, -1.0, 1.0, 1.0])
     wall = np.where(NORMAL_X != 0.0, np.where(CORNER_X > 0.0, 0, 1), np.where(CORNER_Y > 0.0, 2, 3))
     return np.asarray(signs[wall], np.float64)

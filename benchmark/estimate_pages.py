@@ -1,6 +1,6 @@
 """Tables of the estimate's results for the pages, from `benchmark/results/estimate.jsonl`.
 
-`TRUTHS` names the seeds of each group on which no threshold was set; a page counts these and no others.
+`TRUTHS` names the seeds of each group on which no threshold was set; the pages count only these.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ TRUTHS: dict[str, tuple[tuple[int, int], ...]] = {
     "hard_shape": ((50000, 6),),
     "hard_kelvin_voigt": ((50000, 23), (54000, 10), (60000, 30)),
 }
-#: Largest RMSE asked of a group [mm].
+#: Target of the RMSE of a group [mm].
 ASKED = {"plain": 0.05, "sensor": 0.06, "stochastic": 0.06, "middle": 0.05, "firm": 0.05, "hard": 0.1}
 _LEVEL = 0.95
 
@@ -87,7 +87,7 @@ def narrowed(text: str, keep: Sequence[int]) -> list[list[str]]:
 
 
 def right_sum() -> str:
-    """Return the groups whose error was asked for, without widths, bounds and cost, and how many are flagged."""
+    """Return the groups that have an error target, without widths, bounds and cost, and the flagged truths."""
     text = right_models()
     head, *rows = narrowed(text, (0, 1, 2, 3, 5, 6))
     lines = ["| " + " | ".join(row) + " |" for row in (head, *(row for row in rows if row[3]))]
@@ -106,14 +106,14 @@ def wrong_models() -> str:
 
 
 def wrong_sum() -> str:
-    """Return how many truths of wrong models are flagged: behind soft contacts, and behind hard ones of another law."""
+    """Return how many truths of wrong models are flagged: with soft contacts, and with hard contacts of another law."""
     names = [name for name in TRUTHS if (GROUPS[name].model, GROUPS[name].sensor) != ("ok", "ok")]
     hard = "hard_kelvin_voigt"
     soft = [_flagged(row) for name in names if name != hard for row in truths(name, TRUTHS[name])]
     other = [_flagged(row) for row in truths(hard, TRUTHS[hard])]
     return (
         f"Of {len(soft)} truths with a wrong law, load or sensor, {sum(soft)} were flagged; of {len(other)} with the "
-        f"wrong law behind a hard contact, {sum(other)}."
+        f"wrong law and hard contacts, {sum(other)}."
     )
 
 
@@ -154,7 +154,7 @@ def mismatch() -> str:
 
 
 def mismatch_sum() -> str:
-    """Return the rows of all machines and of those without a difference."""
+    """Return the rows of all machines and of machines without a difference."""
     head, line, *rows = mismatch().splitlines()
     return "\n".join([head, line, *rows[:2]])
 

@@ -1,7 +1,7 @@
 """Synthetic truths for the estimate: a scene, its motion, and the readings of a sensor and a load telemetry.
 
-The truth is simulated at a tolerance and with a load sampling of its own; in the groups outside the model its law, the
-shape of its load, its sensor or its machine is another one than the estimate believes.
+The truth is simulated with its own tolerance and load sampling; in the groups outside the model its law, load shape,
+sensor or machine differs from the estimate's assumptions.
 """
 
 from __future__ import annotations
@@ -58,14 +58,14 @@ class Group:
     noisier: float = 1.0
     #: measured over true x, y, theta
     sensor_scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    #: wear coefficient of the truth; the estimate knows of none
+    #: wear coefficient of the truth; the estimate assumes no wear
     wear_m2_n: float = 0.0
-    #: load cells at all pairs: rate, noise, deviation of each one's gain, largest delay of them all
+    #: load cells at all pairs: rate, noise, deviation of each gain, largest delay
     forces_hz: float = 0.0
     forces_noise_n: float = 1e3
     forces_gain: float = 0.05
     forces_delay_s: float = 0.05
-    #: whether model, or sensor, are to be found suspect
+    #: expected verdicts on model and sensor
     model: str = "ok"
     sensor: str = "ok"
 
@@ -118,7 +118,7 @@ GROUPS = {
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """The truth and the estimate's inputs; `clearance` is the one at the end of the window, shape (2,), in m."""
+    """The truth and the estimate's inputs; `clearance`, shape (2,), is at the end of the window, in m."""
 
     group: Group
     scene: Scene
@@ -189,7 +189,7 @@ def _contact(group: Group, rng: np.random.Generator) -> Contact:
     stiffness = float(np.exp(rng.uniform(low, high)))
     damping = 0.72 * float(np.exp(rng.normal(0.0, 0.4)))
     if group.law == "kelvin_voigt":
-        # the same share of the critical one for hard contacts
+        # hard contacts get the same share of the critical damping
         damping = 10.0 ** rng.uniform(4.5, 5.3) * max(1.0, np.sqrt(stiffness / 3e7))
     return Contact(law=group.law, stiffness=stiffness, exponent=group.exponent, damping=damping)
 
@@ -205,7 +205,7 @@ def cutting(rng: np.random.Generator, t: Array) -> Array:
 
 
 def _motion(scene: Scene, group: Group, times: Array, end: float) -> tuple[Array, Array, Array]:
-    """Return the true poses at `times`, (n, 3), the clearances at the end, (2,), and the forces each `_FINE` s."""
+    """Return the true poses at `times`, (n, 3), the clearances at the end, (2,), and the forces every `_FINE` s."""
     if not group.jam_m:
         run = simulate(scene, end, _FINE, 1e-6)
         q = np.stack([np.interp(times, run.t, column) for column in run.q.T], axis=1)
@@ -228,7 +228,7 @@ def _motion(scene: Scene, group: Group, times: Array, end: float) -> tuple[Array
 
 
 def _cells(group: Group, rng: np.random.Generator, force: Array, end: float) -> ContactForces:
-    """Return the readings of load cells for the true forces, (n, 8) each `_FINE` s."""
+    """Return the readings of load cells for the true forces, (n, 8), given every `_FINE` s."""
     t = np.arange(0.0, end, 1.0 / group.forces_hz)
     late = np.maximum(t - group.forces_delay_s * rng.uniform(), 0.0)
     true = np.stack([np.interp(late, _FINE * np.arange(len(column)), column) for column in force.T], axis=1)

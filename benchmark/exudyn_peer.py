@@ -1,6 +1,6 @@
 """Exudyn on the bench scenes.
 
-How it is bent: no connector has this contact law, so each frame corner is a rigid-body spring-damper without stiffness
+Adaptation: no connector has this contact law, so each frame corner is a rigid-body spring-damper without stiffness
 whose force is a *symbolic* user function (compiled, no Python in the loop) of the corner's place and velocity in head
 axes; the loads are symbolic user functions of time.
 """
@@ -92,7 +92,7 @@ def _build(p: Array) -> tuple[Any, Any, list[Any]]:
 
 
 def prepare(p: Array, solver: str, dt: float, rtol: float | None, output_dt: float) -> Callable[[], Sample]:
-    """Prepare an explicit solver with a fixed step, or with step control to `rtol`; a run builds its system afresh."""
+    """Prepare an explicit solver with a fixed step, or with step control to `rtol`; each run builds its system anew."""
 
     def run() -> Sample:
         mbs, exu, kept = _build(p)

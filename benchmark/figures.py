@@ -41,7 +41,7 @@ def solver_rows() -> list[Row]:
 
 
 def speed() -> str:
-    """Return the time for 20 s of impacts at three errors, the peers' as multiples."""
+    """Return the time for 20 s of impacts at three errors, with the peers' times as multiples."""
     rows = solver_rows()
     lines = []
     for level in (1e-3, 1e-6, 1e-9):
@@ -52,7 +52,7 @@ def speed() -> str:
 
 
 def located() -> str:
-    """Return the same at the output of 0.1 s beside the two peers that locate every change of contact."""
+    """Return the same for output every 0.1 s, beside the two peers that locate every change of contact."""
     rows = solver_rows()
     lines = []
     for scene in ("kv", "hc"):
@@ -88,7 +88,7 @@ def work() -> str:
 
 
 def missed() -> str:
-    """Return the targets of the solver that were not reached, those against one peer in a line."""
+    """Return the targets of the solver that were not reached; targets against the same peer share a line."""
     groups: dict[tuple[str, str], list[targets.Verdict]] = {}
     for verdict in targets.verdicts(solver_rows()):
         if not verdict.reached:
@@ -142,7 +142,7 @@ def life_sum() -> str:
     shares = ", ".join(f"{share:g}" for share in lives.SHARES)
     return (
         f"At {shares} of the life, {right} of {len(rows)} forecasts of its end are within {100 * lives.ALPHA:.0f} %.\n"
-        f"The 80 % interval holds in {', '.join(held(own, 80) for own in parts)}, "
+        f"The 80 % interval is right in {', '.join(held(own, 80) for own in parts)}, "
         f"the 90 % interval in {', '.join(held(own, 90) for own in parts)}."
     )
 
@@ -162,7 +162,7 @@ def follow_table() -> str:
 
 
 def follow_sum() -> str:
-    """Return the same without the clearances and the cost."""
+    """Return the table of `follow_table` without clearances and cost."""
     _, *rows = estimate_pages.narrowed(follow_table(), range(6))
     return table(["group", "truths", "forces, RMS", "largest force", "impulse", "coverage of the three"], rows)
 

@@ -1,9 +1,9 @@
-"""Rows a second at which `plow-twin live` takes a CSV file that ends, without and with a recording.
+"""Rows a second that `plow-twin live` reads from a complete CSV file, without and with a recording.
 
 python benchmark/file_rate.py [--rows N]
 
-Prints one line of JSON for each case: rows a second of CPU, the start of the process left out, and of the time on the
-clock.
+Prints one line of JSON for each case: rows per second of CPU time and of elapsed time, without the start of the
+process.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import time
 from pathlib import Path
 from typing import Final
 
-#: Rows of the file by which the time of the start is measured.
+#: Rows of the file that measures the time of the start.
 FEW: Final = 1000
 
 
@@ -50,7 +50,7 @@ def main() -> None:
         few, many = Path(folder, "few.csv"), Path(folder, "many.csv")
         write_load(few, FEW)
         write_load(many, rows)
-        measure(few)  # compiles the solver where it must
+        measure(few)  # compiles the solver if necessary
         for outputs in ("", "none", "all"):
             options = ["--set", f"record_outputs={outputs}", "--record"] if outputs else []
             start = measure(few, *options, *[f"{folder}/few_{outputs}"][: len(options)])

@@ -50,9 +50,9 @@ RESULTS = Path(__file__).resolve().parent / "results"
 
 TOLERANCE = 1e-4
 MEMBERS = 128
-#: Where the unknowns of the estimate lie in the state, behind pose and rate.
+#: Index of the estimate's first unknown in the state, after pose and rate.
 _FIRST = 6
-#: Process noise in each step: m, rad, m/s, rad/s; of the unknowns as a share of the prior's deviation. Set by hand and
+#: Process noise in each step: m, rad, m/s, rad/s; for the unknowns, a share of the prior's deviation. Set by hand and
 #: tried on seeds 200 and 201 only.
 _STATE_NOISE = np.array([1e-5, 1e-5, 4e-5, 3e-3, 3e-3, 1e-2])
 _UNKNOWN_NOISE = 3e-4
@@ -135,7 +135,7 @@ class Members:
 
 
 def seen(point: Array) -> Array:
-    """Return the pose that the sensor shows at a state: late, and with its bias."""
+    """Return the pose that the sensor shows at a state, with its delay and bias."""
     unknown = point[_FIRST:]
     pose: Array = point[:3] + unknown[7:10] - point[3:6] * unknown[10]
     return pose

@@ -1,4 +1,4 @@
-"""Time the operator's way: from an empty virtual environment to numbers on the screen of a growing CSV file.
+"""Time an operator's steps from an empty virtual environment to numbers on the screen of a growing CSV file.
 
 python benchmark/first_screen.py [FOLDER]
 

@@ -3,8 +3,8 @@
     python benchmark/follow.py --group soft --group hard --truths 12 --seed 72000
     python benchmark/follow.py --table                       # of what the file holds
 
-All is causal: the result at a time uses measurements up to it. Everything was set on seeds below 72000.
-Each truth is written as soon as it is done; truths in the file are not run again.
+The result at a time uses only measurements up to that time. Everything was set on seeds below 72000. Each truth is
+written as soon as it is done; truths in the file are not run again.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ RESULTS = Path(__file__).resolve().parent / "results" / "follow.jsonl"
 GROUPS = {
     "soft": Group("K 3e6 .. 3e8", stiffness=(3e6, 3e8)),
     "hard": Group("K 1e9 .. 1e11", stiffness=(1e9, 1e11)),
-    # a load cell's view of a machine that differs from the model
+    # machines that differ from the model
     "friction": Group("friction 0.1", friction=0.1),
     "law": Group("law: Kelvin-Voigt", law="kelvin_voigt"),
     "shape": Group("load: third harmonic of 10 %", third_harmonic=0.1),
 }
-#: Forces count from the beginning of the fifth load period on; pairs with a hundredth of the largest impulse.
+#: Forces count from the fifth load period on, for pairs with at least a hundredth of the largest impulse.
 FIRST_PERIOD, LEAST_SHARE = 4, 0.01
 #: Distance in s of the rows that give the truth's peaks and impulses: the hardest contact lasts five of them.
 _FINE = 1e-4
@@ -47,7 +47,7 @@ def run_one(name: str, seed: int, members: int) -> dict[str, Any]:
     """Follow one truth and compare."""
     try:
         truth = draw(GROUPS[name], seed)
-    except SolverError as error:  # a wall that jumps through the head: no such machine
+    except SolverError as error:  # a wall has jumped through the head: such a machine does not exist
         return {"group": name, "seed": seed, "not_drawn": str(error)}
     true, nominal = (Motion(scene, truth) for scene in (truth.scene, truth.nominal))
     begin = time.process_time()

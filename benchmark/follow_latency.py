@@ -1,4 +1,4 @@
-"""CPU time of a live sample at 1 kHz until its forces are out, and in all, with `follow` off and on.
+"""CPU time of a live sample at 1 kHz, until its forces are sent and in total, with `follow` off and on.
 
     python benchmark/follow_latency.py
 
@@ -27,12 +27,12 @@ from plow_twin.stream.journal import Estimated
 from plow_twin.stream.topics import TOPICS
 
 _T0 = 1_795_000_000_000_000_000
-#: Distance of the samples, time that is played, time that does not count and time of the estimate, in s.
+#: Sampling interval, length of the run, warm-up that does not count, and time of the estimate, in s.
 _STEP, _END, _FIRST, _ESTIMATED = 1e-3, 6.0, 1.0, 0.5
 
 
 class _Front:
-    """Where messages go: nowhere."""
+    """A front that discards all messages."""
 
     name, follows_samples, sends_motion = "/plow_twin", False, True
     topics = {topic.name: f"/{topic.name}" for topic in TOPICS}  # noqa: RUF012
@@ -45,7 +45,7 @@ class _Front:
 
 
 def _known(truth: Truth) -> Estimated:
-    """An estimate as good as one of ten load periods."""
+    """Return an estimate as good as one from ten load periods."""
     contact = truth.scene.contact
     assert contact.damping is not None
     horizontal, vertical = (Interval.normal(value, 3e-5) for value in truth.clearance)

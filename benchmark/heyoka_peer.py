@@ -1,9 +1,9 @@
 """heyoka: Taylor series in compiled code with event detection, called from Python; the nearest peer.
 
-Modes of the eight pairs are parameters of the equations; terminal events, of which Python callbacks set them, are each
-pair's penetration and where its force would pull, as contact may not. The Hunt-Crossley force d^1.5 has no Taylor
-series at a touch: there it begins a little deeper, at a penetration at which it is negligible, and the steps grow from
-that. The batch integrator takes as many scenes side by side as a SIMD vector has places.
+Modes of the eight pairs are parameters of the equations. Python callbacks of terminal events set the modes: one event
+when the penetration of a pair changes sign, one when its force would pull, which contact cannot. The Hunt-Crossley
+force d^1.5 has no Taylor series at a touch, so it begins at a small penetration, at which it is negligible, and the
+steps grow from there. The batch integrator computes as many scenes at once as a SIMD vector has lanes.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from bench_scenes import T_END
 from cases import Array, Sample, timed
 
-#: Time for which an event that has just fired is not searched again [s]; heyoka's default hides the next touch.
+#: Time after an event in which heyoka does not look for it again [s]; the default would hide the next touch.
 _COOLDOWN = 1e-7
 #: Parameters after the modes of the pairs: both clearances.
 _GX, _GY = 8, 9
@@ -70,14 +70,14 @@ def _equations(p: Array, begin: float) -> tuple[list[tuple[Any, Any]], list[tupl
 
 
 def _begin_of(tol: float) -> float:
-    """Return the penetration in m at which a force d^1.5 begins: a touch loses its impulse up to there."""
+    """Return the penetration in m at which a force d^1.5 begins; a touch loses the impulse below it."""
     return min(1e-6, max(1e-9, 1e-4 * math.pow(tol, 2.0 / 3.0)))
 
 
 def _events(guards: list[tuple[Any, Any]], inside: Array, event: Any) -> list[Any]:
     """Return the terminal events that set the modes: whether a pair touches, and whether its force would pull.
 
-    A batch tells its callbacks at which of its places the event fired; `inside` has the shape of the modes.
+    A batch tells its callbacks in which lane the event fired; `inside` has the shape of the modes.
     """
 
     def touches(pair: int) -> Callable[..., bool]:

@@ -26,13 +26,14 @@ PEERS: dict[str, Member] = {
     "our RK4": lambda solver: solver == OURS_RK4,
 }
 OWN: dict[str, Member] = {name: name.__eq__ for name in (OURS_BARE, OURS, OURS_CALL)}
-#: A solver slower than its group's fastest by more than this is measured once, and so is a setting among its solver's.
+#: A solver slower than its group's fastest by more than this factor is measured once; so is a setting slower than its
+#: solver's fastest.
 _NEAR = 1.4
 
 
 @dataclass(frozen=True)
 class Reached:
-    """The time in ms at which a solver reaches an error, and the setting or the two settings that it lies between."""
+    """The time in ms in which a solver reaches an error, and the setting, or the two settings between which it lies."""
 
     wall_ms: float
     solver: str
@@ -49,9 +50,9 @@ def ladders(rows: Sequence[Row], scene: str, output_s: float, member: Member) ->
 
 
 def reach(ladder: Sequence[Row], level: float) -> Reached | None:
-    """Return the least time for an error of at most `level`: a setting, or log time over log error between two.
+    """Return the least time for an error of at most `level`: of a setting, or interpolated between two (log over log).
 
-    Only between neighbouring settings, of which one misses the level and the next reaches it; never beyond the ladder.
+    It interpolates only between neighbours of which the first setting misses the level and the second reaches it.
     """
     done = [row for row in ladder if row.status == "ok" and row.error is not None and row.wall_ms is not None]
     times = [Reached(_wall(row), row.solver, row.setting) for row in done if _error(row) <= level]

@@ -1,14 +1,14 @@
 """The live node under load: loss, share of a core, age at a subscriber, beside a bare rclpy echo of three messages.
 
-`python benchmark/live_load.py [--seconds N] [--repeats N]` prints a line of JSON for each case, medians of the repeats,
-in each of which every case runs once, and then the targets with what was reached. `--minutes N` runs the node with its
-recorder at 1 kHz (or `--rate`) for so long instead, prints a line each ten seconds, what has grown, and
-whether each message sent was used or counted. `--beside` runs the echo, the node and a recording node at once under
-the same samples: what else the machine does meets all of them, so that their ratios hold on a busy one too.
-`--estimate` runs the node without and with the estimate and its 256 twins in turn, under the paper's load and a
-synthetic pose at 100 Hz, `--repeats` times each, for `--seconds` after the first window has been formed.
-`--opcua` runs `plow-twin live` beside an OPC UA server for `--minutes` (10) instead: see `opcua_load.py`.
-The machine is shared by publisher, node and subscriber: what is compared is the node and the echo in the same run.
+`python benchmark/live_load.py [--seconds N] [--repeats N]` runs every case once in each repeat, prints a line of JSON
+for each case with the medians of the repeats, and then the targets with the results. `--minutes N` instead runs the
+node with its recorder at 1 kHz (or `--rate`) for N minutes, and prints a line every ten seconds, the growth of each
+figure, and whether each message sent was used or counted. `--beside` runs the echo, the node and a recording node at
+once under the same samples: other load of the machine affects them alike, so that their ratios are valid even on a busy
+machine. `--estimate` runs the node without and with the estimate and its 256 twins in turn, under the paper's load and
+a synthetic pose at 100 Hz, `--repeats` times each, for `--seconds` after the first window has been formed. `--opcua`
+runs `plow-twin live` beside an OPC UA server for `--minutes` (10) instead: see `opcua_load.py`. Publisher, node and
+subscriber share the machine: compare only the node and the echo of the same run.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ CASES = (ECHO, RAW_ECHO, ON_SAMPLE, RECORDED, FIXED, FIXED_RECORDED, Case("fixed
 def echo(raw: bool = False, namespace: str = "live_load") -> None:
     """Answer each sample with three messages of the sizes that the node sends, and no others.
 
-    `raw`: with bytes that were serialised before, but for the stamp, that of the sample: the least that
-    any node in rclpy does.
+    With `raw` the messages are bytes serialised in advance, and only the sample's stamp is written: the least work of
+    any rclpy node.
     """
     import rclpy
     from geometry_msgs.msg import WrenchStamped
@@ -143,7 +143,7 @@ class Probe:
             self.figures.update({item.key: item.value for item in status.values})
 
     def spin(self, reached: Callable[[], bool], timeout_s: float) -> None:
-        """Listen until something is so, or time is up."""
+        """Listen until `reached` returns true, or time is up."""
         give_up = time.monotonic() + timeout_s
         while not reached() and time.monotonic() < give_up:
             self._executor.spin_once(timeout_sec=0.02)
@@ -188,7 +188,7 @@ def measure(answerer: list[str], rate_hz: float, seconds: float) -> dict[str, fl
             probe.spin(lambda: sender.poll() is not None, seconds + 30.0)
             share = (_cpu_s(process_id) - busy) / (time.monotonic() - begin)
         finally:
-            sender.kill()  # a publisher without a subscriber would send to the next one
+            sender.kill()  # a publisher without a subscriber would send to the next subscriber
             sender.wait()
         figures.pop("samples_used", None)
         if "published" in figures:
@@ -273,7 +273,7 @@ def _children(process_id: int) -> list[int]:
 
 
 def compare(seconds: float, repeats: int) -> None:
-    """Print each run as it ends, then the medians of all cases, and the targets with what was reached."""
+    """Print each run as it ends, then the medians of all cases, and the targets with the results."""
     runs: dict[Case, list[dict[str, float]]] = {case: [] for case in CASES}
     with tempfile.TemporaryDirectory() as folder:
         for repeat in range(repeats):
@@ -365,9 +365,9 @@ def _exact_cpu_s(process_id: int) -> float:
 
 
 def soak(minutes: float, rate_hz: float) -> bool:
-    """Run the node with its recorder; print its size and figures, what has grown in the last half, and the account.
+    """Run the node with its recorder; print its memory and figures, their growth in the last half, and the account.
 
-    True when each message that was sent was used, dropped for a reason or counted as lost.
+    Return whether each sent message was used, dropped for a reason or counted as lost.
     """
     rows: list[dict[str, float | None]] = []
     with tempfile.TemporaryDirectory() as folder, running(_twin("on_sample", f"{folder}/soak")) as (probe, process_id):

@@ -100,7 +100,7 @@ print(json.dumps({
 
 
 def start_rows(notify: Notify) -> Iterator[Row]:
-    """Yield a start with an empty cache and the next one, of a process each; `value` is the kernels compiled."""
+    """Yield a start with an empty cache and the next start, each of a process; `value`: number of compiled kernels."""
     with tempfile.TemporaryDirectory() as cache:
         for name in ("cold start", "second start"):
             notify(name)

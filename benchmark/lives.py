@@ -3,8 +3,7 @@
     python benchmark/lives.py --lives 8
 
 Each life has a wear coefficient drawn from the prior and a load whose size the forecast does not know; the clearances
-of each of some ten visits are measured with noise. The truth follows the wear in steps a quarter as long as those of
-the forecast.
+are measured with noise at each visit. The truth follows the wear in steps a quarter as long as the forecast's.
 
 Definitions: alpha-lambda accuracy and prognostic horizon as Saxena et al., Int. J. Prognostics Health Management 1
 (2010) 1; CRPS as Gneiting and Raftery, J. Am. Stat. Assoc. 102 (2007) 359.
@@ -31,9 +30,9 @@ Array = NDArray[np.float64]
 RESULTS = Path(__file__).resolve().parent / "results"
 #: 5 % and 95 % points of the prior, and of the drawn truth [m^2/N].
 PRIOR = (1e-15, 1e-14)
-#: Growth of a clearance that ends a life [m], noise of an estimate [m], visits in a life, shares of it.
+#: Growth of a clearance that ends a life [m], noise of an estimate [m], visits in a life, shares of the life.
 GROWTH, NOISE, VISITS, SHARES = 3e-3, 5e-5, 20, (0.3, 0.5, 0.7)
-#: The inner 80 %, and the inner 90 %, lie between these.
+#: Quantiles that bound the inner 80 % and the inner 90 %.
 _INNER, _INNER_90 = (0.1, 0.9), (0.05, 0.95)
 #: Relative error within which a forecast counts as right.
 ALPHA = 0.2

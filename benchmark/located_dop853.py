@@ -1,8 +1,8 @@
 """DOP853 compiled by numba, with every change of contact located on its dense output and a restart there.
 
-What a user would write who knows the machine: Hairer's method and step control with SciPy's coefficients (Hairer,
-Norsett and Wanner, Solving ODEs I, sec. II.5 and II.6), contact modes frozen within a step, rows read from the dense
-output.
+The solver that an expert on the machine would write: Hairer's method and step control with SciPy's coefficients
+(Hairer, Norsett and Wanner, Solving ODEs I, sec. II.5 and II.6), contact modes frozen within a step, rows read from the
+dense output.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _ROWS = len(_C)
 #: Poses are about 1e-2, velocities about 1: absolute tolerances relative to rtol.
 _ATOL = np.array([1e-3, 1e-3, 1e-3, 1e-1, 1e-1, 1e-1])
 _OFF, _ON, _CLIPPED = 0, 1, 2
-#: Parts of a step at whose ends guards are looked at.
+#: Number of equal parts of a step; guards are checked at the end of each part.
 _LOOKS = 4
 _AT_ONE_INSTANT = 64
 

@@ -1,4 +1,4 @@
-"""The contact model held against measured impacts of an ellipse and drops of a square (`benchmark/data/measured`).
+"""The contact model compared with measured impacts of an ellipse and drops of a square (`benchmark/data/measured`).
 
     python benchmark/measured.py            fits, errors, coverage: benchmark/results/measured.json
     python benchmark/measured.py --only square
@@ -94,7 +94,7 @@ class Impacts:
         return contact(minimize(cost, first, method="Nelder-Mead", options=options).x)
 
     def held_out(self, start: EllipseContact, names: tuple[str, ...]) -> dict[str, Any]:
-        """Fit to each half and return the errors on the other one."""
+        """Fit to each half and return the errors on the other half."""
         missed, fitted = [], []
         for half in (0, 1):
             contact = self.fit(start, names, np.flatnonzero(self.half != half))
@@ -104,7 +104,7 @@ class Impacts:
         return {**errors(np.concatenate(missed)), "fitted": fitted}
 
     def rigid(self, model: Any) -> dict[str, Any]:
-        """Fit e and mu of a rigid impact to each half; return the errors on the other one."""
+        """Fit e and mu of a rigid impact to each half; return the errors on the other half."""
         missed = []
         for half in (0, 1):
             fit, held = np.flatnonzero(self.half != half), np.flatnonzero(self.half == half)
@@ -149,8 +149,9 @@ def rigid_impact(before: np.ndarray, model: Any, e: float, mu: float) -> np.ndar
 def routh(slip, rate, tt, nn, tn, e, mu, bit=2e-3, energetic=False):  # type: ignore[no-untyped-def]
     """Return impulses after Routh: Coulomb's friction at each bit of the normal impulse.
 
-    It ends by Poisson's restitution, of the impulses, or by Stronge's, of the work of the normal force. Routh, Dynamics
-    of a system of rigid bodies, 1860; Wang and Mason, J. Appl. Mech. 59 (1992) 635; Mirtich, thesis, Berkeley 1996.
+    The impact ends by Poisson's restitution (of the impulses) or by Stronge's (of the work of the normal force). Routh,
+    Dynamics of a system of rigid bodies, 1860; Wang and Mason, J. Appl. Mech. 59 (1992) 635; Mirtich, thesis, Berkeley
+    1996.
     """
     along, away, end = np.zeros_like(slip), np.zeros_like(slip), np.full_like(slip, np.inf)
     work, least = np.zeros_like(slip), np.zeros_like(slip)
@@ -185,7 +186,7 @@ def drumwright_shell(slip, rate, tt, nn, tn, e, mu):  # type: ignore[no-untyped-
     away, along = (tn * slip - tt * rate) / determinant, (tn * rate - nn * slip) / determinant
     slides = np.abs(along) > mu * away
     side = np.sign(along)
-    # on the edge p = (side mu, 1) away: least energy, but no approach is left
+    # on the cone's edge, p = (side mu, 1) away: the least energy that leaves no approach
     least = -(side * mu * slip + rate) / (tt * mu**2 + 2.0 * side * mu * tn + nn)
     stopped = -rate / (nn + tn * mu * side)
     away = np.where(slides, np.maximum(least, stopped), away)
@@ -193,13 +194,13 @@ def drumwright_shell(slip, rate, tt, nn, tn, e, mu):  # type: ignore[no-untyped-
 
 
 def anitescu_potra_newton(slip, rate, tt, nn, tn, e, mu):  # type: ignore[no-untyped-def]
-    """Return impulses of the complementarity problem with Newton's restitution: both are scaled."""
+    """Return impulses of the complementarity problem with Newton's restitution, which scales both components."""
     along, away = newton(slip, rate, tt, nn, tn, 0.0, mu)  # type: ignore[no-untyped-call]
     return (1.0 + e) * along, (1.0 + e) * away
 
 
 def newton(slip, rate, tt, nn, tn, e, mu):  # type: ignore[no-untyped-def]
-    """Return impulses that stop the slip, or of Coulomb's cone, with Newton's restitution (Whittaker, 1904)."""
+    """Return impulses that stop the slip or lie on Coulomb's cone, with Newton's restitution (Whittaker, 1904)."""
     wanted = -(1.0 + e) * rate
     determinant = tt * nn - tn**2
     away, along = (tt * wanted + tn * slip) / determinant, (-nn * slip - tn * wanted) / determinant
@@ -210,7 +211,7 @@ def newton(slip, rate, tt, nn, tn, e, mu):  # type: ignore[no-untyped-def]
 
 
 def anitescu_potra(slip, rate, tt, nn, tn, e, mu):  # type: ignore[no-untyped-def]
-    """Return impulses of a complementarity problem with Poisson's restitution of the normal one.
+    """Return impulses of a complementarity problem with Poisson's restitution of the normal impulse.
 
     Anitescu and Potra, Nonlinear Dyn. 14 (1997) 231.
     """
@@ -229,7 +230,7 @@ RIGID = {
 
 
 def by_law(impacts: Impacts) -> dict[str, Any]:
-    """Return the errors of each law with each friction, all numbers fitted, and of additions to one of them."""
+    """Return the errors of each law with each friction, all numbers fitted, and of extensions of one law."""
     found: dict[str, Any] = {"any impulse at the point": impacts.floor()}
     for name, model in RIGID.items():
         found[f"rigid: {name}"] = impacts.rigid(model)
@@ -283,7 +284,7 @@ def without_drag() -> np.ndarray:
     return block
 
 
-#: Numbers of the block that are fitted with the marker; the stiffness and gravity are not.
+#: Numbers of the block that are fitted with the marker; stiffness and gravity are fixed.
 FITTED = (
     "half", "radius", "gyration", "table", "restitution", "restitution_fall", "friction", "friction_fall", "mass_power",
     "tangential", "tangential_damping", "drag", "spin_drag",
@@ -308,7 +309,7 @@ class Square:
         self.drops, self.usable = drops, np.array(drops.usable())
         self.first = drops.flight_rows[self.usable] - 1
         bounces = [drops.bounces[i] for i in self.usable]
-        #: rows from the last one of the first flight to each bounce, 0 where there is none, shape (n, 3)
+        #: number of rows from the end of the first flight to each bounce, 0 without this bounce, shape (n, 3)
         self.rows = np.array(
             [
                 [its[k] - first if k < len(its) else 0 for k in (1, 2, 3)]
@@ -318,7 +319,7 @@ class Square:
         self.flights = np.array([fit_flight(drops.pose[i, : drops.flight_rows[i]]).state for i in self.usable])
 
     def errors(self, block: np.ndarray, marker: Marker, chosen: np.ndarray, bounces: int) -> np.ndarray:
-        """Return mean distance in m and angle in rad over so many bounces, shape (k, 2), of drops that have them."""
+        """Return mean distance in m and angle in rad over `bounces` bounces, shape (k, 2), of drops with as many."""
         enough = chosen[self.rows[chosen, bounces - 1] > 0]
         states = marker.state_of_block(self.flights[enough])
         tossed = toss(states, self.rows[enough, bounces - 1].max() + 1, np.full(len(enough), block, block.dtype))
@@ -334,9 +335,10 @@ class Square:
         return np.array(found)
 
     def against_rigid(self) -> dict[str, Any]:
-        """Return errors over one bounce of rigid and compliant impacts, of all drops and where two corners hit at once.
+        """Return errors over one bounce of rigid and compliant impacts, for all drops and for drops in which two
+        corners hit at once.
 
-        Both have the marker, the rounded corners and the drag; e and mu of the rigid one are fitted to all drops.
+        Both have the marker, the rounded corners and the drag; e and mu of the rigid impacts are fitted to all drops.
         """
         every = np.flatnonzero(self.rows[:, 0] > 0)
         states, rows = MARKER.state_of_block(self.flights[every]), int(self.rows[every, 0].max()) + 1
@@ -364,7 +366,7 @@ class Square:
     def fit(
         self, chosen: np.ndarray, start: np.ndarray, names: tuple[str, ...], rounds: int = 3
     ) -> tuple[np.ndarray, Marker]:
-        """Fit block and marker to the chosen drops: bounded distances over one bounce, and less those over two."""
+        """Fit block and marker to the chosen drops: bounded distances over one bounce, with less weight over two."""
 
         def numbers(x: np.ndarray) -> tuple[np.ndarray, Marker]:
             block = start.copy()
@@ -380,7 +382,7 @@ class Square:
             distance = sum(share * (d / (1.0 + d / 0.02)).mean() for share, d in ((1.0, one), (0.3, two)))
             return float(1e3 * distance + 0.3 * np.minimum(angle, 1.0).mean())
 
-        # angle and heights at rest give the marker to begin with
+        # angle and heights at rest give the start for the marker
         x = np.array([-0.0335, 3.4e-4, 5.2e-4, *(float(start[name]) for name in names)])
         step = np.array([0.005, 3e-4, 3e-4, *(0.12 * abs(float(start[name])) + 1e-4 for name in names)])
         for turn in range(rounds):
@@ -426,7 +428,7 @@ class Square:
         return {"pairs": len(apart), "distance_mm": round(1e3 * float(np.median(apart)), 1)}
 
     def held_out(self, start: np.ndarray = SQUARE, names: tuple[str, ...] = FITTED) -> dict[str, Any]:
-        """Fit to either half and return the errors on the other one over 1, 2, 3 bounces."""
+        """Fit to either half and return the errors on the other half over 1, 2, 3 bounces."""
         half = np.random.default_rng(1).permutation(len(self.usable)) % 2
         far: list[list[np.ndarray]] = [[], [], []]
         fitted = []

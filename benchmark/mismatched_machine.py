@@ -1,7 +1,7 @@
-"""A machine that differs from every scene: its own equations, integrated with fixed steps of Runge and Kutta.
+"""A machine that differs from every scene: its own equations, integrated with fixed Runge-Kutta steps.
 
 Independent of the solver: the walls may differ in stiffness, the corners may be round, the pads may lie askew, the
-frame may stand on a spring, the corners may rub. A head of `rotation: paper` alone is modelled.
+frame may stand on a spring, the corners may rub. Only heads with `rotation: paper` are modelled.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Machine:
     Attributes
     ----------
     stiffness_share, depth : ndarray, shape (8,)
-        Each pair's stiffness over the contact's, and by how much its wall lies further out, in m.
+        Stiffness of each pair over the contact's, and distance by which its wall lies further out, in m.
     radius : float
         Radius of the corners in m.
     friction : float

@@ -1,9 +1,9 @@
 """The wear coefficient after a simulated month: `python benchmark/month.py --truths 20`.
 
 A head works a month under a broad-band load. On some days its pose is measured over ten load periods, by a noisy,
-biased and late sensor, beside a load that is off by 5 %; `estimate` tells the clearances from that, and what they have
-grown tells the coefficient. The truth follows the wear in steps a quarter as long as those of the estimate, with means
-over four times as many periods.
+biased and late sensor, beside a load that is off by 5 %; `estimate` finds the clearances from these data, and their
+growth gives the coefficient. The truth follows the wear in steps a quarter as long as the estimate's, with means over
+four times as many periods.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ RESULTS = Path(__file__).resolve().parent / "results"
 #: Days on which the pose is measured.
 DAYS = np.linspace(0.0, 30.0, 7)
 SPEED_M_S, PAD_AREA_M2 = 2.0, 0.06
-#: 5 % and 95 % points of the prior, of which the truth is drawn [m^2/N].
+#: 5 % and 95 % points of the prior, from which the truth is drawn [m^2/N].
 PRIOR = (3e-16, 3e-15)
-#: The coefficient is asked to be known within this factor.
+#: The coefficient should be known within this factor.
 FACTOR = 1.3
 #: Samples of the load and of the pose [s]; the true load is finer.
 _FINE, _LOAD_STEP, _POSE_STEP = 1e-3, 2e-3, 1e-2
@@ -69,13 +69,13 @@ def machine(rng: np.random.Generator) -> Machine:
 
 
 def load_of(one: Machine, rng: np.random.Generator, span: float) -> tuple[Array, Array]:
-    """Return times and the load believed."""
+    """Return times and the load given to the estimate."""
     t = np.arange(0.0, span + _FINE, _FINE)
     return t, compile_loads(one.believed.loads).at(t) + cutting(rng, t) * _BROAD
 
 
 def visit(one: Machine, worn: Scene, rng: np.random.Generator) -> tuple[Load, Poses]:
-    """Return the measurements of a worn machine: the load as believed, and the poses that the sensor shows."""
+    """Return the measurements of a worn machine: the given load, and the poses that the sensor shows."""
     t, believed = load_of(one, rng, _SPAN)
     motion = simulate(replace(worn, loads=(Table("cutting", t, believed * one.gain),)), _SPAN, _FINE, 1e-6)
     at = np.arange(0.0, _SPAN, _POSE_STEP)
@@ -87,7 +87,7 @@ def visit(one: Machine, worn: Scene, rng: np.random.Generator) -> tuple[Load, Po
 
 
 def one_month(seed: int, day_m: float) -> dict[str, Any]:
-    """Estimate on each of the days, of `day_m` along the face each, and the coefficient from that."""
+    """Estimate on each of the days, each with `day_m` along the face, and derive the coefficient."""
     rng = np.random.default_rng([20261123, seed])
     one = machine(rng)
     path = true_path(one, rng, day_m)
@@ -117,7 +117,7 @@ def one_month(seed: int, day_m: float) -> dict[str, Any]:
 
 
 def true_path(one: Machine, rng: np.random.Generator, day_m: float) -> life.Path:
-    """Return the path of the true wear over the month, in finer steps and with longer means than an estimate's."""
+    """Return the path of the true wear over the month, in finer steps and with longer means than in an estimate."""
     jump, periods = tuning.JUMP, tuning.MEAN_PERIODS
     tuning.JUMP, tuning.MEAN_PERIODS = (jump[0] / 4.0, jump[1]), (periods[0], 4 * periods[1])
     try:

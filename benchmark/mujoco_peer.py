@@ -1,10 +1,10 @@
 """MuJoCo on the Kelvin-Voigt bench scene.
 
-How it is bent: each frame corner is a sphere of radius r, fixed; the cavity's walls are boxes on the head, r further
-out. A negative `solref` gives stiffness and damping of a constraint directly, but scaled by the bodies' inverse weight
-A and the impedance d: the force is the wanted one when d is small, solref = -(K, C) A (1 - d), and A is made so
-large (times 1e6) that the constraint's regularisation outweighs the coupling of the contacts. Contacts never pull, as
-in F = max(0, K d + C d'). A law with d^1.5 cannot be expressed so.
+Adaptation: each frame corner is a sphere of radius r, fixed; the cavity's walls are boxes on the head, r further out. A
+negative `solref` gives stiffness and damping of a constraint directly, but scaled by the bodies' inverse weight A and
+the impedance d: the force is as wanted if d is small and solref = -(K, C) A (1 - d), with A so large (times 1e6) that
+the constraint's regularisation outweighs the coupling of the contacts. Contacts never pull, as in F = max(0, K d + C
+d'). A law with d^1.5 cannot be expressed in this way.
 """
 
 from __future__ import annotations

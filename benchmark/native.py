@@ -23,7 +23,7 @@ def compile_c(source: str, libraries: Sequence[str], flags: Sequence[str] = FLAG
     Raises
     ------
     NotInstalled
-        Without a compiler, or when a header or library is missing.
+        The compiler, a header or a library is missing.
     """
     compiler = shutil.which("gcc")
     if compiler is None:

@@ -1,8 +1,8 @@
 """`plow-twin live` beside an OPC UA server that writes three values at 1 kHz: loss, share of a core, age at the twin.
 
-`python benchmark/live_load.py --opcua [--minutes 10]` first lets a bare client of asyncua hear the server for a
-tenth of the time: the age that the server and the loopback alone cause. Both processes ask for SCHED_FIFO, so that
-other programs do not stand in their way; the load of the machine is printed with the figures.
+`python benchmark/live_load.py --opcua [--minutes 10]` first connects a bare asyncua client to the server for a tenth of
+the time, to measure the age that server and loopback alone cause. Both processes ask for SCHED_FIFO, so that other
+programs do not delay them; the load of the machine is printed with the figures.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 NODES = ("Load.Fx", "Load.Fy", "Load.M")
 NAMESPACE = 2
-#: Intervals of sending [ms] of the bare client, and length of its queue: those that the twin asks for.
+#: Publishing interval [ms] and queue length of the bare client, as the twin requests them.
 PUBLISHING_MS, QUEUE = 10.0, 10_000
 #: Time of silence after which the bare client has heard all [s].
 SILENCE_S = 3.0
@@ -139,7 +139,7 @@ def _live(
         cwd=folder, env=os.environ | {"PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     assert server.stdout is not None and twin.stdout is not None
-    time.sleep(0.2 * seconds)  # the start's time is no share of the run
+    time.sleep(0.2 * seconds)  # the start does not count as part of the run
     begin, busy, machine = time.monotonic(), _cpu_s(twin.pid), _machine_s() - _cpu_s(server.pid)
     time.sleep(0.6 * seconds)
     passed_s, used_s = time.monotonic() - begin, _cpu_s(twin.pid) - busy
@@ -193,7 +193,7 @@ def _machine_s() -> float:
 
 
 def main() -> None:
-    """Be the server or the bare client."""
+    """Run the server or the bare client."""
     role, port, *numbers = sys.argv[1:]
     at_once()
     logging.disable()

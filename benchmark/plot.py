@@ -31,7 +31,7 @@ STYLES: dict[str, tuple[str, str]] = {
     "MuJoCo RK4": ("#8c510a", ">"),
     "Exudyn RK44": ("#dfa526", "h"),
 }
-#: Engines that have 1 ms rows only are drawn among the others' sparse ones.
+#: Engines with rows only every 1 ms are drawn with the sparse rows of the others.
 _DENSE_ONLY = ("MuJoCo", "Exudyn")
 
 

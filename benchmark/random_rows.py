@@ -12,7 +12,7 @@ from work_precision import OURS_BARE, prepare_bare
 from plow_twin import Scene, SolverError
 
 TOLERANCES = (1e-3, 1e-6, 1e-9)
-#: Growth of a displacement at t = 0 from which on a scene is listed by itself: no step control can hold a tolerance.
+#: Growth of a displacement at t = 0 above which a scene is listed separately: no step control can keep a tolerance.
 AMPLIFIES = 1e4
 QUICK_COUNT = 10
 
@@ -20,7 +20,7 @@ QUICK_COUNT = 10
 def random_rows(few: bool, notify: Callable[[str], None]) -> Iterator[Row]:
     """Yield the random scenes: error in tolerances (`value`) against the reference, and the scene's amplification.
 
-    `few` takes some of those that need no other kernel than the KV bench scene.
+    `few` runs only some scenes, which need no kernel besides that of the KV bench scene.
     """
     saved = random_scenes.load()
     chosen = [index for index, scene in enumerate(saved.scenes) if not few or _is_plain(scene)]

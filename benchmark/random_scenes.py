@@ -59,7 +59,7 @@ class RandomScenes:
     events: NDArray[np.int64]
 
     def chaotic(self, tol: float) -> NDArray[np.bool_]:
-        """Return which scenes have no reference good enough for `tol`: the two reference runs part by a tenth of it."""
+        """Return which scenes have no reference good enough for `tol`: the two runs differ by a tenth of it or more."""
         return ~(self.disagreement <= 0.1 * tol)
 
 
@@ -70,7 +70,7 @@ def distance(scene: Scene, q: NDArray[np.float64], reference: NDArray[np.float64
 
 
 def draw_scene(rng: np.random.Generator) -> Scene:
-    """Draw geometry, mass, law, stiffness, loads and initial velocity; softer than the model's range is drawn again."""
+    """Draw geometry, mass, law, stiffness, loads and initial velocity, again if softer than the model's range."""
     while True:
         parameters = _draw(rng)
         head, frame, contact = parameters["head"], parameters["frame"], parameters["contact"]

@@ -36,7 +36,7 @@ _AMPLITUDE = np.array([32_000.0, -11_000.0, -45_495.0])
 _START_NS = 1_800_000_000_000_000_000
 _REPEATS = 5
 _BATCH = 8192
-#: A recording whose replay is its start [s].
+#: Length of a recording whose replay is almost only the start [s].
 _SHORT_S = 0.1
 
 

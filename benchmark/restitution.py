@@ -64,7 +64,7 @@ def free_impact(contact: Contact, mass: float = MASS_KG, speed: float = SPEED_M_
         locked=("x", "theta"),
         pairs=("top_left_top",),
     )
-    # 5 ms to the wall; out of it the slowest (D at its cap) takes some 50 ms
+    # 5 ms to the wall; the slowest rebound (D at its cap) takes some 50 ms
     result = simulate(scene, 0.2 / speed, output_dt=0.2 / speed, tol=1e-11)
     if result.penetration[-1, 0] > 0.0 or result.statistics["top_left_top"]["makes"] != 1:
         raise RuntimeError(f"{contact}: not one whole impact")

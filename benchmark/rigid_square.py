@@ -12,7 +12,7 @@ import numpy as np
 
 from plow_twin.study.measured.square import RATE_HZ
 
-#: Time step in s: a corner goes 0.5 mm in one at most.
+#: Time step in s: a corner moves at most 0.5 mm in a step.
 STEP = 2e-4
 #: Impulse per mass in m/s of a bit of Routh's integration.
 BIT = 5e-3

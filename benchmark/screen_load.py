@@ -1,4 +1,4 @@
-"""CPU that the operator's screen takes of a twin at 1 kHz, and of its server, for some numbers of open pages.
+"""CPU time of the operator's screen, in a twin at 1 kHz and in the screen's server, by number of open pages.
 
 python benchmark/screen_load.py [SECONDS]
 """

@@ -1,13 +1,14 @@
 """A slider with clearance in its guide (Flores, Leine and Glocker 2010) against the reference data of Siconos.
 
 Multibody Syst. Dyn. 23 (2010) 165, table 1. Siconos computes it with rigid contact and time stepping; its reference
-data lie in github.com/siconos/siconos-tutorials, examples/mechanics/SliderCrank/*.ref (Apache-2.0, INRIA) and are not
-a part of this project. `python benchmark/siconos.py FOLDER` compares the `.ref` files of a copy of that folder and
-writes `benchmark/results/siconos.csv`.
+data are in github.com/siconos/siconos-tutorials, examples/mechanics/SliderCrank/*.ref (Apache-2.0, INRIA) and are not a
+part of this project. `python benchmark/siconos.py FOLDER` compares the `.ref` files of a copy of that folder and writes
+`benchmark/results/siconos.csv`.
 
-Both know four corners in a guide. Ours is a free body under loads, theirs hangs on a crank and a rod; so the slider
-gets what the mechanism would do to it without contact: the load m a(t), with a(t) the free acceleration of the
-slider across the guide at the reference's own state. Times of touch, restitution and rest are then ours.
+Both models have four corners in a guide. Our slider is a free body under loads; theirs hangs on a crank and a rod. The
+effect of the mechanism without contact therefore acts on our slider as a load m a(t), where a(t) is the free
+acceleration of the slider across the guide in the reference's own state. Our solver then computes touches, restitution
+and rests.
 """
 
 from __future__ import annotations
@@ -112,7 +113,7 @@ def rigid_motion(t_end: float, impacts: int) -> tuple[Array, Array, list[float]]
 
 
 def our_slider(t: Array, angles: Array, rates: Array, stiffness: float, output_dt: float) -> Result:
-    """Move our head in the guide under the load that the mechanism puts on it at the states given, (n, 2) each.
+    """Move our head in the guide under the load of the mechanism in given states, (n, 2) each.
 
     Our head is the cavity that moves about the guide's block: its height is minus the slider's.
     """

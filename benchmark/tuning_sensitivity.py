@@ -1,10 +1,10 @@
-"""How sensitive the estimate is to each chosen number: half and twice of it, on a few held-out truths.
+"""How sensitive the estimate is to each chosen number: at half and twice its value, on a few held-out truths.
 
     python benchmark/tuning_sensitivity.py                     # what results/tuning.jsonl lacks
     python benchmark/tuning_sensitivity.py --number HUBER
 
-Only numbers that an estimate reads are varied in it. The truths have four load periods and seeds on which nothing was
-set; `tools/pages.py` makes the table of `benchmark/results/tuning.md` from the result.
+Only numbers that an estimate reads are varied in it. The truths have four load periods and seeds that no tuning used;
+`tools/pages.py` makes the table of `benchmark/results/tuning.md` from the result.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class _Watched(ModuleType):
 
 
 def scaled(value: tuning.Value, factor: float, unit: str) -> tuning.Value:
-    """Return a number times a factor, all elements alike; of a quantile the distance from 1."""
+    """Return a number times a factor, all elements alike; for a quantile, scale the distance from 1."""
     if isinstance(value, tuple):
         return tuple(scaled(part, factor, unit) for part in value)
     if unit == "quantiles":
@@ -54,7 +54,7 @@ def scaled(value: tuning.Value, factor: float, unit: str) -> tuning.Value:
 
 @contextmanager
 def varied(name: str, value: tuning.Value) -> Iterator[None]:
-    """Give a number another value for a while."""
+    """Give a number another value within a context."""
     before = getattr(tuning, name)
     setattr(tuning, name, value)
     try:
@@ -90,7 +90,7 @@ def summary(name: str, factor: float, rows: list[dict[str, Any]]) -> str:
     """Return the effect of one variation on the clearances and verdicts.
 
     The largest change of a clearance in its standard deviations, RMSE over that with the chosen value, intervals that
-    hold of those known, and how many verdicts change.
+    contain the truth among known clearances, and how many verdicts change.
     """
     base = {row["group"]: row for row in rows if row["name"] == ""}
     own = [row for row in rows if row["name"] == name and row["factor"] == factor]
@@ -162,7 +162,7 @@ def main(numbers: tuple[str, ...], cases: tuple[str, ...], out: Path) -> None:
 
 
 def watched(truth: Truth) -> tuple[dict[str, Any], list[str]]:
-    """Run with the chosen values; return which of them were read too."""
+    """Run with the chosen values; also return which of them were read."""
     _Watched.read.clear()
     before, tuning.__class__ = tuning.__class__, _Watched
     try:

@@ -1,6 +1,6 @@
 """How long rerun's viewer takes to show a .rrd, and in how much memory: python benchmark/view_open.py RUN.rrd SECONDS.
 
-SECONDS after the first stamp is the moment that is shown; the memory is that of the viewer's processes, resident.
+The viewer shows the moment SECONDS after the first stamp; the memory is the resident memory of its processes.
 """
 
 from __future__ import annotations

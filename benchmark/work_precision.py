@@ -41,7 +41,7 @@ QUICK_TOLERANCES = (1e-3, 1e-6, 1e-9, 1e-12)
 FIXED_STEPS = (1e-3, 5e-4, 2e-4, 1e-4, 5e-5, 2e-5, 1e-5)
 LEAN_STEPS = (*FIXED_STEPS, 5e-6, 2e-6, 1e-6)
 _LADDER = _decades(2, 13)
-#: CVODE in C goes on to where it breaks down.
+#: CVODE in C is run until it breaks down.
 _C_LADDER = _decades(2, 14)
 #: solve_ivp steps in Python, far from the fastest: sparse output only; Radau and BDF, which take seconds, by decades.
 _SOLVE_IVP = {"LSODA": _decades(3, 12), "DOP853": _decades(3, 12), "Radau": _decades(3, 8, 1), "BDF": _decades(3, 8, 1)}
@@ -70,7 +70,7 @@ def prepare_simulate(
     sensitivity: bool | tuple[str, ...] = False,
     whole_call: bool = False,
 ) -> Callable[[], Sample]:
-    """Prepare `simulate` with everything it gives: poses, rates, forces, penetrations, events, statistics.
+    """Prepare `simulate` with all its outputs: poses, rates, forces, penetrations, events, statistics.
 
     The time is that of the run as `simulate` itself reports it, or (`whole_call`) from call to return.
     """
@@ -93,7 +93,7 @@ def prepare_simulate(
 
 
 def prepare_bare(scene: Scene, output_dt: float, tol: float, t_end: float = T_END) -> Callable[[], Sample]:
-    """Prepare the compiled loop alone, with poses and rates as its only output, as the peers have it."""
+    """Prepare the compiled loop alone, with poses and rates as its only output, like the peers."""
     compiled, work, times = compile_scene(scene, tol), new_work(), output_times(t_end, output_dt)
 
     def solve() -> tuple[int, Motion]:
@@ -208,7 +208,7 @@ def located_cases(scene_name: str) -> Iterator[Case]:
 
 
 def multibody_cases(scene_name: str) -> Iterator[Case]:
-    """Yield MuJoCo and Exudyn; both write rows at each of their steps or each 1 ms."""
+    """Yield MuJoCo and Exudyn; both write rows at each step or every 1 ms."""
     p = constants(bench_scene(scene_name))
     for integrator, steps in _MUJOCO.items() if scene_name == "kv" else ():
         for dt in steps:

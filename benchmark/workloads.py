@@ -56,7 +56,7 @@ def _harmonic(scene: Scene) -> Harmonic:
 
 
 def swaying_scene() -> Scene:
-    """Return the KV scene weightless under a load too small to carry the head to a wall: driven flight."""
+    """Return the KV scene without weight, under a load too small to carry the head to a wall: driven flight."""
     scene = bench_scene("kv")
     load = _harmonic(scene)
     omega = 20.0
@@ -69,7 +69,7 @@ def swaying_scene() -> Scene:
 
 
 def horizon_cases(longest: float) -> Iterator[Case]:
-    """Yield the KV scene over growing machine time, and an hour with next to no events."""
+    """Yield the KV scene over growing machine time, and an hour almost without events."""
     scenes = [(bench_scene("kv"), "kv", t_end) for t_end in (1.0, 10.0, 60.0, 600.0, HOUR_S)]
     scenes += [
         (still_scene(), "at rest after the fall", HOUR_S),

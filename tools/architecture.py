@@ -32,9 +32,9 @@ SAMPLE = (
     ("ros/subscriptions, live/inputs", "stamp and wrench; loss counted"),
     ("live/runtime: step", "samples in, messages out"),
     ("stream/driver, intake", "used, or dropped by a counted reason"),
-    ("stream/session: advance", "journal, then apply | record/replay comes in here"),
+    ("stream/session: advance", "journal, then apply | record/replay starts here"),
     ("run/twin, solve/loop: advance_rows", "steps from event to event; one row for a sample"),
-    ("stream/outputs, live/publishing", "all since the publication before; bytes"),
+    ("stream/outputs, live/publishing", "all since the last publication; bytes"),
     ("ros/front: send | record/recorder", "topics | MCAP"),
 )
 

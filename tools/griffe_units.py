@@ -1,4 +1,4 @@
-"""Gives the fields of scenes their meaning in the reference: unit and text of each from the source."""
+"""Extension of griffe: documents each field of a scene with its unit and text from the source."""
 
 from __future__ import annotations
 

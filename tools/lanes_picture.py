@@ -1,4 +1,4 @@
-"""Draw `docs/images/lanes.svg`: what the lanes of a vector do in one step (`plow_twin/solve/lanes/`).
+"""Draw `docs/images/lanes.svg`: one step in the lanes of a vector (`plow_twin/solve/lanes/`).
 
 python tools/lanes_picture.py
 """

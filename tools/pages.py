@@ -1,4 +1,4 @@
-"""Write what comes from results or code, the tables of the pages and files of `config`: `python tools/pages.py`.
+"""Write the tables of pages and the files of `config` that are made from results or code: `python tools/pages.py`.
 
 A page marks the place of a table by `<!-- made: NAME -->` and `<!-- end -->`; the text between is replaced by what
 `TABLES[NAME]` returns.
@@ -44,7 +44,7 @@ def with_topics(policy: str) -> str:
 
 
 def main() -> None:
-    """Rewrite the pages, the file of parameters, that of the keys of diagnostics, and the policy of SROS2."""
+    """Rewrite the pages, the files of parameters and of diagnostic keys, and the policy of SROS2."""
     for page in PAGES:
         page.write_text(renewed(page.read_text(encoding="utf-8")), encoding="utf-8")
     (ROOT / "config" / "twin.yaml").write_text(yaml_text(), encoding="utf-8")

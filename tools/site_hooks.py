@@ -21,14 +21,14 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Lead links to an example to its place in the gallery, and show the file that a page names as `<!-- file: -->`."""
+    """Point links to examples into the gallery, and insert a file that a page names as `<!-- file: -->`."""
     text = re.sub(r"\]\((?:\.\./)*examples/(\w+)/README\.md\)", r"](examples.md#\1)", markdown)
     text = re.sub(r"\[([^\]]+)\]\(\.\./[^)]+\)", r"`\1`", text)
     return re.sub(r"<!-- file: (.+) -->", lambda named: _shown(ROOT / named[1]), text)
 
 
 def _for_the_site(text: str) -> str:
-    """Let links of the repository's front page start in `docs/`; files that are no page lose their link."""
+    """Make links of the repository's front page relative to `docs/`; links to files that are not pages are removed."""
     text = text.replace("](docs/", "](").replace("](examples/README.md)", "](examples.md)")
 
     def keep(link: re.Match[str]) -> str:
@@ -51,5 +51,5 @@ def _gallery() -> str:
         for source in sorted(folder.iterdir()):
             if source.suffix in LANGUAGES:
                 parts.append(f"`{source.relative_to(ROOT)}`\n\n{_shown(source)}")
-    # the list at the top leads to the parts below
+    # the list at the top links to the parts below
     return re.sub(r"\]\((\w+)/README\.md\)", r"](#\1)", "\n\n".join(parts))

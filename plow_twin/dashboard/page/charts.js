@@ -8,7 +8,7 @@ const ink = () => getComputedStyle(document.documentElement).getPropertyValue("-
 const grid = () => getComputedStyle(document.documentElement).getPropertyValue("--line");
 const faded = (color) => `${color}33`;
 
-// Columns of the seconds: their time, then what `read` takes of each; a line ends where seconds are missing.
+// Columns: the time of each second, then the value that `read` returns for it; a line ends where seconds are missing.
 function columns(seconds, count, read) {
   const found = Array.from({length: count + 1}, () => []);
   let before = null;
@@ -103,7 +103,7 @@ export class Charts {
     plot.ctx.restore();
   }
 
-  // Thresholds across, marks and acknowledgements downwards.
+  // Horizontal lines for thresholds, vertical lines for marks and acknowledgements.
   rule(plot, limits) {
     const {ctx, bbox} = plot;
     ctx.save();

@@ -1,4 +1,4 @@
-// The operator's screen: what the server sends is kept, and drawn when the page is seen.
+// The operator's screen: it keeps the server's data, and draws them while the page is visible.
 
 import {Section, forceColor, wearColor} from "./section.js";
 import {Charts} from "./charts.js";
@@ -18,7 +18,7 @@ const state = {facts: null, parts: {}, events: [], seconds: [], motion: null, ne
 let section = null, charts = null, socket = null, wait = 500;
 const token = {value: sessionStorage.getItem("token") ?? ""};
 
-// a token in the address never leaves the browser: it stands behind #
+// a token in the address never leaves the browser: it follows #
 if (location.hash.startsWith("#token=")) {
   token.value = decodeURIComponent(location.hash.slice(7));
   sessionStorage.setItem("token", token.value);

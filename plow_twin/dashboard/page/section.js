@@ -26,10 +26,10 @@ export function forceColor(force, [warn, error], largest) {
 
 export const wearColor = (depth, largest) => mixed([205, 210, 214], PURPLE, largest > 0 ? depth / largest : 0);
 
-// The walls by the two pads at their ends: top, right, bottom, left.
+// The walls (top, right, bottom, left), each as the two pads at its ends.
 const WALLS = [[0, 2], [3, 5], [4, 6], [7, 1]];
 
-// Where the lines through two points each cross.
+// The intersection of two lines, each through two points.
 function crossing([[ax, ay], [bx, by]], [[cx, cy], [dx, dy]]) {
   const [ux, uy, vx, vy] = [bx - ax, by - ay, dx - cx, dy - cy];
   const share = ((cx - ax) * vy - (cy - ay) * vx) / (ux * vy - uy * vx);
@@ -80,7 +80,7 @@ export class Section {
       return add(this.svg, "rect", {class: "pad", x: Math.min(...xs), y: Math.min(...ys), width: Math.abs(xs[0] - xs[1]), height: Math.abs(ys[0] - ys[1]), "vector-effect": "non-scaling-stroke"});
     };
     const force = stripe(0), wear = stripe(1);
-    // the number stands beyond the end of a pad along the wall, or beside a pad that stands upright
+    // the number is beyond the end of a horizontal pad, or beside an upright pad
     const [dx, dy] = pad.normal[0] ? [0.21, 0.33] : [0.78, 0.1];
     const text = this.text("", pad.at[0] * (this.half[0] - dx * small), -pad.at[1] * (this.half[1] - dy * small));
     if (pad.normal[0]) text.style.textAnchor = pad.normal[0] > 0 ? "end" : "start";

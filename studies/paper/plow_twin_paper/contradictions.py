@@ -37,7 +37,7 @@ def _phase() -> Contradiction:
     return Contradiction(
         "section 3, Figs 8 and 9",
         "All loads are in phase as sin(2t), yet the quoted times do not split by the sign of the load: the "
-        f"counter-clockwise contact at {times} falls into the half period of the clockwise ones.",
+        f"counter-clockwise contact at {times} falls into the half period of clockwise contacts.",
         f"sin(2t): {listed}",
     )
 
@@ -61,7 +61,7 @@ def _zero_load(runs: PaperRuns) -> Contradiction:
 def _doubled(runs: PaperRuns) -> Contradiction:
     pair = int(runs.case.penetration.max(axis=0).argmax())
     depth = float(runs.case.penetration[:, pair].max())
-    # distances to the two opposite walls of a strip, from a point that far outside of it
+    # distances from a point that is `depth` outside a strip to the strip's two sides
     width = runs.scene.frame.height_m + runs.scene.clearance.vertical_m
     excess = abs(-depth) + abs(width + depth) - width
     return Contradiction(
@@ -97,14 +97,14 @@ def _side(runs: PaperRuns, first: str, second: str) -> float:
 _WORDS: Final = (
     Contradiction(
         "section 3, Fig. 9",
-        "The three-point contact {a,b,c} at 57.85 s stands in the paragraph on clockwise contacts and is called "
-        "counter-clockwise there; taken as clockwise here.",
+        "The three-point contact {a,b,c} at 57.85 s is in the paragraph on clockwise contacts but is called "
+        "counter-clockwise there; this study takes it as clockwise.",
         "a, b, c counter-clockwise would be the fourth counter-clockwise set beside {b}, {a,d}, {a,b,d}",
     ),
     Contradiction(
         "section 5, captions of Figs 14 and 15",
-        "The Chinese captions say vertical clearance for Fig. 14 and horizontal for Fig. 15, the English ones the "
-        "reverse; the Chinese ones are followed here.",
+        "The Chinese captions say vertical clearance for Fig. 14 and horizontal for Fig. 15, the English "
+        "captions the reverse; this study follows the Chinese captions.",
         "the order of Figs 10 and 11 speaks for the Chinese captions",
     ),
 )
@@ -136,6 +136,6 @@ _GAPS: Final = (
         "sections 3 and 4",
         "The case of Figs 6 to 9 (25 mm horizontal, 30 mm vertical) lies on neither curve of Figs 10 and 11 (20 mm "
         "kept fixed): the published forces cannot be checked against the published curves.",
-        "no number can be read from Figs 10, 11, 14, 15; the text gives their shape alone",
+        "no number can be read from Figs 10, 11, 14, 15; the text gives only their shape",
     ),
 )

@@ -92,7 +92,7 @@ def fig09(runs: PaperRuns) -> Figure:
 def _close_up(runs: PaperRuns, sense: Sense) -> Figure:
     """Forces of one sense over one period around the quoted times, and below who carries force when."""
     times = {moment: shown_time(moment.time_s, runs.t_end) for moment in MOMENTS if moment.sense == sense}
-    # a shorter run may fit one of them and not another of the same contact: all go back alike
+    # a shorter run may contain only some of the quoted times: all are moved back equally
     back = max(moment.time_s - time for moment, time in times.items())
     times = {moment: moment.time_s - back for moment in times}
     centre = 0.5 * (min(times.values()) + max(times.values()))

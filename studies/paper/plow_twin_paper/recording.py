@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from plow_twin.record.writer import RunWriter
 
 Array = NDArray[np.float64]
-#: Distance of the samples [s]; a message follows each so many of them. Peaks between messages are in the messages.
+#: Interval of the samples [s], and number of samples per message. Messages include the peaks between them.
 SAMPLE_S: Final = 1e-3
 MESSAGE_EVERY: Final = 4
 _CHUNK_B: Final = 256 * 1024

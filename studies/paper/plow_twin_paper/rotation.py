@@ -2,7 +2,7 @@
 
 A centre of mass off the cavity's centre couples translation and rotation in the mass matrix; the paper leaves that out
 and keeps a constant moment -m g arm (its section 2). The equivalent offset is `com_offset_m = (arm, 0)`. The paper does
-not say about which point its inertia is meant: both readings are run.
+not state the reference point of its inertia: both readings are run.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class RotationRow:
     consistent_centre: float
 
     def change(self, value: float) -> float | None:
-        """Return by which share a value differs from that of the constant moment; None when that is zero."""
+        """Return the relative difference of a value from that of the constant moment; None if the latter is zero."""
         return (value - self.constant) / abs(self.constant) if self.constant else None
 
 

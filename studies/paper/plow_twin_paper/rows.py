@@ -41,7 +41,7 @@ class Row:
     inputs : str
         Whether the scene's fitted numbers were fitted to this very statement.
     published_value, value : float, optional
-        The two as numbers in `unit`, for statements that are a number.
+        Both values as numbers in `unit`, for numeric statements.
     """
 
     group: str

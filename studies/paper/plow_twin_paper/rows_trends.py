@@ -89,7 +89,7 @@ def _trend(group: str, source: str, what: str, values: Array, at: str, falls: bo
 def longest_faces(runs: PaperRuns, mark: FaceMark, since_s: float = 0.0) -> tuple[float, float] | None:
     """Return start and length in s of the longest time with that many faces in contact in that sense, if any.
 
-    Looked for from `since_s` to the end of the section's 20 s.
+    The search goes from `since_s` to the end of the section's 20 s.
 
     A corner has one pair in each sense, each with another wall, so that points and faces count alike.
     """

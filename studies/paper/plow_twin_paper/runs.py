@@ -32,13 +32,13 @@ from plow_twin_paper.values import (
 Array = NDArray[np.float64]
 OnProgress = Callable[[float], object]
 
-#: Shortest run that has a settled period of the load to look at.
+#: Shortest run that contains a settled period of the load.
 SHORTEST_S: Final = 2.0 * PERIOD_S
 #: Longest run: its rows of all forms take some gigabyte.
 LONGEST_S: Final = 1000.0
 #: Rows of the figures [s]; forces change over tens of milliseconds.
 OUTPUT_DT_S: Final = 1e-3
-#: Steps of the curves between the five places where the paper's are read.
+#: Steps of a curve between two of the five places at which the paper's curves are read.
 _FINE_STEPS: Final = 10
 
 
@@ -73,10 +73,10 @@ class FaceRun:
 
 @dataclass(frozen=True)
 class PaperRuns:
-    """Everything that is computed.
+    """All runs, and what they were computed from.
 
     `scale` is the scene's clearance over the published one: horizontal, vertical; `failed` counts the runs that could
-    not be brought to their end. The case itself always is.
+    not be completed; the case itself is always complete.
     """
 
     scene: Scene
@@ -117,7 +117,7 @@ def run_all(scene: Scene, t_end: float, workers: int | None = None, on_progress:
     scene : Scene
         At the clearance of the paper's Figs 6 to 9, whatever its convention: the other clearances are scaled alike.
     t_end : float
-        End of the runs in s, at least `SHORTEST_S`; those of section 5 end at 20 s or with it.
+        End of the runs in s, at least `SHORTEST_S`; the runs of section 5 end at 20 s or earlier with it.
     workers, on_progress
         Threads, all cores by default; receives the share done.
 

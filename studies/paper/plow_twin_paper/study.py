@@ -36,7 +36,7 @@ class Change:
 
 @dataclass(frozen=True)
 class PaperStudy:
-    """All that was found; the files of it too when they were written."""
+    """All results, and the files if they were written."""
 
     runs: PaperRuns
     rows: list[Row]

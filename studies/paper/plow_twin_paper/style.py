@@ -40,7 +40,7 @@ _DPI: Final = 130
 
 @contextmanager
 def sheet(width: float, height: float) -> Iterator[Figure]:
-    """Give an empty figure of that size [inch] in the report's style."""
+    """Yield an empty figure of a size [inch] in the report's style."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 

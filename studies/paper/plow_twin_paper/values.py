@@ -1,8 +1,8 @@
 """The paper's published values, as data with their place in the text; every number here is `given`.
 
 Source: Mao, Zhang et al., "Dynamic characteristics of plough head under contact-impact with clearances", J. Vibration
-and Shock 34(19), 2015. Its curves are known through its text alone, so places are sections and figures. The criteria by
-which a run counts as agreeing stand at the end; they are ours.
+and Shock 34(19), 2015. Its curves are known through its text alone, so places are sections and figures. The criteria of
+agreement at the end are ours.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ FACES: Final = ("top", "right", "bottom", "left")
 
 #: Clearance of Figs 6 to 9 (section 3): horizontal, vertical [m].
 CASE_M: Final = (0.025, 0.030)
-#: The clearance that stays fixed in Figs 10 and 11, and the other one, read off at five places [m] (section 4).
+#: The fixed clearance of Figs 10 and 11, and the five values of the other clearance [m] (section 4).
 FIXED_M: Final = 0.020
 GRID_M: Final = (0.020, 0.0225, 0.025, 0.0275, 0.030)
-#: Figs 14 and 15, section 5: both clearances take these values [m]; the simulation lasts that long [s].
+#: Figs 14 and 15, section 5: values of both clearances [m], and length of the simulation [s].
 FACE_GRID_M: Final = (0.020, 0.025, 0.030)
 FACE_T_END_S: Final = 20.0
 #: Angular frequency of the loads [rad/s] (section 3) and their period [s].
@@ -70,7 +70,7 @@ MOMENTS: Final = (
 
 @dataclass(frozen=True)
 class FaceMark:
-    """A mark in Fig. 13 (section 5): that many inner faces touch at once in that sense."""
+    """A mark in Fig. 13 (section 5): `faces` inner faces touch at once in a sense."""
 
     number: int
     sense: Sense
@@ -79,11 +79,11 @@ class FaceMark:
 
 FACE_MARKS: Final = (FaceMark(1, "ccw", 1), FaceMark(2, "cw", 2), FaceMark(3, "cw", 3))
 
-#: A force agrees when it is within this share of the published one.
+#: A force agrees when it is within this share of the published force.
 FORCE_TOLERANCE: Final = 0.05
-#: A contact set occurs when it is held at least that long without a break [s].
+#: A contact set occurs when it lasts at least this long without a break [s].
 SHORTEST_HOLD_S: Final = 5e-3
-#: A step against a trend counts from this share of the curve's largest value on: what a printed curve shows.
+#: Smallest step against a trend that counts, over the curve's largest value: a printed curve shows no smaller step.
 TREND_SLACK: Final = 0.005
 #: "rare", for sets that the paper does not mention: at most this share of the contact time.
 RARE_SHARE: Final = 0.10
