@@ -1,6 +1,6 @@
 """Time and memory of `compare` over a month: `python benchmark/compare_month.py FOLDER`.
 
-With `--hours 0.5 --rate 100 --verb analyse`, those of `analyse` over many short runs.
+With `--hours 0.5 --rate 100 --verb analyse` it measures `analyse` over many short runs.
 
 Ten minutes are computed once; each day's run repeats them with its own stamps. The number of windows, on which the
 memory depends, is that of a month at any rate.

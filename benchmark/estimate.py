@@ -112,7 +112,7 @@ def as_markdown(groups: Sequence[dict[str, Any]]) -> str:
 
 
 def load_rows(path: Path) -> list[dict[str, Any]]:
-    """Return the rows that a file holds, numbers as numbers; none without a file."""
+    """Return the rows that a file holds, with numbers converted; empty without a file."""
     if not path.exists():
         return []
     return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line]

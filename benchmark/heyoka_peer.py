@@ -38,7 +38,7 @@ def _pairs(p: Array, state: Sequence[Any], hy: Any) -> list[tuple[Any, ...]]:
 
 
 def _equations(p: Array, begin: float) -> tuple[list[tuple[Any, Any]], list[tuple[Any, Any]]]:
-    """Return the rates of the state, and for each pair a function positive in contact, negative where it would pull."""
+    """Return the rates of the state, and for each pair a function positive in contact, negative when it would pull."""
     import heyoka as hy
 
     names = ("x", "y", "th", "vx", "vy", "om")

@@ -75,7 +75,7 @@ def _many_twins(scene: Scene, t: Array, wrench: Array, samples: int) -> float:
     return timed(run)[0]
 
 
-#: A process that gets a live twin ready and says how long it took and what numba compiled or read from its cache.
+#: A process that prepares a live twin and prints the time taken and the kernels that numba compiled or read.
 _START = """
 import json, sys, time
 begin = time.perf_counter()

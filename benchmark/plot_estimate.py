@@ -29,7 +29,7 @@ _MOST_MM = 0.5
 
 
 def draw(rows: Sequence[dict[str, Any]], lives: Sequence[dict[str, Any]], path: Path) -> None:
-    """Draw errors with their intervals over the stiffness, how often intervals hold, and forecasts over a life."""
+    """Draw errors with intervals over the stiffness, the coverage of intervals, and forecasts over a life."""
     figure, panels = plt.subplots(2, 2, figsize=(12.5, 8.2), layout="constrained")
     for panel, axis, name in zip(panels[0], "hv", ("horizontal", "vertical"), strict=True):
         for group, color in STYLES.items():

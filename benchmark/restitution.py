@@ -30,7 +30,7 @@ SHOWN = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0)
 RATIOS = (0.0, 0.01, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 2.0)
 #: Ramp lengths of the ramped law, over the depth v sqrt(m/K) of the undamped impact.
 RAMPS = (0.001, 0.01, 0.1, 0.3, 1.0, 3.0, 10.0)
-#: A law is called valid where it delivers the nominal restitution within this share.
+#: A law counts as valid if it delivers the nominal restitution within this share.
 VALID = 0.05
 
 MASS_KG, SPEED_M_S, STIFFNESS, EXPONENT = 2.0, 1.0, 1e9, 1.5
@@ -80,7 +80,7 @@ def damped(ratio: float, ramp: float, stiffness: float, mass: float, speed: floa
 
 
 def measure(law: str, asked: Iterable[float], ramp: float = 0.0) -> list[Row]:
-    """Measure one law: by restitution where it has that form, with C d' by damping ratio, Hertz as it is."""
+    """Measure one law: by restitution or, if it adds C d', by damping ratio; Hertz has neither."""
     rows = []
     for value in asked:
         if LAWS[law].takes_restitution:

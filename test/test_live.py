@@ -950,7 +950,7 @@ def _mistaken(name: str) -> str:
         ("decimal commas", 3, "3000 malformed; the first: load has a line without the 4 cells of its header"),
         ("local dates", 3, "load has no time at 't': got '25.10.2026 02:59:00.000', expected a number or a date"),
         ("milliseconds since 1970", 3, "got '1764000000000.0', expected seconds; they look like ms: state the unit"),
-        ("coarse times", 3, "samples came twice, by stamp or number: have the times too few digits?"),
+        ("coarse times", 3, "samples came twice, by stamp or number: do the times have too few digits?"),
         ("newest first", 2, "they look like rows from the newest to the oldest: sort the rows by time"),
         ("swapped", 2, "t: got stamps of which"),
         ("days", 2, "they look like days of a spreadsheet: write seconds, or dates"),

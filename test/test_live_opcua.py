@@ -486,7 +486,7 @@ def test_untrusted_and_unencrypted_connections_are_refused(
             OpcUa(replace(access, **wrong), roles).start([])  # type: ignore[arg-type]
     for wrong, said in (
         ({"url": "opc.tcp://plough.example", "certificate": None, "key": None, "ca": None}, "without certificates"),
-        ({"url": "opc.tcp://user:secret@localhost"}, "user and topics stand elsewhere"),
+        ({"url": "opc.tcp://user:secret@localhost"}, "user and topics are set by other options"),
         ({"key": None}, "together"),
     ):
         with pytest.raises(BridgeError, match=said) as caught:

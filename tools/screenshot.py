@@ -55,7 +55,7 @@ def connect(port: int, patience_s: float = 60.0) -> ViewerClient:
 
 
 def bring_forward(client: ViewerClient, origins: list[str]) -> None:
-    """Show the views of these origins where they lie behind other tabs."""
+    """Show the views of these origins if they are behind other tabs."""
     shown = client.get_blueprint()
     layout = shown.blueprint
     views = {

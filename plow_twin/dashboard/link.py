@@ -76,7 +76,7 @@ def pair() -> tuple[Link, socket.socket]:
 
 
 def number(value: float) -> float | None:
-    """Return a number as JSON has it, with seven digits; None where it is not finite."""
+    """Return a number as JSON has it, with seven digits; None if it is not finite."""
     return float(f"{value:.7g}") if math.isfinite(value) else None
 
 

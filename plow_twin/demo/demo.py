@@ -64,7 +64,7 @@ class Watch:
         return self.parts.get(part, {}).get(key, "")
 
     def number(self, part: str, key: str) -> float:
-        """Return one figure as a number, 0 where it is missing."""
+        """Return one figure as a number, 0 if it is missing."""
         return float(self.text(part, key) or 0.0)
 
 

@@ -42,7 +42,7 @@ class Control:
     Attributes
     ----------
     services : Services or None
-        The services, once the twin is there.
+        The services, once the twin exists.
 
     Raises
     ------

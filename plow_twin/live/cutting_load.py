@@ -61,7 +61,7 @@ class Face:
     def travel(self, t: Array) -> tuple[Array, Array, NDArray[np.int64]]:
         """Return position [m], signed speed [m/s] and number of the pass at times `t` (n,) [s], from 0 on.
 
-        In a turn the speed falls linearly to zero and rises to the other side; half of it belongs to each pass.
+        In a turn the speed falls linearly to zero and rises to the other side; half of the turn belongs to each pass.
         """
         # the head turns within the face and reaches its end in the middle of the turn
         steady = (self.length_m - 0.5 * self.speed_m_s * self.turn_s) / self.speed_m_s

@@ -240,7 +240,7 @@ def asked_of(settings: Settings) -> Asked:
 
 
 def scenarios_of(settings: Settings) -> tuple[Scenario, ...]:
-    """Return the scenarios that the parameters name; LifeError where they cannot be read."""
+    """Return the scenarios that the parameters name; raise LifeError if they cannot be read."""
     return tuple(Scenario.parse(text) for text in settings.forecast_scenarios.split(";") if text.strip())
 
 

@@ -13,7 +13,7 @@ FILES: Final = ("scene", "record_path", "wear_state_path")
 
 
 class Named(Protocol):
-    """The parameters that matter here."""
+    """The parameters that name files, and the folder that bounds them."""
 
     @property
     def file_root(self) -> str:

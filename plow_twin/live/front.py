@@ -205,7 +205,7 @@ class BridgeFront:
             found.append(f"{counts[Verdict.MALFORMED]} malformed; the first: {self._feeder.unfit}")
         if counts[Verdict.DUPLICATE] > many:
             found.append(
-                f"{counts[Verdict.DUPLICATE]} samples came twice, by stamp or number: have the times too few digits?"
+                f"{counts[Verdict.DUPLICATE]} samples came twice, by stamp or number: do the times have too few digits?"
             )
         if counts[Verdict.NON_FINITE] > many:
             found.append(f"{counts[Verdict.NON_FINITE]} loads have a number that is not finite (nan or inf)")
@@ -269,7 +269,7 @@ class BridgeFront:
                 watcher.part(name, part)
 
     def _messages(self, timeout_s: float) -> Messages:
-        """Return the next messages, first those that the check of units has already read."""
+        """Return the next messages, first the messages that the check of units has already read."""
         if not self._first:
             return self._bridge.poll(timeout_s)
         return self._first.popleft()

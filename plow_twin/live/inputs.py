@@ -74,7 +74,7 @@ class Inputs:
         self.wait_s = 0.0
         self._heard_ns: dict[str, int] = {}
         self._other_heard_ns: dict[str, int] = {}
-        #: messages that could not be read, as far as the transport knows
+        #: messages that could not be read, if the transport counts them
         self.lost = 0
         self.travel, self.head_pose, self.gaps = (Intake(on_unused=self._unused) for _ in OPTIONAL)
         self._gap_limits: Limits | None = None

@@ -314,10 +314,10 @@ class Settings:
         -1.0,
         1e300,
         Effect.NOW,
-        "damping of the contact law, where it has one; -1: the scene's",
+        "damping of the contact law, if it has one; -1: the scene's",
     )
     restitution: float = _number(
-        -1.0, "1", -1.0, 1.0, Effect.NOW, "restitution of the contact law, where it has one; -1: the scene's"
+        -1.0, "1", -1.0, 1.0, Effect.NOW, "restitution of the contact law, if it has one; -1: the scene's"
     )
     wear_coefficient: float = _number(-1.0, "m^2/N", -1.0, 1.0, Effect.NOW, "wear coefficient; -1: the scene's")
     max_evaluations: int = _number(

@@ -133,7 +133,7 @@ class Publishing:
 
     @property
     def memory(self) -> Mapping[str, memoryview]:
-        """The memory of each sent message of the motion, by base name of its topic."""
+        """The buffer of each sent message of the motion, by base name of its topic."""
         return {} if self._messages is None else self._messages.memory
 
     def messages(self, published: Published) -> Iterator[Outgoing]:

@@ -79,7 +79,7 @@ class Recording:
             now_ns=clock or time.time_ns,
             on_error=on_error,
         )
-        #: number of the entry before the publication of each sample of the newest series
+        #: for each sample of the newest series, the number of the journal entry before its publication
         self._series = np.zeros(0, np.int64)
         self._recorder = in_free_folder(Path(settings.record_path), make)
         #: takes a journal entry; a loss is counted by the recorder

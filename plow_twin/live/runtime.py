@@ -190,7 +190,7 @@ class Runtime:
 
     @property
     def follower(self) -> Follower | None:
-        """The twin, where it follows measurements."""
+        """The twin if it follows measurements, otherwise None."""
         found: Follower | None = cast(Any, self.driver.session.following)
         return found
 
@@ -377,7 +377,7 @@ class Runtime:
         self._advanced(len(arrived))
 
     def step_series(self, stamps: NDArray[np.int64], wrench: NDArray[np.float64]) -> Iterator[Outgoing]:
-        """Use many samples of a source with its own time, as `step`; stamps [ns], shape (n,), wrenches (n, 3)."""
+        """Use many samples of a source with its own time, like `step`; stamps [ns], shape (n,), wrenches (n, 3)."""
         if self._start_due or self.publishing.watch is not None or self.settings.record_ring:
             # an observer sees each sample; a ring is written with the state after the sample of its alarm
             yield from self.step(list(zip(stamps.tolist(), map(tuple, wrench.tolist()), strict=True)))
@@ -468,7 +468,7 @@ class Runtime:
             self.driver.travel(stamp_ns, speed_m_s)
 
     def add_pose(self, stamp_ns: int, pose: tuple[float, float, float], deviation: tuple[float, ...] = ()) -> None:
-        """Take a measured pose, as `Inputs.uses_pose`."""
+        """Take a measured pose, as `Inputs.uses_pose` does."""
         if not self.inputs.uses_pose(stamp_ns, pose, deviation):
             return
         known = tuple(index for index, value in enumerate(pose) if math.isfinite(value))

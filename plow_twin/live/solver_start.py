@@ -103,7 +103,7 @@ def _prepare(settings: Settings, warm_up: Callable[[], None]) -> Prepared:
 
 
 def leave(code: int, *, at_once: bool = False) -> int:
-    """Return the exit code; end the process here when an abandoned compiler would hold it up, or `at_once`."""
+    """Return the exit code; end the process here if an abandoned compiler would delay it, or `at_once`."""
     if at_once:  # a stream without a reader can no longer be flushed
         os._exit(code)
     if all(future.done() for future in _started):

@@ -34,7 +34,7 @@ _TYPES: Final = frozenset(kind.value for kind in Parameter.Type)
 
 
 class WithoutEvents(Node):
-    """A node that asks for no events of the middleware, neither for its own topics nor for those that rclpy makes.
+    """A node that asks for no events of the middleware, neither for its own topics nor for topics that rclpy makes.
 
     A time before 0 on `/clock`, and parameters that rclpy cannot read, would end the program; this node refuses them.
     """

@@ -52,7 +52,7 @@ class OpcUaInput:
         )  # fmt: skip
         model = read_load_model(mapping)
         roles = roles_of(self._bridge, mapping, "", model is not None)
-        #: inputs that come from here
+        #: inputs that the server replaces
         self.names = frozenset("excitation" if name == "drive" else name for name in roles)
         self._feeder = Feeder(roles, runtime, front.send, model if "drive" in roles else None)
         self.fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)

@@ -193,9 +193,9 @@ def record_topics(
     folder
         Created for the recording; `<folder>_2`, ... if it exists and is not empty.
     topics
-        Names, in the root namespace unless they have their own.
+        Names; a relative name is in the root namespace.
     every
-        Record all topics except hidden ones, those in `but`, and those that match `exclude`.
+        Record all topics except hidden topics, topics in `but`, and topics that match `exclude`.
     """
     named = {name if name.startswith("/") else f"/{name}" for name in topics}
     left_out = {*but, "/parameter_events"}
@@ -240,7 +240,7 @@ def record_topics(
 def schema_of(message_type: str) -> str:
     """Return the `ros2msg` text of a type and of the types that it uses.
 
-    The texts come from the type's package, or, where it is not installed, are those of ROS 2 Jazzy.
+    The texts come from the type's package, or, if it is not installed, from ROS 2 Jazzy.
 
     Raises
     ------

@@ -412,7 +412,7 @@ class Drawing:
             self.load_arrow.add(stamp_ns, step, origins=[centre], vectors=[vector], labels=[label])
 
     def _statuses(self, batch: Batch) -> None:
-        """Write changes of status and alarms; those before the first sample are written at its stamp."""
+        """Write changes of status and alarms; changes before the first sample are written at that sample's stamp."""
         topics = (self.header.topic("status"), self.header.topic(ALARMS))
         for part in batch.outputs:
             for channel in [number for number, (name, _) in part.topics.items() if name in topics]:

@@ -48,7 +48,7 @@ def signed(value: float, form: str) -> str:
 
 
 def scene_and_date(reader: RunReader, first_ns: int | None = None) -> str:
-    """Return scene and date of a recording for a title; `first_ns` is its first stamp where that is known."""
+    """Return scene and date of a recording for a title; `first_ns` is its first stamp, if known."""
     scene = reader.header.parameters.get("scene")
     parts = [f"scene {Path(scene).name}"] if isinstance(scene, str) and scene else []
     # stamps that count from an arbitrary start have no date

@@ -72,8 +72,8 @@ class FittedValue:
 class FittedPicture:
     """The content of the picture of a fit.
 
-    `noise` is the standard deviation of the measured x, y [m], theta [rad] where it is known. `prior_name` names the
-    prior beside each value, and `prior_meaning` explains it.
+    `noise` is the standard deviation of the measured x, y [m], theta [rad], if known. `prior_name` names the prior
+    beside each value, and `prior_meaning` explains it.
     """
 
     title: str

@@ -97,7 +97,7 @@ def run_figure(reader: RunReader, curves: RunCurves) -> Figure:
 
 
 def _meanings(curves: RunCurves) -> list[str]:
-    """Return the meanings of shades and bands, where there are any."""
+    """Return the meanings of the shades and bands in the picture."""
     span = max(curves.force.bin_s, curves.load.bin_s)
     return [
         *(["grey: without samples"] if curves.held_s else []),

@@ -215,7 +215,7 @@ class RunCurves:
 
 
 def _largest(contact: Rows, head: Rows) -> Iterator[Instant]:
-    """Yield the instant of the largest force among those with a pose of the same publication."""
+    """Yield the instant of the largest force among instants that have a pose of the same publication."""
     at = np.minimum(np.searchsorted(contact.sequence, head.sequence), len(contact) - 1)
     both = np.flatnonzero(contact.stamp_ns[at] == head.stamp_ns)
     if not both.size:

@@ -57,7 +57,9 @@ def host_and_port(access: Access, ports: Mapping[str, int], *, has_path: bool = 
     except (ValueError, KeyError) as error:
         raise BridgeError(f"{access.url}: expected {expected}") from error
     if parts.username or parts.password or (parts.path.strip("/") and not has_path):
-        raise BridgeError(f"{parts.scheme}://...{parts.path}: expected {expected}, user and topics stand elsewhere")
+        raise BridgeError(
+            f"{parts.scheme}://...{parts.path}: expected {expected}, user and topics are set by other options"
+        )
     return parts.scheme, host, port
 
 

@@ -161,7 +161,7 @@ class _Dated:
         return self._tails[-1].path if self._tails else self._pattern
 
     def columns(self, *, grows: bool) -> list[str] | None:
-        """Return the columns of the newest file, as `_Tail.columns`."""
+        """Return the columns of the newest file, as `_Tail.columns` does."""
         there = self.files()
         return _Tail(max(there, key=_changed_ns)).columns(grows=grows) if there else None
 
@@ -295,7 +295,7 @@ class Files(SourceState):
 
     @property
     def share(self) -> float:
-        """Share of the files that has been read, 0..1; 0 where they are followed."""
+        """Share of the files that has been read, 0..1; 0 for followed files."""
         return self._done / self._size if self._size else 0.0
 
     def _next(self) -> Messages:

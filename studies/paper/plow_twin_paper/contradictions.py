@@ -124,8 +124,9 @@ _GAPS: Final = (
     Contradiction(
         "sections 2 and 3",
         "Stiffness, damping and exponent of the contact law are printed nowhere, nor the signs of loads and arms, the "
-        "initial state, the step, or what a mean force is the mean over; equations (5) and (6) are lost in the text.",
-        "in the preset paper every number that stands for one of them is marked reconstructed or assumed",
+        "initial state, the step, or the time over which a force is averaged; equations (5) and (6) are lost in "
+        "the text.",
+        "in the preset paper every number in place of a missing number is marked reconstructed or assumed",
     ),
     Contradiction(
         "section 3",

@@ -57,7 +57,7 @@ def record(
     SolverError
         The motion could not be continued.
     RecordingError
-        The folder holds something already or cannot be written.
+        The folder is not empty or cannot be written.
     """
     from plow_twin.record.header import RunHeader
     from plow_twin.record.writer import RunWriter

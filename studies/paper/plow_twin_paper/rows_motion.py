@@ -74,7 +74,7 @@ def _intermittent(scene: Scene, result: Result) -> Row:
         ", ".join(f"{letter} {value:.1f}" for letter, value in makes.items())
         + f" makes a period; a sense carries {min(shares):.0%} to {max(shares):.0%} of the time",
         Verdict.of(min(makes.values()) >= 1.0 and max(shares) < 1.0),
-        "each point is touched at least once a period, none is held all the time", CHECK,
+        "each point is touched at least once a period, and no point is held all the time", CHECK,
     )  # fmt: skip
 
 

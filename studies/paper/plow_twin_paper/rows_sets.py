@@ -70,7 +70,7 @@ def _sizes(sense: Sense, timeline: Sequence[Hold]) -> Iterator[Row]:
 
 
 def shown_time(time_s: float, t_end: float) -> float:
-    """Return the quoted time, or the last time of the same phase of the load that a shorter run has."""
+    """Return the quoted time or, in a shorter run, the last time at the same phase of the load."""
     return time_s - PERIOD_S * max(0, math.ceil((time_s - t_end) / PERIOD_S))
 
 

@@ -28,9 +28,9 @@ Array = NDArray[np.float64]
 _VERTICAL: Final = "Vertical clearance (Fig. 10)"
 _HORIZONTAL: Final = "Horizontal clearance (Fig. 11)"
 _FACES: Final = "Inner faces, the paper's RecurDyn check (Figs 13 to 15)"
-_RISES: Final = f"no step down and a rise in all, of {TREND_SLACK:.1%} of the largest value or more"
+_RISES: Final = f"no step down, but an overall rise, of at least {TREND_SLACK:.1%} of the largest value"
 _RISES_THEN_FALLS: Final = (
-    f"largest inside the range, no step down before and none up after it, of {TREND_SLACK:.1%} of it or more"
+    f"largest value inside the range; no step down before it, no step up after it, of at least {TREND_SLACK:.1%} of it"
 )
 
 

@@ -150,7 +150,7 @@ def run_all(scene: Scene, t_end: float, workers: int | None = None, on_progress:
 def _sweeps(
     scene: Scene, scale: tuple[float, float], t_end: float, workers: int | None, tell: OnProgress
 ) -> tuple[tuple[Sweep, Sweep], int]:
-    """Return the curves of Figs 10 and 11 and how many of their runs failed; the forces of those are NaN."""
+    """Return the curves of Figs 10 and 11 and how many of their runs failed; their forces are NaN."""
     fine = np.linspace(GRID_M[0], GRID_M[-1], _FINE_STEPS * (len(GRID_M) - 1) + 1)
     cells = [(FIXED_M, value) for value in fine] + [(value, FIXED_M) for value in fine]
     scenes = [_at(scene, scale, *cell) for cell in cells]

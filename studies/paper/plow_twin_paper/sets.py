@@ -33,7 +33,7 @@ class Hold:
 
 @dataclass(frozen=True)
 class SetFigures:
-    """One set over a run: share of the contact time of its sense, all of it and longest hold [s], holds that count."""
+    """One set over a run: share of the contact time of its sense, total and longest hold [s], number of long holds."""
 
     share: float
     total_s: float
@@ -96,7 +96,7 @@ def at(timeline: Sequence[Hold], time_s: float) -> str:
 
 
 def nearest(timeline: Sequence[Hold], time_s: float, corners: str) -> tuple[float, Hold] | None:
-    """Return how far in s (negative: earlier) the nearest hold of a set lies from a time, and that hold."""
+    """Return the nearest hold of a set to a time, after its distance in s (negative: earlier)."""
     found = [hold for hold in timeline if hold.corners == corners]
     if not found:
         return None

@@ -24,7 +24,7 @@ class Samples:
     nodes
         The nodes of the role.
     wait_s
-        How long the values of a stamp may be apart when they arrive [s].
+        Longest time between the arrivals of values with one stamp [s].
     """
 
     def __init__(self, nodes: Sequence[str], wait_s: float) -> None:
@@ -47,7 +47,7 @@ class Samples:
         """Add a value; the same stamp of a node again is ignored."""
         if stamp_ns == self.newest_ns[node]:
             return
-        # the clock of the first value, perhaps that of the starting server, does not bind later values
+        # a starting server may stamp the first value by another clock, which does not bind later values
         self.newest_ns[node] = stamp_ns if node in self._begun else max(stamp_ns, self.newest_ns[node])
         self._begun.discard(node)
         if stamp_ns not in self._waiting:
