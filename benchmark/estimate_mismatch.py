@@ -34,7 +34,7 @@ from plow_twin.scene_file import load_scene
 
 Array = NDArray[np.float64]
 
-#: Distance of the samples of the true load in s.
+#: Interval of the samples of the true load in s.
 _FINE = 1e-3
 #: Penetration in m at which contacts of different exponents have the same force.
 _COMMON_DEPTH = 8e-3

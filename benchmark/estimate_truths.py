@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 ROOT = Path(__file__).resolve().parent.parent
 #: Load period of the paper's scene in s.
 PERIOD = np.pi
-#: Distance of the samples of the true load in s.
+#: Interval of the samples of the true load in s.
 _FINE = 1e-3
 #: Where a shift, a jam or a stuck sensor begins, as a share of the window.
 _FROM = 0.55

@@ -1,4 +1,4 @@
-"""Forecasts on synthetic lives: inside 20 % at shares of the life, coverage of 80 % and 90 % intervals, CRPS, horizon.
+"""Forecasts on synthetic lives: accuracy within 20 %, coverage of 80 % and 90 % intervals, CRPS, horizon.
 
     python benchmark/lives.py --lives 8
 

@@ -1,6 +1,6 @@
 """The square as a rigid body whose corners hit one at a time: Routh's impacts with Poisson's restitution.
 
-Flights, rounded corners and marker are those of the compliant block, so that only the contact differs.
+Flights, rounded corners and marker are the same as for the compliant block, so that only the contact differs.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def _hit(z: np.ndarray, block: np.ndarray, impact: Impact, e: float, mu: float) 
 
 
 def two_at_once(tossed: np.ndarray, rows: np.ndarray, block: np.ndarray, within: float) -> np.ndarray:
-    """Return which motions, a row each quarter of a millisecond, have two corners in contact within `within` s."""
+    """Return which motions, with a row every 0.25 ms, have two corners in contact within `within` s."""
     found = np.zeros(len(tossed), bool)
     width = math.ceil(within * 16.0 * RATE_HZ)
     for index, motion in enumerate(tossed):

@@ -36,7 +36,7 @@ def renewed(text: str) -> str:
 
 
 def with_topics(policy: str) -> str:
-    """Return the policy of SROS2 whose twin may publish the topics of the table."""
+    """Return the SROS2 policy with the topics of the table as the topics that the twin may publish."""
     names = "".join(f"            <topic>{topic.name}</topic>\n" for topic in TOPICS)
     first, last = '<topics publish="ALLOW">\n', "            <topic>markers</topic>"
     begin = policy.index(first, policy.index('<enclave path="/plow_twin/twin">')) + len(first)

@@ -90,7 +90,7 @@ class CuttingLoad:
     ----------
     face : Face
     force_n : float
-        Mean cutting force along x [N], its sign the direction.
+        Mean cutting force along x [N]; its sign gives the direction.
     lateral_n : float
         Standard deviation of the lateral force along y [N], normally distributed.
     at_m : tuple of float

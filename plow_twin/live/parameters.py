@@ -71,7 +71,7 @@ class Settings:
     )
     opcua_map: str = _plain("", Effect.START, "YAML file that gives the nodes of opcua_server for these inputs")
     opcua_access: str = _plain(
-        "", Effect.START, "YAML file of the credentials at opcua_server; empty: none, on this machine"
+        "", Effect.START, "YAML file with the credentials for opcua_server; empty: none (a server on this machine)"
     )
     priority: int = _number(
         0,
@@ -189,7 +189,7 @@ class Settings:
     wear_state_path: str = _plain(
         "",
         Effect.CONFIGURE,
-        "folder that keeps the wear of the pads beyond the process; the wear of another head or scene is refused; "
+        "folder in which the wear of the pads outlives the process; the wear of another head or scene is refused; "
         "empty: not kept",
     )
     wear_save_period: float = _number(10.0, "s", 0.1, 3600.0, Effect.CONFIGURE, "interval at which the wear is saved")

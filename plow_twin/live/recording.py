@@ -141,7 +141,7 @@ class Recording:
         return wanted
 
     def mark(self) -> Path | None:
-        """Have the ring written and return its folder; None when everything is recorded anyway."""
+        """Write the ring and return its folder; None if everything is recorded."""
         return self._recorder.mark()
 
     def close(self) -> LossReport:

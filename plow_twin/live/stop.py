@@ -18,7 +18,7 @@ def stop_signals() -> list[signal.Signals]:
 
 
 class StopSignals:
-    """SIGINT, SIGTERM and SIGHUP as a flag; while `interrupt` is set (a long start), as `StopRequested`.
+    """SIGINT, SIGTERM and SIGHUP set a flag, or raise `StopRequested` while `interrupt` is set (a long start).
 
     A context that restores the signals' handlers when it is left.
     """

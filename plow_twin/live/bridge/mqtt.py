@@ -27,7 +27,7 @@ _PORTS: Final = {"mqtt": 1883, "mqtts": 8883}
 
 
 class Mqtt(SourceState):
-    """A session with a broker that outlives a broken connection: messages of QoS 1 sent meanwhile come later.
+    """A session with a broker that outlives a broken connection: messages of QoS 1 sent in a break arrive later.
 
     Parameters
     ----------

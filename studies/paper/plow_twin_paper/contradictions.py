@@ -131,7 +131,7 @@ _GAPS: Final = (
     Contradiction(
         "section 3",
         "l_y and l_yN are two symbols with one value, 0.615 m.",
-        "if one is meant for each sense of the swing, it changes nothing",
+        "if each symbol is meant for one sense of the swing, nothing changes",
     ),
     Contradiction(
         "sections 3 and 4",

@@ -56,7 +56,7 @@ class Sweep:
 
 @dataclass(frozen=True)
 class FaceRun:
-    """A run of 20 s at a clearance [m] and the force on each inner face [N] in time, shape (n, 4) as `FACES`.
+    """A run of 20 s at a clearance [m] and the force on each inner face [N] over time, shape (n, 4) as `FACES`.
 
     The forces of a run that failed are NaN.
     """

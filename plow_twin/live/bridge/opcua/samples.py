@@ -35,7 +35,7 @@ class Samples:
         #: stamp of the newest value of each node [ns]
         self.newest_ns = dict.fromkeys(nodes, 0)
         self._held: dict[str, Value] = {}
-        #: nodes of which only the value before the first sample has come
+        #: nodes that have only a value from before the first sample
         self._begun: set[str] = set()
         self._released_ns = 0
         #: samples with impossible stamps
