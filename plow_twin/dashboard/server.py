@@ -38,7 +38,7 @@ _PATIENCE_S: Final = 20.0
 _WORD_S, _WISH_S = 1.0, 0.2
 #: Longest request of a page [B].
 _WISH: Final = 4096
-#: Lower priority of the server than the twin (`nice`).
+#: Increment of `nice`: the server has a lower priority than the twin.
 _NICE: Final = 10
 #: Reasons to close a page, as codes of the WebSocket protocol.
 TOO_MANY, NO_TOKEN, ENDED = 1013, 4401, 1001

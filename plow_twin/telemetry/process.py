@@ -29,7 +29,7 @@ WAYS: Final = {
     "influx": ("plow_twin.telemetry.influx", "Influx"),
     "opcua": ("plow_twin.telemetry.opcua.server", "OpcUaServer"),
 }
-#: Lower priority of the process than the twin (`nice`).
+#: Increment of `nice`: the process has a lower priority than the twin.
 _NICE: Final = 5
 #: Longest time between two reports [s].
 _REPORT_S: Final = 0.5

@@ -79,8 +79,8 @@ def _plans(runs: PaperRuns) -> list[tuple[str, str, str, str, Callable[[], Figur
         (
             "paper_fig13", "Fig. 13: contact of the four inner faces",
             "RecurDyn, 20 s: (1) counter-clockwise one face, (2) clockwise two, (3) clockwise three faces in contact.",
-            f"{case} (not stated in the paper); a corner has one pair in each sense, each with another wall, so that as "
-            "many faces touch as points carry force.", lambda: trends.fig13(runs),
+            f"{case} (not stated in the paper); a corner has one pair in each sense, each with another wall, so that "
+            "as many faces touch as points carry force.", lambda: trends.fig13(runs),
         ),
         (
             "paper_fig14", "Fig. 14: inner faces, vertical clearance 20, 25, 30 mm",
