@@ -10,13 +10,15 @@ from xml.sax.saxutils import escape
 
 OUT = Path(__file__).resolve().parent.parent / "docs" / "images" / "lanes.svg"
 WIDTH, HEIGHT, LEFT, ROW, CELL = 920, 330, 96, 34, 66
-#: Four of the eight lanes: scene, pairs that act (slots), guards that may end the step (rounds).
+#: Four of the eight lanes: scene, pairs that act (slots).
 LANES = (
-    ("scene 17", ("a-top",), ("b-right", "c-bottom")),
-    ("scene 4", ("b-right", "d-left", "d-bottom"), ("d-left",)),
-    ("scene 22", (), ("a-left",)),
-    ("scene 9", ("c-bottom", "d-bottom"), ()),
+    ("scene 17", ("a-top",)),
+    ("scene 4", ("b-right", "d-left", "d-bottom")),
+    ("scene 22", ()),
+    ("scene 9", ("c-bottom", "d-bottom")),
 )
+#: Guards that may end the steps: the first of each lane, then the second of lane 0 in the place that is left.
+ROUND = (("lane 0: b-right",), ("lane 1: d-left",), ("lane 2: a-left",), ("lane 0: c-bottom",))
 #: Ends of steps in each lane: (share of the width, "step" | "event" | "next scene").
 STEPS = (
     ((0.18, "step"), (0.30, "event"), (0.55, "step"), (0.80, "step")),
@@ -27,7 +29,7 @@ STEPS = (
 DOES = {
     "series": "all lanes, one linear map of the forces each",
     "step size": "each lane's own",
-    "guards, roots": "one guard of each lane a round",
+    "guards, roots": "eight guards of any lanes a round",
     "totals": "one acting pair of each lane a slot",
     "modes": "lane by lane; a finished scene gives way",
 }
@@ -57,25 +59,27 @@ def timelines(top: float) -> list[str]:
     return parts
 
 
-def cells(left: float, top: float, kind: str, names: tuple[tuple[str, ...], ...], columns: int) -> list[str]:
-    """Return a table with the pair that each lane has in each slot or round."""
-    parts = [text(left + (i + 0.5) * CELL, top - 6, f"{kind} {i}", "small") for i in range(columns)]
-    for lane, row in enumerate(names):
+def cells(
+    left: float, top: float, kind: str, names: tuple[tuple[str, ...], ...], columns: int, cell: float = CELL
+) -> list[str]:
+    """Return a table with the pair or guard at each place of each slot or round."""
+    parts = [text(left + (i + 0.5) * cell, top - 6, f"{kind} {i}", "small") for i in range(columns)]
+    for place, row in enumerate(names):
         for i in range(columns):
-            name, x, y = (row[i] if i < len(row) else ""), left + i * CELL, top + lane * ROW
+            name, x, y = (row[i] if i < len(row) else ""), left + i * cell, top + place * ROW
             fill = FILLS[kind if name else "empty"]
-            parts.append(f'<rect x="{x:g}" y="{y:g}" width="{CELL - 4}" height="{ROW - 6}" rx="4" fill="{fill}"/>')
-            parts.append(text(x + CELL / 2 - 2, y + 18, name, "small"))
+            parts.append(f'<rect x="{x:g}" y="{y:g}" width="{cell - 4:g}" height="{ROW - 6}" rx="4" fill="{fill}"/>')
+            parts.append(text(x + cell / 2 - 2, y + 18, name, "small"))
     return parts
 
 
 def drawing() -> str:
     """Return the picture as SVG."""
     top, parts = 178, timelines(34)
-    for lane, (scene, _, _) in enumerate(LANES):
+    for lane, (scene, _) in enumerate(LANES):
         parts.append(text(LEFT - 44, top + lane * ROW + 18, scene))
-    parts += cells(LEFT, top, "slot", tuple(slots for _, slots, _ in LANES), 3)
-    parts += cells(LEFT + 3.6 * CELL, top, "round", tuple(rounds for _, _, rounds in LANES), 2)
+    parts += cells(LEFT, top, "slot", tuple(slots for _, slots in LANES), 3)
+    parts += cells(LEFT + 3.6 * CELL, top, "round", ROUND, 1, 1.7 * CELL)
     x = LEFT + 6.2 * CELL
     for number, (phase, does) in enumerate(DOES.items()):
         y = top - 8 + number * 28

@@ -83,6 +83,24 @@ def exact_row(typingctx: Any, array: Any, index: Any) -> Any:
 
 
 @_operation
+def gathered(typingctx: Any, array: Any, index: Any, places: Any) -> Any:
+    """Return eight numbers at `places`, a tuple, from row `index` of a contiguous array of rows of eight on."""
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        row_index = context.cast(builder, arguments[1], signature.args[1], types.intp)
+        first = builder.bitcast(
+            _pointer(context, builder, signature.args[0], arguments[0], row_index), ir.DoubleType().as_pointer()
+        )
+        vector = ir.Constant(_VECTOR, ir.Undefined)
+        for lane in range(_WIDTH):
+            number = builder.load(builder.gep(first, [builder.extract_value(arguments[2], lane)]))
+            vector = builder.insert_element(vector, number, ir.Constant(ir.IntType(32), lane))
+        return vector
+
+    return exact_lanes(array, index, places), codegen
+
+
+@_operation
 def set_row(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
     """Write eight numbers to row `index` of a contiguous array of shape (n, 8)."""
 
@@ -203,6 +221,16 @@ def choose(typingctx: Any, bits: Any, there: Any, elsewhere: Any) -> Any:
         return builder.select(mask, arguments[1], arguments[2])
 
     return there(bits, there, elsewhere), codegen
+
+
+@_operation
+def lowest_bit(typingctx: Any, bits: Any) -> Any:
+    """Return the number of the lowest bit that is set in `bits`, which are not zero."""
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.cttz(arguments[0], ir.Constant(ir.IntType(1), 1))
+
+    return types.int64(types.int64), codegen
 
 
 @_operation

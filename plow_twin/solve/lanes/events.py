@@ -1,7 +1,7 @@
 """The first event of each lane's step.
 
-Few guards can turn negative within a step. Each lane lists its guards; in each round every lane searches one of them. A
-clipped pair that parts changes no force and ends no step; the rest of the step is searched for its next touch.
+Few guards can turn negative within a step. Each lane lists its guards; each round searches eight of them, of any lanes.
+A clipped pair that parts changes no force and ends no step; the rest of the step is searched for its next touch.
 """
 
 from __future__ import annotations
@@ -10,9 +10,18 @@ import numpy as np
 
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.polynomial import first_root
-from plow_twin.kernel.simd import below, choose, exact_row, exact_splat, fused, magnitude, set_row
+from plow_twin.kernel.simd import below, choose, exact_row, exact_splat, fused, gathered, lowest_bit, magnitude, set_row
 from plow_twin.model.pairs import PAIR_COUNT
-from plow_twin.solve.lanes.record import AGAIN, GUARDS, SECOND, WIDTH, linear_at, penetration_at, to_bernstein
+from plow_twin.solve.lanes.record import (
+    AGAIN,
+    GUARDS,
+    SECOND,
+    WIDTH,
+    linear_at,
+    penetration_at,
+    places_of,
+    to_bernstein,
+)
 from plow_twin.solve.state import CLIPPED, COS, OFF, ON, SIN, X, Y
 
 #: Events are one instant when they are closer than this share of the step before them.
@@ -21,6 +30,8 @@ _AT_ONCE = 1e-12
 #: root.
 _FOUND, _STRAIGHT, _ROUNDED = 1e-6, 1e-3, 2e-16
 _MOST_CHANGES = 80
+#: A root found over a longer step lies beyond the step by more than its rounding errors.
+_SURELY_LATER = 1.0 + 1e-9
 #: Rows of `lanes.chosen` after those of a penetration.
 _DEPTH, _RATE, _CONSTANT = 5, 6, 7
 
@@ -41,10 +52,12 @@ def _list_guards(lanes, order, hysteretic) -> None:
         if taken == 0:
             break
         if hysteretic is None:
-            _note(lanes, slot, 0, _write_guard(lanes, gear, one, damped, none, lanes.push[slot], order, h) & taken)
+            _note(
+                lanes, slot, 0, _write_guard(lanes, None, gear, one, damped, none, lanes.push[slot], order, h) & taken
+            )
         else:
-            _note(lanes, slot, 0, _write_guard(lanes, gear, one, none, none, lanes.guard[0], order, h) & taken)
-            pull = _write_guard(lanes, gear, none, exact_row(gear, 7), one, lanes.guard[0], order, h)
+            _note(lanes, slot, 0, _write_guard(lanes, None, gear, one, none, none, lanes.guard[0], order, h) & taken)
+            pull = _write_guard(lanes, None, gear, none, exact_row(gear, 7), one, lanes.guard[0], order, h)
             _note(lanes, slot, SECOND, pull & taken)
 
 
@@ -56,15 +69,6 @@ def _note(lanes, slot, kind, bits) -> None:
 
 
 @kernel()
-def _later(series, order, h):
-    """Return the sum of abs(term k) h^k for k > 1."""
-    reach = exact_splat(0.0)
-    for k in range(order, 1, -1):
-        reach = fused(reach, h, magnitude(exact_row(series, k)))
-    return reach * h * h
-
-
-@kernel()
 def _list_off(lanes, order) -> None:
     """List the guards of pairs that are off.
 
@@ -72,8 +76,18 @@ def _list_off(lanes, order) -> None:
     """
     h, series, cosine, sine = exact_row(lanes.step, 0), lanes.series, lanes.series[COS], lanes.series[SIN]
     x, y = series[X], series[Y]
-    later_c, later_s = _later(cosine, order, h), _later(sine, order, h)
-    later_x, later_y = _later(x, order, h), _later(y, order, h)
+    # sums of abs(term k) h^k for k > 1
+    later_c = later_s = later_x = later_y = exact_splat(0.0)
+    for k in range(order, 1, -1):
+        later_c, later_s = (
+            fused(later_c, h, magnitude(exact_row(cosine, k))),
+            fused(later_s, h, magnitude(exact_row(sine, k))),
+        )
+        later_x, later_y = (
+            fused(later_x, h, magnitude(exact_row(x, k))),
+            fused(later_y, h, magnitude(exact_row(y, k))),
+        )
+    later_c, later_s, later_x, later_y = later_c * h * h, later_s * h * h, later_x * h * h, later_y * h * h
     for pair in range(PAIR_COUNT):
         if lanes.off[pair] == 0:
             continue
@@ -88,23 +102,34 @@ def _list_off(lanes, order) -> None:
                 lanes.todo[lane] |= (unsafe >> lane & 1) << pair
 
 
-@kernel()
-def _write_guard(lanes, rows, of_depth, of_rate, constant, guard, order, h):
-    """Write a guard, given by factors of d and d' and a constant; return a bit for each lane where it may end.
+@kernel(inline="code")
+def _row_of(array, k, places):
+    if places is None:
+        return exact_row(array, k)
+    return gathered(array, k, places)
 
-    A guard g is positive on [0, h] where g_0 and g_0 + g_1 h - sum over k > 1 of max(-g_k, 0) h^k are: that bound is
-    concave.
+
+@kernel()
+def _write_guard(lanes, places, rows, of_depth, of_rate, constant, guard, order, h):
+    """Write guards, given by factors of d and d' and a constant; return a bit for each that may turn negative.
+
+    `places` are the guards' lanes, None for one guard of each lane in turn. A guard g is positive on [0, h] where g_0
+    and g_0 + g_1 h - sum over k > 1 of max(-g_k, 0) h^k are: that bound is concave.
     """
     cosine, sine, x, y = lanes.series[COS], lanes.series[SIN], lanes.series[X], lanes.series[Y]
     reach = term = deeper = zero = exact_splat(0.0)
     for k in range(order, 0, -1):
-        depth = linear_at(rows, exact_row(cosine, k), exact_row(sine, k), exact_row(x, k), exact_row(y, k))
+        depth = linear_at(
+            rows, _row_of(cosine, k, places), _row_of(sine, k, places), _row_of(x, k, places), _row_of(y, k, places)
+        )
         term = fused(of_rate * (k + 1.0), deeper, of_depth * depth)
         deeper = depth
         set_row(guard, k, term)
         if k > 1:
             reach = fused(magnitude(term) - term, exact_splat(0.5), reach) * h
-    depth = penetration_at(rows, exact_row(cosine, 0), exact_row(sine, 0), exact_row(x, 0), exact_row(y, 0))
+    depth = penetration_at(
+        rows, _row_of(cosine, 0, places), _row_of(sine, 0, places), _row_of(x, 0, places), _row_of(y, 0, places)
+    )
     first = fused(of_rate, deeper, of_depth * depth) + constant
     first = choose(below(zero, first), first, zero)
     set_row(guard, 0, first)
@@ -112,67 +137,67 @@ def _write_guard(lanes, rows, of_depth, of_rate, constant, guard, order, h):
 
 
 @kernel()
-def _choose_guards(lanes, at, hysteretic):
-    """Choose the next guard of each lane, if any; return bits for lanes with a guard, and with a new touch."""
-    bits = again = 0
-    for lane in range(WIDTH):
-        lanes.guarded[at, lane] = -1
-        lanes.reach[lane] = 0.0
-        if lanes.todo[lane] == 0:
-            continue
-        guard = 0
-        while lanes.todo[lane] >> guard & 1 == 0:
-            guard += 1
-        lanes.todo[lane] &= ~(1 << guard)
-        lanes.guarded[at, lane] = guard
-        lanes.reach[lane] = lanes.step[lane]
-        bits |= 1 << lane
-        if guard >= AGAIN:
-            again |= 1 << lane
-            lanes.reach[lane] -= lanes.parted[guard % PAIR_COUNT, lane]
-        _write_choice(lanes, lane, guard, hysteretic)
-    return bits, again
+def _choose_guards(lanes, at, hysteretic) -> int:
+    """Choose up to eight guards, the next of each lane first, then those after it; return their number."""
+    count, before = 0, -1
+    while before < count < WIDTH:
+        before = count
+        for lane in range(WIDTH):
+            todo = lanes.todo[lane]
+            if todo != 0 and count < WIDTH:
+                guard = lowest_bit(todo)
+                lanes.todo[lane] = todo & ~(1 << guard)
+                lanes.guarded[at, count], lanes.owner[at, count] = guard, lane
+                _write_choice(lanes, lane, guard, count, hysteretic)
+                count += 1
+    for i in range(count, WIDTH):
+        lanes.guarded[at, i], lanes.owner[at, i] = -1, 0
+    return count
 
 
 @kernel()
-def _write_choice(lanes, lane, guard, hysteretic) -> None:
-    """Write the factors of a guard of a lane."""
+def _write_choice(lanes, lane, guard, i, hysteretic) -> None:
+    """Write the factors of guard `i` of a round and how far it is searched."""
     chosen, pair = lanes.chosen, guard % PAIR_COUNT
     mode, sign, constant, rate = lanes.mode[pair, lane], 1.0, 0.0, lanes.viscous[lane] / lanes.stiffness[lane]
-    for i in range(5):
-        chosen[i, lane] = lanes.rows[pair, i, lane]
+    begin = 0.0
     if guard < SECOND:
         sign, rate = -1.0 if mode == OFF else 1.0, rate if mode == ON else 0.0
     elif guard >= AGAIN:
-        sign, rate = -1.0, 0.0
+        sign, rate, begin = -1.0, 0.0, lanes.parted[pair, lane]
     elif hysteretic is None:
         sign, rate = -1.0, -rate
     else:
         constant = 1.0 if mode == ON else -1.0
         sign, rate = 0.0, constant * lanes.factor[pair, lane]
-    chosen[_DEPTH, lane], chosen[_RATE, lane], chosen[_CONSTANT, lane] = sign, rate, constant
+    chosen[_DEPTH, i], chosen[_RATE, i], chosen[_CONSTANT, i] = sign, rate, constant
+    lanes.begin[i], lanes.reach[i] = begin, lanes.step[lane] - begin
+    lanes.row_place[i] = pair * 5 * WIDTH + lane
 
 
 @kernel()
-def _shift(lanes, guard, pair, lane, order) -> None:
-    """Let the guard of a pair that has parted begin at that point."""
-    x = lanes.parted[pair, lane]
+def _shift(lanes, guard, order, again) -> None:
+    """Let the guards of pairs that have parted begin at that point."""
+    x, zero = exact_row(lanes.begin, 0), exact_splat(0.0)
     for r in range(order):
+        after = exact_row(guard, order)
         for j in range(order - 1, r - 1, -1):
-            guard[j, lane] += x * guard[j + 1, lane]
-    guard[0, lane] = 0.0
+            after = exact_row(guard, j) + x * after
+            set_row(guard, j, after)
+    set_row(guard, 0, choose(again, zero, exact_row(guard, 0)))
 
 
 @kernel()
-def _isolate(lanes, column, w, order, bits):
+def isolate(lanes, column, w, order, bits):
     """Return bits for lanes whose column has one root in [0, reach), and for several; write the chord's root to `root`.
 
     The Bernstein coefficients have as many sign changes as roots, or an even number more.
     """
     h, b, zero = exact_row(lanes.reach, 0), lanes.bernstein, exact_splat(0.0)
     to_bernstein(lanes, column, w, order, h)
-    negative = once = more = 0
+    once = more = 0
     before, root = exact_row(b, 0), zero
+    negative = below(before, zero) & bits
     for k in range(1, order + 1):
         here = exact_row(b, k)
         now = below(here, zero) & bits
@@ -188,7 +213,7 @@ def _isolate(lanes, column, w, order, bits):
 
 
 @kernel()
-def _cross(lanes, column, order, bits) -> None:
+def cross(lanes, column, order, bits) -> None:
     """Follow each column to its only root in [0, reach] by Halley's method within the bracket (`polynomial`)."""
     low, high, x = exact_splat(0.0), exact_row(lanes.reach, 0), exact_row(lanes.root, 0)
     zero, open_bits = exact_splat(0.0), bits
@@ -217,28 +242,26 @@ def _cross(lanes, column, order, bits) -> None:
 
 
 @kernel()
-def _leaves(guard, lane, order, h) -> bool:
+def _leaves(guard, i, order, h) -> bool:
     """Return whether a penetration surely falls all the time."""
     rise = 0.0
     for k in range(order, 1, -1):
-        rise = (rise + k * max(guard[k, lane], 0.0)) * h
-    return rise + guard[1, lane] < 0.0
+        rise = (rise + k * max(guard[k, i], 0.0)) * h
+    return rise + guard[1, i] < 0.0
 
 
 @kernel()
-def _note_root(lanes, lane, at, order) -> None:
-    """Use a root of a lane's guard: it ends the step, or marks the parting of a pair."""
-    guard, root = lanes.guarded[at, lane], lanes.root[lane]
+def _note_root(lanes, lane, at, i, order) -> None:
+    """Use the root of a guard: it ends the step, or marks the parting of a pair."""
+    guard, root = lanes.guarded[at, i], lanes.root[i] + lanes.begin[i]
     pair = guard % PAIR_COUNT
     if guard < SECOND and lanes.mode[pair, lane] == CLIPPED:
         lanes.parted[pair, lane] = root
         lanes.parting[0] |= 1 << lane
-        if not _leaves(lanes.guard[at], lane, order, lanes.step[lane]):
+        if not _leaves(lanes.guard[at], i, order, lanes.step[lane]):
             lanes.todo[lane] |= 1 << AGAIN + pair
         return
-    if guard >= AGAIN:
-        root += lanes.parted[pair, lane]
-    elif guard >= SECOND and root >= lanes.parted[pair, lane]:
+    if SECOND <= guard < AGAIN and root >= lanes.parted[pair, lane]:
         return
     if root < lanes.step[lane]:
         lanes.step[lane], lanes.event[lane] = root, guard
@@ -257,50 +280,63 @@ def first_events(states, lanes, w, order, full, hysteretic) -> None:
     for lane in range(WIDTH):
         lanes.event[lane] = -1
     _list_guards(lanes, order, hysteretic)
+    # every round settles a guard of each lane that has any
     for at in range(GUARDS):
         lanes.rounds[0] = at
-        bits, again = _choose_guards(lanes, at, hysteretic)
-        if bits == 0:
+        count = _choose_guards(lanes, at, hysteretic)
+        if count == 0:
             return
-        bits &= again | _write_chosen(lanes, lanes.guard[at], order, full)
-        if again != 0:
-            for lane in range(WIDTH):
-                if again >> lane & 1:
-                    _shift(lanes, lanes.guard[at], lanes.guarded[at, lane] - AGAIN, lane, order)
+        bits = _write_chosen(lanes, at, order, full) & ((1 << count) - 1)
         if bits != 0:
             _search(states, lanes, w, at, full, bits)
     lanes.rounds[0] = GUARDS
 
 
 @kernel()
-def _write_chosen(lanes, guard, order, full):
-    """Write the chosen guards; return as `_write_guard`."""
-    chosen, zero = lanes.chosen, exact_splat(0.0)
+def _write_chosen(lanes, at, order, full):
+    """Write the guards of a round; return a bit for each that may turn negative."""
+    chosen, guard, zero = lanes.chosen, lanes.guard[at], exact_splat(0.0)
+    places = places_of(lanes.row_place)
+    for i in range(5):
+        set_row(chosen, i, gathered(lanes.rows, i, places))
     for k in range(order + 1, full + 1):
         set_row(guard, k, zero)
-    return _write_guard(
-        lanes, chosen, exact_row(chosen, _DEPTH), exact_row(chosen, _RATE), exact_row(chosen, _CONSTANT), guard, order,
-        exact_row(lanes.reach, 0),
+    bits = _write_guard(
+        lanes, places_of(lanes.owner[at]), chosen, exact_row(chosen, _DEPTH), exact_row(chosen, _RATE),
+        exact_row(chosen, _CONSTANT), guard, order, exact_row(lanes.reach, 0),
     )  # fmt: skip
+    again = below(zero, exact_row(lanes.begin, 0))
+    if again != 0:
+        _shift(lanes, guard, order, again)
+    return bits | again & below(zero, exact_row(lanes.reach, 0))
 
 
 @kernel()
 def _search(states, lanes, w, at, order, bits) -> None:
-    """Look for the first root of each lane's guard."""
+    """Look for the first root of each guard; a guard whose step has become shorter is searched again if it matters."""
     guard = lanes.guard[at]
-    single, several = _isolate(lanes, guard, w, order, bits)
+    single, several = isolate(lanes, guard, w, order, bits)
     if single != 0:
-        _cross(lanes, guard, order, single)
-    for lane in range(WIDTH):
-        if (single | several) >> lane & 1:
+        cross(lanes, guard, order, single)
+    left = single | several
+    while left != 0:
+        i = lowest_bit(left)
+        left &= left - 1
+        lane, has_one = lanes.owner[at, i], single >> i & 1 == 1
+        reach = lanes.step[lane] - lanes.begin[i]
+        if reach < lanes.reach[i]:
+            if has_one and lanes.root[i] > reach * _SURELY_LATER:
+                continue
+            lanes.todo[lane] |= 1 << lanes.guarded[at, i]
+            continue
+        if not has_one:
+            column = w.column[0]
+            for k in range(order + 1):
+                column[k] = guard[k, i]
+            lanes.root[i] = first_root(column, order, reach, w)
+        if lanes.root[i] < reach:
             states[lanes.member[lane]].guard_roots += 1
-            if several >> lane & 1:
-                column = w.column[0]
-                for k in range(order + 1):
-                    column[k] = guard[k, lane]
-                lanes.root[lane] = first_root(column, order, lanes.reach[lane], w)
-            if lanes.root[lane] < lanes.reach[lane]:
-                _note_root(lanes, lane, at, order)
+            _note_root(lanes, lane, at, i, order)
 
 
 @kernel()
@@ -340,15 +376,18 @@ def note_switches(lanes, order, viscous) -> None:
             lanes.switch[pair, lane] = -1
     if ending == 0:
         return
-    step = exact_row(lanes.step, 0)
     for at in range(lanes.rounds[0]):
-        ended = _ends_with(lanes.guard[at], order, step, step * _AT_ONCE) & ending
-        for lane in range(WIDTH):
-            if ended >> lane & 1 and 0 <= lanes.guarded[at, lane] < AGAIN:
-                pair = lanes.guarded[at, lane] % PAIR_COUNT
+        step = gathered(lanes.step, 0, places_of(lanes.owner[at]))
+        ended = _ends_with(lanes.guard[at], order, step, step * _AT_ONCE)
+        while ended != 0:
+            i = lowest_bit(ended)
+            ended &= ended - 1
+            guard, lane = lanes.guarded[at, i], lanes.owner[at, i]
+            if lanes.event[lane] >= 0 and 0 <= guard < AGAIN:
+                pair = guard % PAIR_COUNT
                 # a first guard comes before a second
                 if lanes.switch[pair, lane] < 0 and lanes.parted[pair, lane] >= lanes.step[lane]:
-                    _note_switch(lanes, lane, lanes.guarded[at, lane], viscous)
+                    _note_switch(lanes, lane, guard, viscous)
     for lane in range(WIDTH):
         if lanes.event[lane] >= 0:
             _note_switch(lanes, lane, lanes.event[lane], viscous)

@@ -24,7 +24,7 @@ from plow_twin.solve.lanes.record import (
     write_place,
 )
 from plow_twin.solve.lanes.series import accurate_steps, expand, expand_loads
-from plow_twin.solve.lanes.totals import add_step, sum_step
+from plow_twin.solve.lanes.totals import add_step, find_peaks, sum_step
 from plow_twin.solve.lanes.waves import turn_lanes
 from plow_twin.solve.method.flight import safe_time
 from plow_twin.solve.method.rest import slow_enough
@@ -118,12 +118,19 @@ def _fill_rows(lanes, lane, order, t, i, end, q, v) -> int:
         for j in range(WIDTH):
             sigma[j] = max(t[i + min(j, count - 1)] - begin, 0.0)
         at = exact_row(sigma, 0)
-        for component in range(COMPONENTS):
-            series = lanes.series[component]
-            value = exact_splat(series[order, lane])
+        # sums side by side need not wait for each other
+        for first in range(0, COMPONENTS, 4):
+            one, two = lanes.series[first], lanes.series[first + 1]
+            three, four = lanes.series[first + 2], lanes.series[first + 3]
+            a, b = exact_splat(one[order, lane]), exact_splat(two[order, lane])
+            c, d = exact_splat(three[order, lane]), exact_splat(four[order, lane])
             for k in range(order - 1, -1, -1):
-                value = fused(value, at, exact_splat(series[k, lane]))
-            set_row(lanes.out, component, value)
+                a, b = fused(a, at, exact_splat(one[k, lane])), fused(b, at, exact_splat(two[k, lane]))
+                c, d = fused(c, at, exact_splat(three[k, lane])), fused(d, at, exact_splat(four[k, lane]))
+            set_row(lanes.out, first, a)
+            set_row(lanes.out, first + 1, b)
+            set_row(lanes.out, first + 2, c)
+            set_row(lanes.out, first + 3, d)
         turn(lanes.out, X, Y)
         turn(lanes.out, VX, VY)
         for j in range(count):
@@ -236,10 +243,11 @@ def go_past_an_instant(params, states, lanes) -> None:
 
 
 @kernel()
-def _leave(members, lanes, lane, code, t) -> None:
+def _leave(members, lanes, w, order, lane, code, t) -> None:
     """Take the scene out of a lane, with its status; at the end write the remaining rows."""
     member = lanes.member[lane]
     p, state = members.params[member], members.states[member]
+    find_peaks(lanes, w, order - 1)
     save_lane(state, members.totals[member], lanes, lane)
     members.status[member] = _OK if code == _DONE else code
     if code != _DONE:
@@ -296,7 +304,7 @@ def run_lanes(
                 if code == _OK:
                     live += 1
                     break
-                _leave(members, lanes, lane, code, t)
+                _leave(members, lanes, w, order, lane, code, t)
         if live == 0:
             return True
         if lanes.stale[0] == 1 and hysteretic is None:
@@ -305,7 +313,7 @@ def run_lanes(
         _step(members, waves, second, viscous, hysteretic, order, lanes, w, t)
     for lane in range(WIDTH):
         if lanes.member[lane] >= 0:
-            _leave(members, lanes, lane, _PAUSED, t)
+            _leave(members, lanes, w, order, lane, _PAUSED, t)
     return False
 
 
@@ -319,7 +327,7 @@ def _step(members, waves, second, viscous, hysteretic, order, lanes, w, t) -> No
     if infinite != 0:
         for lane in range(WIDTH):
             if infinite >> lane & 1:
-                _leave(members, lanes, lane, _NON_FINITE, t)
+                _leave(members, lanes, w, order, lane, _NON_FINITE, t)
     first_events(members.states, lanes, w, order, order, hysteretic)
     go_past_an_instant(members.params, members.states, lanes)
     note_switches(lanes, order, viscous)

@@ -35,14 +35,16 @@ LANES: Final = np.dtype(
         ("load", "f8", (3, _ROWS, WIDTH)),  # S1, S2, M
         ("depth", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # with lambda d', the penetration of each slot's pairs
         ("push", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # F / K of each slot's pairs
-        ("guard", "f8", (GUARDS, _ROWS, WIDTH)),  # in each round one guard of each lane
+        ("guard", "f8", (GUARDS, _ROWS, WIDTH)),  # in each round eight guards of any lanes
         ("bernstein", "f8", (_ROWS, WIDTH)),
+        ("bulge", "f8", (_ROWS, WIDTH)),  # forces whose maximum may exceed their peak and is yet to be found
+        ("bulge_step", "f8", _LANES_OF),  # the steps that they are series of
         ("rows", "f8", (PAIR_COUNT, 5, WIDTH)),  # penetration: factors of cosine, sine, X, Y, constant
         ("arms", "f8", (PAIR_COUNT, 2, WIDTH)),  # arm: factors of cosine and sine
         ("ratio", "f8", _PAIRS),  # C / K of pairs that are on
         ("factor", "f8", _PAIRS),  # lambda
         ("gear", "f8", (PAIR_COUNT, 8, WIDTH)),  # for each slot's pairs: rows, arms, lambda
-        ("chosen", "f8", (8, WIDTH)),  # one guard of each lane: rows, factors of d and d', further constant
+        ("chosen", "f8", (8, WIDTH)),  # guards of a round: rows, factors of d and d', further constant
         ("along", "f8", (2, 6, WIDTH)),  # higher orders of the forces, by c, s, X or Y and their rates
         ("turn", "f8", (2, 8, WIDTH)),  # and of the factors in the moment, by c, s, X, Y and their rates
         ("constant", "f8", (3, WIDTH)),
@@ -69,8 +71,9 @@ LANES: Final = np.dtype(
         ("accurate", "f8", _LANES_OF),  # step size before an event ends the step
         ("stop", "f8", _LANES_OF),  # time at which a step must end
         ("whole", "f8", _LANES_OF),  # the longest step wanted
-        ("reach", "f8", _LANES_OF),  # how far a column is searched
+        ("reach", "f8", _LANES_OF),  # guards of a round: how far each is searched
         ("root", "f8", _LANES_OF),  # its first root
+        ("begin", "f8", _LANES_OF),  # when its pair has parted, else 0
         ("parted", "f8", _PAIRS),  # when a clipped pair parts within the step, infinity where it does not
         ("parting", "i8", (1,)),  # a bit for each lane in which a clipped pair parts
         ("peak", "f8", _PAIRS),
@@ -91,8 +94,13 @@ LANES: Final = np.dtype(
         ("event", "i8", _LANES_OF),  # the guard that ends the step, or -1
         ("ends_at_stop", "i8", _LANES_OF),
         ("todo", "i8", _LANES_OF),  # a bit for each guard that remains to be searched
-        ("guarded", "i8", (GUARDS, WIDTH)),  # the guard in each round, or -1
+        ("guarded", "i8", (GUARDS, WIDTH)),  # the guards of each round, or -1
+        ("owner", "i8", (GUARDS, WIDTH)),  # and their lanes
+        ("row_place", "i8", _LANES_OF),  # places of a round's guards in `rows`
         ("rounds", "i8", (1,)),
+        ("bulges", "i8", (1,)),  # number of the forces in `bulge`
+        ("bulge_pair", "i8", _LANES_OF),
+        ("bulge_lane", "i8", _LANES_OF),
         ("orders", "i8", _LANES_OF),  # order of the series of each lane; the terms beyond have vanished
         ("vanished", "i8", (1,)),  # a bit for each lane whose series ends early
         ("before", "i8", _LANES_OF),  # steps before the sample
@@ -259,6 +267,14 @@ def _add(there, rates, factor, gear, third, fourth, stiffness, viscous) -> None:
 
 
 @kernel(inline="code")
+def places_of(numbers):
+    """Return eight whole numbers as places for `gathered`."""
+    return (
+        numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], numbers[5], numbers[6], numbers[7],
+    )  # fmt: skip
+
+
+@kernel(inline="code")
 def penetration_at(rows, c, s, x, y):
     """Return the penetrations of one pair or slot in all lanes."""
     normal = fused(exact_row(rows, 2), x, fused(exact_row(rows, 3), y, exact_row(rows, 4)))
@@ -280,9 +296,13 @@ def to_bernstein(lanes, column, w, order, h) -> None:
     for k in range(order + 1):
         set_row(b, k, exact_row(column, k) * (power * w.binomial[order, k]))
         power = power * h
-    for r in range(1, order + 1):
-        before = exact_row(b, r - 1)
-        for j in range(r, order + 1):
+    # two sweeps at once halve the stores
+    for r in range(1, order + 1, 2):
+        before = exact_row(b, r)
+        once = before + exact_row(b, r - 1)
+        set_row(b, r, once)
+        for j in range(r + 1, order + 1):
             here = exact_row(b, j)
-            set_row(b, j, here + before)
-            before = here
+            swept = here + before
+            set_row(b, j, swept + once)
+            before, once = here, swept

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.polynomial import maximum
-from plow_twin.kernel.simd import below, choose, exact_row, exact_splat, fused, magnitude, set_row
+from plow_twin.kernel.simd import below, choose, exact_row, exact_splat, fused, lowest_bit, magnitude, set_row
 from plow_twin.model.pairs import PAIR_COUNT
+from plow_twin.solve.lanes.events import cross, isolate
 from plow_twin.solve.lanes.record import COMPONENTS, WIDTH, linear_at, penetration_at, to_bernstein
 from plow_twin.solve.state import COS, SIN, X, Y
 from plow_twin.solve.totals import add_set_times
@@ -20,18 +21,27 @@ def sum_step(lanes, w, order) -> None:
 
     The integrals are those of the change, without the values at the start.
     """
-    h = exact_row(lanes.step, 0)
-    for i in range(COMPONENTS):
-        series, change = lanes.series[i], exact_splat(0.0)
+    h, zero = exact_row(lanes.step, 0), exact_splat(0.0)
+    # sums side by side need not wait for each other
+    for i in range(0, COMPONENTS, 4):
+        a = b = c = d = zero
         for k in range(order, 0, -1):
-            change = fused(change, h, exact_row(series, k))
-        set_row(lanes.change, i, change * h)
-    for i in range(4):
-        component = COS if i == 0 else SIN if i == 1 else X if i == 2 else Y
-        series, total = lanes.series[component], exact_splat(0.0)
-        for k in range(order, 0, -1):
-            total = fused(total, h, exact_row(series, k) * w.inverse[k + 1])
-        set_row(lanes.sum, i, total * h * h)
+            a, b = fused(a, h, exact_row(lanes.series[i], k)), fused(b, h, exact_row(lanes.series[i + 1], k))
+            c, d = fused(c, h, exact_row(lanes.series[i + 2], k)), fused(d, h, exact_row(lanes.series[i + 3], k))
+        set_row(lanes.change, i, a * h)
+        set_row(lanes.change, i + 1, b * h)
+        set_row(lanes.change, i + 2, c * h)
+        set_row(lanes.change, i + 3, d * h)
+    cosine, sine, x, y = lanes.series[COS], lanes.series[SIN], lanes.series[X], lanes.series[Y]
+    a = b = c = d = zero
+    for k in range(order, 0, -1):
+        part = w.inverse[k + 1]
+        a, b = fused(a, h, exact_row(cosine, k) * part), fused(b, h, exact_row(sine, k) * part)
+        c, d = fused(c, h, exact_row(x, k) * part), fused(d, h, exact_row(y, k) * part)
+    set_row(lanes.sum, 0, a * h * h)
+    set_row(lanes.sum, 1, b * h * h)
+    set_row(lanes.sum, 2, c * h * h)
+    set_row(lanes.sum, 3, d * h * h)
 
 
 @kernel()
@@ -41,7 +51,7 @@ def add_step(totals, lanes, w, order, full, viscous, hysteretic) -> None:
     `order` and `full` are as for `first_events`.
     """
     last = order - 1
-    if totals is None:
+    if totals is None and hysteretic is None:
         # under samples the series of a lane may end earlier; its guard then has one more term
         last = order
     for slot in range(PAIR_COUNT):
@@ -55,14 +65,12 @@ def add_step(totals, lanes, w, order, full, viscous, hysteretic) -> None:
                 lanes.impulse[pair, lane] += max(lanes.gained[0, lane], 0.0)
                 lanes.time_in_contact[pair, lane] += lanes.step[lane]
                 lanes.gained[1, lane] = lanes.peak[pair, lane]
-        if hysteretic is not None:
-            raised = _raise_peaks(lanes, w, lanes.push[slot], order - 1, full - 1, taken)
-        else:
-            raised = _raise_peaks(lanes, w, lanes.push[slot], last, last + full - order, taken)
-        if raised != 0:
-            for lane in range(WIDTH):
-                if raised >> lane & 1:
-                    lanes.peak[lanes.slot[slot, lane], lane] = lanes.gained[1, lane]
+        raised = _raise_peaks(totals, lanes, w, slot, last, last + full - order, taken)
+        while raised != 0:
+            lane = lowest_bit(raised)
+            raised &= raised - 1
+            pair = lanes.slot[slot, lane]
+            lanes.peak[pair, lane] = max(lanes.peak[pair, lane], lanes.gained[1, lane])
     if totals is None:
         return
     for lane in range(WIDTH):
@@ -91,13 +99,13 @@ def _impulses(lanes, gear, viscous, hysteretic):
 
 
 @kernel()
-def _raise_peaks(lanes, w, push, order, full, on) -> int:
+def _raise_peaks(totals, lanes, w, slot, order, full, on) -> int:
     """Raise the peaks in `lanes.gained` by the series of F / K; return a bit for each lane that was looked at.
 
-    First comes a bound; where it exceeds the peak, the larger end; only where the maximum may lie in between, the
-    maximum.
+    First comes a bound; where it exceeds the peak, the larger end. A force whose maximum may lie in between is kept for
+    `find_peaks`; under samples, whose rows need their peaks at once and whose steps are short, it is looked at now.
     """
-    h, zero, half = exact_row(lanes.step, 0), exact_splat(0.0), exact_splat(0.5)
+    h, zero, half, push = exact_row(lanes.step, 0), exact_splat(0.0), exact_splat(0.5), lanes.push[slot]
     end = bend = slope = zero
     for k in range(order, -1, -1):
         term = exact_row(push, k)
@@ -116,25 +124,86 @@ def _raise_peaks(lanes, w, push, order, full, on) -> int:
     peak = choose(exceeds & below(peak, reached), reached, peak)
     set_row(lanes.gained, 1, peak)
     bulges = exceeds & below(magnitude(exact_row(push, 1)), slope)
-    if bulges != 0:
-        for k in range(order + 1, full + 1):
-            set_row(push, k, zero)
-        bulges &= below(peak * _SAME, stiffness * _hull_top(lanes, push, w, full))
-        for lane in range(WIDTH):
-            if bulges >> lane & 1:
-                column, k = w.column[0], lanes.stiffness[lane]
-                for i in range(full + 1):
-                    column[i] = k * push[i, lane]
-                lanes.gained[1, lane] = maximum(column, full, lanes.step[lane], lanes.gained[1, lane], w)
+    if totals is None:
+        if bulges != 0:
+            top = stiffness * _hull_top(lanes, push, w, order, full)
+            _raise_at_once(lanes, w, push, full, bulges & below(peak * _SAME, top))
+        return exceeds
+    while bulges != 0:
+        lane = lowest_bit(bulges)
+        bulges &= bulges - 1
+        _keep_bulge(lanes, push, lanes.slot[slot, lane], lane, order)
+        if lanes.bulges[0] == WIDTH:
+            find_peaks(lanes, w, order)
     return exceeds
 
 
 @kernel()
-def _hull_top(lanes, push, w, order):
+def _hull_top(lanes, push, w, order, full):
     """Return the largest Bernstein coefficient over each lane's step."""
-    to_bernstein(lanes, push, w, order, exact_row(lanes.step, 0))
+    zero = exact_splat(0.0)
+    for k in range(order + 1, full + 1):
+        set_row(push, k, zero)
+    to_bernstein(lanes, push, w, full, exact_row(lanes.step, 0))
     top = exact_row(lanes.bernstein, 0)
-    for k in range(1, order + 1):
+    for k in range(1, full + 1):
         here = exact_row(lanes.bernstein, k)
         top = choose(below(top, here), here, top)
     return top
+
+
+@kernel()
+def _raise_at_once(lanes, w, push, full, bulges) -> None:
+    while bulges != 0:
+        lane = lowest_bit(bulges)
+        bulges &= bulges - 1
+        column, stiffness = w.column[0], lanes.stiffness[lane]
+        for k in range(full + 1):
+            column[k] = stiffness * push[k, lane]
+        lanes.gained[1, lane] = maximum(column, full, lanes.step[lane], lanes.gained[1, lane], w)
+
+
+@kernel()
+def _keep_bulge(lanes, push, pair, lane, order) -> None:
+    """Keep the force of a lane's pair for `find_peaks`."""
+    i, stiffness = lanes.bulges[0], lanes.stiffness[lane]
+    for k in range(order + 1):
+        lanes.bulge[k, i] = stiffness * push[k, lane]
+    lanes.bulge_step[i], lanes.bulge_pair[i], lanes.bulge_lane[i] = lanes.step[lane], pair, lane
+    lanes.bulges[0] = i + 1
+
+
+@kernel()
+def find_peaks(lanes, w, order) -> None:
+    """Raise the peaks by the maxima of the forces that were kept: forces of any lanes and steps.
+
+    A maximum is a root of F'. It does not depend on the peak so far, so that it has the same bits in any company.
+    """
+    if lanes.bulges[0] == 0:
+        return
+    column, zero, bits = lanes.guard[0], exact_splat(0.0), (1 << lanes.bulges[0]) - 1
+    lanes.bulges[0] = 0
+    for k in range(order):
+        set_row(column, k, exact_row(lanes.bulge, k + 1) * (k + 1.0))
+    set_row(lanes.reach, 0, exact_row(lanes.bulge_step, 0))
+    single, several = isolate(lanes, column, w, order - 1, bits)
+    falls = below(exact_row(column, 0), zero)
+    several |= single & falls
+    single &= ~falls
+    if single != 0:
+        cross(lanes, column, order - 1, single)
+    top, at = zero, exact_row(lanes.root, 0)
+    for k in range(order, -1, -1):
+        top = fused(top, at, exact_row(lanes.bulge, k))
+    set_row(lanes.root, 0, top)
+    left = single | several
+    while left != 0:
+        i = lowest_bit(left)
+        left &= left - 1
+        if several >> i & 1:
+            force = w.column[0]
+            for k in range(order + 1):
+                force[k] = lanes.bulge[k, i]
+            lanes.root[i] = maximum(force, order, lanes.bulge_step[i], 0.0, w)
+        pair, lane = lanes.bulge_pair[i], lanes.bulge_lane[i]
+        lanes.peak[pair, lane] = max(lanes.peak[pair, lane], lanes.root[i])
