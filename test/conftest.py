@@ -47,7 +47,15 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--check-skips", action="store_true", help="fail when a test is skipped that test/skips.txt does not list"
     )
+    parser.addoption("--compiles", action="store_true", help="list the kernels that tests compiled, with their time")
     parser.addoption("--golden-update", action="store_true", help="pin the digests of test/golden.py anew")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if config.getoption("--compiles"):
+        from compiles import Compiles
+
+        config.pluginmanager.register(Compiles())
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
