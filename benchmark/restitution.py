@@ -36,6 +36,8 @@ VALID = 0.05
 MASS_KG, SPEED_M_S, STIFFNESS, EXPONENT = 2.0, 1.0, 1e9, 1.5
 #: Stiffness [N/m] of the laws that add C d' to a linear spring.
 LINEAR_STIFFNESS = 1e6
+#: Impact speed [m/s] below which damping stays as it is, so low that all restitutions below 1 share compiled kernels.
+FLOOR = 1e-6
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,8 @@ def measure(law: str, asked: Iterable[float], ramp: float = 0.0) -> list[Row]:
     rows = []
     for value in asked:
         if LAWS[law].takes_restitution:
-            contact = Contact(law, STIFFNESS, LAWS[law].exponent or EXPONENT, restitution=value)
+            exponent = LAWS[law].exponent or EXPONENT
+            contact = Contact(law, STIFFNESS, exponent, restitution=value, impact_speed_floor_m_s=FLOOR)
         elif LAWS[law].additive:
             contact = damped(value, ramp, LINEAR_STIFFNESS, MASS_KG, SPEED_M_S)
         else:

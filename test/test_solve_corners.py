@@ -92,7 +92,7 @@ def test_corners_pass_their_contact_on_at_45_degrees() -> None:
     # pressed on the table by ten times its weight, rolled over its lower right corner
     push = Constant("push", force_n=(0.0, -90.0), moment_n_m=-3.3)
     lying = Initial(q=(0.0, -WALL + 0.5 * SIDE, 0.0), v=(0.0, 0.0, -0.3))
-    scene = block(initial=lying, loads=(push,), friction=Friction(1.0, 0.01))
+    scene = block(initial=lying, loads=(push,), friction=Friction(1.0, 0.02))
     result = simulate(scene, t_end=0.25, output_dt=1e-3, energy_balance=True)  # the kernels of `falls`
     turned = np.flatnonzero(result.q[:, 2] < -0.25 * math.pi)
     assert turned.size > 0
@@ -131,6 +131,7 @@ def mirrored(scene: Scene) -> Scene:
     )
 
 
+STICK = Friction(0.2, stick_stiffness_n_m=1e6, stick_damping_n_s_m=20.0)
 #: With so much inertia that it does not turn; a locked angle would need its own kernels.
 GUIDED = block(
     head=Head(MASS, 1e12, carries="corners"),
@@ -139,7 +140,7 @@ GUIDED = block(
     contact=Contact("exact_restitution", stiffness=1e7, exponent=1.5, restitution=0.5),
     loads=(Harmonic("push", force_n=(120.0, 40.0), omega_rad_s=9.0),),
     initial=Initial(q=(0.001, 0.002, 0.0), v=(0.3, -0.2, 0.0)),
-    friction=Friction(0.2, stick_stiffness_n_m=1e6, stick_damping_n_s_m=20.0),
+    friction=STICK,
 )
 
 
@@ -167,8 +168,9 @@ def test_corners_that_turn_little_are_nearly_a_mirrored_head_with_walls() -> Non
         scene = replace(
             GUIDED,
             head=block().head,
-            friction=None,
-            loads=(),
+            # next to no friction and load, instead of none: the kernels of the test above
+            friction=replace(STICK, coefficient=1e-12),
+            loads=(Harmonic("push", force_n=(1e-9, 0.0), omega_rad_s=9.0),),
             initial=Initial(q=(0.0, 0.0, angle), v=(0.4, -0.3, 0.0)),
         )
         ends = [simulate(one, t_end=0.03, output_dt=1e-3, tol=1e-10).q for one in (scene, mirrored(scene))]
@@ -185,14 +187,14 @@ def test_corners_move_the_same_by_fixed_steps_and_by_a_live_twin(falls) -> None:
     for t in falls.t[1:101]:
         now = twin.advance(float(t))
     np.testing.assert_allclose(now.q, falls.q[100], atol=1e-9)
-    assert TwinBatch([block(), block(friction=Friction(0.3, SLIP_SPEED))]).advance(0.1).q.shape == (2, 1, 3)
 
 
 def test_senses_of_corners_are_those_of_the_block() -> None:
-    # a moment turns the block counter-clockwise against its guide: these sets stop a counter-clockwise swing
+    # a moment turns the block counter-clockwise against its guide: these sets stop a counter-clockwise swing; a larger
+    # moment would compile implicit steps
     scene = block(
         frame=Frame(0.3, 0.2), clearance=Clearance(0.01, 0.01), friction=Friction(1e-12, 0.05), gravity=Gravity(0.0),
-        loads=(Constant("turn", moment_n_m=50.0),), initial=Initial(),
+        loads=(Constant("turn", moment_n_m=5.0),), initial=Initial(),
     )  # fmt: skip
     result = simulate(scene, t_end=0.2, output_dt=1e-2, energy_balance=True)
     assert result.contact_sets["ccw"] and not result.contact_sets["cw"]
@@ -223,7 +225,9 @@ def test_estimate_refuses_a_block() -> None:
         Forward(block(), None)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("radius", [None, 0.01], ids=["sharp", "rounded"])
+@pytest.mark.parametrize(
+    "radius", [pytest.param(None, id="sharp"), pytest.param(0.01, id="rounded", marks=pytest.mark.stress)]
+)
 def test_twins_with_walls_and_with_corners_share_no_compiled_code(radius: float | None) -> None:
     """Both have the same terms: only the records of their constants differ."""
     walls = replace(mirrored(block()), frame=Frame(SIDE, SIDE))

@@ -80,12 +80,19 @@ def draw(rng: np.random.Generator) -> Scene:
     )
 
 
-def drawn(seed: int, count: int) -> list[Scene]:
-    rng = np.random.default_rng(seed)
-    scenes = [draw(rng) for _ in range(2 * count)]
-    fitting = [scene for scene in scenes if fits_lanes(compile_scene(scene, 1e-6))]
-    assert len(fitting) >= count
-    return fitting[:count]
+#: Directions of the harmonics and terms of the law, each pair of which compiles kernels of its own: every one once.
+SOME = {(0, None, None), (0, 1, None), (1, 1, None), (2, None, 1)}
+
+
+def drawn(seed: int, count: int, some: bool = True) -> list[Scene]:
+    rng, found = np.random.default_rng(seed), list[Scene]()
+    while len(found) < count:
+        compiled = compile_scene(scene := draw(rng), 1e-6)
+        terms = compiled.parts.terms
+        kind = (terms.harmonics or 0) + (terms.second or 0), terms.viscous, terms.hysteretic
+        if fits_lanes(compiled) and (not some or kind in SOME):
+            found.append(scene)
+    return found
 
 
 def same(one: Ensemble, i: int, other: Ensemble, k: int) -> bool:
@@ -103,7 +110,7 @@ def test_a_scene_has_the_same_bits_alone_and_in_any_company() -> None:
 
 
 def test_rows_and_limits_on_the_time_between_two_looks_move_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
-    scenes = drawn(2, 9)
+    scenes = drawn(7, 9)
     whole = simulate_many(scenes, 0.5, 0.05, 1e-7)
     monkeypatch.setattr("plow_twin.run.lane_run.next_slice", lambda size, took_s: 7)
     monkeypatch.setattr("plow_twin.run.lane_run._FIRST_SLICE", 3)
@@ -112,8 +119,8 @@ def test_rows_and_limits_on_the_time_between_two_looks_move_no_bit(monkeypatch: 
     assert np.array_equal(finer.steps, whole.steps)
 
 
-def _check_beside_the_loop(seed: int, count: int) -> None:
-    scenes = drawn(seed, count)
+def _check_beside_the_loop(seed: int, count: int, some: bool) -> None:
+    scenes = drawn(seed, count, some)
     many = simulate_many(scenes, 0.7, 0.02, 1e-12)
     close = 0
     for index, scene in enumerate(scenes):
@@ -140,14 +147,14 @@ def _check_beside_the_loop(seed: int, count: int) -> None:
 
 
 def test_random_scenes_move_as_in_the_loop_of_a_single_scene() -> None:
-    _check_beside_the_loop(3, 24)
+    _check_beside_the_loop(3, 16, some=True)
 
 
 @pytest.mark.stress
 @settings(max_examples=10)
 @given(st.integers(0, 2**32 - 1))
 def test_many_random_scenes_move_as_in_the_loop_of_a_single_scene(seed: int) -> None:
-    _check_beside_the_loop(seed, 40)
+    _check_beside_the_loop(seed, 40, some=False)
 
 
 @pytest.mark.parametrize("tol", [1e-3, 1e-6, 1e-9])

@@ -98,10 +98,11 @@ def test_disc_of_rounded_corners_rolls_without_sliding() -> None:
         head=Head(MASS, inertia, carries="corners"),
         frame=Frame(SIDE, SIDE, corner_radius_m=radius),
         friction=Friction(0.5, stick_stiffness_n_m=1e7, stick_damping_n_s_m=200.0),
-        loads=(Constant("push", (push, 0.0)),),
+        # the second load and the balance are there for the kernels of `in_guide`
+        loads=(Constant("push", (push, 0.0)), Harmonic("nothing to speak of", (1e-12, 0.0), 9.0)),
         initial=Initial(q=(0.0, -1.0 + 0.5 * SIDE, 0.0)),
     )
-    found = simulate(disc, t_end=0.6, output_dt=0.01)
+    found = simulate(disc, t_end=0.6, output_dt=0.01, energy_balance=True)
     expected = 0.5 * push / (MASS + inertia / radius**2) * found.t**2
     np.testing.assert_allclose(found.q[:, 0], expected, atol=1e-5)
     np.testing.assert_allclose(found.q[:, 2], -expected / radius, atol=1e-3)
@@ -109,19 +110,18 @@ def test_disc_of_rounded_corners_rolls_without_sliding() -> None:
     assert found.q[-1, 2] < -1.6
 
 
-# each pairing compiles kernels of its own: the others are left to the full count
-PAIRINGS = pytest.mark.parametrize(
-    ("carries", "friction"),
-    [
-        pytest.param("corners", STICK, id="corners, stick"),
-        pytest.param("walls", Friction(MU, SLIP_SPEED), id="walls, regularised"),
-        pytest.param("corners", Friction(MU, SLIP_SPEED), id="corners, regularised", marks=pytest.mark.stress),
-        pytest.param("walls", STICK, id="walls, stick", marks=pytest.mark.stress),
-    ],
-)
+def pairings(*quick: str) -> pytest.MarkDecorator:
+    """Return the pairings; each compiles kernels of its own, so all but the named ones are left to the full count."""
+    drag = {"stick": STICK, "regularised": Friction(MU, SLIP_SPEED)}
+    names = [(carries, name, f"{carries}, {name}") for carries in ("corners", "walls") for name in drag]
+    parts = [
+        pytest.param(carries, drag[name], id=both, marks=() if both in quick else pytest.mark.stress)
+        for carries, name, both in names
+    ]
+    return pytest.mark.parametrize(("carries", "friction"), parts)
 
 
-@PAIRINGS
+@pairings("corners, stick", "walls, regularised")
 def test_rounded_corners_balance_energy_and_momentum(carries: str, friction: Friction) -> None:
     result = simulate(in_guide(carries, friction=friction), t_end=0.5, output_dt=0.01, energy_balance=True)
     balance = result.energy_balance
@@ -131,7 +131,7 @@ def test_rounded_corners_balance_energy_and_momentum(carries: str, friction: Fri
     assert np.abs(balance.momentum_imbalance).max() < 1e-8
 
 
-@PAIRINGS
+@pairings("corners, stick")
 def test_rounded_corners_move_the_same_by_fixed_steps_a_live_twin_and_a_batch(carries: str, friction: Friction) -> None:
     scene = in_guide(carries, friction=friction)
     run = simulate(scene, t_end=0.1, output_dt=0.01, energy_balance=True)
