@@ -34,10 +34,14 @@ def test_every_example_is_listed_and_has_a_short_readme() -> None:
             assert (folder / target).exists(), target
 
 
+#: These compile kernels of their own or take minutes.
+LONG = ("a_year", "calibration", "measured_drop")
+
+
 @pytest.mark.timeout(250)
 @pytest.mark.parametrize(
     "folder",
-    [pytest.param(one, marks=pytest.mark.stress) if one.name == "a_year" else one for one in FOLDERS],
+    [pytest.param(one, marks=pytest.mark.stress) if one.name in LONG else one for one in FOLDERS],
     ids=lambda folder: folder.name,
 )
 def test_the_example_runs(folder: Path, tmp_path: Path) -> None:

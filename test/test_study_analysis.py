@@ -348,7 +348,8 @@ def test_measured_values_are_compared_with_the_stretch_they_belong_to(clock_s: f
         assert signal["rms"] == pytest.approx(0.0, abs=2e-5) and signal["correlation"] == pytest.approx(1.0, abs=1e-4)
 
 
-@pytest.mark.parametrize("rotation", ["paper", "consistent"])
+# each rotation compiles a kernel of its own
+@pytest.mark.parametrize("rotation", ["paper", pytest.param("consistent", marks=pytest.mark.stress)])
 def test_contacts_under_gravity_alone_take_the_energy_of_the_height_lost(rotation: str, tmp_path: Path) -> None:
     """In flight that is 0; for a head at rest m g times the drop of its centre, less the stored energy."""
     scene = load_scene(PAPER)
@@ -487,7 +488,7 @@ def mutate_many(tmp_path: Path, seeds: Iterable[int]) -> None:
 
 
 def test_mutated_files_give_an_error_or_counted_loss(tmp_path: Path) -> None:
-    mutate_many(tmp_path, range(500))
+    mutate_many(tmp_path, range(120))
 
 
 @pytest.mark.stress
