@@ -519,7 +519,7 @@ def test_an_absurd_load_gives_an_error_status_and_no_message(tmp_path: Path) -> 
     assert [stamp_ns(message.header) - T0 for message in forces] == [0, 5 * MS]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.stress), signal.SIGTERM])
 def test_a_stop_under_load_is_clean_and_closes_the_recording(tmp_path: Path, number: signal.Signals) -> None:
     with bench(tmp_path, record_path=tmp_path / "run") as running:
         forces = running.probe.listen(JointState, "contact_forces")

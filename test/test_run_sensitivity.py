@@ -111,7 +111,15 @@ def _law(name: str) -> Scene:
     return replace(scene, contact=contact)
 
 
-@pytest.mark.parametrize("name", ["restitution", "Hertz with restitution", "square", "cube"])
+# integer exponents compile kernels of their own
+@pytest.mark.parametrize(
+    "name",
+    [
+        "restitution",
+        "Hertz with restitution",
+        *(pytest.param(name, marks=pytest.mark.stress) for name in ("square", "cube")),
+    ],
+)
 def test_the_linearised_equations_agree_with_displaced_motions(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Laws that the differences of runs above do not cover; the equations are used, not shadows."""
     scene, used = _law(name), list[int]()

@@ -83,9 +83,16 @@ def test_asking_in_between_does_not_change_the_motion(times: list[float]) -> Non
     assert np.max([row.peak for row in [*rows, last]], axis=0) == pytest.approx(expected.peak, rel=1e-10)
 
 
+#: With all effects on wear, whose kernels `test_solve_wear` has too.
+RUBBED = dataclasses.replace(
+    preset("paper"),
+    wear=Wear(1e-12, 0.015, 2.0, sliding="total", running_in_ratio=4.0, running_in_depth_m=2e-5),
+)
+
+
 @pytest.mark.parametrize("excitation", ["scene", "sampled"])
 def test_a_restored_twin_goes_on_with_the_same_bits(excitation: str) -> None:
-    scene = dataclasses.replace(preset("paper"), wear=Wear(1e-12, 0.015, 2.0))
+    scene = RUBBED if excitation == "scene" else dataclasses.replace(preset("paper"), wear=Wear(1e-12, 0.015, 2.0))
     first, second = (Twin(scene, excitation=excitation) for _ in range(2))  # type: ignore[arg-type]
 
     def go(twin: Twin, t: float) -> np.ndarray:
@@ -136,6 +143,7 @@ def test_a_failed_advance_keeps_the_last_good_state_and_the_next_one_goes_on(wre
     assert after.status is Status.OK and abs(after.q - good.q).max() < 0.05
 
 
+@pytest.mark.stress  # a kernel of its own
 @pytest.mark.parametrize("depth", [0.2, 1.3])
 def test_a_failed_advance_leaves_no_trace_in_later_ones(depth: float) -> None:
     """It has crossed the end of the ramp; the impact continues as if the advance had not been tried."""
@@ -188,7 +196,7 @@ def test_in_free_flight_nothing_of_the_contact_runs() -> None:
 
 
 def test_warm_up_leaves_nothing_to_compile() -> None:
-    twin = Twin(dataclasses.replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0)))
+    twin = Twin(RUBBED)
     twin.warm_up()
     before = [len(kernel.signatures) for kernel in (loop.advance_rows, loop.interrupt_step, loop.lay_out_again)]
     assert min(before) > 0 and twin.time == 0.0

@@ -54,7 +54,14 @@ def fixed_step_errors(
 
 @pytest.mark.parametrize(
     ("name", "order"),
-    [("kelvin_voigt", 1.0), ("n = 1", 2.0), ("n = 1.5", 2.5), ("n = 1.5, Hertz", 2.5), ("n = 2", 3.0)],
+    [
+        ("kelvin_voigt", 1.0),
+        ("n = 1", 2.0),
+        ("n = 1.5", 2.5),
+        # kernels of their own
+        pytest.param("n = 1.5, Hertz", 2.5, marks=pytest.mark.stress),
+        pytest.param("n = 2", 3.0, marks=pytest.mark.stress),
+    ],
 )
 def test_rk4_without_event_location_has_order_n_plus_one(name: str, order: float) -> None:
     """The force sets in as d^n, Kelvin-Voigt's jumps (Shampine and Thompson, Comput. Math. Appl. 39 (2000) 43)."""

@@ -30,7 +30,7 @@ SCENES = {
 }
 SCENES["offset, wear"] = replace(SCENES["offset"], wear=SCENES["wear"].wear)
 # each compiles kernels of its own; a ramp is in test_solve_ramp
-FULL_COUNT = ("offset", "ramp", "wear", "locked")
+FULL_COUNT = ("bench_hc", "offset", "ramp", "wear", "locked")
 
 
 @pytest.mark.parametrize(
