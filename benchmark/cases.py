@@ -69,7 +69,7 @@ class Case:
 TIME_PER_CASE_S = 1.0
 #: A first run shorter than this is a warm-up and does not count; in a longer run start and cache do not matter.
 WARM_UP_BELOW_S = 0.05
-#: Runs as short as this are repeated whether or not anything depends on them.
+#: Cases with runs shorter than this are always repeated.
 SHORT_S = 0.02
 Choose = Callable[[Sequence[Row]], set[int]]
 

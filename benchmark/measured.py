@@ -496,7 +496,7 @@ def of_drops(drops: Drops) -> dict[str, Any]:
 
 
 def of_table(drops: Drops) -> dict[str, Any]:
-    """Return how the estimate finds the table of each drop, whose height the prior knows to 5 mm."""
+    """Return the estimate of the table's height in each drop, with a prior of 5 mm."""
     square, rng = load_scene("measured_square"), np.random.default_rng(1)
     marks = dict(square.marks)
     marks["clearance.vertical_m"] = replace(marks["clearance.vertical_m"], deviation=0.01)

@@ -358,7 +358,7 @@ class Settings:
         0.0,
         1e12,
         Effect.CONFIGURE,
-        "force from which a warning and an error begin; 0: never",
+        "forces that raise a warning and an error; 0: never",
     )
     alarm_clearance: tuple[float, ...] = _list(
         (0.0, 0.0),
@@ -366,7 +366,7 @@ class Settings:
         0.0,
         10.0,
         Effect.CONFIGURE,
-        "clearance, the larger of the two, from which a warning and an error begin; 0: never",
+        "values of the larger clearance that raise a warning and an error; 0: never",
     )
     alarm_wear_rate: tuple[float, ...] = _list(
         (0.0, 0.0),
@@ -374,7 +374,7 @@ class Settings:
         0.0,
         1.0,
         Effect.CONFIGURE,
-        "wear rate of a pad from which a warning and an error begin; 0: never",
+        "wear rates of a pad that raise a warning and an error; 0: never",
     )
     alarm_clearance_rate: tuple[float, ...] = _list(
         (0.0, 0.0),
@@ -382,7 +382,7 @@ class Settings:
         0.0,
         1.0,
         Effect.CONFIGURE,
-        "growth of the larger clearance over 10 s from which a warning and an error begin; 0: never",
+        "growth rates of the larger clearance, over 10 s, that raise a warning and an error; 0: never",
     )
     alarm_residual: tuple[float, ...] = _list(
         (0.0, 0.0),
@@ -390,7 +390,7 @@ class Settings:
         0.0,
         10.0,
         Effect.CONFIGURE,
-        "distance of head_pose from the model at its stamp from which a warning and an error begin; 0: never",
+        "distances between head_pose and the model at its stamp that raise a warning and an error; 0: never",
     )
     alarm_duration: float = _number(
         0.0, "s", 0.0, 3600.0, Effect.CONFIGURE, "time that a level must last before it raises an alarm"

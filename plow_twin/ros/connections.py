@@ -101,7 +101,7 @@ class Connections:
         self._unnamed: set[tuple[str, bytes]] = set()
 
     def publishers(self, subscription: Subscription) -> tuple[list[Any], int]:
-        """Return the publishers that a subscription can receive from, and the number of new ones that cannot."""
+        """Return the publishers that can connect to a subscription, and the number of new publishers that cannot."""
         topic, found = subscription.topic_name, []
         kind, refused = type_name(subscription.msg_type), 0
         for publisher in self._node.get_publishers_info_by_topic(topic):

@@ -143,7 +143,7 @@ class Rows:
         return columns_of(source, self.columns or ())
 
     def of_another_file(self) -> Rows:
-        """Return a parser for the file that replaces this one; without a header that file has the present header."""
+        """Return a parser for the file that replaces this one; a file without a header takes the present header."""
         rows = Rows()
         rows._before = self.columns
         return rows
