@@ -186,24 +186,14 @@ def _history(path: Path) -> History:
 
     Raises
     ------
-    LifeError
+    RecordingError, LifeError
         When the history cannot be used.
     """
-    import numpy as np
-
     from plow_twin.estimate.coefficient import History
     from plow_twin.estimate.life import LifeError
-    from plow_twin.record.sources import read_table
+    from plow_twin.record.sources import read_columns
 
-    names = ("km", "horizontal_mm", "horizontal_sd_mm", "vertical_mm", "vertical_sd_mm")
-    columns, rows = read_table(path)
-    if not set(names) <= set(columns.names):
-        raise LifeError(f"{path}: got the {columns}, expected the columns {', '.join(names)}")
-    places = [columns.names.index(name) for name in names]
-    try:
-        table = np.array([[float(row[place]) for place in places] for row in rows], dtype=np.float64).reshape(-1, 5)
-    except (IndexError, ValueError) as error:
-        raise LifeError(f"{path}: {error}, expected numbers in all of the columns {', '.join(names)}") from error
+    table = read_columns(path, ("km", "horizontal_mm", "horizontal_sd_mm", "vertical_mm", "vertical_sd_mm"))
     if not len(table):
         raise LifeError(f"{path}: got no row, expected at least 2")
     return History(1e3 * (table[:, 0] - table[0, 0]), 1e-3 * table[:, [1, 3]], 1e-3 * table[:, [2, 4]])

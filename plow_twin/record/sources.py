@@ -17,6 +17,9 @@ from pathlib import Path
 from typing import Any, Final, Protocol, TypeAlias
 from urllib.parse import quote
 
+import numpy as np
+from numpy.typing import NDArray
+
 from plow_twin.errors import RecordingError
 from plow_twin.record.chunks import MAGIC, Channel, ChunkReader, is_begun, is_mcap
 from plow_twin.record.merging import StampOf, merged
@@ -424,6 +427,26 @@ def read_table(path: Path) -> tuple[Columns, Iterator[list[str]]]:
     rows = _table_rows(path)
     names = tuple(name.strip() for name in next(rows, ()))
     return columns_of(path, names), rows
+
+
+def read_columns(path: Path, names: Sequence[str]) -> NDArray[np.float64]:
+    """Return the numbers of these columns of a CSV or Parquet file, shape (n, k).
+
+    Raises
+    ------
+    RecordingError
+        As in `read_table`, or a column or a number is missing.
+    """
+    columns, rows = read_table(path)
+    if not set(names) <= set(columns.names):
+        raise RecordingError(f"{path}: got the {columns}, expected {', '.join(names)}")
+    places = [columns.names.index(name) for name in names]
+    try:
+        return np.array([[float(row[place]) for place in places] for row in rows], float).reshape(-1, len(names))
+    except RecordingError:
+        raise
+    except (IndexError, ValueError) as error:
+        raise RecordingError(f"{path}: {error}, expected numbers in all of the columns {', '.join(names)}") from error
 
 
 def _table_rows(path: Path) -> Iterator[list[str]]:

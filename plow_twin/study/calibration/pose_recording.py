@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,10 +11,11 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.errors import ExcessError
+from plow_twin.errors import ExcessError, RecordingError
 from plow_twin.model.scene import Table
+from plow_twin.record.recording import read_recording
+from plow_twin.record.sources import Columns, read_columns
 from plow_twin.run.ensemble import Ensemble
-from plow_twin.scene_file.csv_rows import csv_rows, open_csv
 from plow_twin.study.parameters import StudyError
 
 Array = NDArray[np.float64]
@@ -82,9 +82,11 @@ def load_poses(path: Path) -> PoseRecording:
         t, q, load = readers[path.suffix](path)
     except ExcessError:
         raise
+    except RecordingError as error:
+        raise StudyError(str(error)) from None
     except OSError as error:
         raise StudyError(f"{path}: {error.strerror or error}") from None
-    except (csv.Error, ValueError, AttributeError, MemoryError, BadZipFile, EOFError) as error:  # the last: np.load
+    except (ValueError, AttributeError, MemoryError, BadZipFile, EOFError) as error:  # the last: np.load
         raise StudyError(f"{path}: {error}") from None
     if t.ndim != 1 or q.shape != (len(t), 3) or len(t) < 2:
         raise StudyError(f"{path}: got t {t.shape} and q {q.shape}, expected (n,) and (n, 3) with n >= 2")
@@ -97,16 +99,7 @@ def load_poses(path: Path) -> PoseRecording:
 
 
 def _read_csv(path: Path) -> tuple[Array, Array, None]:
-    with open_csv(path) as file:
-        rows = csv_rows(file)
-        names = [name.strip() for name in next(rows, (0, []))[1]]
-        _require([name for name in COLUMNS if name not in names], names)
-        columns = [names.index(name) for name in COLUMNS]
-        try:
-            table = np.array([[float(cells[column]) for column in columns] for _, cells in rows])
-        except (csv.Error, IndexError) as error:
-            raise ValueError(f"{error}, expected a number in each of the columns {', '.join(COLUMNS)}") from None
-    table = table.reshape(-1, len(columns))
+    table = read_columns(path, COLUMNS)
     return table[:, 0], table[:, 1:], None
 
 
@@ -118,40 +111,17 @@ def _read_npz(path: Path) -> tuple[Array, Array, None]:
         names = list(archive.files)
         if "q" in names and "t" in names:
             return np.asarray(archive["t"], float), np.asarray(archive["q"], float), None
-        _require([name for name in COLUMNS if name not in names], names)
+        if not set(COLUMNS) <= set(names):
+            raise ValueError(f"got the {Columns(tuple(names))}, expected {', '.join(COLUMNS)}")
         return np.asarray(archive["t"], float), np.column_stack([archive[name] for name in COLUMNS[1:]]), None
-
-
-def _require(lacking: list[str], got: list[str]) -> None:
-    if lacking:
-        from plow_twin.record.sources import Columns
-
-        raise ValueError(f"got the {Columns(tuple(got))}, expected {', '.join(COLUMNS)}")
 
 
 def _read_mcap(path: Path) -> tuple[Array, Array, Table | None]:
     """Read the poses that the node published (`head_state`) and the load samples that it used."""
-    from plow_twin.record.entries import EntryRecord, OutputRecord
-    from plow_twin.record.messages import Odometry
-    from plow_twin.record.reader import RunReader
-    from plow_twin.stream.journal import Sample
-
-    reader = RunReader(path)
-    topic = reader.header.topic("head_state")
-    poses: list[tuple[float, ...]] = []
-    samples: list[tuple[float, ...]] = []
-    origin = reader.header.origin_ns
-    for record in reader:
-        if isinstance(record, EntryRecord) and isinstance(record.entry, Sample):
-            origin = record.entry.stamp_ns if origin is None else origin
-            samples.append(((record.entry.stamp_ns - origin) * 1e-9, *record.entry.wrench))
-        elif isinstance(record, OutputRecord) and record.topic == topic:
-            message = record.message()
-            if isinstance(message, Odometry):
-                origin = message.stamp_ns if origin is None else origin
-                theta = 2.0 * np.arctan2(message.orientation[2], message.orientation[3])
-                poses.append(((message.stamp_ns - origin) * 1e-9, *message.position[:2], theta))
-    table = np.array(poses, dtype=float).reshape(-1, 4)
-    wrench = np.array(samples, dtype=float).reshape(-1, 4)
-    load = Table("recorded", wrench[:, 0], wrench[:, 1:]) if len(wrench) else None
-    return table[:, 0], table[:, 1:], load
+    recording = read_recording(path)
+    (stamps, poses), (sampled, wrench) = recording["head_state"].numpy(), recording["excitation"].numpy()
+    origin = recording.header.origin_ns
+    if origin is None:
+        origin = int(min(np.append(sampled, stamps), default=0))
+    load = Table("recorded", 1e-9 * (sampled - origin).astype(float), wrench) if len(wrench) else None
+    return 1e-9 * (stamps - origin).astype(float), poses[:, :3], load
