@@ -9,10 +9,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import Scene
-from plow_twin.record.entries import OutputRecord
-from plow_twin.record.messages import JointState
 from plow_twin.record.reader import RunReader
+from plow_twin.record.recording import read_recording
 from plow_twin.run.advance import AdvanceSeries
 from plow_twin.run.twin import Twin
 from plow_twin.stream.journal import Estimated
@@ -55,11 +55,12 @@ def compare_forces(run: Path, wider_m: float) -> Comparison | None:
     wider_m : float
         Excess of the machine's clearances over the scene's in m.
     """
-    reader = RunReader(run)
-    stamps, wrench, published, estimates = _read(reader)
-    if not len(stamps) or not published:
+    recording = read_recording(run)
+    stamps, wrench = recording["excitation"].numpy()
+    published_ns, forces = recording["contact_forces"].numpy()
+    if not len(stamps) or not len(published_ns):
         return None
-    scene = reader.header.scene(reader.path)
+    scene = recording.scene
     clearance = replace(
         scene.clearance,
         horizontal_m=scene.clearance.horizontal_m + wider_m,
@@ -71,8 +72,9 @@ def compare_forces(run: Path, wider_m: float) -> Comparison | None:
         for name, one in (("nominal", scene), ("true", replace(scene, clearance=clearance)))
     }
     late = times >= times[-1] - COMPARED_S
-    here = np.flatnonzero(late & np.isin(stamps, np.fromiter(published, np.int64)))
-    followed = np.array([published[stamp] for stamp in stamps[here].tolist()])
+    here = np.flatnonzero(late & np.isin(stamps, published_ns))
+    last = dict(zip(published_ns.tolist(), forces[:, -PAIR_COUNT:], strict=True))
+    followed = np.array([last[stamp] for stamp in stamps[here].tolist()])
     true = motions["true"].force[here]
     peaks = {name: motion.peak[late].max(axis=0) for name, motion in motions.items()}
     size = float(np.sqrt((true**2).mean()))
@@ -80,7 +82,7 @@ def compare_forces(run: Path, wider_m: float) -> Comparison | None:
         name: float(np.sqrt(((force - true) ** 2).mean())) / size
         for name, force in (("nominal", motions["nominal"].force[here]), ("followed", followed))
     }
-    came = [1e-9 * (stamp_ns - int(stamps[0])) for stamp_ns in estimates]
+    came = [1e-9 * (stamp_ns - int(stamps[0])) for stamp_ns in _estimate_stamps(RunReader(run))]
     return Comparison({**peaks, "followed": followed.max(axis=0)}, error, came, float(times[-1]) - COMPARED_S)
 
 
@@ -88,22 +90,12 @@ def _motion(scene: Scene, times: Array, wrench: Array) -> AdvanceSeries:
     return Twin(scene, tol=1e-6, excitation="sampled").advance_samples(times, wrench)
 
 
-def _read(reader: RunReader) -> tuple[NDArray[np.int64], Array, dict[int, Array], list[int]]:
-    """Return stamps [ns] and wrenches of the samples, published forces by stamp, and times of the estimates [ns]."""
-    topic = reader.header.topic("contact_forces")
-    stamps, wrench, published, estimates = [], [], {}, []
-    for batch in reader.batches():
+def _estimate_stamps(reader: RunReader) -> list[int]:
+    """Return the stamps [ns] of the samples before the estimates."""
+    found: list[int] = []
+    for batch in reader.batches(outputs=False):
         there = np.flatnonzero(batch.entries.sample)
-        stamps.append(batch.entries.stamp_ns[there])
-        wrench.append(batch.entries.wrench[there])
         places = [index for index, entry in batch.entries.rest.items() if isinstance(entry, Estimated)]
         before = np.searchsorted(there, places) - 1
-        estimates += stamps[-1][before[before >= 0]].tolist()
-        for part in batch.outputs:
-            for place in range(len(part.messages)):
-                record = part.record(place)
-                if isinstance(record, OutputRecord) and record.topic == topic:
-                    message = record.message()
-                    if isinstance(message, JointState):
-                        published[message.stamp_ns] = message.effort
-    return np.concatenate(stamps), np.concatenate(wrench), published, estimates
+        found += batch.entries.stamp_ns[there[before[before >= 0]]].tolist()
+    return found

@@ -13,14 +13,12 @@ from numpy.typing import NDArray
 
 from plow_twin.model.pairs import CORNER_NAMES, PAIR_COUNT, STOPS_COUNTER_CLOCKWISE, corner_of
 from plow_twin.model.scene import Scene
-from plow_twin.record.entries import EntryRecord, OutputRecord
-from plow_twin.record.messages import JointState
+from plow_twin.record.estimated import left_by
 from plow_twin.record.reader import RunReader
-from plow_twin.stream.journal import Estimated
+from plow_twin.record.recording import read_recording
 
 #: Mask of the pairs that belong to each sense of swing.
 SENSES: Final = {"ccw": STOPS_COUNTER_CLOCKWISE, "cw": ~STOPS_COUNTER_CLOCKWISE}
-_TOPICS: Final = ("contact_forces", "contact_peaks", "clearance")
 
 
 @dataclass(frozen=True)
@@ -71,26 +69,22 @@ def summarise(path: Path) -> RunSummary:
     RecordingError
         The file is not a recording of plow_twin.
     """
-    reader = RunReader(path)
-    scene = reader.header.scene(reader.path)
-    found, estimate = _read(reader)
-    forces, peaks = found["contact_forces"], found["contact_peaks"]
-    largest, impulse, in_contact = np.zeros(PAIR_COUNT), np.zeros(PAIR_COUNT), np.zeros(PAIR_COUNT)
-    before_ns = peaks[0].stamp_ns if peaks else 0
-    for message in peaks:
-        largest = np.maximum(largest, message.effort)
-        impulse += message.velocity
-        in_contact += (message.velocity > 0.0) * (message.stamp_ns - before_ns) * 1e-9
-        before_ns = message.stamp_ns
-    mean = np.divide(impulse, in_contact, out=np.zeros(PAIR_COUNT), where=in_contact > 0.0)
-    makes = peaks[-1].position if peaks else np.zeros(PAIR_COUNT)
-    clearance = dict(zip(*_named(found["clearance"]), strict=True))
+    recording = read_recording(path)
+    newest = left_by(RunReader(path))[1]
+    stamps, peaks = recording["contact_peaks"].numpy()
+    makes, impulse, largest = np.moveaxis(peaks.reshape(-1, 3, PAIR_COUNT), 1, 0)
+    in_contact = 1e-9 * ((impulse > 0.0) * np.diff(stamps, prepend=stamps[:1])[:, None]).sum(axis=0)
+    mean = np.divide(impulse.sum(axis=0), in_contact, out=np.zeros(PAIR_COUNT), where=in_contact > 0.0)
+    forces = recording["contact_forces"].numpy()[1][:, -PAIR_COUNT:]
+    table = recording["clearance"]
+    rows = table.numpy()[1]
+    clearance = dict(zip(table.columns, rows[-1].tolist(), strict=True)) if len(rows) else {}
     return RunSummary(
-        scene,
-        largest,
+        recording.scene,
+        largest.max(axis=0, initial=0.0),
         mean,
-        makes,
-        {sense: _shares(forces, mask, corner_letters(scene)) for sense, mask in SENSES.items()},
+        makes[-1] if len(makes) else np.zeros(PAIR_COUNT),
+        {sense: _shares(forces, mask, corner_letters(recording.scene)) for sense, mask in SENSES.items()},
         {
             name: (clearance[name], clearance[f"{name}/p05"], clearance[f"{name}/p95"])
             for name in ("horizontal", "vertical")
@@ -98,32 +92,14 @@ def summarise(path: Path) -> RunSummary:
         },
         np.array([value for name, value in clearance.items() if name.startswith("pad_") and "/" not in name]),
         len(forces),
-        estimate,
+        None if newest is None else json.loads(newest.result),
     )
 
 
-def _read(reader: RunReader) -> tuple[dict[str, list[JointState]], dict[str, Any] | None]:
-    topics = {reader.header.topic(name): name for name in _TOPICS}
-    found: dict[str, list[JointState]] = {name: [] for name in _TOPICS}
-    estimate = None
-    for record in reader:
-        if isinstance(record, EntryRecord) and isinstance(record.entry, Estimated):
-            estimate = json.loads(record.entry.result)
-        if isinstance(record, OutputRecord) and record.topic in topics:
-            message = record.message()
-            if isinstance(message, JointState):
-                found[topics[record.topic]].append(message)
-    return found, estimate
-
-
-def _named(messages: list[JointState]) -> tuple[tuple[str, ...], list[float]]:
-    return (messages[-1].name, messages[-1].position.tolist()) if messages else ((), [])
-
-
-def _shares(forces: list[JointState], mask: NDArray[np.bool_], letters: dict[str, str]) -> dict[str, float]:
+def _shares(forces: NDArray[np.float64], mask: NDArray[np.bool_], letters: dict[str, str]) -> dict[str, float]:
     counts: Counter[str] = Counter()
-    for message in forces:
-        pairs = np.flatnonzero((message.effort > 0.0) & mask)
+    for force in forces:
+        pairs = np.flatnonzero((force > 0.0) & mask)
         if pairs.size:
             counts["".join(sorted(letters[corner_of(int(pair))] for pair in pairs))] += 1
     return {corners: count / counts.total() for corners, count in counts.most_common()}
