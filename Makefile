@@ -46,8 +46,10 @@ lint: $(INSTALLED)
 	"$(VENV)/bin/codespell"
 
 # lines of Python that these tests reach; compiled ones are not seen. Apart from `test`, for tracing makes compiling take
-# two thirds longer: run it after, when the kernels are in the cache
+# two thirds longer: run it after, when the kernels are in the cache. Installed here only: numba imports coverage where it
+# finds it, a twentieth of each of the hundreds of starts in the tests
 coverage: $(INSTALLED)
+	"$(VENV)/bin/python" -m pip install --quiet --disable-pip-version-check -c requirements/constraints.txt pytest-cov
 	"$(VENV)/bin/python" -m pytest -q -m "not stress" $(PARALLEL) $(PYTEST_ARGS) --cov --cov-report=term:skip-covered $(COVERED)
 
 # the pages as one site, the API reference from the docstrings; warnings and broken links are errors

@@ -32,7 +32,6 @@ EXTRAS = {
     "docs": ["mkdocs>=1.6,<2", "mkdocstrings[python]>=0.26"],
     "test": [
         "pytest>=7.4",
-        "pytest-cov",
         "pytest-timeout",
         "pytest-xdist>=3.4",
         "hypothesis",
