@@ -14,7 +14,7 @@ from commands import plow_twin_here
 from numpy.typing import NDArray
 from scenes import ROOT
 
-from plow_twin import Contact, simulate
+from plow_twin import Clearance, Contact, simulate
 from plow_twin.errors import ArgumentError
 from plow_twin.estimate.follow import LATEST_S, Follower
 from plow_twin.estimate.followed import Stretch, follow, table
@@ -149,11 +149,14 @@ def test_nothing_measured_leaves_the_nominal_motion_and_corrects_nothing(
     assert np.array_equal(told.rows.clearance[0], told.rows.clearance[-1])
 
 
-def test_an_estimate_is_taken_over_without_an_impact_that_never_was(truth: Truth, forces: Array) -> None:
+def test_an_estimate_is_taken_over_without_an_impact_that_never_was(
+    truth: Truth, forces: Array, monkeypatch: pytest.MonkeyPatch
+) -> None:
     follower = Follower(truth.nominal, MEMBERS)
     _run(follower, truth, 4.0)
     follower.span()
     assert _take(follower, _known(truth))
+    monkeypatch.setattr(TwinBatch, "change", lambda *_: pytest.fail("nothing is left to learn"))
     told = _run(follower, truth, 6.0, 4.0)
     assert _error(told, forces[401:601]) < 0.03
     peak = simulate(truth.scene, 6.0, 1e-3, 1e-6).force[4000:].max(axis=0)
@@ -253,6 +256,47 @@ def test_a_member_is_never_pushed_into_a_hard_wall() -> None:
     true = simulate(truth.scene, float(truth.load.t[-1]), 1e-4, 1e-6).force
     assert np.isfinite(told).all()
     assert follower.span().peak[0].max() < 3.0 * true.max()
+
+
+def test_stiffness_and_gains_of_a_hard_contact_are_learned_from_the_poses() -> None:
+    truth = draw(replace(GROUPS["hard"], periods=1.6), 71102)
+    stiffness = truth.scene.contact.stiffness
+    open_ = replace(
+        _known(truth), stiffness=Interval(stiffness / 6.0, stiffness / 60.0, 6.0 * stiffness),
+        gain_fx=Interval.normal(truth.gain[0] + 0.05, 0.05), gain_m=None,
+    )  # fmt: skip
+    follower, same = Follower(truth.nominal, MEMBERS), Follower(truth.nominal, MEMBERS)
+    _take(follower, open_)
+    _run(follower, truth, 2.5)
+    same.restore(follower.snapshot())
+    for one in (follower, same):
+        _run(one, truth, 4.0, 2.5)
+    assert follower.digest() == same.digest()
+    follower.span()
+    _run(follower, truth, 5.0, 4.0)
+    peak = simulate(truth.scene, 5.0, 1e-4, 1e-6).force[40_000:].max()
+    # with the stiffness of the estimate it is less than half of it
+    assert follower.span().peak[0].max() == pytest.approx(peak, rel=0.25)
+    # and the twin that only the parameters follow has the numbers learned
+    follower.follow_parameters()
+    _run(follower, truth, 5.02, 5.0)
+    alone = Follower(truth.nominal, 1)
+    alone.restore(follower.snapshot())
+    assert alone.digest() == follower.digest()
+
+
+def test_twins_go_on_with_other_numbers_but_not_with_other_terms() -> None:
+    scene = replace(draw(GROUPS["plain"], 3).scene, loads=())
+    hard = replace(scene, contact=replace(scene.contact, stiffness=1e9, damping=0.3), clearance=Clearance(0.03, 0.02))
+    changed, new = TwinBatch([scene] * 2), TwinBatch([scene, hard])
+    assert changed.change([1], [hard]).all()
+    for twins in (changed, new):
+        twins.move([1], np.array([[0.001, 0.002, 0.01]]), np.array([[0.1, 0.0, 0.2]]))
+        row = twins.advance(0.3, np.array([2e4, 0.0, 1e4]))
+    assert changed.snapshot() == new.snapshot() and row.makes[1].any()
+    damped = [replace(scene, contact=Contact("kelvin_voigt", 1e7, 1.0, damping=damping)) for damping in (1e4, 1e7)]
+    twins = TwinBatch(damped[:1])
+    assert not twins.change([0], damped[1:]).any() and twins.scenes[0] == damped[0]
 
 
 def test_poses_with_missing_components_are_used_and_no_number_is_other_than_finite(truth: Truth) -> None:

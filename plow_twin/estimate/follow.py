@@ -179,7 +179,9 @@ class Follower:
         self._load_share = _load_share(text)
         self._known = self._prior if self.estimate is None else _whole(self.estimate, self._prior)
         rng = np.random.default_rng([self._seed, self.drawn])
-        self._ensemble = Ensemble(self.scene, self._known, self._members, rng, time, self.tol, worn)
+        # an error of the load would be taken for other numbers
+        learns = not self._load_share.any()
+        self._ensemble = Ensemble(self.scene, self._known, self._members, rng, time, self.tol, worn, learns)
         self._ensemble.set_travel_speed(self._speed)
         self._note_clearance()
 
@@ -386,7 +388,8 @@ class Follower:
     def digest(self) -> str:
         """Return 16 hexadecimal digits that stand for the exact state."""
         self.catch_up()
-        state = [*self._ensemble.twins(), self._wrench.tobytes(), self._ensemble.square.tobytes()]
+        learned = (part.tobytes() for part in self._ensemble.learned())
+        state = [*self._ensemble.twins(), self._wrench.tobytes(), self._ensemble.square.tobytes(), *learned]
         return hashlib.blake2b(b"".join(state), digest_size=8).hexdigest()
 
     def snapshot(self) -> bytes:

@@ -3,6 +3,8 @@
 A pose moves all members with perturbed observations (Burgers et al., Mon. Weather Rev. 126 (1998) 1719), a late pose
 through their covariance with the present. A correction that would press a wall with more than half of the head's weight
 is skipped for that member: behind a hard contact a tenth of a millimetre would cause a false impact.
+
+Numbers that an estimate leaves open are learned from the poses (`learned`), some members at each pose take theirs.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ from numpy.typing import NDArray
 
 from plow_twin.estimate import tuning
 from plow_twin.estimate.forces import FEWEST, draw_scenes, quantiles
+from plow_twin.estimate.learned import Learner, numbers_of, with_numbers
 from plow_twin.estimate.result import Estimate, Interval, State
 from plow_twin.estimate.unknowns import QUANTITIES
 from plow_twin.model.geometry import penetration_rows, states_of
@@ -38,6 +41,8 @@ LATEST_S: Final = 0.25
 _PATH_S: Final = 2e-3
 #: Bound: outlying poses in a row after which they are used. A glitch does not last so long: the head has jumped.
 _MOST_OUTLYING: Final = 5
+#: Definition: all members.
+_ALL: Final = slice(None)
 _THETA: Final = DOF_NAMES.index("theta")
 #: Derived: places of c, s, X, Y in the solver's state.
 _PLACES: Final = (5, 6, 0, 1)
@@ -54,11 +59,13 @@ class Ensemble:
         Number of twins; generator of the random numbers; time in s of the scene's initial state; tolerance.
     worn : ndarray, shape (8,)
         Wear depth of the pads in m.
+    learns : bool
+        Whether the poses may change numbers that an estimate leaves open.
     """
 
     def __init__(
         self, scene: Scene, known: Estimate, members: int, rng: np.random.Generator, start: float, tol: float,
-        worn: Array,
+        worn: Array, learns: bool = True,
     ) -> None:  # fmt: skip
         scenes, gain = draw_scenes(scene, known, members, rng) if members > 1 else ([scene], np.ones((1, 3)))
         scenes[0], gain[0] = middle_of(scene, known)
@@ -75,7 +82,12 @@ class Ensemble:
         #: the first member, by itself: its forces need not wait for the others
         self.first = Twin(scenes[0], tol=tol, excitation="sampled", start=start)
         self.others = TwinBatch(scenes[1:], tol=tol, start=start) if members > 1 else None
-        self._scene, self._gain, self._rng = scene, gain, rng
+        self._scene, self._gain, self._rng, self._tol, self._speed = scene, gain, rng, tol, 0.0
+        self._numbers = numbers_of(scenes, gain)
+        #: what the poses tell of numbers that an estimate leaves open, and the member that takes its numbers next
+        learns = learns and self._steers_first and members > 1
+        self._learner = Learner.of(self._numbers.copy(), start) if learns else None
+        self._turn = 0
         #: error of each member's load, N and N m, and time in s up to which it has drifted
         self._load_off, self._drifted = np.zeros((members, 3)), start
         self._walls = np.stack([penetration_rows(one) for one in scenes])
@@ -111,6 +123,7 @@ class Ensemble:
 
     def set_travel_speed(self, speed_m_s: float) -> None:
         """Set the speed along the face, of each member as far as its damping allows."""
+        self._speed = speed_m_s
         speeds = np.minimum(speed_m_s, self._fastest)
         self.first.set_travel_speed(float(speeds[0]))
         if self.others is not None:
@@ -240,12 +253,18 @@ class Ensemble:
         self._path = deque((t, q[from_] * share) for t, q in before._path)
         self._sums[1:], self._sums[0] = before._sums[from_[1:]], before._sums[0]
         self._stand(self._path[-1][1], before._v[from_], before._force(before._depth)[from_])
+        if self._learner is not None and before._learner is not None:
+            self._learner.take_over(before._learner)
+            self._take_numbers(np.arange(len(self.good)))
+        elif self.others is None and before._learner is not None:
+            # the same estimate, followed by one twin from here on
+            self._set_numbers(np.zeros(1, np.int64), before._numbers[:1])
 
     def stand_about(self, q: Array, v: Array) -> None:
         """Move the first member to a pose, the others to the same shares of their clearances."""
         places = q * self._shares(np.broadcast_to(self._room()[0], (len(self.good), 3)))
         force = self._force(self._penetration(places))[:1]
-        self._stand(places, np.tile(v, (len(places), 1)), force)
+        self._stand(places, np.tile(v, (len(places), 1)), np.tile(force, (len(places), 1)))
 
     def _room(self) -> Array:
         """Return the free space of the head: horizontal, vertical, and at its corners, shape (m, 3); 1 if locked."""
@@ -258,15 +277,16 @@ class Ensemble:
 
     def _stand(self, q: Array, v: Array, force: Array, which: NDArray[np.int64] | None = None) -> None:
         """Move members to poses, but only so far from the middle that no pair bears more than its `force`, (m, 8)."""
+        which = np.arange(len(q)) if which is None else which
+        q, v, force = q[which], v[which], force[which]
         low, high = np.zeros(len(q)), np.ones(len(q))
-        free = self._allowed(q, force)
+        free = self._allowed(q, force, which)
         low[free] = 1.0
         for _ in range(40) if not free.all() else ():
             share = 0.5 * (low + high)
-            allowed = self._allowed(self._nearer(q, share), force)
+            allowed = self._allowed(self._nearer(q, share), force, which)
             low, high = np.where(allowed, share, low), np.where(allowed, high, share)
-        which = np.arange(len(q)) if which is None else which
-        self._put(which, self._nearer(q, low)[which], v[which])
+        self._put(which, self._nearer(q, low), v)
 
     def _nearer(self, q: Array, share: Array) -> Array:
         """Return poses moved toward the middle in the directions in which the head is free."""
@@ -287,6 +307,7 @@ class Ensemble:
         path = np.stack([self._path[index][1] for index in range(after - 1, len(times))])
         share = min((t - times[after - 1]) / (times[after] - times[after - 1]), 1.0)
         then = ((1.0 - share) * path[0] + share * path[1])[:, there]
+        since = self.first.time - self._drifted
         self._drift(load_error)
         state = np.concatenate([self._v, *path, self._load_off], axis=1)
         use = self._used()
@@ -304,6 +325,8 @@ class Ensemble:
                 return False
         white = self._rng.standard_normal((len(then), len(there)))
         white[0] = 0.0
+        if self._learner is not None:
+            self._learner.add(self._numbers[use], seen[use], center, noise[there])
         off = _off(q, then, there)
         # bounded, so that a bad pose does not outweigh all others
         most = tuning.OUTLYING * noise[there]
@@ -319,6 +342,7 @@ class Ensemble:
         self._load_off[allowed] = moved[allowed, -3:]
         self._put(allowed, places[-1, allowed], v[allowed])
         self._recover()
+        self._learn(since)
         return True
 
     def _drift(self, load_error: Array) -> None:
@@ -330,6 +354,54 @@ class Ensemble:
             white = self._rng.standard_normal(self._load_off.shape)
             white[0] = 0.0
             self._load_off = kept * self._load_off + math.sqrt(1.0 - kept**2) * load_error * white
+
+    def _learn(self, since: float) -> None:
+        """Let members take what was learned; the others follow in turn, as many as `since` s of a round have."""
+        learner, count = self._learner, len(self.good) - 1
+        if learner is None:
+            return
+        due = self.first.time - learner.time >= tuning.LEARNED_EACH
+        if due:
+            learner.learn(self.first.time)
+        share = math.ceil(min(since / tuning.LEARNED_EACH, 1.0) * count)
+        turn = 1 + (self._turn + np.arange(share)) % count
+        self._turn = (self._turn + share) % count
+        self._take_numbers(np.append(0, turn) if due else turn)
+
+    def _take_numbers(self, which: NDArray[np.int64]) -> None:
+        """Let members, in rising order from 0 on, go on with the numbers that were learned."""
+        assert self._learner is not None
+        self._set_numbers(which, self._learner.numbers(which))
+
+    def _set_numbers(self, which: NDArray[np.int64], numbers: Array) -> None:
+        """Let members, in rising order, go on with other numbers, at the same shares of their clearances.
+
+        A member whose numbers would need other equations, as an overdamped contact does, keeps its own.
+        """
+        now = [self.first.scene, *(() if self.others is None else self.others.scenes)]
+        changed = [with_numbers(now[place], own) for place, own in zip(which.tolist(), numbers, strict=True)]
+        taken, rest = np.ones(len(which), dtype=bool), which > 0
+        if self.others is not None:
+            taken[rest] = self.others.change(which[rest] - 1, [changed[place][0] for place in np.flatnonzero(rest)])
+        which, room, force, before = which[taken], self._room(), self._force(self._depth), self._gain[0].copy()
+        self._numbers[which] = numbers[taken]
+        for place, index in zip(which.tolist(), np.flatnonzero(taken).tolist(), strict=True):
+            one, self._gain[place] = changed[index]
+            self._walls[place] = penetration_rows(one)
+            self._clearance[place] = one.clearance.horizontal_m, one.clearance.vertical_m
+            self._fastest[place], self._stiffness[place] = fastest_travel(one.wear, one.contact), one.contact.stiffness
+        if len(which) and which[0] == 0:
+            load = (self.first.wrench - self._load_off[0]) / before * self._gain[0] + self._load_off[0]
+            time = self.first.time
+            self.first = Twin(changed[0][0], tol=self._tol, excitation="sampled", start=time)
+            self.first.reset(time, wear_depth=self.worn[0], pose=(self.pose[0], self._v[0]))
+            self.first.advance(time, load)
+        if self._scene.wear is not None:
+            self.set_travel_speed(self._speed)
+        share = self._shares(room)[which]
+        for _, q in self._path:
+            q[which] *= share
+        self._stand(self.pose, self._v, force, which)
 
     def _recover(self) -> None:
         """Move members that have left the model's range to the places of others, unless all have left."""
@@ -343,14 +415,15 @@ class Ensemble:
         self._path = deque((t, q[from_] * share) for t, q in self._path)
         self._stand(self._path[-1][1], self._v[from_], self._force(self._depth)[from_], lost)
 
-    def _force(self, depth: Array) -> Array:
-        """Return the elastic force of each pair, (m, 8)."""
-        found: Array = self._stiffness[:, None] * np.maximum(depth, 0.0) ** self._exponent
+    def _force(self, depth: Array, which: NDArray[np.int64] | slice = _ALL) -> Array:
+        """Return the elastic force of each pair of some members, (m, 8)."""
+        found: Array = self._stiffness[which, None] * np.maximum(depth, 0.0) ** self._exponent
         return found
 
-    def _allowed(self, q: Array, force: Array) -> NDArray[np.bool_]:
+    def _allowed(self, q: Array, force: Array, which: NDArray[np.int64] | slice = _ALL) -> NDArray[np.bool_]:
         """Return which members may be moved to poses (m, 3): no pair bears much more than a force, (m, 8)."""
-        return np.asarray((self._force(self._penetration(q)) < force + self._pressed).all(axis=1))
+        there = self._force(self._penetration(q, which), which)
+        return np.asarray((there < force + self._pressed).all(axis=1))
 
     def _put(self, which: NDArray[np.int64], q: Array, v: Array) -> None:
         for place in np.flatnonzero(which == 0):
@@ -359,13 +432,13 @@ class Ensemble:
         if self.others is not None and rest.any():
             self.others.move(which[rest] - 1, q[rest], v[rest])
         self._path[-1][1][which], self._v[which] = q, v
-        self._depth = self._penetration(self._path[-1][1])
+        self._depth[which] = self._penetration(q, which)
 
-    def _penetration(self, q: Array) -> Array:
-        """Return the penetration of each pair in m, (m, 8), with each member's clearances at poses of shape (m, 3)."""
+    def _penetration(self, q: Array, which: NDArray[np.int64] | slice = _ALL) -> Array:
+        """Return the penetration of each pair in m, (m, 8), with some members' clearances at poses of shape (m, 3)."""
         state = states_of(self._scene, np.concatenate([q, np.zeros_like(q)], axis=1))
         body = np.concatenate([state[:, _PLACES], np.ones((len(q), 1))], axis=1)
-        found: Array = np.einsum("mi,mij->mj", body, self._walls) - self.worn
+        found: Array = np.einsum("mi,mij->mj", body, self._walls[which]) - self.worn[which]
         return found
 
     def twins(self) -> list[bytes]:
@@ -378,24 +451,36 @@ class Ensemble:
         if self.others is not None:
             self.others.restore(states[1])
 
+    def learned(self) -> tuple[Array, Array]:
+        """Return the numbers of all members, and what was learned about them, empty where nothing is learned."""
+        state = np.zeros(0) if self._learner is None else np.append(float(self._turn), self._learner.state())
+        return self._numbers, state
+
     def state(self) -> tuple[list[bytes], Any]:
         """Return the whole state, as bytes and as JSON."""
         self.settle()
         times, path = np.array([time for time, _ in self._path]), np.stack([q for _, q in self._path])
         wide = (self._peak, self._impulse, self._v, self.worn, self._depth, self._load_off)
-        arrays = (self.good, self.square, *wide, np.array([self._drifted]), times, path)
+        learned = self.learned()
+        arrays = (self.good, self.square, *wide, np.array([self._drifted]), *learned, times, path)
         return [*self.twins(), *(one.tobytes() for one in arrays)], self._rng.bit_generator.state
 
     def set_state(self, blobs: list[bytes], random: Any) -> None:
         """Restore a state that `state` returned."""
-        self.set_twins(blobs[:2])
         self.good = np.frombuffer(blobs[2], np.bool_).copy()
         count = len(self.good)
-        self.square, *wide, drifted, times, path = (np.frombuffer(blob).copy() for blob in blobs[3:])
+        self.square, *wide, drifted, numbers, learned, times, path = (np.frombuffer(blob).copy() for blob in blobs[3:])
+        if self._learner is not None:
+            self._turn = int(learned[0])
+            self._learner.set_state(learned[1:])
+        numbers = numbers.reshape(count, -1)
+        which = np.flatnonzero((numbers != self._numbers).any(axis=1))
+        self._set_numbers(which, numbers[which])
         own = [one.reshape(count, -1) for one in wide]
         self._peak[:], self._impulse[:], self._v, self.worn, self._depth, self._load_off = own
         self._drifted = float(drifted[0])
         self._newest = None
+        self.set_twins(blobs[:2])
         self._path = deque(zip(times.tolist(), path.reshape(-1, count, 3), strict=True))
         self._rng.bit_generator.state = random
 

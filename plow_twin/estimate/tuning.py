@@ -379,6 +379,25 @@ LOAD_ERROR_LASTS: Annotated[
     float,
     Tuned("s", "time for which that error is correlated", "the same seeds; 0.05 gives the same within 0.04"),
 ] = 0.2
+LEARNED_TO: Annotated[
+    tuple[float, ...],
+    Tuned(
+        "1, 1, m, m, 1, 1, 1",
+        "deviation to which numbers of twins that follow are learned from the poses: logarithms of K^-1/2 and damping, "
+        "clearances, load gains",
+        "hard truths 71101, 71102: errors of the numbers learned",
+    ),
+] = (0.06, 0.12, 5e-5, 5e-5, 0.01, 0.01, 0.01)
+LEARNING: Annotated[
+    float,
+    Tuned(
+        "1",
+        "weight of a pose in this",
+        "hard truths 71101, 71102: at 1 errors of the numbers are two to three of their deviations",
+    ),
+] = 0.25
+LEARNED_FOR: Annotated[float, Tuned("s", "time after which what was learned counts less by e", "the same")] = 20.0
+LEARNED_EACH: Annotated[float, Tuned("s", "time between two changes of the twins' numbers", "the same")] = 1.0
 
 # Loads that do not explain the motion
 MODULATED: Annotated[

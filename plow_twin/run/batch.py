@@ -250,6 +250,40 @@ class TwinBatch:
         places = geometry.states_of(self.scenes[0], np.concatenate([poses, rates], axis=1))
         settle_moved(self._params, self._states, index, places, self.time, self._stick)
 
+    def change(self, which: ArrayLike, scenes: Sequence[Scene]) -> NDArray[np.bool_]:
+        """Go on with other numbers of some scenes, from the present places, wear and travel speed.
+
+        Parameters
+        ----------
+        which : array_like of int, shape (k,)
+            Numbers of the twins; each has to be moved before its next advance.
+        scenes : sequence of Scene
+            Their scenes. A lasting contact keeps a damping that was set at its touch.
+
+        Returns
+        -------
+        ndarray of bool, shape (k,)
+            False for a twin that stays as it was: the terms of its equations would change.
+        """
+        changed = np.zeros(len(scenes), dtype=bool)
+        own = list(self.scenes)
+        for index, (place, scene) in enumerate(zip(np.asarray(which).tolist(), scenes, strict=True)):
+            one, before = compile_scene(scene, self.tol, sampled=True), self._compiled[place]
+            new, old = (
+                [*(part is not None for part in (*each.parts.terms, each.parts.implicit)), *options(each.scene)]
+                for each in (one, before)
+            )
+            changed[index] = new == old
+            if not changed[index]:
+                continue
+            wear = self._params["wear_per_impulse"][place].copy()
+            self._params[place], self._compiled[place], own[place] = one.params, one, scene
+            self._params["wear_per_impulse"][place] = wear
+            if scene.contact.damping is not None and one.parts.terms.hysteretic is not None:
+                self._states["damping_factor"][place] = scene.contact.damping
+        self.scenes = tuple(own)
+        return changed
+
     def set_travel_speed(self, speed_m_s: ArrayLike) -> None:
         """Set the speed along the face from here on; only wear depends on it.
 

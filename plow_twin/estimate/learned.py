@@ -1,0 +1,172 @@
+"""Numbers of the members of a follower, learned from the poses that move them.
+
+The motion behind a hard contact is too irregular to be fitted, so its estimate leaves stiffness and load gains open.
+The predictions of the members differ by their numbers too: their regression on the numbers is the sensitivity of a
+pose, the remainder the covariance of a prediction with known numbers. So innovations determine the numbers as in a
+two-stage Kalman filter (Friedland, IEEE Trans. Autom. Control 14 (1969) 359). Behind a hard contact each rebound shows
+its duration pi sqrt(m / K).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.estimate import tuning
+from plow_twin.estimate.unknowns import contact_with
+from plow_twin.model.scene import Clearance, Scene
+
+Array = NDArray[np.float64]
+
+#: Bound: members for each number that is learned.
+_MEMBERS: Final = 4
+#: Guard: largest restitution.
+_MOST_RESTITUTION = 0.999
+
+
+def numbers_of(scenes: Sequence[Scene], gain: Array) -> Array:
+    """Return the numbers of members in units of `tuning.LEARNED_TO`, shape (m, 7), from scenes and gains (m, 3).
+
+    These are the logarithms of K^-1/2 and of the damping (or restitution), the clearances and the gains of the load.
+    """
+    damping = [one.contact.damping if one.contact.restitution is None else one.contact.restitution for one in scenes]
+    raw = np.column_stack([
+        [-0.5 * np.log(one.contact.stiffness) for one in scenes],
+        [np.log(number) if number else 0.0 for number in damping],
+        [one.clearance.horizontal_m for one in scenes],
+        [one.clearance.vertical_m for one in scenes],
+        gain,
+    ])  # fmt: skip
+    found: Array = raw / np.array(tuning.LEARNED_TO)
+    return found
+
+
+def with_numbers(scene: Scene, numbers: Array) -> tuple[Scene, Array]:
+    """Return a member's scene and gains of the load, (3,), with other numbers, (7,)."""
+    softness, damping, horizontal, vertical, *gain = (numbers * np.array(tuning.LEARNED_TO)).tolist()
+    number = None
+    if scene.contact.restitution is not None:
+        number = min(float(np.exp(damping)), _MOST_RESTITUTION)
+    elif scene.contact.damping:
+        number = float(np.exp(damping))
+    contact = contact_with(scene.contact, float(np.exp(-2.0 * softness)), number)
+    return replace(scene, contact=contact, clearance=Clearance(horizontal, vertical)), np.array(gain)
+
+
+class Learner:
+    """What the poses tell of the numbers of all members: a normal distribution, in units of `tuning.LEARNED_TO`.
+
+    Parameters
+    ----------
+    drawn : ndarray, shape (m, 7)
+        Numbers of the members as drawn from an estimate, of the median twin first.
+    learned : ndarray of int, shape (k,)
+        The numbers that are learned.
+    time : float
+        Time of the estimate in s.
+    """
+
+    def __init__(self, drawn: Array, learned: NDArray[np.int64], time: float) -> None:
+        self._all, self.open, self.time = drawn, learned, time
+        own = drawn[:, learned]
+        self._least, self._most = own.min(axis=0), own.max(axis=0)
+        self.mean, self.covariance = own[0].copy(), np.cov(own.T).reshape(len(learned), -1)
+        self._widest = np.sqrt(np.diag(self.covariance))
+        # the members' places in the distribution; the median twin's is the middle
+        white = own - own.mean(axis=0)
+        white[0] = 0.0
+        self._white = white @ np.linalg.inv(np.linalg.cholesky(self.covariance)).T
+        self._begin()
+
+    @classmethod
+    def of(cls, drawn: Array, time: float) -> Learner | None:
+        """Return a learner of the numbers that an estimate knows worse than to a unit; None without such numbers."""
+        learned = np.flatnonzero(drawn[1:].std(axis=0) > 1.0)
+        enough = len(drawn) >= _MEMBERS * (len(learned) + 1)
+        return cls(drawn, learned, time) if len(learned) and enough else None
+
+    def _begin(self) -> None:
+        """Forget the poses since the distribution was changed."""
+        self._precision, self._score = np.zeros((len(self.open), len(self.open))), np.zeros(len(self.open))
+
+    def take_over(self, before: Learner) -> None:
+        """Combine what was learned before with the new estimate, unless the estimate contradicts it."""
+        both, here, there = np.intersect1d(self.open, before.open, return_indices=True)
+        if not len(both):
+            return
+        known, off = before.covariance[np.ix_(there, there)], before.mean[there] - self.mean[here]
+        total = known + self.covariance[np.ix_(here, here)]
+        if off @ np.linalg.solve(total, off) > tuning.OUTLYING**2:
+            return
+        gain = self.covariance[:, here] @ np.linalg.inv(total)
+        self.mean = np.clip(self.mean + gain @ off, self._least, self._most)
+        self.covariance = self.covariance - gain @ self.covariance[here]
+
+    def add(self, numbers: Array, seen: Array, off: Array, noise: Array) -> None:
+        """Add a pose.
+
+        Parameters
+        ----------
+        numbers : ndarray, shape (m, 7)
+            Of the members.
+        seen : ndarray, shape (m, c)
+            Their predictions, minus the mean.
+        off : ndarray, shape (c,)
+            The pose minus the mean prediction.
+        noise : ndarray, shape (c,)
+            Standard deviation of the pose.
+        """
+        own = numbers[:, self.open]
+        middle = own.mean(axis=0)
+        apart = own - middle
+        spread = np.linalg.inv(apart.T @ apart + 1e-6 * np.eye(len(self.open)))
+        slope = spread @ (apart.T @ seen)
+        rest = seen - apart @ slope
+        alone = rest.T @ rest / (len(own) - len(self.open) - 1)
+        inverse = np.linalg.inv(alone + np.diag(noise**2))
+        # the scatter of the members alone gives a slope whose square looks like information
+        self._precision += slope @ inverse @ slope.T - spread * np.trace(inverse @ alone)
+        self._score += slope @ inverse @ (off - (self.mean - middle) @ slope)
+
+    def learn(self, time: float) -> None:
+        """Change the distribution by the poses since the change before."""
+        root = np.linalg.cholesky(self.covariance)
+        value, axes = np.linalg.eigh(tuning.LEARNING * root.T @ self._precision @ root)
+        turned = root @ axes
+        before = np.sqrt(np.diag(self.covariance))
+        self.covariance = (turned / (1.0 + value.clip(0.0))) @ turned.T
+        step = tuning.LEARNING * (self.covariance @ self._score)
+        # linear within a deviation
+        step /= max(1.0, float(np.abs(step / before).max()))
+        self.mean = np.clip(self.mean + step, self._least, self._most)
+        # the machine changes; nothing is known better than a unit, nor worse than by the estimate
+        deviation = np.sqrt(np.diag(self.covariance))
+        wider = np.maximum(deviation, 1.0) * np.exp(0.5 * (time - self.time) / tuning.LEARNED_FOR)
+        share = np.minimum(wider, self._widest) / deviation
+        self.covariance = self.covariance * np.outer(share, share)
+        self.time = time
+        self._begin()
+
+    def numbers(self, which: NDArray[np.int64]) -> Array:
+        """Return the numbers of some members, shape (k, 7)."""
+        found = self._all[which].copy()
+        own = self.mean + self._white[which] @ np.linalg.cholesky(self.covariance).T
+        found[:, self.open] = np.clip(own, self._least, self._most)
+        return found
+
+    def state(self) -> Array:
+        """Return the state as one array."""
+        parts = (self.mean, self.covariance.ravel(), self._precision.ravel(), self._score, [self.time])
+        return np.concatenate(parts)
+
+    def set_state(self, state: Array) -> None:
+        """Restore a state that `state` returned."""
+        count = len(self.open)
+        ends = np.cumsum([count, count * count, count * count, count])
+        mean, covariance, precision, score, (time,) = np.split(state, ends)
+        self.mean, self._score, self.time = mean.copy(), score.copy(), float(time)
+        self.covariance, self._precision = (one.reshape(count, count).copy() for one in (covariance, precision))
