@@ -52,11 +52,11 @@ def _list_guards(lanes, order, hysteretic) -> None:
         if taken == 0:
             break
         if hysteretic is None:
-            _note(
-                lanes, slot, 0, _write_guard(lanes, None, gear, one, damped, none, lanes.push[slot], order, h) & taken
-            )
+            ends = _write_guard(lanes, None, gear, one, damped, none, lanes.push[slot], order, h)
+            _note(lanes, slot, 0, ends & taken)
         else:
-            _note(lanes, slot, 0, _write_guard(lanes, None, gear, one, none, none, lanes.guard[0], order, h) & taken)
+            ends = _write_guard(lanes, None, gear, one, none, none, lanes.guard[0], order, h)
+            _note(lanes, slot, 0, ends & taken)
             pull = _write_guard(lanes, None, gear, none, exact_row(gear, 7), one, lanes.guard[0], order, h)
             _note(lanes, slot, SECOND, pull & taken)
 
@@ -79,14 +79,10 @@ def _list_off(lanes, order) -> None:
     # sums of abs(term k) h^k for k > 1
     later_c = later_s = later_x = later_y = exact_splat(0.0)
     for k in range(order, 1, -1):
-        later_c, later_s = (
-            fused(later_c, h, magnitude(exact_row(cosine, k))),
-            fused(later_s, h, magnitude(exact_row(sine, k))),
-        )
-        later_x, later_y = (
-            fused(later_x, h, magnitude(exact_row(x, k))),
-            fused(later_y, h, magnitude(exact_row(y, k))),
-        )
+        later_c = fused(later_c, h, magnitude(exact_row(cosine, k)))
+        later_s = fused(later_s, h, magnitude(exact_row(sine, k)))
+        later_x = fused(later_x, h, magnitude(exact_row(x, k)))
+        later_y = fused(later_y, h, magnitude(exact_row(y, k)))
     later_c, later_s, later_x, later_y = later_c * h * h, later_s * h * h, later_x * h * h, later_y * h * h
     for pair in range(PAIR_COUNT):
         if lanes.off[pair] == 0:

@@ -75,7 +75,6 @@ LANES: Final = np.dtype(
         ("root", "f8", _LANES_OF),  # its first root
         ("begin", "f8", _LANES_OF),  # when its pair has parted, else 0
         ("parted", "f8", _PAIRS),  # when a clipped pair parts within the step, infinity where it does not
-        ("parting", "i8", (1,)),  # a bit for each lane in which a clipped pair parts
         ("peak", "f8", _PAIRS),
         ("impulse", "f8", _PAIRS),
         ("time_in_contact", "f8", _PAIRS),
@@ -97,14 +96,16 @@ LANES: Final = np.dtype(
         ("guarded", "i8", (GUARDS, WIDTH)),  # the guards of each round, or -1
         ("owner", "i8", (GUARDS, WIDTH)),  # and their lanes
         ("row_place", "i8", _LANES_OF),  # places of a round's guards in `rows`
-        ("rounds", "i8", (1,)),
-        ("bulges", "i8", (1,)),  # number of the forces in `bulge`
         ("bulge_pair", "i8", _LANES_OF),
         ("bulge_lane", "i8", _LANES_OF),
         ("orders", "i8", _LANES_OF),  # order of the series of each lane; the terms beyond have vanished
-        ("vanished", "i8", (1,)),  # a bit for each lane whose series ends early
         ("before", "i8", _LANES_OF),  # steps before the sample
         ("carrying", "i8", _LANES_OF),  # a bit for each pair that is on
+        # single numbers last, so that every row before them fills a cache line
+        ("parting", "i8", (1,)),  # a bit for each lane in which a clipped pair parts
+        ("rounds", "i8", (1,)),
+        ("bulges", "i8", (1,)),  # number of the forces in `bulge`
+        ("vanished", "i8", (1,)),  # a bit for each lane whose series ends early
         ("stale", "i8", (1,)),  # 1 where modes or scenes have changed since the maps were summed
     ]
 )

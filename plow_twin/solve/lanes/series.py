@@ -116,15 +116,25 @@ def expand(lanes, w, limit, waves, second, viscous, hysteretic, segments) -> int
                     break
             calm = quiet
         # a product's newest orders come last: most of the sum need not wait for them
-        px = py = pvx = pvy = pc = ps = zero
+        px = py = pvx = pvy = pc = ps = torque = other = wc = ws = zero
         for j in range(1, k):
             turned = exact_row(series[OMEGA], j)
             px = fused(turned, exact_row(series[X], k - j), px)
             py = fused(turned, exact_row(series[Y], k - j), py)
             pvx = fused(turned, exact_row(series[VX], k - j), pvx)
             pvy = fused(turned, exact_row(series[VY], k - j), pvy)
+        for j in range(1, k):
+            turned = exact_row(series[OMEGA], j)
             pc = fused(turned, exact_row(series[COS], k - j), pc)
             ps = fused(turned, exact_row(series[SIN], k - j), ps)
+            torque = fused(exact_row(series[COS], j), exact_row(moment[DC], k - j), torque)
+            other = fused(exact_row(series[SIN], j), exact_row(moment[DS], k - j), other)
+            torque = fused(exact_row(series[X], j), exact_row(moment[DX], k - j), torque)
+            other = fused(exact_row(series[Y], j), exact_row(moment[DY], k - j), other)
+            if waves is not None:
+                one = exact_row(load[0], j)
+                wc = fused(one, exact_row(series[COS], k - j), wc)
+                ws = fused(one, exact_row(series[SIN], k - j), ws)
         share = 0.0 if k == 0 else 1.0  # order 0 is one product, not two
         early = om0 * share
         px, py = fused(om, x0, fused(early, x, px)), fused(om, y0, fused(early, y, py))
@@ -145,11 +155,16 @@ def expand(lanes, w, limit, waves, second, viscous, hysteretic, segments) -> int
                 turned_by = exact_row(lanes.slope, 2)
             before_c, before_s = c, s
         if waves is not None:
-            wc, ws = _waves(load[0], series, k, c0, s0, c, s, share)
+            wc, ws = _add_ends(load[0], k, c0, s0, c, s, share, wc, ws)
             ax = fused(exact_row(direction, 0), wc, fused(exact_row(direction, 1), ws, ax))
             ay = fused(exact_row(direction, 1), wc, fused(exact_row(direction, 0), ws * -1.0, ay))
             if second is not None:
-                wc, ws = _waves(load[1], series, k, c0, s0, c, s, share)
+                wc = ws = zero
+                for j in range(1, k):
+                    one = exact_row(load[1], j)
+                    wc = fused(one, exact_row(series[COS], k - j), wc)
+                    ws = fused(one, exact_row(series[SIN], k - j), ws)
+                wc, ws = _add_ends(load[1], k, c0, s0, c, s, share, wc, ws)
                 ax = fused(exact_row(direction, 2), wc, fused(exact_row(direction, 3), ws, ax))
                 ay = fused(exact_row(direction, 3), wc, fused(exact_row(direction, 2), ws * -1.0, ay))
             turned_by = turned_by + exact_row(load[2], k)
@@ -170,12 +185,6 @@ def expand(lanes, w, limit, waves, second, viscous, hysteretic, segments) -> int
         set_row(moment[DS], k, gs)
         set_row(moment[DX], k, gx)
         set_row(moment[DY], k, gy)
-        torque, other = zero, zero
-        for j in range(1, k):
-            torque = fused(exact_row(series[COS], j), exact_row(moment[DC], k - j), torque)
-            other = fused(exact_row(series[SIN], j), exact_row(moment[DS], k - j), other)
-            torque = fused(exact_row(series[X], j), exact_row(moment[DX], k - j), torque)
-            other = fused(exact_row(series[Y], j), exact_row(moment[DY], k - j), other)
         torque = fused(c * share, exact_row(moment[DC], 0), fused(x * share, exact_row(moment[DX], 0), torque))
         other = fused(s * share, exact_row(moment[DS], 0), fused(y * share, exact_row(moment[DY], 0), other))
         torque = fused(c0, gc, fused(x0, gx, torque)) + fused(s0, gs, fused(y0, gy, other))
@@ -225,13 +234,8 @@ def _set_state(series, k, x, y, vx, vy, om, c, s, angle) -> None:
 
 
 @kernel(inline="code")
-def _waves(load, series, k, c0, s0, c, s, share):
-    """Return order k of a load's series times cosine and sine."""
-    wc = ws = exact_splat(0.0)
-    for j in range(1, k):
-        one = exact_row(load, j)
-        wc = fused(one, exact_row(series[COS], k - j), wc)
-        ws = fused(one, exact_row(series[SIN], k - j), ws)
+def _add_ends(load, k, c0, s0, c, s, share, wc, ws):
+    """Add the first and the newest order to order k of a load's series times cosine and sine."""
     first, newest = exact_row(load, 0) * share, exact_row(load, k)
     return fused(newest, c0, fused(first, c, wc)), fused(newest, s0, fused(first, s, ws))
 
