@@ -65,7 +65,7 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "silent_s": "total length of these silences [s]",
         "travel_used": "messages used",
         "travel_dropped": "messages dropped",
-        "travel_misplaced": "speeds that act from the time reached: their stamps are of another clock",
+        "travel_misplaced": "speeds applied at the time reached, because their stamps are of another clock",
         "travel_implausible": "dropped: beyond the limits of the input",
         "travel_not_followed": "messages of publishers that are not followed",
         "head_pose_used": "messages used",
