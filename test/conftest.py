@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import atexit
+import fcntl
+import hashlib
 import os
 import shutil
 import signal
 import tempfile
 from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import Phase, settings
@@ -16,6 +19,8 @@ from hypothesis import Phase, settings
 ROOT = Path(__file__).resolve().parent.parent
 SKIPS = ROOT / "test" / "skips.txt"
 FIRST = ROOT / "test" / "first.txt"
+#: Name of the variable with the folder of the locks of `_compile_once`.
+LOCKS = "PLOW_TWIN_COMPILING"
 
 
 def _prepare_environment() -> None:
@@ -35,7 +40,33 @@ def _prepare_environment() -> None:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+def _compile_once() -> None:
+    """Have the processes of a suite wait for each other's kernels instead of compiling the same ones beside each other.
+
+    Each signature of a kernel has a file that its compiler locks. Locks are taken along calls, and by one thread of a
+    process only, so no two wait for each other.
+    """
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        os.environ[LOCKS] = tempfile.mkdtemp(prefix="plow_twin-compiling-")
+        atexit.register(shutil.rmtree, os.environ[LOCKS], ignore_errors=True)
+        return
+    from numba.core.compiler_lock import global_compiler_lock
+    from numba.core.dispatcher import Dispatcher
+
+    compile_alone = Dispatcher.compile
+
+    def compile_once(dispatcher: Any, signature: Any) -> Any:
+        name = f"{dispatcher.py_func.__module__}.{dispatcher.py_func.__qualname__} {signature}"
+        place = Path(os.environ[LOCKS]) / hashlib.blake2b(name.encode(), digest_size=8).hexdigest()
+        with global_compiler_lock, place.open("wb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            return compile_alone(dispatcher, signature)
+
+    Dispatcher.compile = compile_once
+
+
 _prepare_environment()
+_compile_once()
 settings.register_profile("plow_twin", deadline=None, derandomize=True, database=None)
 # the profile of `make stress`, which prints the seed: new examples each time, shrunk on failure
 FRESH = (Phase.explicit, Phase.generate, Phase.shrink)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import importlib
+import os
 import re
 import runpy
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -91,6 +93,36 @@ def test_a_test_that_hangs_is_named_and_ends_the_run(tmp_path: Path) -> None:
     assert done.returncode != 0 and "1 failed, 1 passed" in done.stdout
     assert re.search("crashed while running '.*test_that_hangs'", done.stdout)
     assert "in test_that_hangs" in done.stderr  # where it stands
+
+
+#: A kernel, and a test of it that waits until another process has come as far.
+DOUBLE = "from plow_twin.kernel.compiler import kernel\n@kernel(entry=True)\ndef double(x):\n    return 2.0 * x\n"
+MEETING = """
+import time
+from pathlib import Path
+from doubling import double
+
+def test_it():
+    here = Path(__file__)
+    here.with_suffix(".here").touch()
+    while len(list(here.parent.glob("*.here"))) < 2:
+        time.sleep(0.01)
+    assert double(2.0) == 4.0
+"""
+
+
+def test_the_processes_of_a_suite_compile_a_kernel_once(tmp_path: Path) -> None:
+    (folder := tmp_path / "test").mkdir()
+    for name in ("conftest.py", "compiles.py", "first.txt"):
+        shutil.copy(ROOT / "test" / name, folder)
+    (folder / "doubling.py").write_text(DOUBLE)
+    for name in ("test_one.py", "test_other.py"):
+        (folder / name).write_text(MEETING)
+    environment = {name: text for name, text in os.environ.items() if not name.startswith("PYTEST_")}
+    command = [sys.executable, "-m", "pytest", "-n", "2", "--dist", "loadfile", "--compiles", "test"]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout
+    assert re.search(r" 1 times  doubling\.double", done.stdout), done.stdout
 
 
 def test_the_files_that_come_first_exist() -> None:
