@@ -41,6 +41,8 @@ LATEST_S: Final = 0.25
 _PATH_S: Final = 2e-3
 #: Bound: outlying poses in a row after which they are used. A glitch does not last so long: the head has jumped.
 _MOST_OUTLYING: Final = 5
+#: Bound: fewest members that take other numbers at once: a call costs as much as three of them.
+_AT_ONCE: Final = 8
 #: Definition: all members.
 _ALL: Final = slice(None)
 _THETA: Final = DOF_NAMES.index("theta")
@@ -84,10 +86,11 @@ class Ensemble:
         self.others = TwinBatch(scenes[1:], tol=tol, start=start) if members > 1 else None
         self._scene, self._gain, self._rng, self._tol, self._speed = scene, gain, rng, tol, 0.0
         self._numbers = numbers_of(scenes, gain)
-        #: what the poses tell of numbers that an estimate leaves open, and the member that takes its numbers next
+        #: what the poses tell of numbers that an estimate leaves open, the member that takes its numbers next, and the
+        #: count of those whose turn has come
         learns = learns and self._steers_first and members > 1
         self._learner = Learner.of(self._numbers.copy(), start) if learns else None
-        self._turn = 0
+        self._turn, self._waiting = 0, 0.0
         #: error of each member's load, N and N m, and time in s up to which it has drifted
         self._load_off, self._drifted = np.zeros((members, 3)), start
         self._walls = np.stack([penetration_rows(one) for one in scenes])
@@ -356,17 +359,20 @@ class Ensemble:
             self._load_off = kept * self._load_off + math.sqrt(1.0 - kept**2) * load_error * white
 
     def _learn(self, since: float) -> None:
-        """Let members take what was learned; the others follow in turn, as many as `since` s of a round have."""
+        """Let the first member take what was learned, and the others in turn: `since` s have passed of their round."""
         learner, count = self._learner, len(self.good) - 1
         if learner is None:
             return
         due = self.first.time - learner.time >= tuning.LEARNED_EACH
         if due:
             learner.learn(self.first.time)
-        share = math.ceil(min(since / tuning.LEARNED_EACH, 1.0) * count)
-        turn = 1 + (self._turn + np.arange(share)) % count
-        self._turn = (self._turn + share) % count
-        self._take_numbers(np.append(0, turn) if due else turn)
+        self._waiting = min(self._waiting + since / tuning.LEARNED_EACH * count, float(count))
+        ready = int(self._waiting) if self._waiting >= _AT_ONCE else 0
+        turn = 1 + (self._turn + np.arange(ready)) % count
+        self._turn, self._waiting = (self._turn + ready) % count, self._waiting - ready
+        which = np.append(0, np.sort(turn)) if due else np.sort(turn)
+        if len(which):
+            self._take_numbers(which)
 
     def _take_numbers(self, which: NDArray[np.int64]) -> None:
         """Let members, in rising order from 0 on, go on with the numbers that were learned."""
@@ -453,8 +459,9 @@ class Ensemble:
 
     def learned(self) -> tuple[Array, Array]:
         """Return the numbers of all members, and what was learned about them, empty where nothing is learned."""
-        state = np.zeros(0) if self._learner is None else np.append(float(self._turn), self._learner.state())
-        return self._numbers, state
+        if self._learner is None:
+            return self._numbers, np.zeros(0)
+        return self._numbers, np.concatenate([[self._turn, self._waiting], self._learner.state()])
 
     def state(self) -> tuple[list[bytes], Any]:
         """Return the whole state, as bytes and as JSON."""
@@ -471,8 +478,8 @@ class Ensemble:
         count = len(self.good)
         self.square, *wide, drifted, numbers, learned, times, path = (np.frombuffer(blob).copy() for blob in blobs[3:])
         if self._learner is not None:
-            self._turn = int(learned[0])
-            self._learner.set_state(learned[1:])
+            self._turn, self._waiting = int(learned[0]), float(learned[1])
+            self._learner.set_state(learned[2:])
         numbers = numbers.reshape(count, -1)
         which = np.flatnonzero((numbers != self._numbers).any(axis=1))
         self._set_numbers(which, numbers[which])
