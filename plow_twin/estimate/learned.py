@@ -58,7 +58,7 @@ def with_numbers(scene: Scene, numbers: Array) -> tuple[Scene, Array]:
 
 
 class Learner:
-    """What the poses tell of the numbers of all members: a normal distribution, in units of `tuning.LEARNED_TO`.
+    """Numbers of all members as the poses determine them: a normal distribution, in units of `tuning.LEARNED_TO`.
 
     Parameters
     ----------

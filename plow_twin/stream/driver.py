@@ -121,7 +121,7 @@ class Driver:
 
     @property
     def policy(self) -> Policy:
-        """What happens without samples; a new one acts at once."""
+        """Reaction to a silence; a new one acts at once."""
         return self._policy
 
     @policy.setter
