@@ -259,16 +259,9 @@ class Recorder:
         """Queue a message that was sent on `topic` (resolved name) for time `stamp_ns`; False when it was lost."""
         now = self._now_ns()
         with self._lock:
-            if self._room(2, self._queue_size * 3 // 4):
-                gap = self._output_gaps.pop(topic, 0)
-                if gap:
-                    self._push_entry(now, Dropped(topic, gap))
+            if fits := self._admitted(now, 2, (topic,)):
                 self._queue.append(_OutputItem(self._sequence, now, topic, stamp_ns, message))
-                return True
-            self._snapshot_due = True
-            self._output_gaps[topic] += 1
-            self._lost[topic] += 1
-            return False
+        return fits
 
     def publication(self, published: Published, sent: Mapping[str, bytes] = MappingProxyType({})) -> bool:
         """Queue the messages of a publication of one row; False when they were lost.
@@ -278,17 +271,9 @@ class Recorder:
         now = self._now_ns()
         topics = self._topics_of[len(published.slow) > 0, bool(sent) and bool(published.rows["marked"][0])]
         with self._lock:
-            if self._room(1 + len(self._topics_of[True, True]), self._queue_size * 3 // 4):
-                for topic in topics if self._output_gaps else ():
-                    gap = self._output_gaps.pop(topic, 0)
-                    if gap:
-                        self._push_entry(now, Dropped(topic, gap))
+            if fits := self._admitted(now, 1 + len(self._topics_of[True, True]), topics):
                 self._queue.append(_PublicationItem(self._sequence, now, published, sent, topics))
-                return True
-            self._snapshot_due = True
-            self._output_gaps.update(topics)
-            self._lost.update(topics)
-            return False
+        return fits
 
     def series(self, series: Series) -> NDArray[np.int64]:
         """Queue the samples and digests of a series as entries of the journal, or lose all of them.
@@ -316,17 +301,21 @@ class Recorder:
         topics = Counter(dict.fromkeys(self._topics_of[False, False], count))
         topics.update(dict.fromkeys(set(self._topics_of[True, False]) - topics.keys(), len(published.slow)))
         with self._lock:
-            if self._room(count + len(topics), self._queue_size * 3 // 4):
-                for topic in topics if self._output_gaps else ():
-                    gap = self._output_gaps.pop(topic, 0)
-                    if gap:
-                        self._push_entry(now, Dropped(topic, gap))
+            if fits := self._admitted(now, count + len(topics), topics):
                 self._push_many(_PublicationsItem(sequence, now, published, topics), count)
-                return True
+        return fits
+
+    def _admitted(self, now: int, items: int, topics: Iterable[str]) -> bool:
+        """Note the losses on the topics of messages for which there is room; otherwise count these as lost."""
+        if not self._room(items, self._queue_size * 3 // 4):
             self._snapshot_due = True
             self._output_gaps.update(topics)
             self._lost.update(topics)
             return False
+        for topic in topics if self._output_gaps else ():
+            if gap := self._output_gaps.pop(topic, 0):
+                self._push_entry(now, Dropped(topic, gap))
+        return True
 
     def _room(self, items: int, limit: int) -> bool:
         return self._accepting and not self._paused and self._queued + items <= limit
