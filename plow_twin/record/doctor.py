@@ -17,7 +17,7 @@ from plow_twin.record.bag import beside_folders
 from plow_twin.record.cdr import type_hash
 from plow_twin.record.chunks import DAMAGE_RECORD, MAGIC, ChunkReader, Messages, is_begun, is_mcap
 from plow_twin.record.follow import is_claimed
-from plow_twin.record.header import HEADER_RECORD, LOSS_RECORD
+from plow_twin.record.header import LAYOUT_VERSION, LOSS_RECORD
 from plow_twin.record.mcap_file import ChunkBuilder, McapFile, UnbufferedFile
 from plow_twin.record.messages import MESSAGE_TYPES
 from plow_twin.record.metadata_yaml import (
@@ -71,7 +71,7 @@ class RunReport:
     parts: list[PartReport] = field(default_factory=list)
     metadata_yaml: bool = False
     status: str = ""
-    layout_version: str = ""
+    layout_version: str = str(LAYOUT_VERSION)
     entries: Counter[str] = field(default_factory=Counter)
     gaps: int = 0
     #: entries that the files hold more than once
@@ -149,7 +149,6 @@ def examine(path: Path) -> RunReport:
     report.inputs = inputs.facts()
     report.span_s = run_time.span_s
     report.status = reader.status.value
-    report.layout_version = _layout(reader)
     _name_problems(report, reader)
     for folder in beside_folders(reader.path.parent) if path.is_dir() else ():
         for part in run_parts(folder):
@@ -157,19 +156,6 @@ def examine(path: Path) -> RunReport:
         for topic, count in recorded_losses(folder).items():
             report.problems.append(f"{folder.name}: {count} lost on {topic}, as counted by the recorder")
     return report
-
-
-def _layout(reader: RunReader) -> str:
-    found: list[str] = []
-
-    def on_metadata(name: str, record: dict[str, str]) -> None:
-        if name == HEADER_RECORD:
-            found.append(record.get("layout_version", ""))
-
-    readable = (part for part in reader.parts if is_begun(part) and is_mcap(part))
-    for _ in ChunkReader(next(readable), on_metadata):
-        break
-    return found[0] if found else ""
 
 
 def _part(path: Path) -> PartReport:
