@@ -35,11 +35,7 @@ class ParameterError(InputError):
         super().__init__(problems, source)
 
 
-def _number(default: float, unit: str, low: float, high: float, effect: Effect, doc: str) -> Any:
-    return field(default=default, metadata={"unit": unit, "low": low, "high": high, "effect": effect, "doc": doc})
-
-
-def _list(default: tuple[float, ...], unit: str, low: float, high: float, effect: Effect, doc: str) -> Any:
+def _number(default: float | tuple[float, ...], unit: str, low: float, high: float, effect: Effect, doc: str) -> Any:
     return field(default=default, metadata={"unit": unit, "low": low, "high": high, "effect": effect, "doc": doc})
 
 
@@ -161,7 +157,7 @@ class Settings:
     follow_members: int = _number(
         128, "twins", 20, 4096, Effect.CONFIGURE, "number of twins with follow: full; each costs the same"
     )
-    forecast_limits: tuple[float, ...] = _list(
+    forecast_limits: tuple[float, ...] = _number(
         (0.0, 0.0),
         "m",
         0.0,
@@ -290,7 +286,7 @@ class Settings:
     limit_gap_rate: float = _number(
         0.0, "m/s", 0.0, 1e300, Effect.NOW, "largest plausible rate of a gap; 0: limit_gap in a millisecond"
     )
-    set_wear: tuple[float, ...] = _list(
+    set_wear: tuple[float, ...] = _number(
         (0.0,) * 8,
         "m",
         0.0,
@@ -335,7 +331,7 @@ class Settings:
         Effect.CONFIGURE,
         "message of head_pose: PoseStamped, or PoseWithCovarianceStamped with variances of x, y and theta",
     )
-    head_pose_deviation: tuple[float, ...] = _list(
+    head_pose_deviation: tuple[float, ...] = _number(
         (0.0, 0.0, 0.0),
         "m, m, rad",
         0.0,
@@ -344,7 +340,7 @@ class Settings:
         "standard deviation of head_pose: x, y, theta; 0: not known",
     )
     gaps_deviation: float = _number(0.0, "m", 0.0, 1.0, Effect.CONFIGURE, "standard deviation of gaps; 0: not known")
-    excitation_deviation: tuple[float, ...] = _list(
+    excitation_deviation: tuple[float, ...] = _number(
         (0.0, 0.0, 0.0),
         "N, N, N m",
         0.0,
@@ -352,7 +348,7 @@ class Settings:
         Effect.CONFIGURE,
         "standard deviation of the excitation: Fx, Fy, M; 0: not known",
     )
-    alarm_force: tuple[float, ...] = _list(
+    alarm_force: tuple[float, ...] = _number(
         (0.0, 0.0),
         "N",
         0.0,
@@ -360,7 +356,7 @@ class Settings:
         Effect.CONFIGURE,
         "forces that raise a warning and an error; 0: never",
     )
-    alarm_clearance: tuple[float, ...] = _list(
+    alarm_clearance: tuple[float, ...] = _number(
         (0.0, 0.0),
         "m",
         0.0,
@@ -368,7 +364,7 @@ class Settings:
         Effect.CONFIGURE,
         "values of the larger clearance that raise a warning and an error; 0: never",
     )
-    alarm_wear_rate: tuple[float, ...] = _list(
+    alarm_wear_rate: tuple[float, ...] = _number(
         (0.0, 0.0),
         "m/s",
         0.0,
@@ -376,7 +372,7 @@ class Settings:
         Effect.CONFIGURE,
         "wear rates of a pad that raise a warning and an error; 0: never",
     )
-    alarm_clearance_rate: tuple[float, ...] = _list(
+    alarm_clearance_rate: tuple[float, ...] = _number(
         (0.0, 0.0),
         "m/s",
         0.0,
@@ -384,7 +380,7 @@ class Settings:
         Effect.CONFIGURE,
         "growth rates of the larger clearance, over 10 s, that raise a warning and an error; 0: never",
     )
-    alarm_residual: tuple[float, ...] = _list(
+    alarm_residual: tuple[float, ...] = _number(
         (0.0, 0.0),
         "m",
         0.0,

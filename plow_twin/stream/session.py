@@ -116,14 +116,6 @@ class Series(NamedTuple):
             self.digest_after[marked] - begin,
         )
 
-    def entries(self) -> Iterator[Sample | Digest]:
-        """Yield the entries of the journal."""
-        digests = dict(zip(self.digest_after.tolist(), self.digests, strict=True))
-        for number, (stamp_ns, wrench) in enumerate(zip(self.stamps.tolist(), self.wrench.tolist(), strict=True), 1):
-            yield Sample(stamp_ns, tuple(wrench))
-            if number in digests:
-                yield Digest(stamp_ns, digests[number])
-
 
 class _UndoneError(Exception):
     """An advance failed, and the twin is in its state before the samples."""
