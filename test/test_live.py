@@ -756,7 +756,7 @@ print(os.sched_getaffinity(0) == {one})
         (["load.csv", "--set", "excitation_timeout=-1"], 2, "a number from 0.01"),
         (["load.csv", "--set", "excitation_source=tool_forces"], 1, "expected 'excitation' or 'scene'"),
         (["other.csv"], 1, "expected the columns fx, fy, m"),
-        (["twice.csv"], 1, "column 'fx' stands more than once"),
+        (["twice.csv"], 1, "column 'fx' occurs more than once"),
         (["load.csv", "--map", "twice.yaml"], 2, "the key twice, in lines 1 and 2"),
         (["junk.csv"], 1, "\\x1b"),
         (["mqtt://localhost:1"], 1, "expected one that names the topics"),

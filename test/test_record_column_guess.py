@@ -179,7 +179,7 @@ def test_dates_that_cannot_be_read_and_stamps_that_fall_are_named(tmp_path: Path
 
 
 @pytest.mark.parametrize(
-    ("zone", "said"), [("", "by its name; dates without a zone count as UTC"), ("+01:00", "by its name")]
+    ("zone", "said"), [("", "by its name; dates without a zone are UTC"), ("+01:00", "by its name")]
 )
 def test_dates_without_a_zone_and_cells_without_a_number_are_mentioned(tmp_path: Path, zone: str, said: str) -> None:
     rows = [f"2026-01-02T03:04:{index:02}.5{zone},{'nan' if index % 3 else 1e3},-1e3,2e3" for index in range(30)]

@@ -352,7 +352,7 @@ def test_a_digest_with_a_flipped_bit_is_another_digest_or_an_error() -> None:
         assert found[0] == (place >= len(whole) - 16)
     nothing = read_digests(np.frombuffer(whole, np.uint8), np.array([1, -1, 2**40]), np.full(3, len(whole)))
     assert not nothing[0].any()
-    with pytest.raises(RecordingError, match="got 3 integers, expected a digest's two"):
+    with pytest.raises(RecordingError, match="got 3 integers, expected the two of a digest"):
         from_message(Integers((1, 2, 3)))
 
 

@@ -146,7 +146,7 @@ def test_faults_that_stop_other_programs_are_named_and_repaired(tmp_path: Path) 
             assert reader.message_count
     with run.file.open("ab") as stream:
         stream.write(b"x" * 100)
-    assert examine(run.folder).problems == ["run_0.mcap: 100 B behind its end"]
+    assert examine(run.folder).problems == ["run_0.mcap: 100 B after its end"]
     assert repair(run.folder) == [run.file] and examine(run.folder).problems == []
     with AnyReader([run.folder]) as reader:
         assert reader.message_count
@@ -335,7 +335,9 @@ def test_a_part_that_is_not_there_is_counted_and_no_load_drawn_over_its_hole(whi
         if listing or which == 1:
             assert report.lost["missing_parts"] == found.losses["missing_parts"] == facts["lost"]["missing_parts"] == 1
             assert report.exit_code == 3 and found.lossy and lossy
-            assert sum("is missing: meta" in problem or "by their numbers" in problem for problem in problems) == 1
+            assert (
+                sum("is missing: meta" in problem or "as the part numbers show" in problem for problem in problems) == 1
+            )
         (run.folder / "metadata.yaml").unlink(missing_ok=True)
     assert found.input["samples_used"] == report.samples < COUNT
     times = np.diff(found.predictions[0].series()[0])

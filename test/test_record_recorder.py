@@ -544,7 +544,7 @@ def test_a_full_disk_beside_a_run_is_reported_at_once_and_when_there_is_room_aga
         writer.flush()
     assert [text.removeprefix(f"{writer.path}: ") for text in said] == [
         "full: messages are lost until there is room",
-        "goes on, 2 messages are lost",
+        "recording continues, 2 messages were lost",
     ]
     writer.close()
     assert (writer.written["/level"], writer.lost["/level"]) == (3, 2)

@@ -230,7 +230,7 @@ def test_a_unit_of_stamps_that_would_be_left_out_is_refused(tmp_path: Path) -> N
     (tmp_path / "load.csv").write_text("zeit,fx,fy,m\n" + "".join(f"{t},0,0,0\n" for t in range(100)))
     mapping = tmp_path / "map.yaml"
     for stamp, said in (
-        ("", "names its column too: the columns zeit, fx, fy, m have none of"),
+        ("", "with the name of its column: the columns zeit, fx, fy, m have none of"),
         ("stamp: log, ", "none"),
     ):
         mapping.write_text(f"excitation: {{topic: load, {stamp}stamp_unit: ms}}")

@@ -160,7 +160,7 @@ def test_a_spreadsheet_s_csv_gives_the_numbers_of_a_plain_one(tmp_path: Path) ->
 
 def test_columns_that_are_missing_or_there_twice_are_named(tmp_path: Path) -> None:
     twice = sheet(tmp_path / "load.csv", ",", comma=False, mark=True, header=("t", "fx", "fx", "m"))
-    with pytest.raises(RecordingError, match="'fx' stands more than once"):
+    with pytest.raises(RecordingError, match="'fx' occurs more than once"):
         analyse(twice, scene=PAPER)
     short = sheet(tmp_path / "load.csv", ",", comma=False, mark=True, header=("t", "fx", "fy"))
     with pytest.raises(RecordingError, match="excitation: got load"):

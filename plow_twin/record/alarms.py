@@ -19,11 +19,11 @@ from plow_twin.stream.alarms import Alarms, Thresholds
 from plow_twin.stream.journal import Parameter, Pose
 from plow_twin.stream.outputs import Published
 
-#: Base name of their topic.
+#: Base name of the alarms' topic.
 ALARMS: Final = "alarms"
 #: Parameter name of an acknowledgement in the journal.
 ACKNOWLEDGED: Final = "alarms_acknowledged"
-#: For each quantity, the unit in which an alarm's text gives it, with the factor from SI.
+#: Factor from SI and unit of each quantity in an alarm's text.
 _UNITS: Final = {
     "force": (1e-3, "kN"),
     "clearance": (1e3, "mm"),
@@ -33,12 +33,12 @@ _UNITS: Final = {
 }
 _NAMES: Final = ("force", "clearance", "clearance_rate", "wear_rate")
 
-#: Step, stamp [ns], topic, field, recorded and computed value of a difference.
+#: A difference: step, stamp [ns], topic, field, recorded value, computed value.
 Difference = tuple[int, int, str, str, str, str]
 
 
 def alarms_of(parameters: Mapping[str, Any]) -> Alarms:
-    """Return the alarms that the node's parameters set, each at its lowest level."""
+    """Return the alarms that the node's parameters configure, each at its lowest level."""
     thresholds = {name: Thresholds(*parameters.get(f"alarm_{name}", ())) for name in _NAMES}
     residual = parameters.get("alarm_residual", ())
     if any(residual):
@@ -47,7 +47,7 @@ def alarms_of(parameters: Mapping[str, Any]) -> Alarms:
 
 
 def alarms_message(alarms: Alarms, node: str, hardware_id: str) -> DiagnosticStatus:
-    """Return the message with the level of each alarm, and the origin of the latched ones."""
+    """Return the message with the level of each alarm and the cause of each latched alarm."""
     values: dict[str, str] = {}
     for name, alarm in alarms.alarms.items():
         raised = alarm.raised
@@ -65,9 +65,9 @@ def alarms_message(alarms: Alarms, node: str, hardware_id: str) -> DiagnosticSta
 
 
 def alarm_texts(values: Mapping[str, str], *, own_start: bool = False, newest: bool = False) -> list[str]:
-    """Return a sentence for each latched alarm: level, value, pad, threshold and time, with `newest` the value now too.
+    """Return a sentence for each latched alarm: value, pad, level, threshold and time.
 
-    `values` are those of `alarms_message`; `own_start` as in `time_text`.
+    `values` are the values of `alarms_message`. `newest` adds the present value. `own_start` is passed to `time_text`.
     """
     found = []
     for name, (factor, unit) in _UNITS.items():
@@ -88,7 +88,8 @@ def alarm_texts(values: Mapping[str, str], *, own_start: bool = False, newest: b
 class AlarmCheck:
     """Compute the alarms of a run again, and compare each of their messages with the recorded message.
 
-    Alarms depend on every publication since the start of the run: after a missing one they cannot be compared.
+    Alarms depend on every publication since the start of the run, so they cannot be compared after a missing
+    publication.
     """
 
     def __init__(self, header: RunHeader, possible: bool) -> None:
@@ -96,9 +97,9 @@ class AlarmCheck:
         self._alarms = alarms_of(header.parameters)
         self._computed: deque[tuple[int, int, DiagnosticStatus]] = deque()
         self._recorded: deque[OutputRecord] = deque()
-        #: whether no publication is missing so far
+        #: whether every publication so far is present
         self.possible = possible
-        #: recorded messages that were compared, and those that could not be compared
+        #: numbers of recorded messages that were compared and that could not be compared
         self.compared = self.not_compared = 0
 
     def give_up(self) -> None:
@@ -126,7 +127,11 @@ class AlarmCheck:
         published: Published,
         poses: Sequence[tuple[int, int, Pose]] = (),
     ) -> None:
-        """Judge publications after entries, each with its number and step, and the poses between them."""
+        """Update the alarms with publications and with the poses between them.
+
+        `sequence` and `step`, shape (n,), give the journal entry and the step of each publication; each pose comes with
+        its own entry and step.
+        """
         if not self.possible:
             return
         if not self._alarms.follows_poses:
@@ -154,7 +159,10 @@ class AlarmCheck:
             self.not_compared += 1
 
     def differences(self) -> Iterator[Difference]:
-        """Yield the differences of messages; a message without its counterpart waits: a loss may be noted later."""
+        """Yield the differences between recorded and computed messages.
+
+        A message without a counterpart waits, because the journal may note a loss later.
+        """
         while self._recorded and self._computed:
             record, (sequence, step, computed) = self._recorded.popleft(), self._computed.popleft()
             self.compared += 1
@@ -167,7 +175,7 @@ class AlarmCheck:
             yield step, record.publish_time_ns, ALARMS, *difference
 
     def left_over(self, step: int) -> Iterator[Difference]:
-        """Yield the messages without a counterpart at the end of a whole recording; `step` is the last advance."""
+        """Yield the messages without a counterpart at the end of a complete recording; `step` is the last advance."""
         for record in self._recorded:
             self.compared += 1
             yield step, record.publish_time_ns, ALARMS, "message", "a message", "none"

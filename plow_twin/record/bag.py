@@ -55,7 +55,7 @@ class BagWriter:
         self._on_trouble, self._in_trouble = on_trouble, False
 
     def topic(self, topic: Topic) -> int:
-        """Return the number of a new topic."""
+        """Register a topic and return its number."""
         metadata = {"offered_qos_profiles": topic.qos, "topic_type_hash": topic.type_hash}
         number = self._file.channel(topic.name, topic.message_type, topic.schema.encode(), metadata)
         self._topics[number] = topic
@@ -70,7 +70,7 @@ class BagWriter:
             self.flush()
 
     def flush(self) -> None:
-        """Pass the messages to the operating system; those for which the disk has no room are lost and counted."""
+        """Pass the waiting messages to the operating system; if the disk is full, count them as lost."""
         waiting, self._waiting = self._waiting, Counter()
         try:
             short = shortage(self.folder, _MIN_FREE_BYTES) if waiting else None
@@ -86,7 +86,7 @@ class BagWriter:
             self._in_trouble = True
         else:
             if waiting and self._in_trouble:
-                self._on_trouble(f"{self.path}: goes on, {sum(self.lost.values())} messages are lost")
+                self._on_trouble(f"{self.path}: recording continues, {sum(self.lost.values())} messages were lost")
                 self._in_trouble = False
             self.written.update(waiting)
 
@@ -115,15 +115,15 @@ def beside_folders(run: Path) -> Sequence[Path]:
 
 
 def readable_beside(run: Path, lost: Counter[str]) -> list[Path]:
-    """Return the readable folders of `beside_folders`, and the losses.
+    """Return the readable folders of `beside_folders` and count the losses in `lost`.
 
-    Losses are the files of the other folders, and by topic the messages that their recorders lost.
+    The losses are the files of the unreadable folders, and by topic the messages that the recorders lost.
     """
     found = []
     for folder in beside_folders(run):
         lost.update(recorded_losses(folder))
         parts = [*folder.glob("*.mcap")]
-        if any(is_begun(part) and is_mcap(part) for part in parts):  # the reader counts the others
+        if any(is_begun(part) and is_mcap(part) for part in parts):  # the reader counts the unreadable files
             found.append(folder)
         else:
             lost.update("damaged_files" if is_begun(part) else "truncated_files" for part in parts)

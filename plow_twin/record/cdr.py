@@ -1,6 +1,6 @@
-"""Plain messages to CDR bytes and back, through the type store of rosbags: no ROS installation is needed.
+"""Conversion of plain messages to CDR bytes and back by the type store of rosbags, without a ROS installation.
 
-The bytes are canonical, with padding of zeros: equal messages have equal bytes, and replay compares bytes.
+Padding bytes are zero, so equal messages have equal bytes and a replay can compare bytes.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def type_hash(message_type: str) -> str:
 
 
 def warm_up() -> None:
-    """Make schemas, hashes and the encoders, which takes 0.1 s, before time matters."""
+    """Make the schemas, hashes and encoders, which takes 0.1 s, before the first message."""
     for message_type in MESSAGE_TYPES:
         schema_text(message_type)
         type_hash(message_type)
@@ -75,7 +75,7 @@ def decode(data: bytes, message_type: str) -> Message:
     Raises
     ------
     RecordingError
-        The type is unknown, or the bytes hold no message of it.
+        The type is unknown, or the bytes are not a message of this type.
     """
     kind = MESSAGE_TYPES.get(message_type)
     if kind is None:
@@ -85,7 +85,7 @@ def decode(data: bytes, message_type: str) -> Message:
     try:
         return _DECODERS[kind](typestore().deserialize_cdr(data, message_type))
     except Exception as error:  # rosbags lets index, struct and assertion errors through
-        raise RecordingError(f"{message_type}: {len(data)} bytes that do not hold one ({error!r})") from error
+        raise RecordingError(f"{message_type}: got {len(data)} bytes, expected one message ({error!r})") from error
 
 
 def _header(types: Any, stamp_ns: int, frame_id: str) -> Any:
@@ -180,18 +180,18 @@ def _decode_integers(wire: Any) -> Integers:
 
 
 def _decode_short_text(data: bytes) -> Text:
-    """Return a string without the general decoder: the journal has many."""
+    """Decode a string message without the general decoder, because the journal has many of them."""
     (length,) = struct.unpack_from("<I", data, 4) if len(data) >= _TEXT_AT else (0,)
     if data[:2] != b"\x00\x01" or not 0 < length <= len(data) - _TEXT_AT:
-        raise RecordingError(f"{Text.TYPE}: {len(data)} bytes that do not hold one")
+        raise RecordingError(f"{Text.TYPE}: got {len(data)} bytes, expected one message")
     try:
         return Text(data[_TEXT_AT : _TEXT_AT + length - 1].decode())
     except UnicodeDecodeError as error:
-        raise RecordingError(f"{Text.TYPE}: {len(data)} bytes that do not hold one ({error})") from error
+        raise RecordingError(f"{Text.TYPE}: got {len(data)} bytes, expected one message ({error})") from error
 
 
 def _encode_short_text(message: Text) -> bytes:
-    """Return the bytes of a string without the general encoder: a live journal has some each second."""
+    """Encode a string message without the general encoder, because a live journal has several each second."""
     text = message.data.encode()
     return b"\x00\x01\x00\x00" + struct.pack("<I", len(text) + 1) + text + b"\x00"
 

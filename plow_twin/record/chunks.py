@@ -1,6 +1,6 @@
-"""MCAP from front to back, a chunk at a time; messages are arrays of places, without an object for each.
+"""Reading of MCAP files from front to back, chunk by chunk; messages are arrays of offsets instead of objects.
 
-No index is needed: a file without its end is read as far as it goes, damaged chunks are left out and counted.
+No index is needed: a truncated file is read up to its last whole record, and damaged chunks are skipped and counted.
 """
 
 from __future__ import annotations
@@ -26,35 +26,35 @@ try:  # twenty times as fast as the standard library's
 except ImportError:
     from zlib import crc32 as crc32
 
-#: A metadata record in the place of an unreadable chunk that a repair left out; it counts as a damaged chunk.
+#: Name of the metadata record that a repair writes in place of an unreadable chunk; the reader counts a damaged chunk.
 DAMAGE_RECORD: Final = "plow_twin_damage"
 MAGIC: Final = b"\x89MCAP0\r\n"
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _METADATA = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x0C
 _ATTACHMENT: Final = 0x09
-#: Endings of the names of tables, which are not recordings.
+#: File name endings of tables, which are not recordings.
 _TABLES: Final = (".csv", ".parquet")
 _HEAD: Final = struct.Struct("<BQ")
 _HEAD_SIZE: Final = _HEAD.size
-#: A head and the number that an index record begins with [B].
+#: Size of a record's head and of the channel number at the start of an index record [B].
 _INDEX_HEAD: Final = _HEAD.size + 2
-#: Most bytes that the chunks of a file unpack to for each byte of the file, beside the first chunk.
+#: Largest ratio of the unpacked size of a file's chunks to the size of the file; `RECORD_LIMIT` comes on top.
 UNPACKED_RATIO: Final = 200
-#: Most schemas and channels of a file.
+#: Largest number of schemas and channels in a file.
 _MOST_DECLARED: Final = 10_000
-#: Channels with a bit of their own.
+#: Number of channels that have a bit of their own in a channel mask.
 _CHANNEL_BITS: Final = 63
-#: Heads of records looked up at once.
+#: Number of record heads that are read at once.
 _AHEAD: Final = 64
-#: pread for compiled code: a recording has more heads than chunks that are opened.
+#: pread for compiled code, because a recording has many more record heads than opened chunks.
 _pread: Final[Any] = types.ExternalFunction("pread", types.intp(types.int32, types.uintp, types.uintp, types.int64))
 _CHUNK_HEAD: Final = struct.Struct("<QQQII")
 #: Bytes of a message record before its data: opcode, length, channel, sequence, log time, publish time.
 MESSAGE_HEAD: Final = 31
 _MESSAGE_FIELDS: Final = MESSAGE_HEAD - _HEAD_SIZE
 _COLUMNS: Final = 6
-#: Chunks below that size [B] are scanned together.
+#: Chunks below this size [B] are scanned together.
 _SMALL: Final = 2**18
-#: The same size where large chunks between them are not opened.
+#: The same limit if the large chunks between the small ones are not opened.
 _SMALL_ALONE: Final = 2**20
 
 
@@ -104,7 +104,7 @@ class Messages:
 class ChunkReader:
     """Iterate over the chunks of one MCAP file.
 
-    `channels` grows while the file is read. Once the iteration has ended, `finished` says whether the file has its end
+    `channels` grows while the file is read. Once the iteration has ended, `finished` says whether the file is complete
     and `damaged` counts the chunks that could not be read. `on_metadata` receives each metadata record.
 
     Parameters
@@ -112,10 +112,11 @@ class ChunkReader:
     path
         The file.
     wanted
-        Called with the channel numbers of a chunk, where its index can be read: False leaves the chunk unopened.
+        Called with the channel numbers of each chunk whose index can be read; if it returns False, the chunk is not
+        opened.
     more
-        Called with the stream and the known size at the end of a file that is being written: True when it has grown.
-        Before the call all messages are yielded, then an empty batch.
+        Called with the stream and the known size at the end of a file that is being written; it returns True when the
+        file has grown. All messages and then an empty batch are yielded before the call.
     """
 
     path: Path
@@ -125,16 +126,16 @@ class ChunkReader:
     channels: dict[int, Channel] = field(default_factory=dict)
     finished: bool = False
     damaged: int = 0
-    #: damaged chunks that a repair has left out
+    #: number of damaged chunks that a repair has left out
     left_out: int = 0
     position: int = 0
-    #: answers of `wanted`, by the bits of the channels
+    #: answers of `wanted` by channel mask
     _answers: dict[int, bool] = field(default_factory=dict, init=False)
-    #: rows of the first table of messages
+    #: rows of the next table of messages
     _room: int = field(default=256, init=False)
-    #: bytes that chunks have unpacked to
+    #: unpacked size of the chunks so far [B]
     _unpacked: int = field(default=0, init=False)
-    #: the records of schemas and channels, by opcode and number: chunks may repeat them
+    #: schema and channel records by opcode and number, because chunks may repeat them
     _declared: dict[tuple[int, bytes], bytes] = field(default_factory=dict, init=False)
     _others: Indexes = field(default_factory=lambda: np.empty(256, np.int64), init=False)
 
@@ -153,7 +154,7 @@ class ChunkReader:
                 begin = place + _HEAD_SIZE
                 if length > RECORD_LIMIT and opcode != _ATTACHMENT:
                     break
-                behind = len(MAGIC) if opcode == _FOOTER else 0  # a writer may be between the record and the magic
+                behind = len(MAGIC) if opcode == _FOOTER else 0  # a writer may not have written the magic yet
                 if begin + length + behind > size:
                     if self.more is None:
                         break
@@ -186,7 +187,7 @@ class ChunkReader:
                 elif opcode == _METADATA:
                     yield from self._scan(
                         waiting.pop_all(), schemas
-                    )  # a note of damage has its place between the messages
+                    )  # a note of damage keeps its place among the messages
                     self._metadata(os.pread(descriptor, length, begin))
                 elif opcode == _FOOTER:
                     self.finished = os.pread(descriptor, len(MAGIC), place) == MAGIC
@@ -194,7 +195,7 @@ class ChunkReader:
             yield from self._scan(waiting.pop_all(), schemas)
 
     def _is_wanted(self, channels: int) -> bool:
-        """Return whether a chunk is wanted, by the bits of its channels; without an index it is."""
+        """Return whether the chunk with a channel mask is wanted; a chunk without an index is always wanted."""
         if self.wanted is None or channels <= 0:
             return True
         if channels not in self._answers:
@@ -222,7 +223,7 @@ class ChunkReader:
         return np.frombuffer(content, np.uint8)
 
     def _count_unpacked(self, count: int, size: int) -> None:
-        """Add to the bytes that the chunks of a file of `size` bytes have unpacked to."""
+        """Add `count` to the unpacked size of the chunks; `size` is the size of the file [B]."""
         self._unpacked += count
         most = RECORD_LIMIT + UNPACKED_RATIO * size
         if self._unpacked > most:
@@ -231,7 +232,7 @@ class ChunkReader:
             )
 
     def _scan(self, contents: list[Bytes], schemas: dict[int, tuple[str, bytes]]) -> Iterator[Messages]:
-        """Yield the messages of some chunks, together unless one is damaged."""
+        """Yield the messages of several chunks as one batch, or as a batch for each chunk if one is damaged."""
         if not contents:
             return
         content = contents[0] if len(contents) == 1 else np.concatenate(contents)
@@ -274,7 +275,7 @@ class ChunkReader:
                 self.channels[channel.id] = Channel(
                     channel.topic, name, channel.message_encoding, text, channel.metadata
                 )
-        except Exception:  # damage: its messages are passed over
+        except Exception:  # damage: the messages of the channel are skipped
             self.damaged += 1
 
     def _metadata(self, record: bytes) -> None:
@@ -291,14 +292,14 @@ class ChunkReader:
         self.on_metadata(metadata.name, dict(metadata.metadata))
 
     def _note_damage(self, schemas: dict[int, tuple[str, bytes]]) -> None:
-        """Count a damaged chunk, and read the channels that it may have declared from the index at the end."""
+        """Count a damaged chunk; read the channels that it may have declared from the index at the file's end."""
         from mcap.reader import make_reader
 
         self.damaged += 1
         try:
             with self.path.open("rb") as stream:
                 summary = make_reader(stream).get_summary()
-        except Exception:  # no index, no help
+        except Exception:  # without an index these channels stay unknown
             return
         if summary is None:
             return
@@ -312,7 +313,7 @@ class ChunkReader:
 
 
 class _Waiting:
-    """Contents of chunks, and messages outside chunks, which are scanned together: each scan has a fixed cost."""
+    """Chunk contents, and messages outside chunks, to be scanned together, because each scan has a fixed cost."""
 
     def __init__(self) -> None:
         self._contents: list[Bytes] = []
@@ -331,7 +332,7 @@ class _Waiting:
         self.size += len(record)
 
     def pop_all(self) -> list[Bytes]:
-        """Return everything in the order of the file, and drop it."""
+        """Return everything in file order and empty the list."""
         self._join()
         contents, self._contents, self.size = self._contents, [], 0
         return contents
@@ -343,17 +344,17 @@ class _Waiting:
 
 
 def is_begun(path: Path) -> bool:
-    """Return whether an MCAP file has its first bytes: a process may be killed before it writes any."""
+    """Return whether an MCAP file has its first bytes; a process may be killed before it writes them."""
     try:
         with path.open("rb") as stream:
             head = stream.read(len(MAGIC))
     except OSError:
-        return True  # the reader reports why it cannot be read
+        return True  # the reader reports why the file cannot be read
     return len(head) == len(MAGIC) or not MAGIC.startswith(head)
 
 
 def is_mcap(path: Path) -> bool:
-    """Return whether a file begins as MCAP does; a file that cannot be opened is left to its reader."""
+    """Return whether a file begins like an MCAP file; a file that cannot be opened is left to its reader (True)."""
     try:
         with path.open("rb") as stream:
             return MAGIC.startswith(stream.read(len(MAGIC)))
@@ -362,7 +363,7 @@ def is_mcap(path: Path) -> bool:
 
 
 def metadata_records(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
-    """Yield name and content of the metadata records of a file; no chunk is opened."""
+    """Yield the name and content of each metadata record of a file without opening a chunk."""
     from mcap.reader import make_reader
 
     found: list[tuple[str, dict[str, str]]] = []
@@ -375,7 +376,7 @@ def metadata_records(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
 
 
 def _metadata_by_heads(descriptor: int) -> list[tuple[str, dict[str, str]]]:
-    """Return the metadata records of a file without an index, by the heads of its records."""
+    """Return the metadata records of a file without an index by stepping from record head to record head."""
     from mcap.data_stream import ReadDataStream
     from mcap.records import Metadata
 
@@ -401,7 +402,7 @@ class _Heads:
         self._table = np.empty((_AHEAD, 5), np.int64)
         self._rows: list[tuple[int, int, int, int, int]] = []
         self._next = 0
-        self._index = [0, 0]  # end of the newest record and of its index, and its channels
+        self._index = [0, 0]  # end of the newest record with its index, and its channel mask
 
     def at(self, place: int) -> tuple[int, int]:
         """Return opcode and length of the record at a place; zeros at the end."""
@@ -409,16 +410,16 @@ class _Heads:
             count = look_ahead(self._descriptor, self._size, place, self._table)
             self._rows, self._next = self._table[:count].tolist(), 0
             if not self._rows:
-                os.pread(self._descriptor, 1, place)  # raises the error of a file that cannot be read
+                os.pread(self._descriptor, 1, place)  # raises the error if the file cannot be read
                 return 0, 0
         _, opcode, length, *self._index = self._rows[self._next]
         self._next += 1
         return opcode, length & (1 << 64) - 1
 
     def index(self) -> tuple[int, int]:
-        """Return the channels, a bit each, in the index records behind the newest chunk, and where these end.
+        """Return the channel mask of the index records after the newest chunk, and the offset of their end.
 
-        -1: a channel is beyond the bits.
+        The mask is -1 if a channel has no bit in it.
         """
         end, channels = self._index
         return channels, end
@@ -426,10 +427,10 @@ class _Heads:
 
 @compiled
 def look_ahead(descriptor, size, place, table):  # type: ignore[no-untyped-def]
-    """Fill rows with place, opcode, length, end and channels of the records from `place` on; return how many.
+    """Fill rows with place, opcode, length, end and channels of the records from `place` on; return the number of rows.
 
-    The index records behind a chunk have no rows of their own: the row of the chunk has their end and their channels, a
-    bit each (-1: a channel is beyond the bits).
+    The index records after a chunk have no rows of their own: the row of the chunk has their end and their channel mask
+    (-1: a channel has no bit in it).
     """
     head, count = np.zeros(_INDEX_HEAD, np.uint8), 0
     while True:
@@ -458,8 +459,8 @@ def look_ahead(descriptor, size, place, table):  # type: ignore[no-untyped-def]
 def scan(content: Bytes, table: Indexes, others: Indexes) -> tuple[int, int, bool]:
     """Fill the columns of `table` with the messages of a chunk and `others` with the places of schemas and channels.
 
-    Returns the number of each, and whether the records end with the chunk. The number of messages is one more than the
-    rows when the table is too small.
+    Returns both numbers, and whether the records end with the chunk. If the table is too small, the number of messages
+    is one more than its rows.
     """
     place, count, other = 0, 0, 0
     size, room = content.size, table.shape[1]
@@ -501,7 +502,7 @@ def open_mcap(path: Path) -> IO[bytes]:
         if path.stat().st_size == 0:
             raise ForeignRecordingError(f"{path}: empty: its recorder was killed before it wrote anything")
         table = path.suffix.lower() in _TABLES
-        more = "; of a table plow-twin live makes a recording, and --map opens it where a verb has it" if table else ""
+        more = "; plow-twin live makes a recording of a table, and commands with --map read a table" if table else ""
         raise ForeignRecordingError(f"{path}: not an MCAP file (its first bytes are not {MAGIC!r}){more}")
     stream.seek(0)
     return stream

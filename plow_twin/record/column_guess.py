@@ -1,4 +1,4 @@
-"""Which columns of an unknown CSV file are the load, the pose and the time, and in which units: by names and sizes."""
+"""Guess of the columns (load, pose, time) and units of an unknown CSV file by their names and magnitudes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from plow_twin.scene_file.csv_rows import csv_rows, delimiter_of, open_csv
 
 Array = NDArray[np.float64]
 
-#: Names of columns, without spaces and signs, by role and number.
+#: Patterns of column names, without spaces and signs, by role and number.
 _NAMES: Final = {
     ("excitation", "fx"): r"fx|(force|load|kraft|last)x|x(force|load|kraft)|fhor(izontal)?|horizontalforce",
     ("excitation", "fy"): r"fy|(force|load|kraft|last)y|y(force|load|kraft)|fver(tical)?|verticalforce",
@@ -37,9 +37,9 @@ _TIME: Final = r"t|time|timestamp|stamp|zeit|zeitstempel|date|datetime|datum"
 _UNIT: Final = re.compile(
     r"(.+?)\s*(?:[\[(]\s*([^\])]+?)\s*[\])]|[ _](kN ?m|N ?m|kN|N|mm|cm|m|mrad|rad|deg|ms|us|ns|s))"
 )
-#: Times beyond these [unit of the file] count from 1970: the year 2001 in s, ms, us and ns.
+#: Times above these count from 1970 in the named unit: each limit is a date in 2001.
 _DATES: Final = (("ns", 1e18), ("us", 1e15), ("ms", 1e12), ("s", 1e9))
-#: Most cells that are looked at: fewer rows of a wide file.
+#: Largest number of cells that are examined, so fewer rows of a wide file.
 _MOST_CELLS: Final = 2_000_000
 #: Numbers that a load needs.
 _NEEDED: Final = tuple(("excitation", name) for name in ROLES["excitation"])
@@ -47,11 +47,11 @@ _NEEDED: Final = tuple(("excitation", name) for name in ROLES["excitation"])
 
 @dataclass
 class Guess:
-    """The content of a file.
+    """The guessed meaning of a file's columns.
 
-    `columns` by role and number; `units` of those that are not SI, by number; `time` is the column of the time and
-    `time_unit` its unit, empty for dates in words. `because` says how each was found. `open` are the undecided
-    ones: number or `t`, and the columns or units to choose from.
+    `columns` maps role and number to a column, and `units` maps each number that is not in SI to its unit. `time` is
+    the column of the time and `time_unit` its unit, empty for dates as text. `because` says how each column was found.
+    `open` maps each undecided number, or `t`, to the columns or units to choose from.
     """
 
     path: Path
@@ -109,7 +109,7 @@ def guess_columns(path: Path, scene: Scene, columns: Mapping[str, str], units: M
     Raises
     ------
     RecordingError
-        The file cannot be read, has no header or no rows, or lacks a column that is named.
+        The file cannot be read, has no header or no rows, or lacks a given column.
     """
     guess, rows = _read(path)
     for name, column in columns.items():
@@ -138,7 +138,7 @@ def guess_columns(path: Path, scene: Scene, columns: Mapping[str, str], units: M
         texts = [cell for cell in cells if cell and not NUMBER.fullmatch(cell)]
         if 2 * len(texts) > len(cells):
             raise RecordingError(
-                f"{path}: {name}: got {texts[0]!r} in the column {column}, expected numbers as -1199.7"
+                f"{path}: {name}: got {texts[0]!r} in the column {column}, expected numbers such as -1199.7"
             )
         if missing := int(np.isnan(numbers[column]).sum()):
             guess.because[name] += f"; {missing} of {len(cells)} cells have no number"
@@ -170,8 +170,8 @@ def _read(path: Path) -> tuple[Guess, list[list[str]]]:
     if 2 * len(fit) < len(rows) - 1:
         other = next(len(row) for row in rows[1:] if len(row) != len(names))
         raise RecordingError(
-            f"{path}: got {other} cells in a row, expected the {len(names)} of its header (where commas are decimal "
-            "signs, semicolons or tabs must stand between the columns)"
+            f"{path}: got {other} cells in a row, expected the {len(names)} of its header (if commas are decimal "
+            "signs, semicolons or tabs must separate the columns)"
         )
     return Guess(path, delimiter, comma, names), fit
 
@@ -179,7 +179,7 @@ def _read(path: Path) -> tuple[Guess, list[list[str]]]:
 def _find_time(
     guess: Guess, rows: Sequence[Sequence[str]], numbers: Mapping[str, Array], given: str, unit: str
 ) -> None:
-    """Find the column of the time, by its name or as the only rising one, and its unit, if the numbers show it."""
+    """Find the time's column, by its name or as the only rising column, and its unit if the numbers show it."""
     alike = [name for name in guess.names if re.fullmatch(_TIME, _plain(name))]
     rising = [name for name, found in numbers.items() if len(found) > 2 and (np.diff(found) > 0.0).all()]
     choices = [given] if given else alike or rising
@@ -187,18 +187,19 @@ def _find_time(
         guess.open["t"] = tuple(choices or guess.names)
         return
     guess.time = choices[0]
-    guess.because["t"] = "as stated" if given else "by its name" if alike else "it alone rises"
+    guess.because["t"] = "as stated" if given else "by its name" if alike else "as the only rising column"
     found = numbers[guess.time]
     if not np.isfinite(found).any():
         index = guess.names.index(guess.time)
         stamps = [time_ns(row[index]) for row in rows]
-        first = next((stamp for stamp in stamps if stamp is not None), 0)  # a float of today resolves 0.2 us
+        first = next((stamp for stamp in stamps if stamp is not None), 0)  # a float resolves today's date to 0.2 us
         guess.stamps_s = np.array([np.nan if stamp is None else (stamp - first) * 1e-9 for stamp in stamps])
         if stamps and np.isnan(guess.stamps_s).all():
             got = f"{rows[0][index]!r} in the column {guess.time}"
-            raise RecordingError(f"{guess.path}: t: got {got}, expected a number or a date as 2026-01-02T03:04:05.678Z")
+            expected = "a number or a date such as 2026-01-02T03:04:05.678Z"
+            raise RecordingError(f"{guess.path}: t: got {got}, expected {expected}")
         if not all(_ZONE.search(row[index].strip()) for row in rows):
-            guess.because["t"] += "; dates without a zone count as UTC"
+            guess.because["t"] += "; dates without a zone are UTC"
         return
     header = _unit_of(guess.time)
     newest = float(np.nanmax(np.abs(found)))
@@ -233,18 +234,18 @@ def _find_units(guess: Guess, numbers: Mapping[str, Array], scene: Scene, given:
             guess.units[name] = doubt.likely
             guess.because[name] += f", {doubt.likely} by its size"
             guess.values[doubt.role, name] *= UNITS[QUANTITIES[doubt.role, name]][doubt.likely]
-    # forces are in one unit
+    # both forces have the same unit
     both = [name for name in ("fx", "fy") if ("excitation", name) in guess.columns]
     for name in both:
         other = next((guess.units[one] for one in both if one in guess.units), "")
         if other and name not in guess.units:
             guess.units[name] = other
-            guess.because[name] += f", {other} as the other force"
+            guess.because[name] += f", {other} like the other force"
             guess.values["excitation", name] *= UNITS["force"][other]
-    # a moment has no size of its own to go by: it is in the unit of its forces
+    # the size of a moment does not show its unit, so it follows the unit of the forces
     if guess.units.get("fx") == "kN" and "m" not in guess.units and ("excitation", "m") in guess.columns:
         guess.units["m"] = "kN m"
-        guess.because["m"] += ", kN m as the forces are in kN"
+        guess.because["m"] += ", kN m because the forces are in kN"
         guess.values["excitation", "m"] *= 1e3
 
 
@@ -260,6 +261,6 @@ def _unit_of(name: str) -> str:
 
 
 def _plain(name: str) -> str:
-    """Return a name in small letters without its unit, spaces and signs."""
+    """Return a name in lower case without its unit, spaces and signs."""
     found = _UNIT.fullmatch(name)
     return re.sub(r"[^a-z0-9]", "", (found[1] if found else name).lower())

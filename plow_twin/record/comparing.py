@@ -1,4 +1,4 @@
-"""Messages that were sent beside the publications that a replay gives: found and compared byte for byte, compiled."""
+"""Compiled comparison, byte for byte, of the messages that a run sent with the publications of its replay."""
 
 from __future__ import annotations
 
@@ -20,40 +20,41 @@ _IS_SLOW = np.array([topic.cadence is Cadence.SLOW for topic in REPLAYED])
 
 
 class Sent:
-    """Which advance of a run each message was sent after.
+    """For each message of a run, the advance after which it was sent.
 
     Parameters
     ----------
     sequence, kind : ndarray of int64, shape (n,)
-        Numbers of the journal, rising, and the messages' places in `REPLAYED` (-1: another topic).
+        Number of the journal entry before each message (rising), and the message's index in `REPLAYED` (-1: another
+        topic).
     done : ndarray of int64, shape (k,)
-        Advances up to each entry of the run, whose first one has the number `first`.
+        Number of advances up to each entry of the run, whose first entry has the number `first`.
     advances
-        How many the run has.
+        Number of advances of the run.
     """
 
     def __init__(self, sequence: Indexes, kind: Indexes, done: Indexes, first: int, advances: int) -> None:
         self.kind = kind
-        #: advance, from 0, after which each was sent
+        #: advance, from 0, after which each message was sent
         self.after = np.empty(len(kind), np.int64)
-        #: messages of each kind
+        #: number of messages of each kind
         self.counts = np.zeros(_KINDS, np.int64)
         numbers = np.full(advances, -1)
         find_advances(sequence, kind, done, first, self.after, self.counts, numbers)
-        #: advances after which a message was sent, and the sequence number of the message
+        #: advances after which messages were sent, and the sequence number of the first message after each
         self.taken = np.flatnonzero(numbers >= 0)
         self.first_sequence = numbers[self.taken]
-        #: publication by advance
+        #: index of the publication of each advance
         self.publication = np.empty(advances, np.int64)
         self.publication[self.taken] = np.arange(len(self.taken))
 
     def expect(self, published: Published, templates: Templates, kinds: NDArray[np.bool_]) -> None:
-        """Set the publications after the advances `taken`; only `kinds` of their messages are compared."""
+        """Set the publications after the advances `taken`; `kinds` is a mask of the message kinds to compare."""
         rows, slow = published
         slow_of = np.full(len(rows), -1)
         slow_of[slow["row"]] = np.arange(len(slow))
         numbers = [topic.numbers(topic.record_of(published)) for topic in REPLAYED]
-        #: kept alive: they are read by their addresses
+        #: kept alive, because compiled code reads them by address
         self._numbers = [[_with_whole_rows(part) for part in parts] for parts in numbers]
         self._expected = (
             self.publication, slow_of, kinds, np.ascontiguousarray(rows["stamp_ns"]),
@@ -61,7 +62,7 @@ class Sent:
         )  # fmt: skip
 
     def differing(self, messages: Messages, chosen: slice) -> list[int]:
-        """Return which messages, `chosen` among all, differ from those of their publication."""
+        """Return the indexes of messages that differ from their publication; `chosen` is their slice of all."""
         wrong = np.empty(len(messages), bool)
         places = messages.start, messages.length
         count = compare(messages.buffer, *places, self.kind[chosen], self.after[chosen], *self._expected, wrong)
@@ -81,14 +82,14 @@ def find_advances(sequence, kind, done, first, after, counts, numbers):  # type:
 
 
 def _with_whole_rows(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return numbers whose rows have no gaps; they may have some between them."""
+    """Return the numbers with contiguous rows; there may be gaps between rows."""
     return numbers if numbers.strides[1] == numbers.itemsize else np.ascontiguousarray(numbers)
 
 
 def _pieces(numbers: list[list[NDArray[np.float64]]], templates: Templates) -> tuple[Indexes, Indexes]:
-    """Return the runs of numbers that are contiguous both in messages and in rows, and the end of each kind.
+    """Return the pieces, which are contiguous both in the message and in the row, and the end of each kind's pieces.
 
-    A piece is its place in the message [B], how many they are, their address in the first row, and from row to row [B].
+    A piece is (offset in the message [B], count of numbers, address in the first row, stride between rows [B]).
     """
     found, ends = [], [0]
     for kind, parts in enumerate(numbers):
@@ -110,22 +111,22 @@ def compare(  # type: ignore[no-untyped-def]
     buffer, starts, lengths, kinds, after, publication, slow, compared, stamps, pieces, piece_ends,
     data, fixed, ends, different,
 ):  # fmt: skip
-    """Compare each message with its template filled with stamp and numbers of its publication, byte for byte.
+    """Compare each message, byte for byte, with its template filled with the stamp and numbers of its publication.
 
     Parameters
     ----------
     kinds, after : ndarray of int64, shape (n,)
         As in `Sent`.
     publication, slow : ndarray of int64
-        Publication by advance, and by publication the row of its slow part, below 0 without one.
+        Publication of each advance, and row of each publication's slow part (below 0: no slow part).
     compared : ndarray of bool
-        By kind.
+        Whether each kind is compared.
     pieces, piece_ends
         As in `_pieces`.
     data, fixed, ends
         As in `Templates`.
     different : ndarray of bool, shape (n,)
-        Receives the result for each message; the number of True is returned.
+        Receives whether each message differs; the function returns their number.
     """
     count = 0
     for n in range(starts.size):

@@ -14,10 +14,10 @@ import numpy as np
 from plow_twin.errors import RecordingError
 from plow_twin.record.template import Bytes
 
-#: Largest record and largest content of a chunk [B]; beyond it a length is damage. Writers close a chunk at some MiB.
+#: Largest record and largest chunk content [B]; a greater length is damage, as writers close a chunk at a few MiB.
 RECORD_LIMIT: Final = 64 * 1024 * 1024
 _of_thread: Final = threading.local()
-#: An LZ4 frame: its head, the flags in it, and the length before each block.
+#: Format of an LZ4 frame: head, magic number, flags, and the length before each block.
 _LZ4_HEAD: Final = struct.Struct("<IBB")
 _LZ4_MAGIC: Final = 0x184D2204
 _LZ4_INDEPENDENT, _LZ4_SIZE = 0x60, 0x08
@@ -48,7 +48,7 @@ def decompress(compression: str, data: memoryview, size: int) -> bytes | Bytes:
 
 @cache
 def _lz4_block() -> Callable[[int, int, int, int], int] | None:
-    """Return liblz4's LZ4_decompress_safe (source, target, length, room), None where it cannot be called."""
+    """Return `LZ4_decompress_safe(source, target, length, room)` of liblz4, or None if it cannot be called."""
     import lz4.block
 
     try:
@@ -60,10 +60,11 @@ def _lz4_block() -> Callable[[int, int, int, int], int] | None:
 
 
 def independent_blocks(data: memoryview, size: int) -> Bytes | None:
-    """Return the `size` bytes of an LZ4 frame as the recorder writes it; None for another frame.
+    """Return the content, `size` bytes, of an LZ4 frame written by the recorder, or None for any other frame.
 
-    Its blocks are independent and without checksums: the chunk has one. The library decompresses into its own memory
-    and copies that, which takes a third longer; with it a replay takes 13 % more processor time.
+    The blocks of such a frame are independent and have no checksums, because the chunk has a checksum. The lz4 package
+    decompresses into its own memory and copies the result, which takes a third longer and costs a replay 13 % more
+    processor time.
     """
     block = _lz4_block()
     if block is None or len(data) < _LZ4_HEAD.size or len(data) > RECORD_LIMIT:
@@ -79,7 +80,7 @@ def independent_blocks(data: memoryview, size: int) -> Bytes | None:
         place += 4
         if length == 0:
             return content if done == size else None
-        if length > len(data) - place:  # cut off, or an uncompressed block, whose highest bit is set
+        if length > len(data) - place:  # truncated, or an uncompressed block (the highest bit of its length is set)
             return None
         count = block(source + place, target + done, length, size - done)
         if count < 0:

@@ -1,4 +1,4 @@
-"""Selection of recorded publications: all, none, or some with the impulses and peaks of those left out."""
+"""Selection of the publications to record: all, none, or some that include the impulses and peaks of the rest."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ class Decimation:
     outputs
         `all`, `decimated` or `none`.
     rate_hz
-        Rate of a decimated recording [Hz]: the first publication in each such span of stamps is kept, and each that
-        has a slow part.
+        Rate of a decimated recording [Hz]: the first publication of each period is kept, and each publication with a
+        slow part.
     """
 
     def __init__(self, outputs: str, rate_hz: float) -> None:
@@ -33,7 +33,7 @@ class Decimation:
         return self._outputs == "all"
 
     def select(self, published: Published) -> Published | None:
-        """Return the publication to record after one of one row, or None."""
+        """Return the publication to record, or None, given a publication of one row."""
         if self._outputs == "all":
             return published
         if self._outputs == "none":

@@ -1,4 +1,4 @@
-"""Examination and repair of a recording: a part that was cut off or damaged gets its end and index again.
+"""Examination and repair of a recording: a truncated or damaged part gets its end and index again.
 
 A repair copies every readable message into a new file and keeps the old one under another name. Lost messages stay
 lost and are counted.
@@ -50,16 +50,16 @@ class PartReport:
     finished: bool
     damaged_chunks: int
     messages: dict[str, int]
-    #: bytes behind the end of the file: other readers refuse the file for them
+    #: bytes after the end of the file, for which other readers refuse the file
     trailing_bytes: int = 0
-    #: chunks that an earlier repair left out
+    #: number of chunks that an earlier repair left out
     left_out: int = 0
     #: whether the file begins as an MCAP file does
     mcap: bool = True
 
     @property
     def healthy(self) -> bool:
-        """Whether the file has its end, no bytes behind it and no damage."""
+        """Whether the file is complete, with no bytes after its end and no damage."""
         return self.mcap and self.finished and not self.damaged_chunks and not self.trailing_bytes
 
 
@@ -74,18 +74,18 @@ class RunReport:
     layout_version: str = str(LAYOUT_VERSION)
     entries: Counter[str] = field(default_factory=Counter)
     gaps: int = 0
-    #: entries that the files hold more than once
+    #: number of entries that occur more than once in the files
     repeated: int = 0
     lost: dict[str, int] = field(default_factory=dict)
     inputs: dict[str, dict[str, int]] = field(default_factory=dict)
-    #: advances that failed: their samples have no forces
+    #: number of failed advances, whose samples have no forces
     failed_advances: int = 0
-    #: as `duration_s` in the facts of a recording
+    #: the same as `duration_s` in the facts of a recording
     span_s: float = 0.0
     problems: list[str] = field(default_factory=list)
 
     def facts(self) -> dict[str, Any]:
-        """Return everything for JSON."""
+        """Return all facts for JSON."""
         parts = [
             {
                 "file": part.path.name,
@@ -120,7 +120,7 @@ def examine(path: Path) -> RunReport:
     Raises
     ------
     RecordingError
-        There is no recording of plow_twin, or its journal cannot be decoded.
+        The path is not a recording of plow_twin, or its journal cannot be decoded.
     """
     reader = RunReader(path)
     report = RunReport(path)
@@ -128,7 +128,7 @@ def examine(path: Path) -> RunReport:
     report.parts = [_part(part) for part in reader.parts]
     expected: int | None = None if reader.header.part else 0
     run_time = RunTime(reader.header.parameters)
-    in_a_row = 0  # entries before the expected one without a gap
+    in_a_row = 0  # number of entries without a gap before the expected entry
     inputs = InputCounts(reader.header.excitation_source)
     for batch in reader.batches(outputs=False):
         entries = batch.entries
@@ -186,9 +186,9 @@ def _name_problems(report: RunReport, reader: RunReader) -> None:
     report.problems += problems
     unnamed = reader.missing_parts - sum("is missing: metadata" in problem for problem in problems)
     if unnamed > 0:
-        report.problems.append(f"{unnamed} part(s) are missing by their numbers")
+        report.problems.append(f"{unnamed} part(s) are missing, as the part numbers show")
     if report.repeated:
-        report.problems.append(f"{report.repeated} journal entries occur more than once: the first are used")
+        report.problems.append(f"{report.repeated} journal entries occur more than once: the first of each is used")
     if report.gaps:
         report.problems.append(f"{report.gaps} journal entries are missing")
     for topic, count in report.lost.items():
@@ -210,7 +210,7 @@ def _part_problems(part: PartReport) -> list[str]:
     if part.left_out:
         problems.append(f"{part.left_out} chunk(s) left out by a repair")
     if part.trailing_bytes:
-        problems.append(f"{part.trailing_bytes} B behind its end")
+        problems.append(f"{part.trailing_bytes} B after its end")
     return [f"{part.path.name}: {problem}" for problem in problems]
 
 
@@ -229,19 +229,19 @@ def _metadata_problems(reader: RunReader) -> list[str]:
 
 
 def repair(path: Path) -> list[Path]:
-    """Give each part that was cut off or damaged its end again, and the folder its `metadata.yaml`.
+    """Restore the end of each truncated or damaged part, and the `metadata.yaml` of the folder.
 
     Returns
     -------
     list of Path
-        The files that were rewritten or put aside, also files of other topics beside the run. A cut, damaged or
-        empty part stays as `<name>.damaged` (`<name>.damaged_2`, ...), a part that repeats another one as
-        `<name>.repeated`, a part of another run as `<name>.foreign`.
+        The files that were rewritten or put aside, including files of other topics beside the run. A truncated, damaged
+        or empty part is kept as `<name>.damaged` (`<name>.damaged_2`, ...), a part that repeats another part as
+        `<name>.repeated`, and a part of another run as `<name>.foreign`.
 
     Raises
     ------
     RecordingError, OSError
-        There is no recording of plow_twin, it is still being written, or the disk is full.
+        The path is not a recording of plow_twin, the recording is still being written, or the disk is full.
     """
     reader = RunReader(path)
     folder = reader.path.parent
@@ -250,7 +250,7 @@ def repair(path: Path) -> list[Path]:
     for parts in (reader.parts, whole.parts, *map(run_parts, besides)):
         with parts[-1].open("rb") as stream:
             if is_claimed(stream.fileno()):
-                raise RecordingError(f"{parts[-1]}: is being written, expected a recording that has ended")
+                raise RecordingError(f"{parts[-1]}: still being written, expected a recording that has ended")
     rewritten = []
     for files, ending in ((reader.repeated, "repeated"), (reader.foreign, "foreign")):
         for file in files:
@@ -272,7 +272,7 @@ def repair(path: Path) -> list[Path]:
 
 
 def _mend(parts: Sequence[Path], last: Path) -> list[Path]:
-    """Rewrite parts that were cut off or damaged, put empty parts aside, and return both."""
+    """Rewrite truncated or damaged parts, put empty parts aside, and return both."""
     mended = []
     for part in parts:
         if not (is_begun(part) and is_mcap(part)):
@@ -286,7 +286,7 @@ def _mend(parts: Sequence[Path], last: Path) -> list[Path]:
 
 
 def _put_aside(file: Path, ending: str) -> None:
-    """Rename a file to a name that is free."""
+    """Rename a file to an unused name with an ending."""
     target, number = file.with_name(f"{file.name}.{ending}"), 2
     while target.exists():
         target, number = file.with_name(f"{file.name}.{ending}_{number}"), number + 1
@@ -304,9 +304,9 @@ def _list_parts(folder: Path, parts: Sequence[Path], repaired: Sequence[str]) ->
 
 
 def _rewrite(part: Path, *, last: bool) -> None:
-    """Copy the readable messages into a new file in the place of the old one, with a note at each gap.
+    """Replace a file by a new file with its readable messages and a note at each gap.
 
-    The end of the last part is the end of the recording and no gap.
+    The end of the last part is the end of the recording, not a gap.
     """
     target = part.with_name(f"{part.name}.partial")
     target.unlink(missing_ok=True)

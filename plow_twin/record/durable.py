@@ -1,4 +1,4 @@
-"""Files that are whole after any failure, errors of the disk that name the file, and waiting for the disk."""
+"""Writing of files in one step, disk errors that name the file, and waiting for the disk."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import BinaryIO
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Add the name of the file or folder to errors of writes to it, such as the error of a full disk."""
+    """Add the path to errors of writing to a file or folder, such as the error of a full disk."""
     try:
         yield
     except OSError as error:
@@ -24,20 +24,20 @@ def naming(path: Path) -> Iterator[None]:
 def whole_file(path: Path, *, sync: bool = False) -> Iterator[BinaryIO]:
     """Open a stream whose content becomes the file `path` in one step at the end.
 
-    Until then, and after an error or a kill, the file stays as it was. With `sync` that holds after a loss of power
-    too. A pipe or a device is written to directly.
+    Until then, and after an error or a kill, the file stays as it was. With `sync` it also survives a loss of power. A
+    pipe or a device is written to directly.
 
     Raises
     ------
     OSError
-        The file cannot be written; the error has its name.
+        The file cannot be written; the error names it.
     """
     try:
         if path.exists() and not path.is_file():
             with path.open("wb") as stream:
                 yield stream
             return
-        place = path.resolve()  # a link keeps pointing there
+        place = path.resolve()  # a symbolic link stays a link
         beside = place.with_name(f".{place.name}.{os.getpid()}")
         try:
             with beside.open("wb") as stream:
@@ -52,24 +52,24 @@ def whole_file(path: Path, *, sync: bool = False) -> Iterator[BinaryIO]:
         if sync:
             sync_path(place.parent)
     except OSError as error:
-        if error.errno is None:  # an error of a library with its own text
+        if error.errno is None:  # raised by a library, with its own text
             raise
         raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 def write_whole(path: Path, content: bytes, *, sync: bool = False) -> None:
-    """Write a file in one step: `whole_file`."""
+    """Write a file in one step by `whole_file`."""
     with whole_file(path, sync=sync) as stream:
         stream.write(content)
 
 
 def sync_path(*paths: Path) -> None:
-    """Wait until the disk has files, or the entries of folders: a new file is lost without its folder.
+    """Wait until files, or the entries of folders, are on the disk; a new file also needs its entry in the folder.
 
     Raises
     ------
     OSError
-        The disk does not take it.
+        The disk cannot be written.
     """
     for path in paths:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)

@@ -1,4 +1,4 @@
-"""Records of a recording, journal entries and outputs: one by one and in batches of arrays."""
+"""Records of a recording (journal entries and outputs), one by one and in batches of arrays."""
 
 from __future__ import annotations
 
@@ -50,10 +50,10 @@ Record = EntryRecord | OutputRecord
 
 @dataclass(frozen=True)
 class Entries:
-    """Journal entries in order of use, shape (n,) each, by kind: `sample` is True for samples.
+    """Journal entries as arrays of shape (n,), in order of use.
 
-    Digests have the indexes `digest_at` (m,) and the values `digest` (m,), their stamps are in `stamp_ns`; all other
-    entries are in `rest` by index. Sequence numbers do not wrap at 2^32.
+    `sample` is True for samples. `digest_at` (m,) has the indexes of the digests and `digest` (m,) their values; their
+    stamps are in `stamp_ns`. All other entries are in `rest` by index. Sequence numbers do not wrap at 2^32.
     """
 
     sequence: Indexes
@@ -83,7 +83,7 @@ class Entries:
         )
 
     def samples(self) -> tuple[Indexes, NDArray[np.float64]]:
-        """Return stamps and wrenches of the samples alone."""
+        """Return the stamps and wrenches of the samples."""
         places = np.flatnonzero(self.sample)
         return self.stamp_ns[places], self.wrench.take(places, axis=0)  # a mask of rows takes five times as long
 
@@ -168,9 +168,10 @@ class Outputs:
 
 @dataclass(frozen=True)
 class Batch:
-    """Entries, and all outputs sent after one of them and before the next batch.
+    """Entries, and all outputs sent after them and before the next batch.
 
-    `damaged` : chunks could not be read since the batch before; their records may be missing anywhere in this one.
+    `damaged` is True if chunks since the previous batch could not be read; their records may be missing anywhere in
+    this batch.
     """
 
     entries: Entries
@@ -178,7 +179,7 @@ class Batch:
     damaged: bool = False
 
     def parted(self, places: Sequence[int]) -> Iterator[Batch]:
-        """Yield the batch in pieces that end before the given entries, whose indexes rise, then the rest."""
+        """Yield the batch in pieces: one up to before each of the entries `places` (rising indexes), then the rest."""
         outputs, begin = self.outputs, 0
         for place in places:
             now, outputs = parted_at(outputs, int(self.entries.sequence[place]))
@@ -188,13 +189,13 @@ class Batch:
 
 
 class Holes:
-    """Finds missing entries of a journal by sequence numbers, batch after batch."""
+    """Search for missing journal entries by sequence number, batch after batch."""
 
     def __init__(self) -> None:
         self._next: int | None = None  # number of the next entry
 
     def find(self, entries: Entries) -> dict[int, int]:
-        """Return how many entries are missing before an index, for each index with a gap, in order."""
+        """Return the number of entries that are missing before an index, for each index after a gap, in order."""
         if not len(entries):
             return {}
         reached = np.maximum.accumulate(entries.sequence) + 1
@@ -220,7 +221,7 @@ def in_order(batch: Batch) -> Iterator[Record]:
     sequences = [part.sequence for part in batch.outputs]
     owners = np.concatenate([np.full(len(part), number) for number, part in enumerate(sequences)] or [np.zeros(0, int)])
     places = np.concatenate([np.arange(len(part)) for part in sequences] or [np.zeros(0, int)])
-    # outputs stand before an entry of a higher number; the running maximum keeps unordered files in their order
+    # outputs come before the first entry with a higher number; the running maximum keeps the order of unordered files
     bounds = np.maximum.accumulate(batch.entries.sequence) if len(batch.entries) else batch.entries.sequence
     slots = np.searchsorted(bounds, np.concatenate(sequences or [np.zeros(0, np.int64)]), side="right")
     order = np.argsort(slots, kind="stable")
@@ -236,6 +237,6 @@ def in_order(batch: Batch) -> Iterator[Record]:
 
 @compiled
 def unwrap(sequence: Indexes, base: int, out: Indexes) -> None:
-    """Write the unwrapped numbers, those nearest to `base`."""
+    """Write the unwrapped numbers, each the value nearest to `base`."""
     for n in range(sequence.size):
         out[n] = base + ((sequence[n] - base + _HALF) & (_WHOLE - 1)) - _HALF

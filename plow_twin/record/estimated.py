@@ -1,4 +1,4 @@
-"""The estimates of a live node, formed again from its journal, and the scene at the end of a run."""
+"""The estimates of a live node, read from its journal, and the scene at the end of a run."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from plow_twin.stream.session import wear_in
 
 @dataclass(frozen=True, eq=False)
 class LiveEstimate:
-    """An estimate as the node journalled it, with its window as the journal gives it.
+    """An estimate from the journal of a node, with its window formed again from the journal.
 
-    `window` is None where the journal lacks a part of it: files were removed, or entries were lost.
+    `window` is None if part of it is missing because files were removed or entries were lost.
     """
 
     entry: Estimated
@@ -38,7 +38,7 @@ class LiveEstimate:
 
 
 def live_estimates(reader: RunReader) -> Iterator[LiveEstimate]:
-    """Yield the estimates of a run in order; windows are formed where the node formed them."""
+    """Yield the estimates of a run in order; each window is formed at the same entry as in the node."""
     settings = reader.header.parameters
     if not settings.get("estimate"):
         return
@@ -73,7 +73,7 @@ def live_estimates(reader: RunReader) -> Iterator[LiveEstimate]:
 
 
 def left_by(reader: RunReader) -> tuple[Scene, Estimated | None]:
-    """Return the scene at the end of a run (its wear, its changed numbers) and the newest estimate of the pads."""
+    """Return the scene at the end of a run, with its wear and changed numbers, and the newest estimate of the pads."""
     scene, newest = reader.header.scene(reader.path), None
     depth, changes = None, dict[str, float]()
     for batch in reader.batches(outputs=False):
@@ -100,7 +100,7 @@ def stated(parameters: Mapping[str, Any]) -> tuple[Deviation, Deviation]:
 
 
 def _whole(window: Window | str, entry: Estimated) -> Window | None:
-    """Return the window if its bounds and counts are those that the node journalled."""
+    """Return the window if its bounds and counts equal those in the journal, otherwise None."""
     if isinstance(window, str):
         return None
     formed = window.start_ns, window.end_ns, window.samples, window.poses

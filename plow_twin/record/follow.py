@@ -1,6 +1,6 @@
 """A recording that is still being written: checks for its writer, and waits for further content.
 
-A writer holds a lock on its file, which the operating system releases at any end of the process.
+A writer locks its file; the operating system releases the lock however the process ends.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ POLL_S: Final = 0.1
 
 
 def claim(descriptor: int) -> None:
-    """Lock a file that is being written until it is closed; a file system without locks is left as it is."""
+    """Lock a file, until it is closed, as being written; do nothing on a file system without locks."""
     import fcntl
 
     try:
@@ -37,12 +37,12 @@ def is_claimed(descriptor: int) -> bool:
 
 
 class Tail:
-    """Waiting of a reader at the end of a file that grows.
+    """The wait of a reader at the end of a growing file.
 
     Parameters
     ----------
     stop
-        Asked while the reader waits: True ends the reading.
+        Called while the reader waits; True ends the reading.
     """
 
     def __init__(self, stop: Callable[[], bool] = lambda: False) -> None:
@@ -53,7 +53,7 @@ class Tail:
     def more(self, stream: IO[bytes], size: int) -> bool:
         """Wait until a file is longer than `size` [B]; False when its writer has ended."""
         while True:
-            # asked before the size, so that the last bytes of a writer that ends are read too
+            # checked before the size, so that the last bytes of an ending writer are still read
             alive = is_claimed(stream.fileno())
             if os.fstat(stream.fileno()).st_size > size:
                 return True

@@ -1,4 +1,4 @@
-"""Facts of a recording of another program, as a mapping reads it."""
+"""Facts of a recording of another program, read through a mapping."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from plow_twin.record.sources import open_source
 
 @dataclass
 class _Seen:
-    """Messages of a role: those that were read, those that did not fit, their stamps [ns] and numbers in SI."""
+    """Messages of a role: how many were used and did not fit, and the range of their stamps [ns] and numbers in SI."""
 
     used: int = 0
     unfit: int = 0

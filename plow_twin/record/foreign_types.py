@@ -1,4 +1,4 @@
-"""Message types with their text in a recording: parsed within bounds, because decoders are generated from them."""
+"""Message types whose text is in a recording; parsing is bounded, because decoders are generated from the types."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from typing import Any, Final
 
 from plow_twin.errors import RecordingError
 
-#: Longest text of a type without its comments [characters]; types with all that they use have some 10,000.
+#: Longest text of a type and all types that it uses, without comments [characters]; usual texts have some 10,000.
 _LONGEST: Final = 2**18
-#: Most numbers, texts and arrays of numbers in a message whose sequences have one item each.
+#: Largest number of parts (numbers, texts, arrays of numbers) of a message whose sequences have one item each.
 _MOST_PARTS: Final = 1_000
 
 
@@ -18,8 +18,8 @@ def parsed_types(text: str, message_type: str) -> dict[str, Any]:
     Raises
     ------
     RecordingError
-        The text is too long, or the type holds itself or too many parts. Parser and type store raise other errors for
-        for other texts.
+        The text is too long, or the type contains itself or too many parts. The parser and the type store raise other
+        errors for other bad texts.
     """
     from rosbags.typesys import get_types_from_msg
 
@@ -35,11 +35,11 @@ def parsed_types(text: str, message_type: str) -> dict[str, Any]:
 
 
 def _count(name: str, types: dict[str, Any], counts: dict[str, int]) -> int:
-    """Return how many parts a message of a type has; types of the store count as one."""
+    """Return the number of parts of a message of a type; a type of the store is one part."""
     if name not in types:
         return 1
     if name not in counts:
-        counts[name] = _MOST_PARTS + 1  # a type that holds itself has no end
+        counts[name] = _MOST_PARTS + 1  # a type that contains itself has no end
         counts[name] = max(1, sum(_parts(field, types, counts) for _, field in types[name][1]))
     if counts[name] > _MOST_PARTS:
         raise RecordingError(f"{name}: got more parts, expected at most {_MOST_PARTS}")

@@ -17,7 +17,7 @@ from plow_twin.stream.journal import ParameterValue
 HEADER_RECORD: Final = "plow_twin"
 #: Name of the MCAP metadata record, written at close, that holds the loss counters.
 LOSS_RECORD: Final = "plow_twin_loss"
-#: Its key for the reason why recording ended before the run; all other keys are topics.
+#: Key of the loss record for the reason why recording ended before the run; all other keys are topics.
 STOPPED_EARLY_KEY: Final = "stopped_early"
 #: Version of the layout that `docs/recording.md` describes.
 LAYOUT_VERSION: Final = 4
@@ -27,10 +27,10 @@ LAYOUT_VERSION: Final = 4
 class RunHeader:
     """Scene and settings of a run.
 
-    `scene_yaml` is self-contained. `topics` maps base names of outputs to the names they were sent under. `clock` is
+    `scene_yaml` is self-contained. `topics` maps base names of outputs to their topic names in the run. `clock` is
     the clock of the receive times: `system` or `ros` (under `/clock`). `origin_ns` is the first stamp if it was known.
-    `record_outputs` says which outputs are recorded: `all`, `decimated` or `none`. `part` counts the files of a run,
-    which share the random `run_id`.
+    `record_outputs` says which outputs are recorded: `all`, `decimated` or `none`. `part` is the number of this file in
+    the run; all files of a run share the random `run_id`.
     """
 
     scene_yaml: str
@@ -70,7 +70,7 @@ class RunHeader:
         return f"{self.node}/journal/entries"
 
     def topic(self, base_name: str) -> str:
-        """Return the name that an output was sent under."""
+        """Return the topic name under which an output was sent."""
         return self.topics.get(base_name, f"{self.node.rpartition('/')[0]}/{base_name}")
 
     def scene(self, source: object) -> Scene:
@@ -79,7 +79,7 @@ class RunHeader:
         Raises
         ------
         RecordingError
-            The scene cannot be used: the recording is damaged, or its law is not known here.
+            The scene cannot be used: the recording is damaged, or this version does not know its contact law.
         """
         from plow_twin.scene_file import loads_scene
 

@@ -1,4 +1,4 @@
-"""The load of any recording through a twin, with the intake, the treatment of late samples and the journal of a run."""
+"""The load of any recording fed to a twin, with the same intake, handling of late samples and journal as a live run."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from plow_twin.stream.steps import Steps
 
 @dataclass
 class Feed:
-    """Pass messages in order of arrival to a walker, samples of the load after they are judged.
+    """Pass messages in order of arrival to walkers; samples of the load are judged first.
 
-    `measured` receives role, stamp [ns] and numbers of all other roles than load and speed.
+    `measured` receives the role, stamp [ns] and numbers of all messages except load and speed.
     """
 
     walkers: list[Walker]
     roles: dict[str, Role]
     measured: Callable[[str, int, dict[str, float]], object]
     intake: Intake = field(default_factory=Intake)
-    #: number of messages that were not used, by reason; the intake also counts the load's
+    #: numbers of unused messages by reason; the intake counts those of the load as well
     unfit: Counter[str] = field(default_factory=Counter)
-    #: whether the first walker's journal gets the measured poses, which move nothing
+    #: whether the measured poses, which do not affect the motion, go into the first walker's journal
     with_poses: bool = False
-    #: stretches without samples, in which the load is a straight line
+    #: stretches without samples, in which the load is interpolated linearly
     silences: Silences = field(default_factory=lambda: Silences(Policy.excitation_timeout_s))
     _poses: list[Pose | PartOfPose] = field(default_factory=list)
     _stamps: list[int] = field(default_factory=list)
@@ -71,8 +71,7 @@ class Feed:
             refused = ", ".join(f"{verdict.value} {count}" for verdict, count in self.intake.counts.items() if count)
             why = "".join(f"; {why}" for why in self.unfit if why.startswith("excitation: "))
             raise RecordingError(
-                f"excitation: got no sample that can be used (topic {topic}: {refused or 'no message'}{why}), "
-                "expected some"
+                f"excitation: got no usable sample (topic {topic}: {refused or 'no message'}{why}), expected some"
             )
         for walker in self.walkers:
             walker.close()
@@ -93,7 +92,7 @@ class Feed:
                 self.flush()
                 for walker in self.walkers:
                     walker.speed_m_s = speed
-                    # at once: it acts from its stamp on
+                    # the speed acts from this sample on
                     walker.apply(Travel(self._reached_ns or 0, speed), max(0, log_time_ns))
         elif name == "excitation":
             wrench = (values["fx"], values["fy"], values["m"])
@@ -123,7 +122,7 @@ class Feed:
             self.flush()
 
     def flush(self) -> None:
-        """Advance by the samples that wait, after the poses that came with them."""
+        """Advance by the waiting samples, after applying the poses that arrived with them."""
         first_ns = self._log_times[0] if self._log_times else 0
         for pose in self._poses if self._log_times or self._reached_ns is not None else ():
             self.walkers[0].apply(pose, first_ns)

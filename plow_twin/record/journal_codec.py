@@ -70,12 +70,12 @@ _KINDS: Final[dict[str, type[Any]]] = {
     "loss": Loss,
     "dropped": Dropped,
 }
-#: A digest's message before its two numbers: encoding, no dimensions, no offset, the count of numbers, padding.
+#: Bytes of a digest's message before its two numbers: encoding, no dimensions, no offset, count of numbers, padding.
 _DIGEST_HEAD: Final = np.frombuffer(struct.pack("<BBHIII4x", 0, 1, 0, 0, 0, 2), np.uint8)
 _DIGEST_SIZE: Final = len(_DIGEST_HEAD) + 16
 _MASK: Final = 2**64 - 1
 _SIGN: Final = 2**63
-#: Optional fields.
+#: Fields that an entry may lack.
 _OPTIONAL: Final = frozenset({"deviation"})
 _NAMES: Final = {kind: name for name, kind in _KINDS.items()}
 
@@ -106,7 +106,7 @@ def from_message(message: Message, source: str = "journal") -> Entry | Dropped:
     Raises
     ------
     RecordingError
-        The message holds no entry; `source` names it in the error.
+        The message is not an entry; the error names `source`.
     """
     if isinstance(message, WrenchStamped):
         wrench = (message.force[0], message.force[1], message.torque[2])
@@ -115,7 +115,7 @@ def from_message(message: Message, source: str = "journal") -> Entry | Dropped:
         return Sample(message.stamp_ns, wrench)
     if isinstance(message, Integers):
         if len(message.data) != 2:
-            raise RecordingError(f"{source}: got {len(message.data)} integers, expected a digest's two")
+            raise RecordingError(f"{source}: got {len(message.data)} integers, expected the two of a digest")
         stamp_ns, digest = message.data
         return Digest((stamp_ns ^ _SIGN) - _SIGN, f"{digest:016x}")
     if not isinstance(message, Text):
@@ -126,9 +126,9 @@ def from_message(message: Message, source: str = "journal") -> Entry | Dropped:
 def read_digests(
     buffer: Bytes, start: Indexes, length: Indexes
 ) -> tuple[NDArray[np.bool_], Indexes, NDArray[np.uint64]]:
-    """Return which messages are digests, and the stamps [ns] and digests of these.
+    """Return a mask of the messages that are digests, and the stamps [ns] and values of these digests.
 
-    `start` and `length`, shape (n,), say where the messages stand in `buffer`.
+    `start` and `length`, shape (n,), give the place of each message in `buffer`.
     """
     found = (length == _DIGEST_SIZE) & (start >= 0) & (start + _DIGEST_SIZE <= buffer.size)
     messages = buffer[start[found, None] + np.arange(_DIGEST_SIZE)]
@@ -161,13 +161,13 @@ def _exactly(*kinds: type) -> Callable[[Any], Any]:
 
 
 def _no_number(text: str) -> Any:
-    raise ValueError(f"{text} is not a number of JSON")
+    raise ValueError(f"{text} is not a JSON number")
 
 
 def _integer(value: Any) -> int:
     found: int = _exactly(int)(value)
     if not -_SIGN <= found < _SIGN:
-        raise ValueError(f"an integer of {found.bit_length()} bits")
+        raise ValueError(f"got an integer of {found.bit_length()} bits, expected a signed 64-bit integer")
     return found
 
 
@@ -185,7 +185,7 @@ def _ints(value: Any) -> tuple[int, ...]:
 
 
 def _rows(value: Any) -> tuple[tuple[float, ...], ...]:
-    """Return rows of numbers; infinity and NaN are texts."""
+    """Return rows of numbers; infinity and NaN are given as texts."""
     read = _exactly(float, str)
     rows = tuple(tuple(float(read(item)) for item in row) for row in value)
     return rows

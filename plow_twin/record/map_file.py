@@ -24,14 +24,14 @@ ROLES: Final[dict[str, tuple[str, ...]]] = {
 }
 #: Type of a topic whose fields are nodes of an OPC UA server.
 OPCUA: Final = "opcua"
-#: Stamp of a node's values that counts for the sample: the sensor's, or the server's.
+#: Stamp of a node's values to use for the sample: the sensor's, or the server's.
 SOURCE_STAMP: Final = "source"
 SERVER_STAMP: Final = "server"
-#: Keys that a node may have, beside its identifier.
+#: Keys that a node may have besides its identifier.
 _NODE_KEYS: Final = ("scale", "offset", "unit", "limits")
-#: Key of a mapping beside the roles: the model of the load from the drive's signals.
+#: Key of the model that computes the load from the drive's signals.
 LOAD_MODEL: Final = "load_model"
-#: Units in SI, by quantity.
+#: Factor from each unit to SI, by quantity.
 UNITS: Final[dict[str, dict[str, float]]] = {
     "force": {"N": 1.0, "kN": 1e3, "MN": 1e6},
     "moment": {"N m": 1.0, "Nm": 1.0, "kN m": 1e3, "kNm": 1e3},
@@ -67,7 +67,7 @@ _LIMITS: Final[Schema] = {
     ],
     "description": "a number, or the smallest and the largest",
 }
-#: Largest difference of two clocks [s].
+#: Largest offset between two clocks [s].
 _MOST_OFFSET_S: Final = 1e9
 
 
@@ -76,7 +76,9 @@ class MapError(InputError, RecordingError):
 
 
 def read_map_file(path: Path) -> dict[str, Any]:
-    """Return the roles and the load model of a mapping file, numbers and texts for all of a role given to each.
+    """Return the roles and the load model of a mapping file.
+
+    A scale, offset, unit or limit that the file gives once for a role is repeated for each of the role's numbers.
 
     Raises
     ------
@@ -97,7 +99,7 @@ def read_map_file(path: Path) -> dict[str, Any]:
 
 
 def _for_each(role: Any, entry: Any) -> Any:
-    """Return a role without empty keys; a number, unit or limit for all names is given to each."""
+    """Return a role without empty keys; a scale, offset, unit or limit for all names is repeated for each name."""
     if role not in ROLES or not isinstance(entry, dict):
         return entry
     kinds: dict[str, tuple[type, ...]] = {
@@ -116,7 +118,7 @@ def _for_each(role: Any, entry: Any) -> Any:
 
 
 def _nodes_as_fields(role: Any, entry: Any) -> Any:
-    """Return a role whose fields name nodes (`fx: {node: ns=2;s=Load.Fx, unit: kN}`) in the form of the others."""
+    """Return a role with its nodes (`fx: {node: ns=2;s=Load.Fx, unit: kN}`) in the form of other fields."""
     if role not in ROLES or not isinstance(entry, dict):
         return entry
     named = {**entry, **(entry["fields"] if isinstance(entry.get("fields"), dict) else {})}
@@ -131,7 +133,7 @@ def _nodes_as_fields(role: Any, entry: Any) -> Any:
         if own:
             given = rest.get(key)
             rest[key] = {**(given if isinstance(given, dict) else {}), **own}
-        elif isinstance(rest.get(key), dict):  # a single entry for all names, except names without a node
+        elif isinstance(rest.get(key), dict):  # repeated for all names: drop those without a node
             rest[key] = {name: value for name, value in rest[key].items() if name in fields or name not in ROLES[role]}
     return {"stamp": SOURCE_STAMP, "stamp_unit": "ns", **rest, "topic": role, "type": OPCUA, "fields": fields}
 

@@ -32,7 +32,7 @@ from plow_twin.record.times import NO_TIME, NUMBER, STAMP_UNITS, TIMES, likely_u
 from plow_twin.scene_file.parquet_lines import SUFFIX
 
 Number = TypeVar("Number", float, NDArray[np.float64])
-#: Begin of the reasons under which messages are counted that do not fit their role.
+#: Prefix of the reasons in the counts of messages that do not fit their role.
 UNFIT: Final = "unfit, "
 _WRENCH: Final = {"fx": "wrench.force.x", "fy": "wrench.force.y", "m": "wrench.torque.z"}
 _FIELDS: Final[dict[tuple[str, str], dict[str, str]]] = {
@@ -72,10 +72,10 @@ class Role:
     """The role of a topic.
 
     A number is (`scale` times the field plus `offset`) times `factor`, in SI; numbers outside `limits` are not used.
-    `stamp` is `header`, `log`, or for CSV and JSON the path of the time (a number in `stamp_unit`, or a text in ISO
-    8601), to which `clock_offset_ns` is added. `sequence` is the path of the sender's number of the message, or empty.
-    A field is a path of names; `[3]` or `[name]` is an item of an array, the name being looked up in the message's
-    `name`. A path to a quaternion gives the angle about z.
+    `stamp` is `header`, `log`, or for CSV and JSON the path of the time (a number in `stamp_unit`, or an ISO 8601
+    text); `clock_offset_ns` is added to it. `sequence` is the path of the sender's message number, or empty. A field is
+    a path of names; `[3]` or `[name]` is an item of an array, and the name is looked up in the message's `name`. A path
+    to a quaternion gives the angle about z.
     """
 
     topic: str
@@ -104,7 +104,7 @@ class Role:
         return None if stamp_ns is None else (stamp_ns, values)
 
     def in_si(self, name: str, value: Number) -> Number:
-        """Return a number of that name, or an array of them, in SI."""
+        """Return a number, or an array of numbers, called `name` in SI."""
         return (value * self.scale.get(name, 1.0) + self.offset.get(name, 0.0)) * self.factor.get(name, 1.0)
 
     def stamp_ns(self, arrived: Arrived) -> int | None:
@@ -118,10 +118,10 @@ class Role:
         if with_value and content is None:
             count = len(self.message_type.names) if isinstance(self.message_type, Columns) else 0
             if not count:
-                return f"{self.topic} has a message that is no JSON object"
+                return f"{self.topic} has a message that is not a JSON object"
             return (
-                f"{self.topic} has a line without the {count} cells of its header (where commas are decimal signs, "
-                "semicolons or tabs must stand between the columns)"
+                f"{self.topic} has a line without the {count} cells of its header (if commas are decimal signs, "
+                "semicolons or tabs must separate the columns)"
             )
 
         def got(path: str) -> str:
@@ -140,12 +140,12 @@ class Role:
         expected = (
             f"seconds; they look like {likely}: state the unit: --unit t={likely}"
             if likely
-            else "a number or a date as 2026-01-02T03:04:05.678Z"
+            else "a number or a date such as 2026-01-02T03:04:05.678Z"
         )
         return f"{self.topic} has no time at {stamp!r}{got(stamp)}, expected {expected}"
 
     def plausible(self, values: Mapping[str, float]) -> bool:
-        """Return whether all numbers are within their limits; a missing number is."""
+        """Return whether all numbers are within their limits; a missing number passes."""
         return not any(
             values[name] < low or values[name] > high for name, (low, high) in self.limits.items() if name in values
         )
@@ -244,7 +244,7 @@ def readings(
 ) -> Iterator[tuple[str, Arrived, tuple[int, dict[str, float]] | None]]:
     """Yield each message with each of its roles, read by `Role.read`.
 
-    Where several roles share a topic, those whose fields are all empty are left out.
+    If several roles share a topic, roles whose fields are all empty are left out.
     """
     by_topic: dict[str, list[tuple[str, Role]]] = {}
     for name, role in roles.items():
@@ -257,7 +257,7 @@ def readings(
 
 
 def stamps_by(roles: Iterable[Role]) -> StampOf[Arrived]:
-    """Return a function that reads the stamp of a message by its roles; the first role with a stamp decides."""
+    """Return a function that reads a message's stamp by its roles; the first role with a stamp is used."""
     by_topic: dict[str, list[Role]] = {}
     for role in roles:
         by_topic.setdefault(role.topic, []).append(role)
@@ -278,7 +278,7 @@ def messages_of(source: Source, roles: Mapping[str, Role]) -> Iterator[Arrived]:
 def roles_by_source(
     sources: Sequence[Source], path: Path | None, left_out: str = ""
 ) -> Iterator[tuple[Source, dict[str, Role]]]:
-    """Yield the recordings of one run, each with the roles of its topics, as `read_map` of all topics together.
+    """Yield each recording of one run with the roles of its topics; `read_map` sees all topics together.
 
     Topics that begin with `left_out` have no role.
     """
@@ -292,9 +292,9 @@ def roles_by_source(
 
 
 def read_map(path: Path | None, topics: Mapping[str, TopicType] | None) -> dict[str, Role]:
-    """Return the roles of topics: from the YAML file, or without one by names and types.
+    """Return the roles of topics: from the YAML file, or without a file by names and types.
 
-    `topics` are types by topic; None if they are unknown: then each topic that the file names has JSON.
+    `topics` maps topics to types. If the types are unknown (None), each topic in the file is read as JSON.
 
     Raises
     ------
@@ -312,7 +312,7 @@ def _role(path: Path, role: str, entry: Mapping[str, Any], topics: Mapping[str, 
     topic, kind = _topic(path, role, entry, topics)
     fields = entry.get("fields") or _default_fields(role, kind)
     if not fields:
-        raise map_error(path, f"{role}.fields", "nothing", f"fields: {kind} has no default ones")
+        raise map_error(path, f"{role}.fields", "nothing", f"fields: {kind} has no default fields")
     if role == "excitation" and (missing := set(ROLES[role]) - set(fields)):
         raise map_error(path, f"{role}.fields", sorted(fields), f"{', '.join(sorted(missing))} too")
     units = entry.get("unit", {})
@@ -351,7 +351,7 @@ def _check_nodes(path: Path, role: str, found: Role) -> None:
 
 
 def with_units(roles: Mapping[str, Role], units: Mapping[str, str]) -> dict[str, Role]:
-    """Return roles whose numbers of these names (fx, x, ..., or t for stamps) are in these units.
+    """Return the roles with other units; `units` maps a number's name (fx, x, ..., or t for stamps) to its unit.
 
     Raises
     ------
@@ -378,7 +378,7 @@ def with_units(roles: Mapping[str, Role], units: Mapping[str, str]) -> dict[str,
 
 
 def _limits(path: Path, key: str, given: float | list[float]) -> tuple[float, float]:
-    """Return smallest and largest; a single number bounds both signs."""
+    """Return the smallest and the largest value; a single number is the bound for both signs."""
     low, high = given if isinstance(given, list) else (-given, given)
     if not low < high:
         raise map_error(path, key, given, "the smallest number, then the largest")
@@ -386,7 +386,7 @@ def _limits(path: Path, key: str, given: float | list[float]) -> tuple[float, fl
 
 
 def _check_columns(path: Path, name: str, role: Role) -> None:
-    """Raise a `MapError` for a name that is neither a column of a file of lines nor a place in one (`load.f[0]`)."""
+    """Raise a `MapError` for a name that is neither a column nor a path that begins with a column (`load.f[0]`)."""
     columns = role.message_type
     if not isinstance(columns, Columns):
         return
@@ -402,9 +402,9 @@ def _check_stamp_unit(path: Path, name: str, role: Role) -> None:
     """Raise a `MapError` for a unit that stamps cannot have."""
     kind, why = role.message_type, ""
     if role.stamp == "log":
-        why = "none beside stamp: log"
+        why = "none with stamp: log"
     elif role.stamp == "header" and isinstance(kind, Columns) and not set(TIMES) & set(kind.names):
-        why = f"a stamp that names its column too: the {kind} have none of {', '.join(TIMES)}"
+        why = f"also a stamp with the name of its column: the {kind} have none of {', '.join(TIMES)}"
     elif role.stamp == "header" and not isinstance(kind, Columns) and kind != "json":
         why = f"none: {kind} has stamps in ns"
     if why:
@@ -440,7 +440,7 @@ def _default_fields(role: str, kind: TopicType) -> dict[str, str]:
 
 
 def _guess(role: str, topics: Mapping[str, TopicType]) -> Role | None:
-    """Return the role of a topic found by its name, or as the only one of a fitting type."""
+    """Return the role with a topic found by its name, or with the only topic of a fitting type."""
     fitting = {}
     for topic, kind in topics.items():
         fields = _default_fields(role, kind)
@@ -448,7 +448,7 @@ def _guess(role: str, topics: Mapping[str, TopicType]) -> Role | None:
         if enough and "/journal/" not in topic:
             fitting[topic] = fields
     ending = [topic for name in _NAMES[role] for topic in fitting if topic.rpartition("/")[2] == name]
-    # forces and gaps by name alone: many topics have their type
+    # forces and gaps are found by name only, because many topics have their type
     lonely = list(fitting) if len(fitting) == 1 and role in ("excitation", "head_pose", "travel") else []
     lonely = [topic for topic in lonely if topic.rpartition("/")[2] not in ("head_state", "contact_forces")]
     for topic in (*ending, *lonely):

@@ -97,7 +97,7 @@ class ChunkBuilder:
         self._offsets.append(offset)
 
     def pop(self) -> tuple[Bytes, dict[int, Any]]:
-        """Return the records and, by channel, times and offsets in order of time; then start empty."""
+        """Return the records and each channel's index (times and offsets, in order of time), and empty the builder."""
         channels, times, offsets = map(np.concatenate, (self._channels, self._times, self._offsets))
         index = {}
         for channel in np.unique(channels).tolist():
@@ -168,7 +168,7 @@ class McapFile:
         self._schemas: dict[str, Any] = {}
         self._channels: dict[int, Any] = {}
         self._undeclared: list[Any] = []
-        # as bytes: a live run has some thousand chunks an hour, and objects take ten times the memory
+        # kept as bytes: a live run has some thousand chunks an hour, and objects would take ten times the memory
         self._chunk_index = bytearray()
         self._chunk_count = 0
         self._metadata: list[Any] = []
@@ -225,7 +225,7 @@ class McapFile:
         return number
 
     def chunk(self, builder: ChunkBuilder) -> None:
-        """Write a chunk and its index; an empty one is left out."""
+        """Write a chunk and its index; an empty chunk is not written."""
         if not builder.size:
             return
         content, index = builder.pop()
@@ -255,7 +255,7 @@ class McapFile:
             raw = entries.tobytes()
             parts.append(struct.pack("<BQHI", 7, 6 + len(raw), channel, len(raw)) + raw)
             place += len(parts[-1])
-        self._file.write(b"".join(parts))  # with its index in one go
+        self._file.write(b"".join(parts))  # the chunk and its index in one write
         self._undeclared = []
         for channel, entries in index.items():
             self._counts[channel] += len(entries)
@@ -351,7 +351,7 @@ def _compress(compression: str, content: Bytes) -> bytes:
     if compression == "lz4":
         import lz4.frame
 
-        # independent blocks: decompressed in two thirds of the time, 1 % larger
+        # independent blocks are decompressed in two thirds of the time and are 1 % larger
         data = lz4.frame.compress(content, block_linked=False)
     else:
         import zstandard
@@ -361,7 +361,7 @@ def _compress(compression: str, content: Bytes) -> bytes:
 
 
 class UnbufferedFile:
-    """A file without a buffer: on a full disk no bytes are left that could fail a second time."""
+    """A file without a buffer, so that on a full disk no bytes remain whose write could fail a second time."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

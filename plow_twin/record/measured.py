@@ -1,8 +1,8 @@
-"""Measured loads and motions for the estimate: from a folder, from a run, or from any recording by a mapping.
+"""Measured loads and motions for the estimate, read from a folder, a run, or any recording by a mapping.
 
-A folder holds scene.yaml, load.csv (t, fx, fy, m), pose.csv (t, x, y, theta) and, where gaps were measured, gaps.csv (t
-and columns named after pairs), beside which pose.csv may be missing. contact_forces.csv is optional and like gaps.csv.
-Each of the tables may be Parquet instead: load.parquet.
+A folder contains scene.yaml, load.csv (t, fx, fy, m) and pose.csv (t, x, y, theta). If gaps were measured, it also
+contains gaps.csv (t and columns named after pairs), and pose.csv may be missing. contact_forces.csv is optional and has
+the same columns as gaps.csv. Each table may be a Parquet file instead, such as load.parquet.
 """
 
 from __future__ import annotations
@@ -44,23 +44,23 @@ FORCES_FILE = "contact_forces.csv"
 _LOAD_COLUMNS: Final = ("t", "fx", "fy", "m")
 _POSE_COLUMNS: Final = ("t", "x", "y", "theta")
 _NOT_STATED: Final = (math.nan,) * 3
-#: Bound: rows of a table that are kept, the newest: 320 MB of a load, nearly three hours at 1 kHz.
+#: Largest number of rows kept of a table (the newest): 320 MB of a load, nearly three hours at 1 kHz.
 MOST_ROWS: Final = 10_000_000
-#: Among the losses: rows before those.
+#: Key of the losses for rows older than the kept rows.
 OLDER_ROWS: Final = "older_rows"
 
 
 class _Rows:
-    """Rows of numbers in bounded memory: the newest `MOST_ROWS`, and up to a quarter more until `table`."""
+    """The newest `MOST_ROWS` rows of numbers, and up to a quarter more until `table` is called."""
 
     def __init__(self, columns: int) -> None:
         self._columns, self._values = columns, array("d")
-        #: rows that came and are not kept
+        #: number of rows that were dropped
         self.dropped = 0
 
     @property
     def came(self) -> int:
-        """Number of rows, kept or not."""
+        """Number of rows that were added, kept or not."""
         return self.dropped + len(self._values) // self._columns
 
     def add(self, values: Iterable[float] | Array) -> None:
@@ -87,11 +87,11 @@ class _Rows:
 class Measured:
     """Measurements of one run.
 
-    load : (n, 4) t [s], Fx, Fy [N], M [N m] believed; poses : (k, 4) t [s], x, y [m], theta [rad], NaN where a cell is
-    empty; unreadable : rows that are not numbers, and the other losses of `lost`, which could not be read or used of a
-    recording; pose_deviation, load_deviation, gaps_deviation : stated standard
-    deviations, 0 where not stated; gaps : (m, 9) t [s] and the gaps of the eight pairs [m], NaN without a sensor;
-    forces : (m, 9) the same of contact forces [N].
+    load : (n, 4) t [s], Fx, Fy [N], M [N m] as measured; poses : (k, 4) t [s], x, y [m], theta [rad], NaN for an empty
+    cell; lost : numbers of rows and messages that could not be read or used, by reason, and unreadable : their sum;
+    pose_deviation, load_deviation, gaps_deviation : stated standard deviations, 0 if not stated; gaps : (m, 9) t [s]
+    and the gaps of the eight pairs [m], NaN without a sensor; forces : (m, 9) t [s] and the contact forces of the eight
+    pairs [N].
     """
 
     scene: Scene
@@ -107,7 +107,7 @@ class Measured:
 
 
 def read_measured(folder: Path, scene: Path | None = None) -> Measured:
-    """Read a folder; `scene` takes the place of its scene.yaml.
+    """Read a folder; `scene` replaces its scene.yaml.
 
     Raises
     ------
@@ -128,7 +128,7 @@ def read_measured(folder: Path, scene: Path | None = None) -> Measured:
         poses = _read(file, lost, _POSE_COLUMNS)
     model = load_scene(scene_path(str(scene)) if scene else folder / SCENE_FILE)
     if len(load) and load[0, 0] >= EPOCH_S:
-        # as in a recording: dates count from the first sample of the load
+        # as in a recording, times count from the first sample of the load
         for table in (poses, gaps, forces, load):
             table[:, 0] -= load[0, 0]
     return Measured(model, load, poses, lost.total(), gaps=gaps, lost=dict(lost), forces=forces)
@@ -140,17 +140,17 @@ def is_measured(folder: Path) -> bool:
 
 
 def _table(folder: Path, name: str) -> Path:
-    """Return the place of a table: Parquet where there is no CSV."""
+    """Return the path of a table: the Parquet file if there is no CSV file."""
     file = folder / name
     other = file.with_suffix(SUFFIX)
     return other if other.is_file() and not file.is_file() else file
 
 
 def read_recording(path: Path, scene: Path | None = None, mapping: Path | None = None) -> Measured:
-    """Read a run by its journal, or another recording (MCAP, rosbag2's sqlite3, csv) by the mapping.
+    """Read a run through its journal, or another recording (MCAP, rosbag2's sqlite3, CSV) through the mapping.
 
-    The measured pose of a run lies in its journal if the node estimated, otherwise in another recording that is given
-    too, or in its folder `beside`. Times count from the first sample of the load.
+    The measured pose of a run is in its journal if the node used it; otherwise it is read from other
+    topics in the run's folder, which include the folders `beside`. Times count from the first sample of the load.
 
     Raises
     ------
@@ -181,7 +181,7 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
             folder = path if path.is_dir() else path.parent
             places = [folder, *readable_beside(folder, lost)]
             rows, _, unread, why = _collect(places, mapping, ("head_pose", "forces"), own.header.node)
-            unread.pop("missing_parts", 0)  # the run has counted it
+            unread.pop("missing_parts", 0)  # already counted by the run
             lost.update(unread)
         lost.update(own.lost, damaged_chunks=own.damaged_chunks, **own.lost_parts)
     poses = rows["head_pose"]
@@ -199,11 +199,11 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
 
 
 def _journal(reader: RunReader, lost: Counter[str]) -> tuple[Array, list[int], Array, Array, Array, Array]:
-    """Return samples, the rows of them before which some are missing, poses, gaps, and stated deviations.
+    """Return the samples, the rows before which samples are missing, the poses, the gaps, and the stated deviations.
 
-    Stamps in ns are in front. The deviations are the largest of the load, (3,), and those that came with each pose,
-    (n, 3), NaN where not stated. Data before new pads, or a step of the clock, belong to another machine or time: the
-    last stretch counts.
+    The first column of each table is the stamp [ns]. The deviations are the load's largest, (3,), and each pose's own,
+    (n, 3), NaN if not stated. Only the data after the last change of the pads or step of the clock are returned,
+    because earlier data belong to another machine or time.
     """
     loads, poses, gaps = _Rows(4), _Rows(7), _Rows(1 + PAIR_COUNT)
     holes, begins, spread = Holes(), list[int](), np.zeros(3)
@@ -235,8 +235,8 @@ def _journal(reader: RunReader, lost: Counter[str]) -> tuple[Array, list[int], A
 def _longest(rows: Array, begins: list[int]) -> Array:
     """Return the longest stretch of a load without missing samples.
 
-    A stretch begins at a row of `begins` before which many samples are missing: unlike in a silence, a load acted
-    there.
+    A stretch begins at each row of `begins` before which many samples are missing. In such a gap, unlike in a silence,
+    an unknown load acted.
     """
     if len(rows) < 2:
         return rows
@@ -250,7 +250,7 @@ def _longest(rows: Array, begins: list[int]) -> Array:
 def _collect(
     places: list[Path], mapping: Path | None, wanted: tuple[str, ...], node: str
 ) -> tuple[dict[str, Array], list[int], Counter[str], str]:
-    """Return the rows of each wanted role, stamps in ns, the rows after gaps, the losses and a reason.
+    """Return the rows of each wanted role with stamps in ns, the rows after gaps, the losses and a reason.
 
     The rows after gaps belong to the load; the reason says why no message fits.
     """
@@ -276,7 +276,7 @@ def _collect(
 def _read(path: Path, lost: Counter[str], columns: tuple[str, ...], some: tuple[str, ...] = ()) -> Array:
     """Return the rows of a csv file, NaN for an empty cell; rows that could not be read are counted in `lost`.
 
-    `columns` must be there; missing ones of `some` are NaN.
+    All of `columns` are required; missing columns of `some` are NaN.
     """
     header, rows = read_table(path)
     names = list(header.names)
@@ -302,7 +302,7 @@ def _read(path: Path, lost: Counter[str], columns: tuple[str, ...], some: tuple[
 
 
 def _counted(rows: _Rows, lost: Counter[str]) -> Array:
-    """Return the table of rows, with those that are not kept among the losses."""
+    """Return the table of the kept rows and count the dropped rows in `lost`."""
     table = rows.table()
     if rows.dropped:
         lost[OLDER_ROWS] += rows.dropped
@@ -310,7 +310,7 @@ def _counted(rows: _Rows, lost: Counter[str]) -> Array:
 
 
 def _date(cell: str) -> float | None:
-    """Return the time of a date after ISO 8601 since the epoch in s."""
+    """Return the time since the epoch [s] of an ISO 8601 date, or None for any other text."""
     stamp_ns = time_ns(cell)
     return None if stamp_ns is None else 1e-9 * stamp_ns
 

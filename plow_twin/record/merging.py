@@ -1,4 +1,4 @@
-"""Messages of several files that were not written together, put in one order by their stamps."""
+"""Merging of the messages of separately written files by their stamps."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import Final, TypeAlias, TypeVar
 
 T = TypeVar("T")
 
-#: Returns the stamp of a message [ns], or None.
+#: A function that returns the stamp of a message [ns], or None.
 StampOf: TypeAlias = Callable[[T], int | None]
 
-#: A stamp older than the newest one by more than this [ns] is a step of the clock; less is a late row.
+#: A stamp older than the newest stamp by more than this [ns] is a step of the clock; by less, a late row.
 _STEP_NS: Final = 1_000_000_000
-#: One newer by more than this [ns] may be wrong.
+#: A stamp newer than the newest stamp so far by more than this [ns] may be wrong.
 _JUMP_NS: Final = 10_000_000_000
 
 
@@ -29,7 +29,7 @@ def merged(streams: Iterable[Iterator[T]], stamp_ns: StampOf[T]) -> Iterator[T]:
 
 
 def _placed(stream: Iterator[T], stamp_ns: StampOf[T]) -> Iterator[tuple[int, int, T]]:
-    """Yield each message with the number of steps of the clock before it and the newest stamp until then."""
+    """Yield each message with the number of steps of the clock before it and the newest stamp so far."""
     steps, newest = 0, None
     stamped = ((arrived, stamp_ns(arrived)) for arrived in stream)
     for (arrived, stamp), (_, following) in pairwise(chain(stamped, [(None, None)])):
@@ -43,7 +43,7 @@ def _placed(stream: Iterator[T], stamp_ns: StampOf[T]) -> Iterator[tuple[int, in
 
 
 def _is_stray(stamp: int, newest: int, following: int | None) -> bool:
-    """Return whether the next stamp continues the earlier stamps and not this one."""
+    """Return whether a stamp is a single wrong one: the next stamp continues the earlier stamps instead."""
     if following is None:
         return False
     back = newest - stamp > _STEP_NS

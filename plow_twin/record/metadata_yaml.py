@@ -1,4 +1,4 @@
-"""The `metadata.yaml` that rosbag2 of Jazzy (version 9) keeps beside its files, and the QoS texts inside the file."""
+"""The `metadata.yaml` of rosbag2 in Jazzy (version 9), and the QoS texts inside MCAP files."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from plow_twin.stream.topics import TOPICS
 
 METADATA_VERSION: Final = 9
 _INFINITE: Final = {"sec": 9223372036, "nsec": 854775807}
-#: Begin of the keys under `custom_data` that count lost messages; the topic follows.
+#: Prefix of the keys in `custom_data` that count lost messages; the topic follows.
 LOST: Final = "plow_twin_lost "
 
 
 @dataclass
 class TopicCount:
-    """A topic of a recording and its number of messages; QoS and hash of topics that the node does not send."""
+    """A topic of a recording and its number of messages, with QoS and type hash if the node does not send the topic."""
 
     topic: str
     message_type: str
@@ -135,13 +135,13 @@ def listed_parts(folder: Path) -> list[str]:
     Raises
     ------
     RecordingError
-        It is not the metadata of a bag.
+        The file is not the metadata of a bag.
     """
     path = folder / "metadata.yaml"
     try:
         found = _information(folder)["relative_file_paths"]
     except (RecordingError, LookupError, TypeError) as error:
-        raise RecordingError(f"{path}: cannot be read as the metadata of a bag") from error
+        raise RecordingError(f"{path}: cannot be read as metadata of a bag") from error
     return [str(name) for name in found]
 
 
@@ -150,7 +150,7 @@ def _information(folder: Path) -> Any:
 
 
 def _parsed(read: tuple[Any, list[Problem]]) -> Any:
-    """Return a document that was read; raises `RecordingError` if the document has problems."""
+    """Return the document, or raise `RecordingError` if reading it found problems."""
     document, problems = read
     if problems:
         raise RecordingError(f"{problems[0]}")

@@ -1,4 +1,4 @@
-"""The messages that follow from the record of a publication, by the table of topics: the same live and replayed."""
+"""The messages made from the record of a publication by the table of topics, equal in a live run and in a replay."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from plow_twin.stream.topics import JOINT_STATE, Cadence, Topic, names_of, topic
 
 Array = NDArray[np.float64]
 
-#: The topics with a message in each publication, or in publications with intervals or a slow part; all follow from the
-#: journal.
+#: Topics that a replay computes from the journal: with a message in each publication, or in each publication with
+#: intervals or a slow part.
 REPLAYED: Final = topics_of(Cadence.EACH, Cadence.FOLLOWED, Cadence.SLOW)
 #: Their base names.
 PUBLICATION_TOPICS: Final = tuple(topic.name for topic in REPLAYED)
-#: The topics among them that only a twin with `follow: full` has.
+#: Topics that only a twin with `follow: full` has.
 FOLLOWED_TOPICS: Final = names_of(Cadence.FOLLOWED)
 
 
 def publication_messages(published: Published, frame_id: str, child_frame_id: str) -> dict[str, Message]:
-    """Return the messages of a publication by the base name of their topic; slow ones only when it has them."""
+    """Return the messages of a publication by base name of the topic; slow messages only if it has a slow part."""
     return _messages(REPLAYED, published, frame_id, child_frame_id)
 
 
 def marks(published: Published, frame_id: str) -> dict[str, Message]:
-    """Return the messages that a marked publication has beside them."""
+    """Return the additional messages of a marked publication."""
     return _messages(topics_of(Cadence.MARKED), published, frame_id, "")
 
 
@@ -46,7 +46,7 @@ def _messages(
 
 
 def message(topic: Topic, stamp_ns: int, numbers: Array, frame_id: str, child_frame_id: str) -> Message:
-    """Return the message of a topic whose numbers, in the order of its columns, are given."""
+    """Return the message of a topic with the given numbers, in the order of the topic's columns."""
     ends = np.cumsum([sum(count for _, count in parts) for parts in topic.columns.values()])
     fields = dict(zip(topic.columns, np.split(numbers, ends[:-1]), strict=True))
     if topic.type == JOINT_STATE:

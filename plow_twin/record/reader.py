@@ -1,7 +1,7 @@
 """Reading a recording from front to back: complete, cut off by a kill, or with damaged chunks; one part or many.
 
-Only some chunks are in memory at a time, and no index is needed: a file without its end is read as far as it goes.
-Journal and outputs, which stand in chunks of their own, are put in order by their sequence numbers.
+Only some chunks are in memory at a time, and no index is needed: a truncated file is read as far as possible. Journal
+and outputs are in separate chunks and are put in order by their sequence numbers.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ from plow_twin.record.metadata_yaml import missing_files
 from plow_twin.record.template import Indexes, Template, read_numbers
 from plow_twin.stream.journal import Entry, Loss, Sample
 
-#: Journal entries that may wait for the messages sent after them [entries]: bounds the memory.
+#: Largest number of journal entries that wait for the messages sent after them; bounds the memory.
 _PENDING: Final = 65_536
-#: Fewest entries of a batch; outputs of a sixteenth as many chunks make a batch too.
+#: Smallest number of entries in a batch; outputs of a sixteenth as many chunks also make a batch.
 _LEAST: Final = 8192
-#: Fewest entries of a batch without outputs, which take most of the memory.
+#: The same number without outputs, which take most of the memory.
 _LEAST_ALONE: Final = 32_768
-#: Size of a second of a recording of all outputs at 1 kHz [B].
+#: Growth of a recording of all outputs at 1 kHz [B/s].
 _BYTES_PER_S: Final = 400_000
-#: Fx, Fy, M among the numbers of a sample.
+#: Indexes of Fx, Fy and M among the six numbers of a sample.
 _WRENCH: Final = np.array([0, 1, 5])
 
 
@@ -55,18 +55,19 @@ class FileStatus(Enum):
 
 @dataclass
 class RunReader:
-    """Iterate over the records of a recording, a folder or an `.mcap` file.
+    """Iterate over the records of a recording: a folder or an `.mcap` file.
 
     `status`, `damaged_chunks`, `lost`, `stop_reason` (of a recording that stopped early) and `counts` (records by
     topic) are known once the iteration has ended; `position` is the share of the files that has been read, 0..1.
 
     `path` is the first file. `parts` are the files that are read; `repeated` maps files that repeat a part to the file
-    that is read instead; `foreign` maps files of another run to the keys of their headers that differ from most. A part
-    that is not an MCAP file counts as a damaged chunk. `missing_parts` counts parts that `metadata.yaml` names, or the
-    numbers around them imply, and that the folder lacks. Parts that are removed while others are read are passed over.
+    that is read instead; `foreign` maps files of another run to the keys of their headers that differ from the
+    majority. A part that is not an MCAP file is counted as a damaged chunk. `missing_parts` counts the parts that the
+    folder lacks, according to `metadata.yaml` and to gaps in the part numbers. Parts that are removed while others are
+    read are skipped.
 
-    With a `tail` a recording is followed while it is written: new parts are read as well, and an empty batch follows
-    whenever all has been read.
+    With a `tail` a recording is followed while it is written: new parts are read as well, and an empty batch is yielded
+    whenever all records so far have been read.
 
     Raises
     ------
@@ -90,7 +91,7 @@ class RunReader:
         self._place = Path(self.path)
         self._headers: dict[Path, RunHeader] = {}
         self._counted: Counter[str] = Counter()
-        self._noted: dict[int, Loss | Dropped] = {}  # by sequence number: an entry may stand in two chunks
+        self._noted: dict[int, Loss | Dropped] = {}  # by sequence number, because an entry may be in two chunks
         self._look_for_parts()
         self.path = self.parts[0]
         for part in self.parts:
@@ -149,7 +150,7 @@ class RunReader:
 
     @property
     def lost(self) -> dict[str, int]:
-        """Losses by topic: as the recorder counted on closing, or noted until it was killed."""
+        """Losses by topic: the recorder's counts at close, or its notes in the journal if it was killed."""
         noted: Counter[str] = Counter()
         for entry in self._noted.values():
             noted[entry.topic if isinstance(entry, Dropped) else "journal"] += entry.count
@@ -157,10 +158,10 @@ class RunReader:
 
     @property
     def lost_parts(self) -> dict[str, int]:
-        """Counts of missing parts and parts of another run, by their names in `lost`; zeros are left out."""
+        """Numbers of missing parts and of parts of another run, by their keys among the losses; zeros are left out."""
         missing = (
             self.missing_parts if self.tail is None else 0
-        )  # the recorder may remove the oldest parts while they are followed
+        )  # the recorder may remove the oldest parts of a followed recording
         found = {"missing_parts": missing, "foreign_parts": len(self.foreign)}
         return {name: count for name, count in found.items() if count}
 
@@ -195,7 +196,7 @@ class RunReader:
         size, before = self.size(), 0
         finished, cut = True, False
         for part in self._parts_to_read():
-            self.damaged_chunks += cut  # the end that the part before lacks may be missing here
+            self.damaged_chunks += cut  # the previous part was cut: its last records may be missing here
             cut = False
             if self.tail is None and len(self.parts) > 1 and not is_begun(part):
                 finished, cut = False, True
@@ -231,7 +232,7 @@ class RunReader:
             self.status = FileStatus.COMPLETE if self.stop_reason is None else FileStatus.STOPPED_EARLY
 
     def _parts_to_read(self) -> Iterator[Path]:
-        """Yield the parts in order; with a tail also those that begin meanwhile."""
+        """Yield the parts in order; with a tail, also parts that begin during the reading."""
         done: list[Path] = []
         while left := [part for part in self.parts if part not in done]:
             done.append(left[0])
@@ -251,17 +252,17 @@ class RunReader:
         return found
 
     def duration_s(self) -> float:
-        """Return the span of the receive times [s] by the index of the parts, or a guess by their size."""
+        """Return the span of the receive times [s] from the parts' indexes, or an estimate from their size."""
         first_ns, last_ns, known = self._received_ns()
         return float(last_ns - first_ns) * 1e-9 if known else self.size() / _BYTES_PER_S
 
     def began_ns(self) -> int | None:
-        """Return the first receive time by the index of the parts [ns]; None while a part has no index."""
+        """Return the first receive time [ns] from the parts' indexes; None while a part has no index."""
         first_ns, _, known = self._received_ns()
         return first_ns if known else None
 
     def _received_ns(self) -> tuple[int, int, bool]:
-        """Return the first and the last receive time [ns], and whether each part has told its own."""
+        """Return the first and the last receive time [ns], and whether every part has an index."""
         from mcap.reader import make_reader
 
         first, last = [], []
@@ -284,7 +285,7 @@ class RunReader:
             counted = Counter({topic: int(count) for topic, count in record.items()})
         except ValueError as error:
             raise RecordingError(f"{self.path}: metadata {LOSS_RECORD!r}: {error}, expected counts") from error
-        self._counted = counted  # counted over the whole run: the newest part has all
+        self._counted = counted  # the newest part has the counts of the whole run
 
 
 class _Merger:
@@ -299,7 +300,7 @@ class _Merger:
         self._template = sample_template(header.frame_id)
         self._places = self._template.places[_WRENCH]
         self._entries = [NO_ENTRIES]
-        self._count = 0  # entries in them
+        self._count = 0  # number of waiting entries
         self._outputs: list[Outputs] = []
         self._base = 0
         self._part = reader.path
@@ -308,7 +309,7 @@ class _Merger:
         self._damaged = 0
 
     def begin(self, part: Path, chunks: ChunkReader) -> None:
-        """Go on with the next part."""
+        """Start the next part."""
         self._part, self._chunks = part, chunks
         self._topics = {}
 
@@ -339,7 +340,7 @@ class _Merger:
             elif channel.message_type in MESSAGE_TYPES:
                 sent.append(number)
                 named = channel.topic, channel.message_type
-                if self._topics.get(number) != named:  # a new dictionary: outputs of earlier parts keep theirs
+                if self._topics.get(number) != named:  # a new dictionary, as earlier outputs refer to the old one
                     self._topics = {**self._topics, number: named}
         if journal:
             chosen = messages if len(journal) == len(there) else _of(messages, journal)
@@ -361,7 +362,7 @@ class _Merger:
         yield from self._read_to(self._newest(newest) + 1)
 
     def _newest(self, least: int) -> int:
-        """Return the highest number of the entries, at least `least`."""
+        """Return the highest sequence number of the waiting entries, at least `least`."""
         return max(int(part.sequence.max(initial=least)) for part in self._entries)
 
     def _unwrap(self, sequence: Indexes) -> Indexes:
@@ -433,7 +434,7 @@ def sample_template(frame_id: str) -> Template:
 
 
 def read_header(path: Path) -> RunHeader | None:
-    """Return the header of a recording of plow_twin, or None without one.
+    """Return the header of a recording of plow_twin, or None for any other recording.
 
     Raises
     ------

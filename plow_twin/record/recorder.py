@@ -1,7 +1,7 @@
-"""The recorder of a live node: queues entries and publications without waiting and writes them in its own thread.
+"""The recorder of a live node: it queues entries and publications without waiting and writes them in its own thread.
 
-The caller's cost is a clock reading and an append. The thread empties the queue some times a second, lays messages into
-chunks, many in one compiled call, and compresses the chunks without the interpreter lock. When it falls behind, items
+The caller only reads a clock and appends to the queue. The thread empties the queue every 50 ms, writes many messages
+into chunks by one compiled call, and compresses the chunks without the interpreter lock. When it falls behind, items
 that do not fit in the queue are dropped, counted by topic, and noted at their place in the file.
 """
 
@@ -41,18 +41,17 @@ JOURNAL: Final = "journal"
 _POLL_S: Final = 0.05
 #: Errors of a full disk, which may have room again.
 _FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
-#: Items that are written in one go, some 0.2 ms of Python. Then the thread sleeps, so that a caller gets the
-#: interpreter: without the sleep the thread would get it back at once.
+#: Number of items written between two sleeps, some 0.2 ms of Python. The sleep gives callers the interpreter; without
+#: it the thread would get the interpreter back at once.
 _BURST: Final = 128
 
 
 @dataclass(frozen=True)
 class RecorderCounters:
-    """State of a recorder. `lost` counts by topic the messages that did not reach the file, journal entries as
-    `journal`.
+    """State of a recorder. `lost` counts by topic the messages that did not reach the file; `journal` counts entries.
 
-    `error` is why recording has stopped (None once it continues), or why the last ring was not written. `marks` counts
-    the rings that were written, `marks_lost` those that failed.
+    `error` is the reason why recording has stopped (None once it continues), or why the last ring was not written.
+    `marks` counts the rings that were written, and `marks_lost` the rings that could not be written.
     """
 
     written: int
@@ -74,11 +73,11 @@ class LossReport:
 
     @property
     def complete(self) -> bool:
-        """Whether the file is without loss and has its index."""
+        """Whether nothing was lost and the file has its index."""
         return self.closed and not self.lost and self.error is None
 
     def sentence(self, folder: Path) -> str:
-        """Say what the recording in `folder` lacks, and which commands show and complete it."""
+        """Return a sentence with the losses of the recording in `folder` and the commands that show and complete it."""
         lacks = [f"{count} lost of {topic}" for topic, count in self.lost.items()]
         if self.error is not None:
             lacks.append(self.error)
@@ -101,21 +100,22 @@ class Recorder:
     queue_size
         Items that may wait for the thread; the last quarter is kept for the journal.
     flush_period_s
-        A killed process loses at most the entries of that time [s] and the messages of twice that time.
+        Interval between writes to the operating system [s]: a killed process loses at most the entries of that time and
+        the messages of twice that time.
     chunk_size
         Bytes [B] in one compressed chunk.
     min_free_bytes
-        Recording stops while the disk has less free space [B].
+        Free space on the disk [B] below which recording pauses.
     part_bytes, part_s
-        Size [B] and time [s] at which the recording goes on in a new part; 0: never.
+        Size [B] and time [s] at which a new part is started; 0: never.
     keep_bytes
-        The oldest parts are removed while the sum of ended parts is larger [B]; 0: all are kept.
+        Size of all ended parts together [B] above which the oldest parts are removed; 0: all are kept.
     ring_s
-        Time kept in memory, which is written at each `mark` [s]; 0: everything is written.
+        Time kept in a ring in memory [s], which is written at each `mark`; 0: no ring, everything is written.
     sync
         Whether each flush, new part and ring waits for the disk (`fdatasync`), against a loss of power.
     now_ns
-        Receive times [ns], read in the caller's thread.
+        Function that returns the receive time [ns], called in the caller's thread.
     on_error
         Called once, from the recorder's thread, with the reason when recording stops early.
 
@@ -163,7 +163,7 @@ class Recorder:
         )
         if header.follow == "full":
             each += tuple(map(header.topic, names_of(Cadence.FOLLOWED)))
-        #: topics of a publication, by whether it has a slow part and whether it is marked
+        #: topics of a publication by (has a slow part, is marked)
         self._topics_of = {
             (False, False): each, (True, False): each + slow, (False, True): each + marked,
             (True, True): each + slow + marked,
@@ -172,7 +172,7 @@ class Recorder:
         self._split_due = False
         self._part_since = time.monotonic()
         self._queue: deque[_Item] = deque()
-        #: by how much the entries and publications that wait are more than the items of the queue
+        #: number of waiting entries and publications minus number of items in the queue
         self._more = 0
         self._queue_size = queue_size
         self._flush_period_s = flush_period_s
@@ -184,10 +184,10 @@ class Recorder:
         self._snapshot_due = False
         self._output_gaps: Counter[str] = Counter()
         self._lost: Counter[str] = Counter()
-        self._unflushed: Counter[str] = Counter()  # written, but not yet safe
+        self._unflushed: Counter[str] = Counter()  # written, but not yet flushed
         self._written = 0
         self._error: str | None = None
-        self._paused: str | None = None  # why items are refused just now
+        self._paused: str | None = None  # why items are refused at present
         self._closed = False
         self._accepting = True
         self._stopping = threading.Event()
@@ -197,7 +197,7 @@ class Recorder:
 
     @property
     def snapshot_wanted(self) -> bool:
-        """Whether the caller should journal a `Snapshot` now: after a loss, or at the end of a part."""
+        """Whether the caller should journal a `Snapshot` now, after a loss or at the end of a part."""
         if not (self._snapshot_due or self._split_due):
             return False
         return self._accepting and not self._paused and self._queued < self._queue_size // 2
@@ -212,9 +212,10 @@ class Recorder:
         return RecorderCounters(self._written, self._queued, self._writer.bytes_written, lost, error, *marks)
 
     def mark(self) -> Path | None:
-        """Write the ring, once the next `Snapshot` is journalled or the recorder is closed.
+        """Write the ring as soon as the next `Snapshot` is journalled or the recorder is closed.
 
-        Returns its folder, or None for a recorder without a ring. Further calls before it is written have no effect.
+        Returns the folder of the ring, or None for a recorder without a ring. Further calls before the ring is written
+        have no effect.
         """
         from plow_twin.record.writer import free_folder
 
@@ -233,7 +234,7 @@ class Recorder:
         now = self._now_ns()
         with self._lock:
             snapshot = isinstance(entry, Snapshot)
-            if not (snapshot or self._journal_gap) and self._room(1, self._queue_size):  # as nearly always
+            if not (snapshot or self._journal_gap) and self._room(1, self._queue_size):  # the usual case
                 self._push_entry(now, entry)
                 return True
             notes = len(self._output_gaps) if snapshot else 0
@@ -242,7 +243,7 @@ class Recorder:
                 if self._journal_gap:
                     self._push_entry(now, Loss(self._journal_gap))
                     self._journal_gap = 0
-                if snapshot:  # the loss is noted before it: all later messages can be compared
+                if snapshot:  # a note of the loss comes first, so that all later messages can be compared
                     self._push_notes(now)
                 self._push_entry(now, entry)
                 self._snapshot_due = self._snapshot_due and not snapshot
@@ -250,7 +251,7 @@ class Recorder:
                 return True
             self._snapshot_due = True
             if not (self._journal_gap and snapshot):
-                self._sequence += 1  # a lost entry keeps its number: messages sent meanwhile refer to it
+                self._sequence += 1  # a lost entry keeps its number, as messages refer to it
                 self._journal_gap += 1
                 self._lost[JOURNAL] += 1
             return False
@@ -266,7 +267,8 @@ class Recorder:
     def publication(self, published: Published, sent: Mapping[str, bytes] = MappingProxyType({})) -> bool:
         """Queue the messages of a publication of one row; False when they were lost.
 
-        `sent` has their bytes by base name of the topic. Without it the messages that follow from the journal are made.
+        `sent` has the bytes of the messages by base name of the topic. If it is empty, the recorder makes the messages
+        that follow from the journal.
         """
         now = self._now_ns()
         topics = self._topics_of[len(published.slow) > 0, bool(sent) and bool(published.rows["marked"][0])]
@@ -278,7 +280,7 @@ class Recorder:
     def series(self, series: Series) -> NDArray[np.int64]:
         """Queue the samples and digests of a series as entries of the journal, or lose all of them.
 
-        Returns the number of the entry before the publication after each sample, shape (n,).
+        Returns, for the publication after each sample, the number of the entry before it, shape (n,).
         """
         now, samples = self._now_ns(), len(series.stamps)
         count = samples + len(series.digests)
@@ -296,7 +298,7 @@ class Recorder:
         return item.sequence + np.arange(samples) + np.cumsum(ends)
 
     def publications(self, published: Published, sequence: NDArray[np.int64]) -> bool:
-        """Queue publications without sent messages, each after the entry of its number; False when lost."""
+        """Queue publications whose messages were not sent, each after the entry with its number; False when lost."""
         now, count = self._now_ns(), len(published.rows)
         topics = Counter(dict.fromkeys(self._topics_of[False, False], count))
         topics.update(dict.fromkeys(set(self._topics_of[True, False]) - topics.keys(), len(published.slow)))
@@ -322,11 +324,11 @@ class Recorder:
 
     @property
     def _queued(self) -> int:
-        """Number of items that wait, each entry and publication of a series counted."""
+        """Number of waiting items, in which each entry and publication of a series is counted."""
         return len(self._queue) + self._more
 
     def _push_many(self, item: _SeriesItem | _PublicationsItem, count: int) -> None:
-        """Queue an item that counts for several."""
+        """Queue an item that contains `count` entries or publications."""
         self._more += count - 1
         self._queue.append(item)
 
@@ -342,7 +344,8 @@ class Recorder:
     def close(self, timeout_s: float = 5.0) -> LossReport:
         """Write the queued items, close the file and return the losses.
 
-        Waits while items are written, and at most `timeout_s` [s] without one. A second call only returns the report.
+        Waits while items are being written, but at most `timeout_s` [s] without a written item. A second call only
+        returns the report.
         """
         atexit.unregister(self.close)
         with self._lock:
@@ -390,11 +393,11 @@ class Recorder:
                 self._give_up(reason)
             if self._mark is not None:
                 self._split()
-            with self._lock:  # callers go on counting their losses
+            with self._lock:  # callers may still count losses
                 lost = dict(self._lost)
             self._writer.close(lost, reason or self._paused)
             self._closed = True
-        except Exception as error:  # any error: the twin goes on without its recorder
+        except Exception as error:  # the twin continues without its recorder after any error
             self._give_up(str(error), self._unflushed)
             self._writer.abandon()
 
@@ -414,7 +417,7 @@ class Recorder:
                 time.sleep(1e-6)
 
     def _write(self, items: list[_Item]) -> None:
-        """Write items in order, runs of one kind at once; journal and outputs each keep their order."""
+        """Write items in order, all neighbours of one kind at once; journal and outputs each keep their order."""
         samples: list[_EntryItem] = []
         publications: list[_PublicationItem] = []
         for item in items:
@@ -434,7 +437,7 @@ class Recorder:
             else:
                 publications = self._write_publications(publications)
                 item.write(self._writer)
-        # samples first: their chunk must precede the chunk of the messages sent after them
+        # samples first, because their chunk must precede the chunk of the messages sent after them
         self._write_samples(samples)
         self._write_publications(publications)
 
@@ -461,7 +464,7 @@ class Recorder:
         return full or (part_s > 0.0 and time.monotonic() - self._part_since >= part_s)
 
     def _split(self) -> None:
-        """Go on in a new part; the snapshot that comes next makes it self-contained."""
+        """Start a new part; the next snapshot makes it self-contained."""
         with self._lock:
             lost = dict(self._lost)
         self._writer.split(lost, self._limits[2])
@@ -482,14 +485,14 @@ class Recorder:
 
         try:
             ring.dump(folder, lost)
-        except TakenError:  # another process has made that folder
+        except TakenError:  # another process has made this folder
             in_free_folder(self._folder, lambda other: ring.dump(other, lost))
 
     def _flush(self) -> str | None:
         self._writer.flush()
         self._unflushed.clear()
         reason = self._writer.reason_to_stop()
-        if reason is not None:  # the folder may be gone too, and with it the disk to ask
+        if reason is not None:  # the folder may be gone too: do not ask for free space
             return reason
         if self._part_is_full():
             self._split_due = True
@@ -502,7 +505,7 @@ class Recorder:
         return None
 
     def _pause(self, reason: str) -> None:
-        """Refuse items until the disk has room again; those that are queued or not yet safe are lost."""
+        """Refuse items until the disk has room again; queued items and items not yet flushed are lost."""
         with self._lock:
             first = not self._paused
             self._paused = reason
@@ -581,7 +584,7 @@ def _numbers(items: Sequence[_EntryItem | _PublicationItem]) -> tuple[NDArray[np
     return np.array(sequence, np.int64), np.array(log_time_ns, np.int64)
 
 
-# tuples are made in a quarter of the time of a frozen class, four thousand times a second
+# named tuples are made in a quarter of the time of frozen dataclasses, four thousand times a second
 class _EntryItem(NamedTuple):
     """A journal entry on its way to the file."""
 
@@ -617,7 +620,7 @@ class _OutputItem(NamedTuple):
 
 
 class _PublicationItem(NamedTuple):
-    """A publication on its way to the file with all its messages; `keys` are the topics that are lost with it."""
+    """A publication on its way to the file with all its messages; `keys` are the topics of these messages."""
 
     sequence: int
     log_time_ns: int
@@ -630,14 +633,14 @@ _Item: TypeAlias = _EntryItem | _OutputItem | _PublicationItem | _SeriesItem | _
 
 
 def _count(item: _Item) -> int:
-    """Return how many entries or publications an item counts for."""
+    """Return the number of entries or publications in an item."""
     if isinstance(item, _SeriesItem):
         return item.keys[JOURNAL]
     return len(item.sequence) if isinstance(item, _PublicationsItem) else 1
 
 
 def _add_keys(counts: Counter[str], items: Iterable[_Item]) -> None:
-    """Count the entries and messages that are lost with some items."""
+    """Add the entries and messages of items to counts of losses."""
     several = [item for item in items if isinstance(item, _SeriesItem | _PublicationsItem)]
     if not several:
         counts.update(chain.from_iterable(item.keys for item in items))

@@ -29,12 +29,12 @@ Array = NDArray[np.float64]
 Indexes = NDArray[np.int64]
 
 _POSE: Final = ("x", "y", "theta")
-#: Names of quantities that the record calls otherwise.
+#: Names in the tables for quantities with another name in the record.
 _NAMES: Final = {"makes": "touches"}
 
 
 def _columns_of(topic: Topic) -> tuple[str, ...]:
-    """Return the columns of the table of a topic: its names, `<name>/<quantity>` where it has several for each."""
+    """Return the columns of a topic's table: its names, or `<name>/<quantity>` if it has several quantities."""
     if topic.type != JOINT_STATE:
         return *_POSE, "velocity_x", "velocity_y", "omega"
     if len(topic.columns) == 1:
@@ -43,7 +43,7 @@ def _columns_of(topic: Topic) -> tuple[str, ...]:
     return tuple(f"{name}/{_NAMES.get(quantity, quantity)}" for quantity in quantities for name in topic.names)
 
 
-#: Columns of each table. The first two hold inputs of the twin, the others its outputs.
+#: Columns of each table. The first two tables are inputs of the twin, the others its outputs.
 COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
     "excitation": ("fx", "fy", "m"),
     "head_pose": _POSE,
@@ -81,7 +81,7 @@ class Recording:
     Attributes
     ----------
     path : Path
-        Where it lies.
+        Its first file.
     header : RunHeader
         Settings of the run.
     """
@@ -95,7 +95,7 @@ class Recording:
 
     @cached_property
     def scene(self) -> Scene:
-        """The scene that was computed; the tables do not need it.
+        """The scene of the run; the tables do not need it.
 
         Raises
         ------
@@ -117,7 +117,7 @@ class Recording:
     def losses(self) -> dict[str, int]:
         """Return the counts of missing messages by topic.
 
-        The recording is read for them, unless `batches` or a table has read it to its end already.
+        This reads the recording, unless `batches` or a table has already read it to its end.
         """
         if self._losses is None:
             for _ in self._read(outputs=False):
@@ -126,14 +126,14 @@ class Recording:
         return dict(self._losses)
 
     def _read(self, *, outputs: bool) -> Iterator[Batch]:
-        """Yield the batches of the recording, and keep its losses at the end."""
+        """Yield the batches of the recording and keep its losses at the end."""
         reader = RunReader(self.path)
         yield from reader.batches(outputs=outputs)
         whole = reader.status is FileStatus.COMPLETE
         self._losses = {**reader.lost, **reader.lost_parts, **({} if whole else {reader.status.value: 1})}
 
     def batches(self, *names: str) -> Iterator[dict[str, Batched]]:
-        """Return an iterator over the rows of some tables in one pass over the recording.
+        """Return an iterator over the rows of several tables in one pass over the recording.
 
         Parameters
         ----------
@@ -197,13 +197,13 @@ class Table:
         return pd.DataFrame(values, index, list(self.columns))
 
     def arrow_schema(self) -> pa.Schema:
-        """Return the columns as Arrow types them."""
+        """Return the Arrow schema of the columns."""
         import pyarrow as pa
 
         return pa.schema([("stamp", pa.timestamp("ns", "UTC")), *((name, pa.float64()) for name in self.columns)])
 
     def arrow_batch(self, part: Batched) -> pa.RecordBatch:
-        """Return rows as Arrow keeps them."""
+        """Return rows as an Arrow record batch."""
         import pyarrow as pa
 
         columns: list[Any] = [pa.array(part.stamp_ns.view("datetime64[ns]"), pa.timestamp("ns", "UTC"))]
@@ -290,7 +290,7 @@ def _poses(batch: Batch) -> Batched | None:
 
 
 def _plain(name: str, rows: Rows) -> Batched:
-    """Return the numbers of messages under the columns of the table: an angle in the place of a quaternion."""
+    """Return the numbers of messages in the columns of the table, with an angle instead of a quaternion."""
     values = rows.numbers
     if name == "head_state":
         theta = 2.0 * np.arctan2(values[:, 2], values[:, 3])

@@ -1,7 +1,7 @@
-"""Run a recording again: the model advances on the journal alone, and recorded messages are compared with its own.
+"""Run a recording again: the model advances by the journal alone, and recorded messages are compared with the model's.
 
-Nothing is copied from the recorded messages. The state is taken from a recorded snapshot only where the journal begins
-or where something was lost; any other snapshot is compared.
+Nothing is copied from the recorded messages. The state is taken from a recorded snapshot only at the start of the
+journal and after a loss; every other snapshot is compared.
 """
 
 from __future__ import annotations
@@ -62,14 +62,13 @@ from plow_twin.stream.topics import TOPICS
 if TYPE_CHECKING:
     from plow_twin.record.writer import RunWriter
 
-#: Topics that depend on the publication before: after a lost message they can be compared again from the next
-#: snapshot on.
+#: Topics that depend on the previous publication: after a lost message they cannot be compared until the next snapshot.
 _CUMULATIVE: Final = frozenset(topic.name for topic in TOPICS if topic.cumulative)
-#: By place in `PUBLICATION_TOPICS`.
+#: Whether each topic of `PUBLICATION_TOPICS` is cumulative.
 _IS_CUMULATIVE: Final = np.array([name in _CUMULATIVE for name in PUBLICATION_TOPICS])
 _SEQUENCE_MASK: Final = 0xFFFFFFFF
 
-#: Receives the share of the file that has been replayed, 0..1.
+#: A function that receives the share of the file that has been replayed, 0..1.
 ProgressCallback = Callable[[float], object]
 
 
@@ -85,10 +84,10 @@ def replay(
     on_progress
         Receives the share of the recording's bytes done, 0..1.
     digests_only
-        Compare the digests alone; messages are not even read where they stand in chunks of their own.
+        Compare the digests alone; chunks that contain only messages are not read.
     write
-        Folder for a full recording made of the journal, with all outputs after each advance. Only digests are compared
-        then.
+        Folder for a full recording made from the journal, with all outputs after each advance. If it is given, only
+        digests are compared.
 
     Raises
     ------
@@ -126,11 +125,11 @@ def following_twin(header: RunHeader, scene: Scene) -> Driven:
 
 
 class _Replay:
-    """The state of a replay: a session, and whether its state is that of the live session."""
+    """The state of a replay: a session, and whether its state equals the state of the live session."""
 
     def __init__(self, header: RunHeader, report: ReplayReport, digests_only: bool) -> None:
         self.digests_only = digests_only
-        #: every publication is there: windows between two of them can be followed
+        #: whether every publication was recorded, so that the windows between publications are known
         self.all_outputs = not digests_only and header.record_outputs == "all"
         self.header = header
         self.report = report
@@ -162,18 +161,18 @@ class _Replay:
         self.next_sequence = 0
         self.in_a_row = 0  # number of entries without a gap up to the next one
         self.synced = False  # the session has the state of the live session
-        self.outputs_synced = False  # and so are its windows between two messages
+        self.outputs_synced = False  # and its windows between messages equal the live ones
         self.outputs_whole = True  # no message of the current batch may be missing without a note
         self.resumed = False  # no advance yet since the state was taken from a snapshot
         self.messages: Mapping[str, Message] | None = None
         self.first_ns: int | None = None
         self.gaps = 0
-        self.lost_entries = 0  # as noted at their place in the journal
+        self.lost_entries = 0  # by the notes in the journal
         self.inputs = InputCounts(header.excitation_source)
         self.alarms = AlarmCheck(header, self.all_outputs)
 
     def batch(self, batch: Batch) -> None:
-        """Apply and compare a batch: runs of samples at once, all else entry by entry."""
+        """Apply and compare a batch: runs of samples at once, other entries one by one."""
         self.outputs_whole = not batch.damaged
         self.outputs_synced = self.outputs_synced and self.outputs_whole
         if batch.damaged:
@@ -193,7 +192,7 @@ class _Replay:
             if not (goes_on and still):
                 breaks[index : index + 2] = True
         samples = np.flatnonzero(entries.sample)
-        late = samples[1:][np.diff(entries.stamp_ns[samples]) < 0]  # worked in one by one
+        late = samples[1:][np.diff(entries.stamp_ns[samples]) < 0]  # applied one by one
         breaks[late] = True
         breaks[late[late + 1 < count] + 1] = True
         ends = np.append(np.flatnonzero(breaks), count)
@@ -235,12 +234,12 @@ class _Replay:
             self._note(Divergence(*difference))
 
     def _messages(self, sent: SentMessages, begin: int, end: int) -> None:
-        chosen = (sent.kind[begin:end] >= 0) == (self.sink is None)  # messages to be written are formed again
+        chosen = (sent.kind[begin:end] >= 0) == (self.sink is None)  # with a sink, only other topics
         for index in (begin + np.flatnonzero(chosen)).tolist():
             self.output(sent.record(index))
 
     def _run(self, entries: Entries, sent: SentMessages, begin: int, end: int) -> bool:
-        """Apply a run of samples and digests at once and compare the messages sent; False: without effect."""
+        """Apply a run of samples and digests at once and compare the messages sent; False if nothing was applied."""
         done: Indexes = np.cumsum(entries.sample, dtype=np.int64)
         digests = entries.digest_at
         stamps, wrench = entries.samples()
@@ -259,7 +258,7 @@ class _Replay:
             rows = self.rows[: len(stamps)]
         try:
             found = self.session.advance(stamps, wrench, rows, taken, done[digests])
-        except ValueError:  # one by one: the sample that is refused is counted
+        except ValueError:  # entry by entry, the refused sample is counted
             return False
         self.inputs.add(entries)
         self.report.entries += len(entries)
@@ -305,7 +304,7 @@ class _Replay:
                 self.sink.write_entry(record.sequence, record.log_time_ns, record.entry)
             begin = end + 1
         samples, published = np.flatnonzero(entries.sample), found.published
-        if found.failed:  # such an advance is not published
+        if found.failed:  # a failed advance is not published
             good = np.flatnonzero(found.rows["stamp_ns"])
             samples, published = samples[good], published.of(good)
         self.sink.write_publications(entries.sequence[samples], entries.log_time_ns[samples], published)
@@ -315,7 +314,7 @@ class _Replay:
         assert self.sink is not None
         entry = record.entry
         if isinstance(entry, Snapshot) and self.synced:
-            entry = self.session.snapshot()  # with the windows of the publications that are written
+            entry = self.session.snapshot()  # with the windows of the written publications
         self.sink.write_entry(record.sequence, record.log_time_ns, entry)
         published = self.session.outputs.pop() if self.synced and isinstance(entry, Sample | Hold | Unload) else NOTHING
         if len(published.rows) and published.finite:
@@ -331,7 +330,7 @@ class _Replay:
         done: Indexes,
         first_step: int,
     ) -> list[tuple[int, int, str, str, str, str]]:
-        """Compare the messages sent with those of the publications; return the differences."""
+        """Return the differences between the messages sent and the messages of the publications."""
         poses = [
             (int(entries.sequence[index]) & _SEQUENCE_MASK, first_step + int(done[index]) - 1, entry)
             for index, entry in sorted(entries.rest.items())
@@ -355,7 +354,7 @@ class _Replay:
         return differences
 
     def _difference(self, record: OutputRecord, published: Published) -> tuple[str, str, str] | None:
-        """Return the difference between a recorded message and the publication's, computed as in the node."""
+        """Return the difference between a recorded message and the message of the computed publication."""
         name = self.topics[record.topic]
         computed = publication_messages(published, self.header.frame_id, self.header.child_frame_id).get(name)
         if computed is None:
@@ -368,7 +367,7 @@ class _Replay:
             self.next_sequence = record.sequence  # the earlier parts are missing
             self.alarms.give_up()
         missing = (record.sequence - self.next_sequence) & _SEQUENCE_MASK
-        if 0 < (-missing & _SEQUENCE_MASK) <= self.in_a_row:  # the entry is repeated
+        if 0 < (-missing & _SEQUENCE_MASK) <= self.in_a_row:  # a repeated entry
             self.report.repeated += 1
             return
         self.inputs.add_entry(record.entry)
@@ -378,11 +377,11 @@ class _Replay:
             self.alarms.give_up()
             self.synced = self.outputs_synced = False
         elif record.sequence == 0 and not isinstance(record.entry, Snapshot):
-            # from the scene's own initial state
+            # a run that begins with the scene's own initial state
             self.synced, self.outputs_synced = True, self.all_outputs and self.outputs_whole
         self.next_sequence = (record.sequence + 1) & _SEQUENCE_MASK
         self.in_a_row += 1
-        if not isinstance(record.entry, Dropped):  # such a note may stand between the messages of one publication
+        if not isinstance(record.entry, Dropped):  # a note may come between messages of one publication
             self.messages = self.published = None
         self.report.entries += 1
         match record.entry:
@@ -417,13 +416,13 @@ class _Replay:
             self.first_ns = entry.stamp_ns if self.first_ns is None else self.first_ns
         try:
             self.session.apply(entry)
-        except ValueError:  # refused by the live session as well; if not, the next comparison fails
+        except ValueError:  # the live session refused it too, or the next comparison fails
             self.report.refused += 1
 
     def _snapshot(self, snapshot: Snapshot) -> None:
         if self.synced and self.outputs_synced:
             self.report.snapshots_compared += 1
-            # earlier time is forgotten, as in the live session when the snapshot was journalled
+            # the live session also forgot earlier times when it journalled the snapshot
             computed = self.session.renew().data
             self._compare("snapshot", snapshot.stamp_ns, "state", _hash(snapshot.data), _hash(computed))
             return
@@ -432,14 +431,14 @@ class _Replay:
             self.session.apply(snapshot)
         except (ValueError, struct.error) as error:
             raise RecordingError(f"{self.report.path}: snapshot at {snapshot.stamp_ns} ns: {error}") from error
-        if before is not None:  # only messages were lost: the motion must be the same
+        if before is not None:  # only messages were lost, so the motion must be the same
             self._compare("snapshot", snapshot.stamp_ns, "state", self.session.twin.digest(), before)
         self.synced = self.resumed = True
-        # without messages the outputs' windows are not taken
+        # the windows of the outputs are known only if every publication was recorded
         self.outputs_synced = self.all_outputs and self.outputs_whole
 
     def output(self, record: OutputRecord) -> None:
-        """Compare a recorded message with the model's at that place."""
+        """Compare a recorded message with the model's message at that place."""
         if self.sink is not None:  # other topics are copied unchanged
             place = (record.topic, record.sequence, record.log_time_ns, record.publish_time_ns)
             self.sink.write_output(*place, record.message())
@@ -525,7 +524,7 @@ def _first_difference(record: OutputRecord, computed: Message) -> tuple[str, str
     try:
         recorded = decode(record.data, record.message_type)
     except RecordingError:
-        return "encoding", "bytes that hold no message", "a message"
+        return "encoding", "bytes that are not a message", "a message"
     if type(recorded) is not type(computed):
         return "type", record.message_type, computed.TYPE
     for name in type(computed).__dataclass_fields__:

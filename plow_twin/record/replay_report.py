@@ -31,9 +31,9 @@ class Divergence:
 class ReplayReport:
     """The result of a replay. `compared` and `not_compared` count messages by base name of their topic.
 
-    `inputs` counts messages by input and outcome. `repeated` counts entries that the files hold more than once.
-    `repeated_parts` names files that repeat a part, each with the file that is read instead; `foreign_parts` files of
-    another run, each with the keys of its header that differ. Neither are read.
+    `inputs` counts messages by input and outcome. `repeated` counts entries that occur more than once in the files.
+    `repeated_parts` maps each file that repeats a part to the file that is read instead, and `foreign_parts` maps each
+    file of another run to the keys of its header that differ; neither kind of file is read.
     """
 
     path: Path
@@ -76,5 +76,5 @@ class ReplayReport:
 
     @property
     def exit_code(self) -> int:
-        """0: equal bit for bit; 1: diverged; 3: equal as far as the file goes, with loss."""
+        """0: equal bit for bit; 1: diverged; 3: equal as far as could be compared, with loss."""
         return 1 if self.first_divergence is not None else 3 if self.loss else 0

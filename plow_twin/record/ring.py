@@ -27,7 +27,7 @@ class RingWriter(RunWriter):
     folder
         Name of the recording; the folder is not made.
     ring_s
-        Smallest time that is kept [s]; up to an eighth more.
+        Shortest time that is kept [s]; up to an eighth more is kept.
     sync_dumps
         Whether `dump` waits for the disk.
     """
@@ -52,7 +52,7 @@ class RingWriter(RunWriter):
         return MemoryFile()
 
     def _prepare(self, folder: Path) -> None:
-        """Make nothing."""
+        """Do nothing, as no folder is needed."""
 
     @property
     def bytes_written(self) -> int:
@@ -64,7 +64,7 @@ class RingWriter(RunWriter):
         return None
 
     def split(self, loss: Mapping[str, int], keep_bytes: int = 0) -> None:
-        """Go on in a new part and drop the parts that are older than the ring is long."""
+        """Start a new part and drop the parts that are older than the length of the ring."""
         old = self._part
         super().split(loss, 0)
         assert isinstance(old.file.out, MemoryFile)
@@ -79,12 +79,12 @@ class RingWriter(RunWriter):
         Raises
         ------
         TakenError
-            Another recording is there.
-        OSError, RecordingError
-            It cannot be written; the ring stays as it is.
+            The folder has another recording.
+            OSError, RecordingError
+                The folder cannot be written; the ring stays as it is.
         """
         make_folder(folder)
-        with ExitStack() as undone:  # remove an incomplete ring
+        with ExitStack() as undone:  # removes an incomplete ring
             undone.callback(_remove, folder)
             self._dump(folder, loss, undone)
             undone.pop_all()

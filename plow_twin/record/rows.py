@@ -1,4 +1,4 @@
-"""The messages of a batch as arrays of numbers, for views and tables, at a fraction of the cost of objects."""
+"""The messages of a batch as arrays of numbers, which views and tables use instead of costly message objects."""
 
 from __future__ import annotations
 
@@ -42,17 +42,17 @@ class Rows:
 def rows_by_topic(
     outputs: list[Outputs], topics: Mapping[str, str], templates: Mapping[str, Template]
 ) -> dict[str, Rows]:
-    """Return the rows of each topic that has some.
+    """Return the rows of each topic that has messages.
 
     Parameters
     ----------
     outputs
-        As in a batch.
-    topics
-        Base names by topic.
-    templates
-        By base name. A message with other texts than its template (an older name) is decoded alone; a message that does
-        not have as many numbers is left out.
+            The outputs of a batch.
+        topics
+            Base names by topic.
+        templates
+            Templates by base name. A message with other texts than its template (an older name) is decoded alone; a
+            message with another count of numbers is left out.
     """
     found: dict[str, list[Rows]] = {}
     for part in outputs:

@@ -1,4 +1,4 @@
-"""The time that a run covers, by its journal: its span, and its stretches without samples."""
+"""The time that the journal of a run covers: its span, and its stretches without samples."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _TIMEOUT = "excitation_timeout"
 
 
 class RunTime:
-    """Collects the time of a run; takes its entries in order.
+    """Measure the time of a run from its entries in order.
 
     Parameters
     ----------
@@ -33,11 +33,11 @@ class RunTime:
 
     @property
     def span_s(self) -> float:
-        """Time from the first advance to the last, without steps of the clock at resets [s]."""
+        """Time from the first advance to the last [s], without the clock's steps at resets."""
         return self._span_ns * 1e-9
 
     def add(self, entries: Entries) -> list[tuple[int, int, int]]:
-        """Take entries; return the silences that end in them: index of the ending sample, begin and end [ns].
+        """Add entries; return the silences that end in them: index of the ending sample, begin and end [ns].
 
         A stretch with missing entries is no silence: samples may have been there.
         """
@@ -64,7 +64,7 @@ class RunTime:
             case Reset() | SetWear() | Restore():
                 self._reached_ns = None
                 self.silences.restart()
-            case Loss():  # samples came there
+            case Loss():  # samples may have been there
                 self.silences.restart()
             case Parameter(name, value) if name == _TIMEOUT:
                 self.silences.timeout_s = float(value)

@@ -1,4 +1,4 @@
-"""Finding the recording that is being written now."""
+"""Search for the recording that is being written now."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from plow_twin.record.reader import read_header, run_parts
 
 
 def find_run(path: Path, wait_s: float, stop: Callable[[], bool] = lambda: False) -> Path:
-    """Return `running_run`, or else the recording at `path` as it is.
+    """Return `running_run`, or else the existing recording at `path`.
 
     Raises
     ------
@@ -29,7 +29,7 @@ def find_run(path: Path, wait_s: float, stop: Callable[[], bool] = lambda: False
 def running_run(path: Path, wait_s: float, stop: Callable[[], bool] = lambda: False) -> Path | None:
     """Return the recording that is being written at `path` or beside it (`<path>_2`, ...).
 
-    None when no recording is written within `wait_s` [s], or before `stop` is true.
+    Returns None if no recording is being written within `wait_s` [s], or once `stop` returns True.
     """
     deadline = time.monotonic() + wait_s
     while True:
@@ -40,7 +40,7 @@ def running_run(path: Path, wait_s: float, stop: Callable[[], bool] = lambda: Fa
                     claimed = is_claimed(stream.fileno())
                 if claimed and read_header(parts[0]) is not None:
                     return candidate
-            except (RecordingError, OSError):  # not begun yet, or removed just now
+            except (RecordingError, OSError):  # not begun yet, or just removed
                 continue
         if stop() or time.monotonic() >= deadline:
             return None

@@ -1,4 +1,4 @@
-"""The messages of a publication as bytes to send: one compiled call for all messages of a record."""
+"""The messages of a publication as bytes to send; one compiled call makes all messages of a record."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ _WORD: Final = 8
 
 
 class Messages:
-    """Write the messages of one publication after the other to the same memory.
+    """Write the messages of each publication to the same memory.
 
     Parameters
     ----------
     frame_id, child_frame_id
         Frames named in the messages.
     intervals
-        Whether there are messages with the intervals of forces.
+        Whether to make messages with the intervals of forces.
     """
 
     def __init__(self, frame_id: str, child_frame_id: str, *, intervals: bool = False) -> None:
@@ -39,10 +39,10 @@ class Messages:
         self.memory = dict(part for group in groups[: 3 + intervals] for part in group.parts)
 
     def write(self, published: Published) -> tuple[tuple[str, memoryview], ...]:
-        """Return topic and bytes of the messages of a publication of one row, in the order in which they are sent.
+        """Return the topic and bytes of each message of a publication of one row, in the order of sending.
 
-        `intervals` returns the messages with intervals. The bytes stay until the next call. The result is empty where
-        a number is not finite.
+        Messages with intervals are not included (see `intervals`). The bytes are valid until the next call. The result
+        is empty if a number is not finite.
         """
         rows, slow = published
         if not self._each.fill(rows) or (len(slow) and not self._slow.fill(slow)):
@@ -56,13 +56,13 @@ class Messages:
         return found
 
     def intervals(self, published: Published) -> tuple[tuple[str, memoryview], ...]:
-        """Return topic and bytes of the messages with intervals, if it has some, as `write`."""
+        """Return the topic and bytes of each message with intervals of a publication, like `write`."""
         wanted = self._followed is not None and published.with_intervals and self._followed.fill(published.rows)
         return self._followed.parts if self._followed is not None and wanted else ()
 
 
 class _Group(NamedTuple):
-    """The messages of one record, one behind the other: only stamps and numbers change."""
+    """The messages of one record, one after the other; only their stamps and numbers change."""
 
     #: base name of each topic, and the memory of its message
     parts: tuple[tuple[str, memoryview], ...]
@@ -88,7 +88,7 @@ class _Group(NamedTuple):
         return cls(tuple(parts), buffer, ends[:-1].copy(), places, sources, integers)
 
     def fill(self, records: NDArray[np.void]) -> bool:
-        """Write the messages of a record, shape (1,); False when a number is not finite."""
+        """Write the messages of a record, shape (1,); return False if a number is not finite."""
         stamp_ns, numbers = records["stamp_ns"], records.view(np.float64)
         return bool(_write(numbers, stamp_ns, self.buffer, self.starts, self.places, self.sources, self.integers))
 
@@ -112,7 +112,7 @@ def warm_up() -> None:
 
 @compiled
 def _write(numbers, stamps, buffer, starts, places, sources, integers):  # type: ignore[no-untyped-def]
-    """Write stamp and numbers of a record into its messages; False when a number is not finite."""
+    """Write the stamp and numbers of a record into its messages; return False if a number is not finite."""
     stamp = stamp_word(stamps[0])
     for start in starts:
         set_word(buffer, start + STAMP_AT, stamp)

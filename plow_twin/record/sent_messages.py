@@ -1,4 +1,4 @@
-"""The messages that a run has sent, chunk by chunk, as one row in the order of the journal."""
+"""The messages that a run has sent, from all chunks, as one sequence in the order of the journal."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from plow_twin.record.template import Indexes
 
 @dataclass(frozen=True)
 class SentMessages:
-    """Messages that were sent, of many chunks, in order of sequence: indexes go over all of them.
+    """Sent messages of many chunks in order of sequence number; an index counts over all chunks.
 
-    `kind` is the place of a message's topic in `PUBLICATION_TOPICS`, -1 for other topics; part k begins at `begins[k]`.
+    `kind` is the index of a message's topic in `PUBLICATION_TOPICS`, -1 for other topics; part k begins at `begins[k]`.
     """
 
     parts: list[Outputs]
@@ -28,12 +28,12 @@ class SentMessages:
 
     @classmethod
     def of(cls, outputs: list[Outputs], topics: Mapping[str, str]) -> Self:
-        """Take messages; `topics` has the base names of those that follow from the motion."""
-        tables = {id(part.topics): _kinds(part.topics, topics) for part in outputs}  # few: parts share topics
+        """Collect messages; `topics` maps the topics that follow from the motion to base names."""
+        tables = {id(part.topics): _kinds(part.topics, topics) for part in outputs}  # few tables, as parts share topics
         sequence = _joined(part.sequence for part in outputs)
         kind = _joined(tables[id(part.topics)][part.messages.channel] for part in outputs)
         begins = np.cumsum([0, *map(len, outputs)])
-        if (sequence[1:] < sequence[:-1]).any():  # not as our recorder writes: each message is a part
+        if (sequence[1:] < sequence[:-1]).any():  # not written by our recorder: each message becomes a part
             order = np.argsort(sequence, kind="stable")
             owner = np.searchsorted(begins, order, side="right") - 1
             places = zip(owner.tolist(), (order - begins[owner]).tolist(), strict=True)
@@ -54,7 +54,7 @@ class SentMessages:
         return self.parts[part].record(index - int(self.begins[part]))
 
     def pieces(self, begin: int, end: int) -> Iterator[tuple[Messages, int, int]]:
-        """Yield the messages from `begin` to before `end`, chunk by chunk, with the indexes of each chunk's."""
+        """Yield the messages from `begin` to before `end` in pieces of one chunk, each with its first and end index."""
         first = int(np.searchsorted(self.begins, begin, side="right")) - 1
         while begin < end:
             origin, behind = self.begins[first : first + 2].tolist()

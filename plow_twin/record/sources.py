@@ -1,7 +1,7 @@
-"""Any recording as a stream of messages: MCAP and rosbag2's sqlite3, files or folders of parts, CSV, and Parquet.
+"""Any recording as a stream of messages: MCAP or rosbag2's sqlite3 (a file or a folder of parts), CSV, or Parquet.
 
-Messages come in the order in which they were written. Unreadable messages are counted and passed over: a file is read
-as far as it goes. Only some chunks are in memory at a time.
+Messages come in the order in which they were written. Unreadable messages are counted and skipped, and a truncated file
+is read as far as possible. Only some chunks are in memory at a time.
 """
 
 from __future__ import annotations
@@ -34,26 +34,26 @@ _ROWS: Final = 1000
 _ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
 #: Largest message that is unpacked [B].
 _LARGEST_MESSAGE: Final = 2**26
-#: Whether topics or messages are a view or a virtual table, or have computed columns: these may have no end.
+#: Query for topics or messages that are a view or a virtual table, or have computed columns, which may never end.
 _COMPUTED: Final = """
     SELECT 1 FROM sqlite_master
     WHERE name COLLATE NOCASE IN ('topics', 'messages') AND (type != 'table' OR rootpage = 0)
     UNION ALL SELECT 1 FROM pragma_table_xinfo('messages') WHERE hidden
     UNION ALL SELECT 1 FROM pragma_table_xinfo('topics') WHERE hidden LIMIT 1
 """
-#: Errors that sqlite3 raises for a damaged file; the last two stand for text that is not UTF-8, and for cells of
+#: Errors that sqlite3 raises for a damaged file; the last two are for text that is not UTF-8 and for cells of
 #: impossible length.
 _SQLITE_ERRORS: Final = (sqlite3.Error, UnicodeDecodeError, MemoryError)
 
 
 @dataclass(frozen=True, slots=True)
 class Columns:
-    """The type of a topic whose messages are lines: the names of their columns, or the keys of the first line."""
+    """The type of a topic whose messages are lines: the names of the columns, or the keys of the first line."""
 
     names: tuple[str, ...]
 
     def __str__(self) -> str:
-        """Return the names in a form to read, with a hint at a missing header row or another separator."""
+        """Return the names as readable text, with a hint if the header row seems missing or the separator wrong."""
         if not any(self.names):
             return "columns (none: is it empty?)"
         names = ", ".join(ascii(name) if "," in name or not name.isprintable() else name for name in self.names)
@@ -74,18 +74,18 @@ class Arrived:
     """A message: topic, when it was received [ns], and its fields by path (`wrench.force.x`)."""
 
     topic: str
-    #: `NO_TIME` where it is unknown
+    #: receive time [ns], or `NO_TIME` if it is unknown
     log_time_ns: int
     content: Any
-    #: whether the broker had kept it from before the subscription
+    #: whether the broker had retained it since before the subscription
     retained: bool = False
-    #: whether messages before it are missing: a part is absent or damaged
+    #: whether messages before it are missing, because a part is absent or damaged
     after_hole: bool = False
 
 
 @dataclass
 class Losses:
-    """Messages of a recording that were not used, by reason, and the topics of unknown type."""
+    """Counts of unused messages of a recording by reason, and the topics of unknown type."""
 
     counts: Counter[str] = field(default_factory=Counter)
     unknown_types: dict[str, str] = field(default_factory=dict)
@@ -94,7 +94,7 @@ class Losses:
 class Source(Protocol):
     """A recording; only messages of topics for which `wanted` is true are decoded.
 
-    Messages of topics in files of their own are put in order by `stamp_ns`.
+    If each topic has its own file, messages are put in order by `stamp_ns`.
     """
 
     losses: Losses
@@ -145,13 +145,13 @@ def open_source(path: Path) -> Source:
 
 
 def packed(path: Path) -> str:
-    """Return a hint at files that rosbag2 has compressed as a whole; empty without one."""
+    """Return a hint if rosbag2 has compressed files as a whole, otherwise an empty text."""
     files = sorted(path.glob("*.zstd")) if path.is_dir() else [path] if path.suffix == ".zstd" else []
     return f" ({files[0].name} is compressed as a whole: unpack it with zstd -d)" if files else ""
 
 
 def _decompressed(data: bytes) -> bytes:
-    """Return a message of a bag whose messages are compressed one by one; no bytes for a damaged one."""
+    """Return a message of a bag with separately compressed messages; no bytes for a damaged message."""
     import zstandard
 
     try:
@@ -179,7 +179,7 @@ class Decoder:
             try:
                 types = parsed_types(schema, message_type)
                 self._store.register({name: type_ for name, type_ in types.items() if name not in self._store.types})
-            except Exception:  # a schema in another language, a damaged one, or one without end
+            except Exception:  # a schema in another language, damaged or endless
                 self._losses.unknown_types[topic] = message_type
         if message_type in self._store.types:
             return True
@@ -187,17 +187,17 @@ class Decoder:
         return False
 
     def reads(self, channel: Channel) -> bool:
-        """Return whether an MCAP channel can be decoded; others are noted as unknown with their encoding."""
+        """Return whether an MCAP channel can be decoded; other channels are noted as unknown with their encoding."""
         if channel.encoding != "cdr":
             self._losses.unknown_types[channel.topic] = f"{channel.message_type} encoded as {channel.encoding}"
             return False
         return self.knows(channel.topic, channel.message_type, channel.schema.decode(errors="replace"))
 
     def decode(self, data: bytes, message_type: str) -> Any | None:
-        """Return a message, or None for bytes that cannot be decoded, which are counted."""
+        """Return a message, or None for bytes that cannot be decoded; these are counted."""
         if data.startswith(_ZSTD_MAGIC):
             data = _decompressed(data)
-        for end in (len(data), len(data) - 8):  # rclpy adds 8 stray bytes behind a last empty float64[]
+        for end in (len(data), len(data) - 8):  # rclpy adds 8 stray bytes after a final empty float64[]
             try:
                 return self._store.deserialize_cdr(data[:end], message_type)
             except Exception:  # rosbags lets index, struct, unicode and assertion errors through
@@ -207,13 +207,13 @@ class Decoder:
 
 
 def _behind_holes(parts: Sequence[Path], missing: Sequence[Path]) -> set[Path]:
-    """Return the parts before which others are missing."""
+    """Return the parts before which other parts are missing."""
     order = sorted((*parts, *missing), key=part_number)
     return {part for before, part in pairwise(order) if before in missing}
 
 
 class McapSource:
-    """MCAP files, in order, of a recording without the files `missing`."""
+    """The MCAP files of a recording in order; the files `missing` are absent."""
 
     def __init__(self, parts: list[Path], missing: Sequence[Path] = ()) -> None:
         self.parts = parts
@@ -270,7 +270,7 @@ class McapSource:
 
 
 class SqliteSource:
-    """Files of rosbag2's sqlite3 storage, of a recording without the files `missing`; damaged files are left out."""
+    """A recording in files of rosbag2's sqlite3 storage without the files `missing`; damaged files are skipped."""
 
     def __init__(self, parts: list[Path], missing: Sequence[Path] = ()) -> None:
         self.parts = sorted(parts, key=part_number)
@@ -287,7 +287,7 @@ class SqliteSource:
         if kept:
             try:
                 connection.execute("SELECT 1 FROM sqlite_master")
-            except sqlite3.OperationalError:  # a read-only place: the log cannot be shared
+            except sqlite3.OperationalError:  # read-only folder: the log cannot be opened
                 connection.close()
                 connection = sqlite3.connect(f"file:{place}?mode=ro&immutable=1", uri=True)
                 self._unread.add(path)
@@ -296,7 +296,7 @@ class SqliteSource:
         connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LARGEST_MESSAGE)
         if connection.execute(_COMPUTED).fetchone() is not None:
             connection.close()
-            raise sqlite3.DatabaseError("its tables are computed, expected stored ones")
+            raise sqlite3.DatabaseError("got computed tables, expected stored tables")
         return connection
 
     def topics(self) -> dict[str, str]:
@@ -318,7 +318,7 @@ class SqliteSource:
 
     @contextmanager
     def _reading(self, part: Path) -> Iterator[tuple[sqlite3.Connection | None, list[tuple[int, str, str]]]]:
-        """Open a file and read its topics: number, name and type; None and no topics where it is damaged."""
+        """Open a file and read its topics (number, name, type); a damaged file gives None and no topics."""
         topics: list[tuple[int, str, str]] = []
         with ExitStack() as opened:
             try:
@@ -370,7 +370,7 @@ def _rows(connection: sqlite3.Connection) -> Iterator[tuple[Any, Any, Any]]:
 
 
 class CsvSource:
-    """CSV files with a header line and Parquet files, each a topic under its name without its ending."""
+    """CSV files with a header line and Parquet files; each is a topic with the name of the file without its ending."""
 
     def __init__(self, parts: list[Path]) -> None:
         self.parts = parts
@@ -382,7 +382,7 @@ class CsvSource:
         Raises
         ------
         RecordingError
-            A file has no header, or two columns of one name.
+            A file has no header, or two columns have the same name.
         """
         found: dict[str, TopicType] = {}
         for part in self.parts:
@@ -395,7 +395,7 @@ class CsvSource:
         return found
 
     def messages(self, wanted: Callable[[str], bool], stamp_ns: StampOf[Arrived] | None = None) -> Iterator[Arrived]:
-        """Yield the rows of all files in order of their stamps, by default those in `t`, `time` or the first column."""
+        """Yield the rows of all files in order of their stamps, by default in the column `t`, `time` or the first."""
         streams = [self._rows(part) for part in self.parts if wanted(part.stem)]
         if len(streams) == 1:
             return streams[0]
@@ -417,12 +417,12 @@ class CsvSource:
 def read_table(path: Path) -> tuple[Columns, Iterator[list[str]]]:
     """Return the columns of a CSV or Parquet file and its rows, one at a time, as `CsvSource` reads them.
 
-    Lines that begin with `#` are left out.
+    Lines that begin with `#` are skipped.
 
     Raises
     ------
     RecordingError
-        The file cannot be read, or has two columns of one name; the rows raise it too.
+        The file cannot be read, or two columns have the same name. Reading the rows may raise it too.
     """
     rows = _table_rows(path)
     names = tuple(name.strip() for name in next(rows, ()))
@@ -465,12 +465,12 @@ def columns_of(source: Path | str, names: Sequence[str]) -> Columns:
     Raises
     ------
     RecordingError
-        A column's name stands twice.
+        Two columns have the same name.
     """
     columns = Columns(tuple(names))
     twice = [name for name, count in Counter(names).items() if name and count > 1]
     if twice:
-        raise RecordingError(f"{source}: column {twice[0]!r} stands more than once in the {columns}, expected once")
+        raise RecordingError(f"{source}: column {twice[0]!r} occurs more than once in the {columns}, expected once")
     return columns
 
 
@@ -479,5 +479,5 @@ def _log_time_ns(arrived: Arrived) -> int | None:
 
 
 def _row_time_ns(cell: str) -> int:
-    """Return the time of a row, by which files are merged: a number too large for s is in a smaller unit."""
+    """Return the time of a row for merging files; a number too large for seconds is in a smaller unit."""
     return next((found for unit in STAMP_UNITS if (found := time_ns(cell, unit)) is not None), NO_TIME)

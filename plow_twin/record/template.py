@@ -1,7 +1,7 @@
-"""Messages of fixed length as bytes with holes for their numbers: made once, filled in or compared many at a time.
+"""Templates of messages of fixed length: bytes with places for numbers, which are filled in or compared many at a time.
 
-A message whose texts do not change differs from the next message of its kind only in the stamp and some float64. CDR
-keeps them at fixed places, which are found by encoding the message once with numbers that occur nowhere else.
+Messages of one kind with equal texts differ only in the stamp and in some float64 numbers. CDR has these at fixed
+places, which are found by encoding the message once with numbers that occur nowhere else.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from plow_twin.record.words import set_word, word
 Bytes = NDArray[np.uint8]
 Indexes = NDArray[np.int64]
 
-#: Place of the stamp, seconds and nanoseconds, behind the four bytes that name the encoding.
+#: Place of the stamp (seconds and nanoseconds) after the four bytes that name the encoding.
 STAMP_AT: Final = 4
 _SECOND_NS: Final = 1_000_000_000
 
@@ -35,9 +35,9 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 
 @dataclass(frozen=True)
 class Template:
-    """The bytes of a message (`data`), where its numbers stand (`places`, shape (count,)), and a mask of the others.
+    """The bytes of a message (`data`), the places of its numbers (`places`, shape (count,)), and a mask (`fixed`).
 
-    `fixed` has all bits set in the bytes that never change.
+    `fixed` has all bits set in the bytes that do not change.
     """
 
     message_type: str
@@ -47,12 +47,12 @@ class Template:
 
     @classmethod
     def of(cls, build: Callable[[NDArray[np.float64]], Message], count: int) -> Self:
-        """Make the template of messages that `build` makes of `count` numbers, with stamp 0.
+        """Make the template of the messages that `build` makes from `count` numbers, with stamp 0.
 
         Raises
         ------
         RecordingError
-            A number does not stand in the message as it was given.
+            The message does not contain a number as given.
         """
         marks = np.frombuffer(np.arange(0x3FD1_2345_6789_0000, 0x3FD1_2345_6789_0000 + count, dtype=np.int64).tobytes())
         message = build(marks)
@@ -72,7 +72,7 @@ class Template:
 
     @property
     def count(self) -> int:
-        """How many numbers a message has."""
+        """Number of numbers in a message."""
         return len(self.places)
 
 
@@ -81,7 +81,7 @@ def _fits(buffer: Bytes, start: int, length: int, data: Bytes, fixed: Bytes) -> 
     """Return whether the bytes from `start` on are a message of a template, with any numbers."""
     if length != data.size or start < 0 or start + length > buffer.size:
         return False
-    last = length - 8  # the last word may overlap the word before
+    last = length - 8  # the last word may overlap the previous word
     wrong = (word(buffer, start + last) ^ word(data, last)) & word(fixed, last)
     for k in range(length >> 3):
         wrong |= (word(buffer, start + 8 * k) ^ word(data, 8 * k)) & word(fixed, 8 * k)
@@ -90,14 +90,14 @@ def _fits(buffer: Bytes, start: int, length: int, data: Bytes, fixed: Bytes) -> 
 
 @compiled
 def stamp_word(stamp_ns: int) -> int:
-    """Return seconds and nanoseconds side by side, as they stand in a message."""
+    """Return the stamp as in a message: seconds and nanoseconds side by side in one word."""
     seconds = stamp_ns // _SECOND_NS
     return (seconds & 0xFFFFFFFF) | ((stamp_ns - seconds * _SECOND_NS) << 32)
 
 
 @compiled
 def read_numbers(buffer, starts, lengths, data, fixed, places, stamps, values, good):  # type: ignore[no-untyped-def]
-    """Read stamp and numbers of each message that fits the template; the others are not `good`."""
+    """Read the stamp and numbers of each message that fits the template; `good` is False for the others."""
     for n in range(starts.size):
         start = starts[n]
         good[n] = _fits(buffer, start, lengths[n], data, fixed)
@@ -111,9 +111,9 @@ def read_numbers(buffer, starts, lengths, data, fixed, places, stamps, values, g
 
 @dataclass(frozen=True)
 class Templates:
-    """Several templates one behind the other, to compare messages of any of them in one pass.
+    """Several templates one after the other, to compare messages of different templates in one pass.
 
-    `ends` (k + 1,) and `place_ends` (k + 1,) say where the bytes and the places of each begin and end.
+    `ends` (k + 1,) and `place_ends` (k + 1,) are the bounds of each template's bytes and places.
     """
 
     data: Bytes
@@ -124,7 +124,7 @@ class Templates:
 
     @classmethod
     def of(cls, templates: Iterable[Template]) -> Self:
-        """Put templates together; a message's kind is its template's place."""
+        """Join templates; the kind of a message is the index of its template."""
         parts = list(templates)
         return cls(
             np.concatenate([part.data for part in parts]),
@@ -137,7 +137,7 @@ class Templates:
 
 @compiled
 def fill(buffer, starts, data, places, stamps, values):  # type: ignore[no-untyped-def]
-    """Write the template with stamp and numbers of row n from `starts[n]` on."""
+    """Write the template with the stamp and numbers of each row n from `starts[n]` on."""
     last = data.size - 8
     for n in range(starts.size):
         start = starts[n]

@@ -1,4 +1,4 @@
-"""The times in messages and rows: numbers of some unit, or dates."""
+"""The times in messages and rows: numbers in some unit, or dates."""
 
 from __future__ import annotations
 
@@ -10,33 +10,30 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-#: Columns and keys that hold the time unless the mapping names others.
+#: Columns and keys with the time, unless the mapping names others.
 TIMES: Final = ("t", "time")
-#: Units of a time, in ns.
+#: Length of each unit of time [ns].
 STAMP_UNITS: Final = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
-#: Time of a message without one [ns].
+#: Time [ns] of a message without a time.
 NO_TIME: Final = -1
 NUMBER: Final = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|inf|nan)", re.IGNORECASE)
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 _NANOSECONDS: Final = re.compile(r"[.,]\d{6}(\d{1,3})")
-#: Times below this [s] count from some start and are moved away from 0, which means a missing stamp.
+#: Times below this [s] count from some start. They are moved away from 0, because a stamp of 0 means a missing stamp.
 EPOCH_S: Final = 1e9
-#: A time of 0 is at this stamp [ns].
+#: Stamp of a time of 0 [ns].
 START_NS: Final = 1_000_000_000
 #: Characters of plain decimal numbers.
 OF_NUMBERS: Final = b"0123456789+-.eE "
-#: Dates beyond this are placeholders: many databases write 9999-12-31 for no date.
+#: Dates after this [ns] are placeholders: many databases write 9999-12-31 for no date.
 _FARTHEST_NS: Final = 4_000_000_000_000_000_000
 
 
 def time_ns(value: Any, unit: str = "s") -> int | None:
-    """Return the stamp [ns] of a number or of a text in ISO 8601 (UTC unless stated).
-
-    None for any other value.
-    """
+    """Return the stamp [ns] of a number or of an ISO 8601 text (UTC unless stated), or None for any other value."""
     if isinstance(value, str):
         value = value.strip()
-        # a number first: 20260102 is a date too
+        # try a number first, because 20260102 is a date too
         if value.isascii() and value.isdigit() and len(value) < 20:
             value = int(value)
         elif NUMBER.fullmatch(value):
@@ -52,14 +49,14 @@ def time_ns(value: Any, unit: str = "s") -> int | None:
 
 
 def likely_unit(value: Any) -> str | None:
-    """Return the coarsest unit but seconds in which a number beyond all dates in seconds is a date; otherwise None."""
+    """Return the coarsest unit in which a number that is too large for seconds is a date; otherwise None."""
     if time_ns(value) is not None:
         return None
     return next((unit for unit in STAMP_UNITS if (time_ns(value, unit) or 0) >= EPOCH_S * 1e9), None)
 
 
 def times_ns(texts: Sequence[bytes], unit: str) -> NDArray[np.int64] | None:
-    """Return the stamps [ns] of texts, shape (n,), each as in `time_ns`; None where a text is not a time."""
+    """Return the stamps [ns] of texts, shape (n,), each as in `time_ns`; None if any text is not a time."""
     try:
         numbers = np.array(list(map(float, texts))) * STAMP_UNITS[unit]
     except ValueError:
@@ -79,7 +76,7 @@ def times_ns(texts: Sequence[bytes], unit: str) -> NDArray[np.int64] | None:
 
 
 def time_text(stamp_ns: int, *, own_start: bool = False) -> str:
-    """Return a stamp as a date, or below `EPOCH_S` in seconds; `own_start` undoes the shift by `time_ns`."""
+    """Return a stamp as a date, or as seconds if it is below `EPOCH_S`; `own_start` undoes the shift by `time_ns`."""
     if stamp_ns < EPOCH_S * 1e9:
         return f"{(stamp_ns - (START_NS if own_start else 0)) * 1e-9:.3f} s"
     date = datetime.fromtimestamp(stamp_ns // 10**9, UTC)
@@ -96,5 +93,5 @@ def _date_ns(text: str) -> int | None:
     except ValueError:
         return None
     time = time if time.tzinfo else time.replace(tzinfo=UTC)
-    digits = _NANOSECONDS.search(text)  # beyond those that a datetime keeps
+    digits = _NANOSECONDS.search(text)  # digits that a datetime does not keep
     return (time - _EPOCH) // timedelta(microseconds=1) * 1000 + (int(digits[1].ljust(3, "0")) if digits else 0)

@@ -1,4 +1,4 @@
-"""Wrong units in measured data: found by magnitude and rate, where a mapping states no unit."""
+"""Check for wrong units in measured data, by magnitude and rate, where a mapping states no unit."""
 
 from __future__ import annotations
 
@@ -23,48 +23,48 @@ from plow_twin.stream.limits import excitation_limits, largest_displacement
 Array = NDArray[np.float64]
 _START_S: Final = START_NS * 1e-9
 
-#: Messages that are looked at: 20 s at 1 kHz hold several periods of a load.
+#: Number of messages that are checked: 20 s at 1 kHz contain several periods of a load.
 CHECKED: Final = 20_000
-#: A machine that idles draws more than the hundredth part of the scene's largest force. Forces between that part and
-#: the ten-thousandth look like kN, forces a thousand times smaller like MN; others may be an idle sensor's noise.
+#: An idling machine has forces above a hundredth of the scene's largest force. Forces between a ten-thousandth and a
+#: hundredth look like kN, and forces a thousand times smaller like MN; others may be the noise of an idle sensor.
 _IDLE_SHARE: Final = 1e-2
 _BROKEN_SHARE: Final = 1e-4
 _SMALLER: Final = {"kN": 1.0, "MN": 1e-3}
-#: An angle beyond this [rad] leaves the model, which ends at 45 degrees.
+#: Largest angle of the model [rad], 45 degrees.
 _LARGEST_ANGLE_RAD: Final = 0.25 * np.pi
-#: A swing so many times the angle that the clearance allows is in degrees: wear and pressed contacts allow less.
+#: A swing of this many times the angle that the clearance allows is in degrees; wear and pressed contacts allow less.
 _BEYOND_CLEARANCE: Final = 3.0
-#: Pads that give way turn a head farther than a narrow clearance does: a swing up to this [rad] is believed.
+#: A swing up to this [rad] is believed, because soft pads let a head turn farther than a narrow clearance.
 _BELIEVED_SWING_RAD: Final = 0.1
-#: Stamps further apart than this [s] cannot follow a load that changes smoothly from one to the next.
+#: Stamps further apart than this [s] are too coarse for a load that changes smoothly from sample to sample.
 _SLOW_S: Final = 0.5
-#: A load is smooth when it changes by less than this share of its range between two samples, in the median.
+#: A load is smooth if its median change between two samples is less than this share of its range.
 _SMOOTH: Final = 0.05
-#: Ploughs travel at 3.6 m/s at most (Caterpillar's GH1600); beyond this [m/s] a speed is in another unit.
+#: Ploughs travel at 3.6 m/s at most (Caterpillar GH1600); a speed above this [m/s] is in another unit.
 _FASTEST_M_S: Final = 5.0
-#: Share of falling stamps above which they are no times; share above which the rows begin with the newest.
+#: Share of falling stamps above which the column is not a time, and share above which the rows are in reverse order.
 _FALLING, _REVERSED = 0.2, 0.9
-#: Units that a time may be in, in s.
+#: Length of each other unit that a time may have [s].
 _TIMES: Final = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-#: Spreadsheets count days since 1900: dates of this century lie between these numbers.
+#: Spreadsheets count days since 1900; the dates of this century are between these numbers.
 _SHEET_DAYS: Final = (36_525.0, 73_050.0)
-#: Smallest number of samples for a judgement of their spacing.
+#: Smallest number of samples whose spacing can be judged.
 _FEW: Final = 20
 _SORT: Final = "sort the rows by time"
 _NAME_TIME: Final = "name the column of the time in a mapping (stamp: NAME)"
 _WRITE_SECONDS: Final = "write seconds, or dates such as 2026-01-02T03:04:05.678Z"
-#: Load cells send at 10 kHz at most: stamps closer together [s] are in another unit.
+#: Load cells send at 10 kHz at most; stamps closer together than this [s] are in another unit.
 _SHORTEST_SPACING_S: Final = 1e-4
-#: Stamps beyond this are dates: 1e9 s is in the year 2001.
+#: Stamps above this [s] are dates: 1e9 s is in the year 2001.
 _DATES_S: Final = 1e9
 
 
 @dataclass(frozen=True)
 class UnitDoubt:
-    """Numbers of a role that look as if they were in another unit; the stamps of the load are `t`.
+    """Numbers of a role that seem to be in another unit; the stamps of the load have the name `t`.
 
-    `found` and `expected` say why, `likely` is the unit that they look like. `is_impossible`: no head can move so.
-    `advice` is a remedy where no unit helps.
+    `found` and `expected` say why, and `likely` is the unit that they seem to have. `is_impossible` is True if no head
+    can move like this. `advice` is a remedy if no unit helps.
     """
 
     role: str
@@ -89,12 +89,12 @@ class UnitDoubt:
 def unit_doubts(
     values: Mapping[tuple[str, str], Sequence[float] | Array], load_stamps_s: Sequence[float] | Array, scene: Scene
 ) -> list[UnitDoubt]:
-    """Return the numbers that look as if they were in another unit than SI.
+    """Return the numbers that seem to be in a unit other than SI.
 
     Parameters
     ----------
     values
-        Measured numbers by role and name, as ("excitation", "fx") or ("head_pose", "theta"); NaN where missing.
+        Measured numbers by role and name, such as ("excitation", "fx") or ("head_pose", "theta"); NaN where missing.
     load_stamps_s
         Stamps of the load [s].
     scene
@@ -108,7 +108,7 @@ def unit_doubts(
 
 
 def small_thresholds(thresholds: Sequence[float], scene: Scene) -> str:
-    """Return that thresholds of a force in N look as if they were in kN; empty where they do not."""
+    """Return a warning if thresholds of a force in N seem to be in kN, otherwise an empty text."""
     usual = _largest_force(scene)
     small = [found for found in thresholds if 0.0 < found < _IDLE_SHARE * usual]
     if not small:
@@ -117,16 +117,16 @@ def small_thresholds(thresholds: Sequence[float], scene: Scene) -> str:
 
 
 def large_loads(values: Mapping[tuple[str, str], Array], units: Mapping[str, str], scene: Scene) -> dict[str, str]:
-    """Return by name the loads that a live twin would not use, and in words why and which unit would fit.
+    """Return the loads that a live twin would not use, by name, with a text that says why and which unit would fit.
 
     Parameters
     ----------
     values
         Numbers in SI, by role and name.
     units
-        Units that they were in, by name; SI where missing.
+        Units of the original numbers, by name; SI where missing.
     scene
-        More than one number in a hundred is beyond the `excitation_limits` of its loads.
+        A load is returned if more than one number in a hundred exceeds the `excitation_limits` of this scene.
     """
     found = {}
     for name, most in zip(("fx", "fy", "m"), excitation_limits(scene).largest, strict=True):
@@ -145,14 +145,14 @@ def large_loads(values: Mapping[tuple[str, str], Array], units: Mapping[str, str
 
 
 def check_units(messages: Iterable[Arrived], roles: Mapping[str, Role], scene: Scene, source: object) -> None:
-    """Refuse a recording whose numbers look as if they were in another unit.
+    """Refuse a recording whose numbers seem to be in another unit.
 
-    Numbers whose unit, scale or limits the mapping states are believed. The first 20,000 messages are looked at.
+    The first 20,000 messages are checked. Numbers are believed if the mapping states their unit, scale or limits.
 
     Raises
     ------
     UnitError
-        It names the numbers, their values, and how to state the unit.
+        Numbers seem to be in another unit; the error names them, their values, and how to state the unit.
     """
     stamps: list[float] = []
     values: dict[tuple[str, str], list[float]] = {}
@@ -173,19 +173,19 @@ def check_units(messages: Iterable[Arrived], roles: Mapping[str, Role], scene: S
 
 
 def check_poses(t: Array, q: Array, scene: Scene, source: object) -> None:
-    """Refuse measured poses whose numbers look as if they were in another unit.
+    """Refuse measured poses whose numbers seem to be in another unit.
 
     Parameters
     ----------
     t, q
         Times, shape (n,), and x, y, theta, shape (n, 3).
     scene, source
-        Of the head; the name of the recording.
+        Scene of the head, and name of the recording.
 
     Raises
     ------
     UnitError
-        It names the numbers and their values.
+        Numbers seem to be in another unit; the error names them and their values.
     """
     magnitudes = {("head_pose", name): _usual_magnitude(q[:, place]) for place, name in enumerate(("x", "y"))}
     doubts = [*_lengths(magnitudes, scene), *_angle(q[:, 2], scene), *_spacing(t, q)]
@@ -195,19 +195,19 @@ def check_poses(t: Array, q: Array, scene: Scene, source: object) -> None:
 
 
 def _stated(doubt: UnitDoubt, roles: Mapping[str, Role]) -> bool:
-    """Return whether the mapping states a unit for each of the numbers."""
+    """Return whether the mapping states a unit for each of the doubted numbers."""
     role = roles[doubt.role]
     return set(doubt.names) <= {*role.factor, *role.scale, *role.limits}
 
 
 def _usual_magnitude(values: Array, percent: float = 99.0) -> float:
-    """Return the magnitude that one value in a hundred exceeds: an outlier is not evidence of the unit."""
+    """Return the magnitude that one value in a hundred exceeds, because an outlier is no evidence of the unit."""
     known = np.abs(values)[np.isfinite(values)]
     return float(np.percentile(known, percent)) if known.size else 0.0
 
 
 def _load(magnitudes: Mapping[tuple[str, str], float], scene: Scene) -> list[UnitDoubt]:
-    """Doubt the forces together, as one component alone may well be small, and the moment beside them."""
+    """Doubt the forces together, as a single component may be small, and the moment in proportion to the forces."""
     found = [magnitudes[key] for key in (("excitation", "fx"), ("excitation", "fy")) if key in magnitudes]
     usual = _largest_force(scene)
     largest = max(found, default=0.0)
@@ -219,7 +219,7 @@ def _load(magnitudes: Mapping[tuple[str, str], float], scene: Scene) -> list[Uni
             largest *= UNITS["force"][unit]
     if largest < _IDLE_SHARE * usual:
         return doubts
-    # a small load has a small moment too
+    # small forces come with a small moment
     beside = float(compile_loads(scene.loads).largest()[2]) * min(1.0, largest / usual) if usual else 0.0
     moment = magnitudes.get(("excitation", "m"), 0.0)
     if _BROKEN_SHARE * beside < moment < _IDLE_SHARE * beside:
@@ -229,18 +229,18 @@ def _load(magnitudes: Mapping[tuple[str, str], float], scene: Scene) -> list[Uni
 
 
 def _angle(theta: Array, scene: Scene) -> list[UnitDoubt]:
-    """Doubt angles beyond the model, or whose swing about their middle no clearance allows."""
+    """Doubt angles outside the model, and angles whose swing about their middle no clearance allows."""
     largest = _usual_magnitude(theta)
     if scene.head.carries == "corners" or not 0.0 < largest < np.degrees(_LARGEST_ANGLE_RAD):
         return []
-    # the zero of a sensor is not the head's
+    # the zero of a sensor differs from the head's
     low, high = np.percentile(theta[np.isfinite(theta)], (0.5, 99.5))
     swing = 0.5 * float(high - low)
     allowed = max(_BELIEVED_SWING_RAD, _BEYOND_CLEARANCE * largest_angle(scene))
     if largest > _LARGEST_ANGLE_RAD:
         found, expected = f"{largest:.3g}", f"less than {_LARGEST_ANGLE_RAD:.3g} rad"
     elif swing > allowed:
-        found, expected = f"a swing by {swing:.3g} to either side", f"at most {allowed:.2g} rad in this clearance"
+        found, expected = f"a swing of {swing:.3g} to either side", f"at most {allowed:.2g} rad in this clearance"
     else:
         return []
     return [UnitDoubt("head_pose", ("theta",), found, expected, "deg", True)]
@@ -257,7 +257,7 @@ def _lengths(magnitudes: Mapping[tuple[str, str], float], scene: Scene) -> list[
 
 
 def _travel(values: Mapping[tuple[str, str], Sequence[float] | Array]) -> list[UnitDoubt]:
-    """Doubt speeds along the face that no plough reaches, where they are more than single outliers."""
+    """Doubt speeds along the face that no plough reaches, unless they are single outliers."""
     speed = _usual_magnitude(np.asarray(values.get(("travel", "speed"), ()), float), 90.0)
     if speed <= _FASTEST_M_S:
         return []
@@ -266,7 +266,7 @@ def _travel(values: Mapping[tuple[str, str], Sequence[float] | Array]) -> list[U
 
 
 def _largest_force(scene: Scene) -> float:
-    """Return the largest force [N] of the scene's loads, or the head's weight where that is larger."""
+    """Return the largest force [N] of the scene's loads, or the head's weight if it is larger."""
     amplitude = compile_loads(scene.loads).largest()
     return max(float(amplitude[:2].max()), scene.head.mass_kg * abs(scene.gravity.acceleration_m_s2))
 
@@ -287,7 +287,7 @@ def _spacing(stamps_s: Array, load: Array) -> list[UnitDoubt]:
     if stamps_s.max() > _DATES_S:
         return []
     spacing = float(np.median(np.abs(steps)))
-    # a number from some start is a second later as a stamp
+    # the stamp of a number from some start is a second later
     low, high = (days + _START_S for days in _SHEET_DAYS)
     if low <= stamps_s[0] <= high and np.ptp(stamps_s) < 1.0 and spacing < _SHORTEST_SPACING_S:
         found = f"{stamps_s[0] - _START_S:.6g} and stamps {spacing:.2g} s apart"
@@ -301,4 +301,4 @@ def _spacing(stamps_s: Array, load: Array) -> list[UnitDoubt]:
         return []
     found = f"stamps {spacing:.4g} s apart"
     likely = next((unit for unit, size in _TIMES.items() if spacing * size < _SLOW_S), "ns")
-    return [UnitDoubt("excitation", ("t",), found, "many in a period of what changes so smoothly", likely)]
+    return [UnitDoubt("excitation", ("t",), found, "many in each period of a load this smooth", likely)]

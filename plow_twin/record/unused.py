@@ -1,4 +1,4 @@
-"""Messages at the inputs of a run, by its journal: those used, and those not used with reason and sender."""
+"""Messages at the inputs of a run by its journal: counts of all, and the unused messages with reason and sender."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from plow_twin.stream.journal import Entry, Gaps, PartOfPose, Pose, Sample, Trav
 class InputCounts:
     """Counts of messages by input and outcome: `used`, or a reason of `Unused`.
 
-    The sum of the counts of `source` without `not_followed` is the number that its publisher has sent.
+    The sum of the counts of `source`, without `not_followed`, is the number of messages that its publisher has sent.
     """
 
     source: str
@@ -54,14 +54,14 @@ class InputCounts:
 
 
 def unused_messages(path: Path) -> Iterator[dict[str, Any]]:
-    """Yield each message that a run did not use, by its journal: input, sender, reason, stamp, values.
+    """Yield each unused message in the journal of a run: input, sender, reason, stamp, values.
 
-    Messages that the journal only counts come last, as one row with a `count` and no stamp.
+    Messages of an entry that are only counted come after its other messages, as one row with a `count` and no stamp.
 
     Raises
     ------
     RecordingError
-        There is no recording of plow_twin, or its journal cannot be decoded.
+        The path is not a recording of plow_twin, or its journal cannot be decoded.
     """
     for batch in RunReader(path).batches(outputs=False):
         for _, entry in sorted(batch.entries.others.items()):

@@ -1,6 +1,6 @@
-"""Many samples at a time through a session: from the journal of a run, or from the load of any recording.
+"""Advancing of a session by many samples at a time, from the journal of a run or from the load of any recording.
 
-Time follows the stamps, and the load is linear from sample to sample: no load is held.
+Time follows the stamps. The load is linear from sample to sample and is never held.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ from plow_twin.stream.session import DIGEST_INTERVAL, Applied, Session
 if TYPE_CHECKING:
     from plow_twin.record.writer import RunWriter
 
-#: Samples advanced together.
+#: Number of samples in one advance of the session.
 BATCH: Final = 4096
-#: Entries at which a walk stops; late samples are sorted in across all others.
+#: Entries at which a walk stops; late samples are sorted in across all other entries.
 _ACTING: Final = (Travel, Reset, Loss, Restore, Snapshot, SetModel, SetWear)
-#: Further such entries where a motion follows measurements.
+#: Further such entries for a motion that follows measurements.
 _FOLLOWED: Final = (Pose, PartOfPose, Estimated, Parameter)
 #: Failed advances in a row after which the model is reset.
 _FAILURE_LIMIT: Final = 10
@@ -51,14 +51,14 @@ _FAILURE_LIMIT: Final = 10
 
 @dataclass(frozen=True)
 class Walked:
-    """Some advances: stamps (n,) [ns], wrench (n, 3), and the rows that would be published after each."""
+    """Several advances: stamps (n,) [ns], wrench (n, 3), and the rows to be published after each advance."""
 
     stamp_ns: NDArray[np.int64]
     wrench: NDArray[np.float64]
-    #: the rows of `published`, with all touches so far
+    #: the rows of `published`, with the number of touches so far
     rows: AdvanceSeries
     published: Published
-    #: touches since the advance before, shape (n, 8)
+    #: touches since the previous advance, shape (n, 8)
     makes: NDArray[np.int64]
     #: signed speed along the face [m/s]
     speed_m_s: float
@@ -88,7 +88,7 @@ class Walker:
         self._sequence = -1
         self._advances = 0
         self._log_time_ns = 0
-        #: failed advances
+        #: number of failed advances
         self.failures = 0
         #: called after each reset of the motion
         self.on_reset: Callable[[], object] = lambda: None
@@ -96,7 +96,7 @@ class Walker:
         self._opening: Snapshot | None = session.snapshot()
 
     def _open(self, log_time_ns: int) -> None:
-        """Begin the journal with the state at the start, at the receive time of the first entry."""
+        """Begin the journal with the initial state, at the receive time of the first entry."""
         opening, self._opening = self._opening, None
         if opening is not None:
             self._sequence += 1
@@ -176,19 +176,19 @@ class Walker:
 class JournalWalk:
     """Pass the journal of a run through walkers of its scene and of other scenes.
 
-    `used` and `late` count samples; a late one is sorted in by its stamp unless the walkers have passed it. `missing`
-    counts entries that the journal lacks: after them a new stretch begins.
+    `used` and `late` count samples; a late sample is sorted in by its stamp unless the walkers have passed it.
+    `missing` counts the entries that the journal lacks; a new stretch begins after each gap.
 
     Parameters
     ----------
     own
-        Walkers that take states from the journal, after a loss or when wear was set.
+        Walkers that take their state from the journal after a loss and when wear was set.
     others
         Walkers that keep their own states.
     whole
         Whether the journal begins with the run; otherwise its first snapshot is restored.
     same_scene
-        Whether `own` have the scene of the run: then they apply changes of the model and restored motions, and
+        Whether `own` have the scene of the run. If so, they apply changes of the model and restored motions, and also
         measurements if their twin follows them.
     """
 
@@ -238,7 +238,7 @@ class JournalWalk:
         stamps, wrench = stamps[order], wrench[order]
         while len(stamps):
             count = len(stamps)
-            if self._travels:  # a speed sent ahead of its time acts from its stamp on
+            if self._travels:  # a speed sent ahead of time acts from its stamp on
                 count = int(np.searchsorted(stamps, self._travels[0].stamp_ns, "right"))
             if count:
                 self._reached_ns = int(stamps[count - 1])
@@ -251,10 +251,10 @@ class JournalWalk:
     def _speed(self, speed_m_s: float) -> None:
         for walker in self._all:
             walker.speed_m_s = speed_m_s
-            walker.apply(Travel(max(0, self._reached_ns), speed_m_s))  # at once
+            walker.apply(Travel(max(0, self._reached_ns), speed_m_s))  # acts at once
 
     def _begin_anew(self) -> None:
-        """Forget the time reached: any stamp may come next; waiting speeds act from now on."""
+        """Forget the time reached, so that any stamp may come next; waiting speeds act from now on."""
         for travel in self._travels:
             self._speed(travel.speed_m_s)
         self._travels, self._reached_ns = [], -1

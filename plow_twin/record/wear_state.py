@@ -1,4 +1,4 @@
-"""The file with the wear of the pads of one head in one slide, which outlives the process."""
+"""The file that keeps the wear of one head's pads in one slide from process to process."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.model.scene import Scene
 from plow_twin.record.durable import write_whole
 
-#: Name of the file in the folder of the user.
+#: Name of the file in the folder that the user gives.
 FILE_NAME: Final = "wear.json"
 VERSION: Final = 1
 
 
 class WearStateError(PlowTwinError, ValueError):
-    """A file of wear cannot be used; the message names it and the reason."""
+    """A file of wear cannot be used; the message names the file and the reason."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def claim_folder(folder: Path) -> int:
     Raises
     ------
     WearStateError
-        No file can be written there, or another twin keeps its wear there.
+        The folder cannot be written to, or another twin keeps its wear there.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -132,7 +132,7 @@ def _unwritable(folder: Path, error: OSError) -> WearStateError:
 
 
 def wear_content(state: WearState) -> bytes:
-    """Return the content of a file with that wear, saved now."""
+    """Return the content of a file with this wear and the present time."""
     record = {
         "version": VERSION,
         "head": state.head,
@@ -144,12 +144,12 @@ def wear_content(state: WearState) -> bytes:
 
 
 def save_wear(folder: Path, content: bytes) -> None:
-    """Write the file in one step: after a crash it is the old or the new file, complete.
+    """Write the file in one step; after a crash it is either the complete old file or the complete new file.
 
     Raises
     ------
     OSError
-        The disk refuses it; the file is the old version, or the new version without confirmation by the disk.
+        The disk refuses the file; it is still the old version, or the new version without confirmation by the disk.
     """
     folder.mkdir(parents=True, exist_ok=True)
     write_whole(folder / FILE_NAME, content, sync=True)

@@ -1,6 +1,6 @@
-"""Access to eight bytes at any place of an array as one number, for compiled code.
+"""Access for compiled code to eight bytes at any place of an array as one number.
 
-Numbers are little-endian, as in MCAP and in the CDR that is written here.
+Numbers are little-endian, as in MCAP and in the CDR of this package.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""One recording on disk: `run/run_0.mcap`, `run/run_1.mcap`, ... with `run/metadata.yaml`, written from one thread."""
+"""Writer of a recording: `run/run_0.mcap`, `run/run_1.mcap`, ... and `run/metadata.yaml`, all from one thread."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from plow_twin.stream.journal import Digest, Entry, Sample
 from plow_twin.stream.outputs import Published
 from plow_twin.stream.topics import TOPICS, Cadence, topics_of
 
-#: Folder of other topics in the folder of a run; further ones are `beside_2`, ...
+#: Folder of other topics in the folder of a run; further such folders are `beside_2`, ...
 BESIDE: Final = "beside"
 _SEQUENCE_MASK: Final = 0xFFFFFFFF
 Made = TypeVar("Made")
@@ -41,9 +41,9 @@ class _Part:
 
     path: Path
     file: McapFile
-    #: number, message type and QoS text of each channel by its topic
+    #: number, message type and QoS text of each channel by topic
     channels: dict[str, tuple[int, str, str]] = field(default_factory=dict)
-    #: numbers of the publications' channels by base name of the topic
+    #: channel number of each publication topic by base name
     sent: dict[str, int] = field(default_factory=dict)
 
     def facts(self) -> PartFacts:
@@ -55,22 +55,22 @@ class _Part:
 
 
 class RunWriter:
-    """Writes entries and outputs in the order of the calls.
+    """Write entries and outputs in the order of the calls.
 
-    Journal and outputs have chunks of their own; the chunk of entries precedes that of the outputs sent after them.
+    Journal and outputs have separate chunks; the chunk of entries precedes the chunk of the outputs sent after them.
     Every method may raise `OSError` (disk full). After a failed `flush` or write the file is complete up to the
     previous flush and can be continued; after any other failed method only `abandon` may be called.
 
     Parameters
     ----------
     folder
-        Folder to make; it must not exist or be empty.
+        Folder to make; an existing folder must be empty.
     chunk_size
         Bytes [B] of journal and outputs at which their chunks are closed.
     min_free_bytes
-        Smallest free space on the disk [B], below which `shortage` returns a text.
+        Free space on the disk [B] below which `shortage` returns a text.
     sync
-        Whether each flush, and the begin and end of each part, wait for the disk.
+        Whether each flush and the start and end of each part wait for the disk.
     """
 
     def __init__(
@@ -175,7 +175,7 @@ class RunWriter:
     def write_sent(
         self, sequence: Indexes, log_time_ns: Indexes, stamp_ns: Indexes, sent: Sequence[Mapping[str, bytes]]
     ) -> None:
-        """Write publications that were sent: entry before them, log time, stamp [ns], bytes by base name."""
+        """Write publications that were sent; `sent` has the bytes of each publication's messages by base name."""
         channels = self._part.sent
         if not channels:
             followed = (Cadence.FOLLOWED,) if self.header.follow == "full" else ()
@@ -226,17 +226,17 @@ class RunWriter:
             self._part.file.chunk(self._journal)
             self._part.file.chunk(self._outputs)
         except OSError:
-            self._outputs.clear()  # the outputs are useless without the chunk of the journal
+            self._outputs.clear()  # outputs are useless without the journal before them
             raise
 
     def flush(self) -> None:
-        """Pass all bytes to the operating system: they survive a kill of the process."""
+        """Pass all bytes to the operating system, so that they survive a kill of the process."""
         self._close_chunks()
         if self._sync:
             self._part.file.sync()
 
     def reason_to_stop(self) -> str | None:
-        """Return why recording must end for good, or None."""
+        """Return the reason why recording must end for good, or None."""
         if not self._part.file.is_linked():
             return "the file was removed or replaced"
         return None
@@ -249,10 +249,10 @@ class RunWriter:
         return shortage(folder, self._min_free_bytes)
 
     def split(self, loss: Mapping[str, int], keep_bytes: int = 0) -> None:
-        """Go on in a new part, opened before the old one is closed.
+        """Start a new part, which is opened before the old part is closed.
 
-        The caller must write a snapshot next. With `keep_bytes` the oldest parts are removed while the parts are larger
-        in total.
+        The caller must write a snapshot next. With `keep_bytes`, the oldest parts are removed while the total size is
+        larger.
         """
         self._close_chunks()
         old, self._number = self._part, self._number + 1
@@ -300,14 +300,14 @@ def shortage(folder: Path, min_free_bytes: int) -> str | None:
 
 
 def _is_free(folder: Path) -> bool:
-    """Return whether a recording can be made there; folders of other topics may exist already."""
+    """Return whether a recording can be made in a folder, in which folders of other topics may exist already."""
     if not folder.exists():
         return True
     return folder.is_dir() and all(item.name.startswith(BESIDE) and item.is_dir() for item in folder.iterdir())
 
 
 def free_folder(folder: Path) -> Path:
-    """Return the folder, or the first free one of `<folder>_2`, `<folder>_3`, ...."""
+    """Return the folder, or the first free folder of `<folder>_2`, `<folder>_3`, ..."""
     path, number = folder, 1
     while not _is_free(path):
         number += 1
@@ -316,7 +316,7 @@ def free_folder(folder: Path) -> Path:
 
 
 def in_free_folder(folder: Path, make: Callable[[Path], Made]) -> Made:
-    """Make a recording in `free_folder`, or in the next one if another process has made that."""
+    """Make a recording in `free_folder`, or in the next free folder if another process has taken it meanwhile."""
     while True:
         try:
             return make(free_folder(folder))
@@ -350,7 +350,7 @@ def make_folder(folder: Path) -> None:
 
 
 def warm_up_writer(header: RunHeader) -> None:
-    """Compile the functions that lay messages into chunks, before the first samples."""
+    """Compile the functions that write messages into chunks, before the first sample."""
     templates: dict[str, Any] = {"sample": sample_template(header.frame_id)}
     templates |= publication_templates(header.frame_id, header.child_frame_id)
     one = np.zeros(1, np.int64)
