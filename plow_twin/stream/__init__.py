@@ -1,1 +1,1 @@
-"""Samples over time: order, gaps, hold policy, health counters; every clock is passed in."""
+"""The stream of samples over time: order, gaps, hold policy and health counters. No module here reads a clock."""

@@ -1,6 +1,6 @@
 """Alarms on publications: two levels, hysteresis, minimum duration, latched until acknowledged.
 
-They follow from the publications and the acknowledgements alone, so a replay gives the same alarms.
+Alarms depend only on the publications and the acknowledgements, so a replay gives the same alarms.
 """
 
 from __future__ import annotations
@@ -22,9 +22,10 @@ from plow_twin.solve.totals import summary
 from plow_twin.stream.intake import NS_PER_S
 from plow_twin.stream.outputs import CLEARANCE_NAMES, Published, Rows
 
-#: A level is left below this share of its threshold.
+#: An alarm leaves a level when its value falls below this share of the level's threshold.
 HYSTERESIS: Final = 0.95
-#: Time [ns] over which the growth rate of the clearance is taken: its steps of a tenth of a second are too short.
+#: Time [ns] over which the growth rate of the clearance is computed; between two slow parts (0.1 s) it grows too
+#: little.
 RATE_SPAN_NS: Final = 10 * NS_PER_S
 #: Time for which poses of the model are kept for late measured poses [ns].
 _KEPT_NS: Final = 2 * NS_PER_S
@@ -33,7 +34,7 @@ _MOST_WAITING: Final = 1000
 
 
 class Level(IntEnum):
-    """How serious an alarm is, by the levels of a diagnostic status."""
+    """Severity of an alarm, in the levels of a diagnostic status."""
 
     NONE = 0
     WARN = 1
@@ -42,7 +43,7 @@ class Level(IntEnum):
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Values from which there is a warning and an error; 0: never."""
+    """Values at and above which an alarm has the level warning or error; 0: never."""
 
     warn: float = 0.0
     error: float = 0.0
@@ -59,7 +60,7 @@ class Thresholds:
 
 @dataclass(frozen=True)
 class Raised:
-    """Origin of an alarm's latched level: value, threshold, stamp, and the pair or axis, if there is one."""
+    """Cause of an alarm's latched level: value, threshold, stamp, and the pair or axis, if any."""
 
     value: float
     threshold: float
@@ -69,16 +70,16 @@ class Raised:
 
 @dataclass
 class Alarm:
-    """One quantity: its value, its level now, and the highest one since it was acknowledged."""
+    """The alarm of one quantity: its value, its present level, and its highest level since the last acknowledgement."""
 
     thresholds: Thresholds
     value: float = 0.0
     level: Level = Level.NONE
     latched: Level = Level.NONE
-    #: how the latched level was raised; None: no level is latched
+    #: cause of the latched level; None: no level is latched
     raised: Raised | None = None
     _since_ns: int | None = None
-    #: value below which there is no level
+    #: value below which the alarm has no level
     lowest: float = field(init=False)
 
     def __post_init__(self) -> None:
@@ -86,7 +87,7 @@ class Alarm:
         self.lowest = min((found for found in thresholds if found > 0.0), default=math.inf)
 
     def feed(self, value: float, stamp_ns: int, duration_ns: int) -> bool:
-        """Judge a value; return whether the level has changed. A higher level must last for `duration_ns` first."""
+        """Judge a value and return whether the level has changed; a higher level must first last for `duration_ns`."""
         self.value = value
         before = self.level
         if not before and value < self.lowest:
@@ -118,14 +119,14 @@ class Alarm:
             self.raised = replace(self.raised, threshold=self._threshold())
 
     def stays(self, values: NDArray[np.float64]) -> bool:
-        """Return whether these values can change no level."""
-        if self.level or self.lowest == math.inf:  # without a threshold there is no level
+        """Return whether the level stays the same for all these values."""
+        if self.level or self.lowest == math.inf:  # inf: the alarm has no threshold
             return not self.level
         return float(values.max(initial=-math.inf)) < self.lowest
 
 
 class _Model:
-    """The latest poses of the model, and measured poses that wait for it."""
+    """The latest poses of the model, and the measured poses that wait for the model."""
 
     def __init__(self) -> None:
         self._stamps_ns: list[int] = []
@@ -133,9 +134,9 @@ class _Model:
         self._waiting: list[tuple[int, float, float]] = []
 
     def add(self, stamp_ns: int, x: float, y: float) -> list[tuple[int, float]]:
-        """Add the model's pose; return stamps and residuals [m] of the measured poses that waited for it."""
+        """Add a pose of the model; return stamps and residuals [m] of the measured poses that waited for it."""
         place = bisect_left(self._stamps_ns, stamp_ns)
-        # late samples have been worked in: the motion after them is computed again
+        # the motion after a late sample is computed again, so the old poses are dropped
         del self._stamps_ns[place:], self._q[place:]
         self._stamps_ns.append(stamp_ns)
         self._q.append((x, y))
@@ -149,7 +150,7 @@ class _Model:
         return [found for pose in due if (found := self.residual(*pose)) is not None]
 
     def residual(self, stamp_ns: int, x: float, y: float) -> tuple[int, float] | None:
-        """Return stamp and distance [m] of a measured pose from the model at its stamp; None: not known, or not yet."""
+        """Return a measured pose's stamp and its distance [m] from the model, or None if it is not known (yet)."""
         if not self._stamps_ns or stamp_ns > self._stamps_ns[-1]:
             if len(self._waiting) < _MOST_WAITING:
                 self._waiting.append((stamp_ns, x, y))
@@ -169,12 +170,12 @@ class Alarms:
     Parameters
     ----------
     thresholds
-        By name: `force` [N], the largest of a pair since the publication before where there were samples;
-        `clearance` [m], the larger of horizontal and vertical; `clearance_rate` [m/s], its growth over `RATE_SPAN_NS`;
-        `wear_rate` [m/s], the largest of a pad; `residual` [m], the distance of a measured pose from the model at its
-        stamp.
+        By name: `force` [N], the largest force of a pair since the previous publication, while there were samples;
+        `clearance` [m], the larger of the horizontal and the vertical clearance; `clearance_rate` [m/s], its growth
+        over `RATE_SPAN_NS`; `wear_rate` [m/s], the largest wear rate of a pad; `residual` [m], the distance of a
+        measured pose from the model at its stamp.
     duration_s
-        How long a level must last before there is an alarm [s].
+        Time for which a level must last before the alarm takes this level [s].
     """
 
     def __init__(self, thresholds: Mapping[str, Thresholds], duration_s: float = 0.0) -> None:
@@ -182,11 +183,11 @@ class Alarms:
         self._duration_ns = round(duration_s * NS_PER_S)
         self._model = _Model() if "residual" in self.alarms else None
         self._clearances: deque[tuple[int, float]] = deque()
-        #: names of the alarms that the newest judgement has latched at a higher level
+        #: names of the alarms that the newest row or pose has latched at a higher level
         self.raised: list[str] = []
 
     def feed(self, published: Published) -> Iterator[int]:
-        """Judge publications; yield the number of each row that has changed a level, right after this row was judged.
+        """Judge publications; yield the number of each row that changes a level, before the next row is judged.
 
         Rows without a sample are not judged.
         """
@@ -217,7 +218,7 @@ class Alarms:
         return changed
 
     def _place(self, row: np.void, slow: np.void | None) -> None:
-        """Note at which pair or along which axis the alarms were raised."""
+        """Note the pair or axis of each alarm that was raised."""
         where = {"force": PAIR_NAMES[int(row["measured_peak"].argmax())]}
         if slow is not None:
             axis = CLEARANCE_NAMES[int(slow["clearance"][:2].argmax())]
@@ -230,11 +231,11 @@ class Alarms:
 
     @property
     def follows_poses(self) -> bool:
-        """Whether measured poses matter."""
+        """Whether an alarm depends on measured poses."""
         return self._model is not None
 
     def _feed_quiet(self, published: Published) -> bool:
-        """Judge many rows at once and return True; False, without effect, where a row may change a level."""
+        """Judge many rows at once and return True; return False, without effect, if a row may change a level."""
         rows, slow = published
         growth = self.alarms.get("clearance_rate")
         if self._model is not None or rows["held"].any() or (growth is not None and growth.lowest < math.inf):
@@ -251,7 +252,7 @@ class Alarms:
                 for found in zip(stamps_ns, earlier, strict=False):
                     self._growth(*found)
             rate = self._growth(stamps_ns[-1], clearance)
-        # without a change of level the newest values are remembered
+        # only the newest values are kept, as no level changes
         newest = {name: float(found[-1].max()) for name, found in values.items() if len(found)}
         for name, value in (newest | ({"clearance_rate": rate} if stamps_ns else {})).items():
             if name in self.alarms:
@@ -277,7 +278,7 @@ class Alarms:
         return changed
 
     def _growth(self, stamp_ns: int, clearance: float) -> float:
-        """Return the growth rate of the clearance [m/s] over the span, 0 until it has passed."""
+        """Return the growth rate of the clearance [m/s] over `RATE_SPAN_NS`, 0 until this time has passed."""
         if self._clearances and stamp_ns <= self._clearances[-1][0]:
             self._clearances.clear()
         self._clearances.append((stamp_ns, clearance))
@@ -294,11 +295,11 @@ class Alarms:
 
     @property
     def worst(self) -> Level:
-        """The highest level, latched ones included."""
+        """The highest level of all alarms, including latched levels."""
         return max((max(levels) for levels in self.levels.values()), default=Level.NONE)
 
     def acknowledge(self) -> list[str]:
-        """Release latched alarms; return the names of those still present."""
+        """Release latched alarms; return the names of the alarms that are still present."""
         for alarm in self.alarms.values():
             alarm.acknowledge()
         return [name for name, alarm in self.alarms.items() if alarm.level]

@@ -1,4 +1,4 @@
-"""Interfaces for a session: a twin, and a twin that follows measurements."""
+"""Interfaces that a session drives: a twin, and a twin that follows measurements."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from plow_twin.run.twin import Advanced
 
 Array = NDArray[np.float64]
 
-#: Most poses kept for later: ten seconds at 1 kHz. Estimates are always kept.
+#: Largest number of poses kept for going back: ten seconds at 1 kHz. Estimates are always kept.
 MOST_MEASURED: Final = 10_000
 
 
@@ -57,30 +57,33 @@ class Following(Driven, Protocol):
 
     #: number of poses and estimates so far
     added: int
-    #: whether, after a single published row, intervals and measurements wait for `catch_up`
+    #: whether intervals and measurements wait for `catch_up` after a row is published alone
     defers: bool
 
     def catch_up(self) -> None:
-        """Finish the work that the newest row left, if any; every other call does this first."""
+        """Finish the work that the newest row left; every other call does this first."""
 
     def add_pose(self, t: float, q: ArrayLike, known: float = ...) -> None:
-        """Add a pose measured at model time `t` in s, shape (3,), NaN where not measured; it acts from `known` on."""
+        """Add a pose measured at model time `t` in s, shape (3,), NaN where not measured.
+
+        It has an effect from model time `known` in s on.
+        """
 
     def add_estimate(self, text: str, t: float) -> None:
-        """Add an estimate, JSON, known from model time `t` in s on."""
+        """Add an estimate (JSON) that is known from model time `t` in s on."""
 
     @property
     def known(self) -> str:
-        """The estimate that is followed, JSON; empty: the prior."""
+        """The estimate that is followed (JSON); empty: the prior."""
 
     def follow_estimate(self, known: str) -> None:
-        """Continue from the present state with the estimate that `known` was."""
+        """Continue from the present state with an estimate that `known` returned."""
 
     def follow_parameters(self) -> None:
-        """Continue with a single twin from the state of the median twin, without corrections by poses."""
+        """Continue from the state of the median twin with a single twin, without corrections by poses."""
 
     def end_spans(self, ends: NDArray[np.int64], begins: bool) -> None:
-        """State which rows of the next `advance_rows` are published, and whether their span begins with the first."""
+        """Set which rows of the next `advance_rows` are published, and whether their span begins with the first row."""
 
     def snapshot_size(self, data: bytes) -> int:
         """Return the length of the snapshot at the beginning of some bytes."""

@@ -1,4 +1,4 @@
-"""Handles arriving samples and silence: intake, hold policy and session meet here."""
+"""Handling of arriving samples and of silence, by intake, hold policy and session."""
 
 from __future__ import annotations
 
@@ -41,11 +41,12 @@ from plow_twin.stream.steps import Steps
 #: Stamp [ns] and wrench (Fx, Fy [N], M [N m]) of a sample that has arrived.
 Arrival = tuple[int, tuple[float, float, float]]
 
-#: Most model time that one call may catch up when the excitation is silent [ns]: the work of a call stays bounded.
+#: Largest model time that one call may catch up when the excitation is silent [ns], so that its work is bounded.
 _LARGEST_HOLD_NS: Final = NS_PER_S
-#: Longest time between two checks for silence [ns]: the policy may change.
+#: Longest time between two checks for silence [ns], because the policy may change.
 _LONGEST_QUIET_NS: Final = NS_PER_S // 10
-#: Most resets by jumps of the clock within a time [ns]: two clocks out of step must not reset the model for ever.
+#: Largest number of resets by jumps of the clock within `_RESET_WINDOW_NS`: two clocks that disagree must not reset the
+#: model for ever.
 _MOST_RESETS: Final = 5
 _RESET_WINDOW_NS: Final = 10 * NS_PER_S
 
@@ -64,10 +65,10 @@ class StreamState(Enum):
 class Policy:
     """Settings that may change at run time.
 
-    After `excitation_timeout_s` without a sample the model follows the steady clock at this distance, so that a sample
-    late by less is still used. `hold` is `hold` (the last load stays) or `zero` (it falls to zero within the first
-    call); after `hold_limit_s` the model stands still. After `failure_limit` failed advances in a row the model is
-    reset (`Failures.wants_restart`); 0: never.
+    After `excitation_timeout_s` without a sample, the model follows the steady clock with this delay, so that a sample
+    with a smaller delay is still used. `hold` is `hold` (the last load is kept) or `zero` (the load falls to zero
+    within the first call); after `hold_limit_s` the model stands still. After `failure_limit` failed advances in a row
+    the model is reset (`Failures.wants_restart`); 0: never.
     """
 
     excitation_timeout_s: float = 0.5
@@ -79,7 +80,7 @@ class Policy:
 class Driver:
     """Feed a session from live events and return the publications.
 
-    Times are passed in: `now_ns` on a steady clock, stamps on the samples' own.
+    Times are arguments: `now_ns` is on a steady clock, and stamps are on the clock of the samples.
 
     Parameters
     ----------
@@ -101,9 +102,9 @@ class Driver:
         self.failed = Failures(session.emit)
         self.resets = 0
         self.holds = 0
-        #: late samples that were worked in by going back
+        #: number of late samples that were inserted by going back
         self.rolled_back = 0
-        #: speeds along the face that could not act at their stamps
+        #: number of speeds along the face that could not act at their stamps
         self.travel_misplaced = 0
         #: steady times of the latest resets, and of the latest refused reset [ns]
         self._resets_ns: deque[int] = deque()
@@ -112,10 +113,10 @@ class Driver:
         self.clock = Intake(jump_back_s=intake.jump_back_s, jump_forward_s=intake.jump_forward_s)
         self._received_ns = 0
         self._newest_ns: int | None = None
-        #: model time that has been counted [ns]
+        #: model time up to which the real-time factor has counted [ns]
         self._counted_ns: int | None = None
         self._zeroed = False
-        #: delay of the stamps of the scene's own loads behind the clock [ns]: time spent inactive
+        #: time spent inactive [ns], by which the stamps of the scene's own loads are behind the clock
         self._behind_ns = 0
         self._resumed = False
 
@@ -137,12 +138,12 @@ class Driver:
     def samples(self, arrived: Iterable[Arrival], now_ns: int) -> Iterator[Published]:
         """Judge samples in order of arrival, advance to the accepted ones, and yield the publications.
 
-        The caller publishes each before the next is computed, so that a recording holds publications in order. A sample
-        whose stamp jumps waits for the next one.
+        The caller sends each publication before the next one is computed, so that a recording has them in order. A
+        sample whose stamp jumps waits for the next sample.
         """
         run: list[Sample] = []
         for stamp_ns, wrench in arrived:
-            if self.every_sample and not run and self._goes_on(stamp_ns, wrench):  # as nearly always
+            if self.every_sample and not run and self._goes_on(stamp_ns, wrench):  # the usual case
                 self._newest_ns, self._received_ns, self._zeroed = stamp_ns, now_ns, False
                 self.silences.add_one(stamp_ns)
                 published = self._apply([Sample(stamp_ns, wrench)], now_ns)
@@ -159,8 +160,8 @@ class Driver:
     ) -> Iterator[Published | Series]:
         """Use many samples in order of arrival, stamps (n,) [ns] and wrenches (n, 3), as `samples` does.
 
-        Samples that continue each other are applied together; the caller journals and publishes a `Series` before the
-        next is computed. All others go through `samples`, with the same outcome.
+        Samples without a jump are applied together as a `Series`, which the caller journals and publishes before the
+        next one is computed. All other samples go through `samples`. The outcome is the same.
         """
         run: list[Sample] = []
         goes_on = self.intake.go_on(stamps, wrench)
@@ -195,12 +196,12 @@ class Driver:
             yield from self._use(run, now_ns)
 
     def _may_go_on(self, stamp_ns: int, wrench: tuple[float, float, float]) -> bool:
-        """Return whether a sample can be accepted."""
+        """Return whether a sample is clearly plausible and no other sample waits."""
         reached_ns = self.session.stamp_ns
         return not (reached_ns is None or self._steps.waits) and self.intake.goes_on(stamp_ns, wrench, reached_ns)
 
     def _goes_on(self, stamp_ns: int, wrench: tuple[float, float, float]) -> bool:
-        """Accept a sample that is clearly plausible; False: `judge` must decide."""
+        """Accept a sample that is clearly plausible; return False if `judge` must decide."""
         found = self._may_go_on(stamp_ns, wrench)
         if found:
             self.intake.accept(stamp_ns, wrench)
@@ -209,9 +210,9 @@ class Driver:
     def _use_samples(
         self, run: list[Sample], stamp_ns: int, wrench: tuple[float, float, float], now_ns: int
     ) -> Iterator[Published]:
-        """Judge a sample, and add it to `run`, the samples applied together; where needed `run` is applied first."""
+        """Judge a sample and add it to `run`, the samples to apply together; `run` is applied first where needed."""
         late = bool(run) and self._is_late(run[0])
-        # a stamp not after the last one may be late or a jump back, which shows once the run is applied
+        # a stamp that does not rise may be late or a jump back, which `judge` can tell once the run is applied
         if run and not late and stamp_ns <= run[-1].stamp_ns:
             yield from self._use(run, now_ns)
             late = False
@@ -236,7 +237,7 @@ class Driver:
         return self.session.outputs.pop()
 
     def silence(self, now_ns: int) -> Published:
-        """Go on under the hold policy when the excitation has been silent for too long; called at intervals."""
+        """Advance under the hold policy if the excitation has been silent for too long; called at intervals."""
         if self._newest_ns is None:
             return NOTHING
         timeout_ns = round(self.policy.excitation_timeout_s * NS_PER_S)
@@ -267,9 +268,9 @@ class Driver:
         return max(0, min(left_ns, _LONGEST_QUIET_NS))
 
     def clock_tick(self, stamp_ns: int, now_ns: int) -> Published:
-        """Advance under the scene's own loads to the time `stamp_ns` of the node's clock, less the time spent inactive.
+        """Advance under the scene's own loads to the time `stamp_ns` of the node's clock minus the time spent inactive.
 
-        The first call after `resume` only measures that time.
+        The first call after `resume` only measures the time spent inactive.
         """
         reached_ns = self.session.stamp_ns
         if reached_ns is None:
@@ -293,10 +294,10 @@ class Driver:
         return self._advance(Hold(stamp_ns), now_ns, StreamState.RUNNING)
 
     def travel(self, stamp_ns: int, speed_m_s: float) -> None:
-        """Take over the speed along the face [m/s]; its sign is the direction, wear takes the magnitude.
+        """Use a speed along the face [m/s] from its stamp on; the sign is the direction, and wear uses the magnitude.
 
-        A speed whose stamp is further ahead than `jump_forward_s`, or older than every kept state, has the stamp of
-        another clock: it acts from the time reached on, and is counted.
+        A stamp that is further ahead than `jump_forward_s`, or older than every kept state, is on another clock: such a
+        speed acts from the time reached on, and is counted.
         """
         reached_ns, oldest_ns = self.session.stamp_ns, self.session.history.oldest_ns
         if reached_ns is not None:
@@ -320,13 +321,13 @@ class Driver:
         self.session.apply(Mark(stamp_ns, text))
 
     def snapshot(self) -> Snapshot:
-        """Journal and return the exact state; older samples can no longer be worked in."""
+        """Journal and return the exact state; older samples can no longer be inserted."""
         snapshot = self.session.renew()
         self.session.emit(snapshot)
         return snapshot
 
     def restore(self, stamp_ns: int, snapshot: Snapshot) -> None:
-        """Return to the motion of a snapshot; the next sample counts at the snapshot's time, with any stamp."""
+        """Return to the motion of a snapshot; the next sample, with any stamp, is at the snapshot's time."""
         self.failed.end()
         self.session.apply(Restore(stamp_ns, snapshot.data))
         self._begin_again()
@@ -334,7 +335,7 @@ class Driver:
         self.clock.restart()
 
     def set_model(self, stamp_ns: int, changes: Mapping[str, float]) -> None:
-        """Continue with other numbers of the scene, by their keys in its file; all others are the scene's.
+        """Continue with other numbers of the scene, by their keys in its file; all other numbers are those of the file.
 
         Raises
         ------
@@ -346,7 +347,7 @@ class Driver:
             self.session.apply(SetModel(stamp_ns, json.dumps(dict(changes))))
 
     def set_wear(self, stamp_ns: int, depth_m: Sequence[float], reason: str) -> None:
-        """Set the wear depth of each pad [m]: other pads, or a measurement; the motion restarts.
+        """Set the wear depth of each pad [m], after new pads or a measurement; the motion restarts.
 
         Raises
         ------
@@ -374,12 +375,12 @@ class Driver:
         self.clock.restart()
 
     def resume(self, now_ns: int) -> None:
-        """Start silence and clock anew: the time spent inactive is not caught up."""
+        """Restart the measurement of silence and clock, so that the time spent inactive is not caught up."""
         self._received_ns = now_ns
         self._resumed = True
 
     def pause(self) -> None:
-        """Count a sample that waits for its successor, because no sample comes at present."""
+        """Count a sample that waits for the next sample, because no sample will come at present."""
         self._steps.end()
 
     def close(self) -> None:
@@ -404,7 +405,7 @@ class Driver:
         return len(self._resets_ns) < _MOST_RESETS
 
     def _restart_model(self, stamp_ns: int, reason: str, now_ns: int | None) -> None:
-        """Reset the model; resets by requests, restores and failures (`now_ns` None) do not count against the limit."""
+        """Reset the model; resets by request, restore or failure (`now_ns` None) are not counted towards the limit."""
         if now_ns is not None:
             self._resets_ns.append(now_ns)
         self.failed.end()
@@ -418,7 +419,7 @@ class Driver:
         self.state = StreamState.WAITING
 
     def _use(self, run: list[Sample], now_ns: int) -> Iterator[Published]:
-        """Advance to samples, removing them from the list, and yield the publications."""
+        """Advance to the samples of `run`, empty it, and yield the publications."""
         samples = run.copy()
         run.clear()
         for part in self.session.parts(samples, each=self.every_sample):
@@ -426,11 +427,11 @@ class Driver:
             if len(published.rows):
                 yield published
         if self._newest_ns is None:
-            # after a reset between two samples silence must be noticed
+            # silence must also be noticed after a reset between two samples
             self._newest_ns = self.session.stamp_ns
 
     def _apply(self, samples: Sequence[Sample], now_ns: int) -> Published:
-        """Advance to samples that are applied together, and return the publication."""
+        """Apply samples together and return the publication."""
         applied = self.session.apply_samples(samples, each=self.every_sample)
         self.rolled_back += applied.late
         self._advanced(now_ns)
@@ -444,7 +445,7 @@ class Driver:
     def _advance(self, entry: Hold | Unload, now_ns: int, state: StreamState) -> Published:
         """Advance without a sample."""
         rows = self.session.apply(entry)
-        assert rows is not None, "such an entry makes an advance"
+        assert rows is not None, "a hold or an unload makes an advance"
         self._advanced(now_ns)
         self._judge_advance(int(rows["status"][0]), entry.stamp_ns, state)
         self._restart_after_failures()
@@ -458,7 +459,7 @@ class Driver:
         self._counted_ns = reached_ns
 
     def _judge_rows(self, rows: Rows) -> None:
-        """Judge advances to samples of which at least one has failed."""
+        """Count good and failed advances, of which at least one has failed."""
         stamps = (self.session.origin_ns or 0) + np.rint(rows["t"] * NS_PER_S).astype(np.int64)
         for status, stamp_ns in zip(rows["status"].tolist(), stamps.tolist(), strict=True):
             self._judge_advance(status, stamp_ns, StreamState.RUNNING)

@@ -1,4 +1,4 @@
-"""Failed advances, counted and journalled by stretches; after some in a row the model restarts."""
+"""Failed advances, counted and journalled by stretches; after several in a row the model restarts."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ class Failures:
     Parameters
     ----------
     emit
-        Receives a `Failed` at the first advance of a stretch, and a second at its end.
+        Receives a `Failed` at the first failure of a stretch, and another `Failed` at its end.
     """
 
     def __init__(self, emit: Callable[[Failed], object]) -> None:
         self._emit = emit
-        #: failed advances, and stretches of failed advances
+        #: numbers of failed advances and of stretches of failed advances
         self.count = self.stretches = 0
         #: reason of the newest failure; empty without a failure
         self.reason = ""
@@ -47,7 +47,7 @@ class Failures:
             self._emit(Failed(stamp_ns, stamp_ns, 1, reason))
 
     def end(self) -> None:
-        """End a stretch, if there is one: an advance succeeded, or the motion restarts."""
+        """End a stretch, if there is one, because an advance succeeded or the motion restarts."""
         if self._in_a_row > 1:
             self._emit(Failed(self.until_ns, self.since_ns, self._in_a_row - 1, self.reason))
         self._in_a_row = 0
@@ -55,9 +55,9 @@ class Failures:
     def wants_restart(self, limit: int) -> bool:
         """Return whether the model should restart, after `limit` failed advances in a row; 0: never.
 
-        Where the model failed again at once after a restart, the next restart waits twice as long as the previous
-        stretch: the number of restarts grows with the logarithm of the time, and at most half of the time in which the
-        model could move is lost.
+        If the model fails again at once after a restart, the next restart waits twice as long as the previous stretch.
+        The number of restarts then grows with the logarithm of time, and at most half of the time in which the model
+        could move is lost.
         """
         if not 0 < limit <= self._in_a_row:
             return False

@@ -1,4 +1,4 @@
-"""Figures of the running system in bounded memory: durations by quantile, model time against wall time."""
+"""Figures of the running system in bounded memory: quantiles of durations, and model time over wall time."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ _BINS: Final = _BINS_PER_DECADE * _DECADES
 
 
 class DurationHistogram:
-    """Durations from 1 us to 100 s in bins of equal ratio, 50 to a decade: a quantile is good to 2.4 %."""
+    """Durations from 1 us to 100 s in bins of equal ratio, 50 per decade, so that a quantile is accurate to 2.4 %."""
 
     def __init__(self) -> None:
-        # a list, because incrementing an item takes a tenth of the time of an array
+        # a list, in which incrementing an item takes a tenth of the time that an array takes
         self._counts = [0] * _BINS
         self._counted = np.zeros(len(self._counts), np.int64)
         self.largest_s = 0.0
@@ -29,7 +29,7 @@ class DurationHistogram:
         return sum(self._counts)
 
     def add(self, duration_s: float, count: int = 1) -> None:
-        """Count a duration [s]; outside the range it counts in the end bin, a negative duration is ignored."""
+        """Count a duration [s]; outside the range it is counted in the end bin, and a negative duration is ignored."""
         if not duration_s >= 0.0:
             return
         if duration_s > self.largest_s:
@@ -38,7 +38,7 @@ class DurationHistogram:
         self._counts[index if index < _BINS else -1] += count
 
     def quantile(self, share: float) -> float:
-        """Return the duration [s] that the given share of all does not exceed; NaN without one."""
+        """Return the duration [s] that the given share of all durations does not exceed; NaN without durations."""
         return self._quantile(np.array(self._counts), share)
 
     def recent(self, share: float) -> float:
@@ -57,7 +57,7 @@ class DurationHistogram:
 
 
 class Periods:
-    """Times between the turns of a loop: their scatter, and the number of missed periods.
+    """Times between the turns of a loop: their mean, scatter and maximum, and the number of missed periods.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ class Periods:
 
     def __init__(self, period_s: float) -> None:
         self._period_s = period_s
-        #: periods left out so far
+        #: number of missed periods so far
         self.missed = 0
         self._before_s = math.nan
         self._recent: list[float] = []
@@ -84,7 +84,7 @@ class Periods:
             self.missed += max(0, round(passed_s / self._period_s) - 1)
 
     def recent(self) -> tuple[float, float, float]:
-        """Return mean, standard deviation and largest time [s] since the last call; NaN without one."""
+        """Return mean, standard deviation and largest time [s] since the last call; NaN without turns."""
         found, self._recent = np.array(self._recent), []
         return (float(found.mean()), float(found.std()), float(found.max())) if found.size else (math.nan,) * 3
 
@@ -107,7 +107,7 @@ class RealTimeFactor:
         self.model_s += duration_s
 
     def mean(self) -> float:
-        """Return the factor from the first to the newest advance; 0 before them."""
+        """Return the factor from the first to the newest advance; 0 before the first advance."""
         if self._start_ns is None or self._newest_ns <= self._start_ns:
             return 0.0
         return self.model_s / ((self._newest_ns - self._start_ns) * 1e-9)

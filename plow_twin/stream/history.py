@@ -1,6 +1,6 @@
-"""The last seconds of a session, for late samples: snapshots, and all entries since the oldest snapshot.
+"""The last seconds of a session, kept for late samples: snapshots, and all entries since the oldest snapshot.
 
-The age at which a sample is too old follows from the journal alone. A call with many samples makes one snapshot, but
+The age at which a sample is too old depends on the journal alone. A call with many samples makes only one snapshot, but
 notes the stamps at which calls with single samples would have made snapshots, so that both have the same limit.
 """
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from plow_twin.stream.journal import Sample, Travel
 
-#: Snapshots in the time remembered; going back computes the samples since a snapshot again.
+#: Number of snapshots in the kept time; going back computes the samples after a snapshot again.
 SNAPSHOTS: Final = 100
 
 
@@ -25,7 +25,7 @@ class History:
     Parameters
     ----------
     span_ns
-        Time remembered before the newest sample [ns]; 0: nothing is remembered.
+        Time kept before the newest sample [ns]; 0: nothing is kept.
     """
 
     def __init__(self, span_ns: int) -> None:
@@ -34,12 +34,12 @@ class History:
         self._snapshots: list[tuple[int, bytes]] = []
         #: stamps of the first sample in each span, where calls with single samples have a snapshot
         self._kept_ns: list[int] = []
-        #: largest of these stamps so far: running again up to it discards no state
+        #: largest of these stamps so far; computing again up to it discards no state
         self._newest_kept_ns: int | None = None
         self._samples: list[Sample] = []
         self._stamps_ns: list[int] = []
         self._travels: list[Travel] = []
-        #: samples as arrays, made into samples when they are needed
+        #: applied samples as arrays, which become `Sample` objects when needed
         self._later: deque[tuple[NDArray[np.int64], NDArray[np.float64]]] = deque()
         #: whether a span has begun since the newest snapshot
         self._due = True
@@ -51,12 +51,12 @@ class History:
 
     @property
     def oldest_ns(self) -> int | None:
-        """Stamp of the oldest snapshot [ns]: newer samples can be worked in; None without one."""
+        """Stamp [ns] after which late samples can be inserted, that of the oldest snapshot; None without a snapshot."""
         return self._kept_ns[0] if self._kept_ns else None
 
     @property
     def earliest_ns(self) -> int | None:
-        """Stamp of the earliest kept state [ns]: going back ends there or later."""
+        """Stamp of the earliest kept state [ns], beyond which the session cannot go back."""
         return self._snapshots[0][0] if self._snapshots else None
 
     @property
@@ -73,14 +73,14 @@ class History:
         return self._stamps_ns[index : index + 1] == [stamp_ns]
 
     def clear(self) -> None:
-        """Drop all."""
+        """Drop everything."""
         for part in (self._snapshots, self._kept_ns, self._samples, self._stamps_ns, self._travels):
             part.clear()
         self._later.clear()
         self._newest_kept_ns, self._due = None, True
 
     def add(self, stamps_ns: NDArray[np.int64], wrench: NDArray[np.float64]) -> None:
-        """Add applied samples, shapes (n,), (n, 3); the arrays must not change any more."""
+        """Add applied samples, shapes (n,) and (n, 3); the arrays must not change afterwards."""
         if not self._span_ns:
             return
         self._later.append((stamps_ns, wrench))
@@ -96,7 +96,7 @@ class History:
         self._keep(stamps_ns[begins])
 
     def _keep(self, stamps_ns: NDArray[np.int64]) -> None:
-        """Note rising stamps of snapshots behind all others, and forget all that is older than the time remembered."""
+        """Add rising stamps of snapshots at the end, and forget everything that is older than the kept time."""
         if not len(stamps_ns):
             return
         newest_ns, before_ns = int(stamps_ns[-1]), self._newest_kept_ns
@@ -113,7 +113,7 @@ class History:
         self._forget_old()
 
     def _forget_old(self) -> None:
-        """Forget snapshots and samples not needed to go back to the oldest stamp."""
+        """Forget the snapshots and samples that are not needed to go back to the oldest stamp."""
         oldest_ns, old = self._kept_ns[0], 0
         while old + 1 < len(self._snapshots) and self._snapshots[old + 1][0] <= oldest_ns:
             old += 1
@@ -136,7 +136,7 @@ class History:
         self._later.clear()
 
     def add_travel(self, travel: Travel) -> None:
-        """Add an applied speed; the last of equal stamps counts."""
+        """Add an applied speed; of speeds with equal stamps the last is kept."""
         if not self._span_ns:
             return
         place = bisect_right(self._travels, travel.stamp_ns, key=lambda item: item.stamp_ns)
@@ -146,7 +146,7 @@ class History:
         self._travels.insert(place, travel)
 
     def add_snapshot(self, stamp_ns: int, data: bytes, *, kept: bool = True) -> None:
-        """Add the state at `stamp_ns`; with `kept` the stamp is kept in any span."""
+        """Add the state at `stamp_ns`; with `kept`, its stamp is noted wherever it is in a span."""
         if not self._span_ns:
             return
         if not self._snapshots or self._snapshots[-1][0] < stamp_ns:
@@ -179,16 +179,16 @@ class RecentStamps:
 
     @property
     def oldest_ns(self) -> int | None:
-        """Stamp before which no sample can be used [ns]; None before the first."""
+        """Stamp before which no sample can be used [ns]; None before the first sample."""
         return self._stamps_ns[-1] - self._span_ns if self._stamps_ns else None
 
     def __contains__(self, stamp_ns: int) -> bool:
-        """Return whether that stamp has occurred."""
+        """Return whether the stamp has occurred."""
         index = bisect_left(self._stamps_ns, stamp_ns)
         return self._stamps_ns[index : index + 1] == [stamp_ns]
 
     def clear(self) -> None:
-        """Forget all."""
+        """Forget all stamps."""
         self._stamps_ns.clear()
 
     def add(self, stamp_ns: int) -> None:

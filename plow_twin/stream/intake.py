@@ -1,7 +1,4 @@
-"""The decision whether an arriving sample is used, and the number of unused samples by reason.
-
-The clock is passed in; the driver reads no clock.
-"""
+"""The decision whether an arriving sample is used, and the numbers of unused samples by reason."""
 
 from __future__ import annotations
 
@@ -19,14 +16,14 @@ NS_PER_S = 1_000_000_000
 
 
 class KnownStamps(Protocol):
-    """Stamps of the past into which a late sample can be worked."""
+    """Stamps of the past among which a late sample can be inserted."""
 
     @property
     def oldest_ns(self) -> int | None:
-        """Stamp after which late samples can be worked in [ns]; None: no late sample can."""
+        """Stamp after which late samples can be inserted [ns]; None: no late sample can be inserted."""
 
     def __contains__(self, stamp_ns: int) -> bool:
-        """Return whether there is a sample of that stamp."""
+        """Return whether there is a sample with this stamp."""
 
 
 class Verdict(Enum):
@@ -41,27 +38,27 @@ class Verdict(Enum):
     UNSTAMPED = "unstamped"
     DUPLICATE = "duplicate"
     OUT_OF_ORDER = "out_of_order"
-    #: newer than the last sample, but passed by the model and older than every kept state
+    #: the model has passed the stamp, and no kept state is older
     LATE = "late"
-    #: behind the time reached, and accepted: it is worked in at its place
+    #: the model has passed the stamp, and the sample is inserted at its place
     WORKED_IN = "worked_in"
     #: a value is impossibly large, or changes impossibly fast
     IMPLAUSIBLE = "implausible"
-    #: the stamps jump repeatedly: the model is not reset each time
+    #: the stamps jump repeatedly, so that this jump does not reset the model
     UNSTEADY = "unsteady"
-    #: the stamp jumped, and the next stamp continued from the stamps before the jump: the stamp of this sample was
-    #: wrong, and the sender's clock did not step
+    #: the stamp jumped, but the next stamp continued the stamps before the jump: this stamp was wrong, and the sender's
+    #: clock did not step
     STRAY = "stray"
     #: names or lengths of the message do not fit the scene
     MALFORMED = "malformed"
-    #: came on a topic that is not the selected excitation source
+    #: arrived on a topic that is not the selected excitation source
     NOT_SELECTED = "not_selected"
-    #: came while the node was not active
+    #: arrived while the node was not active
     INACTIVE = "inactive"
-    #: came before the first message on /clock
+    #: arrived before the first message on /clock
     NO_CLOCK = "without_clock"
 
-    # looked up several times for each sample: an enumeration's own hash is slow
+    # verdicts are looked up several times for each sample, and the hash of an enumeration is slow
     __hash__ = object.__hash__
 
     def __init__(self, name: str) -> None:
@@ -72,7 +69,7 @@ class Verdict(Enum):
 
 
 def _ignore(verdict: Verdict, stamp_ns: int, values: Sequence[float]) -> None:
-    """Refuse a sample and count it."""
+    """Do nothing with an unused sample."""
 
 
 class Intake:
@@ -81,15 +78,16 @@ class Intake:
     Parameters
     ----------
     jump_back_s
-        A stamp older than the newest one by more than this [s] is a step of the sender's clock; less is a late packet.
+        A stamp that is older than the newest stamp by more than this [s] is a step of the sender's clock; by less, a
+        late packet.
     jump_forward_s
-        A stamp newer than the model's time by more than this [s] is a step of the sender's clock.
+        A stamp that is newer than the model's time by more than this [s] is a step of the sender's clock.
     expected_rate_hz
         Rate of the samples [Hz], from which gaps in the stamps are counted as missing samples; 0: not known.
     limits
         Largest values; None: any finite value.
     on_unused
-        Receives reason, stamp [ns] and values of each sample that is not used.
+        Receives the reason, stamp [ns] and values of each unused sample.
     """
 
     def __init__(
@@ -107,15 +105,15 @@ class Intake:
         self.expected_rate_hz = expected_rate_hz
         self.limits = limits
         self.counts: dict[Verdict, int] = dict.fromkeys(Verdict, 0)
-        #: samples that were used although a component outside the plane was not zero
+        #: number of samples that were used although a component outside the plane was not zero
         self.out_of_plane = 0
         self._newest_ns: int | None = None
         self._newest_values: Sequence[float] = ()
         #: newest stamp before the last jump [ns]
         self._before_jump_ns: int | None = None
-        #: whether the last judged sample returned to the stamps before a jump: those in between were wrong
+        #: whether the last judged sample returned to the stamps before a jump, so that the stamps in between were wrong
         self.returned = False
-        #: samples missing up to the last jump; first stamp and number of used samples since then
+        #: number of samples missing up to the last jump; first stamp and number of used samples since then
         self._missing_before = 0
         self._first_ns = 0
         self._since_first = 0
@@ -127,7 +125,7 @@ class Intake:
 
     @property
     def missing(self) -> int:
-        """Samples missing at the expected rate, from stamp to stamp; bursts are credited."""
+        """Number of missing samples at the expected rate, from first to newest stamp; extra samples fill gaps."""
         if self._newest_ns is None or self.expected_rate_hz <= 0.0:
             return self._missing_before
         asked = round((self._newest_ns - self._first_ns) * self.expected_rate_hz / NS_PER_S) + 1
@@ -146,21 +144,21 @@ class Intake:
         history: KnownStamps | None = None,
         may_reset: bool = True,
     ) -> Verdict:
-        """Return the verdict on one sample and count it.
+        """Judge one sample, count it and return the verdict.
 
         Parameters
         ----------
         stamp_ns
             Stamp of the sample [ns].
         values
-            All its numbers.
+            All numbers of the sample.
         reached_ns
             Time that the model has reached [ns], None before its first sample.
         history
             The past, for late samples.
         may_reset
-            Whether a step of the sender's clock may reset the model now; to where the stamps were before the last one
-            it always may, or a single wrong stamp could exclude all right ones.
+            Whether a step of the sender's clock may reset the model now. A return to the stamps before the last step
+            always may, otherwise a single wrong stamp could exclude all correct ones.
         """
         verdict = self._judge(stamp_ns, values, reached_ns, history)
         self.returned = verdict.resets and self._goes_on_from_before(stamp_ns)
@@ -172,7 +170,7 @@ class Intake:
             return verdict
         if self._newest_ns is None or verdict.resets:
             self._missing_before, self._first_ns, self._since_first = self.missing, stamp_ns, 0
-            # after a return, no later sample returns to the wrong stamps
+            # after a return, a later sample cannot return to the wrong stamps
             self._before_jump_ns = None if self.returned else self._newest_ns
         self._since_first += 1
         if self._newest_ns is None or verdict.resets or stamp_ns > self._newest_ns:
@@ -187,12 +185,12 @@ class Intake:
         return not self.near(stamp_ns, newest_ns, reached_ns)
 
     def near(self, stamp_ns: int, newest_ns: int, reached_ns: int | None = None) -> bool:
-        """Return whether a stamp may come after the newest one and the time reached without a step of the clock."""
+        """Return whether a stamp can follow the newest stamp and the time reached without a step of the clock."""
         ahead_ns = stamp_ns - (newest_ns if reached_ns is None else max(newest_ns, reached_ns))
         return ahead_ns <= self.jump_forward_s * NS_PER_S and newest_ns - stamp_ns <= self.jump_back_s * NS_PER_S
 
     def goes_on(self, stamp_ns: int, values: Sequence[float], reached_ns: int) -> bool:
-        """Return whether a sample is surely accepted, as most are; False: otherwise `jumps` and `judge` decide."""
+        """Return whether a sample is certain to be accepted, as most are; if not, `jumps` and `judge` decide."""
         newest_ns = self._newest_ns
         if newest_ns is None or self.limits is None:
             return False
@@ -202,7 +200,7 @@ class Intake:
         return self.limits.keep(self._newest_values, values, (stamp_ns - newest_ns) * 1e-9)
 
     def go_on(self, stamps_ns: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return for each of many samples after the first whether it `goes_on` from an accepted predecessor."""
+        """Return, for each sample after the first, whether it `goes_on` if the previous sample was accepted."""
         if self.limits is None:
             return np.zeros(len(stamps_ns) - 1, bool)
         ahead_ns = np.diff(stamps_ns)
@@ -210,21 +208,21 @@ class Intake:
         return near & self.limits.kept(values, ahead_ns * 1e-9)
 
     def accept(self, stamp_ns: int, values: Sequence[float], count: int = 1) -> None:
-        """Count a sample that `goes_on`, or `count` such samples of which this is the last."""
+        """Count a sample that `goes_on`, or the last of `count` such samples."""
         self.returned = False
         self.counts[Verdict.ACCEPTED] += count
         self._since_first += count
         self._newest_ns, self._newest_values = stamp_ns, values
 
     def refuse(self, verdict: Verdict, stamp_ns: int = 0, values: Sequence[float] = ()) -> None:
-        """Count a sample that was dropped before it could be judged; an unreadable one has no values."""
+        """Count a sample that was dropped before it could be judged; an unreadable sample has no values."""
         if verdict.used:
             raise ValueError(f"verdict: got {verdict.value}, expected a reason to drop")
         self.counts[verdict] += 1
         self._on_unused(verdict, stamp_ns, values)
 
     def restart(self) -> None:
-        """Drop the newest stamp: the next sample counts as the first. The counts are kept."""
+        """Forget the newest stamp, so that the next sample is treated as the first; the counts are kept."""
         self._missing_before = self.missing
         self._newest_ns = None
 
@@ -247,7 +245,7 @@ class Intake:
             return Verdict.JUMP_FORWARD
         if ahead_ns > 0:
             return Verdict.IMPLAUSIBLE if self._too_fast(stamp_ns, values) else Verdict.ACCEPTED
-        # against the sender's own stamps: the hold policy runs ahead of its clock
+        # compared with the sender's own stamps, because the hold policy may be ahead of its clock
         if newest_ns - stamp_ns > self.jump_back_s * NS_PER_S:
             return Verdict.JUMP_BACK
         if history is not None and history.oldest_ns is not None and stamp_ns > history.oldest_ns:

@@ -1,4 +1,4 @@
-"""Entries that the twin accepted, in order of use, from which a second run repeats the first exactly.
+"""Entries that the twin accepted, in order of use; from them a second run repeats the first run exactly.
 
 Stamps are integer nanoseconds on the clock of the samples; they are never rounded through a float.
 """
@@ -16,7 +16,7 @@ ParameterValue = bool | int | float | str
 class Sample:
     """Advance to `stamp_ns` with the load linear from the previous sample.
 
-    A stamp behind the time reached belongs to a late sample, which is worked in at its place.
+    A stamp behind the time reached belongs to a late sample, which is inserted at its place.
     `wrench` is Fx, Fy [N] and M [N m] about the cavity's centre, gravity not included.
     """
 
@@ -26,14 +26,14 @@ class Sample:
 
 @dataclass(frozen=True)
 class Hold:
-    """Advance to `stamp_ns` with the last load held, or with the scene's own loads when these are the excitation."""
+    """Advance to `stamp_ns` with the last load held, or under the scene's own loads if they are the excitation."""
 
     stamp_ns: int
 
 
 @dataclass(frozen=True)
 class Unload:
-    """Advance to `stamp_ns` with no sample and the load falling to zero on a straight line."""
+    """Advance to `stamp_ns` without a sample; the load falls linearly to zero."""
 
     stamp_ns: int
 
@@ -48,7 +48,7 @@ class Travel:
 
 @dataclass(frozen=True)
 class Reset:
-    """Motion back to the initial state, the wear stays; the next stamp is the new origin of model time."""
+    """The motion returns to the initial state and the wear stays; the next stamp is the new origin of model time."""
 
     stamp_ns: int
     reason: str
@@ -56,7 +56,7 @@ class Reset:
 
 @dataclass(frozen=True)
 class SetWear:
-    """The pads are worn by `depth_m` (8 numbers) from here on: other pads, or a measurement; the motion is reset."""
+    """The wear depths become `depth_m` (8 numbers), after new pads or a measurement; the motion is reset."""
 
     stamp_ns: int
     depth_m: tuple[float, ...]
@@ -65,9 +65,10 @@ class SetWear:
 
 @dataclass(frozen=True)
 class SetModel:
-    """Numbers of the scene change from here on: `changes` is JSON, numbers by key of the scene file.
+    """Numbers of the scene change: `changes` is JSON, numbers by key of the scene file.
 
-    All numbers that differ from the scene of the run; pose, rates and wear are kept. Contacts start without history.
+    `changes` has all numbers that differ from the scene of the run. Pose, rates and wear are kept; contacts start
+    without history.
     """
 
     stamp_ns: int
@@ -76,7 +77,7 @@ class SetModel:
 
 @dataclass(frozen=True)
 class Restore:
-    """The motion continues from the snapshot `data`; the next stamp belongs to its time. The wear stays."""
+    """The motion continues from the snapshot `data`, and the wear stays; the next stamp is at the snapshot's time."""
 
     stamp_ns: int
     data: bytes
@@ -92,10 +93,10 @@ class Mark:
 
 @dataclass(frozen=True)
 class Failed:
-    """`advances` advances have failed up to `stamp_ns`, in a row that began at `since_ns`; does not change the motion.
+    """`advances` advances up to `stamp_ns` have failed, in a row that began at `since_ns`; no effect on the motion.
 
-    There is an entry at the first failure of a row, and one for the others at its end: the sum of `advances` is their
-    number.
+    There is one entry at the first failure of a row and another entry for the rest at its end, so that the sum of
+    `advances` is the number of failures.
     """
 
     stamp_ns: int
@@ -106,7 +107,7 @@ class Failed:
 
 @dataclass(frozen=True)
 class Spread:
-    """Standard deviations of the load, Fx, Fy [N] and M [N m], from `stamp_ns` on; do not change the motion."""
+    """Standard deviations of the load, Fx, Fy [N] and M [N m], from `stamp_ns` on; no effect on the motion."""
 
     stamp_ns: int
     deviation: tuple[float, ...]
@@ -122,9 +123,9 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Pose:
-    """The head was measured at `pose` (x, y [m], theta [rad]) at `stamp_ns`: kept for the estimate, moves nothing.
+    """The head was measured at `pose` (x, y [m], theta [rad]) at `stamp_ns`; kept for the estimate.
 
-    `deviation` holds the three standard deviations that came with it; empty without them.
+    `deviation` has the three standard deviations that came with the pose, or is empty.
     """
 
     stamp_ns: int
@@ -134,7 +135,7 @@ class Pose:
 
 @dataclass(frozen=True)
 class PartOfPose:
-    """Only the `components` (0, 1, 2: x, y, theta) of a pose were measured: `values` [m, rad], for the estimate."""
+    """Only `components` (0, 1, 2: x, y, theta) of a pose were measured: `values` [m, rad], kept for the estimate."""
 
     stamp_ns: int
     components: tuple[int, ...]
@@ -143,7 +144,7 @@ class PartOfPose:
 
 @dataclass(frozen=True)
 class Gaps:
-    """Sensors have measured gaps [m] of the pairs numbered `pairs` at `stamp_ns`: kept for the estimate."""
+    """Sensors have measured the `gaps` [m] of the pairs numbered `pairs` at `stamp_ns`; kept for the estimate."""
 
     stamp_ns: int
     pairs: tuple[int, ...]
@@ -152,11 +153,12 @@ class Gaps:
 
 @dataclass(frozen=True)
 class Unused:
-    """`count` messages of `sender` came on the input `topic` and were not used; kept as evidence, moves nothing.
+    """`count` messages of `sender` arrived on the input `topic` and were not used; no effect on the motion.
 
-    `reason` is as in the counters `dropped_<reason>`, or `not_followed`, or `lost`: never arrived (with a negative
-    `count`: arrived after all). `stamps_ns` and `values` have an item for each message in order of arrival; of too many
-    messages at once, they have the first. An unreadable message has no values and stamp 0. A value need not be finite.
+    `reason` is the name in a counter `dropped_<reason>`, or `not_followed`, or `lost` for messages that never arrived
+    (a negative `count` means that they arrived after all). `stamps_ns` and `values` have an item for each message in
+    order of arrival, or only for the first of very many messages. An unreadable message has no values and stamp 0. A
+    value need not be finite.
     """
 
     topic: str
@@ -169,11 +171,11 @@ class Unused:
 
 @dataclass(frozen=True)
 class Estimated:
-    """An estimate of the window from `start_ns` to before `end_ns` is finished.
+    """The estimate of the window from `start_ns` to before `end_ns` is finished.
 
-    `samples` and `poses` count the window's rows of load and pose; the fit began at `guess`, or with a search if that
-    is empty. From here on `shift` (6 numbers [m]) is added to the horizontal clearance of the model with its wear, to
-    its 5 % and 95 % points, then to the same for the vertical clearance. `result` is the whole estimate, JSON.
+    `samples` and `poses` count the window's rows of load and pose; the fit began at `guess`, or with a search if
+    `guess` is empty. `shift` has 6 numbers [m], which are added from here on to the model's horizontal clearance (with
+    wear), to its 5 % and 95 % points, and likewise to the vertical clearance. `result` is the whole estimate (JSON).
     """
 
     start_ns: int
@@ -233,6 +235,6 @@ Entry = (
 
 
 def whole_pose(part: PartOfPose) -> tuple[float, ...]:
-    """Return x, y [m], theta [rad], NaN where it was not measured."""
+    """Return x, y [m] and theta [rad], NaN for a component that was not measured."""
     known = dict(zip(part.components, part.values, strict=True))
     return tuple(known.get(index, math.nan) for index in range(3))

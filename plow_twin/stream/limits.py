@@ -1,4 +1,4 @@
-"""Largest size and rate of measured values; larger ones are faults of the measurement."""
+"""Largest size and rate of measured values; larger values are faults of the measurement."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from plow_twin.model.geometry import half_diagonal
 from plow_twin.model.loads import compile_loads
 from plow_twin.model.scene import Scene
 
-#: Largest measured load over the sum of the scene's largest loads and the head's weight.
+#: Largest measured load as a multiple of the sum of the scene's largest loads and the head's weight.
 _MARGIN: Final = 10.0
-#: A load may change by its largest value within this time [s]: a millisecond's impact passes.
+#: A load may change by its largest value within this time [s], so that an impact of a millisecond passes.
 _SHORTEST_S: Final = 1e-3
 
 
@@ -40,12 +40,12 @@ class Limits:
         return True
 
     def kept(self, values: NDArray[np.float64], duration_s: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return for each of many rows (n, k) after the first whether it would `keep` after the row before it, (n-1,).
+        """Return, for each row (n, k) after the first, whether `keep` is True for it and the previous row, (n-1,).
 
-        `duration_s`, shape (n-1,), are the times between them in s.
+        `duration_s`, shape (n-1,), is the time between rows in s.
         """
         within = np.abs(values[1:]) <= np.array(self.largest)
-        with np.errstate(invalid="ignore"):  # between two infinite numbers: counts as too fast
+        with np.errstate(invalid="ignore"):  # inf - inf is NaN, which is treated as too fast
             steady = np.abs(np.diff(values, axis=0)) <= np.array(self.fastest) * duration_s[:, None]
         return np.asarray((within & steady).all(axis=1))
 
@@ -58,8 +58,8 @@ class Limits:
 def pose_limits(scene: Scene, displacement: float = 0.0, rate: float = 0.0) -> Limits:
     """Return the limits of x, y [m] and theta [rad] of a measured pose and of their rates; 0: derived from the scene.
 
-    Derived are `largest_displacement`, and the same within a millisecond; an angle may be half a turn (of a block, any
-    angle), and change by half a turn in that time.
+    The derived limits are `largest_displacement`, and a change by as much within a millisecond. An angle may be half a
+    turn (of a block, any angle) and change by half a turn within a millisecond.
     """
     displacement = displacement or largest_displacement(scene)
     rate = rate or displacement / _SHORTEST_S
@@ -83,8 +83,8 @@ def excitation_limits(
 ) -> Limits:
     """Return the limits of Fx, Fy [N] and M [N m] and of their rates; 0: derived from the scene.
 
-    Derived are ten times the sum of all loads of the scene and the head's weight, at the arm of half the frame's
-    diagonal for the moment, and that much within a millisecond.
+    The derived limit of a force is ten times the sum of all loads of the scene and the head's weight; the limit of the
+    moment is this force at an arm of half the frame's diagonal. Each may change by as much within a millisecond.
     """
     amplitude = compile_loads(scene.loads).largest()
     total = float(amplitude[:2].sum()) + scene.head.mass_kg * abs(scene.gravity.acceleration_m_s2)

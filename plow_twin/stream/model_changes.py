@@ -1,4 +1,4 @@
-"""Numbers of a scene that can change while its twin runs, because they need no other compiled code."""
+"""Numbers of a scene that can change while its twin runs, because they need no new compiled code."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def changed_scene(scene: Scene, changes: Mapping[str, float]) -> Scene:
     Raises
     ------
     ArgumentError
-        A key or a number cannot be taken; the message names it, the value got and the value expected.
+        A key or a number cannot be used; the message names it, the value got and the value expected.
     """
     for key, value in changes.items():
         if key not in CHANGEABLE:
@@ -48,18 +48,18 @@ def changed_scene(scene: Scene, changes: Mapping[str, float]) -> Scene:
 
 
 def changed_twin(twin: Driven, scene: Scene, changes: Mapping[str, float]) -> Driven:
-    """Return a twin of `scene` with other numbers, otherwise like `twin`, at its scene's initial state.
+    """Return a twin of `scene` with other numbers at the initial state of the scene, with the settings of `twin`.
 
     Raises
     ------
     ArgumentError
-        As `changed_scene`, or the changed scene needs other compiled code, which a live twin has no time to compile.
+        As for `changed_scene`, or the changed scene needs new compiled code, which a live twin has no time to compile.
     """
     found = twin.like(changed_scene(scene, changes))
     if found.signature != twin.signature:
         raise ArgumentError(
-            f"{', '.join(changes)}: got {', '.join(map(repr, changes.values()))}, which adds a term to the equations "
-            "or takes one away, expected a change of numbers: configure the node again"
+            f"{', '.join(changes)}: got {', '.join(map(repr, changes.values()))}, which adds or removes a "
+            "term of the equations, expected a change of numbers only: configure the node again"
         )
     return found
 
@@ -70,7 +70,7 @@ def read_changes(text: str) -> dict[str, float]:
     Raises
     ------
     ArgumentError
-        The text does not hold numbers by key.
+        The text is not a JSON object of numbers by key.
     """
     try:
         found = json.loads(text)

@@ -1,6 +1,6 @@
-"""Publications of the motion: each row sums up the motion since the row before.
+"""Publications of the motion: each row sums up the motion since the previous row.
 
-A publication is a function of the journal alone, so that a replay forms the same publications bit for bit.
+A publication depends on the journal alone, so that a replay forms the same publications bit for bit.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from plow_twin.solve.totals import publish, publish_window, summary
 Array = NDArray[np.float64]
 Rows = NDArray[np.void]
 
-#: `clearance` and `wear_rate` change slowly: they are part of the first publication in each such span of stamps.
+#: Span of stamps [ns]; only its first publication has a slow part, `clearance` and `wear_rate`.
 SLOW_PERIOD_NS: Final = 100_000_000
 
 PAD_NAMES: Final = tuple(f"pad_{name}" for name in PAIR_NAMES)
@@ -35,36 +35,36 @@ _ON_SIDES: Final = np.array(
     [np.flatnonzero(side) for side in (NORMAL_X < 0.0, NORMAL_X > 0.0, NORMAL_Y > 0.0, NORMAL_Y < 0.0)]
 )
 _STATE_SIZE: Final = 4 * PAIR_COUNT
-#: Slowly changing values: clearances under `CLEARANCE_NAMES` [m], growth of each pad's wear [m/s].
+#: Slowly changing values: clearances in the order of `CLEARANCE_NAMES` [m], growth of each pad's wear [m/s].
 SLOW: Final = np.dtype(
     [
         ("stamp_ns", "i8"),
-        ("row", "i8"),  # number of the row that it is published with
+        ("row", "i8"),  # number of the row with which it is published
         ("clearance", "f8", (len(CLEARANCE_NAMES),)),
         ("wear_rate", "f8", (PAIR_COUNT,)),
     ]
 )
-#: Numbers of the rows to publish: the only one, or no row.
+#: Numbers of the rows to publish: the only row, or none.
 THE_ONE: Final = np.zeros(1, np.int64)
 NONE: Final = np.zeros(0, np.int64)
 _NO_ROWS: Final = np.zeros(0, ROW)
 _NO_SLOW: Final = np.zeros(0, SLOW)
-#: Fields of a row whose motion follows measurements.
+#: Additional fields of a row if the motion follows measurements.
 FOLLOWED_FIELDS: Final = (
     "followed", "known_clearance", "force_low", "force_high", "peak_low", "peak_high", "impulse_low", "impulse_high",
 )  # fmt: skip
-#: Fields of the motion at a row's time.
+#: Fields that describe the motion at the row's time.
 _MOTION: Final = ("t", "stamp_ns", "held", "q", "v", "penetration", "rate", "force", "wear_depth", *FOLLOWED_FIELDS)
 #: Fields that `summary` checks for finite numbers by their sum.
 _SUMMED: Final = ("q", "v", "penetration", "rate", "force", "impulse", "peak")
 #: Places of `known_clearance` in `clearance`.
 _KNOWN: Final = np.array([0, len(_CLEARANCES), len(_CLEARANCES) + 1, 1, len(_CLEARANCES) + 2, len(_CLEARANCES) + 3])
-#: Rows made at once: numpy takes as long for one as for some.
+#: Number of rows made at once, because numpy makes many rows in the time of one.
 _STOCK: Final = 256
 
 
 class Published(NamedTuple):
-    """A publication: records of type `ROW`, shape (n,), and for some of them of type `SLOW`, shape (m,)."""
+    """A publication: records of type `ROW`, shape (n,), and slow parts of some of them, of type `SLOW`, shape (m,)."""
 
     rows: Rows
     slow: Rows
@@ -91,14 +91,14 @@ class Published(NamedTuple):
         return Published(self.rows[index : index + 1], _numbered_from(slow, index))
 
     def of(self, index: NDArray[np.int64]) -> Published:
-        """Return some of the rows, whose rising numbers are given, and their slow parts."""
+        """Return the rows with the given rising numbers, and their slow parts."""
         slow = self.slow[np.isin(self.slow["row"], index)]
         slow["row"] = np.searchsorted(index, slow["row"])
         return Published(self.rows[index], slow)
 
     @classmethod
     def joined(cls, parts: Sequence[Published]) -> Published:
-        """Return several publications as one."""
+        """Return several publications joined to one."""
         if len(parts) == 1:
             return parts[0]
         begins = np.cumsum([0, *(len(part.rows) for part in parts)]).tolist()
@@ -111,7 +111,7 @@ NOTHING: Final = Published(_NO_ROWS, _NO_SLOW)
 
 
 def _numbered_from(slow: Rows, first: int) -> Rows:
-    """Return slow records with row numbers relative to another row."""
+    """Return slow parts with row numbers relative to the row `first`."""
     if len(slow):
         slow = slow.copy()
         slow["row"] -= first
@@ -133,9 +133,9 @@ class Stock:
 
 
 def clearances(scene: Scene, wear_depth: Array) -> Array:
-    """Return total horizontal and vertical clearance and the eight pad depths, shape (..., 10) [m], from (..., 8).
+    """Return the total horizontal and vertical clearance and the eight pad depths, (..., 10) [m], from depths (..., 8).
 
-    A side's walls move out by the mean wear depth of the two pads on it.
+    The wall of a side moves out by the mean wear depth of the two pads on this side.
     """
     moved = 0.5 * (wear_depth[..., _ON_SIDES[:, 0]] + wear_depth[..., _ON_SIDES[:, 1]])
     found = np.empty((*wear_depth.shape[:-1], len(_CLEARANCES)))
@@ -148,8 +148,8 @@ def clearances(scene: Scene, wear_depth: Array) -> Array:
 def prior_points(scene: Scene, wear_depth: Array) -> tuple[Array, Array]:
     """Return the 5 % and 95 % points of the pad depths under the prior of the wear coefficient, shape (8,) each [m].
 
-    The growth, taken without running-in, is proportional to k_s as long as it is small against the clearance. Without
-    wear, or with k_s = 0, both points equal the wear depth.
+    The growth, taken without running-in, is proportional to k_s as long as it is small compared with the clearance.
+    Without wear, or with k_s = 0, both points equal the wear depth.
     """
     if scene.wear is None or scene.wear.coefficient_m2_n == 0.0:
         return wear_depth, wear_depth
@@ -163,29 +163,29 @@ def prior_points(scene: Scene, wear_depth: Array) -> tuple[Array, Array]:
 
 
 class Outputs:
-    """Sum up advances to publications: peaks, impulses and touches of any number of advances are kept."""
+    """Sum up advances to publications, which keep the peaks, impulses and touches of any number of advances."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene, self._publish = scene, _publish()
-        #: sums since the publication before, and the newest advance that has not been published, if one `waits`
+        #: sums since the previous publication, and the newest advance if it has not been published (`waits`)
         self._window = np.zeros(1, ROW)
         self._waits = 0
         self._stock = Stock()
-        #: stamp and pad depths of the last slow part; None before the first
+        #: stamp and pad depths of the last slow part; None before the first slow part
         self._slow_ns: int | None = None
         self._slow_wear_depth = np.zeros(PAIR_COUNT)
-        #: stamp from which on the published motion was computed again [ns], while the window is marked as corrected
+        #: stamp from which the published motion was computed again [ns]; valid while the window is marked as corrected
         self._corrected_ns = 0
-        #: the window before that, if it contained an advance
+        #: the window before this correction, if it contained an advance
         self._before: Rows | None = None
         #: shift of the clearances and their quantiles by an estimate, as in `CLEARANCE_NAMES`; None without an estimate
         self._shift: Array | None = None
 
     def set_shift(self, shift: Sequence[float]) -> None:
-        """Add to the horizontal and the vertical clearance of the model, and to their points, from now on.
+        """Shift the horizontal and the vertical clearance of the model, and their points, from now on.
 
-        `shift` has 6 numbers [m]: horizontal, its 5 % and 95 % points, vertical, its points. It is not part of `state`:
-        an estimate stays when late samples are worked in.
+        `shift` has 6 numbers [m]: horizontal, its 5 % and 95 % points, vertical, its points. It is not part of `state`,
+        so that an estimate stays when late samples are inserted.
         """
         values = np.zeros(len(CLEARANCE_NAMES))
         values[_KNOWN] = shift
@@ -196,7 +196,7 @@ class Outputs:
         self._scene = scene
 
     def clear_shift(self) -> None:
-        """Publish the clearances of the model again."""
+        """Return to the model's own clearances."""
         self._shift = None
 
     def add(self, rows: Rows, stamps: NDArray[np.int64], taken: NDArray[np.int64], *, held: bool = False) -> Published:
@@ -205,18 +205,18 @@ class Outputs:
         Parameters
         ----------
         rows : ndarray of `ROW`, shape (n,)
-            The advances; those published become the publications.
+            The advances; the rows that are published become the publications.
         stamps : ndarray of int64, shape (n,)
-            Their stamps [ns].
+            Stamps of the advances [ns].
         taken : ndarray of int64, shape (m,)
-            Rising numbers of advances after which to publish; without a good advance a publication has the stamp 0.
+            Rising numbers of the advances after which to publish; a publication without a good advance has the stamp 0.
         held : bool
-            Whether they were computed without samples.
+            Whether the advances were computed without samples.
 
         Returns
         -------
         Published
-            Of m rows.
+            A publication of m rows.
         """
         self._waits = self._publish(rows, np.ascontiguousarray(stamps), int(held), taken, self._window, self._waits)
         if not len(taken):
@@ -225,7 +225,7 @@ class Outputs:
         return Published(chosen, self._slow(chosen))
 
     def pop(self) -> Published:
-        """Publish all advances since the publication before, if there are any."""
+        """Publish all advances since the previous publication, if there are any."""
         if not self._waits:
             return NOTHING
         rows, self._waits = self._stock.new(1), 0
@@ -233,9 +233,9 @@ class Outputs:
         return Published(rows, self._slow(rows))
 
     def correct(self, stamp_ns: int, oldest_ns: int) -> int:
-        """Note that the motion from `stamp_ns` on is computed again; return the first such stamp since a publication.
+        """Note that the motion from `stamp_ns` on is computed again; return the earliest such stamp of the window.
 
-        It is later than `oldest_ns`: earlier corrections stay as they are.
+        A correction at or before `oldest_ns` is finished: the result is later.
         """
         window = self._window[0]
         if not window["corrected"] or self._corrected_ns <= oldest_ns:
@@ -247,9 +247,9 @@ class Outputs:
         return self._corrected_ns
 
     def begin_correction(self) -> None:
-        """Begin impulses and peaks here, at the time that `correct` returned.
+        """Begin impulses and peaks at the present time, which `correct` returned.
 
-        Advances published before are not published again, even if each later advance fails.
+        Advances that were published before are not published again, even if every later advance fails.
         """
         self._clear()
         if self._before is not None:
@@ -259,12 +259,12 @@ class Outputs:
 
     @property
     def waits(self) -> bool:
-        """Whether some advance has not been published."""
+        """Whether an advance has not been published."""
         return bool(self._waits)
 
     @property
     def is_clear(self) -> bool:
-        """Whether the next publication covers later advances only, without a mark."""
+        """Whether the next publication will cover only later advances and have no mark."""
         window = self._window
         return not (self._waits or window["corrected"][0] or window["marked"][0])
 
@@ -275,7 +275,7 @@ class Outputs:
         return makes
 
     def restart(self) -> None:
-        """Drop all that has not been published; the count of touches is kept."""
+        """Drop everything that has not been published; the count of touches is kept."""
         self._clear()
         self._window["corrected"] = 0
         self._slow_ns = self._before = None
@@ -295,12 +295,12 @@ class Outputs:
         self._slow_ns, self._slow_wear_depth = before
 
     def _slow(self, rows: Rows) -> Rows:
-        """Return the slow parts of some publications: of the first good one in each span of stamps."""
+        """Return the slow parts of publications: one for the first good publication in each span of stamps."""
         stamps, before_ns = rows["stamp_ns"], self._slow_ns
         if before_ns is not None:
             before = before_ns // SLOW_PERIOD_NS
             if before == stamps.item(0) // SLOW_PERIOD_NS == stamps.item(-1) // SLOW_PERIOD_NS:
-                return _NO_SLOW  # as nearly always
+                return _NO_SLOW  # the usual case
         good = np.flatnonzero(stamps)
         spans = stamps[good] // SLOW_PERIOD_NS
         changed = np.ones(len(good), bool)
@@ -353,7 +353,7 @@ class Outputs:
         self._clear()
         self._window["makes"] = parts[0].view(np.int64)
         self._window["impulse"], self._window["peak"] = parts[1:3]
-        self._window["measured_peak"] = parts[2]  # without samples the part is unknown
+        self._window["measured_peak"] = parts[2]  # the part with samples is unknown
         self._slow_wear_depth = parts[3].copy()
         slow_ns = int(np.frombuffer(data, np.int64, 1, offset=8 * _STATE_SIZE)[0])
         self._slow_ns = None if slow_ns < 0 else slow_ns
@@ -374,6 +374,6 @@ def warm_up() -> None:
 
 @cache
 def _publish() -> Callable[..., int]:
-    """Return `publish` compiled for its fixed argument types: checking the types would take longer than the call."""
+    """Return `publish` compiled for its fixed argument types: checking types would take longer than the call."""
     rows = np.zeros(1, ROW)
     return for_arguments(publish, (rows, THE_ONE, 0, THE_ONE, rows, 0))

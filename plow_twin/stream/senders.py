@@ -1,16 +1,16 @@
-"""Which of several senders of one input is followed, and how many of its samples never arrived.
+"""Choice of the sender to follow among several senders of one input, and the count of its lost samples.
 
-A sender numbers its messages from 1 on, as the middleware does for each publisher: a gap in the numbers is loss, on the
-way or in an overrun queue, at any rate and in bursts.
+The middleware numbers the messages of each publisher from 1 on. A gap in the numbers is a loss on the way or in an
+overrun queue, at any rate and also in bursts.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection
 
-#: Silence after which another sender is followed, if no switch can be requested [ns].
+#: Silence of the followed sender [ns] after which `OneSender` follows another sender.
 _SILENT_NS = 10_000_000_000
-#: Senders whose numbers are remembered; the oldest is forgotten.
+#: Largest number of senders whose message numbers are kept; the oldest is forgotten.
 _MOST_SENDERS = 64
 
 
@@ -18,13 +18,13 @@ class Senders:
     """Follow the first sender heard until it disappears or a switch is requested."""
 
     def __init__(self) -> None:
-        #: the sender followed; None before the first sample and after it has gone
+        #: the followed sender; None before the first sample and after the sender has disappeared
         self.followed: bytes | None = None
-        #: samples that the followed sender sent and that never arrived
+        #: number of samples that the followed sender sent and that never arrived
         self.lost = 0
-        #: samples of the other senders, which are not used
+        #: number of samples of other senders, which are not used
         self.ignored = 0
-        #: changes from one sender to another
+        #: number of changes from one sender to another
         self.switches = 0
         self._next: dict[bytes, int] = {}
         self._before: frozenset[bytes] = frozenset()
@@ -32,17 +32,17 @@ class Senders:
         self._other: bytes | None = None
 
     def start(self, present: Collection[bytes]) -> None:
-        """Note the senders that were present before: their messages until now are no loss."""
+        """Note the senders that are present already; their messages until now are not counted as lost."""
         self._before = frozenset(present)
 
     def start_late(self, sender: bytes) -> None:
-        """Note that messages of a sender before the first heard sample need not be loss."""
+        """Note that messages of a sender before its first heard sample need not be lost."""
         self._before |= {sender}
 
     def hear(self, sender: bytes, number: int, count: int = 1) -> bool:
-        """Add the arrival of sample `number` (from 1) of a sender, or of `count` from there on.
+        """Add the arrival of sample `number` (from 1) of a sender, or of `count` samples from this number on.
 
-        Return whether that sender is followed.
+        Returns whether the sender is followed.
         """
         expected = self._next.get(sender)
         if expected is None:
@@ -53,7 +53,7 @@ class Senders:
             self._follow(sender)
         followed = sender == self.followed
         if followed:
-            # a message that comes after all is no longer a loss
+            # a message that arrives after all is no longer lost
             self.lost += number - expected if number >= expected else -1 if self.lost else 0
         else:
             self.ignored += count
@@ -64,7 +64,7 @@ class Senders:
     def alive(self, present: Collection[bytes]) -> None:
         """Note the present senders; when the followed sender has disappeared, the next sender heard is followed.
 
-        A sender that was never in such a list may still be entering it, and has not disappeared.
+        A sender that was never among the present senders may not have been discovered yet, and has not disappeared.
         """
         gone = self._listed.difference(present)
         self._listed = set(present)
@@ -74,7 +74,7 @@ class Senders:
             self._other = None
 
     def switch(self) -> bool:
-        """Follow the other sender heard last; False without one."""
+        """Follow the other sender that was heard last; return False if there is none."""
         if self._other is None:
             return False
         other, self._other = self._other, self.followed
@@ -87,12 +87,12 @@ class Senders:
 
 
 class OneSender:
-    """Follow the first sender heard until it disappears, or is silent for 10 s while another sends."""
+    """Follow the first sender heard until it disappears, or is silent for 10 s while another sender sends."""
 
     def __init__(self) -> None:
-        #: the sender followed; None before the first message and after it has gone
+        #: the followed sender; None before the first message and after the sender has disappeared
         self.followed: bytes | None = None
-        #: messages of the other senders, which are not used
+        #: number of messages of other senders, which are not used
         self.ignored = 0
         self._heard_ns = 0
         self._listed: set[bytes] = set()

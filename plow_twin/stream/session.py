@@ -1,4 +1,4 @@
-"""The deterministic core of the live node and of a replay: entries of the journal in, motion out."""
+"""The deterministic core of the live node and of a replay, which computes the motion from journal entries."""
 
 from __future__ import annotations
 
@@ -46,13 +46,14 @@ from plow_twin.stream.journal import (
 from plow_twin.stream.model_changes import changed_scene, changed_twin, read_changes
 from plow_twin.stream.outputs import NONE, NOTHING, THE_ONE, Outputs, Published, Rows, Stock
 
-#: Advances between digests.
+#: Number of advances between digests.
 DIGEST_INTERVAL: Final = 100
-#: Whether a stamp is known, origin, stamp reached, advances, held, speed along the face, number of waiting speeds.
+#: Head of a snapshot: whether a stamp is known, origin, stamp reached, number of advances, whether the load is held,
+#: speed along the face, number of waiting speeds.
 _HEADER: Final = struct.Struct("<?qqq?dq")
 _TRAVEL: Final = struct.Struct("<qd")
-#: Largest lead of a pose over the time reached. A bag played fast brings poses before their load; a larger lead comes
-#: from another clock.
+#: Largest lead of a pose over the time reached [ns]. A bag that is played fast has poses before their load; a pose with
+#: a larger lead is from another clock.
 _AHEAD_NS: Final = 3_600_000_000_000
 _WEAR_SIZE: Final = 8 * PAIR_COUNT
 _NO_LOAD: Final = np.zeros((1, 3))
@@ -64,9 +65,9 @@ def _ignore(entry: Entry) -> None:
 
 
 class _Measured(NamedTuple):
-    """A pose or an estimate given to the twin: its number, the time reached then and its stamp [ns].
+    """A pose or an estimate given to the twin: its number, the time reached at that moment and its stamp [ns].
 
-    It is known from the model time `known` [s] on, also after going back before it for a late sample.
+    It has an effect from model time `known` [s] on, also when the session has gone back for a late sample.
     """
 
     number: int
@@ -79,7 +80,7 @@ class _Measured(NamedTuple):
 class Applied(NamedTuple):
     """Result of applying samples.
 
-    A row of each, the publications, the requested digests, and the numbers of failed advances and late samples.
+    A row for each sample, the publications, the requested digests, and the numbers of failed advances and late samples.
     """
 
     rows: Rows
@@ -90,10 +91,10 @@ class Applied(NamedTuple):
 
 
 class Series(NamedTuple):
-    """Samples that have been applied together, and are not in the journal yet.
+    """Samples that have been applied together and are not in the journal yet.
 
-    Stamps [ns], shape (n,), and wrenches (n, 3); the publications, a row after each sample, or None; the digests,
-    and the number of samples before each, shape (m,).
+    Stamps [ns], shape (n,), and wrenches (n, 3); the publications, with a row after each sample or with no row; the
+    digests, and the number of samples before each digest, shape (m,).
     """
 
     stamps: NDArray[np.int64]
@@ -103,7 +104,7 @@ class Series(NamedTuple):
     digest_after: NDArray[np.int64]
 
     def part(self, begin: int, end: int) -> Series:
-        """Return some of the samples, with their publications and digests."""
+        """Return the samples from `begin` to before `end`, with their publications and digests."""
         marked = (self.digest_after > begin) & (self.digest_after <= end)
         published = self.published
         if len(published.rows):
@@ -125,14 +126,14 @@ class Session:
     """One run of a twin under a journal.
 
     The same entries in the same order give the same motion, publications (`outputs`) and digests, bit for bit, with any
-    clock. Model time is (stamp - origin), the origin being the first stamp.
+    clock. Model time is (stamp - origin), and the origin is the first stamp.
 
     Motion and wear are two states: a `Reset` restores the initial motion and keeps the wear, which only `SetWear` sets.
-    While the load is held or removed (`Hold`, `Unload`) nothing wears, since the load is unknown. With the scene's own
-    loads the load is known, and a `Hold` only advances the time.
+    While the load is held or removed (`Hold`, `Unload`), there is no wear, because the load is unknown. With the
+    scene's own loads the load is known, and a `Hold` only advances the time.
 
-    A sample whose stamp lies behind the time reached is late: the session goes back to the newest snapshot before it,
-    works it in and runs again up to the newest sample; later motion without samples is dropped.
+    A sample whose stamp is behind the time reached is late: the session goes back to the newest snapshot before it,
+    inserts the sample and runs again up to the newest sample. Later motion without samples is dropped.
 
     Parameters
     ----------
@@ -141,13 +142,13 @@ class Session:
     origin_ns
         Stamp of model time 0, or None: the first stamp.
     on_entry
-        Receives the entries in order of use, those of one call before it applies them, and each digest after the
-        advance that it covers. An entry that the twin then refuses (a number is not finite) has been emitted: a replay
-        refuses it too.
+        Receives the entries in order of use: the entries of one call before the call applies them, and each digest
+        after the advance that it covers. An entry that the twin then refuses (a number is not finite) has already been
+        emitted; a replay refuses it too.
     rollback_span_s
         Largest age of a late sample before the newest one [s]; 0: late samples are refused.
     wear_depth
-        Wear depth of each pad to begin with [m], shape (8,); None: the scene's.
+        Initial wear depth of each pad [m], shape (8,); None: that of the scene.
     """
 
     def __init__(
@@ -162,20 +163,20 @@ class Session:
         self._use(twin)
         #: poses and estimates since the earliest state that is kept
         self._measured: deque[_Measured] = deque()
-        #: number of poses too far ahead of the load, and of poses removed from `_measured` because it was full
+        #: number of dropped poses: too far ahead of the load, or removed from `_measured` because it was full
         self.poses_dropped = 0
         self._scene = twin.scene
-        #: numbers of the scene that have been changed, by their keys
+        #: changed numbers of the scene by key
         self.changes: dict[str, float] = {}
         self.origin_ns = origin_ns
         #: the time that the model has reached [ns], None before the first stamp
         self.stamp_ns: int | None = None
         self.outputs = Outputs(twin.scene)
         self._stock = Stock()
-        #: the latest advance, until the wear at its end is read
+        #: row of the latest advance, kept until the wear at its end is read
         self._row: Rows | None = None
         scene, self._sampled = twin.scene, twin.excitation == "sampled"
-        #: the past, for late samples
+        #: past states and samples, for late samples
         self.history = History(round(rollback_span_s * 1e9) if self._sampled else 0)
         self.wear_depth = np.zeros(PAIR_COUNT)
         if scene.wear is not None:
@@ -195,11 +196,11 @@ class Session:
     def _use(self, twin: Driven) -> None:
         """Drive a twin from here on."""
         self.twin: Driven = twin
-        #: the twin, where it follows measurements
+        #: the twin, if it follows measurements
         self.following = twin if isinstance(twin, Following) else None
 
     def catch_up(self) -> None:
-        """Let a following twin finish the work of its newest row, and save the state that a late sample may need."""
+        """Let a following twin finish the work of its newest row, and save the state if a late sample may need it."""
         if self.following is not None:
             self.following.catch_up()
             if self.history.is_due and self.stamp_ns is not None and not self.held:
@@ -215,16 +216,16 @@ class Session:
             self._on_entry(Digest(self.stamp_ns, self.twin.digest()))
 
     def apply(self, entry: Entry) -> Rows | None:
-        """Emit one entry, apply it, and return the row of the advance that it made, shape (1,), if it made one.
+        """Emit one entry, apply it, and return the row of its advance, shape (1,), or None without an advance.
 
-        `outputs` publishes it on request. A digest or a loss describes a journal and changes nothing: it
-        is not emitted again.
+        `outputs` publishes the row on request. A digest or a loss describes a journal and changes nothing, so it is not
+        emitted again.
 
         Raises
         ------
         ValueError
-            The entry cannot be applied (its stamp lies too far behind the time reached, a number is not finite); the
-            motion is unchanged then.
+            The entry cannot be applied (its stamp is too far behind the time reached, or a number is not finite); the
+            motion is then unchanged.
         """
         match entry:
             case Sample():
@@ -265,7 +266,7 @@ class Session:
                 self.following.follow_parameters()
                 self._forget()
             case Parameter() | Gaps() | Mark() | Failed() | Spread() | Unused():
-                # takes effect by the entries that follow it, or has no effect here
+                # acts through later entries, or has no effect here
                 self._on_entry(entry)
             case Snapshot(_, data):
                 self._on_entry(entry)
@@ -278,13 +279,13 @@ class Session:
     def parts(self, samples: Sequence[Sample], *, each: bool = False) -> Iterator[Sequence[Sample]]:
         """Yield the parts of samples for `apply_samples`; each part must be applied before the next.
 
-        From a late sample on, the rest is one part; other parts are as long as the digests allow, or one sample where
-        `each` is published.
+        All samples from a late sample on are one part. Other parts are as long as the digests allow, or one sample long
+        if `each` is set.
 
         Raises
         ------
         ValueError
-            A stamp falls.
+            Stamps do not rise.
         """
         for earlier, later in pairwise(samples):
             if later.stamp_ns < earlier.stamp_ns:
@@ -299,20 +300,19 @@ class Session:
             samples = samples[count:]
 
     def apply_samples(self, samples: Sequence[Sample], *, each: bool = False) -> Applied:
-        """Emit one of the `parts` of samples and apply it; the bits do not depend on the number of parts.
+        """Emit and apply one of the `parts` of samples; the division into parts does not change a bit of the result.
 
         Parameters
         ----------
         samples : sequence of Sample
-            At least one.
+            At least one sample.
         each : bool
-            Whether there is a publication after each sample (of late ones, after the last); otherwise `outputs` sums
-            up.
+            Whether to publish after each sample (after the last of late samples); otherwise `outputs` sums up.
 
         Raises
         ------
         ValueError
-            As `apply`.
+            As for `apply`.
         """
         late, first_ns = 0, samples[0].stamp_ns
         if self._is_late(first_ns):
@@ -331,22 +331,22 @@ class Session:
         return applied
 
     def apply_series(self, stamps: NDArray[np.int64], wrench: NDArray[np.float64], *, each: bool) -> Series | None:
-        """Apply samples together, the first not late, without entries: the caller journals the series.
+        """Apply samples together without emitting entries; the caller journals the series.
 
         Parameters
         ----------
         stamps : ndarray of int64, shape (n,)
-            Rising [ns].
+            Rising stamps [ns]; the first is not late.
         wrench : ndarray, shape (n, 3)
-            Fx, Fy [N] and M [N m] at each, finite.
+            Fx, Fy [N] and M [N m] at each stamp, finite.
         each : bool
-            Whether there is a publication after each sample; otherwise `outputs` sums up.
+            Whether to publish after each sample; otherwise `outputs` sums up.
 
         Returns
         -------
         Series or None
-            None, and nothing has changed, where the samples are to be applied one by one: an advance fails, a number
-            is not finite, or something else happens on the way.
+            None, with nothing changed, if the samples must be applied one by one, because an advance fails, a number is
+            not finite, or something else happens on the way.
         """
         if self.stamp_ns is None or self.held or self._travels or not (self.outputs.is_clear or not each):
             return None
@@ -382,25 +382,25 @@ class Session:
         taken: NDArray[np.int64] = NONE,
         digest_after: NDArray[np.int64] = NONE,
     ) -> Applied:
-        """Advance to samples of a journal. Nothing is emitted.
+        """Advance to samples of a journal without emitting an entry.
 
         Parameters
         ----------
         stamps : ndarray of int64, shape (n,)
-            Stamps that never fall, the first not late [ns].
+            Stamps that never fall [ns]; the first is not late.
         wrench : ndarray, shape (n, 3)
-            Fx, Fy [N] and M [N m] at each.
+            Fx, Fy [N] and M [N m] at each stamp.
         rows : ndarray of `ROW`, shape (n,), or None
-            Receives the rows; With None no row is read out or passed to `outputs`.
+            Receives the rows; with None, no row is read out or passed to `outputs`.
         taken : ndarray of int64
-            As in `Outputs.add`.
+            As for `Outputs.add`.
         digest_after : ndarray of int64, shape (m,)
             Rising numbers from 1 to n: counts of samples after which a digest is made.
 
         Raises
         ------
         ValueError
-            A number is not finite, or a stamp falls; the motion is unchanged then.
+            A number is not finite, or a stamp falls; the motion is then unchanged.
         """
         if self._is_late(int(stamps[0])) or (stamps[1:] < stamps[:-1]).any():
             raise ValueError(
@@ -421,7 +421,7 @@ class Session:
         taken: NDArray[np.int64],
         digest_after: NDArray[np.int64],
     ) -> Applied:
-        """Advance where speeds along the face wait, or the load was held until now."""
+        """Advance when speeds along the face wait, or when the load was held until now."""
         if not np.isfinite(wrench).all():
             raise ValueError(f"wrench: got {wrench!r}, expected finite numbers")
         resumed, begin, count = self._resume_wear(), 0, len(stamps)
@@ -433,7 +433,7 @@ class Session:
                 continue
             if travel is not None:
                 end = int(np.searchsorted(stamps, travel.stamp_ns, side="right"))
-            if resumed:  # going back never reaches the motion without samples before the first one
+            if resumed:  # going back never reaches the motion without samples before the first sample
                 end = begin + 1
             here = slice(begin, end)
             chosen = taken[(taken >= begin) & (taken < end)] - begin
@@ -452,7 +452,7 @@ class Session:
         self._on_entry(entry)
 
     def check_model(self, changes: Mapping[str, float]) -> None:
-        """Raise an `ArgumentError` when the model cannot be changed in this way while it runs."""
+        """Raise an `ArgumentError` if the model cannot be changed in this way while it runs."""
         self._changed_twin(changes)
 
     def pop_error_estimate(self) -> float:
@@ -461,7 +461,7 @@ class Session:
         return largest
 
     def renew(self) -> Snapshot:
-        """Return the exact state for a journal that continues from here, and drop the past."""
+        """Return the exact state, from which a journal can continue, and drop the past."""
         snapshot = self.snapshot()
         self._forget()
         return snapshot
@@ -480,7 +480,7 @@ class Session:
         )
         travels = b"".join(_TRAVEL.pack(travel.stamp_ns, travel.speed_m_s) for travel in self._travels)
         stamp_ns = self.stamp_ns if self.stamp_ns is not None else self.origin_ns or 0
-        # the changes of the model come last: most runs do not have them
+        # the changes of the model come last, because most runs have none
         changes = json.dumps(self.changes).encode() if self.changes else b""
         data = header + travels + self.wear_depth.tobytes() + self.outputs.state() + self.twin.snapshot() + changes
         return Snapshot(stamp_ns, data)
@@ -505,9 +505,10 @@ class Session:
         resumed: bool = False,
         undo: bytes | None = None,
     ) -> Applied:
-        """Advance to samples without other entries between them; `resumed`: the first after a time without samples.
+        """Advance to samples without other entries between them.
 
-        Where an advance fails the twin returns to the snapshot `undo`, if given, and raises `_UndoneError`.
+        `resumed` is True if there was a time without samples before the first sample. If an advance fails and `undo` is
+        given, the twin returns to this snapshot and `_UndoneError` is raised.
         """
         origin_ns = self._begin(int(stamps[0])) if self.origin_ns is None else self.origin_ns
         if self.history.is_due and not resumed:
@@ -550,7 +551,7 @@ class Session:
             self.poses_dropped += 1
 
     def _travel_on_the_way(self, travel: Travel, stamp_ns: int, wrench: NDArray[np.float64]) -> None:
-        """Advance to the stamp of a speed that comes before the next sample, and take it over."""
+        """Advance to the stamp of a speed that is before the next sample, and use the speed."""
         self._travels.pop(0)
         if self.stamp_ns is not None and travel.stamp_ns > self.stamp_ns:
             share = (travel.stamp_ns - self.stamp_ns) / (stamp_ns - self.stamp_ns)
@@ -560,7 +561,7 @@ class Session:
         self._set_speed(travel)
 
     def _is_late(self, stamp_ns: int) -> bool:
-        """Return whether the model has passed a stamp; without a sample at its own time, that time counts as passed."""
+        """Return whether the model has passed a stamp; its own time is passed too if it has no sample there."""
         if self.stamp_ns is None or stamp_ns > self.stamp_ns:
             return False
         return stamp_ns < self.stamp_ns or (self.held and self.history.oldest_ns is not None)
@@ -575,7 +576,7 @@ class Session:
     def _work_in(self, stamp_ns: int, late: Sequence[Sample], *travels: Travel) -> Applied:
         """Go back to before a late stamp, and run again with late samples and speeds.
 
-        The next publication covers the motion from the first stamp worked in since the publication before.
+        The next publication covers the motion from the earliest stamp inserted since the previous publication.
         """
         corrected_ns = self.outputs.correct(stamp_ns, self.history.oldest_ns or 0)
         again = self._rewind(corrected_ns, *travels)
@@ -587,24 +588,24 @@ class Session:
         return self._run(sorted([*again[len(known) :], *late], key=lambda sample: sample.stamp_ns))
 
     def _rewind(self, stamp_ns: int, *more: Travel) -> list[Sample]:
-        """Go back to the newest snapshot before `stamp_ns`; return the samples after it.
+        """Go back to the newest snapshot before `stamp_ns`; return the samples after the snapshot.
 
-        The speeds after it, and those in `more`, wait again.
+        The speeds after the snapshot, and the speeds `more`, wait again.
         """
         data, samples, travels = self.history.rewind(stamp_ns)
         advances, pending, slow = self._advances, self._travels, self.outputs.slow_before
         self._restore(data)
         self._advances, self.outputs.slow_before = advances, slow
         if self.following is not None:
-            # each as early as it was known: how far one goes back depends on publications, which must not change the
-            # motion
+            # each measurement acts from the time when it was known, because the length of going back depends on
+            # publications, which must not change the motion
             measured, self._measured = self._measured, deque()
             for one in measured:
                 if one.number > self.following.added:
                     self._follow(one.stamp_ns, one.entry, one.known)
                 else:
                     self._measured.append(one)
-        # a change at the time of the snapshot may have been applied or not
+        # a speed at the time of the snapshot may or may not have been applied
         known = {travel.stamp_ns: travel for travel in (*self._travels, *travels, *pending, *more)}
         self._travels = sorted(known.values(), key=lambda travel: travel.stamp_ns)
         return samples
@@ -656,16 +657,16 @@ class Session:
         return held
 
     def _apply_travel(self, travel: Travel) -> None:
-        """Apply a speed: now, once its stamp is reached, or back at its stamp."""
+        """Apply a speed: now, later when its stamp is reached, or by going back to its stamp."""
         newest_ns, oldest_ns = self.history.newest_sample_ns, self.history.oldest_ns
         if not self._wears:
             self._speed = travel.speed_m_s
         elif self.stamp_ns is None:
-            self._use_speed(travel.speed_m_s)  # from the first sample on, because nothing goes back before it
+            self._use_speed(travel.speed_m_s)  # acts from the first sample on, as nothing goes back before it
         elif travel.stamp_ns > self.stamp_ns:
             insort(self._travels, travel, key=lambda item: item.stamp_ns)
         elif oldest_ns is not None and travel.stamp_ns <= oldest_ns:
-            # too old for its place: acts from the newest sample on, or from the only kept state
+            # too old for its place: the speed acts from the newest sample on, or from the only kept state
             self._set_speed(Travel(oldest_ns if newest_ns is None else newest_ns, travel.speed_m_s))
         elif newest_ns is None or oldest_ns is None or travel.stamp_ns >= newest_ns:
             self._set_speed(travel)
@@ -692,7 +693,7 @@ class Session:
             self.history.add_snapshot(self.stamp_ns, self.snapshot().data, kept=kept)
 
     def _forget(self) -> None:
-        """Drop all before the present state."""
+        """Drop everything before the present state."""
         self._forget_past()
         if not self.held:
             self._remember()
@@ -715,7 +716,7 @@ class Session:
         self.origin_ns = self.stamp_ns = None
 
     def _begin(self, stamp_ns: int) -> int:
-        """Return the stamp of model time 0 if the motion continues from its present time at `stamp_ns`."""
+        """Return the stamp of model time 0 for which the present model time is at `stamp_ns`."""
         return stamp_ns - round(self.twin.time * 1e9)
 
     def _change_model(self, changes: dict[str, float]) -> None:
@@ -731,14 +732,14 @@ class Session:
         self._forget()
 
     def _changed_twin(self, changes: Mapping[str, float]) -> Driven:
-        """Return a twin with other numbers that allows the present and the waiting speeds."""
+        """Return a twin with other numbers; the present and the waiting speeds must be possible for it."""
         found = changed_twin(self.twin, self._scene, changes)
         for speed in (self._speed, *(travel.speed_m_s for travel in self._travels)):
             check_travel_speed(found.scene, speed)
         return found
 
     def _carry(self, before: Driven) -> None:
-        """Begin with pose, rates, load and time of another twin; the wear is the present one."""
+        """Take pose, rates, load and time from another twin; the wear is the present wear."""
         now = before.advance(before.time)
         self.twin.reset(before.time, wear_depth=self.wear_depth, pose=(now.q, now.v))
         if self._sampled:
@@ -770,7 +771,7 @@ class Session:
         self.origin_ns = self.stamp_ns = None
 
     def _split_twin(self, data: bytes) -> tuple[bytes, dict[str, float]]:
-        """Return the snapshot of the twin, followed by the changes of the model."""
+        """Return the snapshot of the twin and the changes of the model in the data of a snapshot."""
         size = len(self.twin.snapshot()) if self.following is None else self.following.snapshot_size(data)
         return data[:size], read_changes(data[size:].decode()) if len(data) > size else {}
 
@@ -797,7 +798,7 @@ def _all_finite(rows: Rows | None) -> bool:
 
 
 def wear_in(snapshot: bytes) -> tuple[float, ...]:
-    """Return the wear depths of the eight pads in m that a snapshot of a session holds."""
+    """Return the wear depths of the eight pads in m in a snapshot of a session."""
     travels = _HEADER.unpack_from(snapshot)[-1]
     depth: list[float] = np.frombuffer(snapshot, np.float64, PAIR_COUNT, _HEADER.size + travels * _TRAVEL.size).tolist()
     return tuple(depth)

@@ -1,4 +1,4 @@
-"""Stretches without samples, by the stamps."""
+"""Stretches without samples, found by the stamps."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from numpy.typing import NDArray
 from plow_twin.stream.intake import NS_PER_S
 
 Indexes = NDArray[np.int64]
-#: A stretch is a silence from so many times the interval before it on: a log each minute is not silent.
+#: A silence is longer than this many times the interval before it, so that a log with a sample each minute has none.
 _LONGER: Final = 5
 
 
 class Silences:
-    """Counts stretches between the stamps of two samples that are longer than the timeout of the excitation.
+    """Count silences: stretches between two stamps that are longer than the timeout of the excitation.
 
-    They are longer than five times the interval before them too.
-    The motion goes on there, under the hold policy or on a straight line of the load to the next sample.
+    A silence is also longer than five times the interval before it. The motion continues in a silence, under the hold
+    policy or with a load that is linear up to the next sample.
 
     Parameters
     ----------
     timeout_s
-        Longest time between two samples [s] that is no silence; it may change.
+        Longest time between two samples [s] that is not a silence; it may change.
     """
 
     def __init__(self, timeout_s: float) -> None:
@@ -35,13 +35,13 @@ class Silences:
         self.longest_ns = (0, 0)
         self._first_ns: int | None = None
         self._newest_ns: int | None = None
-        #: the newest interval between samples that is no silence [ns]
+        #: the newest interval between samples that is not a silence [ns]
         self._interval_ns: int | None = None
 
     def add(self, stamps_ns: Indexes) -> list[tuple[int, int, int]]:
-        """Take the stamps of samples, shape (n,) [ns]; return the silences that end at them.
+        """Add the stamps of samples, shape (n,) [ns]; return the silences that end at them.
 
-        Each has the index of the sample that ends it, its begin and its end [ns]. A late sample ends none.
+        Each silence is (index of the sample that ends it, begin, end) [ns]. A late sample does not end a silence.
         """
         if not len(stamps_ns):
             return []
@@ -64,7 +64,7 @@ class Silences:
         return found
 
     def _is_silence(self, interval_ns: int) -> bool:
-        """Return whether an interval is a silence; otherwise it is the newest one that is not."""
+        """Return whether an interval is a silence; any other interval is kept for the next comparison."""
         before_ns = self._interval_ns
         is_long = before_ns is not None and interval_ns > max(self.timeout_s * NS_PER_S, _LONGER * before_ns)
         if not is_long:
@@ -72,7 +72,7 @@ class Silences:
         return is_long
 
     def add_one(self, stamp_ns: int) -> None:
-        """Take the stamp of one sample [ns]."""
+        """Add the stamp of one sample [ns]."""
         newest_ns = self._begin(stamp_ns)
         if stamp_ns > newest_ns:
             if self._is_silence(stamp_ns - newest_ns):
@@ -80,11 +80,11 @@ class Silences:
             self._newest_ns = stamp_ns
 
     def restart(self) -> None:
-        """Continue after a reset: the time across it is no silence."""
+        """Continue after a reset; the time across the reset is not a silence."""
         self._newest_ns = None
 
     def text(self) -> str:
-        """Return the silences in words, with times since the first sample; empty without one."""
+        """Return the silences in words, with times since the first sample; empty without a silence."""
         if not self.count:
             return ""
         begin_s, end_s = ((at - (self._first_ns or 0)) * 1e-9 for at in self.longest_ns)
@@ -94,12 +94,12 @@ class Silences:
         return f"{self.total_ns * 1e-9:.3f} s without samples, {where}"
 
     def facts(self) -> dict[str, int | float]:
-        """Return number and length [s] of all stretches, and the begin of the longest, since the first sample [s]."""
+        """Return number and total length [s] of all silences, and the start of the longest from the first sample [s]."""
         begin_s = (self.longest_ns[0] - (self._first_ns or 0)) * 1e-9
         return {"count": self.count, "total_s": self.total_ns * 1e-9, "longest_from_s": begin_s} if self.count else {}
 
     def _begin(self, stamp_ns: int) -> int:
-        """Return the newest stamp, which is the given one at the start [ns]."""
+        """Return the newest stamp [ns]; at the start it is the given stamp."""
         if self._first_ns is None:
             self._first_ns = stamp_ns
         if self._newest_ns is None:

@@ -1,4 +1,4 @@
-"""Steps of a sender's clock versus single wrong stamps: a sample whose stamp jumps waits for the next sample."""
+"""Distinction of steps of a sender's clock from single wrong stamps: a sample whose stamp jumps waits for the next."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ from typing import Final
 
 from plow_twin.stream.intake import NS_PER_S, Intake, Verdict
 
-#: So many stray stamps within a time [ns] are no longer an accident.
+#: Number of stray stamps within `_WINDOW_NS` from which the stamps are unsteady.
 _MOST_STRAYS: Final = 5
 _WINDOW_NS: Final = 10 * NS_PER_S
 
-#: Stamp [ns] and wrench (Fx, Fy [N], M [N m]) of a sample, and when it arrived [ns].
+#: Stamp [ns], wrench (Fx, Fy [N], M [N m]) and time of arrival [ns] of a sample.
 Timed = tuple[int, tuple[float, float, float], int]
 
 
 class Steps:
-    """Keep a sample whose stamp jumps until the next sample confirms it: a single wrong stamp moves nothing.
+    """Keep a sample whose stamp jumps until the next sample confirms it, so that a single wrong stamp has no effect.
 
     Parameters
     ----------
     intake
-        Judges the samples, and counts stray ones.
+        Judges the samples and counts stray samples.
     """
 
     def __init__(self, intake: Intake) -> None:
@@ -39,10 +39,10 @@ class Steps:
     def settle(
         self, stamp_ns: int, wrench: tuple[float, float, float], now_ns: int, reached_ns: int | None
     ) -> tuple[Timed, ...]:
-        """Add a sample; return those that can be judged now, in order of arrival."""
+        """Add a sample; return the samples that can be judged now, in order of arrival."""
         jumped, jumps = self._jumped, self._intake.jumps(stamp_ns, reached_ns)
         arrival = stamp_ns, wrench, now_ns
-        if jumped is None or stamp_ns <= 0:  # an unstamped sample is no evidence
+        if jumped is None or stamp_ns <= 0:  # a sample without a stamp is no evidence
             if not jumps:
                 return (arrival,)
             self._jumped = arrival
@@ -61,7 +61,7 @@ class Steps:
         return ()
 
     def unopposed(self, now_ns: int, silence_ns: int) -> Timed | None:
-        """Return the waiting sample, once nothing has contradicted it for so long."""
+        """Return the waiting sample if no other sample has arrived for `silence_ns`."""
         jumped = self._jumped
         if jumped is None or now_ns - jumped[2] <= silence_ns:
             return None

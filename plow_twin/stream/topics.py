@@ -1,4 +1,4 @@
-"""The topics that a live twin sends: the one table behind sending, recording, comparing and listing them."""
+"""The table of the topics that a live twin sends, which sending, recording, replay and the documentation use."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from plow_twin.stream.outputs import CLEARANCE_NAMES, PAD_NAMES, SLOW, Published
 JOINT_STATE: Final = "sensor_msgs/msg/JointState"
 ODOMETRY: Final = "nav_msgs/msg/Odometry"
 STATUS: Final = "diagnostic_msgs/msg/DiagnosticStatus"
-#: Depth of a publisher's history: a reader that reads once a second at 1 kHz misses no message.
+#: Depth of a publisher's history, so that a reader that reads once a second at 1 kHz misses no message.
 _DEPTH: Final = 1000
 
 
@@ -26,11 +26,11 @@ class Cadence(Enum):
 
     #: with each publication
     EACH = "each publication"
-    #: with each publication, where `follow` is `full`
+    #: with each publication, if `follow` is `full`
     FOLLOWED = "each publication, with `follow: full`"
     #: with the first publication in each 0.1 s of stamps
     SLOW = "each 0.1 s of stamps"
-    #: with each publication that is marked, and with the first one after it
+    #: with each marked publication, and with the first publication after it
     MARKED = "marked publications"
     #: with each estimate
     ESTIMATE = "each estimate"
@@ -51,16 +51,17 @@ class Topic:
     content : str
         Content of its message, with units.
     cumulative : bool
-        Whether its message depends on the publication before: a replay cannot compare it after a lost message.
+        Whether its message depends on the previous publication, so that a replay cannot compare it after a lost
+        message.
     latched : bool
         Whether a late reader gets earlier messages (`transient_local`).
     depth : int
-        How many messages the publisher keeps.
+        Number of messages that the publisher keeps.
     names : tuple of str
         Names in a `JointState`.
     columns : mapping
-        By field of the message, the fields of the record in it with the count of their numbers, all in order.
-        A message without columns needs more than a record.
+        For each field of the message, the fields of the record that fill it, each with its count of numbers, in order.
+        A topic without columns has messages that are not made from a record alone.
     """
 
     name: str
@@ -80,11 +81,11 @@ class Topic:
 
     @property
     def count(self) -> int:
-        """Count of a message's numbers from the record."""
+        """Number of numbers in a message from the record."""
         return sum(count for _, count in self.parts)
 
     def record_of(self, published: Published) -> NDArray[np.void]:
-        """Return the records that its messages are made of."""
+        """Return the records from which its messages are made."""
         return published.slow if self.cadence is Cadence.SLOW else published.rows
 
     @property
@@ -148,8 +149,8 @@ TOPICS: Final = (
     ),
     Topic(
         "quality", JOINT_STATE, Cadence.MARKED,
-        "position of `held` (the state at the stamp was computed without a sample) and `corrected` (late samples have "
-        "been worked in), 1 or 0; also sent once after the last mark",
+        "position of `held` (the state at the stamp was computed without a sample) and `corrected` (late samples were "
+        "inserted), 1 or 0; also sent once after the last mark",
         names=("held", "corrected"), columns={"position": (("held", 1), ("corrected", 1))}, latched=True,
     ),
     Topic(
@@ -184,10 +185,10 @@ TOPICS: Final = (
 
 
 def topics_of(*cadences: Cadence) -> tuple[Topic, ...]:
-    """Return the topics with one of these cadences, in the order of the table."""
+    """Return the topics with one of the given cadences, in the order of the table."""
     return tuple(topic for topic in TOPICS if topic.cadence in cadences)
 
 
 def names_of(*cadences: Cadence) -> tuple[str, ...]:
-    """Return the base names of these topics."""
+    """Return the base names of the topics with one of the given cadences."""
     return tuple(topic.name for topic in topics_of(*cadences))
