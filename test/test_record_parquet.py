@@ -242,7 +242,7 @@ def test_a_damaged_page_ends_the_rows_there_and_is_counted(tmp_path: Path, capsy
     source = open_source(path)
     assert len(list(source.messages(lambda _: True))) == 8192 and source.losses.counts["truncated_files"] == 1
     assert cli(["live", str(path), "--map", str(mapping), "--scene", "paper"]) == 1
-    assert "row 8193 and those after it cannot be read" in capsys.readouterr().err
+    assert "the rows from 8193 on cannot be read" in capsys.readouterr().err
 
 
 def test_the_share_that_has_been_read_rises_to_all(tmp_path: Path) -> None:

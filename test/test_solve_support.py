@@ -176,7 +176,7 @@ def test_a_file_holds_a_support_and_bad_ones_are_refused(tmp_path: Path) -> None
     assert load_scene(path) == scene
     with pytest.raises(SceneError, match=r"support.mass_kg: got 0.0, expected a finite number > 0"):
         replace(scene, support=replace(SUPPORT, mass_kg=0.0))
-    with pytest.raises(ArgumentError, match="expected one without support"):
+    with pytest.raises(ArgumentError, match="expected a scene without support"):
         simulate(replace(pressed(Harmonic("load", (0.0, 1.0))), support=SUPPORT), 0.01, sensitivity=True)
 
 

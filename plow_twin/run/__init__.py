@@ -1,1 +1,1 @@
-"""Calls of the library's user: motions from start to end, single or in batches, offline or live."""
+"""The calls for users of the library: whole motions and live twins, single or many at once."""

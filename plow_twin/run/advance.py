@@ -1,4 +1,4 @@
-"""Results of advances as views of the rows that the kernels write: at a time, at many times, of many twins."""
+"""Results of advances as views of the rows that the kernels write: for one time, many times, or many twins."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class _View:
 
 
 class Advance(_View):
-    """State at a time, and sums since the advance before: a view of a row.
+    """State at a time and sums since the previous advance, as a view of a row.
 
     Attributes
     ----------
@@ -64,19 +64,19 @@ class Advance(_View):
     penetration, rate, force : ndarray, shape (8,)
         Signed penetration [m], its rate [m/s] and normal force [N] of each pair at `t`.
     peak, impulse : ndarray, shape (8,)
-        Largest force [N] and impulse [N s] since the advance before.
+        Largest force [N] and impulse [N s] since the previous advance.
     time_in_contact : ndarray, shape (8,)
-        Time in contact since the advance before [s].
+        Time in contact since the previous advance [s].
     makes : ndarray of int64, shape (8,)
-        Touches since the advance before.
+        Number of touches since the previous advance.
     wear_depth : ndarray, shape (8,)
-        Wear depth of each pad in m, in total.
+        Total wear depth of each pad in m.
     steps : int
-        Steps the solver took.
+        Number of steps that the solver took.
     status : Status
-        With any other value than `OK` the state is the last good one.
+        Status of the advance; with any value but `OK` the state is the last good state.
     error_estimate_m : float
-        Estimated error of the pose in m where `max_evaluations` did not suffice for the tolerance, otherwise 0.
+        Estimated error of the pose in m if `max_evaluations` was too small for the tolerance, otherwise 0.
     """
 
     __slots__ = ()
@@ -88,12 +88,12 @@ class Advance(_View):
 
     @property
     def steps(self) -> int:
-        """Steps the solver took."""
+        """Number of steps that the solver took."""
         return int(self.rows["steps"])
 
     @property
     def status(self) -> Status:
-        """How the advance ended."""
+        """Status with which the advance ended."""
         return _STATUS[int(self.rows["status"])]
 
     @property
@@ -103,7 +103,7 @@ class Advance(_View):
 
 
 class _Rows(_View):
-    """Columns of many rows: the status as numbers."""
+    """Columns of many rows, with the status as numbers."""
 
     __slots__ = ()
 
@@ -116,7 +116,7 @@ class _Rows(_View):
 
 
 class AdvanceSeries(_Rows):
-    """Many advances at once: the fields of `Advance`, each with a leading axis of length n, `status` as numbers.
+    """Many advances at once: the fields of `Advance` with a leading axis of length n; `status` is an array of numbers.
 
     Attributes
     ----------
@@ -129,11 +129,11 @@ class AdvanceSeries(_Rows):
     t = _Column[np.float64]()
 
     def __getitem__(self, index: int) -> Advance:
-        return Advance(self.rows[index].copy())  # a copy does not keep all the rows
+        return Advance(self.rows[index].copy())  # a copy, so that not all rows are kept in memory
 
 
 class AdvanceBatch(_Rows):
-    """Advances of m twins: the fields of `AdvanceSeries`, each but `t` with a leading axis of length m."""
+    """Advances of m twins: the fields of `AdvanceSeries`, all except `t` with a leading axis of length m."""
 
     __slots__ = ()
 

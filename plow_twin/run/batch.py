@@ -1,4 +1,4 @@
-"""Many live twins under sampled loads, advanced together: scenes that differ in numbers share one compiled call."""
+"""Many live twins under sampled loads, advanced together; scenes that differ in numbers share one compiled call."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ __all__ = ["TwinBatch"]
 
 _Array = NDArray[np.float64]
 _NO_MARKS = np.zeros(0, np.int64)
-#: Terms that have no effect if their numbers are zero.
+#: Terms that have no effect when their numbers are zero.
 _OPTIONAL = ("hysteretic", "wear", "sliding", "running_in", "offset", "free", "slip")
 
 
@@ -47,7 +47,7 @@ class TwinBatch:
     start : float
         Model time of the scenes' initial states in s.
     workers : int, optional
-        Threads; 1 by default, since waking a second thread costs more than an advance by one sample.
+        Number of threads; 1 by default, because waking a second thread costs more than an advance by one sample.
     max_steps : int
         As for `Twin`.
     max_wall_s : float
@@ -56,14 +56,14 @@ class TwinBatch:
     Raises
     ------
     ArgumentError
-        Without scenes, or where their laws differ in terms.
+        There are no scenes, or the terms of their laws differ.
 
     Notes
     -----
-    At `max_wall_s` a call raises `LimitError`, after Ctrl-C `RunInterrupted`; all twins then have the state from before
-    the call. Where every contact has exponent 1 and no scene has wear, friction, support, locks, an offset centre of
-    mass or overdamped contact, twins advance eight to a SIMD vector: each has the same bits alone and in any batch,
-    equal to those of a `Twin` to the tolerance. Other members have the bits of a `Twin` with the same terms.
+    At `max_wall_s` a call raises `LimitError`, and after Ctrl-C `RunInterrupted`; all twins then have the state from
+    before the call. If every contact has exponent 1 and no scene has wear, friction, support, locks, an offset centre
+    of mass or overdamped contact, each SIMD vector advances eight twins. Such a twin has the same bits alone and in any
+    batch, and agrees with a `Twin` to the tolerance. Other twins have the bits of a `Twin` with the same terms.
     """
 
     def __init__(
@@ -110,12 +110,12 @@ class TwinBatch:
 
     @property
     def signature(self) -> tuple[bool, ...]:
-        """Terms of the equations, as in `Twin`: batches with equal terms share their compiled code."""
+        """Terms of the equations, as in `Twin`; batches with equal terms share their compiled code."""
         parts = self._workers[0].parts
         return (*(part is not None for part in (*parts.terms, parts.implicit)), *options(self.scenes[0]))
 
     def set_wrench(self, wrench: ArrayLike) -> None:
-        """Set the first samples of the load, from which it runs to the next samples on straight lines.
+        """Set the first samples of the load; the load is linear from sample to sample.
 
         Parameters
         ----------
@@ -125,24 +125,25 @@ class TwinBatch:
         self._wrench = np.array(wrench, dtype=np.float64).reshape(len(self), 3)
 
     def advance(self, t: float, wrench: ArrayLike | None = None) -> AdvanceBatch:
-        """Advance all twins to model time `t`; see `advance_samples`. Without `wrench` the last samples are held.
+        """Advance all twins to model time `t`; see `advance_samples`.
 
         Parameters
         ----------
         t : float
-            Model time in s, not before the present one.
-        wrench : array_like, shape (m, 3) or (3,), optional
-            Fx, Fy [N] and M [N m] about the cavity's centre at `t`, of each twin or of all.
+            Model time in s, not before the present model time.
+            wrench : array_like, shape (m, 3) or (3,), optional
+                Fx, Fy [N] and M [N m] about the cavity's centre at `t`, of each twin or of all. Without it the last
+                samples are held.
 
         Returns
         -------
         AdvanceBatch
-            One row of each twin.
+            One row for each twin.
 
         Raises
         ------
         ArgumentError
-            As `advance_samples`.
+            As for `advance_samples`.
         """
         sample = self._wrench if wrench is None else np.asarray(wrench, dtype=np.float64)
         if sample.shape not in ((3,), (len(self), 3)):
@@ -150,7 +151,7 @@ class TwinBatch:
         return self.advance_samples(np.array([t], dtype=np.float64), sample[..., None, :])
 
     def advance_samples(self, t: ArrayLike, wrench: ArrayLike) -> AdvanceBatch:
-        """Advance all twins through many samples; the same bits as one `advance` each.
+        """Advance all twins through many samples, with the same bits as by one `advance` for each sample.
 
         Parameters
         ----------
@@ -162,12 +163,12 @@ class TwinBatch:
         Returns
         -------
         AdvanceBatch
-            One row of each twin for each sample.
+            One row for each twin and sample.
 
         Raises
         ------
         ArgumentError
-            For a time before the present one, or anything that is not finite; nothing has changed then.
+            A time is before the present time, or a number is not finite; nothing has changed.
         """
         times, samples = np.ascontiguousarray(t, dtype=np.float64), np.asarray(wrench, dtype=np.float64)
         check_times(self.time, times)
@@ -192,7 +193,7 @@ class TwinBatch:
         Raises
         ------
         ArgumentError
-            For a time that is not finite.
+            The time is not finite.
         """
         if not np.isfinite(t):
             raise ArgumentError(f"t: got {t!r}, expected a finite time in s")
@@ -201,7 +202,7 @@ class TwinBatch:
         self._wrench = np.zeros((len(self), 3))
 
     def begin_beside(self, snapshot: bytes, moved: ArrayLike, *, again: bool = False) -> None:
-        """Displace all twins from the state of a sampled twin, with its contacts, last sample and travel speed.
+        """Set all twins to displaced states of a sampled twin, with its contacts, last sample and travel speed.
 
         Parameters
         ----------
@@ -210,13 +211,13 @@ class TwinBatch:
         moved : array_like, shape (m, 6)
             Displacement of x, y [m], theta [rad] and their rates for each twin.
         again : bool
-            The twins were displaced from that twin before. The damping set at the touch of a lasting contact is kept by
-            each; displaced twins take it from the first.
+            Whether the twins were displaced from the same twin before. Each then keeps the damping that was set at the
+            touch of a lasting contact; otherwise it takes this damping from the sampled twin.
 
         Raises
         ------
         ArgumentError
-            When the data does not have the size of a snapshot; the twin is unchanged.
+            The data does not have the size of a snapshot; the twins are unchanged.
         """
         here, sample, speed = read_snapshot(snapshot, self._states.dtype)
         away = np.broadcast_to(np.asarray(moved, dtype=np.float64), (len(self), 6))
@@ -236,12 +237,12 @@ class TwinBatch:
             self._states["y"][index] = geometry.state_of(self.scenes[index], there[:3], there[3:])
 
     def move(self, which: ArrayLike, q: ArrayLike, v: ArrayLike) -> None:
-        """Set the places of some twins at the present time; their wear and counts stay.
+        """Set the poses and rates of some twins at the present time; their wear and counts stay.
 
         Parameters
         ----------
         which : array_like of int, shape (k,)
-            Their numbers.
+            Numbers of the twins.
         q, v : array_like, shape (k, 3)
             Poses x, y [m], theta [rad] and their rates. A lasting contact keeps the damping of its touch.
         """
@@ -290,12 +291,12 @@ class TwinBatch:
         Parameters
         ----------
         speed_m_s : array_like, shape (m,) or ()
-            In m/s, of each twin or of all; wear takes the magnitude.
+            Speed in m/s, of each twin or of all; wear depends on the magnitude.
 
         Raises
         ------
         ArgumentError
-            As `Twin.set_travel_speed`; the batch is unchanged.
+            As for `Twin.set_travel_speed`; the batch is unchanged.
         """
         speeds = np.broadcast_to(np.abs(np.asarray(speed_m_s, dtype=np.float64)), len(self))
         for scene, speed in zip(self.scenes, speeds.tolist(), strict=True):
@@ -309,7 +310,7 @@ class TwinBatch:
         return self._states.tobytes() + self._wrench.tobytes() + self._params["wear_per_impulse"].tobytes()
 
     def restore(self, data: bytes) -> None:
-        """Take over a state saved by `snapshot`.
+        """Restore a state saved by `snapshot`.
 
         Parameters
         ----------
@@ -319,7 +320,7 @@ class TwinBatch:
         Raises
         ------
         ArgumentError
-            When the data does not have the size of a snapshot.
+            The data does not have the size of a snapshot.
         """
         wear = self._params["wear_per_impulse"]
         ends = np.cumsum([self._states.nbytes, self._wrench.nbytes, wear.nbytes])
@@ -330,7 +331,7 @@ class TwinBatch:
         wear[...] = np.frombuffer(data[ends[1] :]).reshape(wear.shape)
 
     def digest(self) -> str:
-        """Return 16 hexadecimal digits that stand for the exact state."""
+        """Return a hash of the exact state, 16 hexadecimal digits."""
         return hashlib.blake2b(self.snapshot(), digest_size=8).hexdigest()
 
     def _run(self, times: NDArray[np.float64], ends: NDArray[np.float64], rows: NDArray[np.void]) -> None:
@@ -349,7 +350,7 @@ class TwinBatch:
 
             worker.lanes.advance(times, ends, rows, worker.pace, alone)
 
-        # as bytes: numpy copies a record field by field
+        # copied as bytes, because numpy copies a record field by field
         states, begun = self._states.view(np.uint8), list[Future[None]]()
         before = states.copy()
         try:
@@ -369,7 +370,7 @@ class TwinBatch:
             raise (LimitError if late else RunInterrupted)(message, None, self.time) from None
 
     def _stop(self, begun: Sequence[Future[None]]) -> None:
-        """Stop the other threads within a slice of work."""
+        """Stop the other threads, each at the end of its slice of work."""
         for worker in self._workers:
             worker.pace.stopped = True
         wait(begun)
@@ -382,7 +383,7 @@ class TwinBatch:
 
 
 class _Worker(NamedTuple):
-    """The data of a thread."""
+    """The data of one thread."""
 
     parts: Parts
     work: NDArray[np.void]
@@ -407,7 +408,7 @@ class _Worker(NamedTuple):
         self, params: NDArray[np.void], states: NDArray[np.void], first: int, last: int, times: _Array, ends: _Array,
         max_steps: int, rows: NDArray[np.void],
     ) -> None:  # fmt: skip
-        """Advance twins `first` to `last` - 1 through all samples in the loop of a single scene."""
+        """Advance twins `first` to `last` - 1 through all samples by the loop for a single scene."""
         self.pace.run(loop.advance_rows, (
             params, self.parts, states, self.pace.saved, self.work, self.totals, first, last, times, ends, max_steps,
             rows, _NO_MARKS, states[:0], None, self.pace.record,
@@ -415,12 +416,12 @@ class _Worker(NamedTuple):
 
 
 def _merge(compiled: Sequence[CompiledScene]) -> Terms:
-    """Return the terms of all members together.
+    """Return the joint terms of all members.
 
     Raises
     ------
     ArgumentError
-        If the terms of the members' laws differ.
+        The terms of the members' laws differ.
     """
     first = compiled[0].parts.terms
     merged = first

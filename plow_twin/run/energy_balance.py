@@ -1,4 +1,4 @@
-"""The balance of energy and momentum of a run, from the sums of the solver."""
+"""The balance of energy and momentum of a run, computed from the sums of the solver."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class EnergyBalance:
-    """The balance of energy and momentum of a run: integrated forces against the change of state.
+    """The balance of energy and momentum of a run: integrals of the forces compared with the change of state.
 
     Attributes
     ----------
     kinetic_j, stored_j : tuple of float
-        Kinetic energy, including that of a frame on springs, and elastic energy K d^(n+1) / (n+1) of the contacts, at
+        Kinetic energy (with that of a frame on springs) and elastic energy K d^(n+1) / (n+1) of the contacts, each at
         the start and at the end in J.
     load_work_j, gravity_work_j : float
         Work of the loads without gravity, and of gravity with its constant moment, in J.
@@ -41,7 +41,7 @@ class EnergyBalance:
     momentum : ndarray, shape (3,)
         Change of m vx, m vy [N s] and I omega [N m s], world axes, centre of mass.
     impulse : ndarray, shape (2, 3)
-        Integrals of loads (with gravity) and of contact forces over time; without locked axes.
+        Integrals of loads (with gravity) and of contact forces over time; locked axes are not included.
     momentum_imbalance : ndarray, shape (3,)
         Largest |change of momentum - impulse| at any step's end.
     """
@@ -62,7 +62,7 @@ class EnergyBalance:
 
     @property
     def relative_imbalance(self) -> float:
-        """Imbalance of energy over turnover."""
+        """Imbalance of energy as a share of the turnover."""
         return self.imbalance_j / self.turnover_j if self.turnover_j > 0.0 else 0.0
 
 

@@ -1,6 +1,6 @@
-"""Many scenes at once on all cores: clearance, stiffness, load or initial state differ from member to member.
+"""Many scenes at once on all cores; clearance, stiffness, load or initial state differ from member to member.
 
-Scenes whose contact force is linear share SIMD vectors (`solve.lanes`), the others run one after the other.
+Scenes with a linear contact force share SIMD vectors (`solve.lanes`); other scenes run one by one.
 """
 
 from __future__ import annotations
@@ -42,15 +42,16 @@ class Ensemble:
     peak, impulse, time_in_contact : ndarray, shape (m, 8)
         Largest force [N], impulse [N s] and time with force [s] of each pair over the whole motion.
     makes : ndarray of int64, shape (m, 8)
-        Touches.
+        Number of touches of each pair.
     set_time : ndarray, shape (m, 2, 16)
-        Time in s in each set of corners (bit i: corner i), for counter-clockwise and for clockwise contacts.
+        Time in s in which each set of corners (bit i: corner i) is in contact, for counter-clockwise and clockwise
+        contacts.
     events : ndarray of int64, shape (m,)
-        Changes of contact.
-    wear_depth : ndarray, shape (m, 8)
-        Wear depth at the end in m.
-    steps, status : ndarray of int64, shape (m,)
-        Steps taken; `Status` of each member. A member that fails does not stop the others.
+        Number of changes of contact.
+        wear_depth : ndarray, shape (m, 8)
+        Wear depth of each pad at the end in m.
+        steps, status : ndarray of int64, shape (m,)
+            Number of steps, and `Status` of each member. A member that fails does not stop the others.
     """
 
     t: Array
@@ -81,34 +82,35 @@ def simulate_many(
     """Simulate every scene from t = 0 to `t_end`; the bits of a member depend on its scene alone.
 
     Scenes with a linear contact force (exponent 1, undamped or Kelvin-Voigt) and without other terms run eight at a
-    time in the lanes of a SIMD vector: the motion is that of `simulate` to the tolerance. All others have its bits.
+    time in the lanes of a SIMD vector and agree with `simulate` to the tolerance. All other scenes have the bits of
+    `simulate`.
 
     Parameters
     ----------
     scenes : sequence of Scene
     t_end, output_dt, tol
-        As in `simulate`.
-    workers : int, optional
-        Threads; all cores by default. The kernels run without the interpreter's lock.
+        As for `simulate`.
+        workers : int, optional
+            Number of threads; all cores by default. The kernels run without the interpreter's lock.
     on_progress : callable, optional
-        Called with the number of members done, from one thread at a time.
+        Called with the number of finished members, by one thread at a time.
     max_steps : int
-        Steps that each member may take; a member that needs more ends with the status `BUDGET`.
+        Largest number of steps of a member; a member that needs more ends with the status `BUDGET`.
     max_wall_s : float
-        Seconds of wall-clock time that all members together may take, compiling counted.
+        Wall-clock time in s that all members together may take, including compiling.
 
     Returns
     -------
     Ensemble
-        Rows and statistics of each member, and its status: a failed member does not stop the others.
+        Rows, statistics and status of each member; a failed member does not stop the others.
 
     Raises
     ------
     ArgumentError
-        For an argument that cannot be used.
-    LimitError, RunInterrupted
-        At `max_wall_s`, and after Ctrl-C; `result` holds the members up to there, unfinished ones with the status
-        `BUDGET`.
+        An argument cannot be used.
+        LimitError, RunInterrupted
+            At `max_wall_s`, and after Ctrl-C; `result` has the members up to there, and unfinished members have the
+            status `BUDGET`.
     """
     check_times(t_end, output_dt)
     check_limits(max_steps, max_wall_s)
@@ -119,7 +121,7 @@ def simulate_many(
     first, others = run.tasks(threads)
     with ThreadPoolExecutor(threads) as pool:
         try:
-            # the first alone, because it compiles the kernels
+            # the first members run alone, because they compile the kernels
             for task in first:
                 task()
             for done in [pool.submit(task) for task in others]:
@@ -134,7 +136,7 @@ def simulate_many(
     return ensemble
 
 
-#: Smallest number of members that a thread takes at a time: lanes are empty while the last members end.
+#: Smallest number of members that a thread takes at a time, because lanes stay empty while its last members end.
 _LEAST_SHARE = 64
 #: Number of shares for each thread, so that all threads end at about the same time.
 _SHARES = 4
@@ -159,7 +161,7 @@ class _Run:
         self.stopped, self.done = threading.Event(), 0
 
     def tasks(self, threads: int) -> tuple[list[Callable[[], None]], list[Callable[[], None]]]:
-        """Return the tasks to do first, alone, and the tasks that threads then share."""
+        """Return the tasks to do first, one by one, and the tasks that threads then share."""
         groups: dict[object, list[int]] = {}
         alone: list[Callable[[], None]] = []
         for index, one in enumerate(self._compiled):
@@ -213,7 +215,7 @@ class _Run:
             self._report_progress(len(done))
 
     def _run_alone(self, index: int) -> None:
-        """Run a member by the loop of a single scene."""
+        """Run a member by the loop for a single scene."""
         self._look()
         compiled, ensemble = self._compiled[index], self._ensemble
         motion = Motion.start(compiled, ensemble.q[index], ensemble.v[index])
@@ -228,7 +230,7 @@ class _Run:
         state: State | NDArray[np.void],
         status: int | NDArray[np.int64],
     ) -> None:
-        """Take over the results of one or more finished members."""
+        """Store the results of one or more finished members."""
         ensemble = self._ensemble
         ensemble.peak[index], ensemble.impulse[index] = totals["peak"], totals["impulse"]
         ensemble.time_in_contact[index], ensemble.makes[index] = totals["time_in_contact"], totals["makes"]

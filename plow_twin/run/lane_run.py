@@ -1,4 +1,4 @@
-"""Scenes in the lanes of a SIMD vector, in slices; steps of other methods through the loop of a single scene."""
+"""Running scenes in the lanes of a SIMD vector, in slices; the loop for a single scene takes steps of other methods."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from plow_twin.solve.lanes.loop import OTHER_METHOD, Members, run_lanes
 from plow_twin.solve.modes import settle_many
 from plow_twin.solve.state import EVENT, HARMONIC, STATE, TOTALS, Status, Work, new_records
 
-#: Steps of each lane in the first slice.
+#: Number of steps of each lane in the first slice.
 _FIRST_SLICE: Final = 256
-#: Most steps that the loop of a single scene takes when a lane needs a step of another method: a call costs as much as
-#: some thirty steps.
+#: Largest number of steps that the loop for a single scene takes when a lane needs a step of another method; a call of
+#: this loop costs as much as some thirty steps.
 _OTHER_STEPS: Final = 32
 
 
@@ -35,11 +35,11 @@ class LaneRun:
     times : ndarray, shape (n,)
         Times of the rows in s.
     q, v : ndarray, shape (m, n, 3)
-        Receive the rows.
+        Arrays that receive the rows.
     t_end : float
         End in s.
     max_steps : int
-        Steps that each member may take.
+        Largest number of steps of a member.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class LaneRun:
         return done
 
     def _step_otherwise(self, index: int, work: Work) -> None:
-        """Let the loop of a single scene take some steps of a member."""
+        """Let the loop for a single scene take some steps of a member."""
         members = self._members
         state, totals = self.states.view(np.recarray)[index], self.totals.view(np.recarray)[index]
         motion = Motion(state, totals, np.zeros(16 * _OTHER_STEPS, EVENT), members.q[index], members.v[index])
@@ -97,7 +97,7 @@ class LaneRun:
 
 
 def _joined(compiled: Sequence[CompiledScene], members: Sequence[int]) -> tuple[NDArray[np.void], NDArray[np.int64]]:
-    """Return the harmonics of all members in one array; shape (m, 2): first place and number of each member."""
+    """Return the harmonics of all members in one array, and each member's first index and count in it, shape (m, 2)."""
     parts, extent, begin = [np.zeros(0, HARMONIC)], np.zeros((len(compiled), 2), np.int64), 0
     known: dict[int, tuple[int, int]] = {}
     for index in members:

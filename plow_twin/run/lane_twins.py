@@ -1,4 +1,4 @@
-"""Live twins in the lanes of a SIMD vector: slices of their advances, and advances left to another method."""
+"""Live twins in the lanes of a SIMD vector, advanced in slices; some advances are left to another method."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from plow_twin.solve.lanes.advance import Samples, advance_lanes
 from plow_twin.solve.lanes.record import WIDTH, new_lanes
 from plow_twin.solve.state import STATE, TOTALS, Terms, new_records
 
-#: Steps of all lanes in a slice, which takes about a millisecond.
+#: Number of steps of all lanes in a slice, about a millisecond.
 _SLICE: Final = 256
 
 _Array = NDArray[np.float64]
 
 
 class LaneTwins:
-    """Twins that advance side by side, in one thread.
+    """Twins that one thread advances side by side.
 
     Parameters
     ----------
     params, states : ndarray of records, shape (m,)
-        Of all twins of a batch.
-    terms : Terms
-        Of all twins.
+        Parameters and states of all twins of a batch.
+        terms : Terms
+            Joint terms of all twins.
     members : range
         Numbers of the twins that advance here.
     work : ndarray of `WORK`, shape (1,)
         Scratch space.
     max_steps : int
-        Steps that an advance may take.
+        Largest number of steps of an advance.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class LaneTwins:
         self.clear()
 
     def clear(self) -> None:
-        """Empty the lanes of a call that has been stopped."""
+        """Empty the lanes after a call that was stopped."""
         self._lanes, self._totals = new_lanes(), np.zeros(WIDTH, TOTALS)
 
     def advance(

@@ -1,4 +1,4 @@
-"""A run under way: the compiled loop in slices, between which limits, progress and Ctrl-C are handled."""
+"""A run under way: slices of the compiled loop, between which limits, progress and Ctrl-C are handled."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from plow_twin.solve.state import EVENT, TOTALS, Log, State, Status, Totals, Wor
 Array = NDArray[np.float64]
 
 _FIRST_LOG: Final = 4096
-#: Steps after which a run ends with an error, by default.
+#: Default number of steps after which a run ends with an error.
 BUDGET: Final = 10**8
-#: Work between two looks at the clock in s, and steps before the first: explicit ones take microseconds.
+#: Work between two looks at the clock in s, and number of steps before the first look (explicit and implicit steps).
 _SLICE_S: Final = 0.02
 _FIRST_SLICE, _FIRST_SLICE_IMPLICIT = 2048, 64
 
@@ -37,17 +37,17 @@ class Motion:
     v: Array
     penetration: Array | None = None
     force: Array | None = None
-    #: place and rate of a frame on springs, shape (n, 6)
+    #: displacement and rate of a frame on springs, shape (n, 6)
     frame: Array | None = None
     sums: BalanceSums | None = None
-    #: rows written
+    #: number of rows written
     first: NDArray[np.int64] = field(default_factory=lambda: np.zeros(1, np.int64))
-    #: reached by fixed steps, which do not change the state's own time
+    #: time reached by fixed steps [s], which do not change the state's own time
     fixed_time: float | None = None
 
     @property
     def rows(self) -> int:
-        """Rows written so far."""
+        """Number of rows written so far."""
         return int(self.first[0])
 
     @property
@@ -57,7 +57,7 @@ class Motion:
 
     @staticmethod
     def start(compiled: CompiledScene, q: Array, v: Array, outputs: bool = False) -> Motion:
-        """Start at the scene's initial state; rows go to q and v, shape (n, 3) each, pair outputs to new arrays."""
+        """Start at the scene's initial state; rows go to q and v, shape (n, 3), and pair outputs to new arrays."""
         eight = (len(q), PAIR_COUNT)
         penetration, force = (np.zeros(eight), np.zeros(eight)) if outputs else (None, None)
         frame = np.zeros((len(q), 6)) if outputs and compiled.scene.support is not None else None
@@ -74,9 +74,9 @@ def run_events(
     budget: int,
     look: Callable[[Motion], None] | None = None,
 ) -> tuple[int, int]:
-    """Bring a motion to `t_end` by the event-located series; return its `Status` and the number of rows written.
+    """Advance a motion to `t_end` by the event-located series; return its `Status` and the number of rows written.
 
-    `look` is called between slices of the run. Slices do not change a bit of it.
+    `look` is called between slices of the run. The slices do not change a bit of the motion.
     """
     size = _FIRST_SLICE if compiled.parts.implicit is None else _FIRST_SLICE_IMPLICIT
     while True:
@@ -96,7 +96,7 @@ def run_events(
 
 
 def next_slice(size: int, took_s: float) -> int:
-    """Return the steps of the next slice of a run, from the steps and the time of the last one; at most `BUDGET`."""
+    """Return the steps of the next slice, at most `BUDGET`, from the steps `size` and the time of the last slice."""
     return min(BUDGET, max(1, int(size * min(4.0, max(0.1, _SLICE_S / max(took_s, 1e-6))))))
 
 

@@ -11,9 +11,9 @@ import numpy as np
 from plow_twin.errors import ArgumentError
 from plow_twin.solve.state import PACE, first_of, new_records
 
-#: Seconds after which a call ends with an error, by default.
+#: Default time [s] after which a call ends with an error.
 MOST_SECONDS: Final = 3600.0
-#: Steps of a slice: explicit ones take microseconds, implicit ones up to a millisecond.
+#: Number of steps in a slice; explicit steps take microseconds, implicit steps up to a millisecond.
 _SLICE, _SLICE_IMPLICIT = 2048, 64
 
 
@@ -22,27 +22,27 @@ class OutOfTimeError(Exception):
 
 
 class Pace:
-    """The slices of one call after the other.
+    """The slices of successive calls.
 
     Parameters
     ----------
     state_type : dtype
-        Type of the state that is kept from before the advance under way.
+        Type of the state that is kept from the beginning of the advance under way.
     implicit : bool
-        Whether the scene can need implicit steps.
+        Whether the scene may need implicit steps.
     max_wall_s : float
-        Seconds that a call may take.
+        Time in s that a call may take.
     """
 
     def __init__(self, state_type: np.dtype[np.void], implicit: bool, max_wall_s: float) -> None:
         self._records = new_records(PACE, 1)
         self.record = first_of(self._records)
-        #: the record for calls: numba asks a scalar record for an attribute, which numpy looks up in Python
+        #: the record for calls; numba asks a scalar record for an attribute, which numpy looks up in Python
         self.argument = self._records[0]
-        #: advances that have failed in the last call, shape (1,): a view of the record
+        #: number of failed advances in the last call, shape (1,), as a view of the record
         self.failed = self._records["failed"]
         self.record.slice = _SLICE_IMPLICIT if implicit else _SLICE
-        # as bytes: numpy copies a record field by field, five times as slowly
+        # as bytes, because numpy copies a record field by field, five times as slowly
         self._bytes = self._records.view(np.uint8).data
         self._start = self._bytes.tobytes()
         self.saved = new_records(state_type, 1)
@@ -50,12 +50,12 @@ class Pace:
         self.stopped = False
 
     def run(self, work: Callable[..., bool], arguments: tuple[Any, ...] = ()) -> None:
-        """Do slices of `work` until all is done.
+        """Call `work` for slice after slice until it is done.
 
         Raises
         ------
         OutOfTimeError
-            At the limit of time, or when `stopped` was set meanwhile; `record` holds the progress.
+            The time limit is reached, or `stopped` was set meanwhile; `record` has the progress.
         """
         self._bytes[:] = self._start
         begin = _time.perf_counter()

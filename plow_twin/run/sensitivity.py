@@ -1,8 +1,9 @@
-"""Growth of errors along a motion, which shows how long a tolerance holds.
+"""Growth of errors along a motion, which shows how long the tolerance is met.
 
-The columns of the fundamental matrix come from the linearised equations (`solve.tangents`). For other terms, displaced
-motions (shadows) are followed beside the motion itself over short stretches from states close to it; their differences
-are the columns. They include the jumps at touches and separations (saltation), since each shadow has its own events.
+The columns of the fundamental matrix are solutions of the linearised equations (`solve.tangents`). For terms that these
+do not have, the columns are differences between the motion and displaced motions (shadows), which are followed over
+short stretches from states close to it. They include the jumps at touches and separations (saltation), because each
+shadow has its own events.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from plow_twin.solve.tangents import ALONG, STATE_COLUMNS, follow_columns
 
 Array = NDArray[np.float64]
 
-#: Displacement of a shadow in shares of the clearance, smaller near a wall, and the tolerance at which it is followed.
+#: Displacement of a shadow as a share of the clearance, its smallest value near a wall, and the tolerance of a shadow.
 DISPLACEMENT: Final = 1e-7
 _LEAST_DISPLACEMENT: Final = 1e-10
 SHADOW_TOLERANCE: Final = 1e-12
@@ -36,15 +37,15 @@ _STRETCHES: Final = 200
 #: Change of a parameter that is not a length, as a share of the parameter's value.
 _RELATIVE_CHANGE: Final = 1e-6
 #: Smallest distance from walls at the beginning of a stretch, in displacements. If this leaves too small a
-#: displacement, the previous stretch is continued, at most so often in a row.
+#: displacement, the previous stretch is continued, at most `_MOST_MERGED` times in a row.
 _CLEAR_OF_WALLS: Final = 100.0
 _MOST_MERGED: Final = 20
-#: Most steps of a shadow in a stretch.
+#: Largest number of steps of a shadow in a stretch.
 _SHADOW_BUDGET: Final = 10**7
-#: Tolerance of the motion along which the equations are linearised: the error of its derivatives is some 1e-6 times the
-#: growth of errors. Where this is larger than the tolerance of the run, the latter is used.
+#: Tolerance of the motion along which the equations are linearised. The error of the derivatives is some 1e-6 times the
+#: growth of errors; if it exceeds `_LARGEST_ERROR`, the tolerance of the run is used.
 _EQUATIONS_TOLERANCE, _LARGEST_ERROR = 1e-6, 1e-2
-#: Steps before the first look at the clock, and number of explicit steps that is too large where implicit steps are
+#: Number of steps before the first look at the clock, and largest number of explicit steps if implicit steps are
 #: possible.
 _FIRST_SLICE, _MOST_WITHOUT_IMPLICIT = 2048, 200_000
 #: Growth above which an error is no longer within ten tolerances (`docs/solver.md`).
@@ -53,7 +54,7 @@ TRUSTED_GROWTH: Final = 1e4
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """How errors grow along a motion.
+    """Growth of errors along a motion.
 
     Attributes
     ----------
@@ -61,15 +62,16 @@ class Sensitivity:
         Times in s.
     growth : ndarray, shape (n,)
         Largest factor by which an earlier error has grown at `t`. Errors of poses are relative to the clearance, errors
-        of velocities are multiplied by the time in which the largest load crosses it.
+        of velocities are first multiplied by the time in which the largest load moves the head across it.
     from_start : ndarray, shape (n, k, k)
-        Derivatives of the state at `t` by the initial state, of the k / 2 free degrees of freedom: places, then rates.
-    exponent : float
-        Largest Lyapunov exponent in 1/s, of the second half of the motion: above 0 errors grow for ever.
+        Derivatives of the state at `t` by the initial state; a state has the places, then the rates, of the k / 2 free
+        degrees of freedom.
+        exponent : float
+            Largest Lyapunov exponent in 1/s in the second half of the motion; above 0, errors grow for ever.
     tol : float
         Tolerance of the motion.
     by_parameter : mapping of str to ndarray, shape (n, k)
-        Derivatives of the state at `t` by the chosen parameters, in their units.
+        Derivatives of the state at `t` by the chosen parameters, in the parameters' units.
     """
 
     t: Array
@@ -81,16 +83,16 @@ class Sensitivity:
 
     @property
     def trusted(self) -> bool:
-        """Whether the tolerance holds for the whole motion."""
+        """Whether the tolerance is met over the whole motion."""
         return bool(self.growth.max() <= TRUSTED_GROWTH)
 
     def good_until(self, accuracy: float) -> float:
-        """Return the time in s up to which the pose is good to an accuracy.
+        """Return the time in s up to which the error of the pose stays below a limit.
 
         Parameters
         ----------
         accuracy : float
-            Error of the pose relative to the clearance.
+            Limit of the pose error relative to the clearance.
         """
         bad = np.flatnonzero(self.tol * self.growth > accuracy)
         return float(self.t[-1] if len(bad) == 0 else self.t[max(0, bad[0] - 1)])
@@ -105,9 +107,9 @@ class Sensitivity:
 
 
 def sensitivity_parameters(scene: Scene) -> dict[str, float]:
-    """Return the parameters with respect to which a motion has derivatives: values in the scene by path.
+    """Return the parameters by which the derivatives of a motion can be computed.
 
-    Stiffness, damping or restitution, both clearances, and a factor of each load.
+    They are stiffness, damping or restitution, both clearances, and a factor of each load.
 
     Parameters
     ----------
@@ -116,7 +118,7 @@ def sensitivity_parameters(scene: Scene) -> dict[str, float]:
     Returns
     -------
     dict of str to float
-        Values by path.
+        Values in the scene by path.
     """
     contact, clearance = scene.contact, scene.clearance
     found = {"contact.stiffness": contact.stiffness, "contact.damping": contact.damping or 0.0}
@@ -153,7 +155,7 @@ class ChangedScene:
 
     @staticmethod
     def of(scene: Scene, path: str, tol: float) -> ChangedScene:
-        """Change the number at a path."""
+        """Increase the number at a path a little."""
         value = sensitivity_parameters(scene)[path]
         length = path.startswith("clearance")
         change = DISPLACEMENT * geometry.length_scale(scene) if length else _RELATIVE_CHANGE * value
@@ -163,9 +165,9 @@ class ChangedScene:
 
 
 def refuse_support(scene: Scene) -> None:
-    """Raise `ArgumentError` for a scene with a `Support`: shadows are not displaced in its places and rates."""
+    """Raise `ArgumentError` for a scene with a `Support`, because shadows have no displacements of its frame."""
     if scene.support is not None:
-        raise ArgumentError(f"sensitivity: got a scene with {scene.support}, expected one without support")
+        raise ArgumentError(f"sensitivity: got a scene with {scene.support}, expected a scene without support")
 
 
 class StretchProduct:
@@ -174,18 +176,18 @@ class StretchProduct:
     Parameters
     ----------
     size : int
-        Places and rates.
+        Number of places and rates.
     parameters : int
-        Parameters beside them.
+        Number of parameters.
 
     Attributes
     ----------
     total : ndarray, shape (k, k)
-        Derivatives by the state at the beginning.
-    rows : ndarray, shape (p, k)
-        Derivatives by the parameters.
-    growth : float
-        Largest growth since any of the kept times, at least 1.
+        Derivatives of the present state by the state at the beginning.
+        rows : ndarray, shape (p, k)
+        Derivatives of the present state by the parameters.
+        growth : float
+            Largest growth of an error since any of the kept times, at least 1.
     """
 
     def __init__(self, size: int, parameters: int) -> None:
@@ -194,26 +196,26 @@ class StretchProduct:
         self._basis, self._scratch = np.eye(size), np.zeros((5 + MOST_KEPT, size, size))
 
     def follow(self, matrices: Array, changes: Array, ends: NDArray[np.bool_]) -> tuple[Array, Array, Array, Array]:
-        """Multiply by stretches one after the other; the public numbers are those after the last.
+        """Multiply by one stretch after the other; the attributes then belong to the end of the last stretch.
 
-        Growth counts places alone within a stretch: in the middle of an impact a stiff contact turns any displacement
-        into a large, passing difference of velocities.
+        Within a stretch the growth is that of places only, because in the middle of an impact a stiff contact turns any
+        displacement into a large, temporary difference of velocities.
 
         Parameters
         ----------
         matrices : ndarray, shape (n, k, k)
             Fundamental matrices of the stretches so far.
         changes : ndarray, shape (n, p, k)
-            Effects of the parameters in them.
+            Effects of the parameters in these stretches.
         ends : ndarray of bool, shape (n,)
-            Whether a stretch ends there.
+            Whether a stretch ends after each matrix.
 
         Returns
         -------
         totals, rows, growth : ndarray, shapes (n, k, k), (n, p, k) and (n,)
-            The public numbers after each.
+            The attributes after each matrix.
         logs : ndarray, shape (n, k)
-            Logarithms of the factors by which each stretch that ends has stretched a basis, 0 for the others.
+            Logarithms of the factors by which each stretch that ends has extended the vectors of a basis, otherwise 0.
         """
         count, size = matrices.shape[:2]
         totals, rows = np.zeros((count, size, size)), np.zeros((count, len(self.rows), size))
@@ -237,14 +239,14 @@ def sensitivity_of(scene: Scene, t_end: float, tol: float, parameters: Sequence[
     tol : float
         Tolerance of the motion itself.
     parameters : sequence of str
-        Paths of `sensitivity_parameters` by which derivatives are wanted.
+        Paths of the parameters for derivatives, out of `sensitivity_parameters`.
 
     Raises
     ------
     ArgumentError
-        For a parameter that the scene does not have, or a scene with a `Support`.
+        The scene does not have a parameter, or it has a `Support`.
     SolverError
-        When a shadow could not be followed.
+        A shadow could not be followed.
     """
     refuse_support(scene)
     known = sensitivity_parameters(scene)
@@ -262,11 +264,11 @@ def sensitivity_of(scene: Scene, t_end: float, tol: float, parameters: Sequence[
         stretches = _by_shadows(scene, t_end, tol, parameters)
     totals, rows, growth, logs = follow(stretches)
     if tol < _EQUATIONS_TOLERANCE and _EQUATIONS_TOLERANCE * growth.max() > _LARGEST_ERROR:
-        # the motion itself must be known better
+        # the motion along which the equations are linearised was too coarse
         stretches = _by_equations(scene, t_end, tol, parameters) or stretches
         totals, rows, growth, logs = follow(stretches)
     times, ends = _ends(t_end), stretches.ends
-    # the exponent is taken over stretches that begin in the second half
+    # the exponent is computed from stretches that begin in the second half
     edges = np.concatenate([[0.0], times[ends]])
     first = int(np.searchsorted(edges, 0.5 * t_end))
     stretched = logs[ends][first:].sum(axis=0)
@@ -279,15 +281,15 @@ def sensitivity_of(scene: Scene, t_end: float, tol: float, parameters: Sequence[
 
 
 class _Stretches(NamedTuple):
-    """Derivatives at the times of `_ends` since the last stretch that ended, scaled as by `scale_of`."""
+    """Derivatives at the times of `_ends` by the state at the end of the previous stretch, scaled by `scale_of`."""
 
     matrices: Array  #: by the state, shape (n, k, k)
     changes: Array  #: by the parameters, shape (n, p, k)
-    ends: NDArray[np.bool_]  #: whether a stretch ends, and the next one begins, shape (n,)
+    ends: NDArray[np.bool_]  #: whether a stretch ends and the next stretch begins, shape (n,)
 
 
 def _by_equations(scene: Scene, t_end: float, tol: float, parameters: Sequence[str]) -> _Stretches | None:
-    """Follow the linearised equations beside the motion; None where that cannot be done or takes too many steps."""
+    """Follow the linearised equations along the motion; None if this is impossible or takes too many steps."""
     compiled = compile_scene(scene, tol)
     changed = [ChangedScene.of(scene, path, tol) for path in parameters]
     if not fits_tangents(compiled) or any(one.compiled.parts.terms != compiled.parts.terms for one in changed):
@@ -318,7 +320,7 @@ def _by_equations(scene: Scene, t_end: float, tol: float, parameters: Sequence[s
 
 def _by_shadows(scene: Scene, t_end: float, tol: float, parameters: Sequence[str]) -> _Stretches:
     """Follow displaced motions beside the motion."""
-    # five digits finer than a displacement
+    # a tolerance of a hundred-thousandth of a displacement
     fine = min(max(SHADOW_TOLERANCE, TOLERANCE_RANGE[0]), tol)
     compiled = compile_scene(scene, fine)
     changed = [ChangedScene.of(scene, path, fine) for path in parameters]
@@ -353,7 +355,7 @@ def _by_shadows(scene: Scene, t_end: float, tol: float, parameters: Sequence[str
 
 
 def _ends(t_end: float) -> Array:
-    """Return the ends of stretches, at uneven distances so that they do not align with a period."""
+    """Return the ends of stretches in s; their distances are uneven so that they do not align with a period."""
     ends = np.arange(1, _STRETCHES + 1, dtype=np.float64)
     ends[:-1] += 0.4 * (np.mod(ends[:-1] * 0.5 * (math.sqrt(5.0) - 1.0), 1.0) - 0.5)
     ends *= t_end / _STRETCHES
@@ -362,7 +364,7 @@ def _ends(t_end: float) -> Array:
 
 
 def scale_of(compiled: CompiledScene) -> Array:
-    """Return factors that make places and rates shares of the clearance, shape (6,)."""
+    """Return the units of places and rates in which the clearance is 1, shape (6,)."""
     params, length = compiled.params, geometry.length_scale(compiled.scene)
     place = np.array([1.0, 1.0, 1.0 / float(params.radius)]) * length
     scale: Array = np.concatenate([place, place * float(params.velocity_tolerance / params.position_tolerance)])
@@ -374,15 +376,15 @@ def displacement_beside(
 ) -> float | None:
     """Return the largest displacement of shadows, in shares of the clearance, for a stretch that begins here.
 
-    A spring turns a place displaced in contact into a large velocity, which no step of the solver does: no stretch
-    begins there. Where a damper holds the head, a displacement persists, and a small one suffices.
+    A stretch does not begin in a contact with a spring, which would turn a displacement into a large velocity that no
+    error of the solver has. If a damper holds the head, a displacement persists, so that a small one is sufficient.
 
     Parameters
     ----------
     penetration : ndarray, shape (n,)
-        Penetrations of the pairs that can touch, in m.
+        Penetrations in m of the pairs that can touch.
     length : float
-        The clearance in m to which displacements refer.
+        The clearance in m, of which displacements are shares.
     held : bool
         Whether overdamped contact holds the head.
     reads_speed : bool
@@ -392,7 +394,7 @@ def displacement_beside(
     Returns
     -------
     float or None
-        None where a pair is so near its wall that no displacement is small beside the distance, or in a contact whose
+        None if a pair is so near its wall that no displacement is small compared with the distance, or if a contact's
         damping depends on the speed of its touch.
     """
     if reads_speed and bool((penetration > 0.0).any()):
@@ -417,7 +419,7 @@ def _beside(
 ) -> list[State]:
     """Return a state and its shadows: one displaced by `moved` for each free place or rate, one for each changed scene.
 
-    Shadows of changed scenes are not displaced; they keep the damping set at a touch, from `before`.
+    Shadows of changed scenes are not displaced; they keep the damping that was set at a touch, given by `before`.
     """
     start = _pose_and_rate(_follow(compiled, state, float(state.time), work))
     states = [state]
@@ -440,7 +442,7 @@ def _copy(state: State) -> State:
 
 
 def _follow(compiled: CompiledScene, state: State, end: float, work: Work) -> Motion:
-    """Bring a copy of a state to `end`; return the motion with the row there."""
+    """Advance a copy of a state to `end`; return the motion with a row at `end`."""
     motion = Motion.start(compiled, np.zeros((1, 3)), np.zeros((1, 3)), outputs=True)
     motion.state = _copy(state)
     code, _ = run_events(compiled, motion, np.array([end]), end, work, int(motion.state.steps) + _SHADOW_BUDGET)

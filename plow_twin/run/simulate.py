@@ -1,4 +1,4 @@
-"""Run a scene from its initial state and return everything about the motion as arrays."""
+"""Simulation of a scene from its initial state, with the motion as arrays."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ Array = NDArray[np.float64]
 #: Type of one contact event: time in s, pair, modes (0 off, 1 on, 2 clipped), rate of penetration in m/s.
 EVENT_DTYPE: Final = EVENT
 _ROWS_BY_DEFAULT = 1000
-#: Most rows that fit into memory: each takes 176 bytes.
+#: Largest number of rows: each takes 176 bytes of memory.
 _MOST_ROWS: Final = 1e10
 
 
@@ -52,25 +52,26 @@ class Result:
     force, penetration : ndarray, shape (n, 8)
         Normal force [N] and signed penetration [m] of each pair.
     events : ndarray of `EVENT_DTYPE`, shape (k,)
-        Every change of contact in order of time.
-    statistics : mapping
-        By pair name: max, mean_in_contact, mean_over_time [N], impulse [N s], time_in_contact [s], makes; over the
-        whole motion, not over the output rows.
+        All changes of contact in order of time.
+        statistics : mapping
+        By pair name: max, mean_in_contact, mean_over_time [N], impulse [N s], time_in_contact [s] and makes, of the
+        whole motion and not only of the output rows.
     contact_sets : mapping
-        `ccw` and `cw`: share of the contact time of that sense in which exactly these corners carry force. Corners by
-        the scene's labels, otherwise by name.
+        For each sense, `ccw` and `cw`: the share of its contact time in which exactly these corners carry force.
+        Corners have the scene's labels, otherwise their names.
     solver : mapping
-        method, tol or dt, steps, evaluations (orders of series, or right-hand sides), events.
+        method, tol or dt, and the numbers of steps, evaluations (orders of series, or right-hand sides) and events.
     wear_depth : ndarray, shape (8,)
         Wear depth of each pad at the end in m.
     wall_s, compile_s : float
         Time taken by the run, and by compiling before it, in s.
     energy_balance : EnergyBalance or None
-        Energy and momentum, on request.
+        Balance of energy and momentum, on request.
     sensitivity : Sensitivity or None
-        How errors grow along the motion, on request.
+        Growth of errors along the motion, on request.
     frame : ndarray, shape (n, 6), or None
-        Displacement of a frame on springs (`Support`), x, y [m], theta [rad], and its rate; q and v are relative to it.
+        Displacement x, y [m], theta [rad] of a frame on springs (`Support`) and its rate; q and v are relative to the
+        frame.
     """
 
     t: Array
@@ -107,12 +108,12 @@ class Result:
         ModuleNotFoundError
             matplotlib (extra `view` or `study`) is not installed.
         """
-        # found by name, as pandas finds its plotting backend, so that a simulation does not import pictures
+        # imported by name, so that a simulation does not import the drawing code
         drawn: Figure = import_module("plow_twin.view.motion").plot_motion(self, title)
         return drawn
 
     def _repr_html_(self) -> str:
-        """Return the statistics of the contacts as a table, which notebooks show."""
+        """Return the statistics of the contacts as an HTML table for notebooks."""
         duration = float(self.t[-1]) if len(self.t) else 0.0
         title = f"{duration:g} s of motion, {len(self.t)} rows, {len(self.events)} changes of contact"
         heads = ("pair", "largest force [kN]", "mean in contact [kN]", "impulse [kN s]", "in contact [s]", "makes")
@@ -149,8 +150,8 @@ def simulate(
     t_end : float
         End in s, not negative.
     output_dt : float, optional
-        Distance of the output rows in s; a thousandth of the motion by default. The rows do not change the motion, but
-        for the fixed-step methods `output_dt` is a whole multiple of `dt`.
+        Distance of the output rows in s; a thousandth of the motion by default. The rows do not change the motion. For
+        the fixed-step methods, `output_dt` must be a whole multiple of `dt`.
     tol : float
         Tolerance of the pose relative to the clearance (`method="events"`).
     method : {"events", "rk4", "euler"}
@@ -158,18 +159,18 @@ def simulate(
     dt : float, optional
         The fixed step in s.
     energy_balance : bool
-        Balance energy and momentum (`Result.energy_balance`); without it the code does not run.
+        Whether to compute the balance of energy and momentum (`Result.energy_balance`).
     max_steps : int
-        Steps that the run may take.
-    max_wall_s : float
-        Seconds of wall-clock time that the run may take, compiling not counted.
+        Largest number of steps of the run.
+        max_wall_s : float
+            Wall-clock time in s that the run may take, without compiling.
     on_progress : callable, optional
         Called with the share of the motion that is done, 0..1, some fifty times a second.
     sensitivity : bool or sequence of str
-        Follow the linearised motion too, which shows whether the tolerance holds (`Result.sensitivity`). Paths of
-        parameters (`sensitivity_parameters`) give the derivatives by them too. Warns with `ToleranceWarning` where
-        errors grow too much for it. Some five times the work of the run; a hundred times and more for scenes with
-        friction, wear, a ramp, a table, a locked degree of freedom or overdamped contact.
+        Whether to follow the linearised motion too, which shows whether the tolerance is met (`Result.sensitivity`);
+        `ToleranceWarning` is issued if errors grow too much. With paths of parameters (`sensitivity_parameters`), the
+        derivatives by these are computed too. This takes some five times the work of the run, and a hundred times and
+        more for scenes with friction, wear, a ramp, a table, a locked degree of freedom or overdamped contact.
 
     Returns
     -------
@@ -179,13 +180,13 @@ def simulate(
     Raises
     ------
     ArgumentError
-        For an argument that cannot be used.
+        An argument cannot be used.
     SolverError
-        When the motion could not be continued, with time and cause.
+        The motion could not be continued; the error has time and cause.
     LimitError
-        At a limit; `result` holds the motion up to there.
+        A limit is reached; `result` has the motion up to there.
     RunInterrupted
-        After Ctrl-C, likewise; it is a `KeyboardInterrupt` too.
+        After Ctrl-C, with `result` likewise; it is also a `KeyboardInterrupt`.
     """
     check_times(t_end, output_dt, method, dt)
     check_limits(max_steps, max_wall_s)
@@ -274,7 +275,7 @@ def _is_finite(value: object) -> bool:
 
 
 def output_times(t_end: float, output_dt: float | None) -> Array:
-    """Return 0, output_dt, .. and t_end; a thousand rows without `output_dt`."""
+    """Return the times 0, output_dt, ..., t_end; without `output_dt`, a thousand intervals."""
     if t_end == 0.0:
         return np.zeros(1)
     if output_dt is None:
@@ -284,14 +285,14 @@ def output_times(t_end: float, output_dt: float | None) -> Array:
     return times if t_end - times[-1] <= 1e-9 * output_dt else np.append(times, t_end)
 
 
-#: Scratch space of the last run; a run beside it, in another thread or from `on_progress`, takes its own.
+#: Scratch space of the last run; a simultaneous run, in another thread or from `on_progress`, makes its own.
 _spare: Final[deque[Work]] = deque(maxlen=1)
 #: Kinds of run whose kernels this process has compiled or loaded.
 _ready: set[tuple[object, ...]] = set()
 
 
 def _make_ready(compiled: CompiledScene, energy_balance: bool, method: Method, dt: float | None) -> float:
-    """Compile or load the kernels of a kind of run, by a run of no length; return the seconds, 0 the next time."""
+    """Compile or load the kernels of a kind of run by a run of no length; return the time in s, 0 if they are ready."""
     parts = compiled.parts
     loads = parts.harmonics is None, parts.segments is None, None if parts.implicit is None else parts.implicit.dtype
     kind = parts.terms, *loads, options(compiled.scene), method == "events", energy_balance
@@ -373,7 +374,7 @@ def _result(
 def statistics_of(totals: Totals, duration: float) -> dict[str, dict[str, float]]:
     """Return the statistics of each pair over the motion (see `Result`)."""
     table = {}
-    # a record looks up its fields slowly
+    # read once, because a record looks up its fields slowly
     sums = [totals[name].tolist() for name in ("peak", "impulse", "time_in_contact", "makes")]
     for name, peak, impulse, contact, makes in zip(PAIR_NAMES, *sums, strict=True):
         table[name] = {

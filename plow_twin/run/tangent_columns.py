@@ -1,4 +1,4 @@
-"""The parameters of the columns of `solve.tangents`: from scenes in which a number differs to their records."""
+"""The records of the columns of `solve.tangents`, made from scenes in which one number differs."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ _COVERED: Final = {"harmonics", "second", "viscous", "hysteretic", "integer", "f
 def fits_tangents(compiled: CompiledScene) -> bool:
     """Return whether the linearised equations have all terms of a scene; exponents must be integers or 1.5.
 
-    Implicit steps are not among them. A law with a restitution has implicit steps compiled only for slow touches, so it
-    qualifies.
+    The linearised equations have no implicit steps. A law with a restitution still qualifies, because its implicit
+    steps are only for slow touches.
     """
     terms, contact = compiled.parts.terms, compiled.scene.contact
     there = {name for name, term in zip(Terms._fields, terms, strict=True) if term is not None}
@@ -32,7 +32,7 @@ def fits_tangents(compiled: CompiledScene) -> bool:
 
 
 def is_curved(terms: Terms) -> int | None:
-    """Return 1 where the force is not linear in penetration and rate, otherwise None."""
+    """Return 1 if the force is not linear in penetration and rate, otherwise None."""
     return 1 if terms.hysteretic or terms.integer or terms.fraction else None
 
 

@@ -1,4 +1,4 @@
-"""The live twin: one head, advanced by any interval under sampled or analytic loads; saved, restored and hashed."""
+"""The live twin: one head that is advanced by any interval under sampled or analytic loads, saved and restored."""
 
 from __future__ import annotations
 
@@ -43,13 +43,14 @@ from plow_twin.solve.support import frame_at
 
 __all__ = ["Advance", "AdvanceSeries", "Status", "Twin"]
 
-#: Steps one advance may take before it gives up.
+#: Default number of steps after which an advance fails.
 DEFAULT_BUDGET = 50_000_000
-#: The compiled kernels, by a key that determines the types of their arguments; numba's dispatch takes milliseconds.
+#: The compiled kernels by a key that determines the types of their arguments, because numba's dispatch takes
+#: milliseconds.
 _entries: dict[tuple[Any, ...], Callable[..., bool]] = {}
 _NO_DIGESTS = np.zeros(0, np.int64)
 _THE_ONE = np.zeros(1, np.int64)
-#: Fewest evaluations that an advance can be bounded to: four Runge-Kutta steps.
+#: Smallest bound for the evaluations of an advance: four Runge-Kutta steps.
 LEAST_EVALUATIONS = 16
 
 
@@ -67,20 +68,22 @@ class Twin:
     start : float
         Model time of the scene's initial state in s.
     max_evaluations : int, optional
-        For hard real-time: most evaluations of the equations of motion in an advance (an order of the series counts as
-        one). Beyond them a few Runge-Kutta steps complete the advance, and its `error_estimate_m` is not zero. At
-        least `LEAST_EVALUATIONS`.
+        For hard real time: largest number of evaluations of the equations of motion in an advance, at least
+        `LEAST_EVALUATIONS`; an order of the series is one evaluation. An advance that needs more is completed by a few
+        Runge-Kutta steps, and its `error_estimate_m` is not zero.
     max_steps : int
-        Most steps of an advance; beyond them it ends with the status `BUDGET` and leaves the twin unchanged.
+        Largest number of steps of an advance; an advance that needs more has the status `BUDGET` and leaves the twin
+        unchanged.
     max_wall_s : float
-        Seconds that a call for advances may take.
+        Time in s that a call for advances may take.
 
     Notes
     -----
-    At `max_wall_s` a call raises `LimitError`, after Ctrl-C `RunInterrupted`: the twin has the state after the
-    last complete advance; the error's `result` holds the rows up to there.
+    At `max_wall_s` a call raises `LimitError`, and after Ctrl-C `RunInterrupted`. The twin then has the state after the
+    last complete advance, and the error's `result` has the rows up to there.
 
-    The motion does not depend on the times of output, but a sample ends a step: the same samples give the same bits.
+    The motion does not depend on the times of output. A sample ends a step of the solver, so equal samples give equal
+    bits.
     """
 
     def __init__(
@@ -116,24 +119,24 @@ class Twin:
         self._work, self._totals = first_of(self._works), first_of(self._all_totals)
         self._states[0] = compiled.initial_state(start)
         self._inertias = inertias(scene)
-        #: the kernel with rows and without
+        #: the kernels, by whether they write rows
         self._kernels: dict[bool, Callable[..., bool]] = {}
         #: model time, as a view of the state
         self._time = self._states["time"]
         self._wrench = np.zeros(3)
-        #: loads of one sample per mass and inertia, and empty snapshots, made once for live samples one by one
+        #: loads of one sample per mass and inertia, and empty snapshots, made once for all single live samples
         self._one_load, self._no_snapshots = np.empty((1, 2, 3)), self._states[:0]
         self._travel_speed = scene.wear.travel_speed_m_s if scene.wear is not None else 0.0
 
     @property
     def signature(self) -> tuple[bool, ...]:
-        """Terms of the equations: twins with equal terms share their compiled code."""
+        """Terms of the equations; twins with equal terms share their compiled code."""
         parts = self._parts
         there = (*parts.terms, parts.harmonics, parts.segments, parts.implicit, self._bound)
         return (*(part is not None for part in there), *options(self.scene))
 
     def like(self, scene: Scene) -> Twin:
-        """Return a twin of another scene, with the tolerance, excitation and limits of this one.
+        """Return a twin of another scene with the tolerance, excitation and limits of this twin.
 
         Parameters
         ----------
@@ -154,7 +157,7 @@ class Twin:
         return float(self._time[0])
 
     def warm_up(self) -> float:
-        """Compile every kernel that this scene uses, or load it from the cache on disk; return the seconds it took."""
+        """Compile every kernel that this scene uses, or load it from the cache on disk; return the time taken in s."""
         begin = _time.perf_counter()
         saved = self.snapshot()
         self.advance(self.time + 1e-6)
@@ -169,20 +172,20 @@ class Twin:
         Parameters
         ----------
         t : float
-            Model time in s, not before the present one.
+            Model time in s, not before the present model time.
         wrench : array_like, shape (3,), optional
-            Fx, Fy [N] and M [N m] about the cavity's centre at `t` (`excitation="sampled"` only), reached on a straight
-            line from the sample before. Without it the last sample is held.
+            Fx, Fy [N] and M [N m] about the cavity's centre at `t` (`excitation="sampled"` only), reached linearly from
+            the previous sample. Without it the last sample is held.
 
         Returns
         -------
         Advance
-            State at `t`, and sums since the advance before. With a `status` other than `OK` nothing moved.
+            State at `t`, and sums since the previous advance. With a `status` other than `OK` nothing has moved.
 
         Raises
         ------
         ArgumentError
-            For a time before the present one, or anything that is not finite; nothing has changed then.
+            The time is before the present model time, or a number is not finite; nothing has changed.
         """
         if self.excitation == "scene" and wrench is not None:
             raise ArgumentError(f"wrench: got {wrench!r}, expected None with excitation='scene'")
@@ -194,7 +197,7 @@ class Twin:
         return Advance(rows[0])
 
     def advance_samples(self, t: ArrayLike, wrench: ArrayLike) -> AdvanceSeries:
-        """Advance through many samples; the same bits as one `advance` each.
+        """Advance through many samples, with the same bits as by one `advance` for each sample.
 
         Parameters
         ----------
@@ -227,7 +230,7 @@ class Twin:
         rows: NDArray[np.void] | None,
         digest_after: NDArray[np.int64] = _NO_DIGESTS,
     ) -> Advanced:
-        """Advance to given times; every other advance uses this.
+        """Advance to given times; all other calls for advances use this method.
 
         Parameters
         ----------
@@ -236,14 +239,14 @@ class Twin:
         wrench : ndarray, shape (n, 3)
             Fx, Fy [N] and M [N m] about the cavity's centre at each time; not used with `excitation="scene"`.
         rows : ndarray of `ROW`, shape (n,), or None
-            Receives a row for each time. Without rows the motion is the same, and no forces are computed for output.
+            Receives a row for each time. With None the motion is the same, but no forces are computed for output.
         digest_after : ndarray of int64, shape (m,)
             Rising numbers from 1 to n: counts of advances after which a digest is made.
 
         Returns
         -------
         Advanced
-            How many advances failed, and the m digests.
+            Number of failed advances, and the m digests.
 
         Raises
         ------
@@ -278,7 +281,7 @@ class Twin:
 
     @property
     def wrench(self) -> NDArray[np.float64]:
-        """The last sample: Fx, Fy [N] and M [N m], shape (3,); zero before the first."""
+        """The last sample: Fx, Fy [N] and M [N m], shape (3,); zero before the first sample."""
         return self._wrench.copy()
 
     def reset(
@@ -295,14 +298,14 @@ class Twin:
         t : float
             Model time in s.
         wear_depth : array_like, shape (8,), optional
-            Wear depth of each pad in m, at least 0. Without it the scene's initial one.
+            Wear depth of each pad in m, at least 0; by default the scene's initial wear depth.
         pose : tuple of array_like, shapes (3,) and (3,), optional
             x, y [m], theta [rad] and their rates at the start; the scene's by default.
 
         Raises
         ------
         ArgumentError
-            For a time, depth or pose out of range; the twin is unchanged.
+            A time, depth or pose is out of range; the twin is unchanged.
         """
         if not np.isfinite(t):
             raise ArgumentError(f"t: got {t!r}, expected a finite time in s")
@@ -320,7 +323,7 @@ class Twin:
         self._wrench = np.zeros(3)
 
     def move(self, q: ArrayLike, v: ArrayLike) -> None:
-        """Set the place of a head under sampled loads at the present time; its wear and counts stay.
+        """Set the pose and rate of a head under sampled loads at the present time; its wear and counts stay.
 
         Parameters
         ----------
@@ -336,12 +339,12 @@ class Twin:
         Parameters
         ----------
         speed_m_s : float
-            In m/s; the sign is the direction, and wear takes its magnitude.
+            Speed in m/s; the sign is the direction, and wear depends on the magnitude.
 
         Raises
         ------
         ArgumentError
-            For a speed that is not finite, or beyond the limit by the damping (`check_travel_speed`).
+            The speed is not finite, or above the limit by the damping (`check_travel_speed`).
         """
         check_travel_speed(self.scene, float(speed_m_s))
         if self._parts.terms.wear is not None:
@@ -353,7 +356,7 @@ class Twin:
         return self._state.tobytes() + self._wrench.tobytes() + np.float64(self._travel_speed).tobytes()
 
     def restore(self, data: bytes) -> None:
-        """Take over a state saved by `snapshot`.
+        """Restore a state saved by `snapshot`.
 
         Parameters
         ----------
@@ -363,7 +366,7 @@ class Twin:
         Raises
         ------
         ArgumentError
-            When the data does not have the size of a snapshot.
+            The data does not have the size of a snapshot.
         """
         self._states[0], self._wrench, speed = read_snapshot(data, self._states.dtype)
         self._set_wear_rate(speed)
@@ -371,27 +374,27 @@ class Twin:
             loop.lay_out_again(self._compiled.params, self._parts, self._state, self._work)
 
     def digest(self) -> str:
-        """Return 16 hexadecimal digits that stand for the exact state."""
+        """Return a hash of the exact state, 16 hexadecimal digits."""
         return _digest(self.snapshot())
 
     @property
     def wear_depth(self) -> NDArray[np.float64]:
-        """Wear depth of each pad at the end of the last step [m], shape (8,): a sample ends a step."""
+        """Wear depth of each pad at the end of the last step [m], shape (8,); each sample ends a step."""
         depth: NDArray[np.float64] = self._state.wear_depth.copy()
         return depth
 
     def failure(self, status: int) -> str:
-        """Return the reason of the newest failed advance.
+        """Return the reason why the newest failed advance failed.
 
         Parameters
         ----------
         status : int
-            Its status.
+            Status of the advance.
 
         Returns
         -------
         str
-            For `OUT_OF_RANGE`, the limit of the model and the distance of the head beyond it.
+            The reason; for `OUT_OF_RANGE` with the limit of the model and the value of the head.
         """
         if status != Status.OUT_OF_RANGE:
             return Status(status).text
@@ -406,31 +409,31 @@ class Twin:
 
     @property
     def frame(self) -> NDArray[np.float64] | None:
-        """Displacement of a frame on springs, x, y [m], theta [rad], and its rate, shape (6,); None without one."""
+        """Displacement x, y [m], theta [rad] of a frame on springs and its rate, shape (6,); None without one."""
         state, work = self._state, self._work
         if self._parts.terms.support is None:
             return None
         if state.step_size < 0.0:
             return np.array(state.frame)
-        # under the scene's own loads a step is left under way, and the row is read from its series; time runs evenly
-        # or as a square
+        # under the scene's own loads a step may be unfinished, and the row is read from its series, in which time is
+        # linear or quadratic in the parameter
         used, beta = float(state.elapsed), float(state.beta)
         sigma = 2.0 * used / (state.alpha + math.sqrt(max(state.alpha**2 + 2.0 * beta * used, 0.0)))
         return frame_at(work.frame, int(state.order), sigma)
 
     @property
     def steps(self) -> int:
-        """Steps taken so far."""
+        """Number of steps so far."""
         return int(self._state.steps)
 
     @property
     def evaluations(self) -> int:
-        """Evaluations of the equations of motion so far; an order of the series counts as one."""
+        """Number of evaluations of the equations of motion so far; an order of the series is one evaluation."""
         return int(self._state.evaluations)
 
     @property
     def bounded(self) -> int:
-        """Advances so far whose end was coarse because of `max_evaluations`."""
+        """Number of advances so far with a coarse end because of `max_evaluations`."""
         return int(self._state.bounded)
 
     def _kernel(self, kind: tuple[bool, bool], arguments: tuple[Any, ...]) -> Callable[..., bool]:
@@ -441,9 +444,9 @@ class Twin:
         return _entries[key]
 
     def _digests(self, states: NDArray[np.void], wrench: NDArray[np.float64]) -> list[str]:
-        """Return the digests of some states with their last samples, shape (m, 3)."""
+        """Return the digests of states with their last samples, shape (m, 3)."""
         size = states.itemsize
-        rows = np.empty((len(states), size + 32), np.uint8)  # as `snapshot` lays them out
+        rows = np.empty((len(states), size + 32), np.uint8)  # the layout of `snapshot`
         rows[:, :size] = states.view(np.uint8).reshape(len(states), size)
         rows[:, size : size + 24] = np.ascontiguousarray(wrench).view(np.uint8)
         rows[:, size + 24 :] = np.frombuffer(np.float64(self._travel_speed).tobytes(), np.uint8)
@@ -452,7 +455,7 @@ class Twin:
     def _stopped(
         self, stop: BaseException, count: int, samples: NDArray[np.float64] | None, rows: NDArray[np.void] | None
     ) -> NoReturn:
-        """Keep the state after the last finished advance, of `count`, and raise."""
+        """Keep the state after the last of `count` advances that is finished, and raise."""
         steps, done = self.steps, int(self._pace.record.row)
         self._go_back()
         if samples is not None and done > 0:
@@ -464,7 +467,7 @@ class Twin:
         raise (LimitError if late else RunInterrupted)(message, part, self.time) from None
 
     def _go_back(self) -> None:
-        """Take back the advance under way."""
+        """Undo the advance under way."""
         if self._pace.record.underway == 0:
             return
         self._states[0] = self._pace.saved[0]
@@ -496,7 +499,7 @@ def read_snapshot(data: bytes, dtype: np.dtype[np.void]) -> tuple[np.void, NDArr
     Raises
     ------
     ArgumentError
-        When the data does not have the size of a snapshot.
+        The data does not have the size of a snapshot.
     """
     size = dtype.itemsize
     if len(data) != size + 32:
@@ -510,7 +513,7 @@ def _digest(snapshot: bytes | memoryview) -> str:
 
 
 def _bounded(max_evaluations: int | None, order: int, max_steps: int) -> tuple[int, Bound | None]:
-    """Return the steps of the series that an advance may take, and the evaluations kept for its coarse end."""
+    """Return the largest number of series steps of an advance, and the evaluations reserved for its coarse end."""
     if max_evaluations is None:
         return max_steps, None
     if isinstance(max_evaluations, bool) or not max_evaluations >= LEAST_EVALUATIONS:

@@ -1,4 +1,4 @@
-"""Growth of errors and of changes of parameters along the motion of a live twin, by shadows advanced beside it."""
+"""Growth of errors and effects of parameters along the motion of a live twin, from shadows advanced beside it."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from plow_twin.solve.state import Status
 
 Array = NDArray[np.float64]
 
-#: Length of a stretch in s; distance of a shadow, in displacements, at which a stretch ends sooner.
+#: Length of a stretch in s, and distance of a shadow, in displacements, at which a stretch ends earlier.
 _STRETCH_S, _FAR = 0.1, 100.0
-#: Longest stretch in s, where a contact prevents a new one.
+#: Longest stretch in s while a contact prevents the start of the next stretch.
 _LONGEST_S = 0.5
 
 
@@ -39,28 +39,30 @@ class TwinSensitivity:
     Parameters
     ----------
     twin : Twin
-        A twin with `excitation="sampled"`; it is advanced by `advance` from here on, with unchanged bits.
+        A twin with `excitation="sampled"`; from here on only `advance` advances it, with the same bits as without
+        sensitivity.
     parameters : sequence of str
-        Paths of `sensitivity_parameters` by which derivatives are wanted.
+        Paths of the parameters for derivatives, out of `sensitivity_parameters`.
 
     Attributes
     ----------
     t : float
-        Model time of these numbers in s: the end of the last whole stretch, some 0.1 s behind, at most 0.5 s during a
-        contact.
+        Model time in s of the other attributes: the end of the last complete stretch, some 0.1 s before the twin's
+        time, during a contact up to 0.5 s.
     from_start : ndarray, shape (k, k)
-        Derivatives of the state at `t` by the initial state, of the k / 2 free degrees of freedom: places, then rates.
+        Derivatives of the state at `t` by the initial state; a state has the places, then the rates, of the k / 2 free
+        degrees of freedom.
     by_parameter : dict of str to ndarray, shape (k,)
         Derivatives of the state at `t` by the parameters at constant initial state.
     growth : float
-        Largest factor by which an earlier error has grown at `t`, as `Sensitivity.growth`.
+        Largest factor by which an earlier error has grown at `t`, as in `Sensitivity.growth`.
     exponent : float
         Largest Lyapunov exponent in 1/s since the beginning.
 
     Raises
     ------
     ArgumentError
-        For a parameter that the scene does not have, a twin that is not sampled, or a scene with a `Support`.
+        The scene does not have a parameter, the twin is not sampled, or the scene has a `Support`.
     """
 
     def __init__(self, twin: Twin, parameters: Sequence[str] = ()) -> None:
@@ -120,12 +122,12 @@ class TwinSensitivity:
         Returns
         -------
         Advance
-            That of the twin.
+            The advance of the twin.
 
         Raises
         ------
         SolverError
-            When a shadow could not be followed.
+            A shadow could not be followed.
         """
         advanced = self._twin.advance(t, wrench)
         rows = self._shadows.advance(t, self._twin.wrench)
@@ -142,14 +144,14 @@ class TwinSensitivity:
         return advanced
 
     def _end(self, t: float, matrix: Array, changes: Array) -> None:
-        """End a stretch: `matrix` is its fundamental matrix, `changes` the scaled effect of the parameters in it."""
+        """End a stretch: `matrix` is its fundamental matrix, `changes` has the scaled effects of the parameters in it."""
         by_unit = changes / np.array([one.change for one in self._changed])[:, None]
         self._logs += self._product.follow(matrix[None], by_unit[None], np.ones(1, bool))[3][0]
         self.t = t
         self._start()
 
     def _start(self, again: bool = True) -> None:
-        """Begin a stretch: all shadows at the twin's state, the displaced ones a little beside it."""
+        """Begin a stretch: all shadows start at the twin's state, or displaced a little from it."""
         size = len(self._free)
         moved = np.zeros((len(self._shadows), 6))
         moved[np.arange(1, 1 + size), self._free] = DISPLACEMENT * self._scale[self._free]

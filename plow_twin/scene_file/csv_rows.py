@@ -1,4 +1,4 @@
-"""Reader of CSV files as spreadsheets of many countries write them, and of Parquet files as the same rows."""
+"""Reader of CSV files in the formats of spreadsheets in many countries, and of Parquet files as the same rows."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import IO, Final
 from plow_twin.errors import ExcessError
 from plow_twin.scene_file.parquet_lines import SUFFIX, ParquetLines, is_parquet
 
-#: Longest row [characters] and most columns; a historian's export has some hundred.
+#: Longest row [characters] and largest number of columns; the export of a plant historian has some hundred columns.
 LONGEST_ROW: Final = 2**20
 MOST_COLUMNS: Final = 10_000
 
@@ -24,9 +24,9 @@ def open_csv(path: Path) -> IO[str]:
     Raises
     ------
     OSError
-        It cannot be opened.
-    csv.Error, ExcessError
-        As in `check_text` and `ParquetLines`.
+        The file cannot be opened.
+        csv.Error, ExcessError
+            As for `check_text` and `ParquetLines`.
     """
     if is_parquet(path):
         return io.TextIOWrapper(io.BufferedReader(ParquetLines(path)), encoding="utf-8", errors="replace", newline="")
@@ -40,17 +40,17 @@ def open_csv(path: Path) -> IO[str]:
 
 
 def tables(folder: Path) -> list[Path]:
-    """Return the CSV and Parquet files of a folder in order of their names; of two with one name the CSV."""
+    """Return the CSV and Parquet files of a folder in order of their names; of two with the same name, the CSV file."""
     found = {path.stem: path for ending in (SUFFIX, ".csv") for path in folder.glob(f"*{ending}")}
     return [found[name] for name in sorted(found)]
 
 
-#: Files that may be taken for CSV, by their first bytes.
+#: Kinds of file that may be mistaken for CSV, by their first bytes.
 _OTHERS: Final = {
     b"\xff\xfe": "UTF-16 text",
     b"\xfe\xff": "UTF-16 text",
     b"PK\x03\x04": "a workbook or another ZIP file",
-    b"\x1f\x8b": "a file that gzip has packed",
+    b"\x1f\x8b": "a file compressed by gzip",
 }
 
 
@@ -60,11 +60,11 @@ def check_text(begin: bytes) -> None:
     Raises
     ------
     csv.Error
-        It is UTF-16, as spreadsheets write "Unicode text", a workbook or packed.
+        The file is UTF-16 (the "Unicode text" of spreadsheets), a workbook, or compressed.
     """
     for first, kind in _OTHERS.items():
         if begin.startswith(first):
-            raise csv.Error(f"got {kind}, expected UTF-8 (of a spreadsheet: CSV UTF-8)")
+            raise csv.Error(f"got {kind}, expected UTF-8 (export a spreadsheet as CSV UTF-8)")
 
 
 def delimiter_of(header: str) -> str:
@@ -73,17 +73,17 @@ def delimiter_of(header: str) -> str:
 
 
 def csv_rows(stream: IO[str], comment: str = "") -> Iterator[tuple[int, list[str]]]:
-    """Yield line numbers and rows, the header first; empty rows are left out.
+    """Yield line numbers and rows, the header first; empty rows are skipped.
 
-    The delimiter is that of the header. With semicolons or tabs decimal commas become points. Lines that begin with
-    `comment` are left out.
+    The delimiter is taken from the header. With semicolons or tabs, decimal commas become points. Lines that begin with
+    `comment` are skipped.
 
     Raises
     ------
     csv.Error
         A line is not a row.
     ExcessError
-        A row is longer than `LONGEST_ROW`, or there are more than `MOST_COLUMNS`.
+        A row is longer than `LONGEST_ROW`, or there are more than `MOST_COLUMNS` columns.
     """
     number = length = 0
 

@@ -1,4 +1,4 @@
-"""Parquet files as equivalent lines of CSV, for each reader of CSV and within its bounds."""
+"""Parquet files as equivalent lines of CSV, so that every reader of CSV can read them within its bounds."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 SUFFIX: Final = ".parquet"
-#: Most rows that are turned into lines at once.
+#: Largest number of rows that are converted at once.
 _ROWS: Final = 4096
-#: Most rows for each byte of a file, and rows that any file may have: a few bytes can encode any number of rows.
+#: Largest number of rows per byte of a file, and number of rows allowed in any file: a few bytes can encode any number.
 _MOST_PER_BYTE: Final = 100
 _ALWAYS: Final = 1_000_000
-#: Largest column of a group of rows, unpacked [B]: it is in memory as a whole. Writers make groups of 128 MB.
+#: Largest unpacked column of a row group [B], which is in memory as a whole. Writers make groups of 128 MB.
 _LARGEST_COLUMN: Final = 2**29
-#: Most columns, and most bytes of a text in the file's description.
+#: Largest number of columns, and longest text in the file's description [B].
 _MOST_COLUMNS: Final = 10_000
 _LONGEST_TEXT: Final = 2**24
 
@@ -34,8 +34,8 @@ def is_parquet(path: Path) -> bool:
 class ParquetLines(io.RawIOBase):
     """A Parquet file, read as UTF-8 text: a line of names, then a line for each row.
 
-    Numbers have as many digits as they need, times are dates in UTC (those without a zone as they stand), a cell
-    without a value is empty. Columns that hold lists, structures or bytes are left out.
+    Numbers have as many digits as they need, times are dates in UTC (times without a zone are unchanged), and a cell
+    without a value is empty. Columns of lists, structures or bytes are left out.
 
     Parameters
     ----------
@@ -45,11 +45,11 @@ class ParquetLines(io.RawIOBase):
     Raises
     ------
     OSError
-        It cannot be opened.
-    csv.Error
-        It is not Parquet, or damaged; reading raises this too.
-    ExcessError
-        It is larger, unpacked, than any telemetry.
+        The file cannot be opened.
+        csv.Error
+            The file is not Parquet, or is damaged; reading raises this too.
+        ExcessError
+            The unpacked file is larger than any telemetry.
     """
 
     def __init__(self, path: Path) -> None:
@@ -66,7 +66,7 @@ class ParquetLines(io.RawIOBase):
         except FileNotFoundError:
             raise
         except self._arrow_errors as error:
-            raise csv.Error(f"no Parquet file that can be read: {_first_line(error)}") from error
+            raise csv.Error(f"cannot be read as Parquet: {_first_line(error)}") from error
         self._rows = int(self._file.metadata.num_rows)
         self._done = 0
         self._check()
@@ -75,7 +75,7 @@ class ParquetLines(io.RawIOBase):
         self._rest = memoryview(b"")
 
     def _check(self) -> None:
-        """Raise an `ExcessError` for a file that is too large unpacked."""
+        """Raise an `ExcessError` if the unpacked file is too large."""
         facts = self._file.metadata
         if facts.num_columns > _MOST_COLUMNS:
             raise ExcessError(f"{self.name}: got {facts.num_columns} columns, expected at most {_MOST_COLUMNS}")
@@ -95,11 +95,11 @@ class ParquetLines(io.RawIOBase):
             )
 
     def readable(self) -> bool:
-        """Return that it can be read."""
+        """Return True, because the stream can be read."""
         return True
 
     def readinto(self, buffer: Any) -> int:
-        """Put the next bytes into a buffer; return their number, 0 at the end."""
+        """Copy the next bytes into a buffer; return their number, 0 at the end."""
         while not self._rest:
             block = next(self._blocks, None)
             if block is None:
@@ -110,7 +110,7 @@ class ParquetLines(io.RawIOBase):
         return count
 
     def tell(self) -> int:
-        """Return how much of the file has been read, in its own bytes."""
+        """Return the number of bytes of the file that have been read."""
         return round(self._size * self._done / self._rows) if self._rows else self._size
 
     def close(self) -> None:
@@ -133,7 +133,7 @@ class ParquetLines(io.RawIOBase):
                 self._done += batch.num_rows
                 yield text.getvalue()
         except self._arrow_errors as error:
-            raise csv.Error(f"row {self._done + 1} and those after it cannot be read: {_first_line(error)}") from error
+            raise csv.Error(f"the rows from {self._done + 1} on cannot be read: {_first_line(error)}") from error
 
 
 def _first_line(error: BaseException) -> str:
@@ -141,7 +141,7 @@ def _first_line(error: BaseException) -> str:
 
 
 def _is_plain(kind: pa.DataType) -> bool:
-    """Return whether the values of a type are cells."""
+    """Return whether a value of a type fits into a cell."""
     import pyarrow as pa
 
     kind = kind.value_type if pa.types.is_dictionary(kind) else kind

@@ -1,4 +1,4 @@
-"""Paths of the files of `config/`: in the source tree, or in share/plow_twin of the prefix of the package."""
+"""Paths of the files of `config/`, in the source tree or in share/plow_twin of the installation prefix."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ def config_folder() -> Path:
     Raises
     ------
     FileNotFoundError
-        When the package was installed without its data files.
+        The package was installed without its data files.
     """
     package = Path(__file__).resolve().parent.parent
     if (package.parent / "package.xml").is_file():
         return package.parent / "config"
-    # in lib/pythonX.Y/site-packages/plow_twin of pip, colcon or a user's home: share/ is beside lib/
+    # pip, colcon and user installations have lib/pythonX.Y/site-packages/plow_twin, and share/ beside lib/
     unresolved = Path(__file__).absolute().parent.parent
     for prefix in (*package.parents, *unresolved.parents):
         folder = prefix / "share" / "plow_twin" / "config"

@@ -1,4 +1,4 @@
-"""From the text of a scene file to a `Scene`."""
+"""Reading of a scene file to a `Scene`."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from plow_twin.scene_file.validation import Schema, validate
 from plow_twin.scene_file.yaml_text import load_yaml, read_yaml
 
 _SECTIONS: Final = "the sections of a scene"
-#: Replacements of parts with problems, so that the other parts can be checked against each other.
+#: Replacements for parts with problems, so that the other parts can be checked against each other.
 _SOUND: Final[Mapping[str, Any]] = MappingProxyType(
     {
         "head": Head(1.0, 1.0),
@@ -47,7 +47,7 @@ def load_scene(path: str | Path) -> Scene:
     Parameters
     ----------
     path : str or Path
-        The YAML file, or the name of a preset: paper, bench_kv, bench_hc. Load tables are looked up beside it.
+        The YAML file, or the name of a preset such as paper. Load tables are looked up beside the file.
 
     Returns
     -------
@@ -57,7 +57,7 @@ def load_scene(path: str | Path) -> Scene:
     Raises
     ------
     SceneError
-        When the file cannot be read or used; it lists every problem.
+        The file cannot be read or used; the error lists every problem.
     """
     path = scene_path(path)
     if not (path.suffix or path.exists()):
@@ -82,7 +82,7 @@ def loads_scene(text: str, base: str | Path | None = ".", *, source: str = "scen
     Raises
     ------
     SceneError
-        When the scene cannot be used; it lists every problem.
+        The scene cannot be used; the error lists every problem.
     """
     return _scene(*load_yaml(text, "scene", _SECTIONS), None if base is None else Path(base), source)
 
@@ -93,7 +93,7 @@ def _schema() -> Schema:
 
 
 def _scene(raw: Any, problems: list[Problem], base: Path | None, source: str) -> Scene:
-    """Return the scene in a document that was read with these problems."""
+    """Return the scene in a document, or raise its `problems`, which include those found while it was read."""
     if raw is None and problems:
         raise SceneError(problems, source)
     problems += validate(raw, _schema(), "scene")
@@ -129,7 +129,7 @@ def _read_parts(
 
 
 def _arguments(part: type, raw: Mapping[str, Any], path: str, marks: dict[str, Provenance]) -> dict[str, Any]:
-    """Return the keyword arguments of a dataclass: numbers as floats, their marks apart."""
+    """Return the keyword arguments of a dataclass, with numbers as floats; the numbers' marks are put into `marks`."""
     specs = {spec.name: spec for spec in fields(part)}
     return {
         key: _number(value, f"{path}.{key}", marks) if "unit" in specs[key].metadata else value
@@ -184,7 +184,7 @@ def _samples(raw: Mapping[str, Any], path: str, base: Path | None) -> tuple[Any,
 
 
 def _problems_across(parts: Mapping[str, Any]) -> tuple[Problem, ...]:
-    """Check the sound parts against each other, with replacements for the rest."""
+    """Return the problems between parts; parts with problems of their own are replaced by sound ones."""
     try:
         Scene(**{**_SOUND, **parts})
     except SceneError as error:
@@ -193,7 +193,7 @@ def _problems_across(parts: Mapping[str, Any]) -> tuple[Problem, ...]:
 
 
 def _as_written(problem: Problem, raw: Mapping[str, Any]) -> Problem:
-    """Return the problem under the key of the file, in which `loads[0].force_n` lies below the kind of the load."""
+    """Return the problem with the key of the file, where a load's kind comes before its numbers (`loads[0].harmonic`)."""
     head, _, rest = problem.key.partition("].")
     index = head.removeprefix("loads[")
     if index == head or not index.isdigit() or rest.startswith(("name", "at_m")):

@@ -1,6 +1,6 @@
-"""JSON Schema of the scene file, made from the dataclasses of `plow_twin.model.scene`: one source for both.
+"""JSON Schema of the scene file, made from the dataclasses of `plow_twin.model.scene`, so that they cannot differ.
 
-A number, or a list of numbers, is plain or `{value, mark, source}`. Samples of a table load are plain.
+A number or a list of numbers is either plain or `{value, mark, source}`. Samples of a table load are plain.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from plow_twin.model.scene import (
 )
 from plow_twin.scene_file.validation import Schema
 
-#: Sections of the file that are one dataclass each.
+#: Sections of the file, each described by one dataclass.
 SECTIONS: Final[dict[str, type]] = {
     "head": Head,
     "frame": Frame,
@@ -165,7 +165,7 @@ def _load() -> Schema:
 
 
 def _table(plain: Schema) -> Schema:
-    """Return the schema of a table in a file (`file`, `columns`) or in the scene (`t`, `wrench`)."""
+    """Return the schema of a table, which is in a file (`file`, `columns`) or in the scene (`t`, `wrench`)."""
     columns = {
         "type": "array",
         "items": {"type": "string", "description": "the name of a column"},

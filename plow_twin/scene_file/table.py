@@ -24,16 +24,16 @@ def read_table(path: Path, columns: Sequence[str] | None = None, key: str = "fil
     Parameters
     ----------
     path : Path
-        The file, as `csv_rows` reads it; lines that start with `#` are left out.
+        The file, read by `csv_rows`; lines that start with `#` are skipped.
     columns : sequence of str, optional
-        Names in the header of time, Fx, Fy and M; `t, fx, fy, m` by default, or `time` for `t`.
+        Column names of time, Fx, Fy and M; by default `t` (or `time`), `fx`, `fy`, `m`.
     key : str
         Name of the file in messages.
 
     Raises
     ------
     SceneError
-        When the file, a column or a number is missing; it lists every bad line.
+        The file, a column or a number is missing; the error lists every bad line.
     """
     wanted = tuple(columns or TABLE_COLUMNS)
     try:
@@ -64,7 +64,7 @@ def _parse(rows: list[tuple[int, list[str]]], places: list[int], key: str) -> Sa
 
 
 def sample_table(t: list[Any], wrench: list[Any], key: str) -> Samples:
-    """Return the samples written in a scene as arrays; raises `SceneError` naming each bad row."""
+    """Return the samples in a scene as arrays, or raise a `SceneError` that names each bad row."""
     problems = [
         Problem(f"{key}.t[{index}]", value, "a number [s]") for index, value in enumerate(t) if not _is_number(value)
     ]

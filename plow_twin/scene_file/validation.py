@@ -1,7 +1,7 @@
-"""Check of plain data against a JSON schema, with messages for people: key, value got, value expected.
+"""Check of plain data against a JSON schema, with readable messages: key, value got, value expected.
 
-Scenes, parameters, mappings of recordings and load models are checked here. The `description` of a schema is the value
-expected in a message.
+Scenes, parameters, mappings of recordings and load models are checked here. A message gives the `description` of a
+schema as the value expected.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Schema = dict[str, Any]
 
 
 class _Shown:
-    """Words that stand for a value in a message."""
+    """Words that a message shows instead of a value."""
 
     def __init__(self, text: str) -> None:
         self.text = text
@@ -33,16 +33,16 @@ class _Shown:
         return self.text
 
 
-#: Stands for the value of a missing key.
+#: Shown as the value of a missing key.
 NOTHING: Final = _Shown("nothing")
-#: Longest value that is printed, and longest name [characters].
+#: Longest value and longest name that are printed [characters].
 _LONGEST: Final = 200
-#: Most listed problems: finding the nearest key for each takes time.
+#: Largest number of listed problems, because finding the nearest key for each takes time.
 MOST_PROBLEMS: Final = 50
 
 
 def validate(raw: Any, schema: Schema, name: str) -> list[Problem]:
-    """Return the problems of plain data, called `name` as a whole, in the order of the schema."""
+    """Return the problems of plain data in the order of the schema; `name` is what messages call the whole data."""
     problems = (problem for error in _validator(schema).iter_errors(raw) for problem in _explain(error, name))
     unique: dict[str, Problem] = {}  # jsonschema reports a mapping once for each missing key
     for problem in islice(map(_brief, problems), 2 * MOST_PROBLEMS):
@@ -57,7 +57,7 @@ def _validator(schema: Schema) -> Validator:
 
 @cache
 def _validator_class() -> Callable[[Schema], Validator]:
-    """Return a validator for YAML: NaN, infinity and integers beyond float64 are not numbers, 1.0 is not an integer."""
+    """Return a validator in which NaN, infinity and integers beyond float64 are no numbers, and 1.0 is no integer."""
     checker = Draft202012Validator.TYPE_CHECKER.redefine_many(
         {
             "number": lambda _, value: _is_number(value),
@@ -99,7 +99,7 @@ def _explain(error: ValidationError, whole: str) -> Iterator[Problem]:
 
 
 def _closest_branch(key: str, error: ValidationError, whole: str) -> Iterator[Problem]:
-    """Explain the branch whose type fits the value, or the key as a whole when no branch fits."""
+    """Yield the problems of the branch whose type fits the value, or one problem of the key if no branch fits."""
     branches: dict[Any, list[ValidationError]] = {}
     for inner in error.context or ():
         branches.setdefault(inner.schema_path[0], []).append(inner)
@@ -112,13 +112,13 @@ def _closest_branch(key: str, error: ValidationError, whole: str) -> Iterator[Pr
 
 
 def _is_misfit(error: ValidationError) -> bool:
-    """Return whether an error means that the branch is meant for values of another type or for other keys."""
+    """Return whether an error shows that the branch is for values of another type or with other keys."""
     keys_alone = error.validator == "required" and "properties" not in cast(Schema, error.schema)
     return keys_alone or error.validator in ("type", "const", "enum")
 
 
 def _brief(problem: Problem) -> Problem:
-    """Return the problem with words for a value that is too long to print."""
+    """Return the problem, with a value that is too long to print replaced by words."""
     got = problem.got
     if isinstance(got, list | tuple | dict) and len(repr(got)) > _LONGEST:
         shown = _Shown(f"a {'mapping' if isinstance(got, dict) else 'list'} of {len(got)}")

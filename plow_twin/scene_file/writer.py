@@ -1,4 +1,4 @@
-"""From a `Scene` to the text of a scene file."""
+"""Writing of a `Scene` as the text of a scene file."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ _ORDER: Final = (
 
 
 def dump_scene(scene: Scene) -> str:
-    """Write a scene as YAML text that needs no other file; reading it back gives an equal scene, bit for bit.
+    """Return a scene as YAML text that needs no other file; reading the text gives an equal scene, bit for bit.
 
     Parameters
     ----------
     scene : Scene
-        The scene; its tables are written in place.
+        The scene; its tables are written into the text.
 
     Returns
     -------
     str
-        The text, marks included.
+        The text, including the marks.
     """
     raw: dict[str, Any] = {"version": SCENE_VERSION}
     for key in SECTIONS:

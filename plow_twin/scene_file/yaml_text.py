@@ -1,7 +1,7 @@
-"""YAML of untrusted files: safe, bounded, numbers by the YAML 1.2 core schema, floats written exactly.
+"""YAML of untrusted files: safe and bounded, with numbers by the YAML 1.2 core schema and floats written exactly.
 
-The events of the parser are counted before a document is built: libyaml recurses in C for nested collections, and a few
-lines of aliases can expand to any number of values.
+The events of the parser are counted before a document is built, because libyaml recurses in C for nested collections,
+and a few lines of aliases can expand to any number of values.
 """
 
 from __future__ import annotations
@@ -17,21 +17,22 @@ import yaml
 
 from plow_twin.errors import Problem
 
-try:  # libyaml where PyYAML was built with it: ten times faster on recorded tables
+try:  # libyaml, if PyYAML has it, is ten times as fast on recorded tables
     from yaml import CSafeDumper as _Dumper
     from yaml import CSafeLoader as _Loader
 except ImportError:
     from yaml import SafeDumper as _Dumper  # type: ignore[assignment]
     from yaml import SafeLoader as _Loader  # type: ignore[assignment]
 
-#: Largest file [B] and most values in it: a table of 200,000 rows, read in ten seconds; longer tables belong in CSV.
+#: Largest file [B] and largest number of values in it, enough for a table of 200,000 rows, which takes ten seconds to
+#: read; longer tables belong in CSV.
 LARGEST_FILE: Final = 64 * 2**20
 MOST_VALUES: Final = 1_000_000
 #: Deepest nesting of collections; a scene has six levels.
 DEEPEST: Final = 20
-#: Most keys of a document: a scene has some hundred, the `metadata.yaml` of 1,000 parts 20,000.
+#: Largest number of keys of a document; a scene has some hundred, and the `metadata.yaml` of 1,000 parts 20,000.
 MOST_KEYS: Final = 50_000
-#: Most values to which the aliases of a document expand together.
+#: Largest number of values to which all aliases of a document expand.
 MOST_REPEATED: Final = 50_000
 
 _FLOAT: Final = re.compile(r"^(?:[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?|[-+]?\.inf|\.nan)$", re.I)
@@ -48,7 +49,7 @@ _CORE_SCHEMA: Final = (
 class SceneLoader(_Loader):
     """Safe loader with the scalars of the YAML 1.2 core schema."""
 
-    # PyYAML's own table is YAML 1.1: 1e6 a text, `on` a bool, 010 eight, 1:30 ninety
+    # PyYAML's own table is for YAML 1.1, in which 1e6 is a text, `on` a bool, 010 eight and 1:30 ninety
     yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012
 
 
@@ -67,7 +68,7 @@ SceneDumper.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+.01
 
 
 def read_yaml(path: Path, name: str, sections: str) -> tuple[Any, list[Problem]]:
-    """Return content and problems of a YAML file, as `load_yaml`, within `LARGEST_FILE` and `MOST_VALUES`."""
+    """Return the document and problems of a YAML file, as `load_yaml`, within `LARGEST_FILE` and `MOST_VALUES`."""
     try:
         with path.open("rb") as stream:
             data = stream.read(LARGEST_FILE + 1)
@@ -81,7 +82,7 @@ def read_yaml(path: Path, name: str, sections: str) -> tuple[Any, list[Problem]]
 
 
 def load_yaml(text: str, name: str, sections: str, *, most_values: float = math.inf) -> tuple[Any, list[Problem]]:
-    """Return the document, called `name` in messages, and its problems; None for an unreadable document."""
+    """Return the document (None if it is unreadable) and its problems; messages call the document `name`."""
     try:
         excess = _excess(text, most_values)
         if excess is not None:
@@ -100,13 +101,13 @@ def load_yaml(text: str, name: str, sections: str, *, most_values: float = math.
         return None, [Problem(_place(mark) if mark else name, str(error.problem), "YAML")]
     except yaml.YAMLError as error:
         return None, [Problem(name, " ".join(str(error).split()), "YAML")]
-    except ValueError as error:  # an integer of thousands of digits
+    except ValueError as error:  # an integer with thousands of digits
         return None, [Problem(name, str(error), "numbers")]
 
 
 @dataclass
 class _Size:
-    """Size of a node and its children, each alias counted as its node."""
+    """Size of a node with its children; an alias has the size of its node."""
 
     values: int = 1
     keys: int = 0
@@ -114,10 +115,10 @@ class _Size:
 
 
 def _excess(text: str, most_values: float) -> Problem | None:
-    """Return the bound that a document exceeds, by its events alone; errors of YAML are raised."""
+    """Return the bound that the events of a document exceed, or None; YAML errors are raised."""
     scalar = _Size()
     values = repeated = 0
-    sizes: dict[str, _Size | None] = {}  # by anchor; None: the node has not ended
+    sizes: dict[str, _Size | None] = {}  # by anchor; None while the node has not ended
     outer, is_mapping, anchor = _Size(), False, None
     stack: list[tuple[_Size, bool, str | None]] = []  # size, kind and anchor of the collections around it
     event: Any
@@ -141,9 +142,9 @@ def _excess(text: str, most_values: float) -> Problem | None:
                 sizes[anchor] = outer
             outer, is_mapping, anchor = stack.pop()
         elif kind is yaml.AliasEvent:
-            known = sizes.get(event.anchor, scalar)  # the composer reports where an anchor is missing
+            known = sizes.get(event.anchor, scalar)  # the composer reports a missing anchor
             if known is None:
-                return Problem(_place(event.start_mark), "an alias to itself", "an alias to a node before it")
+                return Problem(_place(event.start_mark), "an alias to itself", "an alias to an earlier node")
             node = known
             repeated += node.values
             if repeated > MOST_REPEATED:
@@ -154,7 +155,7 @@ def _excess(text: str, most_values: float) -> Problem | None:
             continue
         values += 1
         if values > most_values:
-            return _above(event, values, most_values, "values", " (a longer table can stand in a csv file)")
+            return _above(event, values, most_values, "values", " (a longer table can be in a csv file)")
         outer.values += node.values
         if is_mapping:
             outer.keys += 1
@@ -175,7 +176,7 @@ def _place(mark: Any) -> str:
 
 
 def dump_yaml(data: Any) -> str:
-    """Return plain data as YAML text; floats by repr, so that reading them back gives the same bits."""
+    """Return plain data as YAML text, with floats by repr so that reading them gives the same bits."""
     return yaml.dump(data, Dumper=SceneDumper, sort_keys=False, default_flow_style=None, allow_unicode=True, width=120)
 
 

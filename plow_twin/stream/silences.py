@@ -94,7 +94,7 @@ class Silences:
         return f"{self.total_ns * 1e-9:.3f} s without samples, {where}"
 
     def facts(self) -> dict[str, int | float]:
-        """Return number and total length [s] of all silences, and the start of the longest from the first sample [s]."""
+        """Return number and length [s] of all silences, and the start of the longest from the first sample [s]."""
         begin_s = (self.longest_ns[0] - (self._first_ns or 0)) * 1e-9
         return {"count": self.count, "total_s": self.total_ns * 1e-9, "longest_from_s": begin_s} if self.count else {}
 
