@@ -183,7 +183,7 @@ def test_a_screen_that_waits_for_a_file_says_so(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "plow_twin", "live", str(file), *OPTIONS, "--follow", "--dashboard"]
     pipes = dict.fromkeys(("stdout", "stderr"), subprocess.PIPE)
     with started([*command, "--listen", "127.0.0.1:0"], **pipes) as process:
-        assert "the page comes with it" in _said(process, f"plow-twin: {file}: its first line is waited for")
+        assert "the page opens after it" in _said(process, f"plow-twin: {file}: waiting for its first line")
         file.write_text("t,fx,fy,m\n")
         assert _said(process, "screen: ").split()[1].startswith("http://127.0.0.1:")
         process.kill()

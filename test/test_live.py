@@ -908,7 +908,7 @@ def test_a_silence_in_a_file_is_named_in_every_view_and_no_loss(
     text = page.read_text(encoding="utf-8")
     assert named in text and "No loss was counted" not in text
     assert run_cli(["analyse", str(run)]) == 0
-    assert f"{named}; the load is a straight line there" in capsys.readouterr().out.replace("\n", "")
+    assert f"{named}; there the load is interpolated linearly" in capsys.readouterr().out.replace("\n", "")
 
 
 @pytest.mark.parametrize(("given", "said"), [("follow=full", True), ("follow=parameters", False)])

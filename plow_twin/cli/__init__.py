@@ -1,4 +1,4 @@
-"""The command `plow-twin`: verbs that call the library.
+"""The command `plow-twin`, whose verbs call the library.
 
 Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 done with counted loss. Results go to standard output, progress
 and errors to standard error.
@@ -19,13 +19,13 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run the command line and leave with its exit code."""
     _open_what_is_closed()
     if os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
-        sys.exit("plow-twin: NUMBA_DISABLE_JIT is set, expected it unset: the solver is compiled code")
+        sys.exit("plow-twin: NUMBA_DISABLE_JIT is set, expected it unset, as the solver is compiled")
     with _ending_at_once():
-        # an interrupted import may end in another error
+        # Ctrl-C during an import may raise another error
         try:
             import plow_twin.run.twin  # noqa: F401
             from plow_twin.cli.app import main as run
-        except (ImportError, OSError, MemoryError) as error:  # memory is short, or a library is missing
+        except (ImportError, OSError, MemoryError) as error:  # short memory, or a missing library
             newer = (
                 "" if sys.version_info < (3, 13) else f"; this is Python 3.{sys.version_info[1]}, expected 3.11 or 3.12"
             )
@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
 
 
 def _open_what_is_closed() -> None:
-    """Open standard streams that are closed at the start as /dev/null, so that no file gets their descriptors."""
+    """Open /dev/null for standard streams that are closed at the start, so that no file gets their descriptors."""
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
         pass
     os.close(descriptor)
@@ -47,7 +47,7 @@ def _open_what_is_closed() -> None:
 
 @contextmanager
 def _ending_at_once() -> Iterator[None]:
-    """End the process on Ctrl-C without a traceback, before any work has begun."""
+    """End the process on Ctrl-C without a traceback while no work has begun."""
 
     def end(*_: object) -> None:
         os.write(2, b"plow-twin: interrupted\n")

@@ -33,17 +33,17 @@ from plow_twin.cli.console import (
     epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 done with counted loss.",
 )
 @click.argument("recordings", metavar="RUN...", type=click.Path(path_type=Path), nargs=-1, required=True)
-@click.option("--scene", help="Scene file or preset; needed for a recording that is no run of ours.")
+@click.option("--scene", help="Scene file or preset; needed for a recording of another program.")
 @click.option(
     "--map",
     "mapping",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    help="YAML that says which topic is the excitation, the head_pose, the travel, the forces, the gaps.",
+    help="YAML mapping: which topic is the excitation, the head_pose, the travel, the forces, the gaps.",
 )
 @unit_option
-@click.option("--with", "others", multiple=True, help="A further scene to predict with; may be repeated.")
+@click.option("--with", "others", multiple=True, help="A further scene for predictions; may be repeated.")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Folder for report.html and Parquet.")
-@click.option("--workers", type=click.IntRange(1), help="Processes for many recordings; by default one a core.")
+@click.option("--workers", type=click.IntRange(1), help="Processes for many recordings; by default one per core.")
 @click.option(
     "--dask", metavar="ADDRESS", help="Scheduler of a Dask cluster for many recordings, e.g. tcp://host:8786."
 )
@@ -63,7 +63,7 @@ def analyse(
     as_json: bool,
     quiet: bool,
 ) -> int:
-    """Analyse recordings: runs of ours, MCAP, rosbag2's sqlite3, CSV, or folders of them."""
+    """Analyse recordings: runs of plow_twin, MCAP, rosbag2's sqlite3, CSV, or folders of these."""
     from plow_twin.study.analysis.task import Task, names_apart
 
     scene_file, further = Path(scene) if scene else None, tuple(map(Path, others))
@@ -77,7 +77,7 @@ def analyse(
     many = len(found) > 1 or found != list(recordings)
     for option, given in (("--dask", dask), ("--workers", workers)):
         if given is not None and not many:
-            raise click.UsageError(f"{option}: got one recording, expected many, or a folder of them")
+            raise click.UsageError(f"{option}: got one recording, expected several, or a folder of recordings")
     if dask is not None and workers is not None:
         raise click.UsageError("--workers cannot be combined with --dask: a cluster has its own")
     folders = [out / name for name in names_apart(found)] if out is not None and many else [out] * len(found)
@@ -86,7 +86,7 @@ def analyse(
         Task(path, scene_file, mapping, further, folder, beside, units)
         for path, folder in zip(found, folders, strict=True)
     ]
-    for task in tasks:  # before any of them removes a file
+    for task in tasks:  # before any task removes a file
         task.check(found)
     results = _run(tasks, workers or os.cpu_count() or 1, dask, quiet) if many else [_alone(tasks[0], quiet)]
     if many and out is not None:
@@ -102,18 +102,18 @@ def analyse(
 
 
 def found_recordings(recordings: Sequence[Path], out: Path | None = None) -> tuple[list[Path], tuple[Path, ...]]:
-    """Return the recordings at paths and in folders; name the items in folders that are not recordings."""
+    """Return the recordings at paths and in folders; report the items in folders that are not recordings."""
     from plow_twin.study.analysis.analyse import counted_once, expand, left_out
 
     for path in recordings:
         if not path.exists():
             raise click.BadParameter(f"{path}: does not exist", param_hint="RUN...")
-    # results of an earlier analysis are not named
+    # results of an earlier analysis are not reported
     results_before = () if out is None else (out.resolve(), (out / "run").resolve())
     left = {item: path for path in recordings for item in left_out(path, results_before)}
     left = {item: path for item, path in left.items() if item.resolve() not in results_before}
     for item, path in left.items():
-        say_error(f"plow-twin: {item}: left out: no recording of {path}")
+        say_error(f"plow-twin: {item}: left out: not a recording of {path}")
     found, repeated = counted_once(expand(recordings, results_before))
     for sentence in repeated:
         say_error(f"plow-twin: {sentence}")
@@ -137,7 +137,7 @@ def _alone(task: Any, quiet: bool) -> dict[str, Any]:
 
 
 def _run(tasks: list[Any], workers: int, dask: str | None, quiet: bool) -> list[dict[str, Any]]:
-    """Analyse on all cores or a cluster; results that exist are kept, so that an interrupted call can be continued."""
+    """Analyse on all cores or a cluster; existing results are kept, so that an interrupted call can be continued."""
     from plow_twin.study.analysis.many import run_many
 
     with progress("analysing", quiet) as on_progress:
@@ -169,7 +169,7 @@ def _watch(task: Any, every: float, as_json: bool, quiet: bool) -> dict[str, Any
             sys.stdout.flush()
         else:
             _show([facts], False, False, quiet)
-        # summing up a long run takes a tenth of the time at most
+        # so that summing up a long run takes at most a tenth of the time
         due = time.monotonic() + max(every, 9.0 * (time.monotonic() - begin))
 
     with interruptible() as stopped:
@@ -209,7 +209,7 @@ def _show_contacts(console: Console, results: Sequence[dict[str, Any]]) -> None:
         shown.add_row(facts["run"], *numbers)
     console.print(shown)
     if len(results) > 1:
-        console.print("Whether they differ by more than chance, pad by pad: plow-twin compare RUN...", highlight=False)
+        console.print("For differences beyond chance, pad by pad: plow-twin compare RUN...", highlight=False)
 
 
 def _show(results: list[dict[str, Any]], many: bool, as_json: bool, quiet: bool, left_out: Sequence[str] = ()) -> None:
@@ -232,7 +232,7 @@ def _show(results: list[dict[str, Any]], many: bool, as_json: bool, quiet: bool,
         _show_contacts(console, good)
     for facts in good:
         if "without_samples" in facts:
-            said = f"{facts['run']}: {facts['without_samples']}; the load is a straight line there"
+            said = f"{facts['run']}: {facts['without_samples']}; there the load is interpolated linearly"
             console.print(said, highlight=False, soft_wrap=True)
         if not facts["signals"]:
             console.print(
@@ -254,7 +254,9 @@ def _show(results: list[dict[str, Any]], many: bool, as_json: bool, quiet: bool,
         console.print(shown)
         if "stretches" in facts:
             left = ", ".join(f"{name} {count}" for name, count in facts["not_compared"].items()) or "none"
-            console.print(f"{facts['stretches']} stretches between resets; of the longest. Not compared: {left}.")
+            console.print(
+                f"{facts['stretches']} stretches between resets; the table is of the longest. Not compared: {left}."
+            )
         if "outside" in facts:
             outside = ", ".join(f"{name} {count}" for name, count in facts["outside"].items())
-            console.print(f"Measured outside the time of the load, not compared: {outside}.")
+            console.print(f"Measurements outside the time of the load, not compared: {outside}.")

@@ -1,4 +1,4 @@
-"""The command group: runs verbs and turns errors into exit codes."""
+"""The command group, which runs verbs and turns errors into exit codes."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from plow_twin.cli.telemetry import telemetry
 from plow_twin.cli.view import view
 from plow_twin.errors import ExcessError, InputError, PlowTwinError, RunInterrupted, UnitError
 
-#: Extra of the package that brings a module.
+#: Extra of the package that installs a module.
 EXTRA_OF_MODULE: Final = {
     "rclpy": "ros",
     "rcl_interfaces": "ros",
@@ -66,7 +66,7 @@ EXTRA_OF_MODULE: Final = {
     "distributed": "dask",
 }
 
-#: Longest message [characters]: a file may have a million names to choose from.
+#: Longest message [characters], because a file may have a million names to choose from.
 _LONGEST: Final = 16_000
 
 
@@ -79,7 +79,7 @@ _LONGEST: Final = 16_000
     "--laws",
     multiple=True,
     metavar="MODULE",
-    help="Python file or module that adds contact laws (plow_twin.add_law); its code is run. May be repeated.",
+    help="Python file or module that adds contact laws (plow_twin.add_law). Its code is executed. May be repeated.",
 )
 def commands(laws: tuple[str, ...]) -> None:
     """Digital twin of a coal plough head: contact-impact motion in its guide."""
@@ -116,20 +116,20 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run the command line and leave with its exit code."""
     code = run(arguments)
     if threading.current_thread() is threading.main_thread():
-        # the work is done: another signal, as from terminal and launch at once, would change the exit code
+        # the work is done, and a second signal, from terminal and launch at once, would change the exit code
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, signal.SIG_IGN)
     try:
-        if sys.stdout is not None:  # closed before the start
+        if sys.stdout is not None:  # None if it was closed at the start
             sys.stdout.flush()
     except BrokenPipeError:
-        # no reader: Python must not complain at exit
+        # the reader is gone, and Python must not report this at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     sys.exit(code)
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line and return its exit code; errors are one message on standard error."""
+    """Run the command line and return its exit code; an error is one message on standard error."""
     try:
         code = commands.main(args=arguments, prog_name="plow-twin", standalone_mode=False)
         return code if isinstance(code, int) else 0
@@ -140,7 +140,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
     except RunInterrupted as error:
         return _fail(str(error))
     except (click.Abort, KeyboardInterrupt) as error:
-        # click turns every KeyboardInterrupt into an Abort
+        # click replaces every KeyboardInterrupt by an Abort
         stopped = error.__cause__
         return _fail(str(stopped) if isinstance(stopped, RunInterrupted) else "interrupted")
     except (InputError, UnitError, ExcessError) as error:

@@ -18,11 +18,11 @@ from plow_twin.live.service_names import SERVICES, mark_problem
 @click.argument("service", type=click.Choice(SERVICES))
 @click.argument("text", required=False)
 def call(socket: Path, service: str, text: str | None) -> int:
-    """Ask the twin of `plow-twin live --control SOCKET` for a SERVICE of the node; TEXT is the text of a mark."""
+    """Call a SERVICE of the twin that `plow-twin live --control SOCKET` runs; TEXT is the text of a mark."""
     from plow_twin.live.control import call as ask
 
     if text is not None and service != "mark":
-        raise click.UsageError(f"{service}: got the text {text!r}, expected none: it concerns all alarms, or the twin")
+        raise click.UsageError(f"{service}: got the text {text!r}, expected no text: only a mark has one")
     if text is not None and (problem := mark_problem(text)) is not None:
         raise click.UsageError(problem)
     done, answer = ask(socket, service, text)

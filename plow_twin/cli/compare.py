@@ -1,4 +1,4 @@
-"""`plow-twin compare`: runs of one machine beside each other, by run, day or shift."""
+"""`plow-twin compare`: comparison of the runs of one machine by run, day or shift."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ if TYPE_CHECKING:
 
 @click.command(
     short_help="Compare runs: do the contacts change, and is it the load or the machine?",
-    epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, 3 done, and a run was left out.",
+    epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, 3 done, but a run was left out.",
 )
 @click.argument("recordings", metavar="RUN...", type=click.Path(path_type=Path), nargs=-1, required=True)
 @click.option("--by", type=click.Choice(["run", "day", "shift"]), default="run", show_default=True, help="Groups.")
-@click.option("--shifts", default="06:00,14:00,22:00", show_default=True, help="Begins of the shifts.")
+@click.option("--shifts", default="06:00,14:00,22:00", show_default=True, help="Times at which shifts begin.")
 @click.option("--zone", default="UTC", show_default=True, help="Time zone of days and shifts, e.g. Europe/Berlin.")
 @click.option("--window", type=POSITIVE, metavar="S", help="Length of a window; by default the load's period.")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Folder for compare.html and Parquet.")
-@click.option("--workers", type=click.IntRange(1), help="Processes; by default one a core.")
+@click.option("--workers", type=click.IntRange(1), help="Processes; by default one per core.")
 @click.option("--dask", metavar="ADDRESS", help="Scheduler of a Dask cluster, e.g. tcp://host:8786.")
 @json_option
 @quiet_option
@@ -54,7 +54,7 @@ def compare(
     as_json: bool,
     quiet: bool,
 ) -> int:
-    """Compare runs, or folders of runs, with the first: peaks, impacts, contact, impulse, dissipation, wear."""
+    """Compare runs, or folders of runs, with the first run: peaks, impacts, contact, impulse, dissipation, wear."""
     from plow_twin.cli.analyse import found_recordings
     from plow_twin.study.analysis.many import run_many
     from plow_twin.study.analysis.task import names_apart
@@ -141,16 +141,16 @@ def _show(found: Comparison) -> None:
     console.print(_KEY, highlight=False)
 
 
-#: Signs of the causes of a change, and their meanings.
+#: Sign of each cause of a change, and the key to the signs.
 _SIGNS: Final = {"chance": "", "machine": "M", "load": "L", "load or machine": "?"}
 _KEY: Final = (
-    "M: the machine changed, L: the load did, ?: either; no letter: may be chance. All numbers of a table are judged "
-    "together: of its letters, one in twenty is there by chance. Contact: share of samples with force."
+    "M: the machine changed, L: the load changed, ?: either; no letter: may be chance. All numbers of a table are "
+    "judged together: one letter in twenty is there by chance. Contact: share of samples with force."
 )
 
 
 def _text(change: Change | None) -> str:
-    """Return a change in percent and the sign of its cause, so short that a table has room in 80 columns."""
+    """Return a change in percent and the sign of its cause, short enough for a table of 80 columns."""
     if change is None:
         return "-"
     percent = round(100.0 * change.share, 1) + 0.0

@@ -33,7 +33,7 @@ FAILED: Final = 1
 WRONG_INPUT: Final = 2
 DONE_WITH_LOSS: Final = 3
 
-#: Called with the share of the work done, 0..1.
+#: Function that is called with the share of the work done, 0..1.
 OnProgress = Callable[[float], None]
 
 quiet_option = click.option("--quiet", "-q", is_flag=True, help="No progress and no tables; files and errors only.")
@@ -41,7 +41,7 @@ json_option = click.option("--json", "as_json", is_flag=True, help="The result a
 
 
 def say_error(text: str) -> None:
-    """Print a line on standard error; a full disk or a closed terminal does not end the work."""
+    """Print a line on standard error; a full disk or a closed terminal raises no error."""
     with suppress(OSError):
         click.echo(printable(text), err=True)
 
@@ -72,7 +72,7 @@ class PlainConsole(Console):
         super().__init__(markup=False, emoji=False, **options)
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
-        """Yield the parts to show; control codes of the console itself are marked as such."""
+        """Yield the parts to show, without control characters except the control codes of the console itself."""
         for part in super().render(renderable, options):
             yield part if part.control else Segment(printable(part.text), part.style)
 
@@ -88,7 +88,7 @@ def error_console() -> Console:
 
 
 class _RateColumn(ProgressColumn):
-    """Share of the work done in a second."""
+    """Column with the share of the work that is done per second."""
 
     def render(self, task: Task) -> Text:
         """Return the text for a task."""
@@ -127,7 +127,7 @@ def progress_bar(title: str, quiet: bool) -> Iterator[OnProgress]:
 
 @contextmanager
 def _interruption() -> Iterator[Callable[[], bool]]:
-    """Note Ctrl-C beside the exception, which is lost in a destructor."""
+    """Note Ctrl-C in addition to its exception, which is lost if it is raised in a destructor."""
     before, asked = signal.getsignal(signal.SIGINT), False
 
     def note(number: int, frame: FrameType | None) -> None:
@@ -156,7 +156,7 @@ def busy(title: str, quiet: bool) -> Iterator[None]:
 
 
 def table(title: str, *columns: str) -> Table:
-    """Return a table of a text column and columns of numbers."""
+    """Return a table with a text column and columns of numbers."""
     result = Table(title=title, title_justify="left")
     for index, name in enumerate(columns):
         result.add_column(name, justify="left" if index == 0 else "right", no_wrap=index == 0)
@@ -164,7 +164,7 @@ def table(title: str, *columns: str) -> Table:
 
 
 def show_facts(console: Console, facts: Mapping[Any, Any], indent: int = 0) -> None:
-    """Print a fact on each line, the facts of a mapping indented below its name; long texts are not wrapped."""
+    """Print one fact per line, with the facts of a mapping indented below its name; long texts are not wrapped."""
     for key, value in facts.items():
         name = " " * indent + str(key)
         if isinstance(value, Mapping) and value:
@@ -190,7 +190,7 @@ def counts(found: Mapping[str, int]) -> str:
 
 
 def say_end(recording: object, status: str) -> None:
-    """Print on standard error that a recording has no proper end, and the verb that completes it."""
+    """Print on standard error that a recording has no proper end, and which verb completes it."""
     from plow_twin.record.reader import FileStatus
 
     if status not in (FileStatus.COMPLETE.value, FileStatus.UNREAD.value):
@@ -222,10 +222,10 @@ def unit_option(command: Callable[..., Any]) -> Callable[..., Any]:
         units = dict(text.partition("=")[::2] for text in given)
         for text in given:
             if "=" not in text:
-                raise click.BadParameter(f"got {text!r}, expected NAME=UNIT, as fx=kN or t=ms")
+                raise click.BadParameter(f"got {text!r}, expected NAME=UNIT, such as fx=kN or t=ms")
         return units
 
     return click.option(
         "--unit", "units", multiple=True, metavar="NAME=UNIT", callback=parsed,
-        help="Unit of a measured number: fx=kN, x=mm, theta=deg, t=ms; may be repeated.",
+        help="Unit of a measured number, e.g. fx=kN, x=mm, theta=deg, t=ms; may be repeated.",
     )(command)  # fmt: skip

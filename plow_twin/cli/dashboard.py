@@ -1,4 +1,4 @@
-"""Options of the screen, and `plow-twin dashboard`: the screen beside a node or a recording."""
+"""Options of the screen, and `plow-twin dashboard`, the screen for a node or a recording."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ def access_options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option(
             "--token-file",
             type=click.Path(path_type=Path, exists=True, dir_okay=False),
-            help="File whose first line is the token of the screen; else PLOW_TWIN_DASHBOARD_TOKEN.",
+            help="File whose first line is the token of the screen; by default PLOW_TWIN_DASHBOARD_TOKEN.",
         ),
         click.option(
             "--listen",
             metavar="HOST:PORT",
             default="127.0.0.1:8070",
             show_default=True,
-            help="Address of the screen; other machines need a token. Port 0: a free one.",
+            help="Address of the screen; other machines need a token. Port 0: any free port.",
         ),
     ):
         command = option(command)
@@ -43,7 +43,7 @@ dashboard_option = click.option("--dashboard", is_flag=True, help="Show the run 
 
 
 def access_of(options: dict[str, Any]) -> PageAccess:
-    """Return the access that the options ask for, before a twin is made; raises as `PageAccess.of` and `listening`."""
+    """Return the access that the options request; raises the errors of `PageAccess.of` and `listening`."""
     from plow_twin.dashboard.access import PageAccess, listening
 
     access = PageAccess.of(options["listen"], options["token_file"])
@@ -52,13 +52,13 @@ def access_of(options: dict[str, Any]) -> PageAccess:
 
 
 def access_if_shown(options: dict[str, Any]) -> PageAccess | None:
-    """Return the access to the screen, or None without `--dashboard`; other options of the screen are then refused."""
+    """Return the access to the screen, or None without `--dashboard`, when other options of the screen are refused."""
     if options["dashboard"]:
         return access_of(options)
     context = click.get_current_context()
     for name in ("listen", "token_file"):
         if context.get_parameter_source(name) is ParameterSource.COMMANDLINE:
-            raise click.UsageError(f"--{name.replace('_', '-')}: got no --dashboard, expected it beside")
+            raise click.UsageError(f"--{name.replace('_', '-')}: got no --dashboard, expected both options")
     return None
 
 
@@ -68,7 +68,7 @@ def say_where(screen: Screen, access: PageAccess) -> None:
 
 
 def stay(screen: Screen, stopped: Callable[[], bool]) -> None:
-    """Keep the page until a stop is requested or its server has ended."""
+    """Keep the page until a stop is requested or its server ends."""
     say_error("the input has ended; the page stays until Ctrl-C")
     while not (stopped() or screen.has_ended):
         screen.feed.turn()
@@ -80,18 +80,22 @@ def stay(screen: Screen, stopped: Callable[[], bool]) -> None:
     epilog="Exit codes: 0 done, 1 failed, 2 wrong usage.",
 )
 @click.argument("run", type=click.Path(path_type=Path), required=False)
-@click.option("--ros", is_flag=True, help="Show a node, by its topics.")
+@click.option("--ros", is_flag=True, help="Show a node through its topics.")
 @click.option("--namespace", default="", help="Its namespace.")
 @click.option("--name", default="plow_twin", show_default=True, help="Its name.")
-@click.option("--scene", help="Its scene, where the name that it has there cannot be read here.")
+@click.option("--scene", help="Scene of the node, if the node's path to it cannot be read here.")
 @click.option(
-    "--wait", type=click.FloatRange(0.0), default=10.0, show_default=True, help="How long to look for either [s]."
+    "--wait",
+    type=click.FloatRange(0.0),
+    default=10.0,
+    show_default=True,
+    help="Time to wait for the node or recording [s].",
 )
 @access_options
 def dashboard(
     run: Path | None, ros: bool, namespace: str, name: str, scene: str | None, wait: float, **options: Any
 ) -> int:
-    """Show RUN, a recording, also while it is written, or a node (--ros) until interrupted."""
+    """Show RUN (a recording, also while it is written) or a node (--ros) until interrupted."""
     if ros == (run is not None):
         raise click.UsageError("expected a recording or --ros")
     if scene is not None and not ros:

@@ -20,15 +20,15 @@ from plow_twin.cli.dashboard import access_if_shown, access_options, dashboard_o
     type=click.Choice(["real", "fast"]),
     default="real",
     show_default=True,
-    help="real: by the clock of the machine; fast: under /clock, as fast as the machine goes.",
+    help="real: in real time; fast: under /clock, as fast as possible.",
 )
-@click.option("--seconds", type=POSITIVE, default=20.0, show_default=True, help="Machine time to run [s].")
+@click.option("--seconds", type=POSITIVE, default=20.0, show_default=True, help="Duration in the machine's time [s].")
 @click.option(
     "--out",
     type=click.Path(path_type=Path, file_okay=False),
     default=Path("out/demo"),
     show_default=True,
-    help="Folder of the recording and the view.",
+    help="Folder for the recording and the view.",
 )
 @dashboard_option
 @access_options

@@ -16,7 +16,7 @@ from plow_twin.cli.console import DONE, DONE_WITH_LOSS, json_option, output_cons
     epilog="Exit codes: 0 complete, 1 failed or no recording, 2 wrong usage, 3 incomplete.",
 )
 @click.argument("recording", type=click.Path(path_type=Path, exists=True))
-@click.option("--repair", is_flag=True, help="Rewrite parts that were cut off or damaged; the old ones are kept.")
+@click.option("--repair", is_flag=True, help="Rewrite parts that were cut off or damaged; the old files are kept.")
 @json_option
 def doctor(recording: Path, repair: bool, as_json: bool) -> int:
     """Report content and losses of RECORDING; with --repair complete its parts."""
@@ -37,7 +37,7 @@ def doctor(recording: Path, repair: bool, as_json: bool) -> int:
 
 
 def _shown(facts: dict[str, Any]) -> dict[str, Any]:
-    """Return the facts for the terminal, parts by name and each problem on its own line."""
+    """Return the facts for the terminal, with parts by name and each problem on its own line."""
     parts = {part["file"]: {key: value for key, value in part.items() if key != "file"} for part in facts["parts"]}
     problems: dict[str, Any] = {
         key: dict(enumerate(facts[key], 1)) if facts[key] else None

@@ -37,16 +37,18 @@ if TYPE_CHECKING:
 
 @click.command(
     short_help="Estimate clearances and contact from measured motion.",
-    epilog="Exit codes: 0 done, also where an estimate is withdrawn; 1 failed; 2 wrong usage or scene; 3 done with "
+    epilog="Exit codes: 0 done, even if an estimate is withdrawn; 1 failed; 2 wrong usage or scene; 3 done with "
     "counted loss.",
 )
 @click.argument("source", metavar="INPUT", type=click.Path(path_type=Path, exists=True))
-@click.option("--scene", type=click.Path(path_type=Path), help="Nominal scene, a file or a preset; INPUT's by default.")
+@click.option(
+    "--scene", type=click.Path(path_type=Path), help="Nominal scene, a file or a preset; by default the scene of INPUT."
+)
 @click.option(
     "--map",
     "mapping",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    help="YAML that says which topic of a recording is the excitation, which the head_pose, the gaps or the forces.",
+    help="YAML mapping: which topic of a recording is the excitation, the head_pose, the gaps, the forces.",
 )
 @json_option
 @click.option(
@@ -65,13 +67,13 @@ if TYPE_CHECKING:
     "--follow",
     "following",
     is_flag=True,
-    help="Write followed.csv: forces and clearances as known at each time.",
+    help="Write followed.csv: forces and clearances from the measurements up to each time.",
 )
 @click.option(
     "--follow-dt",
     metavar="S",
     type=click.FloatRange(min=0.0, min_open=True),
-    help="Distance of its rows in s; one at each sample of the load by default.",
+    help="Distance of the rows of followed.csv [s]; by default one row for each sample of the load.",
 )
 @click.option(
     "--follow-members",
@@ -79,7 +81,7 @@ if TYPE_CHECKING:
     type=click.IntRange(20, 4096),
     default=128,
     show_default=True,
-    help="Twins that follow.",
+    help="Number of twins for --follow.",
 )
 @click.option(
     "--plot",
@@ -102,14 +104,14 @@ def estimate(
 ) -> int:
     """Estimate clearances, contact, load gains, bias and delay from INPUT, with 90 % intervals.
 
-    INPUT is a folder with scene.yaml (the nominal scene), load.csv (t, fx, fy, m: the load believed), pose.csv (t, x,
-    y, theta: the measured pose, a cell left empty was not measured) and, beside or instead of that, gaps.csv (t and
-    columns named after pairs: measured gaps) and contact_forces.csv (the same: measured forces); each of them may be
-    .parquet. Or it is a run of ours, or another recording (MCAP, rosbag2's sqlite3, CSV, Parquet). If the node of a run
-    made estimates, the newest is computed again from the journal and compared, bit for bit; otherwise the measured pose
-    is recorded beside the run.
+    INPUT is a folder with scene.yaml (the nominal scene), load.csv (t, fx, fy, m: the measured load) and pose.csv (t,
+    x, y, theta: the measured pose, an empty cell was not measured). It may also have gaps.csv (t and columns named
+    after pairs: measured gaps), also instead of pose.csv, and contact_forces.csv (likewise: measured forces); each
+    table may be .parquet. INPUT may also be a run of plow_twin or another recording (MCAP, rosbag2's sqlite3, CSV,
+    Parquet). If the node of a run made estimates, the newest is computed again from the journal and compared bit for
+    bit; otherwise the measured pose must be recorded beside the run.
 
-    With --follow each row of followed.csv has forces and clearances, with 90 % intervals, from the measurements up to
+    With --follow, each row of followed.csv has forces and clearances with 90 % intervals, from the measurements up to
     its time.
     """
     import numpy as np
@@ -161,7 +163,7 @@ def estimate(
         if forces is not None:
             _show_forces(forces)
     if more.get("live", {}).get("repeated") is False:
-        say_error("the journal gives another estimate than the node published")
+        say_error("the estimate from the journal differs from the estimate that the node published")
         return FAILED
     if more["losses"]:
         say_error(f"plow-twin: {source}: lost {counts(more['losses'])}")
@@ -170,7 +172,7 @@ def estimate(
 
 @dataclass(frozen=True)
 class _Task:
-    """An estimate to compute: `run` returns it and further facts. Its times count from `first_ns`, if known."""
+    """An estimate to compute: `run` returns it with further facts. Its times count from `first_ns`, if known."""
 
     scene: Scene
     load: Load
@@ -225,19 +227,19 @@ def _given(source: Path, scene: Path | None, mapping: Path | None, folder: bool)
 
 
 def _followed(given: _Given, members: int, dt: float | None) -> tuple[list[str], Any]:
-    """Return names and rows of forces and clearances, with intervals, at each time."""
+    """Return column names, and rows with forces, clearances and their intervals at each time."""
     from plow_twin.estimate import followed as offline
 
     stretch = offline.follow(given.measured.scene, given.load, given.poses, members, dt, gaps=given.gaps)
     return offline.table(stretch.rows)
 
 
-#: Advice about numbers in another unit.
+#: Advice for numbers in another unit.
 _REMEDY: Final = "convert the file, or state the unit in a mapping (--map)"
 
 
 def _check_units(source: Path, measured: Measured) -> None:
-    """Refuse impossible poses, and warn of a load that seems to be in another unit."""
+    """Refuse impossible poses; warn about a load that seems to be in another unit."""
     from plow_twin.record.unit_check import unit_doubts
 
     values = {("excitation", name): measured.load[:, 1 + place] for place, name in enumerate(("fx", "fy", "m"))}
@@ -311,7 +313,7 @@ def _labels(scene: Scene) -> dict[str, str]:
 
 
 def _forces(task: _Task, result: Estimate, members: int) -> Forces | None:
-    """Return the forces under the load believed, or None without an estimate to draw twins from."""
+    """Return the forces under the measured load, or None without an estimate from which twins can be drawn."""
     from plow_twin.estimate.forces import forces_of
     from plow_twin.estimate.result import State
 
@@ -330,7 +332,7 @@ def _show_forces(forces: Forces) -> None:
 
 
 def _show_live(live: dict[str, Any]) -> None:
-    """Print the window of the estimate, in times from its first sample."""
+    """Print the window of the estimate, with times from its first sample."""
     same = "the same bit for bit" if live["repeated"] else "not the same"
     window = f"{1e-9 * live['start_ns']:.3f} s to {1e-9 * live['end_ns']:.3f} s"
     text = (

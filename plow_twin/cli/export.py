@@ -11,7 +11,7 @@ from plow_twin.cli.console import DONE, DONE_WITH_LOSS, busy, output_console, qu
 
 @click.command(
     short_help="Write a recording as CSV, Parquet or NPZ.",
-    epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, 3 done, and the recording lacks something.",
+    epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, 3 done, but the recording is incomplete.",
 )
 @click.argument("recording", metavar="RUN", type=click.Path(path_type=Path, exists=True))
 @click.option("--to", "kind", type=click.Choice(["csv", "parquet", "npz"]), required=True, help="Format.")
@@ -25,7 +25,7 @@ def export(recording: Path, kind: str, out: Path, quiet: bool) -> int:
     opened = read_recording(recording)
     there = [path for path in ([out] if kind == "npz" else _tables(out, kind)) if path.is_file()]
     if there:
-        raise click.UsageError(f"{there[0]}: is there already, expected another place: --out")
+        raise click.UsageError(f"{there[0]}: exists already, expected another place: --out")
     with busy("exporting", quiet):
         rows = write(opened, kind, out)
     if not quiet:

@@ -29,20 +29,27 @@ if TYPE_CHECKING:
     from plow_twin.model.scene import Scene
 
 
-#: A limit below this share of the clearance was not given in mm; a limit in m is a thousandth of the number in mm.
+#: A limit below this share of the clearance was probably given in m, whose number is a thousandth of that in mm.
 _METRES: Final = 1e-2
 
 
 @click.command(
     short_help="Forecast when a clearance reaches its limit.",
-    epilog="Exit codes: 0 done, also where the limit is not reached; 1 failed; 2 wrong usage or scene; 3 done, but "
-    "something of the run is missing.",
+    epilog="Exit codes: 0 done, even if the limit is not reached; 1 failed; 2 wrong usage or scene; 3 done, but "
+    "part of the run is missing.",
 )
 @click.argument("scene")
 @click.option("--limit-horizontal", metavar="MM", type=POSITIVE, required=True, help="Limit of the clearance [mm].")
 @click.option("--limit-vertical", metavar="MM", type=POSITIVE, required=True, help="Limit of the clearance [mm].")
-@click.option("--horizon", metavar="H", type=POSITIVE, default=4000.0, show_default=True, help="Hours of operation.")
-@click.option("--stop", metavar="H", type=POSITIVE, help="Planned stop: the probability to reach the limit before [h].")
+@click.option(
+    "--horizon", metavar="H", type=POSITIVE, default=4000.0, show_default=True, help="Longest time of operation [h]."
+)
+@click.option(
+    "--stop",
+    metavar="H",
+    type=POSITIVE,
+    help="Planned stop [h]; prints the probability of reaching the limit before it.",
+)
 @click.option(
     "--face-length", metavar="M", type=POSITIVE, default=250.0, show_default=True, help="Length of a pass [m]."
 )
@@ -50,20 +57,20 @@ _METRES: Final = 1e-2
     "--estimate",
     "estimated",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    help="estimate.json of `plow-twin estimate --out`: the clearances now, with their intervals, and the contact.",
+    help="estimate.json of `plow-twin estimate --out`: the present clearances with their intervals, and the contact.",
 )
 @click.option(
     "--history",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    help="CSV of clearances over time (km, horizontal_mm, horizontal_sd_mm, vertical_mm, vertical_sd_mm): they tell "
-    "the wear coefficient and the clearances now; of --estimate beside it the contact is taken.",
+    help="CSV of clearances over time (km, horizontal_mm, horizontal_sd_mm, vertical_mm, vertical_sd_mm): gives "
+    "the wear coefficient and the present clearances; --estimate then gives only the contact.",
 )
 @click.option(
     "--scenario",
     "scenarios",
     metavar="NAME:load=X,coefficient=Y",
     multiple=True,
-    help="The same for multiples of load and wear coefficient; may be repeated.",
+    help="A forecast for multiples of load and wear coefficient; may be repeated.",
 )
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="The same seed gives the same bits.")
 @click.option("--plot", type=click.Path(path_type=Path, dir_okay=False), help="PNG of clearances and probability.")
@@ -86,8 +93,8 @@ def forecast(
 ) -> int:
     """Forecast when a clearance of SCENE, which has a section `wear`, reaches its limit.
 
-    SCENE is a scene file, a preset, or a run of ours: then its scene with the pads as worn at its end, and the newest
-    estimate of its node since these pads were set.
+    SCENE is a scene file, a preset, or a run of plow_twin. For a run, the forecast uses its scene with the wear at its
+    end, and the newest estimate of its node since the pads were set.
     """
     from plow_twin.estimate.coefficient import coefficient
     from plow_twin.estimate.forecast import Plan, Scenario, with_clearances
@@ -140,7 +147,7 @@ def forecast(
 
 
 def _check_limits(limits_m: tuple[float, float], scene: Scene) -> None:
-    """Refuse limits that look like metres, and name a clearance that has passed its limit already."""
+    """Refuse limits that seem to be in m, and report a clearance that has already passed its limit."""
     import numpy as np
 
     from plow_twin.stream.outputs import clearances
@@ -152,11 +159,11 @@ def _check_limits(limits_m: tuple[float, float], scene: Scene) -> None:
         if limit <= _METRES * now:
             raise click.UsageError(f"{option}: got {1e3 * limit:g} mm, expected more than {present}; is it in m?")
         if limit <= now:
-            say_error(f"plow-twin: {option}: {present}, is past {1e3 * limit:g} mm already")
+            say_error(f"plow-twin: {option}: {present}, has already passed {1e3 * limit:g} mm")
 
 
 def _scene(name: str) -> tuple[Scene, dict[str, Any] | None, dict[str, int]]:
-    """Return the scene (of a run as at its end), the newest estimate of its pads, and the losses of the journal."""
+    """Return the scene (of a run: at its end), the newest estimate of its pads, and the losses of the journal."""
     from plow_twin.record.estimated import left_by
     from plow_twin.record.reader import RunReader, own_run
     from plow_twin.scene_file import load_scene
@@ -171,7 +178,7 @@ def _scene(name: str) -> tuple[Scene, dict[str, Any] | None, dict[str, int]]:
 
 
 def _estimate(path: Path) -> Any:
-    """Return the content of the JSON of an estimate, unchecked."""
+    """Return the unchecked content of the JSON file of an estimate."""
     try:
         facts = json.loads(path.read_text(encoding="utf-8-sig"))
     except (ValueError, RecursionError) as error:
@@ -187,7 +194,7 @@ def _history(path: Path) -> History:
     Raises
     ------
     RecordingError, LifeError
-        When the history cannot be used.
+        The history cannot be used.
     """
     from plow_twin.estimate.coefficient import History
     from plow_twin.estimate.life import LifeError

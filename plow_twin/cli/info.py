@@ -34,17 +34,17 @@ from plow_twin.scene_file.presets import PRESETS
     epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 a recording with loss.",
 )
 @click.argument("target", required=False)
-@click.option("--unused", is_flag=True, help="Of a recording: each message that came and was not used, one a line.")
+@click.option("--unused", is_flag=True, help="Print each unused message of a recording, one per line.")
 @click.option(
     "--map",
     "mapping",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    help="YAML that says where load, travel and pose stand in a recording of another program.",
+    help="YAML mapping of load, travel and pose in a recording of another program.",
 )
 @unit_option
 @json_option
 def info(target: str | None, unused: bool, mapping: Path | None, units: dict[str, str], as_json: bool) -> int:
-    """Describe TARGET: a scene (file or preset) or a recording; without it, this installation."""
+    """Describe TARGET: a scene (file or preset) or a recording; without TARGET, this installation."""
     if target is not None and (mapping is not None or units):
         from plow_twin.record.foreign_facts import foreign_facts
 
@@ -58,7 +58,7 @@ def info(target: str | None, unused: bool, mapping: Path | None, units: dict[str
     if Path(target).suffix == ".mcap" or Path(target).is_dir():
         return _recording(Path(target), as_json)
     if Path(target).suffix.lower() in (".csv", ".parquet"):
-        raise RecordingError(f"{target}: got a table, expected --map with where its load, travel and pose stand")
+        raise RecordingError(f"{target}: got a table, expected --map with a mapping of its load, travel and pose")
     return _scene(target, as_json)
 
 
@@ -119,7 +119,7 @@ def _scene(target: str, as_json: bool) -> int:
 
 
 def _print_numbers(console: Console, target: str, rows: Sequence[dict[str, Any]]) -> None:
-    """Print the numbers by section, then their sources, which are numbered."""
+    """Print the numbers by section, then the numbered list of their sources."""
     sources = list(dict.fromkeys(row["source"] for row in rows if row["source"]))
     stated = table(f"{target}: what is stated", "number", "value", "unit", "mark, source")
     section = ""
@@ -146,7 +146,7 @@ def _recording(path: Path, as_json: bool) -> int:
 
 
 def _unused(path: Path, as_json: bool) -> int:
-    """Print the messages that were not used as CSV, or as JSON lines."""
+    """Print the unused messages as CSV or as JSON lines."""
     from plow_twin.record.unused import unused_messages
 
     table = csv.writer(sys.stdout, lineterminator="\n")

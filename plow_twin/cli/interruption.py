@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM and SIGHUP end a verb in bounded time, even if it waits in the code of a library."""
+"""End of a verb by Ctrl-C, SIGTERM or SIGHUP in bounded time, even while it waits in the code of a library."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Final
 
 from plow_twin.live.stop import stop_signals
 
-#: Time in which an interrupted verb must end by itself [s].
+#: Time within which an interrupted verb must end by itself [s].
 PATIENCE_S: Final = 3.0
 
 
@@ -19,8 +19,8 @@ PATIENCE_S: Final = 3.0
 def interruptible(on_overdue: Callable[[], object] = lambda: None) -> Iterator[Callable[[], bool]]:
     """Yield a function that returns whether the process was asked to end.
 
-    If the block lasts longer than `PATIENCE_S` after that, `on_overdue` is called and the process ends with exit code
-    1: a library that waits for a viewer cannot be interrupted otherwise.
+    If the block runs for more than `PATIENCE_S` after the request, `on_overdue` is called and the process ends with
+    exit code 1, because a library that waits for a viewer cannot be interrupted in another way.
     """
     asked, done = threading.Event(), threading.Event()
     receive, send = os.pipe()

@@ -42,9 +42,9 @@ if TYPE_CHECKING:
     from plow_twin.live.stop import StopSignals
     from plow_twin.telemetry.access import WayOut
 
-#: Time between two looks of the progress bar [s].
+#: Time between two updates of the progress bar [s].
 _PROGRESS_S = 0.2
-#: Counters of input that was not used.
+#: Names of the counters of unused input.
 _LOST = re.compile(r"dropped_.*|.*_dropped|.*_lost")
 _FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 
@@ -54,10 +54,10 @@ _FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
     epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 done with counted loss.",
 )
 @click.argument("source")
-@click.option("--scene", help="Scene file or preset; else the parameter scene.")
-@click.option("--map", "mapping", type=_FILE, help="YAML that says where load, travel and pose stand, with units.")
+@click.option("--scene", help="Scene file or preset; by default the parameter scene.")
+@click.option("--map", "mapping", type=_FILE, help="YAML mapping of load, travel and pose, with units.")
 @unit_option
-@click.option("--params", type=_FILE, help="YAML file of parameters, as of the node.")
+@click.option("--params", type=_FILE, help="YAML file of parameters, as for the node.")
 @click.option("--set", "given", multiple=True, metavar="NAME=VALUE", help="One parameter; may be repeated.")
 @click.option("--record", type=click.Path(path_type=Path, file_okay=False), help="Folder for the recording.")
 @click.option("--follow", is_flag=True, help="Continue while the files grow.")
@@ -65,20 +65,22 @@ _FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
     "--seconds",
     type=POSITIVE,
     default=None,
-    help="Stop so long [s] after the start of the twin, whether samples come or not.",
+    help="Stop this long [s] after the start of the twin, even without samples.",
 )
 @click.option(
     "--user",
     default="",
-    help="User at the broker or server; password: PLOW_TWIN_MQTT_PASSWORD, PLOW_TWIN_OPCUA_PASSWORD, or a file.",
+    help="User at the broker or server; password in PLOW_TWIN_MQTT_PASSWORD, PLOW_TWIN_OPCUA_PASSWORD or a file.",
 )
 @click.option("--password-file", type=_FILE, help="File whose first line is the password.")
-@click.option("--user-cert", type=_FILE, help="Certificate of the user at an OPC UA server, in the place of --user.")
+@click.option("--user-cert", type=_FILE, help="Certificate of the user at an OPC UA server, instead of --user.")
 @click.option("--user-key", type=_FILE, help="Key of that certificate.")
-@click.option("--tls-ca", type=_FILE, help="Authority that the broker's or server's certificate is checked against.")
+@click.option("--tls-ca", type=_FILE, help="Certificate authority for the broker's or server's certificate.")
 @click.option("--tls-cert", type=_FILE, help="Certificate of this client.")
 @click.option("--tls-key", type=_FILE, help="Key of that certificate.")
-@click.option("--client-id", default="plow_twin", show_default=True, help="Name under which the broker keeps messages.")
+@click.option(
+    "--client-id", default="plow_twin", show_default=True, help="Client name under which the broker keeps messages."
+)
 @click.option("--plain", is_flag=True, help="Allow brokers and servers on other machines without encryption.")
 @click.option("--lines", is_flag=True, help="Status, alarms and diagnostics as JSON lines on standard output.")
 @click.option(
@@ -148,7 +150,7 @@ def _live(
     facts = {name: values for name, (_, _, values) in parts.items()}
     taken = report.close_lines()
     if report.lost:
-        lost = [*lost, f"standard output took {report.lost} lines not, or in part"]
+        lost = [*lost, f"{report.lost} lines were not, or only partly, written to standard output"]
     for text in (*lost, *front.causes()):
         report.error(text)
     hangs = not report.close() or not taken
@@ -163,7 +165,7 @@ def _live(
 
 
 def _say_what_differs(front: BridgeFront, settings: Settings) -> None:
-    """Say where the recording goes if its folder was taken, and which thresholds look wrong."""
+    """Report where the recording is if its folder was in use, and which thresholds seem wrong."""
     from plow_twin.record.unit_check import small_thresholds
 
     recording = front.runtime.recording
@@ -175,16 +177,16 @@ def _say_what_differs(front: BridgeFront, settings: Settings) -> None:
 
 
 def _say_pace(settings: Settings, quiet: bool) -> None:
-    """Say, before a file is read, why that takes long and which setting is faster."""
+    """Say, before a file is read, why reading takes long and which setting is faster."""
     if settings.follows == "full" and not quiet:
         say_error(
-            f"plow-twin: {settings.follow_members} twins follow the machine, which takes about as long as the file's "
-            "measurements did; --set follow=parameters is faster, without intervals of the forces"
+            f"plow-twin: {settings.follow_members} twins follow the machine, which takes about as long as the "
+            "measurement of the file; --set follow=parameters is faster, but gives no intervals of the forces"
         )
 
 
 def _also_metrics(say: Say, port: int | None, opened: ExitStack) -> Say:
-    """Return the receivers of a twin's reports: `say`, and the page of metrics where there is one."""
+    """Return the receiver of a twin's reports: `say`, together with the page of metrics if it is requested."""
     if port is None:
         return say
     from plow_twin.live.metrics import Metrics
@@ -234,7 +236,7 @@ def _show_progress(front: BridgeFront, bridge: Bridge, update: OnProgress) -> No
 
 
 def _control(path: Path | None) -> AbstractContextManager[Control | None]:
-    """Return the requested socket, which is removed at the end."""
+    """Return the requested socket, which is removed when the context ends."""
     if path is None:
         return nullcontext()
     from plow_twin.live.control import Control
@@ -258,7 +260,7 @@ def _shown(values: dict[str, str]) -> list[str]:
 
 
 def _settings(options: dict[str, Any]) -> Settings:
-    """Return the parameters: from the file, replaced by those of --set, then by those of their own options."""
+    """Return the parameters of the file, overridden by --set and then by the options of single parameters."""
     from plow_twin.live import parameters
 
     values = parameters.read_parameters(options["params"]) if options["params"] else {}
@@ -277,7 +279,7 @@ def _settings(options: dict[str, Any]) -> Settings:
     if not options["scene"] and "scene" not in values:
         say_error(f"plow-twin: no --scene: the preset {settings.scene} is used, which is not your machine")
     if settings.opcua_server:
-        raise click.UsageError("opcua_server: a parameter of the node; expected the address as SOURCE")
+        raise click.UsageError("opcua_server: a parameter of the node only; expected the address as SOURCE")
     scene, record = options["scene"] or settings.scene, options["record"] or settings.record_path
     return replace(settings, scene=scene, record_path=str(record))
 
@@ -315,14 +317,14 @@ def _bridge(source: str, options: dict[str, Any], rate_hz: float) -> Bridge:
         kinds = ".csv" if options["follow"] else ".csv or .parquet"
         raise BridgeError(f"{path}: got a folder without {kinds}, expected some")
     files = Files(paths, follow=options["follow"])
-    page = "; the page comes with it, and its address is printed then" if options["dashboard"] else ""
+    page = "; the page opens after it, and its address is then printed" if options["dashboard"] else ""
     for missing in files.awaited() if options["follow"] else ():
-        say_error(f"plow-twin: {missing}: its first line is waited for{page}")
+        say_error(f"plow-twin: {missing}: waiting for its first line{page}")
     return files
 
 
 def _tables(folder: Path, *, growing: bool) -> list[Path]:
-    """Return the files of a folder, without Parquet where files are read while they grow."""
+    """Return the tables of a folder, without Parquet files if files are read while they grow."""
     from plow_twin.scene_file.csv_rows import tables
     from plow_twin.scene_file.parquet_lines import is_parquet
 

@@ -15,22 +15,22 @@ from plow_twin.cli.outlet import Outlet
 
 _LEVELS = ("OK", "WARN", "ERROR")
 
-#: Level, message and values of a status, the alarms or a part of the diagnostics.
+#: Level, message and values of a status, of the alarms or of a part of the diagnostics.
 Part = tuple[int, str, dict[str, str]]
 
 
 class Report:
-    """Says status and alarms when they change, and with `lines` all parts as JSON lines.
+    """Report status and alarms when they change, and with `lines` all parts as JSON lines.
 
     An alarm is reported when it is raised and when it is acknowledged, not each time its quantity passes a threshold.
-    A hanging reader does not delay the twin: lines are dropped and counted.
+    A hanging reader does not delay the twin, because lines are dropped and counted.
 
     Parameters
     ----------
     lines, quiet : bool
-        JSON lines on standard output; no text for a person.
+        Whether to write JSON lines to standard output, and whether to write no text for a person.
     stamp_ns
-        Returns the stamp that the twin has reached [ns].
+        Function that returns the stamp that the twin has reached [ns].
     """
 
     def __init__(self, *, lines: bool, quiet: bool, stamp_ns: Callable[[], int]) -> None:
@@ -43,18 +43,18 @@ class Report:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is not None:  # otherwise there is more to say
+        if kind is not None:  # otherwise another report follows
             with suppress(BrokenPipeError):
                 self.close_lines()
             self.close()
 
     @property
     def lost(self) -> int:
-        """Lines that standard output has refused."""
+        """Number of lines that standard output has refused."""
         return self._out.lost
 
     def error(self, text: str) -> None:
-        """Say an error; may be called from any thread."""
+        """Report an error; may be called from any thread."""
         self._errors.put(f"plow-twin: {text}")
 
     def close_lines(self) -> bool:
@@ -66,7 +66,7 @@ class Report:
         return self._errors.close()
 
     def say(self, name: str, part: Part) -> None:
-        """Say a part."""
+        """Report a part."""
         level, message, values = part
         if name == "alarms":
             from plow_twin.record.alarms import alarm_texts
@@ -85,7 +85,7 @@ class Report:
 
 
 def _typed(value: str) -> int | float | str:
-    """Return a number as a number."""
+    """Return the text of a number as a number, any other text unchanged."""
     for kind in (int, float):
         try:
             found = kind(value)
@@ -96,11 +96,11 @@ def _typed(value: str) -> int | float | str:
 
 
 def _printed(line: str) -> bool:
-    """Print a line; return False where standard output fails, as on a full disk: the twin goes on."""
+    """Print a line; return False if standard output fails, as on a full disk, so that the twin continues."""
     try:
         click.echo(line)
         sys.stdout.flush()
-    except BrokenPipeError:  # no reader any more
+    except BrokenPipeError:  # the reader is gone
         raise
     except OSError:
         return False

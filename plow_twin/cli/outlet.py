@@ -7,19 +7,19 @@ from collections import deque
 from collections.abc import Callable
 from typing import Final
 
-#: Bound: lines that wait for the reader; the oldest are dropped first.
+#: Largest number of lines that wait for the reader; the oldest are dropped first.
 MOST_WAITING: Final = 1000
-#: Bound: time at the end for which the reader may read nothing [s].
+#: Longest time at the end without a line taken by the reader [s].
 _PATIENCE_S: Final = 2.0
 
 
 class Outlet:
-    """Writes lines in a thread of its own, in order.
+    """Write lines in order, in a separate thread.
 
     Parameters
     ----------
     write
-        Writes a line; returns whether it was taken.
+        Function that writes a line and returns whether it was taken.
     on_loss
         Called once, when the first line is dropped.
     """
@@ -30,7 +30,7 @@ class Outlet:
         self._news = threading.Condition()
         self._thread: threading.Thread | None = None
         self._closed = self._broken = False
-        #: lines that were not taken, and lines that were dropped
+        #: number of lines that were not taken or were dropped
         self.lost = 0
 
     def put(self, line: str) -> None:
@@ -51,7 +51,7 @@ class Outlet:
             self._thread.start()
 
     def close(self) -> bool:
-        """Wait for the reader as long as it reads; return False if it hangs; raises as `put`."""
+        """Wait as long as the reader reads; return False if it hangs, and raise the errors of `put`."""
         with self._news:
             self._closed = True
             self._news.notify()

@@ -28,10 +28,8 @@ from plow_twin.cli.console import (
 @click.argument("run", type=click.Path(path_type=Path, file_okay=False))
 @click.argument("topics", metavar="[TOPIC]...", nargs=-1)
 @click.option("--all", "every", is_flag=True, help="All topics except hidden ones and the run's own.")
-@click.option("--exclude", metavar="REGEX", help="With --all: leave these out.")
-@click.option(
-    "--wait", type=click.FloatRange(0.0), default=10.0, show_default=True, help="How long to look for a run [s]."
-)
+@click.option("--exclude", metavar="REGEX", help="With --all: leave out these topics.")
+@click.option("--wait", type=click.FloatRange(0.0), default=10.0, show_default=True, help="Time to wait for a run [s].")
 @json_option
 @quiet_option
 def record(
@@ -39,18 +37,18 @@ def record(
 ) -> int:
     """Record topics into the folder of RUN, beside the twin's recording, until interrupted.
 
-    RUN is the recording that the twin is making (its `record_path`, or the newest of RUN_2, ...); without one the
-    folder is made, and the twin takes it later.
+    RUN is the recording that the twin is making (its `record_path`, or the newest of RUN_2, ...); without such a
+    recording the folder is made, and the twin uses it later.
     """
     if not topics and not every:
-        raise click.UsageError("got no topic, expected some or --all")
+        raise click.UsageError("got no topic, expected topics or --all")
     try:
         re.compile(exclude or "")
     except re.error as error:
         raise click.BadParameter(
             f"got {exclude!r}, expected a regular expression: {error}", param_hint="--exclude"
         ) from None
-    os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)  # for ROS from wheels: folder of message definitions
+    os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)  # ROS from wheels: folder of message definitions
     from plow_twin.cli.interruption import interruptible
     from plow_twin.record.reader import RunReader
     from plow_twin.record.running import running_run

@@ -12,13 +12,12 @@ from plow_twin.stream.journal import Failed
 
 
 def read_recording(path: Path) -> tuple[dict[str, Any], bool]:
-    """Read a recording from front to back; return its facts, and whether anything is missing: it has losses, or
-    advances that failed.
+    """Read a recording from front to back; return its facts, and whether it has losses or failed advances.
 
     Raises
     ------
     RecordingError
-        When the file is not a recording.
+        The file is not a recording.
     """
     reader = RunReader(path)
     inputs, failed = InputCounts(reader.header.excitation_source), 0

@@ -23,12 +23,12 @@ if TYPE_CHECKING:
 @click.option(
     "--write",
     type=click.Path(path_type=Path, file_okay=False),
-    help="New folder for a full recording made of the journal: all outputs after each advance.",
+    help="New folder for a full recording made from the journal, with all outputs after each advance.",
 )
 @json_option
 @quiet_option
 def replay(recording: Path, digests_only: bool, write: Path | None, as_json: bool, quiet: bool) -> int:
-    """Run the model again on the journal of RECORDING and compare with the recorded outputs; needs no ROS."""
+    """Run the model again by the journal of RECORDING and compare its outputs with the recorded ones; needs no ROS."""
     from plow_twin.record.replay import replay as run
 
     with progress("replaying", quiet) as on_progress:
@@ -50,7 +50,7 @@ def replay(recording: Path, digests_only: bool, write: Path | None, as_json: boo
         differ = ", ".join(keys)
         say_error(f"plow-twin: warning: {file} is of another run (its {differ} differ): it is not read")
     if report.repeated:
-        say_error(f"plow-twin: warning: {report.repeated} entries stand there more than once")
+        say_error(f"plow-twin: warning: {report.repeated} entries occur more than once")
     if report.first_divergence is not None:
         say_error(f"plow-twin: diverged: {report.first_divergence}")
     return report.exit_code

@@ -1,4 +1,4 @@
-"""Facts of a scene: every number with its mark, and derived quantities."""
+"""Facts of a scene: all numbers with their marks, and derived quantities."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Fact = dict[str, Any]
 
 
 def numbers(scene: Scene) -> list[Fact]:
-    """Return key, value, unit, mark and source of every number of a scene, each item of a list apart."""
+    """Return key, value, unit, mark and source of every number of a scene; list items are separate numbers."""
     rows = [row for key in SECTIONS for row in _numbers_of(getattr(scene, key), key, scene)]
     for index, load in enumerate(scene.loads):
         rows += _numbers_of(load, f"loads[{index}]", scene)
@@ -44,7 +44,7 @@ def _numbers_of(part: Any, path: str, scene: Scene) -> Iterator[Fact]:
 
 
 def damping_unit(scene: Scene) -> str:
-    """Return the unit of `contact.damping`: C of an additive law, lambda of the others."""
+    """Return the unit of `contact.damping`, which is C of an additive law and lambda of all other laws."""
     return "N s/m" if LAWS[scene.contact.law].additive else "s/m"
 
 
@@ -67,7 +67,7 @@ def derived(scene: Scene) -> list[Fact]:
     if scene.friction is not None:
         least = float(painleve_coefficients(scene).min())
         if math.isfinite(least):
-            facts.append(_fact("friction coefficient above which a sliding corner is Painleve's case", least, "1"))
+            facts.append(_fact("friction coefficient above which a sliding corner jams (Painleve)", least, "1"))
     return [*facts, *_contact_facts(scene), *_load_facts(scene)]
 
 

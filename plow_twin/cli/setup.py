@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path(), help="Folder for the files.")
 @quiet_option
 def setup(file: Path, scene: str | None, given: tuple[str, ...], units: dict[str, str], out: Path, quiet: bool) -> int:
-    """Guess separator, time, columns and units of FILE; ask in a terminal about the rest; write map and scene."""
+    """Guess separator, time, columns and units of FILE, ask in a terminal about the rest, and write map and scene."""
     from plow_twin.record.column_guess import guess_columns
     from plow_twin.record.sources import Columns
     from plow_twin.scene_file import load_scene
@@ -60,7 +60,7 @@ def setup(file: Path, scene: str | None, given: tuple[str, ...], units: dict[str
 
 
 def _check_sizes(guess: Guess, scene: Scene, stated: dict[str, str]) -> None:
-    """Refuse loads that are too large for the scene; warn of those whose unit the user states."""
+    """Refuse loads that are too large for the scene; only warn if the user states their unit."""
     from plow_twin.record.unit_check import large_loads
 
     large = large_loads(guess.values, guess.units, scene)
@@ -72,7 +72,7 @@ def _check_sizes(guess: Guess, scene: Scene, stated: dict[str, str]) -> None:
 
 
 def _write(guess: Guess, scene: str | None, out: Path) -> list[Path]:
-    """Write mapping, stub and picture; return their paths."""
+    """Write the mapping, the stub of a scene and the picture; return their paths."""
     from plow_twin.scene_file import dump_scene, load_scene
 
     out.mkdir(parents=True, exist_ok=True)
@@ -81,7 +81,7 @@ def _write(guess: Guess, scene: str | None, out: Path) -> list[Path]:
         files["scene.yaml"] = _STUB + dump_scene(load_scene("paper"))
     for name in files:
         if (out / name).exists():
-            raise click.UsageError(f"{out / name}: is there already, expected another folder: --out")
+            raise click.UsageError(f"{out / name}: exists already, expected another folder: --out")
     for name, text in files.items():
         (out / name).write_text(text, encoding="utf-8")
     try:
@@ -95,8 +95,8 @@ def _write(guess: Guess, scene: str | None, out: Path) -> list[Path]:
 
 
 _STUB = """\
-# A stub: every number is of the preset `paper`, a reconstruction, and not of your machine. Replace mass, frame,
-# clearance, contact and loads (tutorial, step 1); `plow-twin info scene.yaml` shows all with what follows from them.
+# A stub: all numbers are from the preset `paper`, a reconstruction, and not from your machine. Replace mass, frame,
+# clearance, contact and loads (tutorial, step 1); `plow-twin info scene.yaml` shows all numbers and derived values.
 """
 
 

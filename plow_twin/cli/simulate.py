@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from plow_twin.run.sensitivity import Sensitivity
     from plow_twin.run.simulate import Result
 
-#: Most rows; a row takes some 200 B.
+#: Largest number of rows; a row takes some 200 B.
 MOST_ROWS: Final = 10_000_000
 
 
@@ -30,29 +30,33 @@ MOST_ROWS: Final = 10_000_000
     "--output-dt", type=POSITIVE, help="Distance of the output rows [s]; a thousandth of the motion by default."
 )
 @click.option("--tol", type=POSITIVE, default=1e-9, show_default=True, help="Tolerance, relative to the clearance.")
-@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), help="Output rows to this .csv or .npz file.")
+@click.option(
+    "--out", type=click.Path(path_type=Path, dir_okay=False), help="Write the output rows to this .csv or .npz file."
+)
 @json_option
 @click.option(
     "--method",
     type=click.Choice(["events", "rk4", "euler"]),
     default="events",
     show_default=True,
-    help="events: every touch located; rk4, euler: fixed steps for comparison.",
+    help="events: every touch is located; rk4, euler: fixed steps, for comparison.",
 )
 @click.option("--dt", type=POSITIVE, help="Step of rk4 and euler [s].")
 @click.option(
     "--energy-balance",
     is_flag=True,
-    help="Balance energy and momentum; takes some four times as long.",
+    help="Balance of energy and momentum; takes some four times as long.",
 )
 @click.option(
     "--trust",
     is_flag=True,
-    help="Report the growth of errors and the worth of the tolerance; takes some ten times as long.",
+    help="Report the growth of errors and how long the tolerance is met; takes some ten times as long.",
 )
-@click.option("--max-steps", type=click.IntRange(min=1), default=10**8, show_default=True, help="Steps at most.")
 @click.option(
-    "--max-wall", metavar="S", type=POSITIVE, default=3600.0, show_default=True, help="Wall-clock time at most [s]."
+    "--max-steps", type=click.IntRange(min=1), default=10**8, show_default=True, help="Largest number of steps."
+)
+@click.option(
+    "--max-wall", metavar="S", type=POSITIVE, default=3600.0, show_default=True, help="Longest wall-clock time [s]."
 )
 @quiet_option
 def simulate(
@@ -72,7 +76,7 @@ def simulate(
 ) -> int:
     """Simulate SCENE, a file or one of the presets paper, bench_kv, bench_hc.
 
-    At Ctrl-C or a limit, files and JSON hold the results so far, and the exit code is 1.
+    After Ctrl-C or at a limit, files and JSON have the results so far, and the exit code is 1.
     """
     _check_usage(out, method, dt)
     _check_rows(t_end, output_dt)
@@ -106,7 +110,7 @@ def simulate(
 def _run(
     scene: str, quiet: bool, t_end: float, *settings: Any, **limits: Any
 ) -> tuple[Result, LimitError | RunInterrupted | None]:
-    """Run the scene; after Ctrl-C or at a limit return the motion so far and the reason of the end."""
+    """Run the scene; after Ctrl-C or at a limit, return the motion so far and the reason for the end."""
     from plow_twin.errors import LimitError, RunInterrupted, SceneError, ToleranceWarning
     from plow_twin.run.simulate import simulate as run
     from plow_twin.scene_file import load_scene
@@ -145,7 +149,7 @@ def _check_rows(t_end: float, output_dt: float | None) -> None:
 
 
 def write_samples(result: Result, path: Path) -> None:
-    """Write the samples as .csv (numbers with 17 digits, exact) or .npz (with all contact events), in one step."""
+    """Write the samples in one step as .csv (exact numbers of 17 digits) or .npz (with all contact events)."""
     from plow_twin.record.durable import whole_file
 
     with whole_file(path) as stream:
@@ -199,7 +203,7 @@ def as_plain(result: Result, scene: str, t_end: float) -> dict[str, Any]:
 
 
 def balance_of(balance: EnergyBalance) -> dict[str, Any]:
-    """Return the balance as plain numbers and lists, with the imbalance over the turnover."""
+    """Return the balance as plain numbers and lists, with the imbalance as a share of the turnover."""
     from dataclasses import asdict
 
     import numpy as np
@@ -232,12 +236,12 @@ def _balance_table(balance: EnergyBalance) -> Table:
         ("- dissipated in contacts", -balance.dissipated_j),
         ("- dissipated by friction", -balance.friction_work_j),
         ("- taken by the support", -balance.support_work_j),
-        ("- stored in contacts at the end, more than at the start", -stored),
+        ("- stored in contacts, end minus start", -stored),
         ("= kinetic energy gained", kinetic),
     ):
         rows.add_row(name, f"{value + 0.0:.6g}")  # no -0
-    rows.add_row("largest imbalance on the way", f"{balance.imbalance_j:.3g}")
-    rows.add_row("the same over the turnover", f"{balance.relative_imbalance:.1e}")
+    rows.add_row("largest imbalance at any step", f"{balance.imbalance_j:.3g}")
+    rows.add_row("largest imbalance over turnover", f"{balance.relative_imbalance:.1e}")
     rows.add_row(
         "largest imbalance of momentum [N s, N s, N m s]", " ".join(f"{v:.1e}" for v in balance.momentum_imbalance)
     )

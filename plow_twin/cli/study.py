@@ -13,7 +13,7 @@ from plow_twin.cli.study_calibrate import calibrate
 from plow_twin.cli.study_sweep import sweep
 from plow_twin.errors import PlowTwinError
 
-#: Where a clone of the repository holds the study of the paper.
+#: Folder of the paper's study in a clone of the repository.
 CLONE: Final = Path(__file__).resolve().parents[2] / "studies" / "paper"
 
 
@@ -26,9 +26,9 @@ def study() -> None:
 
 
 def paper_command() -> click.Command:
-    """Return the verb `paper` of the package `plow_twin_paper`: installed, or beside this package in a clone.
+    """Return the verb `paper` of the package `plow_twin_paper`, installed or beside this package in a clone.
 
-    Where neither is installed, a verb in its place says how to get it.
+    Without this package, the verb says how to install it.
     """
     if CLONE.is_dir() and str(CLONE) not in sys.path:
         sys.path.append(str(CLONE))
@@ -45,7 +45,7 @@ def _absent_paper() -> click.Command:
     @click.command("paper", short_help="Not installed.", context_settings={"ignore_unknown_options": True})
     @click.argument("arguments", nargs=-1, type=click.UNPROCESSED)
     def paper(arguments: tuple[str, ...]) -> int:
-        """Compute the paper's figures and numbers again: not installed, see `studies/paper` of the repository."""
+        """Compute the paper's figures and numbers again (not installed, see `studies/paper` of the repository)."""
         raise PlowTwinError(
             "study paper: plow_twin_paper is not installed; run it from a clone, or there: pip install ./studies/paper"
         )
@@ -53,7 +53,7 @@ def _absent_paper() -> click.Command:
     return paper
 
 
-# a verb of this package lives in a module of its own, plow_twin/cli/study_<verb>.py
+# each verb of this package has its own module, plow_twin/cli/study_<verb>.py
 _VERBS: tuple[click.Command, ...] = (sweep, calibrate, paper_command())
 for _verb in _VERBS:
     study.add_command(_verb)

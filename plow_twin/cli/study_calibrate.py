@@ -30,16 +30,16 @@ if TYPE_CHECKING:
     "unknowns",
     multiple=True,
     metavar="RANGE",
-    help="PATH=LOW:HIGH[:log], PATH=CHOICE,CHOICE.. or, for a sign, PATH; may be repeated. Default: the target file's.",
+    help="PATH=LOW:HIGH[:log], PATH=CHOICE,CHOICE.. or, for a sign, PATH; may be repeated. Default: the target file.",
 )
-@click.option("--target", metavar="FILE", help="Figures to fit to: a target file, or `paper` for the paper's.")
+@click.option("--target", metavar="FILE", help="Figures to fit: a target file, or `paper` for those of the paper.")
 @click.option(
     "--without", multiple=True, metavar="PATTERN", help="Leave out targets by name, e.g. 'max at*'; may be repeated."
 )
 @click.option(
     "--recording",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    help="Motion to fit to: .csv, .parquet or .npz with t, x, y, theta, or a recording of the node (.mcap).",
+    help="Motion to fit: .csv, .parquet or .npz with t, x, y, theta, or a recording of the node (.mcap).",
 )
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="The same seed gives the same bits.")
 @click.option("--starts", type=click.IntRange(1), default=8, show_default=True, help="Independent random starts.")
@@ -47,11 +47,15 @@ if TYPE_CHECKING:
 @click.option("--population", type=click.IntRange(5), default=30, show_default=True, help="Population of a start.")
 @click.option("--generations", type=click.IntRange(0), default=40, show_default=True, help="Generations of a start.")
 @click.option(
-    "--simplex", type=click.IntRange(0), help="Evaluations of the last polish; 200 with --target, 0 with --recording."
+    "--simplex", type=click.IntRange(0), help="Evaluations of the final simplex; 200 with --target, 0 with --recording."
 )
-@click.option("--t-end", metavar="T", type=POSITIVE, help="Time to simulate, in place of the target file's [s].")
-@click.option("--tol", type=POSITIVE, help="Tolerance; the target file's, or 1e-8 with --recording.")
-@click.option("--excess", type=POSITIVE, help="Objective above the best that still counts as near optimal; 10 % of it.")
+@click.option("--t-end", metavar="T", type=POSITIVE, help="Time to simulate [s]; by default that of the target file.")
+@click.option("--tol", type=POSITIVE, help="Tolerance; by default that of the target file, or 1e-8 with --recording.")
+@click.option(
+    "--excess",
+    type=POSITIVE,
+    help="Objective above the best up to which a point is near optimal; by default 10 % of the best.",
+)
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), required=True, help="Folder of the results.")
 @click.option(
     "--plot",
@@ -98,7 +102,7 @@ def calibrate(
 
 
 def _merged(proposed: Sequence[str], given: Sequence[str]) -> tuple[str, ...]:
-    """Return the unknowns of the target file; given ones replace those of the same parameter.
+    """Return the unknowns of the target file, replaced by given unknowns of the same parameter.
 
     A given `contact.damping` also replaces `contact.restitution`, and the reverse; `PATH=fixed` removes an unknown.
     """
@@ -137,7 +141,7 @@ def _today() -> str:
 def _check_options(options: dict[str, Any]) -> None:
     for name, value in (("--without", options["without"]), ("--t-end", options["t_end"])):
         if value and options["target"] is None:
-            raise click.UsageError(f"{name}: got it with --recording, expected it with --target alone")
+            raise click.UsageError(f"{name}: got it with --recording, expected it only with --target")
 
 
 def _objective(
@@ -153,7 +157,7 @@ def _objective(
 
     target, recording, workers = options["target"], options["recording"], options["workers"]
     if (target is None) == (recording is None):
-        raise click.UsageError("got both or none of --target and --recording, expected one of them")
+        raise click.UsageError("got both or neither of --target and --recording, expected one of them")
     _check_options(options)
     model = study_scene(scene, settings)
     if recording is not None:
@@ -207,7 +211,7 @@ def _run(
 def _show(fit: Fit, space: Space, out: Path) -> None:
     console = output_console()
     found = fit.calibration
-    before = "" if fit.before is None else f" (the scene as it stood: {fit.before:.4g})"
+    before = "" if fit.before is None else f" (before the fit: {fit.before:.4g})"
     shown = table(
         f"best of {len(found.starts)} starts, objective {found.best.objective:.4g}{before}", "unknown", "fitted"
     )

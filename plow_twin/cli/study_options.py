@@ -16,13 +16,13 @@ set_option = click.option(
     "settings",
     multiple=True,
     metavar="PATH=VALUE",
-    help="Change a number or word of the scene first; may be repeated.",
+    help="Change a number or word of the scene; may be repeated.",
 )
 
 
 @contextmanager
 def usage_errors() -> Iterator[None]:
-    """Turn errors of a question into a usage error, exit code 2."""
+    """Turn errors of a study's arguments into a usage error, exit code 2."""
     from plow_twin.study.parameters import StudyError
 
     try:
@@ -37,7 +37,7 @@ def study_scene(name: str, settings: Sequence[str]) -> Scene:
     Raises
     ------
     StudyError, SceneError
-        When the scene or a setting cannot be used.
+        The scene or a setting cannot be used.
     """
     from plow_twin.scene_file import load_scene
     from plow_twin.study.parameters import parse_settings, with_parameters

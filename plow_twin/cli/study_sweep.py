@@ -1,4 +1,4 @@
-"""`plow-twin study sweep`: parameters of a scene against statistics of its motion."""
+"""`plow-twin study sweep`: statistics of a scene's motion over one or two of its parameters."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from plow_twin.study.store import Store
     from plow_twin.study.sweep.table import Axis, Table
 
-#: Most rows of a table on the terminal; larger tables are thinned out, files have all rows.
+#: Largest number of rows of a table on the terminal; larger tables are thinned out, and files have all rows.
 MOST_ROWS: Final = 24
 #: Width of a column of numbers, and of the first column with its frame [characters].
 _COLUMN, _FIRST_COLUMN = 12, 8
@@ -25,7 +25,7 @@ _COLUMN, _FIRST_COLUMN = 12, 8
 
 @click.command(
     short_help="Sweep one or two parameters of a scene.",
-    epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 done, but some members failed (they are listed).",
+    epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 done, but some members failed (listed).",
 )
 @click.argument("scene")
 @click.option("--x", "first", required=True, metavar="AXIS", help="PATH=LOW:HIGH:COUNT[:log] or PATH=VALUE,VALUE..")
@@ -39,15 +39,17 @@ _COLUMN, _FIRST_COLUMN = 12, 8
     "--out",
     type=click.Path(path_type=Path, file_okay=False),
     required=True,
-    help="Folder of chunks, table and picture.",
+    help="Folder for chunks, table and picture.",
 )
 @set_option
 @click.option("--workers", type=click.IntRange(1), help="Threads; all cores by default.")
 @click.option("--dask", metavar="ADDRESS", help="Scheduler of a Dask cluster to run on, e.g. tcp://host:8786.")
-@click.option("--chunk", type=click.IntRange(1), help="Members stored together; 16, or two for each core if more.")
 @click.option(
-    "--resume/--fresh", default=True, show_default=True, help="Keep the results in the folder, or discard them."
+    "--chunk",
+    type=click.IntRange(1),
+    help="Members stored together; by default 16, or twice the number of cores if larger.",
 )
+@click.option("--resume/--fresh", default=True, show_default=True, help="Keep or discard the results in the folder.")
 @quiet_option
 def sweep(
     scene: str,
@@ -89,7 +91,7 @@ def sweep(
 
 
 def _list_failed(result: Table) -> None:
-    """Name the members that failed, by reason; the Parquet file has all of them."""
+    """Report the failed members by reason; the Parquet file has all failures."""
     reasons: dict[str, list[str]] = {}
     for member in result.failed:
         values = ", ".join(f"{path}={_text(value)}" for path, value in result.sweep.values(member).items())
@@ -108,7 +110,7 @@ def _computed(store: Store, workers: int | None, dask: str | None, quiet: bool) 
     size, chunks = store.sweep.size, store.chunks
     lacking = sum(len(chunks[index]) for index in store.missing())
     if not quiet:
-        say_error(f"{size} members, {size - lacking} stored before, {lacking} to compute")
+        say_error(f"{size} members, {size - lacking} already stored, {lacking} to compute")
     with progress("sweeping", quiet) as on_progress:
 
         def report(done: int) -> None:

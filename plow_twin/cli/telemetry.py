@@ -1,4 +1,4 @@
-"""Options of the outputs, and `plow-twin telemetry`, the outputs of a node."""
+"""Options of the outputs, and `plow-twin telemetry`, which sends the outputs of a node."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ def telemetry_options(command: Callable[..., Any]) -> Callable[..., Any]:
             type=POSITIVE,
             default=1.0,
             show_default=True,
-            help="Updates sent out a second [Hz]; peaks are those since the update before.",
+            help="Updates per second [Hz]; peaks are those since the previous update.",
         ),
-        click.option("--opcua-acknowledge", is_flag=True, help="Let clients of --opcua acknowledge alarms."),
+        click.option("--opcua-acknowledge", is_flag=True, help="Allow clients of --opcua to acknowledge alarms."),
         click.option(
             "--opcua", metavar="URL", help="Serve results to OPC UA clients at opc.tcp://HOST:PORT (extra opcua)."
         ),
@@ -42,7 +42,7 @@ def telemetry_options(command: Callable[..., Any]) -> Callable[..., Any]:
             "--sparkplug",
             metavar="GROUP/NODE",
             default="",
-            help="Send results to the broker of --mqtt-out as this edge node of Sparkplug B (extra sparkplug).",
+            help="Send results to the broker of --mqtt-out as this Sparkplug B edge node (extra sparkplug).",
         ),
         click.option(
             "--mqtt-out", metavar="URL", help="Send results as JSON to mqtt[s]://HOST:PORT/PREFIX (extra mqtt)."
@@ -53,7 +53,7 @@ def telemetry_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def ways_of(options: dict[str, Any]) -> list[WayOut]:
-    """Return the outputs named by the options; raises as the functions of `telemetry.access`."""
+    """Return the outputs that the options request; raises the errors of `telemetry.access`."""
     if options["sparkplug"] and not options["mqtt_out"]:
         raise click.UsageError("--sparkplug: expected --mqtt-out with the broker")
     if not any(options[name] for name in ("mqtt_out", "influx", "opcua")):
@@ -74,18 +74,18 @@ def ways_of(options: dict[str, Any]) -> list[WayOut]:
 
 @click.command(
     short_help="Send the results of a node to MQTT, Sparkplug, InfluxDB or OPC UA.",
-    epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, 3 done, and messages were lost.",
+    epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, 3 done, but messages were lost.",
 )
 @click.option("--namespace", default="", help="Its namespace.")
 @click.option("--name", default="plow_twin", show_default=True, help="Its name.")
-@click.option("--scene", help="Its scene, where the name that it has there cannot be read here.")
+@click.option("--scene", help="Scene of the node, if the node's path to it cannot be read here.")
 @click.option(
-    "--wait", type=click.FloatRange(0.0), default=10.0, show_default=True, help="How long to look for the node [s]."
+    "--wait", type=click.FloatRange(0.0), default=10.0, show_default=True, help="Time to wait for the node [s]."
 )
 @click.option("--plain", is_flag=True, help="Allow receivers on other machines without encryption.")
 @telemetry_options
 def telemetry(namespace: str, name: str, scene: str | None, wait: float, **options: Any) -> int:
-    """Send the results of a running node, by its topics, until interrupted."""
+    """Send the results of a running node, read from its topics, until interrupted."""
     ways = ways_of(options)
     if not ways:
         raise click.UsageError("expected --mqtt-out, --influx or --opcua")

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from plow_twin.view.rrd import ViewSummary
 
 
-#: Largest factor of the drawn clearance; a larger one draws the cavity far from the frame.
+#: Largest factor of the drawn clearance; a larger factor would draw the cavity far from the frame.
 _MOST_EXAGGERATED = 1e4
 
 
@@ -47,36 +47,46 @@ _MOST_EXAGGERATED = 1e4
 @click.option(
     "--exaggerate",
     type=POSITIVE,
-    help="How many times as wide the clearance is drawn beside the true one.",
+    help="Factor by which a second cross-section widens the clearance.",
 )
 @click.option(
     "--with",
     "others",
     multiple=True,
     metavar="SCENE",
-    help="A further scene, whose forces under the run's load are drawn too; may be repeated.",
+    help="A further scene whose forces under the run's load are also drawn; may be repeated.",
 )
-@click.option("--scene", help="Scene file or preset of a recording that is no run of ours.")
+@click.option("--scene", help="Scene file or preset for a recording of another program.")
 @click.option(
     "--map",
     "mapping",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    help="YAML that says where load, travel and pose stand in a recording of another program.",
+    help="YAML mapping of load, travel and pose in a recording of another program.",
 )
 @unit_option
-@click.option("--png", type=click.Path(path_type=Path, dir_okay=False), help="A picture instead; needs no viewer.")
+@click.option(
+    "--png", type=click.Path(path_type=Path, dir_okay=False), help="Write a picture instead; needs no viewer."
+)
 @click.option(
     "--html",
     type=click.Path(path_type=Path, dir_okay=False),
-    help="One page instead, with picture, curves and tables; needs neither viewer nor network.",
+    help="Write one page instead, with picture, curves and tables; needs no viewer and no network.",
 )
 @click.option("--web", is_flag=True, help="Serve rerun's own web viewer on this machine until interrupted.")
 @click.option(
-    "--web-port", type=click.IntRange(0, 65535), default=9090, show_default=True, help="Its port; 0: a free one."
+    "--web-port",
+    type=click.IntRange(0, 65535),
+    default=9090,
+    show_default=True,
+    help="Port of the web viewer; 0: any free port.",
 )
 @click.option("--follow", is_flag=True, help="Show a run while it is recorded: in a window, with --web, or into --out.")
 @click.option(
-    "--wait", type=click.FloatRange(0.0), default=10.0, show_default=True, help="How long --follow waits for one [s]."
+    "--wait",
+    type=click.FloatRange(0.0),
+    default=10.0,
+    show_default=True,
+    help="Time that --follow waits for a run [s].",
 )
 @quiet_option
 def view(
@@ -97,13 +107,13 @@ def view(
 ) -> int:
     """Make a .rrd of RECORDING: the cross-section in motion, force and clearance curves, the event log.
 
-    A recording of another program (--scene, --map) is drawn with the motion that the model computes, as by analyse.
+    For a recording of another program (--scene, --map), the motion that the model computes is drawn, as in analyse.
     """
     from plow_twin.record.reader import mcap_path
 
     foreign = scene is not None or mapping is not None or bool(units)
     if foreign and follow:
-        raise click.UsageError("--follow cannot be combined with --scene, --map or --unit: it shows a run of ours")
+        raise click.UsageError("--follow cannot be combined with --scene, --map or --unit: it shows a run of plow_twin")
     if not follow and not recording.exists():
         raise click.BadParameter(f"{recording}: does not exist", param_hint="RECORDING")
     if exaggerate is not None and exaggerate > _MOST_EXAGGERATED:
@@ -142,7 +152,7 @@ def view(
 
 
 def _check_still(option: str, *, moving: bool, exaggerate: float | None, others: tuple[str, ...]) -> None:
-    """Refuse options that a picture of a whole run lacks."""
+    """Refuse options that do not apply to a picture of a whole run."""
     if moving:
         raise click.UsageError(
             f"{option} cannot be combined with --out, --web or --follow: it is a picture of a whole run"
@@ -154,7 +164,7 @@ def _check_still(option: str, *, moving: bool, exaggerate: float | None, others:
 
 
 def _still(run: Path, png: Path | None, html: Path | None) -> tuple[FileStatus, dict[str, int], int]:
-    """Write the picture or the page of a run; return its end, its losses, and its failed advances."""
+    """Write the picture or the page of a run; return the run's status, losses and number of failed advances."""
     if png is not None:
         from plow_twin.view.picture import to_png
 
@@ -179,14 +189,14 @@ def _made_run(
         with busy("computing", quiet):
             found = analyse(recording, scene=Path(scene) if scene else None, mapping=mapping, units=units, out=place)
         if found.kind != "other":
-            raise click.UsageError("--scene, --map, --unit: got a run of ours, expected another recording")
+            raise click.UsageError("--scene, --map, --unit: got a run of plow_twin, expected another recording")
         if found.lost:
             say_lost(recording, found.lost)
         yield place / "run", found.lossy
 
 
 def _scenes(files: tuple[str, ...]) -> dict[str, Scene]:
-    """Return scenes by a short name."""
+    """Return the scenes by short names."""
     from plow_twin.scene_file import load_scene
     from plow_twin.scene_file.presets import scene_path
 
@@ -219,7 +229,7 @@ def _print_losses(recording: Path, status: FileStatus, lost: Mapping[str, int], 
 
 
 def _serve(file: Path, port: int) -> int:
-    """Serve a .rrd by the program of the viewer on the loopback address until it is interrupted."""
+    """Serve a .rrd by the viewer's program on the loopback address until interrupted."""
     from plow_twin.view.viewer import LOOPBACK, free_port, page_address, page_port, viewer_program
 
     program, data_port = viewer_program(), free_port()
@@ -227,8 +237,8 @@ def _serve(file: Path, port: int) -> int:
     command = [program, str(file), "--serve-web", "--bind", LOOPBACK, "--port", str(data_port)]
     click.echo(f"serving until interrupted: {page_address(port, data_port)}")
     sys.stdout.flush()
-    # replaces this process, so that a signal to it reaches the server without the program's own lines: its address
-    # opens the light theme, on which labels cannot be read
+    # this replaces the process, so that signals reach the server; errors only, because the program prints the address
+    # of the light theme, in which labels cannot be read
     os.execve(program, [*command, "--web-viewer-port", str(port)], {"RUST_LOG": "error", **os.environ})
 
 
@@ -241,7 +251,7 @@ def _follow(
     wait: float,
     quiet: bool,
 ) -> int:
-    """Show a run while it is recorded; a viewer that was started ends with the command."""
+    """Show a run while it is recorded; a viewer that the command starts ends with it."""
     from plow_twin.cli.interruption import interruptible
     from plow_twin.record.running import find_run
     from plow_twin.view.live import follow

@@ -144,7 +144,7 @@ class TwinSensitivity:
         return advanced
 
     def _end(self, t: float, matrix: Array, changes: Array) -> None:
-        """End a stretch: `matrix` is its fundamental matrix, `changes` has the scaled effects of the parameters in it."""
+        """End a stretch: `matrix` is its fundamental matrix, `changes` are the scaled effects of the parameters."""
         by_unit = changes / np.array([one.change for one in self._changed])[:, None]
         self._logs += self._product.follow(matrix[None], by_unit[None], np.ones(1, bool))[3][0]
         self.t = t
