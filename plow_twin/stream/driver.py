@@ -122,7 +122,7 @@ class Driver:
 
     @property
     def policy(self) -> Policy:
-        """Reaction to a silence; a new one acts at once."""
+        """The rules for silence and failures; a new policy acts at once."""
         return self._policy
 
     @policy.setter

@@ -1,4 +1,4 @@
-"""Offline questions asked of many runs: sweeps of a scene, calibration against figures or recordings, analysis.
+"""Offline studies of many runs: sweeps of a scene, calibration to figures or recordings, analysis of recordings.
 
 matplotlib, pyarrow, jinja2 and distributed are imported where they are used (extras `study` and `dask`).
 """

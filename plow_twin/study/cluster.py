@@ -1,4 +1,4 @@
-"""A Dask cluster: the connection to its scheduler, and its results as they come."""
+"""A Dask cluster: the connection to its scheduler, and its results as they arrive."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ if TYPE_CHECKING:
 
 #: Time to wait for a scheduler [s].
 CONNECT_TIMEOUT_S = 20.0
-#: Time to wait for a cluster without a worker [s]: it may still grow.
+#: Time to wait for a cluster without a worker [s], because the cluster may still grow.
 WORKER_TIMEOUT_S = 300.0
-#: Time between two checks for a worker while no result comes [s].
+#: Time between two checks for a worker while no result arrives [s].
 _LOOK_S: Final = 2.0
 
 
@@ -25,7 +25,7 @@ def connect(address: str) -> Client:
     Raises
     ------
     StudyError
-        It does not answer.
+        The scheduler does not answer.
     """
     from distributed import Client
 
@@ -60,4 +60,4 @@ def completed(client: Client, futures: Iterable[Future[Any]]) -> Iterator[Future
             workers_seen = now if client.scheduler_info()["workers"] else workers_seen
             if now - workers_seen > WORKER_TIMEOUT_S:
                 got = f"got no worker for {WORKER_TIMEOUT_S:g} s, expected at least one"
-                raise StudyError(f"dask: {got}; stored chunks stay, the same call computes the rest") from None
+                raise StudyError(f"dask: {got}; stored chunks are kept, and the same call computes the rest") from None

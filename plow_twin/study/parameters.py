@@ -1,15 +1,15 @@
-"""Numbers and words of a scene by path, as in its messages: `contact.stiffness`, `head.com_offset_m[0]`.
+"""Numbers and words of a scene by path, such as `contact.stiffness`, `head.com_offset_m[0]`.
 
 Loads are called by name: `loads.fx1.phase_rad`. Four paths are settings of a study and not fields of a scene:
 
     loads.<name>.sign       sign of the load's force (its first component that is not zero); -1 turns the whole force
     loads.<name>.arm_sign   the same for its point of action
     loads.<name>.scale      factor of its force and free moment
-    clearance.scale         factor of both clearances: 1 total, 2 when a published clearance is meant per side
+    clearance.scale         factor of both clearances: 1 for a total, 2 for a published clearance per side
 
-`frame.labels` takes one of eight words, `bottom_right_ccw`: a at the bottom right, then b, c, d counter-clockwise. The
-four act after the other paths. `contact.damping` takes the place of a restitution and the reverse. A scene without
-friction also has the paths of `friction`: setting one switches friction on.
+`frame.labels` takes one of eight words such as `bottom_right_ccw`: a at the bottom right, then b, c, d
+counter-clockwise. The four settings act after the other paths. `contact.damping` replaces a restitution, and the
+reverse. A scene without friction also has the paths of `friction`, and setting such a path switches friction on.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from plow_twin.errors import PlowTwinError, Problem, SceneError
 from plow_twin.model.contact_laws import LAWS
 from plow_twin.model.scene import Friction, Head, Scene, Table
 
-#: Value of a parameter: numbers, or the words of `contact.law` and `head.rotation`.
+#: Value of a parameter: a number, or a word for the paths `WORDS`.
 Value = float | str
 
 #: Paths whose values are words.
@@ -33,13 +33,13 @@ WORDS: Final = ("contact.law", "head.rotation", "frame.labels")
 _CORNERS_CCW: Final = ("bottom_right", "top_right", "top_left", "bottom_left")
 _PARTS: Final = ("head", "frame", "clearance", "contact", "gravity", "initial", "wear", "friction", "support")
 _DERIVED: Final = ("sign", "arm_sign", "scale")
-#: Starting point of a study where a scene has no friction: without effect.
+#: Friction without effect, with which a study of a scene without friction starts.
 _NO_FRICTION: Final = Friction(0.0)
 _INDEX: Final = re.compile(r"(.+)\[(\d+)\]")
 
 
 class StudyError(PlowTwinError, ValueError):
-    """A study cannot be made or continued as asked; the message has the reason."""
+    """A study cannot be made or continued as requested; the message has the reason."""
 
 
 def parameter_paths(scene: Scene) -> tuple[str, ...]:
@@ -78,7 +78,7 @@ def check_path(scene: Scene, path: str) -> str:
     Raises
     ------
     StudyError
-        With the nearest paths and all existing ones.
+        The scene does not have the path; the error has the nearest paths and all paths.
     """
     known = parameter_paths(scene)
     if path not in known:
@@ -87,13 +87,13 @@ def check_path(scene: Scene, path: str) -> str:
 
 
 def nearest_of(path: str, known: Iterable[str]) -> str:
-    """Return a hint with the known paths that are nearest, or an empty text."""
+    """Return a hint with the nearest known paths, or an empty text."""
     near = get_close_matches(path, known, n=3, cutoff=0.6)
     return f"; nearest: {', '.join(near)}" if near else ""
 
 
 def parameter_of(scene: Scene, path: str) -> Value | None:
-    """Return the value at a path; None for a damping or restitution that is not given."""
+    """Return the value at a path, or None for a damping or restitution that is not given."""
     check_path(scene, path)
     if path == "frame.labels":
         return next((word for word, labels in label_words().items() if labels == dict(scene.frame.labels)), None)
@@ -116,9 +116,9 @@ def with_parameters(scene: Scene, values: Mapping[str, Value]) -> Scene:
     Raises
     ------
     StudyError
-        For a path that the scene does not have, or a value of the wrong kind.
-    SceneError
-        When the scene is not usable with these values; lists every problem.
+        The scene does not have a path, or a value is of the wrong kind.
+        SceneError
+            The scene cannot be used with these values; the error lists every problem.
     """
     known = parameter_paths(scene)
     for path, value in values.items():
@@ -129,7 +129,7 @@ def with_parameters(scene: Scene, values: Mapping[str, Value]) -> Scene:
             raise StudyError(f"{path}: got {value!r}, expected a {'word' if words else 'number'}")
     parts: dict[str, Any] = {name: getattr(scene, name) for name in _PARTS}
     loads = {load.name: load for load in scene.loads}
-    # fields first: sign and scale act on the new values
+    # fields first, because sign and scale act on the new values
     for path, value in sorted(values.items(), key=lambda item: item[0].rsplit(".", 1)[1] in _DERIVED):
         owner, field_name = path.rsplit(".", 1)
         if path == "frame.labels":
@@ -146,7 +146,7 @@ def with_parameters(scene: Scene, values: Mapping[str, Value]) -> Scene:
 
 
 def label_words() -> dict[str, dict[str, str]]:
-    """Return the eight ways to letter the corners in turn, by their words."""
+    """Return the eight orders of lettering the corners by their words."""
     words = {}
     for turn, corners in (("ccw", _CORNERS_CCW), ("cw", _CORNERS_CCW[::-1])):
         for first in range(4):
@@ -156,12 +156,12 @@ def label_words() -> dict[str, dict[str, str]]:
 
 
 def check_word(path: str, word: str) -> str:
-    """Return the word if it can stand at a path of `WORDS`.
+    """Return the word if it is possible for a path of `WORDS`.
 
     Raises
     ------
     StudyError
-        With the possible words.
+        The word is impossible; the error has the possible words.
     """
     (rotation,) = (spec for spec in fields(Head) if spec.name == "rotation")
     words = {"contact.law": LAWS, "head.rotation": rotation.metadata["choices"], "frame.labels": label_words()}[path]
@@ -222,7 +222,7 @@ def _vector(load: Any, field_name: str) -> tuple[float, ...]:
     if field_name == "arm_sign":
         return tuple(load.at_m)
     if isinstance(load, Table):
-        # the sign of a sampled load is that of its largest force
+        # the sign of a sampled load is the sign of its largest force component
         return (float(load.wrench[:, :2].flat[abs(load.wrench[:, :2]).argmax()]),)
     return tuple(load.force_n)
 
@@ -232,7 +232,7 @@ def _scaled_clearance(clearance: Any, factor: float) -> Any:
 
 
 def _times(vector: tuple[float, ...], factor: float) -> tuple[float, ...]:
-    # 0 stays +0: equal scenes have equal texts
+    # 0 stays +0, so that equal scenes have equal texts
     return tuple(factor * x if x != 0.0 else 0.0 for x in vector)
 
 
@@ -247,7 +247,7 @@ def _load(scene: Scene, owner: str) -> Any:
 
 
 def _is_set(key: str, values: Mapping[str, Value], scene: Scene) -> bool:
-    """Return whether these values change the number at a key of `Scene.marks`, where loads have indexes."""
+    """Return whether the values change the number at a key of `Scene.marks`, in which loads have indexes."""
     match = re.match(r"loads\[(\d+)\]\.(.+)", key)
     path = f"loads.{scene.loads[int(match[1])].name}.{match[2]}" if match else key
     whole = path.partition("[")[0]
@@ -270,7 +270,7 @@ def parse_settings(scene: Scene, texts: Sequence[str]) -> dict[str, Value]:
     Raises
     ------
     StudyError
-        Names the setting, the value got and the value expected.
+        A text cannot be used; the message names the setting, the value got and the value expected.
     """
     values: dict[str, Value] = {}
     for text in texts:

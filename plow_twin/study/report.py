@@ -1,4 +1,4 @@
-"""A report on disk: one self-contained HTML file, and its tables as JSON and CSV."""
+"""Files of a report: a self-contained HTML page, and tables as JSON and CSV."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ if TYPE_CHECKING:
 
 
 def require(*modules: str) -> None:
-    """Raise `ModuleNotFoundError` before minutes of work, not after."""
+    """Raise `ModuleNotFoundError` if a module is missing, before minutes of work instead of after."""
     for module in modules:
         import_module(module)
 
 
 def write_html(path: Path, template: str, context: Mapping[str, Any], package: str = "plow_twin.study") -> None:
-    """Fill `templates/<template>` of a package and write the page; the filter `image` embeds a PNG file.
+    """Fill `templates/<template>` of a package and write the page; the template's filter `image` embeds a PNG file.
 
     Raises
     ------
@@ -48,7 +48,7 @@ def write_html(path: Path, template: str, context: Mapping[str, Any], package: s
 
 
 def embedded_figure(figure: Figure) -> str:
-    """Return a figure of matplotlib as the data address of an image within the page."""
+    """Return a matplotlib figure as a data URL for an image in the page."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     stream = io.BytesIO()
@@ -61,7 +61,7 @@ def _embedded(png: bytes) -> str:
 
 
 def percent(share: float | None) -> str:
-    """Return a share as text with a proper sign, e.g. +3.5 %; nothing for None."""
+    """Return a share as text with its sign, such as +3.5 %, or an empty text for None."""
     return "" if share is None else signed(100.0 * share, "+.1f") + " %"
 
 
@@ -82,7 +82,7 @@ def _plain(value: Any) -> Any:
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write rows with the same keys, the first row's as header."""
+    """Write rows that have the same keys, with the keys as header."""
     with whole_file(path) as stream, io.TextIOWrapper(stream, encoding="utf-8", newline="") as text:
         writer = csv.DictWriter(text, fieldnames=list(rows[0]))
         writer.writeheader()

@@ -29,14 +29,14 @@ from plow_twin.view.run_curves import RunCurves
 
 Array = NDArray[np.float64]
 
-#: Rows of a table of the page; further ones are counted.
+#: Largest number of rows of a table of the page; further rows are only counted.
 _MOST_ROWS: Final = 200
 _PADS: Final = np.array([CLEARANCE_NAMES.index(name) for name in PAD_NAMES])
 _LOADS: Final = ("Fx", "Fy", "M")
 
 
 def write_run_page(path: Path, out: Path) -> tuple[FileStatus, dict[str, int], int]:
-    """Write the page of a run; return how the recording ended, counts of its losses, and failed advances.
+    """Write the page of a run; return the recording's status, counts of its losses, and the number of failed advances.
 
     Raises
     ------
@@ -69,13 +69,13 @@ def write_run_page(path: Path, out: Path) -> tuple[FileStatus, dict[str, int], i
 
 
 def _uplot(name: str) -> str:
-    """Return a file of the plotting library that the operator's screen uses too."""
+    """Return a file of the plotting library, which the operator's screen also uses."""
     return files("plow_twin").joinpath("dashboard", "page", name).read_text(encoding="utf-8")
 
 
 @dataclass
 class _Log:
-    """The events of a run, with its times as texts."""
+    """The events of a run, with times as texts."""
 
     samples: int = 0
     first_ns: int | None = None
@@ -117,7 +117,7 @@ class _Log:
 
 
 def _estimate_row(end_ns: int, facts: dict[str, Any]) -> dict[str, str]:
-    """Return an estimate as texts by column."""
+    """Return a table row of an estimate as texts by column."""
     row = {"until": time_text(end_ns)}
     for name in ("horizontal", "vertical"):
         found = facts[name]
@@ -140,7 +140,7 @@ def _summary(reader: RunReader, curves: RunCurves, log: _Log) -> dict[str, str]:
         "first sample": "none" if log.first_ns is None else time_text(log.first_ns),
         "span of the samples": span or "none",
         "samples used": str(log.samples),
-        "advances that failed": str(curves.failed),
+        "failed advances": str(curves.failed),
         "load": header.excitation_source,
         "scene": str(header.parameters.get("scene") or "that of the recording"),
         "head": f"{scene.head.mass_kg:g} kg",
@@ -215,7 +215,7 @@ def _plots(reader: RunReader, curves: RunCurves) -> list[dict[str, Any]]:
 
 
 def _columns(rows: Envelope, chosen: list[tuple[int, int]]) -> list[list[float | None]]:
-    """Return times and the least (0) or largest (1) values of some columns, null where a line ends."""
+    """Return times and the least (0) or largest (1) values of the chosen columns, None where a line ends."""
     times: Array | None = None
     columns: list[list[float | None]] = []
     order = np.zeros(0, np.int64)

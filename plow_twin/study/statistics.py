@@ -1,17 +1,16 @@
 """Statistics of a run by path.
 
-    max.top_left_top                    of one pair
-    max.ccw.a                           of the pair of corner a that stops a counter-clockwise swing; cw the other one
-    max.a   max.ccw   max               over the pairs of a corner, of a sense, over all
-    contact_sets.ccw.ad                 share of the contact time of that sense with force at exactly these corners
-    contact_set_time.ccw.ad             the same in s
-    contact_points.ccw.2                share of that contact time with force at exactly two corners
-    events   steps                      contact changes; steps of the solver
+    max.top_left_top                    of one pair max.ccw.a                           of the pair of corner a that
+    stops a counter-clockwise swing; cw: of its other pair max.a   max.ccw   max               over the pairs of a
+    corner, over the pairs of a sense, over all pairs contact_sets.ccw.ad                 share of the contact time of
+    that sense with force at exactly these corners contact_set_time.ccw.ad             the same in s
+    contact_points.ccw.2                share of that contact time with force at exactly two corners events   steps
+    contact changes; steps of the solver
 
-In place of `max` [N]: `mean_in_contact` and `mean_over_time` [N], `impulse` [N s], `time_in_contact` [s], `makes`,
-`wear_depth` [m]. Over several pairs the largest force and the deepest wear count; impulses, times and touches add up,
-and means are computed from these sums. Corners by the scene's letters or by their names; sets of named corners joined
-by `+`.
+Instead of `max` [N], a path may begin with `mean_in_contact` or `mean_over_time` [N], `impulse` [N s],
+`time_in_contact` [s], `makes` or `wear_depth` [m]. Of several pairs, the largest force and the deepest wear are used;
+impulses, times and touches are added, and means are computed from these sums. Corners have the scene's letters or their
+names; named corners of a set are joined by `+`.
 """
 
 from __future__ import annotations
@@ -32,14 +31,14 @@ from plow_twin.solve.state import Status
 from plow_twin.study.parameters import StudyError, nearest_of
 
 Array = NDArray[np.float64]
-#: From m runs to the statistic of each, shape (m,).
+#: Function from m runs to the statistic of each run, shape (m,).
 Statistic = Callable[[Ensemble], Array]
 
 SENSES: Final = ("ccw", "cw")
 
 
 def _sum(array: Array, columns: list[int]) -> Array:
-    """Add columns one after the other: numpy's order, and with it the last bit, would depend on the number of rows."""
+    """Add columns one by one, because numpy's order, and so the last bit, would depend on the number of rows."""
     total = np.zeros(len(array))
     for column in columns:
         total = total + array[:, column]
@@ -91,7 +90,7 @@ UNITS: Final[Mapping[str, str]] = {
 
 
 def statistics_of(members: Ensemble, scenes: Sequence[Scene], paths: Sequence[str]) -> Array:
-    """Return the statistics of runs, shape (m, paths), NaN for a failed run; each scene may letter its own corners."""
+    """Return the statistics of runs, shape (m, paths), NaN for a failed run; scenes may have different letters."""
     result = np.full((len(scenes), len(paths)), np.nan)
     names = [spec.name for spec in fields(Ensemble) if spec.name != "t"]
     groups: dict[tuple[tuple[str, str], ...], list[int]] = {}
@@ -129,10 +128,10 @@ def statistic(scene: Scene, path: str) -> Statistic:
     Raises
     ------
     StudyError
-        With the nearest paths and the existing kinds.
+        There is no such statistic; the error has the nearest paths and the existing kinds.
     """
     known = statistics_of_scene(scene)
-    # letters of a set in any order
+    # the letters of a set may be in any order
     head, _, last = path.rpartition(".")
     key = path if path in known else f"{head}.{''.join(sorted(last))}"
     if key not in known:
@@ -155,7 +154,7 @@ def _labels(scene: Scene) -> list[str]:
 
 
 def _groups(scene: Scene) -> dict[str, list[int]]:
-    """Return the groups of pairs by the end of a path."""
+    """Return the groups of pairs by the last part of a path."""
     ccw = [pair for pair in range(8) if STOPS_COUNTER_CLOCKWISE[pair]]
     cw = [pair for pair in range(8) if not STOPS_COUNTER_CLOCKWISE[pair]]
     groups: dict[str, list[int]] = {"": list(range(8)), ".ccw": ccw, ".cw": cw}

@@ -3,7 +3,7 @@
     sweep.json          the arguments, and the number of members in a chunk
     chunks/00007.npz    status and statistics of the members of one chunk, and the build that computed them
 
-A chunk is written beside its place, synced and moved there in one step: a killed run loses only the chunk under way.
+A chunk is written to another file, synced and renamed in one step, so that a killed run loses only the chunk under way.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from plow_twin.study.sweep.table import Sweep, Table, chunks_of
 Array = NDArray[np.float64]
 
 FORMAT: Final = 1
-#: A chunk, or the remainder of one whose process was killed while writing.
+#: Name of a chunk, or of an incomplete chunk whose process was killed while writing it.
 _CHUNK_NAME: Final = re.compile(r"\d{5,}\.npz|\.\d{5,}\.npz\.\d+")
 
 
@@ -34,17 +34,17 @@ class Store:
     Parameters
     ----------
     folder : Path
-        Made when it is not there.
+        Folder of the sweep; it is made if it does not exist.
     sweep : Sweep
     chunk : int
-        Members in a chunk; the stored number counts when the folder holds this sweep already.
+        Number of members in a chunk; if the folder already has this sweep, its stored number is used.
     fresh : bool
-        Discard every sweep in the folder.
+        Whether to discard any sweep in the folder.
 
     Raises
     ------
     StudyError
-        When the folder holds another sweep, with the difference, or something else.
+        The folder has another sweep (the error names the difference) or something else.
     """
 
     def __init__(self, folder: Path, sweep: Sweep, chunk: int, fresh: bool = False) -> None:
@@ -52,7 +52,7 @@ class Store:
         self._chunks = folder / "chunks"
         if fresh:
             for path in [*self._chunks.glob("*.npz*"), *self._chunks.glob(".*.npz.*")]:
-                if _CHUNK_NAME.fullmatch(path.name):  # other files stay
+                if _CHUNK_NAME.fullmatch(path.name):  # other files are kept
                     path.unlink()
             (folder / "sweep.json").unlink(missing_ok=True)
         if (folder / "sweep.json").exists():
@@ -71,7 +71,7 @@ class Store:
             facts: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
             stored, self.chunk = facts["arguments"], int(facts["chunk"])
         except (ValueError, KeyError, TypeError):
-            raise StudyError(f"{path}: got no readable sweep, expected one (--fresh discards it)") from None
+            raise StudyError(f"{path}: cannot be read, expected a sweep (--fresh discards it)") from None
         asked = self.sweep.arguments()
         differing = [key for key in asked if stored.get(key) != asked[key]]
         if differing or facts.get("format") != FORMAT:
@@ -86,11 +86,11 @@ class Store:
         return list(chunks_of(self.sweep.size, self.chunk))
 
     def missing(self) -> list[int]:
-        """Return the numbers of the chunks that are not stored, or are damaged."""
+        """Return the numbers of the chunks that are missing or damaged."""
         return [index for index in range(len(self.chunks)) if self.read(index) is None]
 
     def read(self, index: int) -> tuple[Array, str] | None:
-        """Return a chunk's table and build, or None when it is missing or incomplete."""
+        """Return the table and the build of a chunk, or None if the chunk is missing or incomplete."""
         try:
             with self._path(index).open("rb") as file, np.load(file, allow_pickle=False) as archive:
                 table, build = np.asarray(archive["table"], float), str(archive["build"])
@@ -113,7 +113,7 @@ class Store:
         Raises
         ------
         StudyError
-            When a chunk is not there.
+            A chunk is missing.
         """
         found = [self.read(index) for index in range(len(self.chunks))]
         parts = [part for part in found if part is not None]

@@ -1,1 +1,1 @@
-"""Analysis of recordings: predicted against measured, loads of the contacts, other scenes beside."""
+"""Analysis of recordings: predictions compared with measurements, loads of the contacts, and other scenes."""

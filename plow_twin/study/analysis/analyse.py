@@ -1,4 +1,4 @@
-"""Analysis of one recording: a run's journal is computed again, the load of any other recording passes the intake."""
+"""Analysis of one recording: a run's journal is computed again; the load of any other recording passes the intake."""
 
 from __future__ import annotations
 
@@ -49,36 +49,36 @@ _COLUMNS: Final = (
     *(f"force_{name}" for name in PAIR_NAMES),
     *(f"gap_{name}" for name in PAIR_NAMES),
 )
-#: Tolerance of the run that the analysis computes from a recording that is no run.
+#: Tolerance of the run that the analysis computes from a recording of another program.
 _TOLERANCE: Final = 1e-9
-#: A measured stamp older than the newest one by more than this [ns] is a step of its clock.
+#: A measured stamp that is older than the newest stamp by more than this [ns] is a step of its clock.
 _STEP_NS: Final = 1_000_000_000
-#: Largest measured value, in any unit; squares of larger values overflow.
+#: Largest measured value, in any unit, because squares of larger values may overflow.
 _LARGEST: Final = 1e15
-#: Name of the scene in the header of a run.
+#: Name of the scene that is in the header of a run.
 _OF_THE_RUN: Final = "of the run"
 _MAP: Final = "map_"
 #: Parameter that marks each run made by an analysis.
 MAPPED_LOAD: Final = f"{_MAP}excitation"
-#: Receives the share of the work done, 0..1.
+#: Function that receives the share of the work done, 0..1.
 OnProgress = Callable[[float], object]
 
 
 @dataclass
 class Prediction:
-    """The prediction by a scene: its rows, and the sums of its contacts over all of them."""
+    """The prediction of a scene: its rows, and the sums of its contacts over all rows."""
 
     name: str
     scene: Scene
     loads: LoadTotals
     longest: Thinned = field(default_factory=lambda: Thinned(len(_COLUMNS)))
     present: Thinned = field(default_factory=lambda: Thinned(len(_COLUMNS)))
-    #: resets of the motion so far: the number of the present stretch
+    #: number of resets of the motion so far, which is the number of the present stretch
     resets: int = 0
     #: first and last stamp [ns] of each stretch that has rows, by its number
     spans: dict[int, tuple[int, int]] = field(default_factory=dict)
     _longest_number: int = 0
-    #: clearance under `CLEARANCE_NAMES`, of all stretches without a reset
+    #: clearances in the order of `CLEARANCE_NAMES`, of all stretches
     clearance: Thinned = field(default_factory=lambda: Thinned(len(CLEARANCE_NAMES)))
 
     def walked(self, part: Walked) -> None:
@@ -91,7 +91,7 @@ class Prediction:
         self.clearance.add(slow["stamp_ns"], slow["clearance"])
 
     def is_inside(self, signal: ThinnedSignal) -> NDArray[np.bool_]:
-        """Return for each measured value whether it lies in the time of the load."""
+        """Return, for each measured value, whether it is within the time of the load."""
         stamps = signal.series()[0]
         if not self.spans:
             return np.ones(len(stamps), np.bool_)
@@ -99,12 +99,12 @@ class Prediction:
         return np.asarray(np.any(inside, axis=0))
 
     def outside(self, signal: ThinnedSignal) -> int:
-        """Return how many values of a measured signal lie outside the time of the load."""
+        """Return the number of values of a measured signal outside the time of the load."""
         inside = self.is_inside(signal)
         return round(signal.came * (1.0 - float(inside.mean()))) if len(inside) else 0
 
     def restart(self) -> None:
-        """Begin a new stretch: the stamps may go back."""
+        """Begin a new stretch, whose stamps may be earlier."""
         self.loads.restart()
         self._longest_number = self.longest_number
         self.longest, self.present = self._longer(), Thinned(len(_COLUMNS))
@@ -116,10 +116,10 @@ class Prediction:
         return self.resets if self._longer() is self.present else self._longest_number
 
     def is_of_longest(self, signal: ThinnedSignal) -> NDArray[np.bool_]:
-        """Return for each measured value whether it belongs to the longest stretch.
+        """Return, for each measured value, whether it belongs to the longest stretch.
 
-        A value belongs to the stretch that contains its stamp; if there are several, as after a step of the clock back,
-        to the one in which it arrived.
+        A value belongs to the stretch that contains its stamp. If several stretches do, as after a step back of the
+        clock, it belongs to the stretch in which it arrived.
         """
         at, _ = signal.series()
         if len(self.spans) < 2:
@@ -143,25 +143,25 @@ class Prediction:
 
     @property
     def stride(self) -> int:
-        """One in this many rows of the longest stretch is kept for the signals."""
+        """One in `stride` rows of the longest stretch is kept for the signals."""
         return self._longer().stride
 
 
 @dataclass
 class Measured:
-    """Measured values by signal, in order of arrival; of very many only every second, fourth, ... is kept."""
+    """Measured values by signal, in order of arrival; of very many values only every second, fourth, ... is kept."""
 
     signals: dict[str, ThinnedSignal] = field(default_factory=dict)
     #: stretch and stamp [ns] of the latest message of each role
     _latest: dict[str, tuple[int, int]] = field(default_factory=dict)
-    #: values that are impossible in any unit
+    #: number of values that are impossible in any unit
     implausible: int = 0
 
     def add(self, role: str, stamp_ns: int, numbers: Mapping[str, float], stretch: int = 0) -> None:
-        """Add the numbers of one message of that stretch; a non-finite number was not measured."""
+        """Add the numbers of one message in a stretch; a number that is not finite was not measured."""
         before, newest = self._latest.get(role, (0, stamp_ns))
         back = newest - stamp_ns > _STEP_NS
-        # its clock has stepped before the clock of the load
+        # the clock of the measurement has stepped earlier than the clock of the load
         stretch = max(stretch, before + back)
         self._latest[role] = stretch, stamp_ns if back else max(newest, stamp_ns)
         prefix = {"forces": "force_", "gaps": "gap_"}.get(role, "")
@@ -183,10 +183,10 @@ class Analysis:
     input: dict[str, int]
     losses: dict[str, int]
     unknown_types: dict[str, str]
-    #: stretches without samples, in which the load is a straight line
+    #: stretches without samples, in which the load is interpolated linearly
     silences: Silences
     wall_s: float = 0.0
-    #: other folders there: empty, or with recordings of their own
+    #: other folders in the recording's folder: empty, or with recordings of their own
     left_out: tuple[Path, ...] = ()
 
     @property
@@ -196,7 +196,7 @@ class Analysis:
 
     @property
     def lost(self) -> dict[str, int]:
-        """Losses, and measured signals without a value in the time of the load."""
+        """Losses, including measured signals without a value in the time of the load."""
         counts = ((self.predictions[0].outside(signal), signal.came) for signal in self.measured.signals.values())
         outside = sum(count for count, came in counts if count == came)
         found = {"measured_implausible": self.measured.implausible, "measured_outside_the_load": outside}
@@ -221,7 +221,7 @@ class Analysis:
         return found
 
     def facts(self) -> dict[str, Any]:
-        """Return everything for JSON: the prediction of the scene at the top, other scenes under `with`."""
+        """Return all facts for JSON, with the prediction of the scene at the top and other scenes under `with`."""
         first, *others = self.predictions
         return {
             "run": str(self.path),
@@ -256,7 +256,7 @@ class Analysis:
         return facts if confusion is None else facts | {"contact_set_confusion": confusion}
 
     def _confusion(self, prediction: Prediction) -> dict[str, dict[str, int]] | None:
-        """Return, by pair, how often contact was predicted and measured, where forces were measured."""
+        """Return, by pair, how often contact was predicted and measured, or None without measured forces."""
         stamps, columns = prediction.series()
         found = {}
         for name in PAIR_NAMES:
@@ -295,25 +295,25 @@ def analyse(
     Parameters
     ----------
     path
-        A run of ours, another recording (MCAP, rosbag2's sqlite3, CSV), or a folder of its parts.
+        A run of plow_twin, another recording (MCAP, rosbag2's sqlite3, CSV), or a folder with its parts.
     scene
-        Scene file or preset; needed for other recordings (or `scene.yaml` beside them), otherwise the run's.
+        Scene file or preset; by default the scene of a run, or `scene.yaml` beside another recording.
     mapping
         YAML that maps topics to roles.
     units
-        Units by name (fx, x, ..., t) in place of the mapping's; for another recording only.
+        Units by name (fx, x, ..., t), which replace those of the mapping; only for another recording.
     others
-        Further scenes to predict with.
+        Further scenes for predictions.
     out
-        Folder in which another recording becomes a run like any other (`run`).
+        Folder in which a run (`run`) is made from another recording.
     tail, on_caught_up
-        With a `Tail` a run of ours is followed while it is written; the second receives the analysis so far,
-        each time that all has been read.
+        With a `Tail`, a run of plow_twin is followed while it is written; `on_caught_up` receives the analysis so far
+        whenever everything has been read.
 
     Raises
     ------
     RecordingError, SceneError
-        The recording, the mapping or a scene cannot be used; `UnitError`: a unit looks wrong.
+        The recording, the mapping or a scene cannot be used, or (`UnitError`) a unit seems wrong.
     """
     begin = time.perf_counter()
     if not path.exists():
@@ -367,7 +367,7 @@ def _walk_own(
     for walker, prediction in zip(walkers, predictions, strict=True):
         walker.on_reset = prediction.restart
     walk = JournalWalk(walkers[:1], walkers[1:], whole=not header.part, same_scene=own)
-    journalled = Measured()  # if the node estimates
+    journalled = Measured()  # poses are in the journal if the node uses them
     run_time = RunTime(header.parameters)
 
     def so_far() -> Analysis:
@@ -403,7 +403,7 @@ def _walk_own(
 def _measured_beside(path: Path, mapping: Path | None, node: str) -> tuple[Measured, dict[str, str], dict[str, int]]:
     """Return the measurements beside a run, the topics of unknown type, and the counts of unusable messages by reason.
 
-    Its loads are in the journal.
+    Loads are not read, because the load of a run is in its journal.
     """
     measured, unknown, unused = Measured(), dict[str, str](), Counter[str]()
     folder = path if path.is_dir() else path.parent
@@ -420,7 +420,9 @@ def _measured_beside(path: Path, mapping: Path | None, node: str) -> tuple[Measu
                 measured.add(name, *found)
         unknown |= source.losses.unknown_types
         for name, count in source.losses.counts.items():
-            if count and (name == "undecodable" or number >= len(places)):  # the run itself counts the others
+            if count and (
+                name == "undecodable" or number >= len(places)
+            ):  # the run itself has counted the other losses
                 unused[name] += count
     return measured, unknown, unused
 
@@ -491,19 +493,19 @@ def _holds(folder: Path, kinds: Sequence[str] = _KINDS) -> bool:
 
 
 def _is_recording(folder: Path, results: Sequence[Path]) -> bool:
-    """Return whether a folder is one recording: its files are parts of one, or no runs lie in folders beside them."""
+    """Return whether a folder is one recording: its files are parts of one recording, or no folder in it is a run."""
     if not _holds(folder):
         return False
     if (folder / "metadata.yaml").is_file() or any(folder.glob(f"{glob.escape(folder.name)}_*")):
         return True
-    if (folder / "analysis.json").is_file():  # the run beside it is its result
+    if (folder / "analysis.json").is_file():  # the run in this folder is the result of an analysis
         results = [*results, (folder / "run").resolve()]
     runs = [item for item in folder.iterdir() if _holds(item, _KINDS[:2]) and item.resolve() not in results]
     return not set(runs) - set(beside_folders(folder))
 
 
 def left_out(path: Path, results: Sequence[Path] = ()) -> list[Path]:
-    """Return the items that `expand` leaves out: empty folders, tables beside runs, and runs inside others."""
+    """Return the items that `expand` leaves out: empty folders, tables beside runs, and runs inside other runs."""
     if not path.is_dir():
         return []
     folders = [item for item in sorted(path.iterdir()) if item.is_dir()]
@@ -516,12 +518,12 @@ def left_out(path: Path, results: Sequence[Path] = ()) -> list[Path]:
 def expand(paths: Sequence[Path], results: Sequence[Path] = ()) -> list[Path]:
     """Return the recordings at some paths: a folder that is not a recording is replaced by the recordings in it.
 
-    `results` are folders of an earlier analysis, which are no recordings.
+    `results` are folders with results of an earlier analysis, which are not recordings.
 
     Raises
     ------
     RecordingError
-        A folder holds no recording.
+        A folder has no recording.
     """
     found: list[Path] = []
     for path in paths:
@@ -531,10 +533,10 @@ def expand(paths: Sequence[Path], results: Sequence[Path] = ()) -> list[Path]:
         inside = [
             item
             for item in sorted(path.iterdir())
-            # a recording whose parts are missing counts too: its analysis names them
+            # also a recording with missing parts, which its analysis names
             if item.suffix in (".mcap", ".db3") or _holds(item) or (item / "metadata.yaml").is_file()
         ]
-        if not inside and any(path.glob(f"*{SUFFIX}")):  # beside recordings it is the result of an analysis
+        if not inside and any(path.glob(f"*{SUFFIX}")):  # a table beside recordings is the result of an analysis
             inside = [path]
         if not inside:
             raise RecordingError(f"{path}: got a folder without recordings, expected some{packed(path)}")
@@ -565,6 +567,6 @@ def _identity(path: Path) -> object:
     """Return a run's random id with the number of its first part; the path of any other recording."""
     try:
         header = read_header(mcap_path(path))
-    except (RecordingError, OSError):  # named where it is used
+    except (RecordingError, OSError):  # reported where the recording is used
         header = None
     return path if header is None or not header.run_id else (header.run_id, header.part)

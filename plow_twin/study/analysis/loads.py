@@ -20,11 +20,11 @@ from plow_twin.run.energy_balance import elastic_energy
 
 Array = NDArray[np.float64]
 
-#: Bins of the rainflow count.
+#: Number of bins of the rainflow count.
 CYCLE_BINS: Final = 16
 #: Length of a piece of the face [m].
 FACE_BIN_M: Final = 1.0
-#: Bytes of the reversals of a pair that are kept in memory: 131 072 reversals; the others are on the disk.
+#: Size of a pair's reversals that are kept in memory [B]: 131 072 reversals; further reversals are on the disk.
 _IN_MEMORY: Final = 2**20
 
 
@@ -45,7 +45,7 @@ class Pass:
 
 
 class Series:
-    """A series of any length that is written once and can be read repeatedly from its start; on the disk when long."""
+    """A series of any length that is written once and can be read repeatedly; a long series is on the disk."""
 
     def __init__(self) -> None:
         self._file = tempfile.SpooledTemporaryFile(_IN_MEMORY)  # noqa: SIM115 (goes with this object)
@@ -68,7 +68,7 @@ class Series:
 
 @dataclass
 class LoadTotals:
-    """Sums over a run; `add` takes in batch after batch."""
+    """Sums over a run, to which `add` adds batch after batch."""
 
     scene: Scene
     duration_s: float = 0.0
@@ -83,12 +83,12 @@ class LoadTotals:
     face: dict[tuple[int, int], float] = field(default_factory=dict)
     #: wear depth that the pads have gained in travel forward and backward [m]
     pad_wear: Array = field(default_factory=lambda: np.zeros((2, PAIR_COUNT)))
-    #: wear depth of the slide by direction (0 forward, 1 backward) and piece of the face, of each pair [m]
+    #: wear depth of the slide at each pair [m], by direction (0 forward, 1 backward) and piece of the face
     slide_wear: dict[tuple[int, int], Array] = field(default_factory=dict)
     _first_ns: int | None = None
     #: stamp [ns], load, pose, rates and penetrations of the last row
     _last: tuple[int, Array, Array, Array, Array] | None = None
-    #: depth of the pads after the last advance [m]
+    #: wear depth of the pads after the last advance [m]
     _worn: Array | None = None
     _place_m: float = 0.0
     _direction: float = 0.0
@@ -99,7 +99,7 @@ class LoadTotals:
         self._last = self._worn = None
 
     def add(self, walked: Walked) -> None:
-        """Add some advances."""
+        """Add a batch of advances."""
         self.scene = walked.scene
         rows, stamps = walked.rows, walked.stamp_ns
         self._first_ns = int(stamps[0]) if self._first_ns is None else self._first_ns
@@ -117,7 +117,7 @@ class LoadTotals:
             self.sets[int(mask)] += int(count)
         for pair, kept in enumerate(self._reversals):
             turning = reversals(rows.peak[:, pair])
-            if turning.any() or kept.last != 0.0:  # a single zero suffices for a long time without contact
+            if turning.any() or kept.last != 0.0:  # a long time without contact needs only one zero
                 kept.add(turning)
         loss = self._contact_loss(walked, steps)
         self.contact_loss_j += float(loss.sum())
@@ -128,7 +128,8 @@ class LoadTotals:
     def _contact_loss(self, walked: Walked, steps: Array) -> Array:
         """Return the energy taken by the contacts between two rows [J]: work of load and gravity minus energy gained.
 
-        The load's work is its mean times the distance; the energy gained is kinetic or stored in the contacts.
+        The work of the load is its mean times the distance. The energy gained is the kinetic energy and the energy
+        stored in the contacts.
         """
         now = walked.wrench, walked.rows.q, walked.rows.v, walked.rows.penetration
         first = (column[0] for column in now) if self._last is None else self._last[1:]
@@ -176,9 +177,9 @@ class LoadTotals:
         self._worn = walked.rows.wear_depth[-1].copy()
 
     def _wear(self, depth: Array, speed: float, pieces: NDArray[np.int64]) -> None:
-        """Add the wear by direction: of the pads, and of the places of the slide that they pass.
+        """Add the wear of the pads and of the places of the slide that they pass, by direction.
 
-        A pad is in contact over the whole distance, a place of the slide only over the length of the pad.
+        A pad is in contact over the whole distance, a place of the slide only while the length of the pad passes it.
         """
         wear = self.scene.wear
         if wear is None or wear.coefficient_m2_n == 0.0:
@@ -205,13 +206,13 @@ class LoadTotals:
         if self.slide_wear:
             pieces = {piece for _, piece in self.slide_wear}
             total = np.sum(list(self.slide_wear.values()), axis=0) / len(pieces)
-            # mean over the pieces: to the wear of the pads it is as a pad's length to the face's length
+            # mean over the pieces; its ratio to the wear of the pads is that of a pad's length to the face's length
             out["slide_mean_m"] = dict(zip(PAIR_NAMES, total.tolist(), strict=True))
             out["slide_pieces"] = len(pieces)
         return out
 
     def cycles(self) -> dict[str, list[dict[str, float]]]:
-        """Return rainflow counts of the contact force by pair (ASTM E1049): upper end of a range [N] and its count."""
+        """Return rainflow counts of the contact force by pair (ASTM E1049): upper end [N] and count of each range."""
         import rainflow
 
         found = {}
@@ -242,7 +243,7 @@ class LoadTotals:
 
 
 def reversals(values: Array) -> Array:
-    """Return the turning points of a series, its ends included."""
+    """Return the turning points of a series, including its ends."""
     if len(values) < 3:
         return values
     changes = np.flatnonzero(np.diff(values) != 0.0)

@@ -1,4 +1,4 @@
-"""Many recordings: on all cores of this machine, or on a Dask cluster; the death of a worker costs no result."""
+"""Analysis of many recordings on all cores or on a Dask cluster; no result is lost when a worker dies."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from plow_twin.model.law_modules import load_laws, loaded_laws
 from plow_twin.study.analysis.task import RunTask, run_task
 from plow_twin.study.cluster import completed, connect
 
-#: Receives the share of the recordings done.
+#: Function that receives the share of the recordings done, 0..1.
 OnProgress = Callable[[float], object]
 _OnDone = Callable[[int, dict[str, Any]], object]
 
@@ -24,14 +24,14 @@ _OnDone = Callable[[int, dict[str, Any]], object]
 def run_many(
     tasks: Sequence[RunTask], *, workers: int, dask: str | None = None, on_progress: OnProgress = lambda share: None
 ) -> list[dict[str, Any]]:
-    """Return the facts of each task, `error` for a failed one; stored facts are used.
+    """Return the facts of each task (`error` if it failed); stored facts are used.
 
     Parameters
     ----------
     workers
-        Processes on this machine.
+        Number of processes on this machine.
     dask
-        Address of a scheduler to run on instead; its workers must see the same files.
+        Address of a scheduler to use instead; its workers must see the same files.
 
     Raises
     ------
@@ -55,7 +55,7 @@ def run_many(
 def _here(tasks: Sequence[RunTask], waiting: list[int], workers: int, done: _OnDone) -> None:
     while waiting:
         left = _round(tasks, waiting, workers, done)
-        if len(left) == len(waiting):  # one of the first tasks has killed its worker: run each of them alone
+        if len(left) == len(waiting):  # a task has killed its worker: run each of the first tasks alone
             left, first = left[workers:], left[:workers]
             for number in first:
                 if _round(tasks, [number], 1, done):
@@ -64,7 +64,7 @@ def _here(tasks: Sequence[RunTask], waiting: list[int], workers: int, done: _OnD
 
 
 def _round(tasks: Sequence[RunTask], waiting: list[int], workers: int, done: _OnDone) -> list[int]:
-    """Run some tasks and return the lost ones: when a worker dies, all unfinished tasks are lost."""
+    """Run tasks and return the lost tasks; when a worker dies, all unfinished tasks are lost."""
     left = []
     others = active_children()
     pool = ProcessPoolExecutor(min(workers, len(waiting)), get_context("spawn"), _begin, (loaded_laws(),))
@@ -75,7 +75,7 @@ def _round(tasks: Sequence[RunTask], waiting: list[int], workers: int, done: _On
                 done(futures[future], future.result())
             except BrokenProcessPool:
                 left.append(futures[future])
-    except BaseException:  # an interrupt: the next call repeats unfinished analyses
+    except BaseException:  # after an interrupt the next call repeats unfinished analyses
         for worker in set(active_children()).difference(others):
             worker.kill()
         raise
@@ -85,7 +85,7 @@ def _round(tasks: Sequence[RunTask], waiting: list[int], workers: int, done: _On
 
 
 def _begin(laws: tuple[str, ...]) -> None:
-    """Begin a worker, with the contact laws that its caller has."""
+    """Prepare a worker with the contact laws of its caller."""
     _belong_to_the_caller()
     load_laws(laws)
 
@@ -110,6 +110,6 @@ def _on_cluster(tasks: Sequence[RunTask], waiting: list[int], address: str, done
             number = futures[future]
             try:
                 done(number, future.result())
-            except Exception as error:  # in any state of the worker
+            except Exception as error:  # any error, in any state of the worker
                 path = str(tasks[number].path)
                 done(number, {"run": path, "error": f"{path}: {type(error).__name__}: {error}"})

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from plow_twin.study.analysis.analyse import Analysis, Prediction
 
 _MOST_POINTS: Final = 4000
-#: Placeholder for the results of a folder without a recording.
+#: Text in place of results for a folder without a recording.
 LEFT_OUT: Final = "left out: no recording"
 
 _PAGE: Final = """<!doctype html>
@@ -29,10 +29,10 @@ table{border-collapse:collapse;margin:1em 0}td,th{border:1px solid #ccc;padding:
 th:first-child,td:first-child,.long{text-align:left}img{max-width:100%}</style></head><body>
 <h1>{{ facts.run }}</h1>
 <p>{{ facts.kind }}; {{ facts.input.samples_used }} samples used, {{ "%.1f" | format(facts.loads.duration_s) }} s.
-{% if facts.without_samples %}{{ facts.without_samples }}; the load is a straight line there.{% endif %}
+{% if facts.without_samples %}{{ facts.without_samples }}; there the load is interpolated linearly.{% endif %}
 {% if facts.lost %}Lost: {{ facts.lost }}.{% endif %}
-{% if facts.left_out %}Left out, no part of this recording: {{ facts.left_out | join(", ") }}.{% endif %}
-{% if facts.skipped_topics %}Topics passed over: {{ facts.skipped_topics }}.{% endif %}</p>
+{% if facts.left_out %}Left out, not part of this recording: {{ facts.left_out | join(", ") }}.{% endif %}
+{% if facts.skipped_topics %}Topics of unknown type: {{ facts.skipped_topics }}.{% endif %}</p>
 {% for part in parts %}
 <h2>Scene {{ part.scene }}</h2>
 {% if part.signals %}<h3>Predicted minus measured</h3>
@@ -42,8 +42,8 @@ th:first-child,td:first-child,.long{text-align:left}img{max-width:100%}</style><
 <td>{{ number(s.correlation) }}</td><td>{{ number(s.lag_s) }}</td><td>{{ number(s.rms_aligned) }}</td>
 <td>{{ number(s.coherence) }}</td></tr>{% endfor %}</table>
 {% else %}<p>Nothing was measured.</p>{% endif %}
-{% if part.stretches %}<p>Resets part the run into {{ part.stretches }} stretches: signals are of the longest one;
-measured values of others: {{ part.not_compared or "none" }}.</p>{% endif %}
+{% if part.stretches %}<p>Resets divide the run into {{ part.stretches }} stretches; signals are of the
+longest. Measured values of the others: {{ part.not_compared or "none" }}.</p>{% endif %}
 {% if part.outside %}<p>Measured values outside the time of the load, not compared: {{ part.outside }}.</p>{% endif %}
 <h3>Contacts</h3>
 <table><tr><th>pair</th><th>impacts</th><th>largest force [kN]</th><th>impulse [kN s]</th><th>duty [%]</th></tr>
@@ -71,7 +71,7 @@ measured values of others: {{ part.not_compared or "none" }}.</p>{% endif %}
 
 
 def write_report(found: Analysis, out: Path) -> None:
-    """Write all files of an analysis into the folder `out`; an error of the disk names it."""
+    """Write all files of an analysis into the folder `out`; a disk error names the file."""
     with naming(out):
         _write_report(found, out)
 
@@ -183,7 +183,7 @@ def _picture(found: Analysis) -> str:
 
 
 def write_table_of_runs(rows: list[dict[str, Any]], out: Path, left_out: Sequence[Path] = ()) -> None:
-    """Write to `runs.parquet` a row for each recording, and a row with the reason for each folder left out."""
+    """Write `runs.parquet` with a row for each recording and for each folder left out, with the reason."""
     flat = []
     for facts in [*rows, *({"run": str(path), "error": LEFT_OUT} for path in left_out)]:
         lost = sum(facts["lost"].values()) if "lost" in facts else None

@@ -1,4 +1,4 @@
-"""Predicted against measured: bias, RMS, correlation, lag and coherence of one signal."""
+"""Comparison of a predicted with a measured signal: bias, RMS, correlation, lag and coherence."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-#: Largest lag searched [s]; a longer lag cannot be distinguished from a period of the load.
+#: Largest lag in the search [s]; a longer lag cannot be distinguished from a period of the load.
 LARGEST_LAG_S: Final = 1.0
-#: Fewest measured values for a comparison.
+#: Smallest number of measured values for a comparison.
 _FEWEST: Final = 8
 _MOST_POINTS: Final = 400_000
 
@@ -25,13 +25,13 @@ class Comparison:
     Attributes
     ----------
     n : int
-        Measured values within the time of the prediction.
+        Number of measured values within the time of the prediction.
     bias, rms : float
         Mean and root mean square of predicted minus measured, at equal stamps.
     correlation : float or None
-        Pearson's correlation, at equal stamps; None where a signal does not change.
+        Pearson's correlation, at equal stamps; None if a signal does not change.
     lag_s : float or None
-        Lag of the measurement in s, positive where it is late, at which the correlation is largest.
+        Lag in s of the measurement behind the prediction at which the correlation is largest.
     rms_aligned : float or None
         Standard deviation of the difference at that lag.
     coherence : float or None
@@ -57,7 +57,7 @@ def signal_unit(name: str) -> str:
 
 
 def compare(t: Array, predicted: Array, t_measured: Array, measured: Array) -> Comparison | None:
-    """Compare a prediction (n,) at times t (rising) with measured values (m,) at their own times; None for too few."""
+    """Compare a prediction (n,) at rising times t with measured values (m,) at other times; None for too few values."""
     inside = (t_measured >= t[0]) & (t_measured <= t[-1]) & np.isfinite(measured) if len(t) else np.zeros(0, bool)
     if inside.sum() < _FEWEST:
         return None
@@ -82,12 +82,12 @@ def _correlation(one: Array, other: Array) -> float | None:
         return None
     one, other = one - one.mean(), other - other.mean()
     size = math.sqrt(float(one @ one) * float(other @ other))
-    # rounding may give more than 1
+    # without these bounds, rounding could give more than 1
     return min(1.0, max(-1.0, float(one @ other) / size)) if size > 1e-300 else None
 
 
 def _shifted(t: Array, predicted: Array, times: Array, lag_s: float) -> Array:
-    """Return the prediction as seen by a measurement that is late by `lag_s`; NaN outside its time."""
+    """Return the prediction at `times` minus `lag_s`, NaN outside its time."""
     return _at(times - lag_s, t, predicted)
 
 
@@ -96,14 +96,14 @@ def _at(times: Array, t: Array, predicted: Array) -> Array:
 
 
 def _step(times: Array, span: float) -> float:
-    """Return the usual distance of two stamps [s], bounded to limit the points; equal stamps count once."""
+    """Return the usual distance between stamps [s], at least so large that the number of points is bounded."""
     return max(float(np.median(np.diff(np.unique(times)))), span / _MOST_POINTS, 1e-6)
 
 
 def _correlations(longer: Array, shorter: Array) -> Array:
-    """Return Pearson's correlation of a series with each piece of a longer one, over the known part of the piece.
+    """Return Pearson's correlation of a series with each piece of a longer series, over the known part of the piece.
 
-    The known part of the longer series, without NaN, is contiguous. -1 where there is too little.
+    The known part of the longer series, without NaN, is contiguous. The result is -1 if the known part is too short.
     """
     from scipy.signal import correlate
 
@@ -125,14 +125,14 @@ def _correlations(longer: Array, shorter: Array) -> Array:
     square_one = sums(one**2, low + begin, high + begin) - count * mean_one**2
     square_other = sums(other**2, low, high) - count * mean_other**2
     product = correlate(one, other, mode="valid", method="fft") - count * mean_one * mean_other
-    # a constant piece has no correlation: its deviation from the mean is rounding
+    # a constant piece has no correlation, because its deviation from the mean is only rounding
     enough = (high - low >= _FEWEST) & (square_one > 1e-12 * (one @ one)) & (square_other > 1e-12 * (other @ other))
     size = np.sqrt(np.where(enough, square_one * square_other, 1.0))
     return np.where(enough, product / size, -1.0)
 
 
 def _lag(t: Array, predicted: Array, times: Array, values: Array) -> float | None:
-    """Return the lag with the largest correlation: first on a grid, then between its points."""
+    """Return the lag with the largest correlation, found on a grid and then refined between its points."""
     from scipy.optimize import minimize_scalar
 
     span = float(times[-1] - times[0])

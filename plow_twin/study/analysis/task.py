@@ -1,4 +1,4 @@
-"""One analysis with its files, as a call for a process of its own."""
+"""One analysis with its files, as a task that another process can run."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from plow_twin.scene_file.presets import scene_path
 from plow_twin.study.analysis.analyse import MAPPED_LOAD, analyse
 from plow_twin.study.analysis.report import write_report
 
-#: Written last: the inputs of the other files of an analysis.
+#: File with the inputs of an analysis, which is written last.
 _ASKED: Final = "asked.json"
 _FILES: Final = (_ASKED, "analysis.json", "report.html", "measured.parquet")
-#: Tables, one for each scene that predicts.
+#: Names of the tables, of which each scene has its own.
 _TABLE: Final = re.compile(r"(predicted|clearance|face|slide_wear)(_\d+)?\.parquet")
 
 
 def names_apart(paths: Sequence[Path]) -> list[str]:
-    """Return a short name for each recording: the part of its path that distinguishes it from the others."""
+    """Return a short name for each recording, the part of its path that distinguishes it from the others."""
     whole = [path.absolute() for path in paths]
     stems = Counter(path if path.is_dir() else path.with_suffix("") for path in whole)
     parts = [
@@ -47,7 +47,7 @@ def names_apart(paths: Sequence[Path]) -> list[str]:
 
 
 class RunTask(Protocol):
-    """Work on one recording, for a process of its own."""
+    """Work on one recording that another process can run."""
 
     @property
     def path(self) -> Path:
@@ -62,7 +62,7 @@ class RunTask(Protocol):
 
 @dataclass(frozen=True)
 class Task:
-    """One analysis, for a process of its own."""
+    """One analysis, which another process can run."""
 
     path: Path
     scene: Path | None
@@ -71,11 +71,11 @@ class Task:
     out: Path | None
     #: other contents of the recording's folder, named in the results
     left_out: tuple[Path, ...] = ()
-    #: units of measured numbers by name, in place of the mapping's
+    #: units of measured numbers by name, which replace those of the mapping
     units: Mapping[str, str] = field(default_factory=dict)
 
     def stored(self) -> dict[str, Any] | None:
-        """Return the facts of the same analysis if all its files are there."""
+        """Return the facts of the same analysis if all its files exist."""
         if self.out is None:
             return None
         try:
@@ -91,7 +91,7 @@ class Task:
         Raises
         ------
         RecordingError
-            A file to remove is an input of this analysis or of one beside it (`inputs`).
+            A file to remove is an input of this analysis or of another analysis (`inputs`).
         """
         old = self._old()
         self._keep(old, (*self._inputs(), *inputs))
@@ -102,11 +102,11 @@ class Task:
                 path.unlink(missing_ok=True)
 
     def check(self, inputs: Sequence[Path]) -> None:
-        """Raise a `RecordingError` when an input would be replaced."""
+        """Raise a `RecordingError` if an input would be replaced."""
         self._keep(self._old(), inputs)
 
     def _old(self) -> list[Path]:
-        """Return the files of an earlier analysis, first the file that marks it as complete."""
+        """Return the files of an earlier analysis; the first file marks the analysis as complete."""
         if self.out is None or not self.out.is_dir():
             return []
         found = sorted(path for path in self.out.iterdir() if path.name in _FILES or _TABLE.fullmatch(path.name))
@@ -131,7 +131,7 @@ class Task:
         Raises
         ------
         PlowTwinError
-            It cannot be made.
+            The analysis cannot be made.
         """
         self.clear()
         asked = self._asked()  # state of the inputs at the start of the analysis
@@ -156,7 +156,7 @@ class Task:
         beside = folder / "scene.yaml" if self.scene is None else None
         return {
             "run": _state(self.path, self.out),
-            # measurements beside a part, in other parts too
+            # a single part may have measurements beside it, also in other parts
             "parts": [] if self.path.is_dir() else [_state(path, self.out) for path in _measured_near(folder)],
             "scene": _scene_state(self.scene),
             "scene_beside": _scene_state(beside) if beside is not None and beside.is_file() else None,
@@ -168,24 +168,24 @@ class Task:
 
 
 def _is_ours(file: Path) -> bool:
-    """Return whether a file belongs to a run that an analysis has made."""
+    """Return whether a file is part of a run that an analysis has made."""
     if file.name in ("metadata.yaml", "metadata.yaml.partial"):
         return True
     if not re.fullmatch(r"run_\d+\.mcap", file.name):
         return False
-    if file.stat().st_size == 0:  # killed before its first byte
+    if file.stat().st_size == 0:  # its process was killed before the first byte
         return True
     try:
         header = read_header(file)
         if header is None and next(iter(ChunkReader(file)), None) is None:
-            return True  # killed before its header: it is empty
+            return True  # its process was killed before the header
     except RecordingError:
         return False
     return header is not None and MAPPED_LOAD in header.parameters
 
 
 def _state(path: Path, out: Path | None) -> list[Any]:
-    """Return name, sizes and times of a file, or of the files of a folder, without the results in `out`."""
+    """Return names, sizes and times of a file, or of all files in a folder except the results in `out`."""
     files = sorted(path.rglob("*")) if path.is_dir() else [path]
     if out is not None and out.resolve().is_relative_to(path.resolve()):
         results = out.resolve()
@@ -205,21 +205,21 @@ def _measured_near(folder: Path) -> list[Path]:
 
 
 def _scene_state(scene: Path | None) -> list[str] | None:
-    """Return the name of a scene and the digest of its contents, tables included."""
+    """Return the name of a scene and the digest of its contents, including tables."""
     if scene is None:
         return None
     try:
         text = dump_scene(load_scene(scene_path(str(scene))))
-    except (PlowTwinError, OSError, ValueError):  # named by the analysis
+    except (PlowTwinError, OSError, ValueError):  # the analysis reports it
         text = ""
     return [str(scene), hashlib.blake2b(text.encode(), digest_size=16).hexdigest()]
 
 
 def run_task(task: RunTask) -> dict[str, Any]:
-    """Return the facts of one task, `error` where it failed."""
+    """Return the facts of one task, `error` if it failed."""
     try:
         return task.run()
     except PlowTwinError as error:
         return {"run": str(task.path), "error": str(error)}
-    except Exception as error:  # any error of one recording among many: the others continue
+    except Exception as error:  # any error of one recording, so that the others continue
         return {"run": str(task.path), "error": f"{task.path}: {error!r}"}

@@ -1,4 +1,4 @@
-"""Rows and values in bounded memory: of too many only every second, then every fourth, ... is kept."""
+"""Rows and values in bounded memory: if there are too many, only every second, then every fourth, ... is kept."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-#: Rows that are kept: 150 MB of a prediction, 16 MB of a measured signal.
+#: Largest number of rows that are kept: 150 MB of a prediction, 16 MB of a measured signal.
 MOST_ROWS: Final = 1_000_000
 
 
 class Thinned:
-    """Rows of some columns with their stamps; Of `rows` received rows one in `stride` is kept."""
+    """Rows of several columns with their stamps; of the `rows` received, one in `stride` is kept."""
 
     def __init__(self, columns: int) -> None:
         self._stamps: list[NDArray[np.int64]] = [np.zeros(0, np.int64)]
@@ -42,7 +42,7 @@ class Thinned:
 
 
 class ThinnedSignal:
-    """Values, added one at a time, with their stamps and the number of the stretch in which each came."""
+    """Values that are added one at a time, each with its stamp and the number of the stretch in which it arrived."""
 
     def __init__(self) -> None:
         self._stamps, self._values, self._stretches = array("q"), array("d"), array("I")
@@ -61,7 +61,7 @@ class ThinnedSignal:
 
     @property
     def came(self) -> int:
-        """Number of values, kept or not."""
+        """Number of values received, kept or not."""
         return self._came
 
     def series(self) -> tuple[NDArray[np.int64], Array]:
@@ -69,5 +69,5 @@ class ThinnedSignal:
         return np.array(self._stamps, np.int64), np.array(self._values)
 
     def stretches(self) -> NDArray[np.int64]:
-        """Return in which stretch each value came, shape (m,)."""
+        """Return the number of the stretch in which each kept value arrived, shape (m,)."""
         return np.array(self._stretches, np.int64)

@@ -1,11 +1,11 @@
-"""Fit unknowns of a scene to an objective: many independent starts, each global first, then local.
+"""Fit of unknowns of a scene to an objective by many independent starts, each first global, then local.
 
-One start: (1) `screen` random points of the unit cube, the best of which become the first population of (2) a
-differential evolution (Storn and Price, J. Global Optim. 11 (1997) 341; scipy), whose every generation is one ensemble
-of runs; (3) its best point is polished in the unknowns that have a range: least squares (trust region reflective,
-scipy) with a finite-difference Jacobian from one ensemble, then, where the residuals have kinks, Nelder and Mead's
-simplex. Every start draws from a generator of its own, spawned from the seed: the same seed gives the same bits with
-any number of threads.
+One start has three stages: (1) `screen` random points of the unit cube, of which the best become the first population
+of (2) a differential evolution (Storn and Price, J. Global Optim. 11 (1997) 341; scipy), in which each generation is
+one ensemble of runs. (3) The best point is polished in the unknowns that have a range, by least squares (trust region
+reflective, scipy) with a finite-difference Jacobian from one ensemble, and then, for residuals with kinks, by Nelder
+and Mead's simplex. Every start has its own random generator, spawned from the seed, so that the same seed gives the
+same bits with any number of threads.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from plow_twin.study.calibration.unknowns import Space
 from plow_twin.study.parameters import Value
 
 Array = NDArray[np.float64]
-#: Called with the share of the work done, 0..1, and the best objective so far.
+#: Function that is called with the share of the work done, 0..1, and the best objective so far.
 OnProgress = Callable[[float, float], None]
 
 
@@ -41,7 +41,7 @@ class Search:
 
 @dataclass(frozen=True)
 class Start:
-    """Result of a start: its point in the cube, the values there, the objective before and after polishing."""
+    """Result of a start: point in the cube, values of the unknowns, and objective before and after polishing."""
 
     number: int
     point: Array
@@ -53,12 +53,12 @@ class Start:
 
 @dataclass(frozen=True)
 class Calibration:
-    """The result of a calibration; `starts` in the order of their objective, best first."""
+    """The result of a calibration; `starts` are sorted by their objective, best first."""
 
     starts: tuple[Start, ...]
     seed: int
     runs: int
-    #: every point of a last population with its objective, to find points that fit almost as well
+    #: all points of the last populations, among which are points that fit almost as well as the best
     population: Array = field(repr=False)
     population_objective: Array = field(repr=False)
 
@@ -88,7 +88,7 @@ def calibrate(
     search : Search, optional
         Effort of each start.
     first : ndarray, shape (n,), optional
-        A point that joins the first population of the first start: the given scene.
+        A point that is put into the first population of the first start, such as that of the given scene.
     on_progress : callable, optional
         Called after every generation.
     """
@@ -107,7 +107,7 @@ def calibrate(
         points, values = _evolve(space, objective, rng, search, known, report)
         point, best = polish(space, objective, points[np.argmin(values)], search)
         populations.append((points, values))
-        # a polish without success keeps the best of the population
+        # otherwise the best point of the population is kept
         if values.min() < best:
             point, best = points[np.argmin(values)], float(values.min())
         point = space.settled(point)
@@ -142,7 +142,7 @@ def _evolve(
     cut, generation = float(values.max()), [0]
 
     def evaluate(columns: Array) -> Array:
-        # a trial above the worst of the population is never accepted, and need not be run to the end
+        # a trial worse than the whole population is never accepted and need not be run to the end
         return sums(objective.residuals(space.values_of(np.atleast_2d(columns.T)), cut))
 
     def after(intermediate_result: object) -> None:
@@ -169,7 +169,7 @@ def _screened(space: Space, objective: Objective, points: Array, keep: int) -> A
 
 
 def polish(space: Space, objective: Objective, point: Array, search: Search) -> tuple[Array, float]:
-    """Improve a point in its continuous unknowns; return it and its objective."""
+    """Improve a point in its continuous unknowns; return the new point and its objective."""
     from scipy.optimize import least_squares, minimize
 
     free = space.continuous

@@ -1,4 +1,4 @@
-"""A calibration's result for people and files: the fitted scene with its marks, the targets met, the uniqueness."""
+"""The result of a calibration as tables and files: the fitted scene with its marks, the targets met, the uniqueness."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _NOT_NUMBERS: Final = ("sign", "scale", "labels", "law", "rotation")
 
 @dataclass(frozen=True)
 class TargetRow:
-    """One target at the best fit: statistics of its runs, residual, met or not."""
+    """One target at the best fit: statistics of its runs, residual, and whether it is met."""
 
     name: str
     kind: str
@@ -41,7 +41,7 @@ class TargetRow:
 def fitted_scene(scene: Scene, values: Mapping[str, Value], source: str) -> Scene:
     """Return the scene with the fitted values; every number that they change is marked as reconstructed.
 
-    An unchanged number keeps its mark; a number with only a changed sign keeps the source of its size.
+    An unchanged number keeps its mark; a number of which only the sign changed keeps the source of its size.
     """
     fit = with_parameters(scene, values)
     marks = dict(fit.marks)
@@ -104,12 +104,12 @@ class Fit:
     source: str
     identifiability: Identifiability
     clusters: list[Cluster]
-    #: objective of the given scene, None when it lies outside the ranges of the unknowns
+    #: objective of the given scene; None if the scene is outside the ranges of the unknowns
     before: float | None
     targets: list[TargetRow]
 
     def plain(self, space: Space, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Return everything as plain data, for JSON."""
+        """Return all results as plain data for JSON."""
         found = self.calibration
         starts = [
             {key: getattr(start, key) for key in ("number", "objective", "before_polish", "runs", "values")}
@@ -126,7 +126,7 @@ class Fit:
 
 
 def write_fit(fit: Fit, space: Space, arguments: Mapping[str, Any], folder: Path) -> None:
-    """Write fit.yaml (the fitted scene) and calibration.json (everything else)."""
+    """Write fit.yaml (the fitted scene) and calibration.json (all other results)."""
     folder.mkdir(parents=True, exist_ok=True)
     write_whole(folder / "fit.yaml", dump_scene(fit.scene).encode(), sync=True)
     content = json.dumps(fit.plain(space, arguments), indent=1).encode()

@@ -1,4 +1,4 @@
-"""Objectives of a calibration: residuals of a candidate against targets or a recorded motion, as one row."""
+"""Objectives of a calibration: residuals of a candidate from targets or from a recorded motion, as one row."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ Values = Mapping[str, Value]
 
 
 class Objective(Protocol):
-    """The facts of an objective for a calibration."""
+    """The interface of an objective for a calibration."""
 
-    #: runs made so far
+    #: number of runs so far
     runs: int
 
     def residuals(self, candidates: Sequence[Values], cut: float = np.inf) -> Array:
@@ -46,7 +46,7 @@ class TargetObjective:
     runs: int = 0
 
     def __post_init__(self) -> None:
-        # marks of a candidate are never read: without them it is made in a third of the time
+        # the marks of a candidate are never read, and without marks it is made in a third of the time
         self.scene = replace(self.scene, marks={})
 
     def residuals(self, candidates: Sequence[Values], cut: float = np.inf) -> Array:
@@ -109,10 +109,11 @@ class TargetObjective:
 
 @dataclass
 class RecordingObjective:
-    """Distance from a recorded motion: (q - q recorded) / clearance at every row, angles by the half diagonal.
+    """Distance from a recorded motion: (q - q recorded) / clearance at every row.
 
-    The rows are divided by the square root of their number: the objective is the mean square error of x, y and theta
-    together, in clearances of the scene before the fit.
+    Angles are multiplied by the half diagonal. The rows are divided by the square root of their number, so that the
+    objective is the mean square error of x, y and theta together, relative to the clearance of the scene before the
+    fit.
     """
 
     scene: Scene

@@ -1,4 +1,4 @@
-"""Picture of a calibration: fitted motion or figures, and each unknown with its near-optimal values in its range."""
+"""Picture of a calibration: fitted motion or figures, and the near-optimal values of each unknown within its range."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from plow_twin.view.figures import signed, write_png
 from plow_twin.view.fitted import FittedPicture, FittedValue
 from plow_twin.view.fitted_file import write_fit_picture
 
-#: Larger residuals are drawn at this value: failed runs have thousands.
+#: Larger residuals are drawn at this value, because those of failed runs are in the thousands.
 _MOST: Final = 5.0
 
 
 def draw_motion(fit: Fit, space: Space, objective: RecordingObjective, title: str, path: Path) -> None:
-    """Draw the recorded and the fitted motion as a PNG, or for rerun by the suffix .rrd.
+    """Draw the recorded and the fitted motion as a PNG, or for rerun if the suffix is .rrd.
 
     Raises
     ------
@@ -58,7 +58,7 @@ def _value(unknown: Unknown, fit: Fit) -> FittedValue:
 def _notes(fit: Fit, space: Space) -> list[str]:
     """Return objective, starts and choices in words."""
     found = fit.calibration
-    before = "" if fit.before is None else f", of the scene as it stood {fit.before:.3g}"
+    before = "" if fit.before is None else f", before the fit {fit.before:.3g}"
     lines = [f"starts: {len(found.starts)}, objective of the best {found.best.objective:.3g}{before}"]
     chosen = {parameter_words(one.path)[0]: found.best.values[one.path] for one in space.unknowns if one.choices}
     words = [f"{name}: {value if isinstance(value, str) else signed(value, 'g')}" for name, value in chosen.items()]
@@ -66,7 +66,7 @@ def _notes(fit: Fit, space: Space) -> list[str]:
 
 
 def draw_targets(fit: Fit, space: Space, title: str, path: Path) -> None:
-    """Draw the residual of each figure, and the range in which it counts as met, as a PNG.
+    """Draw the residual of each figure, and the range in which the figure is met, as a PNG.
 
     Raises
     ------
@@ -84,13 +84,13 @@ def draw_targets(fit: Fit, space: Space, title: str, path: Path) -> None:
                       va="center", fontsize=7, annotation_clip=False)  # fmt: skip
     axis.set_yticks(range(len(fit.targets)), [target.name for target in fit.targets], fontsize=7)
     axis.set(xlim=(-1.05 * _MOST, 1.05 * _MOST), ylim=(len(fit.targets) - 0.5, -0.5))
-    axis.set_xlabel(f"residual; blue: met, red: not met; beyond ±{_MOST:g} drawn there")
+    axis.set_xlabel(f"residual; blue: met, red: not met; larger values are drawn at ±{_MOST:g}")
     figure.suptitle("\n".join(line for note in (title, *_notes(fit, space)) for line in wrap(note, 120)), fontsize=10)
     write_png(figure, path)
 
 
 def _got_and_asked(target: TargetRow) -> str:
-    """Return the figures of the fit and the published ones, forces in kN."""
+    """Return the figures of the fit and the published figures as text, forces in kN."""
     unit = unit_of(target.statistic)
     factor, shown = (1e-3, " kN") if unit == "N" else (1.0, "" if unit == "1" else f" {unit}")
     got = ", ".join(signed(factor * value, ".4g") for value in target.got)

@@ -1,4 +1,4 @@
-"""A user's own recording of the head's pose, to fit a scene to."""
+"""A recording of the head's pose to which a scene is fitted."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from plow_twin.study.parameters import StudyError
 Array = NDArray[np.float64]
 
 COLUMNS: Final = ("t", "x", "y", "theta")
-#: Most bytes that an archive unpacks to.
+#: Largest unpacked size of an archive [B].
 _LARGEST_ARCHIVE: Final = 2**28
-#: Most rows of a simulated motion between which recorded times are interpolated.
+#: Largest number of rows of a simulated motion, which is interpolated to the recorded times.
 _MOST_ROWS: Final = 20_000
 
 
@@ -34,12 +34,12 @@ class PoseRecording:
     t: Array
     q: Array
     source: str = ""
-    #: the recorded load in place of the scene's
+    #: the recorded load, which replaces the loads of the scene
     load: Table | None = None
 
     @property
     def output_dt(self) -> float:
-        """Distance of the simulated rows in s: as recorded, but at least t_end / 20000."""
+        """Distance of the simulated rows in s: that of the recording, but at least t_end / 20000."""
         end = float(self.t[-1])
         step = float(np.median(np.diff(self.t))) if len(self.t) > 1 else end
         return max(min(step, 0.01), end / _MOST_ROWS)
@@ -67,12 +67,12 @@ class PoseRecording:
 
 
 def load_poses(path: Path) -> PoseRecording:
-    """Read t, x, y, theta of .csv, .parquet or .npz (there q of shape (n, 3) too), or an .mcap of this package.
+    """Read t, x, y, theta from .csv, .parquet or .npz (also t and q, shape (n, 3)), or from an .mcap of this package.
 
     Raises
     ------
     StudyError
-        When the file cannot be read or its rows cannot be used.
+        The file cannot be read, or its rows cannot be used.
     """
     readers: dict[str, Callable[[Path], tuple[Array, Array, Table | None]]]
     readers = {".csv": _read_csv, ".parquet": _read_csv, ".npz": _read_npz, ".mcap": _read_mcap}
@@ -86,7 +86,7 @@ def load_poses(path: Path) -> PoseRecording:
         raise StudyError(str(error)) from None
     except OSError as error:
         raise StudyError(f"{path}: {error.strerror or error}") from None
-    except (ValueError, AttributeError, MemoryError, BadZipFile, EOFError) as error:  # the last: np.load
+    except (ValueError, AttributeError, MemoryError, BadZipFile, EOFError) as error:  # EOFError: np.load
         raise StudyError(f"{path}: {error}") from None
     if t.ndim != 1 or q.shape != (len(t), 3) or len(t) < 2:
         raise StudyError(f"{path}: got t {t.shape} and q {q.shape}, expected (n,) and (n, 3) with n >= 2")

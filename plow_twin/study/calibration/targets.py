@@ -1,15 +1,15 @@
 """Targets of a calibration: published figures, orders and trends, read from YAML.
 
-Each target is one residual r of a candidate, 0 where it is met exactly:
+Each target gives one residual r of a candidate, 0 if it is met exactly:
 
     value              r = (s - value) / (tolerance |value|)                       met: |r| <= 1
     at_least, at_most  r = max(0, shortfall) / scale                               met: r = 0
     above              r = max(0, largest of the others - s) / (tolerance |largest|)          met: r = 0
     trend              r = (steps the wrong way + shortfall of the rise or fall) / (tolerance mean)   met: r = 0
 
-with s the statistic of the run with the target's `set` of parameters (the smallest when several are named). A trend is
-a sequence of runs along one parameter; `rises_then_falls` takes the turn that violates it least. Rise and fall are each
-at least `margin` times the mean. The objective is the sum of weight times r^2.
+where s is the statistic of the run with the target's `set` of parameters (the smallest if several statistics are
+named). A trend is a sequence of runs along one parameter; for `rises_then_falls` the turn with the smallest violation
+is used. Rise and fall must each be at least `margin` times the mean. The objective is the sum of weight times r^2.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from plow_twin.study.statistics import statistic
 Array = NDArray[np.float64]
 
 TRENDS: Final = ("rises", "falls", "rises_then_falls")
-#: Residual of a target whose run failed or was not made.
+#: Residual of a target with a failed or omitted run.
 FAILED_RESIDUAL: Final = 10.0
 _KINDS: Final = ("value", "at_least", "at_most", "above", "trend")
 _KEYS: Final = {
@@ -59,7 +59,7 @@ class Target:
 
     @property
     def paths(self) -> tuple[str, ...]:
-        """Statistics that the target needs of each of its runs."""
+        """Statistics that the target needs from each of its runs."""
         return (*self.statistics, *self.others)
 
     def residual(self, table: Array) -> Array:
@@ -94,20 +94,20 @@ class Target:
 
 
 def _wrong_way(s: Array, least: Array) -> Array:
-    """Return the sum of the downward steps of a sequence that should rise, and its shortfall from the least rise."""
+    """Return the sum of downward steps of a sequence that should rise, plus its shortfall from the smallest rise."""
     down = np.maximum(0.0, -np.diff(s, axis=1)).sum(axis=1)
     return np.asarray(down + np.maximum(0.0, least - (s[:, -1] - s[:, 0])))
 
 
 @dataclass(frozen=True)
 class TargetSet:
-    """Targets and the runs that they refer to."""
+    """Targets and the runs that they need."""
 
     targets: tuple[Target, ...]
     t_end_s: float
     tol: float = 1e-6
     source: str = ""
-    #: unknowns that the file proposes, as on the command line
+    #: unknowns that the file proposes, in the form of the command line
     unknowns: tuple[str, ...] = ()
     settings: tuple[Mapping[str, Value], ...] = field(init=False)
 
@@ -115,7 +115,7 @@ class TargetSet:
         unique: list[Mapping[str, Value]] = []
         for target in self.targets:
             unique += [setting for setting in target.settings if setting not in unique]
-        # most used first: a candidate that fails there needs no further runs
+        # the most used setting first, because a candidate that fails there needs no further runs
         uses = [sum(setting in target.settings for target in self.targets) for setting in unique]
         order = sorted(range(len(unique)), key=lambda index: -uses[index])
         object.__setattr__(self, "settings", tuple(unique[index] for index in order))
@@ -126,7 +126,7 @@ class TargetSet:
         Raises
         ------
         StudyError
-            When a pattern matches no target, or no target is left.
+            A pattern matches no target, or no target is left.
         """
         names = [target.name for target in self.targets]
         for pattern in patterns:
@@ -136,7 +136,7 @@ class TargetSet:
             target for target in self.targets if not any(fnmatchcase(target.name, pattern) for pattern in patterns)
         )
         if not left:
-            raise StudyError(f"without: got {', '.join(map(repr, patterns))}, expected to leave a target")
+            raise StudyError(f"without: got {', '.join(map(repr, patterns))}, expected patterns that leave a target")
         return TargetSet(left, self.t_end_s, self.tol, self.source, self.unknowns)
 
 
@@ -146,7 +146,7 @@ def load_targets(path: Path, scene: Scene) -> TargetSet:
     Raises
     ------
     StudyError
-        When the file cannot be read or used; the error lists every problem.
+        The file cannot be read or used; the error lists every problem.
     """
     raw, found = read_yaml(path, "target", "version, t_end, targets")
     problems = [str(problem) for problem in found]
@@ -187,7 +187,7 @@ def _target(item: Any, scene: Scene) -> Target:
     for name in (*names, *others):
         statistic(scene, name)
     if not names or (kind == "above" and not others):
-        raise StudyError(f"got statistic {item.get('statistic')!r}, expected the path of one or more")
+        raise StudyError(f"got statistic {item.get('statistic')!r}, expected one or more paths of statistics")
     if item.get("mark") not in (None, *(mark.value for mark in Mark)):
         raise StudyError(f"mark: got {item['mark']!r}, expected one of {', '.join(m.value for m in Mark)}")
     numbers = {key: _float(item, key) for key in ("tolerance", "scale", "margin", "weight") if key in item}
@@ -231,7 +231,7 @@ def _float(item: Mapping[str, Any], key: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or (positive and value <= 0.0):
         raise StudyError(f"{key}: got {value!r}, expected a number{' > 0' if positive else ''}")
     if key == "value" and value == 0.0:
-        raise StudyError("value: got 0, expected another number (use at_most: the tolerance is relative)")
+        raise StudyError("value: got 0, expected another number (use at_most, because the tolerance is relative)")
     return float(value)
 
 

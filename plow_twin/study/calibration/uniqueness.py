@@ -17,9 +17,9 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Identifiability:
-    """Singular values of dr/dz at the optimum over the unknowns with a range (z: places 0..1 of their ranges).
+    """Singular values of dr/dz at the optimum, for the unknowns with a range (z: places 0..1 in their ranges).
 
-    `weakest` is the direction of the smallest value: the combination of unknowns that the data determine least.
+    `weakest` is the singular vector of the smallest value, the combination of unknowns that the data determine least.
     """
 
     paths: tuple[str, ...]
@@ -28,18 +28,18 @@ class Identifiability:
 
     @property
     def condition(self) -> float:
-        """Largest over smallest singular value."""
+        """Ratio of the largest to the smallest singular value."""
         return float(np.divide(self.singular_values[0], self.singular_values[-1])) if self.singular_values else 1.0
 
 
 @dataclass(frozen=True)
 class Cluster:
-    """Near-optimal points that agree in every choice and lie close together in the rest."""
+    """Near-optimal points that agree in every choice and are close together in the other unknowns."""
 
     members: int
     objective: float
     values: dict[str, Value]
-    #: by unknown: smallest and largest value among the members
+    #: smallest and largest value of each unknown among the members
     spread: dict[str, tuple[float, float]]
 
 
@@ -50,7 +50,7 @@ def identifiability(space: Space, objective: Objective, point: Array, step: floa
     if free.size == 0:
         return Identifiability((), (), {})
     _, singular, right = np.linalg.svd(jacobian(space, objective, point, step)[:, free], full_matrices=False)
-    # the sign of a singular vector is free: the largest component positive
+    # the sign of a singular vector is arbitrary: make the largest component positive
     weakest = right[-1] * np.sign(right[-1][np.argmax(np.abs(right[-1]))])
     return Identifiability(
         paths, tuple(map(float, singular)), {path: float(x) for path, x in zip(paths, weakest, strict=True)}
@@ -58,10 +58,10 @@ def identifiability(space: Space, objective: Objective, point: Array, step: floa
 
 
 def near_optimal(space: Space, found: Calibration, excess: float, distance: float = 0.1) -> list[Cluster]:
-    """Cluster every point found whose objective exceeds the best by at most `excess`.
+    """Cluster all found points whose objective exceeds the best objective by at most `excess`.
 
-    Points belong together when their choices are equal and no unknown differs by more than `distance` of its range
-    (complete linkage). The clusters come best first.
+    Points are in one cluster if their choices are equal and no unknown differs by more than `distance` of its range
+    (complete linkage). The clusters are sorted, best first.
     """
     points = np.concatenate([[start.point for start in found.starts], found.population])
     values = np.concatenate([[start.objective for start in found.starts], found.population_objective])

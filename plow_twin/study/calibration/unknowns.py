@@ -1,4 +1,4 @@
-"""Unknowns of a calibration and their range: the map between the unit cube and the values of a scene's parameters."""
+"""Unknowns of a calibration: the map between the unit cube and the values of a scene's parameters."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Unknown:
-    """One parameter to find: between `low` and `high` (evenly in its logarithm if `log`), or one of `choices`."""
+    """A parameter to find, between `low` and `high` (uniform in the logarithm if `log`), or one of `choices`."""
 
     path: str
     low: float = 0.0
@@ -43,7 +43,7 @@ class Unknown:
         return float(self.low + (self.high - self.low) * place)
 
     def place(self, value: Value) -> float:
-        """Return the place 0..1 of a value; a choice lies in the middle of its share."""
+        """Return the place 0..1 of a value; the place of a choice is the middle of its share."""
         if self.choices:
             return (self.choices.index(value) + 0.5) / len(self.choices)
         number = float(value)
@@ -61,7 +61,7 @@ def parse_unknown(text: str, scene: Scene) -> Unknown:
     Raises
     ------
     StudyError
-        Names the unknown, the value got and the value expected.
+        The text is not an unknown; the message names the unknown, the value got and the value expected.
     """
     path, equals, rest = text.partition("=")
     check_path(scene, path)
@@ -97,7 +97,7 @@ def _number(path: str, text: str) -> float:
 
 @dataclass(frozen=True)
 class Space:
-    """The unknowns together: a cube of places 0..1."""
+    """The space of all unknowns: a cube of places 0..1."""
 
     unknowns: tuple[Unknown, ...]
 
@@ -113,7 +113,7 @@ class Space:
 
     @property
     def continuous(self) -> NDArray[np.int64]:
-        """Numbers of the unknowns that have a range."""
+        """Indexes of the unknowns that have a range."""
         return np.array([i for i, unknown in enumerate(self.unknowns) if not unknown.choices], dtype=np.int64)
 
     def values(self, point: Array) -> dict[str, Value]:
@@ -125,7 +125,7 @@ class Space:
         return [self.values(point) for point in points]
 
     def point(self, scene: Scene) -> Array | None:
-        """Return the point of a scene, or None when one of its values is outside."""
+        """Return the point of a scene, or None if a value is outside the range of its unknown."""
         places = []
         for unknown in self.unknowns:
             value = parameter_of(scene, unknown.path)
@@ -136,7 +136,7 @@ class Space:
         return np.array(places)
 
     def settled(self, point: Array) -> Array:
-        """Return the point with each choice in the middle of its share, so that equal choices are equal places."""
+        """Return the point with each choice in the middle of its share, so that equal choices have equal places."""
         choices: Sequence[Unknown] = self.unknowns
         return np.array(
             [u.place(u.value(float(x))) if u.choices else float(x) for u, x in zip(choices, point, strict=True)]
@@ -144,7 +144,7 @@ class Space:
 
 
 def check_usable(space: Space, scene: Scene, trials: int = 100) -> None:
-    """Raise the `SceneError` of the first of some random points if all fail."""
+    """Raise the `SceneError` of the first random point if all of `trials` random points fail."""
     points = np.random.default_rng(0).random((trials, space.size))
     if not any(is_usable(scene, values) for values in space.values_of(points)):
         with_parameters(scene, space.values(points[0]))

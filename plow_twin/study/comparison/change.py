@@ -1,4 +1,4 @@
-"""Comparison of groups of windows: distributions, changes with intervals, and the load's share in them."""
+"""Comparison of groups of windows: distributions, changes with intervals, and the load's share in the changes."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from scipy.stats import t as student
 
 Array = NDArray[np.float64]
 
-#: Draws of the bootstrap: the 2.5 % point of an interval is then known to 0.5 % of probability.
+#: Number of bootstrap draws; the 2.5 % point of an interval is then known to 0.5 % of probability.
 _DRAWS: Final = 1000
-#: Smallest number of windows that can separate chance from change.
+#: Smallest number of windows that can distinguish a change from chance.
 FEWEST: Final = 8
-#: Smallest variation of the load within groups, over its mean, that shows how a quantity follows it.
+#: Smallest variation of the load within groups, relative to its mean, that shows how a quantity depends on it.
 _LEAST_VARIATION: Final = 0.01
-#: Loads of two groups that differ by less than this share count as equal.
+#: Loads of two groups that differ by less than this share are treated as equal.
 _EQUAL_LOAD: Final = 0.01
-#: Percentiles between which the loads of two groups must overlap [%]: a slope does not hold far beyond its loads.
+#: Percentiles between which the loads of two groups must overlap [%], because a slope is not valid far from its loads.
 _USUAL: Final = (5.0, 95.0)
 #: Probability below which a change is more than chance.
 _LEVEL: Final = 0.05
-#: Windows drawn at once [windows]: bounds the memory.
+#: Number of windows drawn at once, which bounds the memory.
 _AT_ONCE: Final = 2**21
-#: Means of equal numbers differ by rounding, by less than this share.
+#: Share by which means of equal numbers may differ because of rounding.
 _ROUNDING: Final = 1e-12
-#: A window that starts within this many lengths counts as the next one.
+#: A window that starts within this many window lengths is the next window.
 _NEXT: Final = 1.5
 
 
@@ -41,11 +41,11 @@ class Change:
     share, low, high : float
         The change and its 95 % interval.
     chance : float
-        Probability of such a change by chance, adjusted for the number of cells judged together (Benjamini and
-        Hochberg): of the cells below 0.05, one in twenty is there by chance.
+        Probability of such a change by chance, adjusted for the number of cells that are judged together (Benjamini and
+        Hochberg): one in twenty of the cells below 0.05 is there by chance.
     machine, machine_low, machine_high, machine_chance : float or None
-        The same at equal load; None where the load varies too little to show how the quantity follows it, or where the
-        loads of the groups do not overlap.
+        The same numbers at equal load; None if the load varies too little to show how the quantity depends on it, or if
+        the loads of the groups do not overlap.
     """
 
     share: float
@@ -76,9 +76,9 @@ def points(values: Array) -> dict[str, float]:
 def with_neighbours(load: Array, start_ns: NDArray[np.int64]) -> Array:
     """Return the load of each window, of the window before and of the window after, shape (n, 3).
 
-    Where a neighbour is missing, the window's own load takes its place. A window cuts through changes of the load,
-    and the head's motion remembers the load before: the slope over a window's own load alone is not the effect of a
-    lasting change, the sum of the slopes over all three is.
+    A missing neighbour has the window's own load. A window cuts through changes of the load, and the head's motion
+    still depends on the previous load. Therefore the effect of a lasting change is not the slope over a window's own
+    load, but the sum of the slopes over all three loads.
     """
     steps = np.diff(start_ns)
     joined = (steps > 0) & (steps < _NEXT * np.median(steps)) if len(steps) else steps > 0
@@ -88,25 +88,25 @@ def with_neighbours(load: Array, start_ns: NDArray[np.int64]) -> Array:
 
 
 class Drawn:
-    """Moments of a group: of its windows, then of each draw from them.
+    """Moments of a group: of all its windows in the first row, then of each draw from the windows.
 
     Parameters
     ----------
     values
         Quantities of the windows, shape (n, k).
     load
-        Their load, shape (n,), or as of `with_neighbours`, shape (n, 3).
+        Load of the windows, shape (n,), or the loads of `with_neighbours`, shape (n, 3).
     random
-        Source of the draws.
-    draws
-        Their number.
+        Generator of the draws.
+        draws
+            Number of draws.
 
     Attributes
     ----------
     usual : ndarray, shape (2,)
-        Points of the loads between which most lie.
-    size : int
-        Windows of a draw.
+        Smallest and largest usual load (`_USUAL`).
+        size : int
+            Number of windows in a draw.
     mean : ndarray, shape (draws + 1, k)
         Means of the quantities.
     load : ndarray, shape (draws + 1, m)
@@ -124,7 +124,7 @@ class Drawn:
         centred = whole - usual
         means, products = [np.zeros((1, whole.shape[1]))], [centred[:, :width].T @ centred / self.size]
         done = 0
-        while done < draws:  # as many at a time as fit into the memory
+        while done < draws:  # as many draws at a time as the memory allows
             count = min(draws - done, max(1, _AT_ONCE // self.size))
             done += count
             times = np.stack(
@@ -140,10 +140,10 @@ class Drawn:
 
 
 def changes(before: Drawn, after: Drawn) -> list[Change | None]:
-    """Return the changes of quantities between two groups of windows, None where there are too few windows.
+    """Return the changes of quantities between two groups of windows, None if there are too few windows.
 
-    Means are compared by a bootstrap over windows. At equal load the part that follows the load is subtracted, by the
-    slopes over the load's variation within the groups (analysis of covariance).
+    Means are compared by a bootstrap over windows. At equal load, the part that depends on the load is subtracted, with
+    the slopes over the load's variation within the groups (analysis of covariance).
 
     References
     ----------
@@ -169,9 +169,9 @@ def changes(before: Drawn, after: Drawn) -> list[Change | None]:
 
 
 def _tested(differences: Array, mean: Array, fewest: int) -> tuple[Array, Array, Array, Array]:
-    """Return share, low, high and adjusted chance of each difference; the first row is the value, the others draws.
+    """Return share, low, high and adjusted chance of each difference; the first row is the value, the others are draws.
 
-    Student's t with the degrees of freedom of the smaller group errs on the side of chance.
+    Student's t with the degrees of freedom of the smaller group gives too large rather than too small chances.
     """
     drawn = np.divide(differences, mean, out=np.full_like(mean, np.nan), where=mean > 0.0)
     low, high = np.nanpercentile(drawn[1:], (2.5, 97.5), axis=0)
@@ -190,7 +190,7 @@ def _apart(before: Drawn, after: Drawn) -> bool:
 
 
 def _at_equal_load(before: Drawn, after: Drawn) -> Array:
-    """Return the differences of the means at the first group's load, NaN where the load hardly varies."""
+    """Return the differences of the means at the first group's load, NaN if the load hardly varies."""
     usual, difference = before.load[:, 0], after.load - before.load
     changed = np.abs(difference[:, 0]) >= _EQUAL_LOAD * usual
     width, size = difference.shape[1], before.size + after.size

@@ -19,33 +19,33 @@ from plow_twin.study.comparison.windows import FULL, QUANTITIES, Windows, window
 
 #: Stamps before this [ns] are not dates: 1e18 ns is in the year 2001.
 _DATES_NS: Final = 10**18
-#: Share of a window that may be without messages: rates that differ by less count as equal.
+#: Share of a window that may be without messages; rates that differ by less are treated as equal.
 _MISSING: Final = 1.0 - FULL
-#: Default begins of the shifts.
+#: Default start times of the shifts.
 SHIFTS: Final = (time(6), time(14), time(22))
 
-#: Returns the label of the group that a window belongs to, by the run's name and the window's stamp.
+#: Function that returns the label of a window's group, given the run's name and the window's stamp [ns].
 Label = Callable[[str, int], str]
 
 
 @dataclass
 class Comparison:
-    """Groups of windows in order of their labels' first appearance, and the change from the first to every other group.
+    """Groups of windows in order of first appearance, and the change from the first group to every other group.
 
     Attributes
     ----------
     groups : dict of str to Windows
         All windows of a group.
     runs : dict of str to list of str
-        Runs that have windows in a group.
+        Runs with windows in each group.
     changes : dict
-        By group (but the first), pair and quantity: `Change`, or None where there are too few windows.
+        `Change` by group (except the first), pair and quantity; None if there are too few windows.
     clearance_changes : dict
-        By group (but the first), horizontal and vertical: the same.
+        `Change` by group (except the first) and by horizontal and vertical, likewise.
     scenes : list of str
         Names of the scenes of all runs.
     notes : list of str
-        Doubts about the runs: stretches without samples, times that several runs have, sample rates that differ.
+        Doubts about the runs: stretches without samples, times that several runs cover, different sample rates.
     """
 
     groups: dict[str, Windows]
@@ -108,14 +108,14 @@ def by_time(kind: str, shifts: Sequence[time] = SHIFTS, zone: tzinfo = UTC) -> L
     kind
         `day` or `shift`.
     shifts
-        Begins of the shifts.
-    zone
-        The zone of days and shifts.
+        Times at which shifts begin.
+        zone
+            Time zone of days and shifts.
 
     Raises
     ------
     RecordingError
-        By the labels: the stamps are not dates.
+        Raised by the returned function if a stamp is not a date.
     """
     begins = sorted(shifts)
 
@@ -126,7 +126,7 @@ def by_time(kind: str, shifts: Sequence[time] = SHIFTS, zone: tzinfo = UTC) -> L
         if kind == "day":
             return at.strftime("%Y-%m-%d")
         before = [begin for begin in begins if begin <= at.time()]
-        if not before:  # the last shift of the day before
+        if not before:  # the last shift of the previous day
             return f"{(at - timedelta(days=1)).strftime('%Y-%m-%d')} {begins[-1].strftime('%H:%M')}"
         return f"{at.strftime('%Y-%m-%d')} {before[-1].strftime('%H:%M')}"
 
@@ -146,9 +146,9 @@ def compare(
     runs
         Name and windows of each run, in order of time.
     label
-        Names the group of a window.
+        Function that returns the group of a window.
     seed
-        Of the draws of the bootstrap.
+        Seed of the bootstrap draws.
     scenes
         Name and contents of each run's scene.
 
@@ -163,7 +163,7 @@ def compare(
     runs = list(runs)
     for name, windows in runs:
         if windows.silent:
-            notes.append(f"{name}: {windows.silent} windows left out: a stretch without samples is in them")
+            notes.append(f"{name}: {windows.silent} windows with a stretch without samples were left out")
         labels = np.array([label(name, stamp) for stamp in windows.start_ns.tolist()])
         for group in dict.fromkeys(labels.tolist()):
             chosen = windows.chosen(labels == group)
@@ -200,22 +200,22 @@ def _cells(windows: Windows) -> np.ndarray[Any, Any]:
 
 
 def _overlapping(windows: Windows, others: Windows) -> np.ndarray[Any, Any]:
-    """Return which windows share time with one of the others."""
+    """Return a mask of the windows that overlap in time with a window of `others`."""
     if not len(others.start_ns):
         return np.zeros(len(windows.start_ns), bool)
     order = np.argsort(others.start_ns)
     (begins, ends), (starts, stops) = (
-        # messages that a window surely has
+        # the range of stamps in which a window certainly has messages
         ((part.start_ns + _MISSING * part.length_ns), (part.start_ns + FULL * part.length_ns))
         for part in (windows, others)
     )
     starts, stops = starts[order], stops[order]
-    before = np.searchsorted(starts, ends) - 1  # the newest other window that begins before a window's end
+    before = np.searchsorted(starts, ends) - 1  # the last other window that begins before a window's end
     return np.asarray((before >= 0) & (stops[before] > begins))
 
 
 def _rates_apart(runs: Sequence[tuple[str, Windows]]) -> list[str]:
-    """Name the sample rates of the runs where they differ."""
+    """Return a note with the sample rates of the runs if they differ."""
     rates = {name: float(windows.rate_hz.mean()) for name, windows in runs if len(windows.rate_hz)}
     if not rates or min(rates.values()) >= FULL * max(rates.values()):
         return []
@@ -224,26 +224,26 @@ def _rates_apart(runs: Sequence[tuple[str, Windows]]) -> list[str]:
 
 
 def _scenes_apart(scenes: Mapping[str, tuple[str, str]]) -> list[str]:
-    """Name the scenes of the runs where their contents differ."""
+    """Return a note with the scenes of the runs if their contents differ."""
     if len({contents for _, contents in scenes.values()}) < 2:
         return []
     found = ", ".join(f"{run} {name or 'without a name'}" for run, (name, _) in scenes.items())
-    return [f"the runs have different scenes, so a change of the machine may be that of its description: {found}"]
+    return [f"the runs have different scenes, so a change of the machine may be a change of its description: {found}"]
 
 
 @dataclass(frozen=True)
 class WindowsTask:
-    """The windows of one run, for a process of its own."""
+    """The windows of one run, as a task that another process can run."""
 
     path: Path
     window_s: float | None = None
 
     def stored(self) -> dict[str, Any] | None:
-        """Return nothing: windows are not kept."""
+        """Return None, because windows are not stored."""
         return None
 
     def run(self) -> dict[str, Any]:
-        """Return the windows (`windows`), the run's losses (`lost`), name and contents of its scene (`scene`).
+        """Return the windows (`windows`), the run's losses (`lost`), and the name and contents of its scene (`scene`).
 
         Raises
         ------

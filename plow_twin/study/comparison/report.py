@@ -1,4 +1,4 @@
-"""A comparison as files: one HTML page that needs no other file, `compare.json`, and the windows as Parquet."""
+"""A comparison as files: a self-contained HTML page, `compare.json`, and the windows as Parquet."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from plow_twin.view.section import PAIR_COLORS
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: Groups whose boxes can be told apart; names that have room beside each other, and their length: that of a date.
+#: Largest number of groups drawn as boxes; largest number of names side by side, which have the length of a date.
 _MOST_BOXES: Final = 6
 _MOST_LABELS: Final = 12
 _WIDEST: Final = 10
@@ -75,7 +75,7 @@ def _figure(found: Comparison) -> Figure:
 
 
 def _lines(axis: Any, found: Comparison) -> None:
-    """Draw the median and the 95 % point of each pair's peaks over the groups; so many boxes would overlap."""
+    """Draw lines of the median and the 95 % point of each pair's peaks over many groups, whose boxes would overlap."""
     peaks = [windows.pairs["peak"] / 1e3 for windows in found.groups.values()]
     places = np.arange(len(peaks))
     median, high = (np.array([np.percentile(values, point, axis=0) for values in peaks]) for point in (50.0, 95.0))
@@ -84,7 +84,7 @@ def _lines(axis: Any, found: Comparison) -> None:
         axis.plot(places, median[:, pair], color=color, label=name)
         axis.plot(places, high[:, pair], color=color, ls=":", lw=1.0)
     shown = places[:: 1 + len(places) // _MOST_LABELS]
-    names = [list(found.groups)[place].replace(" ", "\n") for place in shown]  # a shift has date and time
+    names = [list(found.groups)[place].replace(" ", "\n") for place in shown]  # a shift has date and time, on two lines
     slanted = max(len(line) for name in names for line in name.split("\n")) > _WIDEST
     axis.set_xticks(shown, names, rotation=30 if slanted else 0, ha="right" if slanted else "center", fontsize=8)
     axis.set_ylim(bottom=0.0)
@@ -93,7 +93,7 @@ def _lines(axis: Any, found: Comparison) -> None:
 
 
 def _title(found: Comparison) -> str:
-    """Return the scenes, and the dates of the first and the last window where their stamps are dates."""
+    """Return the scenes and, if stamps are dates, the dates of the first and the last window."""
     starts = np.concatenate([windows.start_ns for windows in found.groups.values()])
     first, last = date_text(int(starts.min())), date_text(int(starts.max()))
     span = f"{first} to {last}" if first else f"drawn {datetime.now(UTC):%Y-%m-%d}"
@@ -102,7 +102,7 @@ def _title(found: Comparison) -> str:
 
 
 def _write_windows(found: Comparison, path: Path) -> None:
-    """Write a row group for each group, so that only one group is in memory twice."""
+    """Write a row group for each group of windows, so that only one group is copied in memory at a time."""
     import pyarrow as pa
     import pyarrow.parquet
 

@@ -1,4 +1,4 @@
-"""A run as windows of about a load period: the load, and quantities of each pair."""
+"""Windows of a run, each about a load period long, with the load and the quantities of each pair."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ QUANTITIES: Final[Mapping[str, str]] = {
     "dissipation": "W",
     "wear": "m/h",
 }
-#: Span of the load in which a period is looked for [s].
+#: Span of the load in which a period is searched [s].
 _PERIOD_SPAN_S: Final = 60.0
-#: Length of a window where the load has no period [s].
+#: Length of a window if the load has no period [s].
 _NO_PERIOD_S: Final = 10.0
-#: Smallest share of a full window's messages; a window with fewer messages is left out: an end or a gap cuts it.
+#: Smallest share of a full window's messages; a window with fewer messages, cut by an end or a gap, is left out.
 FULL: Final = 0.9
 _PADS: Final = np.array([CLEARANCE_NAMES.index(name) for name in PAD_NAMES])
 _TOTALS: Final = np.array([CLEARANCE_NAMES.index(name) for name in ("horizontal", "vertical")])
@@ -40,25 +40,25 @@ _TOTALS: Final = np.array([CLEARANCE_NAMES.index(name) for name in ("horizontal"
 
 @dataclass
 class Windows:
-    """Windows of a run, n of them.
+    """The n windows of a run.
 
     Attributes
     ----------
     start_ns : ndarray, shape (n,)
-        Their first stamps [ns].
+        First stamp of each window [ns].
     pairs : dict of str to ndarray, shape (n, 8)
-        `QUANTITIES`: largest force, impacts a minute, share of samples in contact, impulse and dissipated energy a
-        second, wear an hour.
+        `QUANTITIES`: largest force, impacts per minute, share of samples in contact, impulse and dissipated energy per
+        second, wear per hour.
     load : ndarray, shape (n, 2)
         Root mean square of the force [N] and of the moment [N m] of the load.
     clearance : ndarray, shape (n, 2)
         Horizontal and vertical clearance [m].
     length_ns : ndarray, shape (n,)
-        Their lengths [ns].
+        Length of each window [ns].
     rate_hz : ndarray, shape (n,)
-        Samples of the load a second.
+        Sample rate of the load [Hz].
     silent : int
-        Windows left out because of a stretch without samples.
+        Number of windows left out because of a stretch without samples.
     """
 
     start_ns: Indexes
@@ -70,7 +70,7 @@ class Windows:
     silent: int = 0
 
     def chosen(self, which: NDArray[np.bool_]) -> Windows:
-        """Return some of the windows, by a mask (n,); all of them without a copy."""
+        """Return the windows of a mask, shape (n,); if it selects all, without a copy."""
         if which.all():
             return self
         return Windows(
@@ -84,7 +84,7 @@ class Windows:
 
     @classmethod
     def joined(cls, parts: Sequence[Windows]) -> Windows:
-        """Return the windows of several runs as one; those of one run without a copy."""
+        """Return the joined windows of several runs; a single run is not copied."""
         if len(parts) == 1:
             return parts[0]
         return cls(
@@ -99,13 +99,13 @@ class Windows:
 
 @dataclass
 class _Sums:
-    """Sums over the messages of each window, by the window's number."""
+    """Sums over the messages of each window, by window number."""
 
     width: int
     rows: dict[int, Array] = field(default_factory=dict)
 
     def add(self, window: Indexes, values: Array, reduce: Any = np.add) -> None:
-        """Add values (n, width) of windows (n,), whose numbers do not fall."""
+        """Add values, shape (n, width), of the windows numbered `window`, shape (n,), never falling."""
         if not len(window):
             return
         first = np.flatnonzero(np.r_[True, np.diff(window) != 0])
@@ -113,7 +113,7 @@ class _Sums:
             self.rows[number] = reduce(self.rows[number], value) if number in self.rows else value
 
     def of(self, numbers: list[int]) -> Array:
-        """Return the sums of some windows, zero where there are no values."""
+        """Return the sums of the windows `numbers`, zero for a window without values."""
         return np.array([self.rows.get(number, np.zeros(self.width)) for number in numbers]).reshape(-1, self.width)
 
 
@@ -125,12 +125,12 @@ def windows_of(recording: Recording, window_s: float | None = None) -> Windows:
     recording
         The run.
     window_s
-        Length of a window [s]; by default the period of the load, or 10 s where it has none.
+        Length of a window [s]; by default the period of the load, or 10 s if it has no period.
 
     Raises
     ------
     RecordingError
-        It is not a run of plow_twin, has no outputs, or each window has a stretch without samples.
+        The recording is not a run of plow_twin or has no outputs, or each window has a stretch without samples.
     """
     window_ns = round(1e9 * (window_s or _load_period(recording)))
     peak, moved, contact, load = _Sums(PAIR_COUNT), _Sums(2 * PAIR_COUNT), _Sums(2 * PAIR_COUNT + 1), _Sums(3)
@@ -177,7 +177,7 @@ def windows_of(recording: Recording, window_s: float | None = None) -> Windows:
                 f"{recording.path}: got no {name}, expected a run with outputs: plow-twin replay --write"
             )
     full = FULL * float(np.median([row[0] for row in messages.rows.values()]))
-    # the messages at the end of a silence are of the whole silence
+    # the messages at the end of a silence cover the whole silence
     known, silent = np.array(sorted(messages.rows)), set[int]()
     for begin, end in silent_ns:
         first, last = np.searchsorted(known, begin // window_ns), np.searchsorted(known, end // window_ns, side="right")
@@ -185,8 +185,8 @@ def windows_of(recording: Recording, window_s: float | None = None) -> Windows:
     numbers = sorted(number for number, row in messages.rows.items() if row[0] >= full and number not in silent)
     if not numbers:
         raise RecordingError(
-            f"{recording.path}: got a stretch without samples in each window, expected some without: "
-            "excitation_timeout is the longest time between samples that is none"
+            f"{recording.path}: got a stretch without samples in each window, expected windows without: "
+            "excitation_timeout is the longest time between samples that is not such a stretch"
         )
     seconds = window_ns * 1e-9
     sums, touched = moved.of(numbers), contact.of(numbers)
@@ -211,20 +211,20 @@ def windows_of(recording: Recording, window_s: float | None = None) -> Windows:
 
 
 def _between(sums: _Sums, count: _Sums, numbers: list[int]) -> Array:
-    """Return the means of some windows; a window without a message has those between its neighbours'."""
+    """Return the means of windows; a window without a message gets interpolated means."""
     known = sorted(sums.rows)
     means = sums.of(known) / count.of(known)
     return np.column_stack([np.interp(numbers, known, column) for column in means.T])
 
 
 def _risen(part: Batched, window: Indexes) -> tuple[Batched, Indexes]:
-    """Return rows in order of their stamps: late samples and steps of the clock bring older stamps."""
+    """Return rows in order of their stamps, because late samples and steps of the clock have older stamps."""
     order = np.argsort(part.stamp_ns, kind="stable")
     return Batched(part.stamp_ns[order], part.values[order]), window[order]
 
 
 def _powers(part: Batched, newest: tuple[Indexes, Array] | None) -> tuple[Indexes, Array, Array]:
-    """Return stamps, power into each contact [W] and whether it carries force, with the newest row before first."""
+    """Return stamps, power into each contact [W] and whether it has force; `newest`, the row before, is put first."""
     stamps, values = part.stamp_ns, part.values
     if newest is not None and newest[0][0] < stamps[0]:
         stamps, values = np.concatenate((newest[0], stamps)), np.concatenate((newest[1], values))

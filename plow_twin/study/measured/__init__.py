@@ -1,4 +1,4 @@
-"""Bodies that others have measured, compared with the contact model: impacts of an ellipse, drops of a square.
+"""Comparison of the contact model with published measurements: impacts of an ellipse, drops of a square.
 
 Data: Fazeli and others, in DAIRLab/ImpactModeling (BSD-3-Clause); `docs/measured.md`.
 """

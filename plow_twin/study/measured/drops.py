@@ -1,4 +1,4 @@
-"""Measured drops: end of the first flight, bounces, and errors of bands and motions."""
+"""Measured drops of the square: end of the first flight, bounces, and check of the predicted bands."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ Array = NDArray[np.float64]
 
 #: Half the side of the square in m.
 _HALF: Final = 0.03
-#: An impact: deviation of the accelerations of z [m/s^2] and theta [rad/s^2] from a flight, and largest gap [m].
+#: Criteria of an impact: fall [m/s^2], deviation of the accelerations of z [m/s^2] and theta [rad/s^2] from a flight,
+#: and largest gap [m].
 _FALL, _JERK, _TWIST, _NEAR = 9.0, 9.0, 300.0, 0.03
 #: Smallest rise in m between two separate bounces.
 _RISE: Final = 0.003
@@ -30,9 +31,9 @@ class Drops:
     pose : ndarray, shape (n, rows, 3)
         x, z [m] and unwrapped theta [rad] at 250 Hz.
     flight_rows : ndarray, shape (n,)
-        Rows before the first impact.
-    bounces : tuple of tuple of int
-        Rows at which each drop is lowest, between rises of 3 mm.
+        Number of rows before the first impact.
+        bounces : tuple of tuple of int
+        Rows of each drop at which it is lowest between rises of 3 mm.
     """
 
     pose: Array
@@ -63,7 +64,7 @@ class Drops:
         return self.bounces[index][min(bounce, len(self.bounces[index]) - 1)]
 
     def inside(self, index: int, bounce: int = 2) -> NDArray[np.bool_]:
-        """Return which measured x, z, theta lie in their 90 % bands, shape (rows, 3), up to a bounce."""
+        """Return whether measured x, z and theta are in their 90 % bands, shape (rows, 3), up to a bounce."""
         rows = self.until(index, bounce) + 1
         points = bands(self.pose[index, : self.flight_rows[index]], rows)
         found: NDArray[np.bool_] = (self.pose[index, :rows] >= points[:, 0]) & (self.pose[index, :rows] <= points[:, 2])

@@ -21,14 +21,14 @@ Array = NDArray[np.float64]
 #: Semi-axes and radius of gyration in m.
 SEMI_AXES: Final = (0.035, 0.025)
 GYRATION: Final = 0.0192
-#: Stiffness per mass in 1/s^2: as place and arms are constant during an impact, it sets only the duration.
+#: Stiffness per mass in 1/s^2; it affects only the duration, because place and arms are constant during an impact.
 _STIFFNESS: Final = 1e9
-#: Speed in m/s of approach at which restitutions are given: the middle of the measured speeds.
+#: Speed of approach in m/s for which restitutions are given, the middle of the measured speeds.
 USUAL_SPEED: Final = 2.5
 _LEAST, _LARGEST = 0.05, 0.98
-#: Bound: rate in m/s or rad/s that no measured body has.
+#: Upper bound for rates in m/s or rad/s, which no measured body reaches.
 _FASTEST: Final = 1e4
-#: Gap in m at which a whole impact starts, and time in s in which it is over: 13 half periods of the contact.
+#: Gap in m at which a simulated impact starts, and time in s after which it is over: 13 half periods of the contact.
 _GAP, _WHOLE = 1e-9, 40.0 / _STIFFNESS**0.5
 
 
@@ -43,22 +43,22 @@ class EllipseContact:
     exponent : float
         n in F = K d^n.
     restitution : float
-        Restitution of an impact at 2.5 m/s without motion along the surface; for a law without restitution its damping
-        number lambda v0, or C over the critical damping.
+        Restitution of an impact at 2.5 m/s without motion along the surface. For a law without restitution: its damping
+        number lambda v0, or C relative to the critical damping.
     fall : float
-        Power q by which it falls with the speed of approach v, (v / 2.5 m/s)^-q.
+        Exponent q of the fall of the restitution with the speed of approach v, (v / 2.5 m/s)^-q.
     fall_along : float
-        Its fall with the speed of the centre of mass along the surface, in s/m.
+        Fall of the restitution with the speed of the centre of mass along the surface, in s/m.
     friction : float
-        mu.
+        Coefficient of friction mu.
     slip_speed : float
         Regularisation speed in m/s; 0 for a tangential spring.
     stick_stiffness : float
-        Tangential stiffness over the normal one.
+        Ratio of tangential to normal stiffness.
     stick_damping : float
-        Tangential damping over the critical one.
+        Tangential damping relative to the critical damping.
     tilt : float
-        Angle in rad by which the surface is turned against the axes of the data.
+        Angle in rad of the surface relative to the axes of the data.
     """
 
     law: str = "exact_restitution"
@@ -73,12 +73,12 @@ class EllipseContact:
     tilt: float = -0.0131
 
 
-#: Fitted to the impacts with odd numbers.
+#: Contact fitted to the impacts with odd numbers.
 ELLIPSE: Final = EllipseContact()
 
 
 def contact_arms(theta: Array) -> tuple[Array, Array]:
-    """Return the place of the lowest point from the centre along and away from the surface in m, shape (n,) each.
+    """Return the place in m of the lowest point from the centre, along and away from the surface, shape (n,) each.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ def contact_arms(theta: Array) -> tuple[Array, Array]:
 
 
 def impact(before: ArrayLike, contact: EllipseContact = ELLIPSE) -> Array:
-    """Return the state of the ellipse after an impact from the state before.
+    """Return the states of the ellipse after impacts, given the states before.
 
     Parameters
     ----------
@@ -100,18 +100,18 @@ def impact(before: ArrayLike, contact: EllipseContact = ELLIPSE) -> Array:
         x, y [m], theta [rad], vx, vy [m/s], omega [rad/s] as measured: y away from the surface; theta and x as in the
         data, where a positive theta turns y towards x.
     contact : EllipseContact
-        Numbers of the contact; the fitted ones unless given.
+        Numbers of the contact; by default the fitted numbers.
 
     Returns
     -------
     ndarray, shape (n, 6)
-        x, y, theta as before, and the velocities after the impact. A point that does not approach the surface is left
-        as it is.
+        x, y, theta as before, and the velocities after the impact. The state is unchanged if the lowest point does not
+        approach the surface.
 
     Raises
     ------
     ArgumentError
-        For another shape, numbers that are not finite, or a law that is not known.
+        The shape is wrong, a number is not finite, or the law is unknown.
     """
     states = _states(before)
     if contact.law not in LAWS:
@@ -152,9 +152,9 @@ def _states(before: ArrayLike) -> Array:
 
 
 def _to_surface(x: Array, y: Array, tilt: float) -> tuple[Array, Array]:
-    """Resolve vectors in the data's axes along the surface and away from it; the map is its own inverse.
+    """Resolve vectors in the axes of the data into components along and away from the surface.
 
-    The data's x runs against the sense in which theta is counter-clockwise.
+    The map is its own inverse. The x axis of the data is reversed, so that its theta is counter-clockwise otherwise.
     """
     c, s = np.cos(tilt), np.sin(tilt)
     return s * y - c * x, s * x + c * y
@@ -171,12 +171,12 @@ def impact_scene(before: ArrayLike) -> Scene:
     Parameters
     ----------
     before : array_like, shape (6,)
-        As a row of `impact`.
+        A row as for `impact`.
 
     Raises
     ------
     ArgumentError
-        As `impact`.
+        As for `impact`.
     """
     state = _states(np.asarray(before)[None])[0]
     along, up = (float(rate[0]) for rate in _to_surface(state[3:4], state[4:5], ELLIPSE.tilt))
@@ -189,7 +189,7 @@ def impact_scene(before: ArrayLike) -> Scene:
 
 
 def simulated_impact(before: ArrayLike) -> Array:
-    """Return the states after impacts as `impact` does, each from a whole motion by the preset `measured_ellipse`.
+    """Return the states after impacts like `impact`, each by a full simulation of the preset `measured_ellipse`.
 
     Parameters
     ----------
@@ -205,7 +205,7 @@ def simulated_impact(before: ArrayLike) -> Array:
         scene = impact_scene(state)
         motion = simulate(scene, t_end=_WHOLE, output_dt=_WHOLE)
         (vx, vy, omega), theta = motion.v[-1], motion.q[-1, 2]
-        # the offset of the centre of mass is half a metre and has turned during the impact
+        # the offset of the centre of mass is half a metre, so its turning during the impact matters
         x, y = scene.head.com_offset_m
         c, s = np.cos(theta), np.sin(theta)
         state[3:5] = _to_surface(vx - omega * (s * x + c * y), vy + omega * (c * x - s * y), ELLIPSE.tilt)
@@ -214,7 +214,7 @@ def simulated_impact(before: ArrayLike) -> Array:
 
 
 def _numbers(contact: EllipseContact, speed: Array, along: Array, normal_arm: Array) -> tuple[Array, NDArray[np.void]]:
-    """Return lambda of each impact in s/m, and the numbers common to all."""
+    """Return lambda of each impact in s/m, and the numbers that all impacts share."""
     law, wanted = LAWS[contact.law], contact.restitution
     e = np.clip(wanted * (speed / USUAL_SPEED) ** -contact.fall - contact.fall_along * np.abs(along), _LEAST, _LARGEST)
     viscous, damping = 0.0, np.zeros_like(speed)

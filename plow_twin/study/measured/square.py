@@ -1,4 +1,4 @@
-"""Drops of a square block: its first flight fitted, and bands of the later motion from a batch of blocks."""
+"""Drops of a square block: fit of the first flight, and bands of the later motion from a batch of blocks."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from plow_twin.solve.rounded_block import BLOCK, toss_blocks
 
 Array = NDArray[np.float64]
 
-#: Rate of the rows in Hz.
+#: Rate of the measured rows in Hz.
 RATE_HZ: Final = 250.0
 _DT: Final = 1.0 / RATE_HZ
-#: Steps of the table of damping numbers.
+#: Number of steps in the table of damping numbers.
 _NUMBERS: Final = 1000
-#: Number of touches of a motion with a scatter of their own.
+#: Number of touches of a motion that each have their own scatter.
 _TOUCHES: Final = 64
-#: Additional turn in rad within a row that only an impact causes.
+#: Change of the turn from row to row in rad that only an impact causes.
 _TURN_IN_A_ROW: Final = 0.1
-#: Fewest rows of a first flight, for its speeds.
+#: Smallest number of rows of a first flight, from which its speeds are fitted.
 LEAST_ROWS: Final = 4
-#: Bound: most rows of bands, 4 s; a block rests after one. Speed in m/s that no drop has.
+#: Largest number of rows of bands, 4 s (a block rests after 1 s), and speed in m/s that no drop reaches.
 _MOST_ROWS, _FASTEST = 1000, 100.0
 
 #: Fitted to drops with odd numbers.
@@ -39,15 +39,15 @@ SQUARE: Final = np.array(
 class Marker:
     """The tracked frame on the block, whose pose the sensor measures.
 
-    At rest the block lies flat and its tracked angle is 33 mrad less, in 242 of 250 drops; heights at rest differ with
-    the side that it lies on.
+    In 242 of 250 drops the block lies flat at rest while its tracked angle is 33 mrad less. The tracked height at rest
+    depends on the side on which the block lies.
 
     Attributes
     ----------
     turn : float
-        Measured minus true angle [rad].
+        Measured minus true angle of the block [rad].
     lever : tuple of 2 float
-        From the block's centre to the tracked point, in the block's axes [m].
+        Vector from the block's centre to the tracked point, in the block's axes [m].
     """
 
     turn: float = 0.0
@@ -82,22 +82,22 @@ MARKER: Final = Marker(-0.0308, (2.3e-4, 5.2e-4))
 
 @dataclass(frozen=True)
 class Scatter:
-    """Scatter beyond the parameters, as standard deviations.
+    """Scatter in addition to the parameters, as standard deviations.
 
     Attributes
     ----------
     restitution, friction : float
-        Of the restitution of each touch [1]; of the logarithm of its friction.
+        Scatter of the restitution of each touch [1], and of the logarithm of its friction.
     table, spin : float
-        Of the table's height from drop to drop [m]; of the rate of turning that the flight shows [rad/s].
+        Scatter of the table's height from drop to drop [m], and of the fitted rate of turning [rad/s].
     speed : float
-        Of the speed that the flight shows [m/s].
+        Scatter of the fitted speed [m/s].
     place, angle : float
-        Of a measured row [m], [rad].
+        Scatter of a measured row [m], [rad].
     shift : float
-        Of the place where the force of a touch acts, along the table [m].
+        Scatter of the place along the table where the force of a touch acts [m].
     drag : float
-        Of the logarithm of a drop's drag.
+        Scatter of the logarithm of a drop's drag.
     """
 
     restitution: float = 0.065
@@ -129,11 +129,11 @@ def toss(initial: Array, n_rows: int, blocks: NDArray[np.void], scatter: Array |
     initial : ndarray, shape (m, 6)
         x, z [m], theta [rad] and their rates.
     n_rows : int
-        Rows at 250 Hz, the first at the start.
+        Number of rows at 250 Hz; the first row is the start.
     blocks : ndarray of `solve.rounded_block.BLOCK`, shape (m,)
         Numbers of each block.
     scatter : ndarray, shape (m, touches, 3), optional
-        Of each touch (`solve.rounded_block.toss_blocks`); nothing unless given.
+        Scatter of each touch (`solve.rounded_block.toss_blocks`); by default no scatter.
 
     Returns
     -------
@@ -155,9 +155,9 @@ class Flight:
     state : ndarray, shape (6,)
         x, z, theta and their rates at the last row.
     covariance : ndarray, shape (3, 2, 2)
-        Of place and rate of x, z, theta there.
+        Covariance of place and rate at the last row, for each of x, z, theta.
     times : ndarray, shape (k,)
-        Times of the rows relative to the last one, in s: lost rows show by the distance covered.
+        Times of the rows relative to the last row in s, in which lost rows are taken into account.
     """
 
     state: Array
@@ -175,12 +175,12 @@ def fit_flight(first_flight: ArrayLike, block: NDArray[np.void] = SQUARE, scatte
     block : ndarray of BLOCK, shape ()
         Only gravity and drag are used.
     scatter : Scatter
-        Errors of a row.
+        Errors of a measured row.
 
     Raises
     ------
     ArgumentError
-        For fewer than four rows, numbers that are not finite, or no flight above the table.
+        There are fewer than four rows, a number is not finite, or the rows are not a flight above the table.
     """
     try:
         rows = np.array(first_flight, dtype=np.float64)
@@ -211,7 +211,7 @@ def fit_flight(first_flight: ArrayLike, block: NDArray[np.void] = SQUARE, scatte
 
 
 def _leaves_flight(rows: Array) -> bool:
-    """Return whether the last row comes after an impact: the rate of turning has changed, or the block rises again."""
+    """Return whether the last row is after an impact: the rate of turning has changed, or the block rises again."""
     t = np.arange(-3.0, 1.0)
     turn = float(np.polyval(np.polyfit(t[:3], rows[-4:-1, 2], 1), t[3]))
     return bool(
@@ -220,7 +220,7 @@ def _leaves_flight(rows: Array) -> bool:
 
 
 def _row_times(rows: Array, gravity: float) -> Array:
-    """Return the times of the rows, 0 at the last one: a lost row doubles the distance to the next."""
+    """Return the times of the rows in s, 0 at the last row; a lost row doubles the distance to the next row."""
     way = np.hypot(*np.diff(rows[:, :2], axis=0).T)
     steps = np.ones(len(way))
     for _ in range(3):
@@ -282,7 +282,7 @@ def ensemble(
     n_rows : int
         Number of rows to return, counted from the first row of `first_flight`.
     members, seed : int
-        How many motions; of the draws.
+        Number of motions, and seed of the draws.
     block : ndarray of BLOCK, shape ()
         Numbers of the block.
     scatter : Scatter
@@ -293,7 +293,7 @@ def ensemble(
     Raises
     ------
     ArgumentError
-        As `fit_flight`.
+        As for `fit_flight`.
     """
     flight = fit_flight(first_flight, block, scatter)
     given = len(flight.times)
@@ -329,7 +329,7 @@ def bands(first_flight: ArrayLike, n_rows: int) -> Array:
     Raises
     ------
     ArgumentError
-        For fewer than four rows of flight, numbers that are not finite, or no requested row.
+        There are fewer than four rows of flight, a number is not finite, or no row is requested.
     """
     if not isinstance(n_rows, int | np.integer) or not 1 <= n_rows <= _MOST_ROWS:
         raise ArgumentError(f"n_rows: got {n_rows!r}, expected an integer from 1 to {_MOST_ROWS}")

@@ -19,14 +19,14 @@ from plow_twin.view.figures import write_png
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-#: Key of the Parquet file's metadata.
+#: Key of the sweep's facts in the Parquet file's metadata.
 METADATA_KEY: Final = "plow_twin"
 #: Statistics that are whole numbers.
 _COUNTS: Final = ("makes", "events", "steps")
 
 
 def write_parquet(table: Table, path: Path) -> None:
-    """Write one row for each member: its parameters, status (0: done), the status in words, the statistics.
+    """Write one row for each member: its parameters, status (0: done), status in words, and statistics.
 
     The metadata under `plow_twin` is JSON: arguments with the scene as YAML text, package version, builds.
     """
@@ -46,14 +46,14 @@ def write_parquet(table: Table, path: Path) -> None:
         "package_version": package_version(),
         "builds": [json.loads(build) for build in table.builds],
     }
-    # metadata is written with the schema: the same table gives the same bytes
+    # sorted keys, so that the same table gives the same bytes
     arrow = pa.table(columns).replace_schema_metadata({METADATA_KEY: json.dumps(facts, sort_keys=True)})
     with whole_file(path) as stream:
         pq.write_table(arrow, stream)
 
 
 def draw(table: Table, path: Path, title: str) -> None:
-    """Draw a curve (one parameter) or a heat map (two) for each statistic; members that failed are crosses."""
+    """Draw a curve (one parameter) or a heat map (two) for each statistic; failed members are crosses."""
     from matplotlib.figure import Figure
 
     count = len(table.sweep.statistics)
@@ -81,7 +81,7 @@ def _curve(axes: Axes, table: Table, index: int) -> None:
 
     (axis,) = table.sweep.axes
     numbers, places = _scaled(table, index), _places(axis)
-    # no values between words
+    # no line, because there are no values between words
     style = "none" if isinstance(axis.values[0], str) else "-"
     axes.plot(places, numbers, marker="o", markersize=3 if style == "-" else 6, linestyle=style)
     for member in table.failed:
@@ -99,13 +99,13 @@ def _curve(axes: Axes, table: Table, index: int) -> None:
 
 
 def _bracketed(name: str) -> str:
-    """Return the unit of a statistic in brackets, unless its words end with the unit."""
+    """Return the unit of a statistic in brackets, or an empty text if its words already end with the unit."""
     words = statistic_words(name)[0]
     return words[words.index(" [") :] if "," in words and " [" in words else ""
 
 
 def _legend(axes: Axes) -> None:
-    """Put the legend below the axes: over the data it would hide some."""
+    """Put the legend below the axes, where it hides no data."""
     axes.legend(fontsize=8, loc="upper right", bbox_to_anchor=(1.0, -0.16))
 
 

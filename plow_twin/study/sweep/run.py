@@ -1,4 +1,4 @@
-"""Compute the missing chunks of a sweep's folder, on this machine or a Dask cluster, by the same code."""
+"""Computation of the missing chunks of a sweep's folder, on this machine or a Dask cluster, by the same code."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from plow_twin.study.store import Store
 from plow_twin.study.sweep.table import Sweep, Table, run_members_of
 
 Array = NDArray[np.float64]
-#: Called with the number of members that are done.
+#: Function that is called with the number of finished members.
 OnProgress = Callable[[int], None]
 
 
 def run_here(store: Store, workers: int | None = None, on_progress: OnProgress | None = None) -> Table:
-    """Compute the missing chunks with threads of this process, store each as it comes, and return the whole table."""
+    """Compute the missing chunks with threads of this process, store each chunk, and return the whole table."""
     chunks, missing = store.chunks, store.missing()
     done = store.sweep.size - sum(len(chunks[index]) for index in missing)
     build = _build()
@@ -38,14 +38,14 @@ def run_here(store: Store, workers: int | None = None, on_progress: OnProgress |
 
 
 def run_on_cluster(store: Store, address: str, on_progress: OnProgress | None = None) -> Table:
-    """Compute the missing chunks on the Dask cluster at `address`, one task each; return the whole table.
+    """Compute the missing chunks on the Dask cluster at `address`, each as one task; return the whole table.
 
     The scheduler gives the tasks of a dead worker to another worker; a result is stored as soon as it arrives.
 
     Raises
     ------
     StudyError
-        When the cluster cannot be reached, has no worker, or gives a task up.
+        The cluster cannot be reached, has no worker, or gives up a task.
     """
     chunks, missing = store.chunks, store.missing()
     done = store.sweep.size - sum(len(chunks[index]) for index in missing)
@@ -60,7 +60,7 @@ def run_on_cluster(store: Store, address: str, on_progress: OnProgress | None = 
             try:
                 table, build = future.result()
             except Exception as error:
-                # any error of a worker: the stored chunks stay, and the call can be repeated
+                # after any error of a worker, stored chunks are kept and the call can be repeated
                 raise StudyError(f"dask: chunk {index}: {type(error).__name__}: {error}") from error
             store.write(index, table, build)
             done += len(chunks[index])
@@ -70,7 +70,7 @@ def run_on_cluster(store: Store, address: str, on_progress: OnProgress | None = 
 
 
 def _task(sweep: Sweep, members: list[int]) -> tuple[Array, str]:
-    """Compute a chunk on a worker; its threads run one task each."""
+    """Compute a chunk on a worker, each of whose threads runs one task."""
     return run_members_of(sweep, members, workers=1), _build()
 
 

@@ -1,4 +1,4 @@
-"""Sweep one or two parameters of a scene against statistics of its motion."""
+"""Sweep of one or two parameters of a scene, with statistics of the motion."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 #: Status of a member with values that are impossible in a scene.
 UNUSABLE: Final = -1
-#: A sweep has at most that many members: the table, and the list of chunks, are held in memory.
+#: Largest number of members of a sweep, because the table and the list of chunks are in memory.
 _MOST_MEMBERS: Final = 1_000_000
 
 
@@ -42,7 +42,7 @@ def parse_axis(text: str, scene: Scene) -> Axis:
     Raises
     ------
     StudyError
-        Names the axis, the value got and the value expected.
+        The text is not an axis; the message names the axis, the value got and the value expected.
     """
     path, _, rest = text.partition("=")
     check_path(scene, path)
@@ -63,7 +63,7 @@ def parse_axis(text: str, scene: Scene) -> Axis:
                 raise ValueError
             if int(count) > _MOST_MEMBERS:
                 raise StudyError(f"axis: got {int(count)} values of {path}, expected at most {_MOST_MEMBERS}")
-            # numpy's spacing includes the bounds exactly
+            # these functions include the bounds exactly
             spaced = (np.geomspace if log else np.linspace)(float(low), float(high), int(count))
             values = tuple(map(float, spaced))
     except StudyError:
@@ -77,7 +77,7 @@ def parse_axis(text: str, scene: Scene) -> Axis:
 
 @dataclass(frozen=True)
 class Sweep:
-    """The task as plain data, so that it can be stored and sent; `scene_yaml` is self-contained."""
+    """The arguments of a sweep as plain data, which can be stored and sent; `scene_yaml` is self-contained."""
 
     scene_yaml: str
     axes: tuple[Axis, ...]
@@ -103,7 +103,7 @@ class Sweep:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Number of values of each axis; the last axis runs fastest in the order of the members."""
+        """Number of values of each axis; in the order of members the last axis varies fastest."""
         return tuple(len(axis.values) for axis in self.axes)
 
     @property
@@ -117,7 +117,7 @@ class Sweep:
         return {axis.path: axis.values[int(place)] for axis, place in zip(self.axes, places, strict=True)}
 
     def arguments(self) -> dict[str, Any]:
-        """Return all inputs of the result, as plain data for JSON."""
+        """Return all inputs of the result as plain data for JSON."""
         plain: dict[str, Any] = json.loads(json.dumps(asdict(self)))
         return plain
 
@@ -131,7 +131,7 @@ class Table:
     status : ndarray of int64, shape (m,)
         `plow_twin.solve.state.Status`, or `UNUSABLE`.
     numbers : ndarray, shape (m, statistics)
-        NaN where the status is not 0.
+        The statistics, NaN for a member whose status is not 0.
     builds : tuple of str
         The builds (versions, processor, platform) that computed the members.
     """
@@ -143,11 +143,11 @@ class Table:
 
     @property
     def failed(self) -> list[int]:
-        """Members without a result."""
+        """Numbers of the members without a result."""
         return [int(member) for member in np.flatnonzero(self.status)]
 
     def reason(self, member: int) -> str:
-        """Return in words how a member ended."""
+        """Return the status of a member in words."""
         status = int(self.status[member])
         if status != UNUSABLE:
             return Status(status).text
@@ -161,7 +161,7 @@ class Table:
 def run_members_of(
     sweep: Sweep, members: Sequence[int], workers: int | None = None, on_done: Callable[[int], None] | None = None
 ) -> Array:
-    """Compute members, by number; return shape (k, 1 + statistics): status, then the statistics.
+    """Compute the members with these numbers; return status and statistics, shape (k, 1 + statistics).
 
     A member has the same bits in any chunk, thread or machine of the same build.
     """
