@@ -107,7 +107,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ([*CALIBRATE, "empty.csv"], 2, "columns (none: is it empty?)"),
         (["setup", "headless.csv"], 1, "got no header row or no rows"),
         (["setup", "bars.csv"], 2, "(expected commas, semicolons or tabs between them); state --column t=COLUMN"),
-        (["setup", "decimal.csv"], 1, "got 14 cells in a row, expected the 7 of its header (where commas are decimal"),
+        (["setup", "decimal.csv"], 1, "got 14 cells in a row, expected the 7 of its header (if commas are decimal"),
         (["setup", "empty.csv"], 1, "got no header row or no rows"),
         (["setup", "nowhere.csv"], 2, "'nowhere.csv' does not exist"),
         (["export", "own.csv", "--to", "csv", "--out", "out"], 1, "plow-twin live makes a recording of a table"),

@@ -316,7 +316,7 @@ def test_unusable_input_of_a_forecast_is_refused_and_not_left_out(
         said("--limit-horizontal", "0.028").split()
     )
     assert cli(["forecast", str(file), "-q", *limits, "--limit-horizontal", "24"]) == 0
-    assert "--limit-horizontal: the present clearance, 25.000 mm, is past 24 mm already" in capsys.readouterr().err
+    assert "--limit-horizontal: the present clearance, 25.000 mm, has already passed 24 mm" in capsys.readouterr().err
     whole = {"mean_m": 0.026, "p05_m": 0.0259, "p95_m": 0.0261, "state": "estimated"}
     for text, expected in (
         ("null", "got NoneType, expected JSON of an estimate"),

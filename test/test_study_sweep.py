@@ -121,11 +121,11 @@ def test_a_killed_sweep_goes_on_where_it_was(tmp_path: Path, capsys: pytest.Capt
 
     assert run([*arguments, str(killed)]) == 0
     before = 2 * (stored - 1)
-    assert f"15 members, {before} stored before, {15 - before} to compute" in capsys.readouterr().err
+    assert f"15 members, {before} already stored, {15 - before} to compute" in capsys.readouterr().err
     assert run([*arguments, str(whole), "--quiet"]) == 0
     assert (killed / "sweep.parquet").read_bytes() == (whole / "sweep.parquet").read_bytes()
     assert run([*arguments, str(killed)]) == 0
-    assert "15 stored before, 0 to compute" in capsys.readouterr().err
+    assert "15 already stored, 0 to compute" in capsys.readouterr().err
 
 
 def test_failed_members_are_listed_and_other_questions_refused(
