@@ -77,7 +77,7 @@ def analyse(
     many = len(found) > 1 or found != list(recordings)
     for option, given in (("--dask", dask), ("--workers", workers)):
         if given is not None and not many:
-            raise click.UsageError(f"{option}: got one recording, expected several, or a folder of recordings")
+            raise click.UsageError(f"{option}: got one recording, expected many, or a folder of recordings")
     if dask is not None and workers is not None:
         raise click.UsageError("--workers cannot be combined with --dask: a cluster has its own")
     folders = [out / name for name in names_apart(found)] if out is not None and many else [out] * len(found)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 @json_option
 @quiet_option
 def replay(recording: Path, digests_only: bool, write: Path | None, as_json: bool, quiet: bool) -> int:
-    """Run the model again by the journal of RECORDING and compare its outputs with the recorded ones; needs no ROS."""
+    """Run the model again by the journal of RECORDING and compare it with the recorded outputs; needs no ROS."""
     from plow_twin.record.replay import replay as run
 
     with progress("replaying", quiet) as on_progress:

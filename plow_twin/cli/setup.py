@@ -81,7 +81,7 @@ def _write(guess: Guess, scene: str | None, out: Path) -> list[Path]:
         files["scene.yaml"] = _STUB + dump_scene(load_scene("paper"))
     for name in files:
         if (out / name).exists():
-            raise click.UsageError(f"{out / name}: exists already, expected another folder: --out")
+            raise click.UsageError(f"{out / name}: is there already, expected another folder: --out")
     for name, text in files.items():
         (out / name).write_text(text, encoding="utf-8")
     try:

@@ -70,7 +70,7 @@ _MOST_EXAGGERATED = 1e4
 @click.option(
     "--html",
     type=click.Path(path_type=Path, dir_okay=False),
-    help="Write one page instead, with picture, curves and tables; needs no viewer and no network.",
+    help="Write one page instead, with picture, curves and tables; needs neither viewer nor network.",
 )
 @click.option("--web", is_flag=True, help="Serve rerun's own web viewer on this machine until interrupted.")
 @click.option(

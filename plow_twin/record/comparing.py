@@ -62,7 +62,7 @@ class Sent:
         )  # fmt: skip
 
     def differing(self, messages: Messages, chosen: slice) -> list[int]:
-        """Return the indexes of messages that differ from their publication; `chosen` is their slice of all."""
+        """Return the indexes of `messages` that differ; `chosen` is the slice of these messages in the run."""
         wrong = np.empty(len(messages), bool)
         places = messages.start, messages.length
         count = compare(messages.buffer, *places, self.kind[chosen], self.after[chosen], *self._expected, wrong)

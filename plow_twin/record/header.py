@@ -13,9 +13,9 @@ from plow_twin.model.scene import Scene
 from plow_twin.solve.compiled_scene import TOLERANCE_RANGE
 from plow_twin.stream.journal import ParameterValue
 
-#: Name of the MCAP metadata record that holds the header.
+#: Name of the MCAP metadata record with the header.
 HEADER_RECORD: Final = "plow_twin"
-#: Name of the MCAP metadata record, written at close, that holds the loss counters.
+#: Name of the MCAP metadata record with the loss counters, written at close.
 LOSS_RECORD: Final = "plow_twin_loss"
 #: Key of the loss record for the reason why recording ended before the run; all other keys are topics.
 STOPPED_EARLY_KEY: Final = "stopped_early"

@@ -1,7 +1,7 @@
-"""Writer of one MCAP file: compiled code lays messages into chunks as bytes, many at a time.
+"""Writer of one MCAP file; compiled code writes many messages at a time into chunks.
 
-The compiled code and the compressors hold no interpreter lock. Each write is a whole record: the file of a
-killed process can be read up to its last chunk.
+The compiled code and the compressors run without the interpreter lock. Each write is a whole record, so that the file
+of a killed process can be read up to its last chunk.
 """
 
 from __future__ import annotations

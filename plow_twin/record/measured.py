@@ -112,9 +112,9 @@ def read_measured(folder: Path, scene: Path | None = None) -> Measured:
     Raises
     ------
     RecordingError
-        When a file or a column is missing.
+        A file or a column is missing.
     SceneError
-        When the scene cannot be used.
+        The scene cannot be used.
     """
     lost = Counter[str]()
     load = _read(_table(folder, LOAD_FILE), lost, _LOAD_COLUMNS)
@@ -155,9 +155,9 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
     Raises
     ------
     RecordingError
-        When a recording cannot be read, or holds no load or no pose.
+        A recording cannot be read, or has no load or no pose.
     SceneError
-        When the scene cannot be used.
+        The scene cannot be used.
     """
     own, deviations = own_run(path), (UNSTATED, UNSTATED)
     if own is None:

@@ -43,7 +43,7 @@ def _placed(stream: Iterator[T], stamp_ns: StampOf[T]) -> Iterator[tuple[int, in
 
 
 def _is_stray(stamp: int, newest: int, following: int | None) -> bool:
-    """Return whether a stamp is a single wrong one: the next stamp continues the earlier stamps instead."""
+    """Return whether a stamp is a single wrong stamp, after which the next stamp continues the earlier stamps."""
     if following is None:
         return False
     back = newest - stamp > _STEP_NS

@@ -289,7 +289,7 @@ class RunReader:
 
 
 class _Merger:
-    """Puts journal and outputs into one order."""
+    """Put journal and outputs into one order."""
 
     def __init__(self, reader: RunReader, outputs: bool) -> None:
         self._run = reader

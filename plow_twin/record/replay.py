@@ -159,7 +159,7 @@ class _Replay:
         absent = FOLLOWED_TOPICS if header.follow != "full" else ()
         self.topics = {header.topic(name): name for name in PUBLICATION_TOPICS if name not in absent}
         self.next_sequence = 0
-        self.in_a_row = 0  # number of entries without a gap up to the next one
+        self.in_a_row = 0  # number of entries without a gap before the next entry
         self.synced = False  # the session has the state of the live session
         self.outputs_synced = False  # and its windows between messages equal the live ones
         self.outputs_whole = True  # no message of the current batch may be missing without a note

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Rows:
-    """Messages on one topic in order: `sequence` and `stamp_ns` (n,), `numbers` (n, k) as in their template."""
+    """Messages on one topic in order: `sequence` and `stamp_ns` (n,), `numbers` (n, k) in the order of the template."""
 
     sequence: Indexes
     stamp_ns: Indexes

@@ -56,7 +56,7 @@ class InputCounts:
 def unused_messages(path: Path) -> Iterator[dict[str, Any]]:
     """Yield each unused message in the journal of a run: input, sender, reason, stamp, values.
 
-    Messages of an entry that are only counted come after its other messages, as one row with a `count` and no stamp.
+    Each entry's messages without values come last, as one row with their `count` and no stamp.
 
     Raises
     ------

@@ -184,7 +184,7 @@ def _samples(raw: Mapping[str, Any], path: str, base: Path | None) -> tuple[Any,
 
 
 def _problems_across(parts: Mapping[str, Any]) -> tuple[Problem, ...]:
-    """Return the problems between parts; parts with problems of their own are replaced by sound ones."""
+    """Return the problems between parts; parts with problems of their own are replaced by parts without problems."""
     try:
         Scene(**{**_SOUND, **parts})
     except SceneError as error:

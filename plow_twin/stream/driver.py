@@ -41,7 +41,7 @@ from plow_twin.stream.steps import Steps
 #: Stamp [ns] and wrench (Fx, Fy [N], M [N m]) of a sample that has arrived.
 Arrival = tuple[int, tuple[float, float, float]]
 
-#: Largest model time that one call may catch up when the excitation is silent [ns], so that its work is bounded.
+#: Largest model time that one call may catch up when the excitation is silent [ns], so that a call's work is bounded.
 _LARGEST_HOLD_NS: Final = NS_PER_S
 #: Longest time between two checks for silence [ns], because the policy may change.
 _LONGEST_QUIET_NS: Final = NS_PER_S // 10
@@ -136,7 +136,7 @@ class Driver:
         return self._newest_ns
 
     def samples(self, arrived: Iterable[Arrival], now_ns: int) -> Iterator[Published]:
-        """Judge samples in order of arrival, advance to the accepted ones, and yield the publications.
+        """Judge samples in order of arrival, advance to the accepted samples, and yield the publications.
 
         The caller sends each publication before the next one is computed, so that a recording has them in order. A
         sample whose stamp jumps waits for the next sample.
@@ -233,7 +233,7 @@ class Driver:
         insort(run, Sample(stamp_ns, wrench), key=_stamp)
 
     def due(self) -> Published:
-        """Return the publication of all advances since the last one."""
+        """Return the publication of all advances since the last publication."""
         return self.session.outputs.pop()
 
     def silence(self, now_ns: int) -> Published:

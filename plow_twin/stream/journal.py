@@ -205,7 +205,7 @@ class Digest:
 
 @dataclass(frozen=True)
 class Loss:
-    """`count` entries before this one were lost; a `Snapshot` follows."""
+    """`count` entries before this entry were lost; a `Snapshot` follows."""
 
     count: int
 

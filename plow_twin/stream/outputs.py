@@ -336,7 +336,7 @@ class Outputs:
         return found
 
     def modelled(self, wear_depth: Array) -> Array:
-        """Return the model's horizontal clearance and its two points, then the vertical ones, shape (6,) [m]."""
+        """Return the model's horizontal clearance and its two points, then the same of the vertical, shape (6,) [m]."""
         middle = clearances(self._scene, wear_depth)
         low, high = (clearances(self._scene, points) for points in prior_points(self._scene, wear_depth))
         return np.stack((middle, low, high), axis=1)[:2].ravel()

@@ -146,7 +146,7 @@ class Session:
         after the advance that it covers. An entry that the twin then refuses (a number is not finite) has already been
         emitted; a replay refuses it too.
     rollback_span_s
-        Largest age of a late sample before the newest one [s]; 0: late samples are refused.
+        Largest age of a late sample relative to the newest sample [s]; 0: late samples are refused.
     wear_depth
         Initial wear depth of each pad [m], shape (8,); None: that of the scene.
     """

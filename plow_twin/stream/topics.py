@@ -144,7 +144,7 @@ TOPICS: Final = (
     ),
     Topic(
         "wear_rate", JOINT_STATE, Cadence.SLOW,
-        "velocity = growth of each pad's wear since the message before [m/s]",
+        "velocity = growth of each pad's wear since the previous message [m/s]",
         names=PAD_NAMES, columns={"velocity": (("wear_rate", 8),)}, cumulative=True,
     ),
     Topic(

@@ -224,7 +224,7 @@ def _risen(part: Batched, window: Indexes) -> tuple[Batched, Indexes]:
 
 
 def _powers(part: Batched, newest: tuple[Indexes, Array] | None) -> tuple[Indexes, Array, Array]:
-    """Return stamps, power into each contact [W] and whether it has force; `newest`, the row before, is put first."""
+    """Return stamps, power into each contact [W] and whether it has force; the previous row, `newest`, is put first."""
     stamps, values = part.stamp_ns, part.values
     if newest is not None and newest[0][0] < stamps[0]:
         stamps, values = np.concatenate((newest[0], stamps)), np.concatenate((newest[1], values))

@@ -198,7 +198,7 @@ def simulated_impact(before: ArrayLike) -> Array:
     Raises
     ------
     ArgumentError
-        As `impact`.
+        As for `impact`.
     """
     states = _states(before)
     for state in states:
