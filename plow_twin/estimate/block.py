@@ -19,9 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.estimate import tuning
-from plow_twin.estimate.discrepancy import UNSTATED
 from plow_twin.estimate.measurements import Load, Poses
-from plow_twin.estimate.priors import deviation_of
+from plow_twin.estimate.priors import UNSTATED, deviation_of
 from plow_twin.estimate.result import NORMAL_P95, Estimate, Interval, State
 from plow_twin.estimate.similar import PAPER_LENGTH
 from plow_twin.estimate.start import noise_level

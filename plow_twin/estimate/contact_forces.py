@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from plow_twin.errors import PlowTwinError
 from plow_twin.estimate import tuning
-from plow_twin.estimate.fit import Fit, Problem, Window, depth_of
+from plow_twin.estimate.fit import DIFFERENCES, TURNS, Fit, Problem, Window, depth_of
 from plow_twin.estimate.measurements import FEWEST_IN_CONTACT, FEWEST_POSES, Poses, usable_rows
 from plow_twin.estimate.unknowns import BIAS, DELAY
 from plow_twin.model.contact import free_force
@@ -105,10 +105,12 @@ class Feeling:
 
     def __init__(self, problem: Problem, t: Array) -> None:
         window = Window(Poses(t, np.zeros((len(t), 3))), problem.window.starts, problem.window.states)
+        turns = problem.differences[TURNS]
+        differences = np.concatenate([turns, np.zeros(len(DIFFERENCES) - len(turns))])
         self._problem = Problem(
-            problem.forward, problem.unknowns, window, horizon=problem.horizon, turns=problem.turns
+            problem.forward, problem.unknowns, window, horizon=problem.horizon, differences=differences
         )  # fmt: skip
-        self._depth = depth_of(problem.turns)
+        self._depth = depth_of(turns)
 
     def at(self, shared: Array, states: Array, delay: float) -> Felt | None:
         """Return penetrations and forces with these unknowns; None where the model cannot be run."""

@@ -18,34 +18,23 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from plow_twin.estimate import tuning
-from plow_twin.estimate.fit import FEWEST_OF_SWING, WALLS, Fit, Problem, freed, huber_weight
+from plow_twin.estimate.fit import DIFFERENCES, FEWEST_OF_SWING, WALLS, Fit, Point, Problem, freed, huber_weight
 from plow_twin.estimate.measurements import FEWEST_FOR_SCATTER
-from plow_twin.estimate.pads import TURN_STEP
-from plow_twin.estimate.priors import ROUNDING, SCALES, deviation_of
+from plow_twin.estimate.pads import deviations
+from plow_twin.estimate.priors import ROUNDING, UNSTATED, deviation_of
 from plow_twin.estimate.unknowns import GX, GY, MOVING, SIZE, SOFTNESS
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import Friction, Scene
 
 Array = NDArray[np.float64]
 
-#: Prior: deviations of quantities that no scene states. Walls by `WALLS`: stiffness over the contact's, turn in m. Of
-#: the sensor: scales, lever arm in m, square of a filter's time constant in s2 (the delay is an unknown of the fit),
-#: drift of its clock.
-UNSTATED: Final = {
-    **{f"stiffness_{wall}": 0.1 for wall in ("left", "right", "top", "bottom")},
-    **{f"turn_{wall}": 1e-3 for wall in ("left", "right", "top", "bottom")},
-    **{f"scale_{axis}": scale for axis, scale in zip(("x", "y", "theta"), SCALES, strict=True)},
-    **{f"lever_{axis}": 4e-3 for axis in ("x", "y")},
-    "filter": 1e-4,
-    "clock": 1e-4,
-}
 #: Step: of the difference quotients by quantities of a scene, by path; a fifth to a half of the prior's deviation.
 STATED: Final = {
     "head.mass_kg": 0.02,
@@ -133,67 +122,67 @@ def graded(problem: Problem, found: Fit, doubtful: bool = False, seed: int = 0) 
     return Graded(found.shared + step, covariance, named, linear.load, linear.inflation, surprise)
 
 
-def _columns(problem: Problem, found: Fit) -> tuple[dict[str, tuple[float, Array]], Array]:
-    """Return prior deviation and derivative of the prediction by each quantity, and the derivatives by a constant load.
+@dataclass(frozen=True, eq=False)
+class _Column:
+    """A further quantity: the prior's deviation, the derivative of the prediction, (n, 3), and its value in the fit.
 
-    Shapes (n, 3) and (n, 3, 3). Quantities with which the model cannot be run are left out.
+    The value is None where the fit leaves the quantity as the scene has it.
     """
-    base = problem.predicted(found.point)
-    if base is None:
-        raise np.linalg.LinAlgError("the model cannot be run at the fit")
+
+    deviation: float
+    derivative: Array
+    value: float | None = None
+
+
+def _columns(problem: Problem, found: Fit) -> tuple[dict[str, _Column], Array]:
+    """Return the further quantities, and the derivatives of the prediction by a constant load, shape (n, 3, 3).
+
+    Quantities with which the model cannot be run are left out.
+    """
+    point = found.point
+
+    def by(step: float, **changed: Any) -> Array | None:
+        moved = problem.evaluate(point.shared, point.states, **changed)
+        return None if moved is None else np.nan_to_num((moved.predicted - point.predicted) / step)
+
     scene, depth = problem.unknowns.scene, problem.unknowns.penetration_of(float(found.shared[SOFTNESS]))
-    out: dict[str, tuple[float, Array]] = {}
+    out: dict[str, _Column] = {}
     for path, step in STATED.items():
         deviation = deviation_of(scene, path)
         change = partial(_moved, path=path, step=step, depth=depth)
-        moved = problem.predicted(found.point, change=change) if deviation > 0.0 else None
-        if moved is not None:
-            out[path] = deviation, np.nan_to_num((moved[0] - base[0]) / step)
-    sides = [out[path][1] for path in ("frame.width_m", "frame.height_m") if path in out]
+        column = by(step, change=change) if deviation > 0.0 else None
+        if column is not None:
+            out[path] = _Column(deviation, column)
+    sides = [out[path].derivative for path in ("frame.width_m", "frame.height_m") if path in out]
     if len(sides) == 2 and scene.frame.corner_radius_m is None:
         # at small angles a round corner acts as sides shorter by twice its radius
-        out["corner_radius"] = ROUNDING, -2.0 * (sides[0] + sides[1])
-    for index, wall in enumerate(("left", "right", "top", "bottom")):
-        share, turns = np.ones(PAIR_COUNT), problem.turns.copy()
-        share[list(WALLS[index])] += _WALL_STEP
-        turns[index] += TURN_STEP
-        for name, step, moved in (
-            (f"stiffness_{wall}", _WALL_STEP, problem.predicted(found.point, share=share)),
-            (f"turn_{wall}", TURN_STEP, problem.predicted(found.point, turns=turns)),
-        ):
-            if moved is not None:
-                out[name] = UNSTATED[name], np.nan_to_num((moved[0] - base[0]) / step)
-    out |= {name: (UNSTATED[name], np.nan_to_num(column)) for name, column in _of_sensor(problem, *base)}
-    return out, _pushes(problem, found, base[0])
-
-
-def _pushes(problem: Problem, found: Fit, base: Array) -> Array:
-    """Return the derivatives of the prediction by a constant load in half the load's range, shape (n, 3, 3)."""
+        out["corner_radius"] = _Column(ROUNDING, -2.0 * (sides[0] + sides[1]))
+    for wall, pads in zip(("left", "right", "top", "bottom"), WALLS, strict=True):
+        share, name = np.ones(PAIR_COUNT), f"stiffness_{wall}"
+        share[list(pads)] += _WALL_STEP
+        column = by(_WALL_STEP, share=share)
+        if column is not None:
+            out[name] = _Column(UNSTATED[name], column)
+    held, columns = problem.differences.any(), problem.by_differences(point)
+    for index, name in enumerate(DIFFERENCES):
+        if held:
+            out[name] = _Column(deviations()[index], columns[:, :, index], float(problem.differences[index]))
+        else:
+            out[name] = _Column(UNSTATED[name], columns[:, :, index])
+    out |= {name: _Column(UNSTATED[name], np.nan_to_num(column)) for name, column in _of_sensor(problem, point)}
     size = np.ptp(problem.forward.load.wrench, axis=0) / 2.0
-    size = np.maximum(size, 1e-3 * size.max())
-    out = np.zeros((*base.shape, 3))
-    for index in range(3):
-        push = np.zeros(3)
-        push[index] = _PUSH_STEP * size[index]
-        moved = problem.predicted(found.point, push=push)
-        if moved is not None:
-            out[:, :, index] = np.nan_to_num((moved[0] - base) / _PUSH_STEP)
-    return out
+    pushes = [by(_PUSH_STEP, push=_PUSH_STEP * push) for push in np.diag(np.maximum(size, 1e-3 * size.max()))]
+    return out, np.stack([np.zeros_like(point.rate) if push is None else push for push in pushes], axis=2)
 
 
-def _of_sensor(problem: Problem, q: Array, v: Array) -> Iterator[tuple[str, Array]]:
-    """Yield the derivatives of the prediction, (n, 3), by each part of a sensor's error."""
+def _of_sensor(problem: Problem, point: Point) -> Iterator[tuple[str, Array]]:
+    """Yield the derivatives of the prediction, (n, 3), by each scale and by the drift of the clock."""
     t = problem.window.poses.t
     for index, axis in enumerate(("x", "y", "theta")):
-        column = np.zeros_like(q)
-        column[:, index] = q[:, index]
+        column = np.zeros_like(point.predicted)
+        column[:, index] = point.predicted[:, index]
         yield f"scale_{axis}", column
-    c, s, zero = np.cos(q[:, 2]), np.sin(q[:, 2]), np.zeros(len(q))
-    yield "lever_x", np.stack([c - 1.0, s, zero], axis=1)
-    yield "lever_y", np.stack([-s, c - 1.0, zero], axis=1)
-    # a low pass 1 / (1 + tau s) without its delay: tau^2 s^2 / 2
-    yield "filter", 0.5 * np.gradient(v, t, axis=0)
-    yield "clock", -v * (t - t.mean())[:, None]
+    yield "clock", -point.rate * (t - t.mean())[:, None]
 
 
 def variants(scene: Scene) -> tuple[Scene, ...]:
@@ -226,15 +215,15 @@ class _Linearised:
     load : (3,) deviation of the load's error in a swing
     """
 
-    def __init__(self, problem: Problem, found: Fit, columns: dict[str, tuple[float, Array]], pushes: Array) -> None:
-        self.names = list(columns)
+    def __init__(self, problem: Problem, found: Fit, columns: dict[str, _Column], pushes: Array) -> None:
+        self.names, every = list(columns), columns.values()
         self._found, self._swing = found, found.point.swing
-        further = np.stack([column for _, column in columns.values()], axis=2)
-        self._precision = np.concatenate(
-            [problem.deviation**-2.0, [deviation**-2.0 for deviation, _ in columns.values()]]
-        )
-        self._pull = np.zeros(len(self._precision))
-        self._pull[:SIZE] = (problem.mean - found.shared) / problem.deviation**2
+        further = np.stack([one.derivative for one in every], axis=2)
+        self._precision = np.concatenate([problem.deviation, [one.deviation for one in every]]) ** -2.0
+        #: (k,) values of the further quantities in the fit, and whether the fit holds them
+        self._value = np.array([one.value or 0.0 for one in every])
+        self._held = np.array([one.value is not None for one in every])
+        self._pull = np.concatenate([problem.mean - found.shared, -self._value]) * self._precision
         rows = [np.flatnonzero(self._swing == index) for index in range(problem.window.swings)]
         self._rows = [some for some in rows if len(some) >= FEWEST_OF_SWING]
         if not self._rows:
@@ -312,10 +301,10 @@ class _Linearised:
     def averaged(self, rng: np.random.Generator) -> tuple[Array, Array, Array, bool]:
         """Return mean, covariance and share of differences of the border over the draws, and if the scene may be exact.
 
-        The scene may be exact if any draw leaves it so.
+        The scene may be exact if any draw leaves it so. A quantity that the fit holds always differs.
         """
         count, size = len(self.names), len(self._precision)
-        differs, log_precision = np.zeros(count, np.bool_), np.log(self._precision)
+        differs, log_precision = self._held.copy(), np.log(self._precision)
 
         def evidence(which: NDArray[np.bool_]) -> float:
             use = np.append(np.arange(SIZE), SIZE + np.flatnonzero(which))
@@ -327,13 +316,13 @@ class _Linearised:
         now, exact = evidence(differs), False
         mean, second, often, counted = np.zeros(size), np.zeros((size, size)), np.zeros(count), _SWEEPS - _BURNT
         for sweep in range(_SWEEPS):
-            for index in rng.permutation(count):
+            for index in rng.permutation(np.flatnonzero(~self._held)):
                 other = differs.copy()
                 other[index] = not other[index]
                 instead = evidence(other)
                 if np.log(rng.random()) < instead - now:
                     differs, now = other, instead
-                exact |= sweep >= _BURNT and not differs.any()
+                exact |= sweep >= _BURNT and bool((differs == self._held).all())
             if sweep >= _BURNT:
                 use = np.append(np.arange(SIZE), SIZE + np.flatnonzero(differs))
                 inverse = np.linalg.inv(self._normal[np.ix_(use, use)])
@@ -359,7 +348,7 @@ class _Linearised:
 
     def surprise(self, mean: Array, often: Array) -> float:
         """Return the mean square of the differences in deviations of their prior, at least 1; above 1: not linear."""
-        z = mean[SIZE:] * np.sqrt(self._precision[SIZE:])
+        z = (self._value + mean[SIZE:]) * np.sqrt(self._precision[SIZE:])
         # for each quantity, the mean over the draws in which the quantity differs
         return max(1.0, float((z**2 / np.maximum(often, 0.1)).sum() / max(often.sum(), 1.0)))
 
@@ -368,7 +357,7 @@ class _Linearised:
         deviation = np.sqrt(1.0 / np.diag(self._normal)[SIZE:])
         return {
             name: (float(share), float(value / max(share, 1e-9)), float(spread))
-            for name, share, value, spread in zip(self.names, often, mean[SIZE:], deviation, strict=True)
+            for name, share, value, spread in zip(self.names, often, self._value + mean[SIZE:], deviation, strict=True)
         }
 
 

@@ -18,9 +18,9 @@ from plow_twin.estimate.fit import Fit, Problem, freed
 from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.gaps import Gaps, GapsFit, fit_gaps
 from plow_twin.estimate.measurements import FEWEST_POSES, Load, Poses, useless_deviation
-from plow_twin.estimate.pads import askew, by_group, of_turns, turned
+from plow_twin.estimate.pads import by_group, of_differences, shown, with_differences
 from plow_twin.estimate.result import NORMAL_P95, Estimate, ForcesUsed, Interval, Motion, State
-from plow_twin.estimate.search import candidate, refine
+from plow_twin.estimate.search import LOW_PASS, behind_low_pass, candidate, refine
 from plow_twin.estimate.similar import Units
 from plow_twin.estimate.start import filled, noise_level, range_of_motion
 from plow_twin.estimate.uncertain_load import compare_under_uncertain_load
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from plow_twin.estimate.contact_forces import ContactForces
 
 Array = NDArray[np.float64]
-#: Shared unknowns, noise and turns of the walls of the window before, 18 numbers; empty: no guess.
+#: Shared unknowns, noise and differences of the window before, 21 numbers; empty: no guess.
 Guess = tuple[float, ...]
 
 #: Bound: load periods and seconds of a window, whichever is longer, and the longest window of a node in s; of longer
@@ -203,17 +203,17 @@ def _from_motion(
         ), ()
     period = min(load.period(), float(poses.t[-1] - poses.t[0]))
     felt, broad = thinned(load, period)
-    drift = tuning.LEFT_OPEN * load.left_open() / np.asarray(inertias(scene)) ** 2 if broad else None
+    drift = tuning.LEFT_OPEN * np.array(felt.unknown) / np.asarray(inertias(scene)) ** 2 if broad else None
     forward = Forward(scene, felt)
     if guess:
         numbers = np.array(guess)
-        shared, noise, turns = np.split(numbers, [SIZE, SIZE + 3])
+        shared, noise, differences = np.split(numbers, [SIZE, SIZE + 3])
         # a guess comes from a fit, and contacts harder than this are not fitted
         certain = unknowns.penetration_of(float(shared[SOFTNESS])) > tuning.FITTED
-        near = refine(forward, unknowns, poses, period, unknowns.within(shared), noise, drift, turns, certain)
+        near = refine(forward, unknowns, poses, period, unknowns.within(shared), noise, drift, differences, certain)
         verdict = judge(*near, period) if near else None
-        if near and verdict and not (verdict.model or verdict.sensor) and near[1].finished:
-            near, verdict = _with_turns(near, verdict, period)
+        if near and verdict and not _fails(near[1], verdict):
+            near, verdict = _with_differences(near, verdict, period)
             return summarise(*near, verdict, lost, forces), _next_guess(*near)
         forward = Forward(scene, felt)
     bias = bias_of_hard(unknowns, poses)
@@ -239,7 +239,8 @@ def _searched(
     """Estimate from the motion without a guess."""
     narrow = bounces(unknowns, poses)
     bounced = compare(forward, unknowns, poses, period) if narrow else None
-    first = candidate(forward, unknowns, poses, period) if bounced is None else None
+    searched = candidate(forward, unknowns, poses, period) if bounced is None else None
+    first = None if searched is None else searched[1]
     if first is not None:
         penetration = unknowns.penetration_of(float(first.shared[SOFTNESS]))
         if penetration < tuning.CERTAINLY_HARD and not narrow:
@@ -258,13 +259,23 @@ def _searched(
         return summarise_bounced(unknowns, poses, bounced, lost, spent + forward.work), ()
     if found is None:
         return under_uncertain_load(_without_fit(unknowns, poses, lost), unknowns, forward.load, poses, period), ()
-    found, verdict = _with_turns(found, judge(*found, period), period)
+    verdict = judge(*found, period)
+    behind = behind_low_pass(*searched) if searched and _fails(found[1], verdict) and not verdict.broken else None
+    if behind is not None:
+        again = refine(forward.renewed(), unknowns, poses, period, behind.shared, behind.noise, drift, LOW_PASS)
+        if again and again[1].loss < found[1].loss:
+            found, verdict = again, judge(*again, period)
+    found, verdict = _with_differences(found, verdict, period)
     result = summarise(*found, verdict, lost, forces if bounced is None else None)
-    unexplained = bool(verdict.model or verdict.sensor) or not found[1].finished
-    if bounced is None and unexplained and not verdict.broken:
+    if bounced is None and _fails(found[1], verdict) and not verdict.broken:
         result = under_uncertain_load(result, unknowns, forward.load, poses, period, found)
     following = () if verdict.model or verdict.sensor else _next_guess(*found)
     return result if bounced is None else with_bounced(result, bounced, spent), following
+
+
+def _fails(found: Fit, verdict: Verdict) -> bool:
+    """Return whether a fit has not come to its end or fails a check."""
+    return bool(verdict.model or verdict.sensor) or not found.finished
 
 
 def under_uncertain_load(
@@ -345,21 +356,21 @@ def with_bounced(result: Estimate, bounced: Bounced, spent: int) -> Estimate:
     return replace(result, horizontal=values[0], vertical=values[1], figures=figures)
 
 
-def _with_turns(found: tuple[Problem, Fit], verdict: Verdict, period: float) -> tuple[tuple[Problem, Fit], Verdict]:
-    """Let the walls turn where the fit fails with straight walls, or shows turned ones: pads worn askew.
+def _with_differences(
+    found: tuple[Problem, Fit], verdict: Verdict, period: float
+) -> tuple[tuple[Problem, Fit], Verdict]:
+    """Let walls and sensor differ where the fit fails without, or shows that they do.
 
     Walls taken for straight make the clearance too small, by 0.2 mm where pads differ by 1.2 mm.
     """
     if verdict.sensor and not verdict.by_scale:
         return found, verdict
-    fits = not verdict.model and found[1].finished
-    if fits and askew(*found) < (
-        tuning.MORE_ASKEW * verdict.figures["scale"] if verdict.by_scale else tuning.OUTLYING**2
-    ):
+    least = tuning.MORE_ASKEW * verdict.figures["scale"] if verdict.by_scale else tuning.OUTLYING**2
+    if (verdict.by_scale or not _fails(found[1], verdict)) and shown(*found) < least:
         return found, verdict
-    again = turned(*found)
+    again = with_differences(*found)
     other = None if again is None else judge(*again, period)
-    if again and other and not (other.model or other.sensor) and again[1].finished:
+    if again and other and not _fails(again[1], other):
         return again, other
     return found, verdict
 
@@ -514,13 +525,13 @@ def _figures(beside: Graded | None) -> dict[str, float]:
 def _graded(problem: Problem, fit: Fit, verdict: Verdict) -> Graded | None:
     """Return the result of the fit where the machine may differ from the model; None where data contradict themselves.
 
-    None too for linked swings and turned walls while no check fails. A fit that has not converged may be in a false
-    optimum: None if its swings are linked, or if its residuals far exceed the noise.
+    None too for linked swings while no check fails. A fit that has not converged may be in a false optimum: None if its
+    swings are linked, or if its residuals far exceed the noise.
     """
     if verdict.broken:
         return None
     clean = fit.finished and not (verdict.model or verdict.sensor)
-    if (problem.turns.any() and clean) or (len(problem.link) and (clean or not fit.finished)):
+    if len(problem.link) and (clean or not fit.finished):
         return None
     found = _if_it_differs(problem, fit, doubtful=not clean)
     if found is None or (not fit.finished and found.inflation.mean() >= tuning.MOST_INFLATED):
@@ -537,11 +548,12 @@ def _if_it_differs(problem: Problem, fit: Fit, doubtful: bool = True) -> Graded 
 
 
 def _next_guess(problem: Problem, fit: Fit) -> Guess:
-    return (*fit.shared.tolist(), *fit.noise.tolist(), *problem.turns.tolist())
+    return (*fit.shared.tolist(), *fit.noise.tolist(), *problem.differences.tolist())
 
 
 def thinned(load: Load, period: float) -> tuple[Load, bool]:
     """Thin a load to the samples that move the head; return whether it is broad-band: nearly every sample counts."""
+    load = load.believable()
     most = tuning.KNOTS[0] * max(1.0, float(load.t[-1] - load.t[0]) / period)
     shares = (5e-4, 1e-3, 2e-3, 4e-3, 8e-3)
     significance = load.significance(shares[0])
@@ -552,7 +564,8 @@ def thinned(load: Load, period: float) -> tuple[Load, bool]:
             break
     broad = len(thin.t) > most
     # the mean values of a broad-band load move the head
-    return load.averaged(tuning.KNOTS[1] * int(most)) if len(thin.t) > tuning.KNOTS[1] * most else thin, broad
+    felt = load.averaged(tuning.KNOTS[1] * int(most)) if len(thin.t) > tuning.KNOTS[1] * most else thin
+    return replace(felt, unknown=load.unknown), broad
 
 
 def warm_up(scene: Scene) -> None:
@@ -692,8 +705,8 @@ def _numbers(unknowns: Unknowns, normal: list[Interval]) -> dict[str, Any]:
 
 
 def _plain(problem: Problem, fit: Fit) -> Array:
-    """Return the covariance due to noise, and, if walls were found turned, to the uncertainty of their turns."""
-    return fit.covariance + of_turns(problem, fit) if problem.turns.any() else fit.covariance
+    """Return the covariance due to noise, and to the uncertainty of the differences that the fit holds."""
+    return fit.covariance + of_differences(problem, fit) if problem.differences.any() else fit.covariance
 
 
 def _covariance(problem: Problem, fit: Fit, verdict: Verdict, plain: Array) -> Array:

@@ -25,6 +25,7 @@ from plow_twin.estimate import tuning
 from plow_twin.estimate.arrow import OWN, Arrow, Factor
 from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.measurements import Poses
+from plow_twin.estimate.sensor import Memory, lagged, moved_by_lever
 from plow_twin.estimate.unknowns import BIAS, DAMPING, DELAY, GAIN, MOVING, PROBES, QUANTITIES, SIZE, Unknowns
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import Scene
@@ -39,6 +40,15 @@ _DISPLACED = np.array([2e-4, 2e-4, 1e-3, 5e-3, 5e-3, 3e-2])
 _LEAST_DRIFT = 1e-8
 #: Definition: walls by their two pads: left, right (top pad first), top, bottom (left pad first).
 WALLS: Final = ((1, 7), (3, 5), (0, 2), (6, 4))
+#: Definition: differences of machine and sensor that a fit holds beside the shared unknowns: distances in m by which
+#: the first pad of a wall lies further out than the second (`WALLS`), the sensor's lever arm in m along x and y, and
+#: the square of the time constant in s2 of its low pass.
+TURNS, LEVER, LAG = slice(0, 4), slice(4, 6), 6
+DIFFERENCES: Final = ("turn_left", "turn_right", "turn_top", "turn_bottom", "lever_x", "lever_y", "filter")
+#: Step: of their difference quotients.
+DIFFERENCE_STEPS: Final = np.array([2e-4, 2e-4, 2e-4, 2e-4, 1e-3, 1e-3, 4e-6])
+#: Guard: longest distance in s of poses between which a cubic is near the motion in a soft contact, for a low pass.
+RESOLVING = 0.02
 #: Derived: a row has three numbers, the start of a swing six; fewer rows determine the start alone.
 FEWEST_OF_SWING = 4
 
@@ -77,8 +87,9 @@ class Point:
 
     shared, states : (SIZE,), (s, 6)
     swing : (n,) swing of each pose, -1 outside of all swings
+    predicted : (n, 3) predicted measurements without the bias; NaN outside all swings
     residual : (n, 3) measured minus predicted; NaN where not measured
-    rate : (n, 3) predicted rates
+    rate : (n, 3) their rates
     contact : (s, 8) time in contact of each pair in s
     defect : (s - 1, 6) from the end of each swing to the start of the next; (0, 6) where they are not linked
     """
@@ -86,6 +97,7 @@ class Point:
     shared: Array
     states: Array
     swing: NDArray[np.int64]
+    predicted: Array
     residual: Array
     rate: Array
     contact: Array
@@ -189,80 +201,77 @@ def depth_of(turns: Array) -> Array | None:
 class Problem:
     """A window of measurements, the prior and the forward model together.
 
-    `horizon` limits each swing to its first seconds; `turns` (4,) are the distances in m by which the first pad of
-    each wall lies further out than the second (`WALLS`); `drift` (3,) is the spectral density of an unknown
-    acceleration, in m2/s3 and rad2/s3, with which the swings are linked.
+    `horizon` limits each swing to its first seconds; `differences` (7,) are those of `DIFFERENCES`; `drift` (3,) is the
+    spectral density of an unknown acceleration, in m2/s3 and rad2/s3, with which the swings are linked.
     """
 
     def __init__(
         self, forward: Forward, unknowns: Unknowns, window: Window, prior: tuple[Array, Array] | None = None,
-        horizon: float = np.inf, turns: Array | None = None, drift: Array | None = None,
+        horizon: float = np.inf, differences: Array | None = None, drift: Array | None = None,
     ) -> None:  # fmt: skip
         self.forward, self.unknowns, self.window, self.horizon = forward, unknowns, window, horizon
         self.mean, self.deviation = prior or (unknowns.nominal(), unknowns.deviations())
-        self.turns = np.zeros(len(WALLS)) if turns is None else turns
+        self.differences = np.zeros(len(DIFFERENCES)) if differences is None else differences
         self.drift = drift
         self.link = np.zeros((0, 6, 6)) if drift is None else link_weights(np.diff(window.starts)[:-1], drift)
+        self._memory: Memory | None = None
+        self._columns: tuple[Point | None, Array] = None, np.zeros(0)
+        self._scene: tuple[bytes, Scene] = b"", unknowns.scene
 
-    def evaluate(self, shared: Array, states: Array, turns: Array | None = None) -> Point | None:
-        """Run the model, with other `turns` than the problem's if given; None where it leaves the model's range."""
-        window = self.window
-        times = window.poses.t - shared[DELAY]
+    def evaluate(
+        self, shared: Array, states: Array, differences: Array | None = None, push: Array | None = None,
+        share: Array | None = None, change: Callable[[Scene], Scene] | None = None,
+    ) -> Point | None:  # fmt: skip
+        """Run the model; None where it leaves the model's range.
+
+        Parameters
+        ----------
+        shared, states : ndarray, shape (SIZE,), (s, 6)
+            The unknowns.
+        differences : ndarray, shape (7,), optional
+            Others than the problem's.
+        push, share : ndarray, optional
+            As in `Forward.run`.
+        change : callable, optional
+            Returns another scene, perhaps with other terms.
+        """
+        window, differences = self.window, self.differences if differences is None else differences
+        lag = float(np.sqrt(differences[LAG]))
+        shift = shared[DELAY] - lag
+        times = window.poses.t - shift
         swing = np.searchsorted(window.starts, times, side="right") - 1
         swing[swing >= window.swings] = -1
         swing[times - window.starts[np.maximum(swing, 0)] > self.horizon] = -1
         rows = np.flatnonzero(swing >= 0)
         # times rise, so a swing's rows lie together
-        edges = np.searchsorted(swing[rows], np.arange(window.swings + 1)).astype(np.int64)
-        asked, ends = times[rows], np.zeros(0, np.int64)
+        inner = np.searchsorted(swing[rows], np.arange(window.swings + 1)).astype(np.int64)
+        asked, ends, edges = times[rows], np.zeros(0, np.int64), inner
         if len(self.link):  # each swing but the last runs to the start of the next
             ends = edges[1:-1] + np.arange(len(self.link))
             asked = np.insert(asked, edges[1:-1], window.starts[1:-1])
             edges = edges + np.minimum(np.arange(window.swings + 1), len(self.link))
-        motions = self.forward.run(
-            self.unknowns.scene_of(shared), shared[GAIN], window.starts[:-1], states, edges, asked,
-            depth_of(self.turns if turns is None else turns),
-        )  # fmt: skip
-        if motions is None:
-            return None
-        residual, rate = np.full((len(times), 3), np.nan), np.zeros((len(times), 3))
-        residual[rows] = window.poses.q[rows] - np.delete(motions.q, ends, axis=0) - shared[BIAS]
-        rate[rows] = np.delete(motions.v, ends, axis=0)
-        defect = states[1 : len(ends) + 1] - np.hstack((motions.q[ends], motions.v[ends]))
-        return Point(shared, states, swing, residual, rate, motions.contact, defect)
-
-    def predicted(
-        self, point: Point, turns: Array | None = None, push: Array | None = None, share: Array | None = None,
-        change: Callable[[Scene], Scene] | None = None,
-    ) -> tuple[Array, Array] | None:  # fmt: skip
-        """Return poses and rates, (n, 3), at a changed point; NaN outside the swings.
-
-        Parameters
-        ----------
-        turns, push, share : ndarray, optional
-            Turns of the walls in m (4,), as in `Forward.run`.
-        change : callable, optional
-            Returns another scene, perhaps with other terms.
-
-        Returns
-        -------
-        tuple of ndarray, or None
-            None where the model cannot be run.
-        """
-        times, rows = self.window.poses.t - point.shared[DELAY], np.flatnonzero(point.swing >= 0)
-        edges = np.searchsorted(point.swing[rows], np.arange(self.window.swings + 1)).astype(np.int64)
-        scene, forward = self.unknowns.scene_of(point.shared), self.forward
+        scene, forward = self._scene_of(shared), self.forward
         if change is not None:
             scene, forward = change(scene), forward.of(change(self.unknowns.scene))
         motions = forward.run(
-            scene, point.shared[GAIN], self.window.starts[:-1], point.states, edges, times[rows],
-            depth_of(self.turns if turns is None else turns), push, share,
-        )  # fmt: skip
+            scene, shared[GAIN], window.starts[:-1], states, edges, asked, depth_of(differences[TURNS]), push, share
+        )
         if motions is None:
             return None
-        q, v = np.full((len(times), 3), np.nan), np.zeros((len(times), 3))
-        q[rows], v[rows] = motions.q, motions.v
-        return q, v
+        q, v = np.delete(motions.q, ends, axis=0), np.delete(motions.v, ends, axis=0)
+        begin = states[:, :3], states[:, 3:]
+        if differences[LEVER].any():
+            q, v = moved_by_lever(q, v, differences[LEVER])
+            begin = moved_by_lever(*begin, differences[LEVER])
+        if lag:
+            self._memory = self._memory or Memory(window.poses)
+            memory = self._memory.at(window.starts[:-1] + shift) - shared[BIAS]
+            q, v = lagged(lag, inner, window.starts[:-1], *map(np.ascontiguousarray, begin), memory, times[rows], q, v)
+        predicted, rate = np.full((len(times), 3), np.nan), np.zeros((len(times), 3))
+        predicted[rows], rate[rows] = q, v
+        residual = window.poses.q - predicted - shared[BIAS]
+        defect = states[1 : len(ends) + 1] - np.hstack((motions.q[ends], motions.v[ends]))
+        return Point(shared, states, swing, predicted, residual, rate, motions.contact, defect)
 
     def cost(self, point: Point, variance: Array) -> float:
         """Return twice the negative logarithm of the posterior: Huber's function of the residuals and the prior.
@@ -287,6 +296,27 @@ class Problem:
         for j in range(6):
             rows[:, :, SIZE + j], ends[:, :, SIZE + j] = self._quotient_by_state(point, j)
         return Linear(rows, ends)
+
+    def _scene_of(self, shared: Array) -> Scene:
+        """Return the scene of a vector; many in a row differ by other numbers than the scene's."""
+        key = shared[: GAIN.start].tobytes()
+        if self._scene[0] != key:
+            self._scene = key, self.unknowns.scene_of(shared)
+        return self._scene[1]
+
+    def by_differences(self, point: Point) -> Array:
+        """Return the derivatives of the prediction by the differences, shape (n, 3, 7); zero where it cannot be run."""
+        if self._columns[0] is not point:
+            out = np.zeros((*point.residual.shape, len(DIFFERENCES)))
+            resolved = self.window.poses.interval() <= RESOLVING
+            for index, step in enumerate(DIFFERENCE_STEPS[: None if resolved else LAG]):
+                moved = self.differences.copy()
+                moved[index] += step
+                other = self.evaluate(point.shared, point.states, moved)
+                if other is not None:
+                    out[:, :, index] = np.nan_to_num((other.predicted - point.predicted) / step)
+            self._columns = point, out
+        return self._columns[1]
 
     def _quotient(self, point: Point, index: int) -> tuple[Array, Array]:
         step = QUANTITIES[index].step

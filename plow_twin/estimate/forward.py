@@ -67,7 +67,7 @@ class Forward:
         self._knots = pieces.knots
         self._scene, self.load = scene, load
         self._work, self._log = new_work(), np.zeros(_LOG_SIZE, EVENT)
-        self._last: tuple[Scene, tuple[bytes | None, ...], Any, Any] | None = None
+        self._params: tuple[Scene, tuple[bytes | None, ...], Any] | None = None
         #: work done so far, in steps of the series
         self.work = 0
 
@@ -128,21 +128,21 @@ class Forward:
     def _compiled(
         self, scene: Scene, gain: Array, depth: Array | None, push: Array | None, share: Array | None
     ) -> tuple[Any, Any]:
-        """Return parameters and segments of the load; many runs in a row differ by their states alone."""
-        others = tuple(None if part is None else part.tobytes() for part in (gain, depth, push, share))
-        if self._last is not None and self._last[:2] == (scene, others):
-            return self._last[2:]
-        segments, inertia = np.zeros(len(self._knots), SEGMENT), inertias(scene)
+        """Return parameters and segments of the load; many runs in a row differ by their states or gains alone."""
+        walls = tuple(None if part is None else part.tobytes() for part in (depth, share))
+        if self._params is None or self._params[:2] != (scene, walls):
+            params = compile_scene(scene, tuning.TOLERANCE, sampled=True).params
+            if depth is not None:
+                params["penetration_rows"][4] -= depth
+            if share is not None:
+                # scaling the penetration of a linear contact scales its stiffness
+                params["penetration_rows"][:] *= share
+            self._params = scene, walls, params
+        inertia = inertias(scene)
+        segments = np.zeros(len(self._knots), SEGMENT)
         segments["knot"] = self._knots
         segments["start"] = self._start / inertia * gain
         segments["slope"] = self._slope / inertia * gain
         if push is not None:
             segments["start"] += push / inertia
-        params = compile_scene(scene, tuning.TOLERANCE, sampled=True).params
-        if depth is not None:
-            params["penetration_rows"][4] -= depth
-        if share is not None:
-            # scaling the penetration of a linear contact scales its stiffness
-            params["penetration_rows"][:] *= share
-        self._last = scene, others, params, segments
-        return params, segments
+        return self._params[2], segments

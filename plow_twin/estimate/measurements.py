@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -132,11 +132,14 @@ class Load:
         Fx, Fy [N] and M [N m] about the cavity's centre, without gravity.
     deviation : tuple of 3 float
         Stated standard deviation of each component; 0 if not stated.
+    unknown : tuple of 3 float
+        Of a load that was thinned, `left_open` of the load before.
     """
 
     t: Array
     wrench: Array
     deviation: Deviation = UNSTATED
+    unknown: Deviation = UNSTATED
 
     @staticmethod
     def of(t: ArrayLike, wrench: ArrayLike, deviation: Deviation = UNSTATED) -> tuple[Load, int]:
@@ -273,15 +276,45 @@ class Load:
         return out
 
     def left_open(self) -> Array:
-        """Return the spectral density of the impulse missed by lines between the samples, in N2 s and (N m)2 s.
+        """Return the spectral density of the impulse missed by lines between the samples, in N2 s and (N m)2 s."""
+        _, its, of_samples = self._roughness()
+        return of_samples - its
 
-        A load as rough between its samples as from sample to sample differs from the lines by Brownian bridges.
+    def _roughness(self) -> tuple[float, Array, Array]:
+        """Return the correlation from sample to sample, and spectral densities of the load and of the lines.
+
+        The rough part of the load is taken for an Ornstein-Uhlenbeck process. If a is its correlation from sample to
+        sample, their mean square distance from the lines through their neighbours grows over twice the distance by
+        (1 + a) (3 - a^2) / (3 - a): by 2 for a process that is rough (a Brownian bridge is missed), by 1 for one that
+        is sampled too rarely, whose lines themselves are off.
         """
-        step = np.diff(self.t)
-        slope = np.diff(self.wrench, axis=0) / step[:, None]
-        jump = np.diff(slope, axis=0) * (step[:-1] * step[1:] / (step[:-1] + step[1:]))[:, None]
-        variance: Array = 2.0 * (jump**2).mean(axis=0)
-        return variance * float(step.mean()) / 12.0
+        if len(self.t) < 5:
+            return 1.0, np.zeros(3), np.zeros(3)
+        near = _from_lines(self.t, self.wrench)
+        far = 0.5 * (_from_lines(self.t[::2], self.wrench[::2]) + _from_lines(self.t[1::2], self.wrench[1::2]))
+        growth = np.divide(far, near, out=np.full(3, 2.0), where=near > 0.0)
+        steps = np.linspace(0.0, 1.0, 101)[1:-1]
+        a = float(np.interp(growth.mean(), (1.0 + steps) * (3.0 - steps * steps) / (3.0 - steps), steps))
+        variance = 2.0 * near * float(np.diff(self.t).mean()) / ((1.0 - a) * (3.0 - a))
+        return a, -2.0 * variance / math.log(a), variance * (1.0 + a) / (1.0 - a)
+
+    def believable(self) -> Load:
+        """Return the load as known best between its samples, with the spectral density of its unknown part.
+
+        Samples without correlation say little about the time between them: their strong oscillations alone are kept.
+        """
+        correlation, its, of_samples = self._roughness()
+        if correlation > 2.0 / math.sqrt(len(self.t)):
+            fx, fy, moment = (of_samples - its).tolist()
+            return replace(self, unknown=(fx, fy, moment))
+        t = np.linspace(self.t[0], self.t[-1], len(self.t))
+        wrench = np.stack([np.interp(t, self.t, column) for column in self.wrench.T], axis=1)
+        mean = wrench.mean(axis=0)
+        lines = np.fft.rfft(wrench - mean, axis=0)
+        power = np.abs(lines) ** 2 * float(t[1] - t[0]) / len(t)
+        strong = np.fft.irfft(np.where(power > 0.5 * tuning.OUTLYING**2 * of_samples, lines, 0.0), len(t), axis=0)
+        fx, fy, moment = its.tolist()
+        return Load(t, mean + strong, self.deviation, (fx, fy, moment))
 
     def averaged(self, count: int) -> Load:
         """Return `count` knots at equal distances whose lines are nearest to this load (least squares).
@@ -305,6 +338,25 @@ class Load:
                 np.bincount(left, (1.0 - share) * value, count) + np.bincount(left + 1, share * value, count)
             )
         return Load(knots, solveh_banded(bands, np.stack(columns, axis=1)))
+
+
+def _from_lines(t: Array, value: Array) -> Array:
+    """Return the mean square distance of inner values from the lines through their neighbours, shape (3,)."""
+    step = np.diff(t)
+    slope = np.diff(value, axis=0) / step[:, None]
+    off = np.diff(slope, axis=0) * (step[:-1] * step[1:] / (step[:-1] + step[1:]))[:, None]
+    mean: Array = (off**2).mean(axis=0)
+    return mean
+
+
+def filled(poses: Poses) -> Array:
+    """Return the poses with gaps of components bridged by straight lines; zeros for a component never measured."""
+    out = np.zeros_like(poses.q)
+    for i, column in enumerate(poses.q.T):
+        there = np.isfinite(column)
+        if there.any():
+            out[:, i] = np.interp(poses.t, poses.t[there], column[there])
+    return out
 
 
 def own_deviations(brought: Iterable[tuple[float, ...]]) -> Array:

@@ -1,9 +1,9 @@
-"""The clearance by groups of pads.
+"""Walls that are turned, a sensor with a lever arm or a low pass, and the clearance by groups of pads.
 
 The two pads of a wall may be worn differently, which turns the wall. One linearised step beside a fit of the clearances
-finds these turns, with all other unknowns eliminated; their intervals show whether the motion determines them. If walls
-are turned so far that the fit does not hold, it is repeated with turned walls. A pose cannot divide a clearance between
-the two sides of the head: the difference is the sensor's bias.
+finds these turns with the lever arm and the low pass of the sensor, all other unknowns eliminated; their intervals show
+whether the motion determines them. If they are so large that the fit does not hold, it is repeated with them. A pose
+cannot divide a clearance between the two sides of the head: the difference is the sensor's bias.
 """
 
 from __future__ import annotations
@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.estimate import tuning
-from plow_twin.estimate.fit import WALLS, Fit, Problem, fit, joint_step
+from plow_twin.estimate.fit import DIFFERENCE_STEPS, DIFFERENCES, LAG, TURNS, WALLS, Fit, Problem, fit, joint_step
 from plow_twin.estimate.gaps import GROUPS
+from plow_twin.estimate.priors import UNSTATED
 from plow_twin.estimate.result import Interval
 from plow_twin.estimate.unknowns import GX, GY, SIZE
 
@@ -28,11 +29,16 @@ _MADE_OF: Final = {
     "vertical_left": (GY, np.array([0.0, 0.0, 0.5, 0.5])),
     "vertical_right": (GY, np.array([0.0, 0.0, -0.5, -0.5])),
 }
-#: Step: of the difference quotient by a turn in m.
-TURN_STEP = 2e-4
-#: Bound: rounds of fits with turned walls, iterations of each; change of a turn in m that ends them, half of that step.
-_ROUNDS, _ITERATIONS, _NO_TURN = 4, 15, 0.5 * TURN_STEP
+#: Bound: rounds of fits with differences, iterations of each.
+_ROUNDS, _ITERATIONS = 6, 15
 assert list(_MADE_OF) == list(GROUPS)
+
+
+def deviations() -> Array:
+    """Return the prior's standard deviations of the differences in a fit, shape (7,)."""
+    out = np.array([UNSTATED[name] for name in DIFFERENCES])
+    out[TURNS] = tuning.TURN
+    return out
 
 
 def by_group(problem: Problem, found: Fit, widened: float) -> dict[str, tuple[Interval, float]]:
@@ -43,43 +49,46 @@ def by_group(problem: Problem, found: Fit, widened: float) -> dict[str, tuple[In
     step, covariance = _joint_step(problem, found)
     out = {}
     for name, (axis, shares) in _MADE_OF.items():
-        made = np.zeros(SIZE + len(WALLS))
+        made = np.zeros(SIZE + len(DIFFERENCES))
         made[axis] = 1.0
-        made[SIZE:] = shares
-        mean = float(found.shared[axis] + shares @ problem.turns + made @ step)
+        made[SIZE : SIZE + len(WALLS)] = shares
+        mean = float(found.shared[axis] + shares @ problem.differences[TURNS] + made @ step)
         deviation = widened * float(np.sqrt(made @ covariance @ made))
         out[name] = Interval.normal(mean, deviation), deviation
     return out
 
 
-def askew(problem: Problem, found: Fit) -> float:
-    """Return chi^2 of the linearised step of the four turns: whether the motion shows walls that are worn askew."""
+def shown(problem: Problem, found: Fit) -> float:
+    """Return chi^2 of the linearised step of the differences: whether the motion shows them."""
     step, covariance = _joint_step(problem, found)
-    turn = step[SIZE:]
-    return float(turn @ np.linalg.solve(covariance[SIZE:, SIZE:], turn))
+    step, covariance = step[SIZE:], covariance[SIZE:, SIZE:]
+    return float(step @ np.linalg.solve(covariance, step))
 
 
-def turned(problem: Problem, found: Fit) -> tuple[Problem, Fit] | None:
-    """Fit again with walls that are turned, from a fit without; None where the model cannot be run there."""
+def with_differences(problem: Problem, found: Fit) -> tuple[Problem, Fit] | None:
+    """Fit again with differences of machine and sensor, from a fit without; None where the model cannot be run."""
     forward = problem.forward.renewed()
     for _ in range(_ROUNDS):
         step, _ = _joint_step(problem, found)
-        turn = np.clip(step[SIZE:], -tuning.TURN[1], tuning.TURN[1])
+        most = 0.5 * deviations()
+        differences = problem.differences + np.clip(step[SIZE:], -most, most)
+        differences[LAG] = max(differences[LAG], 0.0)
+        change = np.abs(differences - problem.differences)
         problem = Problem(
-            forward, problem.unknowns, problem.window, horizon=problem.horizon, turns=problem.turns + turn,
+            forward, problem.unknowns, problem.window, horizon=problem.horizon, differences=differences,
             drift=problem.drift,
         )  # fmt: skip
         again = fit(problem, found.shared, found.point.states, found.noise, _ITERATIONS)
         if again is None:
             return None
         found = again
-        if np.abs(turn).max() < _NO_TURN:
+        if (change < 0.5 * DIFFERENCE_STEPS).all():
             break
     return problem, found
 
 
-def of_turns(problem: Problem, found: Fit) -> Array:
-    """Return the covariance of the shared unknowns due to walls that may be turned, shape (SIZE, SIZE).
+def of_differences(problem: Problem, found: Fit) -> Array:
+    """Return the covariance of the shared unknowns due to the differences, shape (SIZE, SIZE).
 
     If only one of two facing pads is touched, the distance of the others is unknown.
     """
@@ -90,19 +99,6 @@ def of_turns(problem: Problem, found: Fit) -> Array:
 
 
 def _joint_step(problem: Problem, found: Fit) -> tuple[Array, Array]:
-    """Return the linearised step of the shared unknowns and the turns together, shape (15,), and its covariance."""
-    precision = np.full(len(WALLS), 1.0 / tuning.TURN[0] ** 2)
-    return joint_step(problem, found, _columns(problem, found), precision, -problem.turns * precision)
-
-
-def _columns(problem: Problem, found: Fit) -> Array:
-    """Return the derivatives of the prediction by the walls' turns, shape (n, 3, 4)."""
-    point = found.point
-    out = np.zeros((*point.residual.shape, len(WALLS)))
-    for index in range(len(WALLS)):
-        turns = problem.turns.copy()
-        turns[index] += TURN_STEP
-        other = problem.evaluate(point.shared, point.states, turns)
-        if other is not None:
-            out[:, :, index] = np.nan_to_num((point.residual - other.residual) / TURN_STEP)
-    return out
+    """Return the linearised step of the shared unknowns and the differences together, (18,), and its covariance."""
+    precision = deviations() ** -2.0
+    return joint_step(problem, found, problem.by_differences(found.point), precision, -problem.differences * precision)

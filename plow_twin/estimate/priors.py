@@ -27,6 +27,17 @@ ROUNDING: Final = 3e-3
 SCALES: Final = (5e-3, 5e-3, 1e-2)
 #: Prior: standard deviation of a sensor's constant error of x, y [m] and theta [rad].
 BIAS: Final = (5e-3, 5e-3, 0.02)
+#: Prior: deviations of quantities that no scene states. Walls: stiffness over the contact's, turn in m. Of the sensor:
+#: scales, lever arm in m, square in s2 of the time constant of its low pass (its mean delay is an unknown of the fit),
+#: drift of its clock.
+UNSTATED: Final = {
+    **{f"stiffness_{wall}": 0.1 for wall in ("left", "right", "top", "bottom")},
+    **{f"turn_{wall}": 1e-3 for wall in ("left", "right", "top", "bottom")},
+    **{f"scale_{axis}": scale for axis, scale in zip(("x", "y", "theta"), SCALES, strict=True)},
+    **{f"lever_{axis}": 4e-3 for axis in ("x", "y")},
+    "filter": 4e-4,
+    "clock": 1e-4,
+}
 #: Row of the table for each number.
 KINDS: Final = {
     "clearance.horizontal_m": "clearance",

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.estimate import tuning
-from plow_twin.estimate.fit import Fit, Problem, Window, fit
+from plow_twin.estimate.fit import LAG, RESOLVING, Fit, Problem, Window, fit
 from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.measurements import Poses
+from plow_twin.estimate.priors import UNSTATED
 from plow_twin.estimate.start import cut, first_vectors, range_of_motion
 from plow_twin.estimate.unknowns import BIAS, DELAY, GX, GY, SOFTNESS, Unknowns
 
@@ -29,19 +30,22 @@ class Stage:
 
 #: Derived: rows within a horizon, and within a swing: more numbers than the six of its start in each component.
 _FEWEST_ROWS = (8, 12)
+#: Prior: differences of a sensor with a slow low pass alone.
+LOW_PASS: Final = np.array([0.0] * LAG + [UNSTATED["filter"]])
 #: Bound: rounds in which the candidates become fewer.
 STAGES: Final = (Stage(0.1, 4, 5), Stage(0.2, 3, 2))
 #: Bound: swings; the cost of a fit grows with them.
 _MOST_SWINGS = 350
 
 
-def candidate(forward: Forward, unknowns: Unknowns, poses: Poses, period: float) -> Fit | None:
+def candidate(forward: Forward, unknowns: Unknowns, poses: Poses, period: float) -> tuple[Problem, Fit] | None:
     """Return the best fit to the beginnings of the first swings, or None where no start could be run."""
     interval = poses.interval()
     first = poses.between(float(poses.t[0]), float(poses.t[0]) + tuning.FIRST_PERIODS * period)
     window = cut(unknowns.scene, first, period, max(0.2 * period, _FEWEST_ROWS[1] * interval))
     horizons = [max(stage.horizon * period, _FEWEST_ROWS[0] * interval) for stage in STAGES]
-    vectors = first_vectors(Problem(forward, unknowns, window, horizon=horizons[0]), 6)
+    problem = Problem(forward, unknowns, window, horizon=horizons[0])
+    vectors = first_vectors(problem, 6)
     points = [(vector, states_at(window, vector), tuning.FIRST_NOISE) for vector in vectors]
     fits: list[Fit] = []
     for stage, horizon in zip(STAGES, horizons, strict=True):
@@ -50,19 +54,33 @@ def candidate(forward: Forward, unknowns: Unknowns, poses: Poses, period: float)
         fits = [one for one in (fit(problem, *point, stage.iterations) for point in points) if one is not None]
         fits = sorted(fits, key=lambda one: one.loss)[: stage.keep]
         points = [(one.shared, one.point.states, one.noise) for one in fits]
-    return fits[0] if fits else None
+    return (problem, fits[0]) if fits else None
+
+
+def behind_low_pass(problem: Problem, found: Fit) -> Fit | None:
+    """Return the fit to the same swings behind a low pass of the prior's deviation, None where it is not nearer.
+
+    Impacts last for less than the time constant of a slow low pass, so a fit without does not lead to it.
+    """
+    if problem.window.poses.interval() > RESOLVING:
+        return None
+    other = Problem(
+        problem.forward.renewed(), problem.unknowns, problem.window, horizon=problem.horizon, differences=LOW_PASS
+    )
+    again = fit(other, found.shared, found.point.states, found.noise, STAGES[-1].iterations)
+    return again if again is not None and again.loss < found.loss - tuning.OUTLYING**2 else None
 
 
 def refine(
     forward: Forward, unknowns: Unknowns, poses: Poses, period: float, shared: Array, noise: Array, drift: Array | None,
-    turns: Array | None = None, close: bool = False,
+    differences: Array | None = None, close: bool = False,
 ) -> tuple[Problem, Fit] | None:  # fmt: skip
     """Fit all poses from a good start: the beginning of each swing first.
 
     From a start `close` to the optimum, also long swings of a hard contact converge.
 
     `drift` (3,) is the spectral density of the acceleration by the unknown part of a broad-band load in m2/s3 and
-    rad2/s3, None for another load; `turns` (4,) are the turns of the walls, in m.
+    rad2/s3, None for another load; `differences` (7,) are held.
     """
     hard = not close and bool(np.exp(shared[SOFTNESS]) < tuning.HARD)
     rows = poses.interval() * np.array(_FEWEST_ROWS)
@@ -74,7 +92,7 @@ def refine(
     shortest = max(shortest * period, rows[1], float(poses.t[-1] - poses.t[0]) / _MOST_SWINGS)
     horizon = max(horizon * period, rows[0])
     window = cut(unknowns.scene, poses, period, shortest)
-    near = Problem(forward, unknowns, window, horizon=min(max(0.2 * period, rows[0]), horizon), turns=turns)
+    near = Problem(forward, unknowns, window, horizon=min(max(0.2 * period, rows[0]), horizon), differences=differences)
     starts = [shared]
     if unknowns.is_hard(shared):  # good for hard contacts only
         starts.append(range_of_hard(unknowns, poses, shared))
@@ -85,7 +103,7 @@ def refine(
     found = min((one for one in fits if one is not None), key=lambda one: one.loss, default=None)
     if found is None:
         return None
-    whole = Problem(forward, unknowns, window, horizon=horizon, turns=turns, drift=None if hard else drift)
+    whole = Problem(forward, unknowns, window, horizon=horizon, differences=differences, drift=None if hard else drift)
     states = better_states(whole, found.shared, found.point.states)
     found = fit(whole, found.shared, states, found.noise, 20 if not hard and drift is None else 12)
     return None if found is None else (whole, found)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from plow_twin.estimate import tuning
 from plow_twin.estimate.fit import Problem, Window
-from plow_twin.estimate.measurements import Poses
+from plow_twin.estimate.measurements import Poses, filled
 from plow_twin.estimate.unknowns import BIAS, DAMPING, DELAY, GX, GY, SOFTNESS, Unknowns
 from plow_twin.model import geometry
 from plow_twin.model.pairs import NORMAL_X, NORMAL_Y
@@ -21,16 +21,6 @@ Array = NDArray[np.float64]
 WALLS: Final = (NORMAL_X > 0.0, NORMAL_X < 0.0, NORMAL_Y > 0.0, NORMAL_Y < 0.0)
 #: Bound: moments tried for the start of a swing.
 _CANDIDATES = 12
-
-
-def filled(poses: Poses) -> Array:
-    """Return the poses with gaps of components bridged by straight lines; zeros for a component never measured."""
-    out = np.zeros_like(poses.q)
-    for i, column in enumerate(poses.q.T):
-        there = np.isfinite(column)
-        if there.any():
-            out[:, i] = np.interp(poses.t, poses.t[there], column[there])
-    return out
 
 
 def smoothed(q: Array, width: int) -> Array:

@@ -266,9 +266,7 @@ BENT_BY_EXPONENT: Annotated[
 UNEXPLAINED: Annotated[
     float, Tuned("m", "deviation of a clearance by the root of the growth of the variance", "as above")
 ] = 1e-4
-TURN: Annotated[
-    tuple[float, ...], Tuned("m", "turn of a wall in a fit: prior deviation, longest change in a round")
-] = (4e-3, 2e-3)
+TURN: Annotated[float, Tuned("m", "prior deviation of the turn of a wall in a fit")] = 4e-3
 
 # Hard contacts
 FITTED: Annotated[

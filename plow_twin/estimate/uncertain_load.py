@@ -27,6 +27,8 @@ Array = NDArray[np.float64]
 
 #: Derived: distance of the knots of a load's error, a third of its shortest correlation, in that correlation.
 _KNOTS = 1.0 / 3.0
+#: Derived: distance of the knots in s of the part that samples miss: half the period of a soft contact (20 Hz).
+_KNOT = 0.025
 #: Bound: rounds of draws, the second and third about the result of the round before.
 _ROUNDS = 3
 #: Bound: fewest draws that a regression is made of.
@@ -202,7 +204,10 @@ def _with_exponent(unknowns: Unknowns, rng: np.random.Generator) -> Unknowns:
 
 
 def _with_error(load: Load, share: float, rng: np.random.Generator) -> Load:
-    """Return a load with an error of a `share` of its amplitude, an Ornstein-Uhlenbeck process."""
+    """Return a load with an error of a `share` of its amplitude, an Ornstein-Uhlenbeck process, and what samples miss.
+
+    The missed part is white noise of the density `load.unknown`.
+    """
     least, most = tuning.LOAD_CORRELATION
     time = math.exp(rng.uniform(math.log(least), math.log(most)))
     grid = np.arange(load.t[0], load.t[-1], _KNOTS * least)
@@ -211,8 +216,10 @@ def _with_error(load: Load, share: float, rng: np.random.Generator) -> Load:
     error[1:] *= math.sqrt(1.0 - keep * keep)
     for index in range(1, len(grid)):
         error[index] += keep * error[index - 1]
-    t = np.union1d(load.t, grid)
     amplitude = 0.5 * share * np.ptp(load.wrench, axis=0)
-    wrench = [np.interp(t, load.t, column) for column in load.wrench.T]
-    added = [np.interp(t, grid, column) for column in error.T]
-    return Load(t, np.stack(wrench, axis=1) + amplitude * np.stack(added, axis=1))
+    within = np.arange(load.t[0], load.t[-1], _KNOT)
+    missed = rng.standard_normal((len(within), 3)) * np.sqrt(np.array(load.unknown) / _KNOT)
+    t = np.unique(np.concatenate([load.t, grid, within]))
+    parts = ((load.t, load.wrench), (grid, amplitude * error), (within, missed))
+    wrench = sum(np.stack([np.interp(t, its, column) for column in part.T], axis=1) for its, part in parts)
+    return Load(t, np.asarray(wrench))

@@ -153,7 +153,7 @@ def _other_law(problem: Problem, fit: Fit, verdict: Verdict) -> None:
     shared[DAMPING] = math.log(tuning.LAW_DAMPING[0] * unknowns.critical_damping(stiffness))
     prior = problem.mean, problem.deviation
     forward, window = problem.forward.of(unknowns.scene), problem.window
-    other = Problem(forward, unknowns, window, prior, problem.horizon, problem.turns, problem.drift)
+    other = Problem(forward, unknowns, window, prior, problem.horizon, problem.differences, problem.drift)
     point = other.evaluate(shared, fit.point.states)
     problem.forward.work += forward.work
     if point is None:
