@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from estimate_support import known
+from scipy.signal import lfilter
 
 from plow_twin.estimate.measurements import EstimateError, Load, Poses, believed
 
@@ -90,3 +91,21 @@ def test_the_impulse_that_a_rough_load_leaves_open_between_its_samples_is_known(
     assert load.left_open() == pytest.approx((impulse**2).sum(axis=0) / fine[-1], rel=0.1)
     smooth, _ = Load.of(fine[::50], np.sin(2.0 * fine[::50, None]) * [1.0, 2.0, 3.0])
     assert (smooth.left_open() < 1e-9 * load.left_open()).all()
+
+
+def test_samples_too_rare_for_a_rough_load_leave_its_oscillation_and_the_density_of_the_rest() -> None:
+    rng = np.random.default_rng(4)
+    fine, keep = np.arange(0.0, 200.0, 1e-3), np.exp(-1e-3 / 8e-3)
+    drive = np.sqrt(1.0 - keep**2) * rng.standard_normal((len(fine), 3)) * [1.0, 2.0, 3.0]
+    rough = lfilter([1.0], [1.0, -keep], drive, axis=0)
+    slow = np.sin(2.0 * fine[:, None]) * [3.0, 6.0, 9.0]
+    load, _ = Load.of(fine[::100], (slow + rough)[::100])
+    lines = np.stack([np.interp(fine, load.t, column) for column in load.wrench.T], axis=1)
+    impulse = np.add.reduceat((slow + rough - lines) * 1e-3, np.arange(0, len(fine), 1000), axis=0)
+    share = load.left_open() / (impulse**2).mean(axis=0)
+    assert ((share > 0.4) & (share < 1.3)).all(), "samples hardly tell how short the correlation is"
+    known = load.believable()
+    left = np.stack([np.interp(known.t, fine, column) for column in slow.T], axis=1) - known.wrench
+    # the samples were off by 1, 2, 3
+    assert (left.std(axis=0) < [0.4, 0.8, 1.2]).all()
+    assert (np.array(known.unknown) < (impulse**2).mean(axis=0)).all()

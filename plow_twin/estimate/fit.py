@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from plow_twin.estimate import tuning
 from plow_twin.estimate.arrow import OWN, Arrow, Factor
 from plow_twin.estimate.forward import Forward
-from plow_twin.estimate.measurements import Poses
+from plow_twin.estimate.measurements import RESOLVING, Poses
 from plow_twin.estimate.sensor import Memory, lagged, moved_by_lever
 from plow_twin.estimate.unknowns import BIAS, DAMPING, DELAY, GAIN, MOVING, PROBES, QUANTITIES, SIZE, Unknowns
 from plow_twin.model.pairs import PAIR_COUNT
@@ -47,8 +47,6 @@ TURNS, LEVER, LAG = slice(0, 4), slice(4, 6), 6
 DIFFERENCES: Final = ("turn_left", "turn_right", "turn_top", "turn_bottom", "lever_x", "lever_y", "filter")
 #: Step: of their difference quotients.
 DIFFERENCE_STEPS: Final = np.array([2e-4, 2e-4, 2e-4, 2e-4, 1e-3, 1e-3, 4e-6])
-#: Guard: longest distance in s of poses between which a cubic is near the motion in a soft contact, for a low pass.
-RESOLVING = 0.02
 #: Derived: a row has three numbers, the start of a swing six; fewer rows determine the start alone.
 FEWEST_OF_SWING = 4
 

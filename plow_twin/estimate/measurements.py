@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,6 +23,8 @@ UNSTATED: Deviation = (0.0, 0.0, 0.0)
 #: Derived: a standard deviation from n values is known to 1 / sqrt(2 n), which is 22 % for a cell in contact, 16 % for
 #: poses and gaps, 10 % for a scatter in a comparison.
 FEWEST_IN_CONTACT, FEWEST_POSES, FEWEST_FOR_SCATTER = 10, 20, 50
+#: Guard: longest distance in s of poses, or samples, between which the motion in a soft contact is near a cubic.
+RESOLVING: Final = 0.02
 #: Bound: smallest number of points between two knots over which a load is averaged.
 _FINER = 8
 #: Guard: largest number that can be a head's pose, in m or rad, and a load, in N or N m.
@@ -280,8 +282,8 @@ class Load:
         _, its, of_samples = self._roughness()
         return of_samples - its
 
-    def _roughness(self) -> tuple[float, Array, Array]:
-        """Return the correlation from sample to sample, and spectral densities of the load and of the lines.
+    def _roughness(self) -> tuple[Array, Array, Array]:
+        """Return the correlation from sample to sample, and spectral densities of the load and of the lines, (3,) each.
 
         The rough part of the load is taken for an Ornstein-Uhlenbeck process. If a is its correlation from sample to
         sample, their mean square distance from the lines through their neighbours grows over twice the distance by
@@ -289,23 +291,26 @@ class Load:
         is sampled too rarely, whose lines themselves are off.
         """
         if len(self.t) < 5:
-            return 1.0, np.zeros(3), np.zeros(3)
+            return np.ones(3), np.zeros(3), np.zeros(3)
         near = _from_lines(self.t, self.wrench)
         far = 0.5 * (_from_lines(self.t[::2], self.wrench[::2]) + _from_lines(self.t[1::2], self.wrench[1::2]))
         growth = np.divide(far, near, out=np.full(3, 2.0), where=near > 0.0)
-        steps = np.linspace(0.0, 1.0, 101)[1:-1]
-        a = float(np.interp(growth.mean(), (1.0 + steps) * (3.0 - steps * steps) / (3.0 - steps), steps))
+        a = np.linspace(0.0, 1.0, 101)[1:-1]
+        a = np.interp(growth, (1.0 + a) * (3.0 - a * a) / (3.0 - a), a)
         variance = 2.0 * near * float(np.diff(self.t).mean()) / ((1.0 - a) * (3.0 - a))
-        return a, -2.0 * variance / math.log(a), variance * (1.0 + a) / (1.0 - a)
+        return a, -2.0 * variance / np.log(a), variance * (1.0 + a) / (1.0 - a)
 
     def believable(self) -> Load:
         """Return the load as known best between its samples, with the spectral density of its unknown part.
 
-        Samples without correlation say little about the time between them: their strong oscillations alone are kept.
+        Rare samples without correlation say little about the time between them: their strong oscillations alone are
+        kept.
         """
         correlation, its, of_samples = self._roughness()
-        if correlation > 2.0 / math.sqrt(len(self.t)):
-            fx, fy, moment = (of_samples - its).tolist()
+        # not by three standard errors
+        rare = (correlation < 3.0 / math.sqrt(len(self.t))) & (self.interval() > RESOLVING)
+        fx, fy, moment = np.where(rare, its, of_samples - its).tolist()
+        if not rare.any():
             return replace(self, unknown=(fx, fy, moment))
         t = np.linspace(self.t[0], self.t[-1], len(self.t))
         wrench = np.stack([np.interp(t, self.t, column) for column in self.wrench.T], axis=1)
@@ -313,8 +318,7 @@ class Load:
         lines = np.fft.rfft(wrench - mean, axis=0)
         power = np.abs(lines) ** 2 * float(t[1] - t[0]) / len(t)
         strong = np.fft.irfft(np.where(power > 0.5 * tuning.OUTLYING**2 * of_samples, lines, 0.0), len(t), axis=0)
-        fx, fy, moment = its.tolist()
-        return Load(t, mean + strong, self.deviation, (fx, fy, moment))
+        return Load(t, np.where(rare, mean + strong, wrench), self.deviation, (fx, fy, moment))
 
     def averaged(self, count: int) -> Load:
         """Return `count` knots at equal distances whose lines are nearest to this load (least squares).

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.estimate import tuning
-from plow_twin.estimate.fit import LAG, RESOLVING, Fit, Problem, Window, fit
+from plow_twin.estimate.fit import LAG, Fit, Problem, Window, fit
 from plow_twin.estimate.forward import Forward
-from plow_twin.estimate.measurements import Poses
+from plow_twin.estimate.measurements import RESOLVING, Poses
 from plow_twin.estimate.priors import UNSTATED
 from plow_twin.estimate.start import cut, first_vectors, range_of_motion
 from plow_twin.estimate.unknowns import BIAS, DELAY, GX, GY, SOFTNESS, Unknowns

@@ -110,10 +110,11 @@ MORE_ASKEW: Annotated[
     float,
     Tuned(
         "1",
-        "chi^2 of the turns of walls over that of the scales, each explaining the other in part",
-        "walls worn askew: 5 and more (0.3 to 1 times the wear late in a life); scales of 1.05: 0.4 to 1.6",
+        "chi^2 of turned walls, lever arm and low pass over that of the scales, each explaining the other in part",
+        "walls worn askew: 5 and more (0.3 to 1 times the wear late in a life); low pass of 20 Hz: 2.2 and 7.3 "
+        "(`filter_20`, seeds 99001, 98002); scales of 1.05: 0.4 to 1.6; frame, mass, scale of theta: 0.2 to 0.7",
     ),
-] = 3.0
+] = 2.0
 CHANGE_CHI2: Annotated[float, Tuned("chi^2", "gain of a change within the window")] = 200.0
 CHANGE_SHARE: Annotated[float, Tuned("1", "least share of the excess residuals that such a change explains")] = 0.25
 STUCK: Annotated[

@@ -218,7 +218,8 @@ def _with_error(load: Load, share: float, rng: np.random.Generator) -> Load:
         error[index] += keep * error[index - 1]
     amplitude = 0.5 * share * np.ptp(load.wrench, axis=0)
     within = np.arange(load.t[0], load.t[-1], _KNOT)
-    missed = rng.standard_normal((len(within), 3)) * np.sqrt(np.array(load.unknown) / _KNOT)
+    # rare samples bound the correlation of the missed part, to which its density is proportional, from above only
+    missed = rng.standard_normal((len(within), 3)) * np.sqrt(rng.random() * np.array(load.unknown) / _KNOT)
     t = np.unique(np.concatenate([load.t, grid, within]))
     parts = ((load.t, load.wrench), (grid, amplitude * error), (within, missed))
     wrench = sum(np.stack([np.interp(t, its, column) for column in part.T], axis=1) for its, part in parts)

@@ -19,6 +19,7 @@ from plow_twin.estimate.measurements import FEWEST_FOR_SCATTER, FEWEST_POSES, Po
 from plow_twin.estimate.scales import scales_of
 from plow_twin.estimate.start import noise_level
 from plow_twin.estimate.unknowns import BIAS, DAMPING, GAIN, GX, GY, SIZE, SOFTNESS, with_other_law
+from plow_twin.solve.compiled_scene import inertias
 
 Array = NDArray[np.float64]
 
@@ -257,7 +258,16 @@ def _change_within(problem: Problem, fit: Fit, verdict: Verdict) -> None:
     elif clearance > bias and np.abs(growth).max() > 0.5 * tuning.OBSERVED:
         verdict.model.append(f"machine changed within the window: clearances by {growth[0]:.2g} m, {growth[1]:.2g} m")
     # residuals of a wrong load or law also look like a change, but it explains little of them
-    verdict.broken |= len(verdict.sensor) + len(verdict.model) > found and share > tuning.CHANGE_SHARE
+    verdict.broken |= (
+        len(verdict.sensor) + len(verdict.model) > found and share > tuning.CHANGE_SHARE and _felt(problem, fit)
+    )
+
+
+def _felt(problem: Problem, fit: Fit) -> bool:
+    """Return whether the load is known so well that it moves the head in a swing as believed, up to the noise."""
+    drift = np.array(problem.forward.load.unknown) / np.asarray(inertias(problem.unknowns.scene)) ** 2
+    span = float(np.median(np.diff(problem.window.starts)))
+    return len(problem.link) > 0 or bool((drift * span**3 / 3.0 < fit.noise**2).all())
 
 
 def _excess(fit: Fit) -> float:
