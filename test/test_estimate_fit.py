@@ -9,6 +9,7 @@ from scipy.stats import truncnorm
 from plow_twin.estimate.arrow import Arrow
 from plow_twin.estimate.fit import link_weights
 from plow_twin.estimate.result import Interval
+from plow_twin.estimate.sensor import lagged
 
 
 def test_links_have_the_weight_of_white_noise_of_acceleration() -> None:
@@ -38,6 +39,20 @@ def test_the_normal_equations_of_linked_swings_agree_with_dense_ones(swings: int
     inverse = np.linalg.inv(dense + np.diag(more))
     assert factor.solve(right) == pytest.approx(inverse @ right, rel=1e-9, abs=1e-12)
     assert factor.covariance() == pytest.approx(inverse[:3, :3], rel=1e-9, abs=1e-12)
+
+
+def test_a_low_pass_is_exact_behind_a_cubic() -> None:
+    tau, t = 0.03, np.linspace(0.01, 0.5, 50)
+    powers = np.array([0.4, -2.0, 5.0, 30.0])
+    place = np.polynomial.Polynomial(powers)
+    rate, steady = place.deriv(), place - tau * place.deriv() + tau**2 * place.deriv(2) - tau**3 * place.deriv(3)
+    start = np.full((1, 3), 0.7)
+    q, v = (np.repeat(part(t)[:, None], 3, axis=1) for part in (place, rate))
+    begin = np.full((1, 3), place(0.0)), np.full((1, 3), rate(0.0))
+    out, slope = lagged(tau, np.array([0, len(t)]), np.zeros(1), *begin, start, t, q, v)
+    expected = steady(t) + (0.7 - steady(0.0)) * np.exp(-t / tau)
+    assert out == pytest.approx(np.repeat(expected[:, None], 3, axis=1), rel=1e-9)
+    assert slope == pytest.approx((q - out) / tau)
 
 
 def test_an_interval_is_cut_off_where_the_head_has_been() -> None:

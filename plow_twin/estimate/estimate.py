@@ -21,6 +21,7 @@ from plow_twin.estimate.measurements import FEWEST_POSES, Load, Poses, useless_d
 from plow_twin.estimate.pads import by_group, of_differences, shown, with_differences
 from plow_twin.estimate.result import NORMAL_P95, Estimate, ForcesUsed, Interval, Motion, State
 from plow_twin.estimate.search import LOW_PASS, behind_low_pass, candidate, refine
+from plow_twin.estimate.sensor import lagged
 from plow_twin.estimate.similar import Units
 from plow_twin.estimate.start import filled, noise_level, range_of_motion
 from plow_twin.estimate.uncertain_load import compare_under_uncertain_load
@@ -583,6 +584,8 @@ def warm_up(scene: Scene) -> None:
             np.array([0, 1]),
             np.array([1e-3]),
         )
+    row = np.zeros((1, 3))
+    lagged(1.0, np.array([0, 1]), np.zeros(1), row, row, row, np.ones(1), row, row)
 
 
 def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: ContactForces | None = None) -> Estimate:
