@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scenes import preset
 
-from plow_twin import Clearance, Gravity, Harmonic, Scene, Status, Table, simulate, simulate_many
+from plow_twin import Clearance, Gravity, Harmonic, Initial, Scene, Status, Table, simulate, simulate_many
+from plow_twin.model import geometry
 from plow_twin.model.loads import compile_loads
 from plow_twin.solve import compiled_scene
 
@@ -81,6 +82,24 @@ def test_scenes_one_after_the_other_share_what_their_equal_parts_need(monkeypatc
     for _ in range(2):  # a table is not kept
         simulate(dataclasses.replace(scene, loads=(table,)), 1e-3)
     assert len(summed) == 3
+
+
+def test_parts_that_the_clearance_does_not_decide_are_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows, computed = geometry.arm_rows, list[Scene]()
+
+    def counted(scene: Scene) -> object:
+        computed.append(scene)
+        return rows(scene)
+
+    monkeypatch.setattr(geometry, "arm_rows", counted)
+    centred = preset("bench_kv")
+    beside = dataclasses.replace(centred, initial=Initial(q=(1e-3, 2e-3, 0.01)))  # may touch its walls at the start
+    gaps = [Clearance(gap, 0.03) for gap in (0.015, 0.020, 0.025)]
+    scenes = [dataclasses.replace(scene, clearance=gap) for scene in (centred, beside) for gap in gaps]
+    params, _ = compiled_scene.compile_scenes(scenes, 1e-6)
+    assert len(computed) == 1 + len(gaps)
+    alone = [compiled_scene.compile_scenes([scene], 1e-6)[0] for scene in scenes]
+    assert [one.tobytes() for one in alone] == [params[i : i + 1].tobytes() for i in range(len(scenes))]
 
 
 def test_a_member_that_fails_does_not_stop_the_others() -> None:

@@ -104,17 +104,22 @@ def penetration_rows(scene: Scene) -> NDArray[np.float64]:
     n . p - H  with p of the module's docstring, or with the corner's place x + R c of a head that carries corners.
     """
     corner_x, corner_y = corner_positions(scene)
-    offset_x, offset_y = scene.head.com_offset_m
     rows = np.array(
         [
             NORMAL_X * corner_x + NORMAL_Y * corner_y,
             NORMAL_X * corner_y - NORMAL_Y * corner_x,
             -NORMAL_X,
             -NORMAL_Y,
-            NORMAL_X * offset_x + NORMAL_Y * offset_y - (wall_distances(scene) - corner_radius(scene)),
+            penetrations_at_centre(scene),
         ]
     )
     return _of_places(scene, rows)
+
+
+def penetrations_at_centre(scene: Scene) -> NDArray[np.float64]:
+    """Return the last of the rows of `penetration_rows`, shape (8,), the only one that depends on the clearance."""
+    offset_x, offset_y = scene.head.com_offset_m
+    return NORMAL_X * offset_x + NORMAL_Y * offset_y - (wall_distances(scene) - corner_radius(scene))
 
 
 def _of_places(scene: Scene, rows: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from numbers import Real
-from typing import Any, Final, TypeVar
+from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -135,8 +135,9 @@ def compile_scenes(scenes: Sequence[Scene], tol: float) -> tuple[NDArray[np.void
     shares = [not any(options(scene)) for scene in scenes]
     for name in PARAMS.names or ():
         there = [index for index, one in enumerate(descriptions) if shares[index] and name in one.values]
-        if there:
-            params[name][there] = [descriptions[index].values[name] for index in there]
+        values = [descriptions[index].values[name] for index in there]
+        if values:
+            params[name][there] = values[0] if all(value is values[0] for value in values) else values
     rows = params.view(np.recarray)
     return params, [one.compiled(rows[i] if shares[i] else None) for i, one in enumerate(descriptions)]
 
@@ -161,12 +162,13 @@ class _Shared:
         self._most = most
         self._known: OrderedDict[tuple[Any, ...], tuple[Any, Any]] = OrderedDict()
 
-    def of(self, compute: Callable[..., _Found], *sources: object) -> _Found:
-        """Return `compute` of the sources; computed only once for the same objects."""
+    def of(self, compute: Callable[..., _Found], *sources: object, given: tuple[Any, ...] | None = None) -> _Found:
+        """Return `compute` of the sources, or of the `given` that they decide; once for the same objects."""
         key = (compute, *map(id, sources))
         known = self._known.get(key)
         if known is None:
-            known = self._known[key] = sources, compute(*sources)  # the sources stay, and keep their identity
+            # the sources stay, and keep their identity
+            known = self._known[key] = sources, compute(*(sources if given is None else given))
             if len(self._known) > self._most:
                 self._known.popitem(last=False)
         found: _Found = known[1]
@@ -195,7 +197,18 @@ class _Description:
         return CompiledScene(self.scene, params, self.parts, self.loads)
 
 
-def _describe(scene: Scene, tol: float, sampled: bool, shared: _Shared) -> _Description:
+class _Unchanged(NamedTuple):
+    """All that the clearance of a scene does not decide; `values` are fields of its `PARAMS`."""
+
+    loads: LoadSet
+    acceleration: float  #: largest, in m/s^2
+    start_speed: float  #: in m/s
+    harmonics: Harmonics | None
+    terms: Terms
+    values: dict[str, Any]
+
+
+def _unchanged(scene: Scene, sampled: bool, shared: _Shared) -> _Unchanged:
     loads = shared.of(compile_loads, () if sampled else scene.loads)
     mass, inertia = scene.head.mass_kg, scene.head.inertia_kg_m2
     gravity = scene.gravity.acceleration_m_s2
@@ -204,10 +217,6 @@ def _describe(scene: Scene, tol: float, sampled: bool, shared: _Shared) -> _Desc
     constant[2] -= mass * gravity * scene.gravity.arm_m / inertia
     direction, harmonics = shared.of(_harmonics, scene.head, loads)
     terms, number = shared.of(law_terms, scene.contact)
-    length = geometry.length_scale(scene)
-    speed = _velocity_scale(scene, shared.of(_largest_wrench, loads), length)
-    admissible = min(tol * (STEP_SHARE if terms.fraction is None else STEP_SHARE_FRACTION), LARGEST_STEP_ERROR)
-    order, radius = order_for(admissible), geometry.half_diagonal(scene)
     rows = geometry.penetration_rows(scene)
     values: dict[str, Any] = dict(
         penetration_rows=rows,
@@ -224,28 +233,50 @@ def _describe(scene: Scene, tol: float, sampled: bool, shared: _Shared) -> _Desc
         gravity=float(gravity),
         constant=constant,
         direction=direction,
-        order=order,
         lacuna=_lacuna(scene.contact.exponent),
-        threshold=speed * _thresholds(admissible, order),
-        velocity_tolerance=tol * speed,
-        position_tolerance=tol * length,
-        weight=radius * speed / length,
-        radius=radius,
-        release=0.0 if terms.fraction is None else _release(scene, tol, length, speed),
+        radius=geometry.half_diagonal(scene),
         wear_per_impulse=_wear_rates(scene.wear),
         offset=scene.head.com_offset_m,
         free=[float(name not in scene.locked) for name in DOF_NAMES],
         fastest=float(loads.omega.max(initial=0.0)),
         leverage=float(np.hypot(rows[0], rows[1]).max()),
-        half_cavity=0.5 * float(geometry.wall_distances(scene).min()),
         max_events=MAX_EVENTS_AT_ONCE,
+    )
+    terms = _scene_terms(scene, terms, loads, harmonics, sampled or loads.pieces is not None, shared)
+    acceleration = _largest_acceleration(scene, shared.of(_largest_wrench, loads))
+    return _Unchanged(loads, acceleration, _start_speed(scene), harmonics, terms, values)
+
+
+def _describe(scene: Scene, tol: float, sampled: bool, shared: _Shared) -> _Description:
+    loads, acceleration, start_speed, harmonics, terms, unchanged = shared.of(
+        _unchanged, scene.head, scene.frame, scene.contact, scene.gravity, scene.loads, scene.initial, scene.locked,
+        scene.pairs, scene.wear, scene.friction, scene.support, sampled,
+        # beside the centre a wall may be reached at the start
+        scene.clearance if any(scene.initial.q) else None,
+        given=(scene, sampled, shared),
+    )  # fmt: skip
+    length, radius = geometry.length_scale(scene), unchanged["radius"]
+    # the speed that the largest steady load gives the head over half the length scale
+    speed = max(math.sqrt(length * acceleration), start_speed, 1e-3 * length)
+    admissible = min(tol * (STEP_SHARE if terms.fraction is None else STEP_SHARE_FRACTION), LARGEST_STEP_ERROR)
+    order = order_for(admissible)
+    rows = unchanged["penetration_rows"].copy()
+    rows[4] = geometry.penetrations_at_centre(scene)
+    values: dict[str, Any] = unchanged | dict(
+        penetration_rows=rows,
+        order=order,
+        threshold=speed * _thresholds(admissible, order),
+        velocity_tolerance=tol * speed,
+        position_tolerance=tol * length,
+        weight=radius * speed / length,
+        release=0.0 if terms.fraction is None else _release(scene, tol, length, speed),
+        half_cavity=0.5 * float(geometry.wall_distances(scene).min()),
     )
     values |= _of_options(scene)
     values |= _rubbing(scene) | _slip(scene) | _frame(scene)
     segments = _segments(scene, loads.pieces) if loads.pieces is not None else None
     if sampled:
         segments = np.zeros(1, SEGMENT)
-    terms = _scene_terms(scene, terms, loads, harmonics, segments, shared)
     return _Description(scene, values, Parts(terms, harmonics, segments, _implicit(scene, terms, values)), loads)
 
 
@@ -282,13 +313,13 @@ def damping_numbers(law: str) -> Array:
 
 
 def _scene_terms(
-    scene: Scene, law: Terms, loads: LoadSet, harmonics: Harmonics | None, segments: Segments | None, shared: _Shared
+    scene: Scene, law: Terms, loads: LoadSet, harmonics: Harmonics | None, segments: bool, shared: _Shared
 ) -> Terms:
     """Return the terms of the law together with those of the rest of the scene."""
     present = dict(
         harmonics=harmonics is not None,
         second=harmonics is not None and shared.of(_has_second, harmonics),
-        segments=segments is not None,
+        segments=segments,
         **_wear_terms(scene.wear),
         offset=any(scene.head.com_offset_m),
         free=bool(scene.locked),
@@ -439,17 +470,16 @@ def _has_second(harmonics: Harmonics) -> bool:
     return bool(harmonics["second"].any())
 
 
-def _velocity_scale(scene: Scene, wrench: Array, length: float) -> float:
-    """Return the speed in m/s that the largest steady load gives the head over half the length scale."""
+def _start_speed(scene: Scene) -> float:
+    """Return a bound in m/s of the head's speed at the start."""
+    return float(np.hypot(*scene.initial.v[:2])) + geometry.half_diagonal(scene) * abs(scene.initial.v[2])
+
+
+def _largest_acceleration(scene: Scene, wrench: Array) -> float:
+    """Return a bound in m/s^2 of the acceleration by gravity and by loads of at most `wrench`."""
     acceleration = per_mass(scene, wrench)
-    radius = geometry.half_diagonal(scene)
-    total = (
-        abs(scene.gravity.acceleration_m_s2)
-        + float(np.hypot(acceleration[0], acceleration[1]))
-        + radius * acceleration[2]
-    )
-    initial = float(np.hypot(*scene.initial.v[:2])) + radius * abs(scene.initial.v[2])
-    return max(math.sqrt(length * total), initial, 1e-3 * length)
+    across = abs(scene.gravity.acceleration_m_s2) + float(np.hypot(acceleration[0], acceleration[1]))
+    return across + geometry.half_diagonal(scene) * float(acceleration[2])
 
 
 def _release(scene: Scene, tol: float, length: float, speed: float) -> float:
