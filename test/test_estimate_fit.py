@@ -9,7 +9,7 @@ from scipy.stats import truncnorm
 from plow_twin.estimate.arrow import Arrow
 from plow_twin.estimate.fit import link_weights
 from plow_twin.estimate.result import Interval
-from plow_twin.estimate.sensor import lagged
+from plow_twin.kernel.low_pass import lagged
 
 
 def test_links_have_the_weight_of_white_noise_of_acceleration() -> None:

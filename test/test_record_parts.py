@@ -108,7 +108,7 @@ def test_a_recording_that_is_being_written_is_not_repaired(tmp_path: Path) -> No
     scene = dump_scene(load_scene(scene_path("paper")))
     with Recorder(tmp_path / "run", RunHeader(scene)) as recorder:
         recorder.journal(paper_sample(0))
-        with pytest.raises(RecordingError, match="is being written"):
+        with pytest.raises(RecordingError, match="still being written"):
             repair(tmp_path / "run")
     assert repair(tmp_path / "run") == [] and RunReader(tmp_path / "run").parts
 

@@ -191,12 +191,12 @@ def test_two_runs_are_compared_on_the_terminal_as_json_and_as_a_page(
     assert set(changes) == set(PAIR_NAMES) and changes["top_right_top"]["peak"]["verdict"] != "machine"
     assert facts["clearance_changes"]["tuesday"]["horizontal"]["verdict"] == "chance"  # the pads do not wear
     page = (tmp_path / "compare.html").read_text(encoding="utf-8")
-    assert "tuesday beside monday" in page and "data:image/png;base64," in page and "http" not in page
+    assert "tuesday compared with monday" in page and "data:image/png;base64," in page and "http" not in page
     table = pyarrow.parquet.read_table(tmp_path / "windows.parquet")
     assert len(table) == 4 * SECONDS and set(table["group"].to_pylist()) == {"monday", "tuesday"}
     assert cli(["compare", *folders, "--window", "0.5", "--workers", "1"]) == 0
     printed = capsys.readouterr().out
-    assert "tuesday beside monday" in printed and "clearance [%]: horizontal +0.0" in printed
+    assert "tuesday compared with monday" in printed and "clearance [%]: horizontal +0.0" in printed
 
 
 @pytest.mark.parametrize("dask", [False, pytest.param(True, marks=pytest.mark.stress)])

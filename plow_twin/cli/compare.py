@@ -129,7 +129,7 @@ def _show(found: Comparison) -> None:
     for name, by_pair in found.changes.items():
         names = {"dissipation": "energy", "in_contact": "in contact"}
         quantities = [names.get(quantity, quantity) for quantity in next(iter(by_pair.values()))]
-        view = table(f"{name} beside {first}: change of the means [%]", "pad", *quantities)
+        view = table(f"{name} compared with {first}: change of the means [%]", "pad", *quantities)
         for pair, by_quantity in by_pair.items():
             view.add_row(
                 pair,

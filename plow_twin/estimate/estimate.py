@@ -21,7 +21,6 @@ from plow_twin.estimate.measurements import FEWEST_POSES, Load, Poses, useless_d
 from plow_twin.estimate.pads import by_group, of_differences, shown, with_differences
 from plow_twin.estimate.result import NORMAL_P95, Estimate, ForcesUsed, Interval, Motion, State
 from plow_twin.estimate.search import LOW_PASS, behind_low_pass, candidate, refine
-from plow_twin.estimate.sensor import lagged
 from plow_twin.estimate.similar import Units
 from plow_twin.estimate.start import filled, noise_level, range_of_motion
 from plow_twin.estimate.uncertain_load import compare_under_uncertain_load
@@ -38,6 +37,7 @@ from plow_twin.estimate.unknowns import (
     with_other_law,
 )
 from plow_twin.estimate.verdict import COMPONENTS, Verdict, judge, judge_sensor, predicted, sandwich
+from plow_twin.kernel.low_pass import lagged
 from plow_twin.model import geometry
 from plow_twin.model.scene import Gravity, Scene
 from plow_twin.solve.compiled_scene import inertias

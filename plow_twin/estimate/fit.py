@@ -25,8 +25,9 @@ from plow_twin.estimate import tuning
 from plow_twin.estimate.arrow import OWN, Arrow, Factor
 from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.measurements import RESOLVING, Poses
-from plow_twin.estimate.sensor import Memory, lagged, moved_by_lever
+from plow_twin.estimate.sensor import Memory, moved_by_lever
 from plow_twin.estimate.unknowns import BIAS, DAMPING, DELAY, GAIN, MOVING, PROBES, QUANTITIES, SIZE, Unknowns
+from plow_twin.kernel.low_pass import lagged
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import Scene
 

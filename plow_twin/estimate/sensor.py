@@ -13,14 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.estimate.measurements import Poses, filled
-from plow_twin.kernel.compiler import kernel
 
 Array = NDArray[np.float64]
 
 #: Derived: rows of the parabola that gives a measured pose at a swing's start: a kink of a slow sensor spans as many.
 _ROWS: Final = 7
-#: Guard: shortest span in s over which a cubic is formed from places and rates.
-_SHORTEST: Final = 1e-6
 
 
 def moved_by_lever(q: Array, v: Array, lever: Array) -> tuple[Array, Array]:
@@ -48,29 +45,3 @@ class Memory:
     def at(self, t: Array) -> Array:
         """Return the pose at some stamps, shape (k, 3)."""
         return np.stack([np.interp(t, self._t, column) for column in self._q.T], axis=1)
-
-
-@kernel(entry=True)
-def lagged(tau, edges, starts, places, rates, memory, t, q, v):  # type: ignore[no-untyped-def]
-    """Return poses and rates (n, 3) behind a low pass with the time constant `tau` in s.
-
-    Swing m has the rows edges[m]:edges[m + 1] of `t`, `q`, `v`. It starts at starts[m] with the pose places[m] and the
-    rates rates[m], while the low pass is at memory[m]. Between rows the pose is a cubic, for which this is exact.
-    """
-    out, rate = np.empty_like(q), np.empty_like(q)
-    for swing in range(len(starts)):
-        for j in range(3):
-            before, u0, v0, y = starts[swing], places[swing, j], rates[swing, j], memory[swing, j]
-            for row in range(edges[swing], edges[swing + 1]):
-                u1, v1 = q[row, j], v[row, j]
-                h = max(t[row] - before, _SHORTEST)
-                mean = (u1 - u0) / h
-                third = 6.0 * (v0 + v1 - 2.0 * mean) / (h * h)
-                # the particular solution u - tau u' + tau^2 u'' - tau^3 u''' at both ends
-                first = u0 - tau * (v0 - tau * ((6.0 * mean - 4.0 * v0 - 2.0 * v1) / h - tau * third))
-                last = u1 - tau * (v1 - tau * ((2.0 * v0 + 4.0 * v1 - 6.0 * mean) / h - tau * third))
-                y = last + (y - first) * np.exp(-h / tau)
-                out[row, j] = y
-                rate[row, j] = (u1 - y) / tau
-                before, u0, v0 = t[row], u1, v1
-    return out, rate

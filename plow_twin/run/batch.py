@@ -131,9 +131,9 @@ class TwinBatch:
         ----------
         t : float
             Model time in s, not before the present model time.
-            wrench : array_like, shape (m, 3) or (3,), optional
-                Fx, Fy [N] and M [N m] about the cavity's centre at `t`, of each twin or of all. Without it the last
-                samples are held.
+        wrench : array_like, shape (m, 3) or (3,), optional
+            Fx, Fy [N] and M [N m] about the cavity's centre at `t`, of each twin or of all. Without it the last
+            samples are held.
 
         Returns
         -------

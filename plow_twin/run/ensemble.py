@@ -48,10 +48,10 @@ class Ensemble:
         contacts.
     events : ndarray of int64, shape (m,)
         Number of changes of contact.
-        wear_depth : ndarray, shape (m, 8)
+    wear_depth : ndarray, shape (m, 8)
         Wear depth of each pad at the end in m.
-        steps, status : ndarray of int64, shape (m,)
-            Number of steps, and `Status` of each member. A member that fails does not stop the others.
+    steps, status : ndarray of int64, shape (m,)
+        Number of steps, and `Status` of each member. A member that fails does not stop the others.
     """
 
     t: Array
@@ -90,8 +90,8 @@ def simulate_many(
     scenes : sequence of Scene
     t_end, output_dt, tol
         As for `simulate`.
-        workers : int, optional
-            Number of threads; all cores by default. The kernels run without the interpreter's lock.
+    workers : int, optional
+        Number of threads; all cores by default. The kernels run without the interpreter's lock.
     on_progress : callable, optional
         Called with the number of finished members, by one thread at a time.
     max_steps : int

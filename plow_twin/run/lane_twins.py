@@ -27,8 +27,8 @@ class LaneTwins:
     ----------
     params, states : ndarray of records, shape (m,)
         Parameters and states of all twins of a batch.
-        terms : Terms
-            Joint terms of all twins.
+    terms : Terms
+        Joint terms of all twins.
     members : range
         Numbers of the twins that advance here.
     work : ndarray of `WORK`, shape (1,)

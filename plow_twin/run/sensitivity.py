@@ -66,8 +66,8 @@ class Sensitivity:
     from_start : ndarray, shape (n, k, k)
         Derivatives of the state at `t` by the initial state; a state has the places, then the rates, of the k / 2 free
         degrees of freedom.
-        exponent : float
-            Largest Lyapunov exponent in 1/s in the second half of the motion; above 0, errors grow for ever.
+    exponent : float
+        Largest Lyapunov exponent in 1/s in the second half of the motion; above 0, errors grow for ever.
     tol : float
         Tolerance of the motion.
     by_parameter : mapping of str to ndarray, shape (n, k)
@@ -184,10 +184,10 @@ class StretchProduct:
     ----------
     total : ndarray, shape (k, k)
         Derivatives of the present state by the state at the beginning.
-        rows : ndarray, shape (p, k)
+    rows : ndarray, shape (p, k)
         Derivatives of the present state by the parameters.
-        growth : float
-            Largest growth of an error since any of the kept times, at least 1.
+    growth : float
+        Largest growth of an error since any of the kept times, at least 1.
     """
 
     def __init__(self, size: int, parameters: int) -> None:

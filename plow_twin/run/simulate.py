@@ -53,7 +53,7 @@ class Result:
         Normal force [N] and signed penetration [m] of each pair.
     events : ndarray of `EVENT_DTYPE`, shape (k,)
         All changes of contact in order of time.
-        statistics : mapping
+    statistics : mapping
         By pair name: max, mean_in_contact, mean_over_time [N], impulse [N s], time_in_contact [s] and makes, of the
         whole motion and not only of the output rows.
     contact_sets : mapping
@@ -162,8 +162,8 @@ def simulate(
         Whether to compute the balance of energy and momentum (`Result.energy_balance`).
     max_steps : int
         Largest number of steps of the run.
-        max_wall_s : float
-            Wall-clock time in s that the run may take, without compiling.
+    max_wall_s : float
+        Wall-clock time in s that the run may take, without compiling.
     on_progress : callable, optional
         Called with the share of the motion that is done, 0..1, some fifty times a second.
     sensitivity : bool or sequence of str

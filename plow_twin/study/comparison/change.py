@@ -105,8 +105,8 @@ class Drawn:
     ----------
     usual : ndarray, shape (2,)
         Smallest and largest usual load (`_USUAL`).
-        size : int
-            Number of windows in a draw.
+    size : int
+        Number of windows in a draw.
     mean : ndarray, shape (draws + 1, k)
         Means of the quantities.
     load : ndarray, shape (draws + 1, m)

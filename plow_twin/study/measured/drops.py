@@ -32,7 +32,7 @@ class Drops:
         x, z [m] and unwrapped theta [rad] at 250 Hz.
     flight_rows : ndarray, shape (n,)
         Number of rows before the first impact.
-        bounces : tuple of tuple of int
+    bounces : tuple of tuple of int
         Rows of each drop at which it is lowest between rises of 3 mm.
     """
 
