@@ -50,7 +50,7 @@ def test_a_thinned_load_gives_the_same_forces(noise: float) -> None:
     few = followed(load, truth.load.period())
     assert len(few.t) < 0.3 * len(t)
     # side by side from 3.1 s on in both, with any samples
-    each = [forces_of(truth.nominal, result, one, 20, 3.1, over_time=False) for one in (load, few)]
+    each = [forces_of(truth.nominal, result, one, 60, 3.1, over_time=False) for one in (load, few)]
     assert each[0].start == each[1].start == pytest.approx(3.1)
     for one, other in ((each[0].peak, each[1].peak), (each[0].impulse, each[1].impulse)):
         assert other == pytest.approx(one, rel=0.03, abs=1e-3 * float(one.max()))

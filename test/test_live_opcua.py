@@ -467,7 +467,7 @@ def test_a_user_signs_in_by_certificate_and_no_other_one_does(
     with pytest.raises(BridgeError, match="--user-key cannot be used"):
         bridge.start(list(bridge.topics()))
     for wrong in (replace(stolen, user_key=None), replace(stolen, user="a"), replace(stolen, ca=None)):
-        with pytest.raises(BridgeError, match=r"expected --|--user-cert stands for"):
+        with pytest.raises(BridgeError, match=r"expected --|--user-cert replaces"):
             OpcUa(wrong, roles)
 
 
