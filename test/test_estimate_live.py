@@ -47,7 +47,8 @@ START_NS = 1_700_000_000_000_000_000
 WINDOW_S, INTERVAL_S, WAIT_S = 10.0, 4.0, 2.0
 #: A busy machine loses no sample and no pose: a window with holes is another window.
 RELIABLE = {
-    f"qos_overrides.{{ns}}/{topic}.subscription.reliability": "reliable" for topic in ("excitation", "head_pose", "gaps")
+    f"qos_overrides.{{ns}}/{topic}.subscription.reliability": "reliable"
+    for topic in ("excitation", "head_pose", "gaps")
 }
 
 
