@@ -23,10 +23,10 @@ from plow_twin.estimate import priors, tuning
 from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.laws import Draws, log_odds
 from plow_twin.estimate.likely import Seen, likeliest
-from plow_twin.estimate.measurements import FEWEST_FOR_SCATTER, Poses
+from plow_twin.estimate.measurements import FEWEST_FOR_SCATTER, Poses, filled
 from plow_twin.estimate.priors import deviation_of, is_stated
 from plow_twin.estimate.regression import ridge
-from plow_twin.estimate.start import filled, noise_level, range_of_motion, reaches, smooth_width
+from plow_twin.estimate.start import noise_level, range_of_motion, reaches, smooth_width
 from plow_twin.estimate.unknowns import DAMPING, GAIN, GX, GY, OTHER_LAW, SOFTNESS, Unknowns, with_other_law
 from plow_twin.model import geometry
 

@@ -163,10 +163,10 @@ def _columns(problem: Problem, found: Fit) -> tuple[dict[str, _Column], Array]:
         column = by(_WALL_STEP, share=share)
         if column is not None:
             out[name] = _Column(UNSTATED[name], column)
-    held, columns = problem.differences.any(), problem.by_differences(point)
+    held, columns, prior = problem.differences.any(), problem.by_differences(point), deviations()
     for index, name in enumerate(DIFFERENCES):
         if held:
-            out[name] = _Column(deviations()[index], columns[:, :, index], float(problem.differences[index]))
+            out[name] = _Column(prior[index], columns[:, :, index], float(problem.differences[index]))
         else:
             out[name] = _Column(UNSTATED[name], columns[:, :, index])
     out |= {name: _Column(UNSTATED[name], np.nan_to_num(column)) for name, column in _of_sensor(problem, point)}

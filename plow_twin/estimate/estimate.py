@@ -17,12 +17,12 @@ from plow_twin.estimate.discrepancy import Graded, graded, variants
 from plow_twin.estimate.fit import Fit, Problem, freed
 from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.gaps import Gaps, GapsFit, fit_gaps
-from plow_twin.estimate.measurements import FEWEST_POSES, Load, Poses, useless_deviation
+from plow_twin.estimate.measurements import FEWEST_POSES, Load, Poses, filled, useless_deviation
 from plow_twin.estimate.pads import by_group, of_differences, shown, with_differences
 from plow_twin.estimate.result import NORMAL_P95, Estimate, ForcesUsed, Interval, Motion, State
 from plow_twin.estimate.search import LOW_PASS, behind_low_pass, candidate, refine
 from plow_twin.estimate.similar import Units
-from plow_twin.estimate.start import filled, noise_level, range_of_motion
+from plow_twin.estimate.start import noise_level, range_of_motion
 from plow_twin.estimate.uncertain_load import compare_under_uncertain_load
 from plow_twin.estimate.unknowns import (
     BIAS,
@@ -531,7 +531,7 @@ def _graded(problem: Problem, fit: Fit, verdict: Verdict) -> Graded | None:
     """
     if verdict.broken:
         return None
-    clean = fit.finished and not (verdict.model or verdict.sensor)
+    clean = not _fails(fit, verdict)
     if len(problem.link) and (clean or not fit.finished):
         return None
     found = _if_it_differs(problem, fit, doubtful=not clean)

@@ -135,7 +135,7 @@ class Load:
     deviation : tuple of 3 float
         Stated standard deviation of each component; 0 if not stated.
     unknown : tuple of 3 float
-        Of a load that was thinned, `left_open` of the load before.
+        Spectral density of the part between the samples that is not known (`believable`), in N2 s and (N m)2 s.
     """
 
     t: Array
@@ -276,11 +276,6 @@ class Load:
             left, right = np.concatenate([left, middle]), np.concatenate([middle, right])
             least = np.concatenate([least, least])
         return out
-
-    def left_open(self) -> Array:
-        """Return the spectral density of the impulse missed by lines between the samples, in N2 s and (N m)2 s."""
-        _, its, of_samples = self._roughness()
-        return of_samples - its
 
     def _roughness(self) -> tuple[Array, Array, Array]:
         """Return the correlation from sample to sample, and spectral densities of the load and of the lines, (3,) each.

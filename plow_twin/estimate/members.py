@@ -84,7 +84,7 @@ class Ensemble:
         #: the first member, by itself: its forces need not wait for the others
         self.first = Twin(scenes[0], tol=tol, excitation="sampled", start=start)
         self.others = TwinBatch(scenes[1:], tol=tol, start=start) if members > 1 else None
-        self._scene, self._gain, self._rng, self._tol, self._speed = scene, gain, rng, tol, 0.0
+        self._scene, self._gain, self._rng, self._speed = scene, gain, rng, 0.0
         self._numbers = numbers_of(scenes, gain)
         #: what the poses tell of numbers that an estimate leaves open, the member that takes its numbers next, and the
         #: count of those whose turn has come
@@ -399,7 +399,7 @@ class Ensemble:
         if len(which) and which[0] == 0:
             load = (self.first.wrench - self._load_off[0]) / before * self._gain[0] + self._load_off[0]
             time = self.first.time
-            self.first = Twin(changed[0][0], tol=self._tol, excitation="sampled", start=time)
+            self.first = self.first.like(changed[0][0])
             self.first.reset(time, wear_depth=self.worn[0], pose=(self.pose[0], self._v[0]))
             self.first.advance(time, load)
         if self._scene.wear is not None:

@@ -67,10 +67,9 @@ def shown(problem: Problem, found: Fit) -> float:
 
 def with_differences(problem: Problem, found: Fit) -> tuple[Problem, Fit] | None:
     """Fit again with differences of machine and sensor, from a fit without; None where the model cannot be run."""
-    forward = problem.forward.renewed()
+    forward, most = problem.forward.renewed(), 0.5 * deviations()
     for _ in range(_ROUNDS):
         step, _ = _joint_step(problem, found)
-        most = 0.5 * deviations()
         differences = problem.differences + np.clip(step[SIZE:], -most, most)
         differences[LAG] = max(differences[LAG], 0.0)
         change = np.abs(differences - problem.differences)

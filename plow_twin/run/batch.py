@@ -34,6 +34,11 @@ _NO_MARKS = np.zeros(0, np.int64)
 _OPTIONAL = ("hysteretic", "wear", "sliding", "running_in", "offset", "free", "slip")
 
 
+def _signature(parts: Parts, scene: Scene) -> tuple[bool, ...]:
+    """Return which terms and options the compiled code of a scene has."""
+    return (*(part is not None for part in (*parts.terms, parts.implicit)), *options(scene))
+
+
 class TwinBatch:
     """Twins that are advanced together, each under its own sampled load: a live ensemble.
 
@@ -111,8 +116,7 @@ class TwinBatch:
     @property
     def signature(self) -> tuple[bool, ...]:
         """Terms of the equations, as in `Twin`; batches with equal terms share their compiled code."""
-        parts = self._workers[0].parts
-        return (*(part is not None for part in (*parts.terms, parts.implicit)), *options(self.scenes[0]))
+        return _signature(self._workers[0].parts, self.scenes[0])
 
     def set_wrench(self, wrench: ArrayLike) -> None:
         """Set the first samples of the load; the load is linear from sample to sample.
@@ -270,11 +274,7 @@ class TwinBatch:
         own = list(self.scenes)
         for index, (place, scene) in enumerate(zip(np.asarray(which).tolist(), scenes, strict=True)):
             one, before = compile_scene(scene, self.tol, sampled=True), self._compiled[place]
-            new, old = (
-                [*(part is not None for part in (*each.parts.terms, each.parts.implicit)), *options(each.scene)]
-                for each in (one, before)
-            )
-            changed[index] = new == old
+            changed[index] = _signature(one.parts, scene) == _signature(before.parts, before.scene)
             if not changed[index]:
                 continue
             wear = self._params["wear_per_impulse"][place].copy()
