@@ -2,8 +2,9 @@
 
     python benchmark/beside.py COMMIT [--rounds 5]
 
-Each round starts one process in a worktree of the commit and one in this checkout; a process warms up, repeats each
-case and reports its fastest time. The table (medians over the rounds, and their ratio) is benchmark/results/beside.md.
+Each round starts one process in a worktree of the commit and one in this checkout, in alternating order; a process
+warms up, repeats each case and reports its fastest time. The table (medians over the rounds, and their ratio) is
+benchmark/results/beside.md.
 """
 
 from __future__ import annotations
@@ -88,11 +89,14 @@ def main() -> None:
         tree = Path(folder) / "tree"
         _git("worktree", "add", "--detach", str(tree), commit)
         try:
-            before, now = [], []
+            before: list[dict[str, float]] = []
+            now: list[dict[str, float]] = []
             for number in range(chosen.rounds):
                 print(f"round {number + 1} of {chosen.rounds}", file=sys.stderr)
-                before.append(measure(tree, f"{folder}/before"))
-                now.append(measure(ROOT, f"{folder}/now"))
+                both = (before, tree, "before"), (now, ROOT, "now")
+                # the second process of a round would always be measured on the warmer machine
+                for times, place, cache in both if number % 2 == 0 else reversed(both):
+                    times.append(measure(place, f"{folder}/{cache}"))
         finally:
             _git("worktree", "remove", "--force", str(tree))
     text = table(commit, now, before)
