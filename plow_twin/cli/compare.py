@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 @click.command(
     short_help="Compare runs: do the contacts change, and is it the load or the machine?",
-    epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, 3 done, but a run was left out.",
+    epilog="Exit codes: 0 done; 1 failed; 2 wrong usage; 3 done, but a run was left out.",
 )
 @click.argument("recordings", metavar="RUN...", type=click.Path(path_type=Path), nargs=-1, required=True)
 @click.option("--by", type=click.Choice(["run", "day", "shift"]), default="run", show_default=True, help="Groups.")

@@ -91,7 +91,7 @@ def _motion(scene: Scene, times: Array, wrench: Array) -> AdvanceSeries:
 
 
 def _estimate_stamps(reader: RunReader) -> list[int]:
-    """Return the stamps [ns] of the samples before the estimates."""
+    """Return the stamp [ns] of the last sample before each estimate."""
     found: list[int] = []
     for batch in reader.batches(outputs=False):
         there = np.flatnonzero(batch.entries.sample)

@@ -137,7 +137,7 @@ class _Column:
 def _columns(problem: Problem, found: Fit) -> tuple[dict[str, _Column], Array]:
     """Return the further quantities, and the derivatives of the prediction by a constant load, shape (n, 3, 3).
 
-    Quantities with which the model cannot be run are left out.
+    A quantity is left out if its prior holds it fixed, or if the model cannot be run with its changed value.
     """
     point = found.point
 

@@ -359,7 +359,11 @@ class Ensemble:
             self._load_off = kept * self._load_off + math.sqrt(1.0 - kept**2) * load_error * white
 
     def _learn(self, since: float) -> None:
-        """Let the first member take what was learned, and the others in turn: `since` s have passed of their round."""
+        """Learn each `tuning.LEARNED_EACH`, and let members take the learned numbers.
+
+        The first member takes them at once, the others in turn, each about once in that time. `since` is the time since
+        the pose before [s].
+        """
         learner, count = self._learner, len(self.good) - 1
         if learner is None:
             return
@@ -458,7 +462,7 @@ class Ensemble:
             self.others.restore(states[1])
 
     def learned(self) -> tuple[Array, Array]:
-        """Return the numbers of all members, and what was learned about them, empty where nothing is learned."""
+        """Return the numbers of all members, and the state of the learning (empty without a learner)."""
         if self._learner is None:
             return self._numbers, np.zeros(0)
         return self._numbers, np.concatenate([[self._turn, self._waiting], self._learner.state()])

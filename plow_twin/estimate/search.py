@@ -58,9 +58,10 @@ def candidate(forward: Forward, unknowns: Unknowns, poses: Poses, period: float)
 
 
 def behind_low_pass(problem: Problem, found: Fit) -> Fit | None:
-    """Return the fit to the same swings behind a low pass of the prior's deviation, None where it is not nearer.
+    """Fit the same swings again, with the sensor's low pass held at its prior's standard deviation.
 
-    Impacts last for less than the time constant of a slow low pass, so a fit without does not lead to it.
+    Returns None if this fit is not clearly better, or if the poses are too rare to show a low pass. Impacts last for
+    less than the time constant of a slow low pass, so a fit without a low pass does not lead to it.
     """
     if problem.window.poses.interval() > RESOLVING:
         return None

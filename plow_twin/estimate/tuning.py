@@ -384,15 +384,15 @@ LEARNED_TO: Annotated[
         "1, 1, m, m, 1, 1, 1",
         "deviation to which numbers of twins that follow are learned from the poses: logarithms of K^-1/2 and damping, "
         "clearances, load gains",
-        "hard truths 71101, 71102: errors of the numbers learned",
+        "simulated hard contacts (benchmark/follow.py, seeds 71101, 71102): errors of the learned numbers",
     ),
 ] = (0.06, 0.12, 5e-5, 5e-5, 0.01, 0.01, 0.01)
 LEARNING: Annotated[
     float,
     Tuned(
         "1",
-        "weight of a pose in this",
-        "hard truths 71101, 71102: at 1 errors of the numbers are two to three of their deviations",
+        "weight of a pose when these numbers are learned",
+        "the same seeds: at 1 the learned numbers are two to three of their deviations off",
     ),
 ] = 0.25
 LEARNED_FOR: Annotated[float, Tuned("s", "time after which what was learned counts less by e", "the same")] = 20.0

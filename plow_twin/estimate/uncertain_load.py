@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 
 #: Derived: distance of the knots of a load's error, a third of its shortest correlation, in that correlation.
 _KNOTS = 1.0 / 3.0
-#: Derived: distance of the knots in s of the part that samples miss: half the period of a soft contact (20 Hz).
+#: Derived: distance of the knots [s] of the load that samples miss, half the period of a soft contact (20 Hz).
 _KNOT = 0.025
 #: Bound: rounds of draws, the second and third about the result of the round before.
 _ROUNDS = 3
@@ -218,7 +218,7 @@ def _with_error(load: Load, share: float, rng: np.random.Generator) -> Load:
         error[index] += keep * error[index - 1]
     amplitude = 0.5 * share * np.ptp(load.wrench, axis=0)
     within = np.arange(load.t[0], load.t[-1], _KNOT)
-    # rare samples bound the correlation of the missed part, to which its density is proportional, from above only
+    # the density is an upper bound: samples hardly tell how short the correlation of the missed part is
     missed = rng.standard_normal((len(within), 3)) * np.sqrt(rng.random() * np.array(load.unknown) / _KNOT)
     t = np.unique(np.concatenate([load.t, grid, within]))
     parts = ((load.t, load.wrench), (grid, amplitude * error), (within, missed))

@@ -95,7 +95,7 @@ class Recording:
 
     @cached_property
     def scene(self) -> Scene:
-        """The scene of the run; the tables do not need it.
+        """The scene of the run, made when asked for: the tables can be read without a usable scene.
 
         Raises
         ------

@@ -251,7 +251,7 @@ def _describe(scene: Scene, tol: float, sampled: bool, shared: _Shared) -> _Desc
     loads, acceleration, start_speed, harmonics, terms, unchanged = shared.of(
         _unchanged, scene.head, scene.frame, scene.contact, scene.gravity, scene.loads, scene.initial, scene.locked,
         scene.pairs, scene.wear, scene.friction, scene.support, sampled,
-        # beside the centre a wall may be reached at the start
+        # the clearance matters here only to a head that starts off centre and may touch a wall
         scene.clearance if any(scene.initial.q) else None,
         given=(scene, sampled, shared),
     )  # fmt: skip

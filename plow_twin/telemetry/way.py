@@ -40,7 +40,7 @@ class Way(Protocol):
     state: State
 
     async def open(self, link: Link, newest: Newest) -> None:
-        """Open the output for the machine in the facts of `newest`; requests of operators arrive through `link`."""
+        """Open the output for the machine that `newest.facts` describes; send operators' requests through `link`."""
 
     async def send(self, changed: dict[str, Group], newest: Newest) -> None:
         """Send the groups that have changed."""

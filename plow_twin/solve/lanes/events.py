@@ -1,7 +1,8 @@
 """The first event of each lane's step.
 
 Few guards can turn negative within a step. Each lane lists its guards; each round searches eight of them, of any lanes.
-A clipped pair that parts changes no force and ends no step; the rest of the step is searched for its next touch.
+A pair whose force is clipped to zero ends no step when it parts, because no force changes; the rest of the step is
+searched for the pair's next touch.
 """
 
 from __future__ import annotations
@@ -107,10 +108,11 @@ def _row_of(array, k, places):
 
 @kernel()
 def _write_guard(lanes, places, rows, of_depth, of_rate, constant, guard, order, h):
-    """Write guards, given by factors of d and d' and a constant; return a bit for each that may turn negative.
+    """Write to `guard` the series of the guards `of_depth` d + `of_rate` d' + `constant`, d the penetrations.
 
-    `places` are the guards' lanes, None for one guard of each lane in turn. A guard g is positive on [0, h] where g_0
-    and g_0 + g_1 h - sum over k > 1 of max(-g_k, 0) h^k are: that bound is concave.
+    Returns a bit for each guard that may turn negative. `places` are the guards' lanes, None for one guard of each lane
+    in turn. A guard g is positive on [0, h] where g_0 and g_0 + g_1 h - sum over k > 1 of max(-g_k, 0) h^k are: that
+    bound is concave.
     """
     cosine, sine, x, y = lanes.series[COS], lanes.series[SIN], lanes.series[X], lanes.series[Y]
     reach = term = deeper = zero = exact_splat(0.0)
