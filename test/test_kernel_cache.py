@@ -7,10 +7,12 @@ import pickle
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
+from numba.core.caching import IndexDataCacheFile
 
-from plow_twin.kernel.compiler import kernel
+from plow_twin.kernel.compiler import kernel, share
 from plow_twin.model import contact
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -46,6 +48,40 @@ def test_an_index_of_other_sources_is_replaced_unread(tmp_path: Path) -> None:
     (index,) = tmp_path.rglob("contact.power_term*.nbi")
     index.write_bytes(pickle.dumps("another version") + b"cannot be read")
     assert run(tmp_path) == "1" and run(tmp_path) == "0"
+
+
+def cache_file(folder: Path, sources: str) -> Any:
+    file = IndexDataCacheFile(str(folder), "module.kernel[1].py311", sources)
+    share(file)
+    return file
+
+
+def test_processes_that_save_at_once_do_not_exchange_code(tmp_path: Path) -> None:
+    """The second process has read the index before, and saves between the two writes of the first."""
+    first, second = (cache_file(tmp_path, "sources") for _ in range(2))
+    write, opened = first._open_for_write, []
+
+    def interrupted(path: str) -> Any:
+        opened.append(path)
+        if len(opened) == 2:
+            second.save("signature 2", "code 2")
+        return write(path)
+
+    first._open_for_write = interrupted
+    second._load_index = dict
+    first.save("signature 1", "code 1")
+    del second._load_index
+    found = {number: second.load(f"signature {number}") for number in (1, 2)}
+    assert found[1] in (None, "code 1") and found[2] in (None, "code 2") and set(found.values()) != {None}
+
+
+def test_code_of_other_sources_is_removed(tmp_path: Path) -> None:
+    old, new = (cache_file(tmp_path, sources) for sources in ("old", "new"))
+    old.save("signature", "old code")
+    new.save("signature", "new code")
+    new.save("another", "other code")
+    assert len(list(tmp_path.glob("*.nbc"))) == 2 and new.load("signature") == "new code"
+    assert old.load("signature") is None
 
 
 def test_a_kernel_that_only_kernels_call_has_no_machine_code(tmp_path: Path) -> None:

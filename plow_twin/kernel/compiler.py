@@ -6,6 +6,7 @@ Here the stamp of each cached function is a digest of the source of all kernels.
 
 from __future__ import annotations
 
+import glob
 import hashlib
 import warnings
 from collections.abc import Callable, Iterator
@@ -119,8 +120,39 @@ def kept(function: Callable[..., Any], **options: Any) -> Any:
         with _read_only_cache():
             dispatcher = compiler(function)
     if hasattr(dispatcher, "_cache"):  # absent with NUMBA_DISABLE_JIT
+        share(dispatcher._cache._cache_file)
         _save_or_warn(dispatcher._cache)
     return dispatcher
+
+
+def share(cache_file: Any) -> None:
+    """Make numba's cache of a function on disk safe for processes that compile at the same time.
+
+    Numba numbers the files of code by the index, and writes the index first. Two processes that compile two signatures
+    could leave the code of one under the signature of the other. Here the content names a file, and the index names
+    only files that exist. A race can still lose an entry of the index; its signature is then compiled again.
+
+    Parameters
+    ----------
+    cache_file : numba.core.caching.IndexDataCacheFile
+        Its method `save` is replaced.
+    """
+    stem = cache_file._index_name.removesuffix("nbi")
+
+    def save(key: Any, data: Any) -> None:
+        code = cache_file._dump(data)
+        name = f"{stem}{hashlib.blake2b(code, digest_size=8).hexdigest()}.nbc"
+        with cache_file._open_for_write(cache_file._data_path(name)) as file:
+            file.write(code)
+        overloads = cache_file._load_index()
+        if not overloads and Path(cache_file._index_path).exists():  # the index of other sources
+            for old in Path(cache_file._cache_path).glob(f"{glob.escape(stem)}*.nbc"):
+                if old.name != name:
+                    old.unlink(missing_ok=True)
+        overloads[key] = name
+        cache_file._save_index(overloads)
+
+    cache_file.save = save
 
 
 def _save_or_warn(cache: Any) -> None:
