@@ -14,6 +14,8 @@ import pytest
 from hostile_files import MADE
 from hostile_files import run as recorded
 
+from plow_twin.dashboard.access import PageAccess
+from plow_twin.errors import InputError
 from plow_twin.live.bridge.access import password
 from plow_twin.live.bridge.files import Files
 from plow_twin.live.bridge.source import BridgeError
@@ -27,6 +29,7 @@ from plow_twin.scene_file.yaml_text import (
     load_yaml,
     read_yaml,
 )
+from plow_twin.telemetry.access import Credentials
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -304,15 +307,23 @@ def test_names_and_texts_of_a_file_do_nothing_to_a_terminal(tmp_path: Path) -> N
         assert all(text in written for text in shown), (arguments, written)
 
 
-@pytest.mark.parametrize("content", ["x" * 70_000, "\0\0", "p\x1b[2Jw"])
-def test_a_file_that_holds_no_password_is_named_and_not_shown(tmp_path: Path, content: str) -> None:
+@pytest.mark.parametrize("content", [b"x" * 70_000, b"\0\0", b"p\x1b[2Jw", b"\xff\xfe"])
+def test_a_file_that_holds_no_secret_is_named_and_not_shown(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "secret"
-    path.write_text(content)
-    with pytest.raises(BridgeError, match=f"^{path}: expected a password, at most 65535 printable bytes") as refused:
-        password(path, "MQTT")
-    assert content[:2] not in str(refused.value).removeprefix(str(path))
-    path.write_text("s3cret\r\nmore")
-    assert password(path, "MQTT") == "s3cret"
+    path.write_bytes(content)
+    outputs = Credentials({"influx": {"token_file": "secret"}}, tmp_path)
+    for read in (
+        lambda: password(path, "MQTT"),
+        lambda: PageAccess.of("0.0.0.0:8070", path),
+        lambda: outputs.secret("influx", "token_file", "INFLUX_TOKEN"),
+    ):
+        with pytest.raises(
+            InputError, match=f"^{path}: line 1: got '.* bytes', expected a password or token"
+        ) as refused:
+            read()
+        assert repr(content)[2:-1][:4] not in str(refused.value).removeprefix(str(path))
+    path.write_text("s3cret, at least 16 characters\r\nmore")
+    assert password(path, "MQTT") == outputs.secret("influx", "token_file", "") == "s3cret, at least 16 characters"
 
 
 @pytest.mark.parametrize(("count", "got"), [(20_000, "got 20004 columns"), (100_000, "more than 262144 bytes")])

@@ -24,6 +24,7 @@ CORE = SOLVER | {"run"}
 SUBPACKAGES = {
     "errors": set(),
     "build": set(),
+    "access": {"errors"},
     "kernel": {"errors"},
     "model": {"errors", "kernel"},
     "scene_file": {"errors", "model"},
@@ -34,10 +35,10 @@ SUBPACKAGES = {
     "record": CORE | {"build", "scene_file", "stream", "estimate"},
     "view": CORE | {"scene_file", "stream", "estimate", "record"},
     "study": CORE | {"build", "scene_file", "stream", "estimate", "record", "view"},
-    "live": CORE | {"scene_file", "stream", "estimate", "record"},
+    "live": CORE | {"access", "scene_file", "stream", "estimate", "record"},
     "ros": CORE | {"build", "scene_file", "stream", "estimate", "record", "live"},
-    "dashboard": CORE | {"scene_file", "stream", "record", "live", "ros"},
-    "telemetry": CORE | {"scene_file", "stream", "record", "live", "ros", "dashboard"},
+    "dashboard": CORE | {"access", "scene_file", "stream", "record", "live", "ros"},
+    "telemetry": CORE | {"access", "scene_file", "stream", "record", "live", "ros", "dashboard"},
     "demo": CORE | {"scene_file", "stream", "record", "view", "live", "ros"},
     "cli": CORE
     | {"build", "scene_file", "stream", "estimate", "record", "view", "study", "live", "ros", "dashboard", "demo"}

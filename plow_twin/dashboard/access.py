@@ -6,11 +6,11 @@ import hmac
 import os
 import socket
 from dataclasses import dataclass
-from ipaddress import ip_address
 from pathlib import Path
 from typing import Final
 from urllib.parse import urlsplit
 
+from plow_twin.access import is_address, is_loopback, read_secret
 from plow_twin.errors import InputError, Problem
 
 #: Name of the environment variable of the token, used without a file.
@@ -52,10 +52,7 @@ class PageAccess:
             host, port = "", None
         if not host or port is None or parts.path or parts.username:
             raise DashboardError("--listen", listen, "HOST:PORT, as 127.0.0.1:8070; port 0: a free one")
-        if token_file is None:
-            token = os.environ.get(TOKEN_VARIABLE, "").strip()
-        else:
-            token = token_file.read_text(encoding="utf-8").partition("\n")[0].strip()
+        token = os.environ.get(TOKEN_VARIABLE, "").strip() if token_file is None else read_secret(token_file).strip()
         if token and (len(token) < _SHORTEST or not token.isascii() or not token.isprintable()):
             raise DashboardError("token", f"{len(token)} characters", f"at least {_SHORTEST} of ASCII, without spaces")
         if not token and not is_loopback(host):
@@ -79,24 +76,11 @@ class PageAccess:
             return False
         if is_loopback(name) or name == self.host.lower():
             return True
-        return not is_loopback(self.host) and (_is_address(name) or name in (socket.gethostname(), socket.getfqdn()))
+        return not is_loopback(self.host) and (is_address(name) or name in (socket.gethostname(), socket.getfqdn()))
 
     def is_own(self, origin: str | None, host: str) -> bool:
         """Return whether a connection comes from the page itself, or from a program other than a browser."""
         return origin is None or urlsplit(origin).netloc.lower() == host.lower()
-
-
-def is_loopback(host: str) -> bool:
-    """Return whether a host is this machine's loopback address."""
-    return host == "localhost" or (_is_address(host) and ip_address(host).is_loopback)
-
-
-def _is_address(host: str) -> bool:
-    try:
-        ip_address(host)
-    except ValueError:
-        return False
-    return True
 
 
 def listening(access: PageAccess) -> socket.socket:

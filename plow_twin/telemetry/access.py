@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any, Final
 from urllib.parse import urlsplit
 
+from plow_twin.access import is_loopback, read_secret
 from plow_twin.errors import InputError, Problem
-from plow_twin.live.bridge.access import is_loopback
 from plow_twin.scene_file.yaml_text import read_yaml
 
 _PORTS: Final = {"mqtt": 1883, "mqtts": 8883, "opc.tcp": 4840, "http": 8086, "https": 443}
@@ -118,9 +118,7 @@ class Credentials:
     def secret(self, section: str, key: str, variable: str) -> str:
         """Return the first line of a file, or a variable of the environment."""
         path = self.file(section, key)
-        if path is None:
-            return os.environ.get(f"PLOW_TWIN_{variable}", "")
-        return Path(path).read_text(encoding="utf-8").partition("\n")[0]
+        return os.environ.get(f"PLOW_TWIN_{variable}", "") if path is None else read_secret(Path(path))
 
 
 def mqtt_out(url: str, credentials: Credentials, *, plain: bool, sparkplug: str = "") -> list[WayOut]:

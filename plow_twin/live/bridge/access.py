@@ -5,17 +5,15 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from ipaddress import ip_address
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import urlsplit
 
+from plow_twin.access import read_secret
 from plow_twin.errors import InputError, Problem
 from plow_twin.live.bridge.source import BridgeError
 from plow_twin.scene_file.yaml_text import read_yaml
 
-#: Longest password in an MQTT packet [B].
-_LONGEST_PASSWORD: Final = 65_535
 #: Keys of a file of credentials that name files.
 _FILES: Final = ("ca", "certificate", "key", "user_certificate", "user_key", "password_file")
 
@@ -63,37 +61,17 @@ def host_and_port(access: Access, ports: Mapping[str, int], *, has_path: bool = 
     return parts.scheme, host, port
 
 
-def is_loopback(host: str) -> bool:
-    """Return whether a host is this machine."""
-    if host == "localhost":
-        return True
-    try:
-        return ip_address(host).is_loopback
-    except ValueError:
-        return False
-
-
 def password(path: Path | None, source: str) -> str:
-    """Return the first line of a file, or the variable PLOW_TWIN_`source`_PASSWORD.
+    """Return the password of a file, or the variable PLOW_TWIN_`source`_PASSWORD.
 
     Raises
     ------
-    BridgeError
-        The line is longer than a broker accepts, or is not text.
+    InputError
+        The first line of the file is no password.
     OSError
         The file cannot be read.
     """
-    if path is None:
-        return os.environ.get(f"PLOW_TWIN_{source}_PASSWORD", "")
-    with path.open("rb") as file:
-        line = file.readline(_LONGEST_PASSWORD + 2).removesuffix(b"\n").removesuffix(b"\r")
-    try:
-        text = line.decode()
-    except UnicodeDecodeError:
-        text = "\0"
-    if len(line) > _LONGEST_PASSWORD or not text.isprintable():
-        raise BridgeError(f"{path}: expected a password, at most {_LONGEST_PASSWORD} printable bytes, on line 1")
-    return text
+    return os.environ.get(f"PLOW_TWIN_{source}_PASSWORD", "") if path is None else read_secret(path)
 
 
 def read_access(url: str, path: Path | None) -> Access:

@@ -7,7 +7,8 @@ import time
 from collections import deque
 from typing import Any, Final
 
-from plow_twin.live.bridge.access import Access, host_and_port, is_loopback
+from plow_twin.access import is_loopback
+from plow_twin.live.bridge.access import Access, host_and_port
 from plow_twin.live.bridge.paho_client import (
     end_of,
     is_resumed,

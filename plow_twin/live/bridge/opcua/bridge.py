@@ -16,7 +16,8 @@ from typing import Any, Final
 from asyncua import ua
 from asyncua.ua.uaerrors import UaError
 
-from plow_twin.live.bridge.access import Access, host_and_port, is_loopback
+from plow_twin.access import is_loopback
+from plow_twin.live.bridge.access import Access, host_and_port
 from plow_twin.live.bridge.opcua.link import PUBLISHING_MS, Link, Revised
 from plow_twin.live.bridge.opcua.readings import Counts, overflowed, reading
 from plow_twin.live.bridge.opcua.samples import Samples

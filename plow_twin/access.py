@@ -1,0 +1,48 @@
+"""Rules for hosts and secrets that every connection to another program shares."""
+
+from __future__ import annotations
+
+from ipaddress import ip_address
+from pathlib import Path
+from typing import Final
+
+from plow_twin.errors import InputError, Problem
+
+#: Longest secret, a password in an MQTT packet [B].
+_LONGEST_SECRET: Final = 65_535
+
+
+def is_address(host: str) -> bool:
+    """Return whether a host is an IP address and not a name."""
+    try:
+        ip_address(host)
+    except ValueError:
+        return False
+    return True
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether a host is this machine."""
+    return host == "localhost" or (is_address(host) and ip_address(host).is_loopback)
+
+
+def read_secret(path: Path) -> str:
+    """Return a password or token: the first line of a file.
+
+    Raises
+    ------
+    InputError
+        The line is too long or not printable text. The message does not show the line.
+    OSError
+        The file cannot be read.
+    """
+    with path.open("rb") as file:
+        line = file.readline(_LONGEST_SECRET + 2).removesuffix(b"\n").removesuffix(b"\r")
+    try:
+        text = line.decode()
+    except UnicodeDecodeError:
+        text = "\0"
+    if len(line) > _LONGEST_SECRET or not text.isprintable():
+        expected = f"a password or token, at most {_LONGEST_SECRET} printable bytes"
+        raise InputError([Problem("line 1", f"{len(line)} bytes", expected)], str(path))
+    return text
