@@ -11,9 +11,10 @@ from numba.extending import intrinsic
 
 
 def _unowned(typingctx: Any, array: Any) -> Any:
-    """Return the same array without a reference count; its caller keeps the memory alive. None stays None.
+    """Return the same array without a reference count; the caller must keep its memory alive. None stays None.
 
-    Otherwise every call with an array counts it up and down, atomically: a seventh of the time of a run.
+    With a reference count, each call that takes the array would increment and decrement it atomically, which costs a
+    seventh of a run's time.
     """
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Compiled functions of a record that are chosen by whether its type has a field: the other choice is not compiled."""
+"""Compile-time choice between two functions of a record: only the function that suits the record's type is compiled."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from plow_twin.errors import ArgumentError
 
 
 def by_field(name: str, present: Callable[..., Any], absent: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function of a record p for use in kernels: `present` for types with the field, `absent` for the others.
+    """Return a function for kernels that calls `present` if the type of its record p has the field, else `absent`.
 
     Parameters
     ----------
     name : str
         The field.
     present, absent : callable
-        Functions that numba compiles, of p and of the same further arguments.
+        Compiled functions that take p and the same further arguments.
     """
 
     def choose(p: Any, *more: Any) -> Any:
@@ -27,6 +27,6 @@ def by_field(name: str, present: Callable[..., Any], absent: Callable[..., Any])
     def implementation(p, *more):  # type: ignore[no-untyped-def]
         return present if name in p.fields else absent
 
-    # strict would compare this signature with the chosen one
+    # strict=True would reject `choose`, whose signature differs from the chosen function's
     overload(choose, strict=False)(implementation)
     return choose

@@ -1,7 +1,7 @@
 """The decorator of every compiled function: numba with a cache on disk that notices a change in any kernel.
 
-Numba's own cache compares the file of the called function only and misses a change in the functions that it calls.
-Here the stamp of each cached function is a digest of the source of all kernels.
+Numba's own cache checks only the file of the cached function and misses changes in the functions that it calls. Here
+each cached function is stamped with a digest of the source of all kernels.
 """
 
 from __future__ import annotations
@@ -24,14 +24,15 @@ from plow_twin.kernel.linked import EntryCompiler, LinkedCompiler, garbage_kept,
 #: Value-preserving relaxations only: sums may be reordered and fused, but NaN and infinity keep their meaning.
 FASTMATH: Final = frozenset({"contract", "reassoc", "nsz", "arcp"})
 
-#: the warning, once it has been given
+#: The warning about the cache, after it has been issued once.
 _said: list[str] = []
 
 
 def _load_numba() -> None:
-    """Load numba's tables of types and of code without SciPy's linear algebra, which takes 0.15 s, a third of a start.
+    """Load numba's tables of types and of code, without importing SciPy's linear algebra.
 
-    Numba imports it only to check for a BLAS; compiled functions that use a BLAS import it themselves.
+    The import takes 0.15 s, a third of a start. Numba needs it here only to check for a BLAS; compiled functions that
+    use a BLAS import it themselves.
     """
     found = linalg.ensure_blas
     linalg.ensure_blas = lambda: None
@@ -70,10 +71,10 @@ def kernel(
     fast : bool
         Allow reordered and fused sums.
     inline : {"code", "source"}, optional
-        Inline its code or its source into its callers. Inlined source compiles more slowly, follows the caller's `fast`
-        and may return records, which numba's functions cannot.
+        Inline the function's LLVM code or its source into its callers. Inlined source compiles more slowly and follows
+        the caller's `fast`, but may return records, unlike other functions of numba.
     entry : bool
-        Whether Python calls it too. The wrapper for that costs a tenth of the time of compiling.
+        Whether Python calls the function too. The wrapper for Python costs a tenth of the compile time.
     """
     options: dict[str, Any] = {"fastmath": set(FASTMATH)} if fast else {}
     if inline == "source":
@@ -89,7 +90,7 @@ def kernel(
         cache_file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
         if cache_file is not None:
             cache_file._source_stamp = SOURCE_DIGEST
-            # numba compares the version first: an index that names a removed type cannot be unpickled
+            # numba compares the version before it unpickles the index, which fails if the index names a removed type
             cache_file._version = f"{numba.__version__} {SOURCE_DIGEST}"
             if inline != "source" and not entry:
                 keep_from_python(dispatcher)
@@ -101,7 +102,10 @@ def kernel(
 
 @contextmanager
 def _read_only_cache() -> Iterator[None]:
-    """Have numba take the cache beside the sources, which another user may have filled, without a trial of writing."""
+    """Let numba read the cache beside the sources without testing whether it can be written.
+
+    Another user may have filled it, for example when the package was installed.
+    """
     locator: Any = caching._CacheLocator
     found = locator.ensure_cache_path
     locator.ensure_cache_path = lambda its: None
@@ -112,11 +116,11 @@ def _read_only_cache() -> Iterator[None]:
 
 
 def kept(function: Callable[..., Any], **options: Any) -> Any:
-    """Return numba's dispatcher with a cache on disk; if the cache cannot be written, it warns and works without."""
+    """Return numba's dispatcher with a cache on disk; it warns if the cache cannot be written, and works without it."""
     compiler = numba.njit(cache=True, nogil=True, error_model="numpy", **options)
     try:
         dispatcher = compiler(function)
-    except RuntimeError:  # neither the package's folder nor the user's can be written
+    except RuntimeError:  # neither the package's folder nor the user's cache folder is writable
         with _read_only_cache():
             dispatcher = compiler(function)
     if hasattr(dispatcher, "_cache"):  # absent with NUMBA_DISABLE_JIT
@@ -163,7 +167,7 @@ def _save_or_warn(cache: Any) -> None:
             save(signature, result)
         except OSError as error:
             place = Path(cache.cache_path).parent
-            if not _said:  # numba resets Python's register of warnings
+            if not _said:  # numba resets Python's registry of warnings, which would repeat the warning
                 _said.append(f"compiled kernels are not kept for the next start: {place}: {error.strerror or error}")
                 warnings.warn(_said[0], RuntimeWarning, stacklevel=1)
 
@@ -171,10 +175,9 @@ def _save_or_warn(cache: Any) -> None:
 
 
 def for_arguments(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Callable[..., Any]:
-    """Return an entry compiled for the types of these arguments; a call of it does not look at types.
+    """Return the entry compiled for the types of these arguments; its calls must keep these types, and check none.
 
-    It serves calls whose types never change: numba needs more time to inspect nested tuples and records than the twin
-    needs for a sample.
+    Numba needs more time to inspect the types of nested tuples and records than the twin needs for a sample.
     """
     compile_for = getattr(function, "compile", None)
     if compile_for is None:

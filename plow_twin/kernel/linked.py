@@ -1,8 +1,9 @@
 """Two compilers for numba: one for kernels that only kernels call, one for kernels that Python calls too.
 
-LLVM optimises a kernel together with everything that it calls. Numba would also optimise each called kernel alone and
-generate its machine code, a quarter of the compile time; the first compiler stops at code for linking. Both use numba's
-extension point (its manual, "Customizing the Compiler") and lower into a code library of their own.
+LLVM optimises a kernel together with every kernel that it calls. Numba would also optimise each called kernel alone and
+generate its machine code, which takes a quarter of the compile time; the first compiler stops before, at code that
+callers can link. Both compilers use numba's extension point (its manual, "Customizing the Compiler"), each with its own
+class of code library.
 """
 
 from __future__ import annotations
@@ -23,22 +24,22 @@ _ENVIRONMENT = "_ZN08NumbaEnv"
 
 
 class LinkedLibrary(JITCodeLibrary):
-    """The code of a kernel as its callers link it; its machine code holds only the variables that numba sets."""
+    """The code of a kernel for its callers to link; machine code is made only for the variables that numba sets."""
 
     def __init__(self, codegen: Any, name: str) -> None:
         super().__init__(codegen, name)
         self._exported: list[str] = []
-        #: whether sums may be reordered and fused, so that the bits may depend on the caller it is inlined into
+        #: whether sums may be reordered and fused, so that the last bits may depend on the caller
         self.fast = False
 
     def add_ir_module(self, ir_module: llvmlite.ir.Module) -> None:
-        """Add the functions of a module, and note those that callers use."""
+        """Add the functions of a module, and note the names of the functions that callers use."""
         super().add_ir_module(ir_module)
         defined = (function for function in ir_module.functions if not function.is_declaration)
         self._exported += [function.name for function in defined if not function.linkage]
 
     def finalize(self) -> None:
-        """Link everything that the functions call."""
+        """Link the libraries of all called functions."""
         self._finalized = True
         whole = self._final_module
         self._finalize_dynamic_globals()
@@ -74,9 +75,10 @@ def _variables(module: llvmlite.ir.Module, names: set[str]) -> llvm.ModuleRef:
 class EntryLibrary(JITCodeLibrary):
     """The code of a kernel that Python calls, with its own copy of every kernel that it calls.
 
-    Shared copies would come from the entry that is loaded first: optimised for another caller, they may differ in the
-    last bit. Copies become internal before LLVM optimises, so that it inlines kernels with one caller. Copies of `fast`
-    kernels become internal afterwards: inlining would reorder their sums in other ways.
+    If entries shared copies, all would use the copies of the entry that is loaded first, which may differ in the last
+    bit because they were optimised for that entry. Copies become internal before LLVM optimises, so that LLVM inlines
+    kernels with one caller. Copies of `fast` kernels become internal afterwards, because inlining may change the order
+    of their sums.
     """
 
     def _optimize_final_module(self) -> None:
@@ -85,7 +87,7 @@ class EntryLibrary(JITCodeLibrary):
         self._keep(llvm.Linkage.linkonce_odr)
 
     def _keep(self, linkage: llvm.Linkage) -> None:
-        """Make the functions of one linkage internal."""
+        """Make the defined functions of this linkage internal."""
         for function in self._final_module.functions:
             if function.linkage == linkage and not function.is_declaration:
                 function.linkage = llvm.Linkage.internal
@@ -99,7 +101,7 @@ def _new_library(state: Any, kind: type[JITCodeLibrary]) -> JITCodeLibrary:
 
 @register_pass(mutates_CFG=True, analysis_only=False)
 class _LowerForLinking(NativeLowering):
-    """Numba's lowering, without making the function callable."""
+    """Numba's lowering, without an entry point for Python."""
 
     _name = "lower_for_linking"
 
@@ -109,7 +111,7 @@ class _LowerForLinking(NativeLowering):
         state.flags.no_compile = True
         super().run_pass(state)
         state.library.finalize()
-        # numba compiles the callers with this object in the place of a callable
+        # numba looks the function up by this object when it compiles callers; it is never called
         entry_point = object()
         state.targetctx.insert_user_function(entry_point, state.cr.fndesc, [state.library])
         state["cr"] = state.cr._replace(cfunc=entry_point)
@@ -136,25 +138,25 @@ class _Compiler(CompilerBase):
 
 
 class LinkedCompiler(_Compiler):
-    """numba's compiler with `LinkedLibrary`, for kernels that only kernels call."""
+    """Numba's compiler with `LinkedLibrary`, for kernels that only kernels call."""
 
     lowering = _LowerForLinking
 
 
 class EntryCompiler(_Compiler):
-    """numba's compiler with `EntryLibrary`, for kernels that Python calls."""
+    """Numba's compiler with `EntryLibrary`, for kernels that Python calls."""
 
     lowering = _LowerForPython
 
     def compile_extra(self, func: Any) -> Any:
-        """Compile with garbage collection paused: it would take a seventh of the time and free little."""
+        """Compile with garbage collection paused, which would take a seventh of the time and free little memory."""
         with garbage_kept():
             return super().compile_extra(func)
 
 
 @contextmanager
 def garbage_kept() -> Iterator[None]:
-    """Pause Python's collection of garbage."""
+    """Pause Python's garbage collection."""
     paused = gc.isenabled()
     gc.disable()
     try:
@@ -165,9 +167,11 @@ def garbage_kept() -> Iterator[None]:
 
 
 def keep_from_python(dispatcher: Any) -> None:
-    """Make a call from Python an error: there is no machine code to run."""
+    """Make a call from Python raise an error, since there is no machine code to run."""
 
     def refuse(*arguments: Any, **named: Any) -> None:
-        raise TypeError(f"{dispatcher.py_func.__qualname__} is for kernels to call: it would have to be an entry")
+        raise TypeError(
+            f"{dispatcher.py_func.__qualname__} is for kernels to call; only a kernel with entry=True can be called"
+        )
 
     dispatcher._insert, dispatcher._compile_for_args = lambda *overload, **options: None, refuse

@@ -8,7 +8,7 @@ import numpy as np
 
 from plow_twin.kernel.compiler import kernel
 
-#: Shortest span in s over which a cubic is formed from places and rates.
+#: Shortest time between two rows in s for which a cubic is formed from their poses and rates.
 _SHORTEST: Final = 1e-6
 
 
@@ -16,8 +16,9 @@ _SHORTEST: Final = 1e-6
 def lagged(tau, edges, starts, places, rates, memory, t, q, v):
     """Return poses and rates (n, 3) behind a low pass with the time constant `tau` in s.
 
-    Swing m has the rows edges[m]:edges[m + 1] of `t`, `q`, `v`. It starts at starts[m] with the pose places[m] and the
-    rates rates[m], while the low pass is at memory[m]. Between rows the pose is a cubic, for which this is exact.
+    Swing m has the rows edges[m]:edges[m + 1] of `t`, `q`, `v`. It starts at time starts[m] with the pose places[m],
+    the rates rates[m] and the low pass's output memory[m]. Between rows the pose is taken as a cubic, through which the
+    low pass is integrated exactly.
     """
     out, rate = np.empty_like(q), np.empty_like(q)
     for swing in range(len(starts)):

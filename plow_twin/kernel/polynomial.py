@@ -1,7 +1,8 @@
-"""Polynomials on an interval: guaranteed sign, first root and maximum, from the Bernstein form.
+"""First root and maximum of a polynomial on an interval, found without a miss from its Bernstein form.
 
-A polynomial lies within the hull of its Bernstein coefficients, and has at most as many roots as they have sign
-changes; halving the interval sharpens both bounds (Farouki, Comput. Aided Geom. Des. 29 (2012) 379).
+A polynomial lies within the hull of its Bernstein coefficients, and has at most as many roots as these coefficients
+have sign changes. Both bounds become sharper when the interval is halved (Farouki, Comput. Aided Geom. Des. 29 (2012)
+379).
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from plow_twin.kernel.compiler import kernel
 
 Array = NDArray[np.float64]
 
-#: Halvings of an interval, at most, when a root or a maximum is isolated.
+#: Most halvings of an interval when a root or a maximum is isolated.
 MAX_HALVINGS: Final = 48
 
 
@@ -33,17 +34,16 @@ def to_bernstein(g: Array, n: int, h: float, inverse_binomial: Array, b: Array) 
 
 @kernel(inline="code")
 def _halve(left: Array, right: Array, n: int) -> None:
-    """Split Bernstein coefficients in `left` at the middle: left half in place, right half to `right`."""
+    """Split the Bernstein coefficients in `left` at the middle: the left half stays there, `right` gets the other."""
     for r in range(n + 1):
         right[n - r] = left[n]
         for j in range(n, r, -1):
             left[j] = 0.5 * (left[j] + left[j - 1])
-    # the sweep above leaves the left half's coefficients in `left`, the right half's in `right`
 
 
 @kernel(fast=True)
 def _crossing(g: Array, n: int, low: float, high: float, start: float) -> float:
-    """Return the only root in [low, high], where g >= 0 at `low` side and < 0 at `high`: Halley within the bracket."""
+    """Return the only root in [low, high] by Halley's method kept within the bracket; g(low) >= 0 > g(high)."""
     x = min(max(start, low), high)
     for _ in range(80):
         value, slope, bend = g[n], 0.0, 0.0
@@ -61,7 +61,7 @@ def _crossing(g: Array, n: int, low: float, high: float, start: float) -> float:
         if not (low <= new <= high):
             new = 0.5 * (low + high)
         elif abs(change) <= 1e-6 * new and abs(bend * change) <= 1e-3 * abs(slope):
-            # the next change would be of the order of its cube
+            # Halley converges cubically: the next step would be of the order of this step's cube
             return new
         if abs(new - x) <= 2e-16 * high or high - low <= 2e-16 * high:
             return new
@@ -71,7 +71,7 @@ def _crossing(g: Array, n: int, low: float, high: float, start: float) -> float:
 
 @kernel()
 def first_root(g: Array, n: int, h: float, w) -> float:
-    """Return where g first turns negative in [0, h), or infinity; g[0] >= 0."""
+    """Return where g first becomes negative in [0, h), or infinity if it does not; g[0] must be >= 0."""
     to_bernstein(g, n, h, w.binomial[n], w.halves[0])
     return first_root_within(g, n, h, w)
 
@@ -80,8 +80,8 @@ def first_root(g: Array, n: int, h: float, w) -> float:
 def first_root_within(g: Array, n: int, h: float, w) -> float:
     """Return the root that `first_root` finds, from the Bernstein coefficients in `w.halves[0]`.
 
-    An interval without a negative Bernstein coefficient has no root; one sign change means one root; every other
-    interval is halved, and its left half searched first.
+    An interval without a negative Bernstein coefficient has no root, and an interval with one sign change has one.
+    Every other interval is halved, and its left half is searched first.
     """
     b, bounds = w.halves, w.bounds
     bounds[0, 0], bounds[0, 1] = 0.0, h
@@ -109,7 +109,7 @@ def first_root_within(g: Array, n: int, h: float, w) -> float:
             top -= 1
         else:
             middle = 0.5 * (low + high)
-            # the right half stays below the left one on the stack
+            # push the left half above the right half, so that it is searched first
             for k in range(n + 1):
                 b[top + 1, k] = b[top, k]
             _halve(b[top + 1], b[top], n)
@@ -121,7 +121,7 @@ def first_root_within(g: Array, n: int, h: float, w) -> float:
 
 @kernel()
 def maximum(g: Array, n: int, h: float, floor: float, w) -> float:
-    """Return the larger of `floor` and the maximum of g on [0, h], to 1e-12 of it."""
+    """Return the larger of `floor` and the maximum of g on [0, h], to a relative error of 1e-12."""
     end, steepest, power = g[n], 0.0, 1.0
     for k in range(n - 1, -1, -1):
         end = end * h + g[k]
@@ -129,7 +129,7 @@ def maximum(g: Array, n: int, h: float, floor: float, w) -> float:
         power *= h
         steepest += k * abs(g[k]) * power
     if abs(g[1]) >= steepest:
-        # monotonic
+        # g is monotonic on [0, h]
         return max(floor, g[0], end)
     b = w.halves
     to_bernstein(g, n, h, w.binomial[n], b[0])
@@ -152,7 +152,7 @@ def maximum(g: Array, n: int, h: float, floor: float, w) -> float:
 
 @kernel()
 def shift_column(g: Array, lane: int, n: int, x: float, out: Array) -> None:
-    """Write the coefficients of g(x + .) of one column to the same column of `out`."""
+    """Write the Taylor coefficients of g(x + t) of one column to the same column of `out`; g has them of g(t)."""
     for k in range(n + 1):
         out[k, lane] = g[k, lane]
     for r in range(n):

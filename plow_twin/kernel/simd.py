@@ -1,8 +1,8 @@
-"""Eight numbers side by side: one SIMD vector as a value inside kernels.
+"""A type for kernels that holds eight numbers as one SIMD vector.
 
-The compiler may or may not vectorise a loop over eight columns. Here the vector is a type: `row`, `set_row`, `splat`
-and `total` are single operations, and + - * act on all eight. Where the processor's vectors are shorter, the compiler
-splits them.
+The compiler does not always vectorise a loop over eight columns. With this type `row`, `set_row`, `splat` and `total`
+are single operations, and + - * / act on all eight numbers. If the processor's vectors are shorter, the compiler splits
+them.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _FLAGS = ("contract", "reassoc", "nsz", "arcp")
 
 
 def _operation(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Make an operation of kernels from a function that emits its code; callers omit the first parameter."""
+    """Make an operation for kernels from a function that emits its code; kernels omit the first parameter."""
     operation: Callable[..., Any] = intrinsic(function)
     return operation
 
@@ -39,7 +39,7 @@ class Lanes(types.Type):
 
 
 class ExactLanes(Lanes):
-    """The same, but each operation is rounded as written, so that the surrounding code changes no bit."""
+    """Eight float64 whose operations are rounded as written, so that the bits do not depend on the code around them."""
 
     flags = ()
 
@@ -78,13 +78,16 @@ def row(typingctx: Any, array: Any, index: Any) -> Any:
 
 @_operation
 def exact_row(typingctx: Any, array: Any, index: Any) -> Any:
-    """Return the result of `row` or `splat` as `ExactLanes`."""
+    """Return the result of `row` as `ExactLanes`."""
     return exact_lanes(array, index), _load
 
 
 @_operation
 def gathered(typingctx: Any, array: Any, index: Any, places: Any) -> Any:
-    """Return eight numbers at `places`, a tuple, from row `index` of a contiguous array of rows of eight on."""
+    """Return eight numbers of a contiguous array of shape (n, 8).
+
+    The tuple `places` holds their offsets, counted in numbers from the start of row `index`.
+    """
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         row_index = context.cast(builder, arguments[1], signature.args[1], types.intp)
@@ -130,13 +133,13 @@ def splat(typingctx: Any, value: Any) -> Any:
 
 @_operation
 def exact_splat(typingctx: Any, value: Any) -> Any:
-    """Return the result of `row` or `splat` as `ExactLanes`."""
+    """Return the result of `splat` as `ExactLanes`."""
     return exact_lanes(value), _splat
 
 
 @_operation
 def pack(typingctx: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: Any) -> Any:
-    """Return eight numbers as one value."""
+    """Return eight numbers as one vector."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         vector = ir.Constant(_VECTOR, ir.Undefined)
@@ -149,7 +152,7 @@ def pack(typingctx: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any,
 
 
 def permutation(*places: int) -> Callable[..., Any]:
-    """Make an operation that returns the lanes at eight places of its argument, in this order."""
+    """Make an operation that permutes lanes: lane i of its result is lane places[i] of its argument."""
 
     @_operation
     def permuted(typingctx: Any, value: Any) -> Any:
@@ -175,7 +178,7 @@ def lane(typingctx: Any, value: Any, index: Any) -> Any:
 
 @_operation
 def total(typingctx: Any, value: Any) -> Any:
-    """Return the sum of the eight."""
+    """Return the sum of the eight lanes."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         kind = ir.FunctionType(ir.DoubleType(), [ir.DoubleType(), _VECTOR])
@@ -187,7 +190,7 @@ def total(typingctx: Any, value: Any) -> Any:
 
 @_operation
 def spread_total(typingctx: Any, value: Any) -> Any:
-    """Return the sum of the eight in each lane, faster than `splat(total(...))`."""
+    """Return a vector with the sum of the eight lanes in each lane, faster than `splat(total(...))`."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         value = arguments[0]
@@ -202,7 +205,7 @@ def spread_total(typingctx: Any, value: Any) -> Any:
 
 @_operation
 def below(typingctx: Any, left: Any, right: Any) -> Any:
-    """Return a bit for each lane in which left < right; not for NaN."""
+    """Return an integer whose bit i is set if left < right in lane i; NaN sets no bit."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         found = builder.fcmp_ordered("<", *arguments)
@@ -213,7 +216,7 @@ def below(typingctx: Any, left: Any, right: Any) -> Any:
 
 @_operation
 def choose(typingctx: Any, bits: Any, there: Any, elsewhere: Any) -> Any:
-    """Return the lanes of `there` whose bit is set, otherwise those of `elsewhere`."""
+    """Return lane i of `there` if bit i of `bits` is set, otherwise lane i of `elsewhere`."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         number = context.cast(builder, arguments[0], signature.args[0], types.int64)
@@ -225,7 +228,7 @@ def choose(typingctx: Any, bits: Any, there: Any, elsewhere: Any) -> Any:
 
 @_operation
 def lowest_bit(typingctx: Any, bits: Any) -> Any:
-    """Return the number of the lowest bit that is set in `bits`, which are not zero."""
+    """Return the index of the lowest set bit; `bits` must not be zero."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.cttz(arguments[0], ir.Constant(ir.IntType(1), 1))
@@ -235,7 +238,7 @@ def lowest_bit(typingctx: Any, bits: Any) -> Any:
 
 @_operation
 def fused(typingctx: Any, factor: Any, other: Any, term: Any) -> Any:
-    """Return factor * other + term of each lane, rounded once where the processor can."""
+    """Return factor * other + term of each lane, rounded once if the processor has fused operations."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         kind = ir.FunctionType(_VECTOR, [_VECTOR] * 3)
@@ -246,7 +249,7 @@ def fused(typingctx: Any, factor: Any, other: Any, term: Any) -> Any:
 
 @_operation
 def magnitude(typingctx: Any, value: Any) -> Any:
-    """Return the absolute value of each."""
+    """Return the absolute value of each lane."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         kind = ir.FunctionType(_VECTOR, [_VECTOR])
@@ -257,7 +260,7 @@ def magnitude(typingctx: Any, value: Any) -> Any:
 
 
 def _elementwise(operation: Callable[..., Any], emit: str) -> None:
-    """Let an operator act on lanes, and on lanes and a number."""
+    """Define a binary operator for two vectors, and for a vector and a number."""
 
     @infer_global(operation)
     class _Typing(AbstractTemplate):

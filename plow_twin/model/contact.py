@@ -3,8 +3,8 @@
     additive laws     F = K d^n + C psi(d) d',  psi = 1 (Kelvin-Voigt) or u^2 (3 - 2 u), u = min(d / ramp, 1)
     all other laws    F = K d^n (1 + lambda d')
 
-(model of the paper's lost eq. 6; the laws' lambda comes from `contact_laws`). A solver decides when a pair is in
-contact and when its force would pull; then the force is zero.
+They reconstruct eq. 6 of the paper, which is lost; `contact_laws` gives lambda. The solver decides when a pair is in
+contact, and sets the force to zero where it would pull.
 """
 
 from __future__ import annotations
@@ -28,9 +28,10 @@ def free_force(
     viscous: float,
     ramp: float,
 ) -> float:
-    """Return the law's F in N for penetration d in m and rate d' in m/s, negative where it would pull.
+    """Return the law's F in N for penetration d in m and rate d' in m/s; it is negative where it would pull.
 
-    `damping_factor` is lambda in s/m, `viscous` is C in N s/m; one of them is zero. `ramp` in m is zero without a ramp.
+    `damping_factor` is lambda in s/m, `viscous` is C in N s/m; one of the two is zero. `ramp` in m is zero without a
+    ramp.
     """
     elastic = stiffness * (penetration if exponent == 1.0 else max(penetration, 0.0) ** exponent)
     if ramp > 0.0 and penetration < ramp:
@@ -49,7 +50,7 @@ def normal_force(
     viscous: float,
     ramp: float,
 ) -> float:
-    """Return F >= 0 in N: a contact never pulls, nor acts from outside (`free_force`)."""
+    """Return the contact force in N: F of `free_force`, but 0 without penetration and where it would pull."""
     if penetration <= 0.0:
         return 0.0
     return max(0.0, free_force(penetration, rate, stiffness, exponent, damping_factor, viscous, ramp))
@@ -57,7 +58,10 @@ def normal_force(
 
 @kernel(fast=True, inline="code")
 def ramp_terms(square: NDArray[np.float64], cube: NDArray[np.float64], k: int, ramp: float) -> Any:
-    """Return coefficient k of u^2 (3 - 2 u), u = d / ramp, of the eight columns, from those of d^2 and d^3."""
+    """Return coefficient k of the series u^2 (3 - 2 u), u = d / ramp, of the eight columns.
+
+    `square` and `cube` hold the coefficients of d^2 and d^3.
+    """
     return row(square, k) * (3.0 / (ramp * ramp)) - row(cube, k) * (2.0 / (ramp * ramp * ramp))
 
 
@@ -65,10 +69,11 @@ def ramp_terms(square: NDArray[np.float64], cube: NDArray[np.float64], k: int, r
 def power_term(
     base: NDArray[np.float64], power: NDArray[np.float64], lane: int, k: int, exponent: float, shift: int
 ) -> float:
-    """Return coefficient k of base(t)^exponent for one column, series of shape (n, 8) with orders in rows.
+    """Return coefficient k of base(t)^exponent for one column; `base` and `power` are series of shape (n, 8).
 
-    Recurrence  b_0 k P_k = sum_j (exponent j - (k - j)) b_j P_{k-j}  (Knuth, TAOCP 2, sec. 4.7). A base that starts
-    with t^shift is divided by it first; its power then starts with t^(shift exponent).
+    Row k holds the coefficients of order k. Recurrence  b_0 k P_k = sum_j (exponent j - (k - j)) b_j P_{k-j}  (Knuth,
+    TAOCP 2, sec. 4.7). If the lowest order of the base is t^shift, the recurrence is used for base / t^shift, and the
+    power starts with t^(shift exponent).
     """
     offset = int(shift * exponent)
     if k < offset:
@@ -84,8 +89,8 @@ def power_term(
 
 @kernel(fast=True, inline="code")
 def power_terms(base: NDArray[np.float64], power: NDArray[np.float64], k: int, exponent: float) -> Any:
-    """Return coefficient k >= 1 of the eight columns of base^exponent, times base[0]: `power_term` without a shift."""
-    # the newest orders come last, so that most of the sum does not wait for them
+    """Return coefficient k >= 1 of base^exponent times base[0], for the eight columns; `power_term` without a shift."""
+    # the newest orders are added last, so that most of the sum need not wait until they are computed
     even, odd = splat(0.0), splat(0.0)
     weight = (exponent + 1.0) * (k - 1) - k
     for j in range(k - 1, 2, -2):
@@ -102,9 +107,10 @@ def power_terms(base: NDArray[np.float64], power: NDArray[np.float64], k: int, e
 
 @kernel(fast=True, inline="code")
 def root_terms(newest: Any, root: NDArray[np.float64], k: int) -> Any:
-    """Return coefficient k >= 1 of the square roots of eight series, times 2 root[0]; `newest` are the b_k.
+    """Return coefficient k >= 1 of the square roots r of eight series b, times 2 r_0; `newest` holds the b_k.
 
-    Recurrence  2 r_0 r_k = b_k - sum_{j=1}^{k-1} r_j r_{k-j},  half of whose terms are equal in pairs.
+    Recurrence  2 r_0 r_k = b_k - sum_{j=1}^{k-1} r_j r_{k-j}.  Terms j and k - j are equal, so each pair is computed
+    once.
     """
     rest, products = newest, splat(0.0)
     half = k // 2

@@ -1,9 +1,9 @@
-"""Contact laws: each is one definition with its equation and its source.
+"""Contact laws, each defined with its equation and its source.
 
-Most laws have the form  F = K d^n (1 + lambda d'),  with penetration d and its rate d', positive inward. They differ
-in the damping number  D = lambda v0  that they derive from the restitution e; v0 is the speed of the touch. The others
-add C d' to K d^n, at once (Kelvin-Voigt) or ramped in. One entry in `_LAWS` adds a law, `add_law` one from outside;
-solvers read only its options and its damping number.
+Most laws have the form  F = K d^n (1 + lambda d')  with penetration d and its rate d', positive inward. They differ in
+the damping number  D = lambda v0  that they derive from the restitution e, where v0 is the speed at first touch. The
+other laws add C d' to K d^n, either fully from the start (Kelvin-Voigt) or ramped in. A new law needs one entry in
+`_LAWS`, or a call of `add_law` from outside the package; solvers read only its options and its damping number.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from typing import Final
 
 from plow_twin.errors import ArgumentError
 
-#: 1 - e below which rounding dominates the residual of the exact law, and two terms of D's series are better.
+#: Limit of 1 - e below which rounding dominates the exact law's residual, so that two terms of D's series are used.
 _NEARLY_ELASTIC: Final = 1e-5
-#: Largest D = lambda v0 used: a restitution below about 1/1000 would need an unbounded damping.
+#: Largest D = lambda v0 used; as the restitution goes to 0 the damping would grow without bound.
 DAMPING_NUMBER_CAP: Final = 1e3
 
 
 def exact_damping_number(restitution: float) -> float:
-    """Return the D that delivers the restitution e exactly:  D (1 + e) = ln((1 + D) / (1 - D e)).
+    """Return the D that gives exactly the restitution e:  D (1 + e) = ln((1 + D) / (1 - D e)).
 
-    It holds for F = K d^n (1 + lambda d') with any K, n and mass. D is 0 at e = 1 and unbounded as e goes to 0.
-    Source: first integral of the free impact; cf. Hunt and Crossley, J. Appl. Mech. 42 (1975) 440.
+    The equation is valid for F = K d^n (1 + lambda d') with any K, n and mass. D is 0 at e = 1 and grows without bound
+    as e goes to 0. Source: first integral of the free impact; cf. Hunt and Crossley, J. Appl. Mech. 42 (1975) 440.
     """
     if restitution >= 1.0:
         return 0.0
@@ -37,16 +37,16 @@ def exact_damping_number(restitution: float) -> float:
         return 1.5 * lost * (1.0 + lost)
 
     def residual(damping: float) -> float:
-        # (1 + e) - ln(...)/D keeps the trivial root D = 0 out of reach
+        # divided by D, so that the trivial root D = 0 is no root of the residual
         return (1.0 + restitution) - (math.log1p(damping) - math.log1p(-damping * restitution)) / damping
 
-    # the positive root lies below 1/e; near e = 1 it behaves as 3 (1 - e) / 2
+    # the positive root lies below 1/e, and is about 3 (1 - e) / 2 near e = 1
     lower, upper = 0.5 * lost, 1.0 / restitution
     while upper * restitution >= 1.0:
         upper = math.nextafter(upper, 0.0)
     if residual(upper) > 0.0:
         return upper
-    from scipy.optimize import brentq  # the import takes a quarter of a second: only scenes with this law wait for it
+    from scipy.optimize import brentq  # imported here, since it takes 0.25 s that only scenes with this law need
 
     root: float = brentq(residual, lower, upper, xtol=1e-300, rtol=1e-15)
     return root
@@ -54,28 +54,31 @@ def exact_damping_number(restitution: float) -> float:
 
 @dataclass(frozen=True)
 class ContactLaw:
-    """One law: its options, and how a restitution becomes damping.
+    """The options of one law, and the damping that it derives from a restitution.
 
     Attributes
     ----------
-    title, source : str
-        Its usual name; its equation and where it was published.
+    title : str
+        Usual name of the law.
+    source : str
+        Its equation, and where it was published.
     number_of : callable, optional
-        D(e) of the law: the damping number lambda v0 [1] for a restitution e; None where it has no restitution form.
+        Function of the restitution e that returns the damping number D = lambda v0 [1]; None if the law cannot be given
+        by a restitution.
     takes_damping : bool
         Whether a scene can give the damping itself.
     exponent : float, optional
-        The only exponent that the law admits.
+        The only exponent that the law admits; None if it admits any.
     additive : bool
-        The damping is C d' beside K d^n (Kelvin-Voigt), not a factor of K d^n.
+        Whether the damping is a term C d' added to K d^n (Kelvin-Voigt) instead of a factor of K d^n.
     ramped : bool
-        C grows from 0 over the penetration `ramp_m`.
+        Whether C grows from 0 over the penetration `ramp_m`.
 
     Raises
     ------
     ArgumentError
-        For contradictory options: a ramp or a restitution with the wrong kind of damping, or an additive law without a
-        ramp whose exponent is not 1.
+        For contradictory options: a ramp without additive damping, a restitution with additive damping, or an additive
+        law without a ramp whose exponent is not 1.
     """
 
     title: str
@@ -89,9 +92,9 @@ class ContactLaw:
     def __post_init__(self) -> None:
         problems = []
         if self.ramped and not self.additive:
-            problems.append("ramped=True: expected additive=True, for it is C that is ramped in")
+            problems.append("ramped=True: expected additive=True, since the ramp acts on C")
         if self.additive and self.number_of is not None:
-            problems.append("number_of: expected None with additive=True, whose damping is C")
+            problems.append("number_of: expected None, since the damping of a law with additive=True is C")
         if self.additive and not self.ramped and self.exponent != 1.0:
             problems.append(f"exponent: got {self.exponent!r}, expected 1 for an additive law without a ramp")
         if problems:
@@ -99,7 +102,7 @@ class ContactLaw:
 
     @property
     def takes_restitution(self) -> bool:
-        """Whether the law takes a restitution."""
+        """Whether a scene can give a restitution for this law."""
         return self.number_of is not None
 
     def damping_number(self, restitution: float) -> float:
@@ -108,7 +111,7 @@ class ContactLaw:
         Parameters
         ----------
         restitution : float
-            0 to 1 [1].
+            Coefficient of restitution [1], 0 to 1.
 
         Returns
         -------
@@ -118,10 +121,10 @@ class ContactLaw:
         Raises
         ------
         ArgumentError
-            The law has no restitution form.
+            The law cannot be given by a restitution, or its D(e) is not a number >= 0.
         """
         if self.number_of is None:
-            raise ArgumentError(f"{self.title} has no restitution form")
+            raise ArgumentError(f"{self.title} cannot be given by a restitution")
         try:
             number = self.number_of(restitution)
         except ZeroDivisionError:
@@ -174,26 +177,26 @@ _LAWS: Final[dict[str, ContactLaw]] = {
         ramped=True,
     ),
 }
-#: Every law by its name in scenes; `add_law` adds to it.
+#: Every law, by the name that scenes use.
 LAWS: Final[Mapping[str, ContactLaw]] = MappingProxyType(_LAWS)
 
 
 def add_law(name: str, law: ContactLaw) -> None:
-    """Add a law of your own: from now on scenes of this process can name it, and every solver takes it at full speed.
+    """Add a law of your own, which scenes can then name and every solver runs as fast as the built-in laws.
 
-    Other processes (the node, workers of a cluster) do not know it; commands import it by `--laws`.
+    Only this process knows the law. Commands, with the processes that they start, learn it by `--laws`.
 
     Parameters
     ----------
     name : str
         The name in scenes: letters, digits and _.
     law : ContactLaw
-        Its options, and how a restitution becomes damping.
+        The options of the law, and the damping that it derives from a restitution.
 
     Raises
     ------
     ArgumentError
-        The name is taken, or a scene file cannot hold it.
+        The name is taken, or it is not made of letters, digits and _.
     """
     if name in LAWS or not name.isidentifier():
         raise ArgumentError(f"contact law: got {name!r}, expected a new name of letters, digits and _")

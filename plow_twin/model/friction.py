@@ -1,8 +1,8 @@
-"""Tangential friction of a pair: regularised Coulomb, compiled,  T = mu N tanh(s' / v_s); Painleve's case.
+"""Regularised Coulomb friction of a pair, compiled,  T = mu N tanh(s' / v_s),  and a check for Painleve's case.
 
-s' is the rate at which the frame's corner slides along the head's wall; the corner drags the wall with it. Below the
-regularisation speed v_s friction is viscous: a body held by friction creeps with v_s atanh(T / (mu N)). Source:
-Andersson, Soederberg and Bjoerklund, Tribol. Int. 40 (2007) 580, eq. 5. Friction with stick has a state of its own:
+The frame's corner slides along the head's wall with the rate s' and drags the wall with it. Below the regularisation
+speed v_s friction is viscous, so that a body held by friction creeps with v_s atanh(T / (mu N)). Source: Andersson,
+Soederberg and Bjoerklund, Tribol. Int. 40 (2007) 580, eq. 5. Friction with stick, which needs further states, is in
 `solve.grip`.
 """
 
@@ -23,17 +23,18 @@ if TYPE_CHECKING:
 
 @kernel(inline="source")
 def friction_force(normal: float, slip_rate: float, coefficient: float, speed: float) -> float:
-    """Return T in N for the normal force N in N and the slip rate in m/s; it has the slip rate's sign."""
+    """Return the friction T in N, with the slip rate's sign; `normal` is in N, `slip_rate` and `speed` are in m/s."""
     return coefficient * normal * math.tanh(slip_rate / speed)
 
 
 def painleve_coefficients(scene: Scene) -> NDArray[np.float64]:
-    """Return for each pair the mu above which its sliding corner can be Painleve's case, shape (8,); inf if it cannot.
+    """Return the mu above which each pair's sliding corner can be in Painleve's case, shape (8,); inf if it never is.
 
-    A sliding corner is pressed into the wall by its own friction where d'' = -p N with p = 1/m + a^2/I - mu |a b|/I <
-    0, with the arms a and b of N and T about the centre of mass, here at q = 0. Rigid bodies then have no solution or
-    several; the compliant contact has one: N grows with the rate sqrt(-p K) until the slip has stopped ("impact without
-    collision"). Source: Genot and Brogliato, Eur. J. Mech. A 18 (1999) 653.
+    In Painleve's case a sliding corner is pressed into the wall by its own friction: in d'' = -p N the factor p = 1/m +
+    a^2/I - mu |a b|/I is negative, with the arms a of N and b of T about the centre of mass (here at q = 0). Rigid
+    bodies then have no solution or several. The compliant contact has one solution, in which N grows with the rate
+    sqrt(-p K) until the slip stops ("impact without collision"). Source: Genot and Brogliato, Eur. J. Mech. A 18
+    (1999) 653.
     """
     c, s, (x, y) = 1.0, 0.0, scene.head.com_offset_m
     normal, along = (rows.T @ np.array([c, s, x, y]) for rows in (arm_rows(scene), slip_arm_rows(scene)))

@@ -1,4 +1,4 @@
-"""Geometry of the guide: where each frame corner lies in the head's axes, how deep, and with which arm.
+"""Geometry of the guide: place of each frame corner in the head's axes, its penetration, and the arm of its force.
 
 The head's state is kept in *body coordinates* of its centre of mass G:
 
@@ -13,15 +13,15 @@ centre at p = R(theta)^T (C - (x, y)) (paper, eq. 1, inverted), that is
 with (rx, ry) the offset of G from the cavity's centre in head axes. The penetration past a wall with outward normal n
 at distance H is n . p - H; its rate is n . dp/dt, positive inward.
 
-A head that carries corners (`carries: corners`) is a block in a fixed cavity. Its state is kept in world axes, and its
-corner c = (cx, cy) is at
+A head that carries corners (`carries: corners`) is a block in a fixed cavity. Its state is kept in world axes. Its
+corner c = (cx, cy) lies at
 
     p_x = X + c cx - s cy              p_y = Y + s cx + c cy
 
 so penetrations and arms are linear again, and the same equations hold with other coefficients.
 
-A rounded corner meets a wall as the centre of its arc meets a wall that is nearer by the radius. C is then that centre;
-only for friction does the point that touches matter, which is nearer to the wall by the radius (`roll`).
+For a rounded corner C is the centre of its arc, and its walls are moved towards the cavity's centre by the radius.
+Friction acts at the touching point itself, one radius from the arc's centre (`roll`).
 """
 
 from __future__ import annotations
@@ -39,22 +39,22 @@ if TYPE_CHECKING:
 
 #: Number of components of the body-coordinate state: X, Y, VX, VY, omega, c, s, theta.
 STATE_SIZE = 8
-#: 1 for pairs at walls whose normal is along x, and along y.
+#: 1 for pairs at a wall with its normal along x (or along y), 0 for the others, shape (8,) each.
 _ALONG_X, _ALONG_Y = np.abs(NORMAL_X), np.abs(NORMAL_Y)
 
 
 def corner_positions(scene: Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the frame corner (Cx, Cy) of each pair, shape (8,) each, in m, world axes; of a rounded one the centre."""
+    """Return Cx and Cy of each pair's corner in m, world axes, shape (8,) each; of rounded corners the arc's centre."""
     radius = corner_radius(scene)
     return (0.5 * scene.frame.width_m - radius) * CORNER_X, (0.5 * scene.frame.height_m - radius) * CORNER_Y
 
 
 def corner_radius(scene: Scene) -> float:
-    """Return the radius of the corners in m, 0 for sharp ones."""
+    """Return the radius of the corners in m, 0 for sharp corners."""
     return scene.frame.corner_radius_m or 0.0
 
 
-#: Sides that an arc of an outline is drawn with.
+#: Number of straight lines that draw the arc of a rounded corner.
 _ARC_SIDES = 6
 
 
@@ -66,12 +66,12 @@ def outline(sides: NDArray[np.float64], radius: float) -> NDArray[np.float64]:
     sides : ndarray, shape (2,)
         Width and height.
     radius : float
-        Radius of the corners in the same unit; 0 for sharp ones.
+        Radius of the corners in the same unit; 0 for sharp corners.
 
     Returns
     -------
     ndarray, shape (n, 2)
-        The first point is the last one too.
+        Points of the outline; the last repeats the first.
     """
     angles = np.linspace(math.pi, 0.5 * math.pi, _ARC_SIDES + 1 if radius > 0.0 else 1)
     points = []
@@ -84,24 +84,25 @@ def outline(sides: NDArray[np.float64], radius: float) -> NDArray[np.float64]:
 
 
 def roll(scene: Scene) -> float:
-    """Return the distance in m along its wall by which the angle in rad moves the touching point of a rounded corner.
+    """Return how far a rounded corner's touching point moves along the wall per angle of the head [m/rad].
 
-    It counts along the wall's tangent (`slip_rows`) and shortens the arm of a force there (`slip_arm_rows`).
+    The distance is positive along the wall's tangent (`slip_rows`). It shortens the arm of a friction force
+    (`slip_arm_rows`).
     """
     return corner_radius(scene) * (1.0 if scene.head.carries == "corners" else -1.0)
 
 
 def wall_distances(scene: Scene) -> NDArray[np.float64]:
-    """Return the distance of each pair's wall from the cavity's centre, shape (8,), in m, before wear."""
+    """Return the distance of each pair's unworn wall from the cavity's centre in m, shape (8,)."""
     half_width = 0.5 * (scene.frame.width_m + scene.clearance.horizontal_m)
     half_height = 0.5 * (scene.frame.height_m + scene.clearance.vertical_m)
     return _ALONG_X * half_width + _ALONG_Y * half_height
 
 
 def penetration_rows(scene: Scene) -> NDArray[np.float64]:
-    """Return the coefficients of each penetration, shape (5, 8): rows for c, s, X, Y and 1, before wear.
+    """Return the coefficients of each penetration n . p - H before wear, shape (5, 8): rows for c, s, X, Y and 1.
 
-    n . p - H  with p of the module's docstring, or with the corner's place x + R c of a head that carries corners.
+    The module's docstring gives p for a head that carries walls and for a head that carries corners.
     """
     corner_x, corner_y = corner_positions(scene)
     rows = np.array(
@@ -117,20 +118,26 @@ def penetration_rows(scene: Scene) -> NDArray[np.float64]:
 
 
 def penetrations_at_centre(scene: Scene) -> NDArray[np.float64]:
-    """Return the last of the rows of `penetration_rows`, shape (8,), the only one that depends on the clearance."""
+    """Return the last row of `penetration_rows`, shape (8,); no other row depends on the clearance."""
     offset_x, offset_y = scene.head.com_offset_m
     return NORMAL_X * offset_x + NORMAL_Y * offset_y - (wall_distances(scene) - corner_radius(scene))
 
 
 def _of_places(scene: Scene, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return rows of a place; R c turns opposite to R^T c, and the head's place has a positive sign."""
+    """Return the rows of a place of a head that carries walls, or adapt them to a head that carries corners.
+
+    There R takes the place of R^T, and the head's position has the opposite sign.
+    """
     if scene.head.carries == "corners":
         rows[1:4] *= -1.0
     return rows
 
 
 def _of_arms(scene: Scene, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return rows of an arm about G; the arm of a corner of the head does not depend on the head's place."""
+    """Return the rows of an arm about G of a head that carries walls, or adapt them to a head that carries corners.
+
+    There the arm does not depend on the head's position.
+    """
     if scene.head.carries == "corners":
         rows[0] *= -1.0
         rows[2:] = 0.0
@@ -140,7 +147,7 @@ def _of_arms(scene: Scene, rows: NDArray[np.float64]) -> NDArray[np.float64]:
 def arm_rows(scene: Scene) -> NDArray[np.float64]:
     """Return the coefficients of each force's arm about G, shape (4, 8): rows for c, s, X, Y.
 
-    The force of a pair acts at the corner along n, so its moment about G is (p - r) x n per newton.
+    The force of a pair acts at the corner along n, so its arm is (p - r) x n with r = (rx, ry).
     """
     corner_x, corner_y = corner_positions(scene)
     rows = np.array(
@@ -155,9 +162,9 @@ def arm_rows(scene: Scene) -> NDArray[np.float64]:
 
 
 def slip_rows(scene: Scene) -> NDArray[np.float64]:
-    """Return the coefficients of each corner's place along its wall, shape (4, 8): rows for c, s, X, Y.
+    """Return the coefficients of each corner's place t . p along its wall, shape (4, 8): rows for c, s, X, Y.
 
-    t . p without its constant, t the wall's outward normal turned by +90 degrees.
+    The constant of t . p is left out. The tangent t is the wall's outward normal turned by +90 degrees.
     """
     corner_x, corner_y = corner_positions(scene)
     rows = np.array(
@@ -172,9 +179,9 @@ def slip_rows(scene: Scene) -> NDArray[np.float64]:
 
 
 def slip_arm_rows(scene: Scene) -> NDArray[np.float64]:
-    """Return the coefficients of the arm about G of a force along t at each corner, shape (4, 8): c, s, X, Y.
+    """Return the coefficients of the arm about G of a force along t at each corner, shape (4, 8): rows for c, s, X, Y.
 
-    (p - r) x t per newton.
+    The arm is (p - r) x t with r = (rx, ry).
     """
     corner_x, corner_y = corner_positions(scene)
     rows = np.array(
@@ -227,7 +234,7 @@ def body_states(states: NDArray[np.float64], offset: tuple[float, float]) -> NDA
 
 
 def tumbles(scene: Scene) -> bool:
-    """Return whether the head may turn beyond 45 degrees: a square block without wear, whose corners are all alike."""
+    """Return whether the head may turn beyond 45 degrees: only a square block without wear, since its corners match."""
     alike = scene.frame.width_m == scene.frame.height_m and scene.wear is None
     return scene.head.carries == "corners" and alike
 
@@ -239,8 +246,8 @@ def state_of(
 ) -> NDArray[np.float64]:
     """Convert pose and rate of the cavity's or the block's centre, shape (3,) each, to the solver's state, shape (8,).
 
-    Of a head that carries walls these are body coordinates. Where it carries corners, place and velocity are resolved
-    in world axes, and cosine and sine are those of the angle without the quarter turns of a tumbling block.
+    The state of a head that carries walls is its body coordinates. The state of a head that carries corners has place
+    and velocity in world axes, and cosine and sine of the angle less the quarter turns of a tumbling block.
     """
     if scene.head.carries == "walls":
         return body_state(q, v, scene.head.com_offset_m)
@@ -259,9 +266,9 @@ def states_of(scene: Scene, states: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def largest_angle(scene: Scene) -> float:
-    """Return the angle in rad to which the frame can turn in an unworn cavity, at most 45 degrees.
+    """Return the largest angle in rad to which the frame can turn in an unworn cavity, at most 45 degrees.
 
-    A frame at an angle is as wide and as high as its corners, or the arcs of its corners, reach.
+    The width and height of the turned frame are measured to its corners, or to the arcs of rounded corners.
     """
     radius = corner_radius(scene)
     sides = np.array([[scene.frame.width_m], [scene.frame.height_m]])
@@ -274,15 +281,14 @@ def largest_angle(scene: Scene) -> float:
 
 
 def length_scale(scene: Scene) -> float:
-    """Return the length in m that a tolerance refers to: the smallest clearance that is not negligible.
+    """Return the length in m to which tolerances are relative: the smallest clearance that is not negligible.
 
-    A clearance that is zero, negative or below 1e-4 of the frame's diagonal does not count; without any other the scale
-    is that fraction of the diagonal.
+    Clearances below 1e-4 of the frame's diagonal are negligible. If both are, the scale is this share of the diagonal.
     """
     floor = 1e-4 * math.hypot(scene.frame.width_m, scene.frame.height_m)
     return min((c for c in (scene.clearance.horizontal_m, scene.clearance.vertical_m) if c > floor), default=floor)
 
 
 def half_diagonal(scene: Scene) -> float:
-    """Return the distance of a frame corner from the frame's centre in m: it turns angles into lengths."""
+    """Return the distance of a frame corner from the frame's centre in m, by which angles are converted to lengths."""
     return 0.5 * math.hypot(scene.frame.width_m, scene.frame.height_m)

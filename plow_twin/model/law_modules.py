@@ -1,4 +1,4 @@
-"""Python modules that define contact laws, named by the user of a command and never by a file."""
+"""Python modules that define contact laws; only the user of a command can name them, never a file."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ _loaded: list[str] = []
 
 
 def load_laws(names: Iterable[str]) -> None:
-    """Import modules, whose calls of `add_law` define laws for this process; a loaded module is passed over.
+    """Import modules that call `add_law`, so that this process knows their laws; a loaded module is not loaded again.
 
     Parameters
     ----------
     names : iterable of str
-        Each a file ending in .py, or the name of an installed module.
+        Path of a file ending in .py, or name of an installed module, for each.
 
     Raises
     ------
@@ -35,15 +35,15 @@ def load_laws(names: Iterable[str]) -> None:
         before = set(LAWS)
         try:
             _import_file(Path(key)) if name.endswith(".py") else importlib.import_module(name)
-        except Exception as error:  # also after an error in the module
-            raise InputError([Problem("module", name, f"one that can be imported ({error})")], "--laws") from error
+        except Exception as error:  # the module's code can raise anything
+            raise InputError([Problem("module", name, f"a module that can be imported ({error})")], "--laws") from error
         if set(LAWS) == before:
-            raise InputError([Problem("module", name, "one that calls plow_twin.add_law")], "--laws")
+            raise InputError([Problem("module", name, "a module that calls plow_twin.add_law")], "--laws")
         _loaded.append(key)
 
 
 def loaded_laws() -> tuple[str, ...]:
-    """Return the modules that `load_laws` has imported; a child process needs them too."""
+    """Return the names of the modules that `load_laws` has imported, for child processes to import too."""
     return tuple(_loaded)
 
 

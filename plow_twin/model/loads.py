@@ -1,7 +1,7 @@
-"""Loads of a scene for the solver: harmonics grouped by frequency, and one list of linear pieces.
+"""Loads of a scene as the solver needs them: harmonics grouped by frequency, and one list of linear pieces.
 
-A load (Fx, Fy) at the constant arm (x, y) in world axes gives M = x Fy - y Fx about the cavity's centre, in any pose
-(paper, section 2). Gravity is not a load.
+A load (Fx, Fy) at the constant arm (x, y) in world axes has the moment M = x Fy - y Fx about the cavity's centre in
+every pose (paper, section 2). Gravity is not a load.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ Array = NDArray[np.float64]
 class Pieces:
     """A piecewise linear wrench: `start + slope (t - knots[i])` on [knots[i], knots[i + 1]); the last piece has no end.
 
-    `knots` has shape (n,), strictly increasing; before the first one the first start value holds. `start` and `slope`
-    have shape (n, 3): Fx, Fy in N, M in N m, and the same per second.
+    `knots` [s] has shape (n,) and increases strictly; before the first knot the wrench is the first row of `start`.
+    `start` and `slope` have shape (n, 3): Fx, Fy in N and M in N m, and their rates per second.
     """
 
     knots: Array
@@ -31,13 +31,13 @@ class Pieces:
 
     @staticmethod
     def through(t: Array, wrench: Array) -> Pieces:
-        """Join samples by straight lines; the last value is held."""
+        """Join samples by straight lines, and keep the last value after the last sample."""
         slope = np.zeros_like(wrench)
         slope[:-1] = np.diff(wrench, axis=0) / np.diff(t)[:, None]
         return Pieces(t, wrench, slope)
 
     def at(self, t: Array) -> tuple[Array, Array]:
-        """Return value and slope just after each time, shape (m, 3) each."""
+        """Return the wrench and its slope just after each time, shape (m, 3) each."""
         index = np.clip(np.searchsorted(self.knots, t, side="right") - 1, 0, None)
         before = t < self.knots[0]
         slope = np.where(before[:, None], 0.0, self.slope[index])
@@ -68,7 +68,7 @@ class LoadSet:
         return wrench if self.pieces is None else wrench + self.pieces.at(t)[0]
 
     def largest(self) -> Array:
-        """Return a bound of the magnitude of Fx, Fy [N] and M [N m] at any time, shape (3,)."""
+        """Return an upper bound of |Fx|, |Fy| [N] and |M| [N m] at any time, shape (3,)."""
         amplitude: Array = np.abs(self.constant) + np.hypot(self.sine, self.cosine).sum(axis=0)
         return amplitude if self.pieces is None else amplitude + np.abs(self.pieces.start).max(axis=0)
 
@@ -79,7 +79,7 @@ def wrench_of(force: tuple[float, float], moment: float, at: tuple[float, float]
 
 
 def load_direction(load: Harmonic | Constant) -> Array:
-    """Return the wrench per newton along the load's own direction, shape (3,); a pure moment counts per N m."""
+    """Return the load's wrench per newton of its force, shape (3,), or of a pure moment the wrench per N m."""
     size = float(np.hypot(*load.force_n)) or abs(load.moment_n_m) or 1.0
     return wrench_of(load.force_n, load.moment_n_m, load.at_m) / size
 

@@ -1,7 +1,7 @@
 """The eight corner/wall pairs of the guide, in their fixed order.
 
-Corners are those of the frame (the slide), seen from the front: top left, top right, bottom right, bottom left.
-Each can touch the two adjacent walls of the head's cavity: the horizontal one (top or bottom), then the vertical one.
+The corners are the frame's (the slide's), seen from the front: top left, top right, bottom right, bottom left. Each
+corner can touch two walls of the head's cavity; its pair at the horizontal wall precedes its pair at the vertical wall.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ CORNER_NAMES: Final[tuple[str, ...]] = ("top_left", "top_right", "bottom_right",
 
 #: Side of the frame on which each pair's corner lies, shape (8,): -1 left, +1 right.
 CORNER_X: Final[NDArray[np.float64]] = np.array([-1.0, -1.0, 1.0, 1.0, 1.0, 1.0, -1.0, -1.0])
-#: The same vertically: -1 bottom, +1 top.
+#: Side of the frame on which each pair's corner lies, shape (8,): -1 bottom, +1 top.
 CORNER_Y: Final[NDArray[np.float64]] = np.array([1.0, 1.0, 1.0, 1.0, -1.0, -1.0, -1.0, -1.0])
 #: Outward normal of each pair's wall in head axes, shape (8,) each.
 NORMAL_X: Final[NDArray[np.float64]] = np.array([0.0, -1.0, 0.0, 1.0, 0.0, 1.0, 0.0, -1.0])

@@ -1,13 +1,13 @@
-"""Running-in: a new pad wears faster; the excess falls with the wear depth h as exp(-h / h0).
+"""Running-in: a new pad wears faster, by an excess that falls with the wear depth h as exp(-h / h0).
 
-With the coefficient k_s (1 + (r - 1) exp(-h / h0)) a pad whose wear depth would be z with k_s alone has the depth
+The wear coefficient is k_s (1 + (r - 1) exp(-h / h0)). If a pad's depth with k_s alone is z, its depth h is
 
     h = z + h0 ln(r - (r - 1) exp(-z / h0))        z = h + h0 ln((1 + (r - 1) exp(-h / h0)) / r)
 
-h0 ln r deeper in the end. At constant force z grows with the sliding distance s, z = k_s F s / A, and the coefficient
-reaches its steady value as exp(-s / s0) with s0 = h0 A / (k_s F): a transient that dies away exponentially with the
-distance (Queener, Smith and Mitchell, Wear 8 (1965) 391). As a function of the depth it needs no state of its own: it
-continues from a saved depth, and starts again with new pads.
+In the end the pad is h0 ln r deeper than with k_s alone. Under a constant force F z grows with the sliding distance s
+as z = k_s F s / A, and the coefficient approaches k_s as exp(-s / s0) with s0 = h0 A / (k_s F), the exponential
+transient of Queener, Smith and Mitchell, Wear 8 (1965) 391. The coefficient depends on the depth alone, so no further
+state is needed: running-in continues from a saved depth, and starts again with new pads.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 
 def without_running_in(wear: Wear, depth: Array) -> Array:
-    """Return z in m, the depth [m] at the steady coefficient from new: z(0) = 0."""
+    """Return the depth z [m] that the pad would have with the steady coefficient alone; z(0) = 0."""
     if wear.running_in_depth_m is None or wear.running_in_ratio == 1.0:
         return depth
     ratio, h0 = wear.running_in_ratio, wear.running_in_depth_m
@@ -30,7 +30,7 @@ def without_running_in(wear: Wear, depth: Array) -> Array:
 
 
 def with_running_in(wear: Wear, steady: Array) -> Array:
-    """Return the depth h in m that goes with z in m; inverse of `without_running_in`."""
+    """Return the depth h [m] for the depth z [m] (`steady`); inverse of `without_running_in`."""
     if wear.running_in_depth_m is None or wear.running_in_ratio == 1.0:
         return steady
     ratio, h0 = wear.running_in_ratio, wear.running_in_depth_m

@@ -47,7 +47,7 @@ class Mark(Enum):
 
 @dataclass(frozen=True)
 class Provenance:
-    """The mark of one number of a scene and the source that stands behind it.
+    """The mark and the source of one number of a scene.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class Provenance:
     source : str
         The source, in words.
     deviation : float, optional
-        Standard deviation of the number, in its unit; None where it is not stated.
+        Standard deviation of the number, in its unit; None if it is not stated.
     """
 
     mark: Mark
@@ -128,22 +128,22 @@ class Clearance:
 class Contact:
     """Normal contact of every pair: one law and one uniform set of parameters.
 
-    Exactly one of `damping` and `restitution` is given, or neither for a law without damping. The default law returns
-    exactly the given restitution.
+    Exactly one of `damping` and `restitution` must be given, or neither for a law without damping. Impacts with the
+    default law have exactly the given restitution.
 
-    With `restitution_speed_m_s` v1 and `restitution_fall` q the restitution of impacts faster than v1 falls as (w /
-    v1)^-q, where w = v (m' / m)^p with the speed of approach v, the effective mass m' of the head at the corner and the
-    `restitution_mass_power` p. `restitution_fall_along_s_m` times the speed of the centre of mass along the wall is
-    subtracted from it.
+    The restitution can fall with the impact speed w = v (m' / m)^p, where v is the speed of approach, m' the head's
+    effective mass at the corner, m its mass and p the `restitution_mass_power`. If w exceeds the
+    `restitution_speed_m_s` v1, the restitution is multiplied by (w / v1)^-q with the `restitution_fall` q. Then
+    `restitution_fall_along_s_m` times the speed of the centre of mass along the wall is subtracted.
 
     References
     ----------
-    Fall with the speed, v^-1/4 of plastic contact: Johnson, Contact Mechanics, 1985, sec. 11.5. The other two were
-    found in measured impacts (docs/measured.md).
+    Fall with the speed (v^-1/4 in plastic contact): Johnson, Contact Mechanics, 1985, sec. 11.5. The falls with the
+    effective mass and with the speed along the wall were found in measured impacts (docs/measured.md).
     """
 
     law: str = _choice("contact law", LAWS, "exact_restitution")
-    # must be given; has a default only because it follows a field with a default
+    # must be given; the default (NaN, not admissible) is here only because the field before has a default
     stiffness: float = _quantity("N/m^exponent", "K in F = K d^n (...)", math.nan, gt=0.0)
     exponent: float = _quantity("1", "n in F = K d^n (...)", 1.0, ge=1.0, le=4.0)
     damping: float | None = _quantity(
@@ -169,7 +169,7 @@ class Contact:
     )
 
 
-#: Numbers by which the restitution depends on the impact; all absent where it does not.
+#: Fields of `Contact` by which the restitution depends on the impact; all absent if it is constant.
 FALL_NAMES: Final = (
     "restitution_fall",
     "restitution_speed_m_s",
@@ -182,9 +182,9 @@ FALL_NAMES: Final = (
 class Friction:
     """Tangential friction of every pair, by one of two laws.
 
-    Without `stick_stiffness_n_m` regularised Coulomb, T = mu N tanh(slip rate / regularisation speed), which creeps.
-    With it Coulomb's law with stick: a spring and a damper hold a corner to the wall up to static mu N, then it slips
-    with T = mu N.
+    Without `stick_stiffness_n_m` friction is regularised Coulomb, T = mu N tanh(slip rate / regularisation speed),
+    under which bodies creep. With it friction is Coulomb's law with stick: a spring and a damper hold a corner to the
+    wall up to static mu N, then the corner slips with T = mu N.
 
     References
     ----------
@@ -201,10 +201,10 @@ class Friction:
 
 @dataclass(frozen=True)
 class Support:
-    """The frame as a body with mass on springs and dampers to ground. Without it the frame is fixed.
+    """The frame as a body with mass on springs and dampers to ground. In a scene without a support the frame is fixed.
 
-    The frame's displacement is counted from where its springs are slack, at rest there at the start; its weight is
-    carried there. q is the head's displacement from the frame, as without a support.
+    The frame starts at rest in its equilibrium without contact, where its weight is carried, and its displacement is
+    measured from there. q is the head's displacement from the frame, as without a support.
     """
 
     mass_kg: float = _quantity("kg", "mass of the frame and of the parts that move with it", gt=0.0)
@@ -261,9 +261,9 @@ class Constant:
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """A load given by samples; before the first and after the last one the end value holds.
+    """A load given by samples; before the first and after the last sample it keeps that sample's value.
 
-    With `hold` `linear` it is interpolated, with `zero` each sample holds until the next.
+    With `hold` = `linear` the samples are interpolated; with `zero` each value is kept until the next sample.
 
     Attributes
     ----------
@@ -297,9 +297,9 @@ class Initial:
 class Wear:
     """Archard wear of the eight pads by the travel along the face: dh/dt = k_s F v / A.
 
-    With `sliding: total` v is the speed of the corner over its pad, sqrt(v^2 + s'^2), with the speed s' in the plane of
-    the section. With `running_in_ratio` r and `running_in_depth_m` h0 a pad that is worn by h has the coefficient k_s
-    (1 + (r - 1) exp(-h / h0)).
+    With `sliding: total` the corner's speed over its pad, sqrt(v^2 + s'^2), takes the place of v; s' is its speed in
+    the plane of the section. With `running_in_ratio` r and `running_in_depth_m` h0 the coefficient of a pad that is
+    worn by h is k_s (1 + (r - 1) exp(-h / h0)).
 
     References
     ----------
@@ -339,18 +339,18 @@ class Scene:
     locked : tuple of str
         Degrees of freedom held: any of x, y, theta.
     pairs : tuple of str
-        The pairs that can touch; all unless given.
+        The pairs that can touch, by default all.
     wear : Wear or None
     friction : Friction or None
     support : Support or None
         Springs under the frame; without it the frame is fixed.
     marks : mapping of str to Provenance
-        Where numbers come from, by their path; no part of equality.
+        Provenance of numbers by their path; not compared by ==.
 
     Raises
     ------
     SceneError
-        When the scene cannot be used; the error lists every problem.
+        The scene cannot be used; the error lists every problem.
     """
 
     head: Head
@@ -388,12 +388,12 @@ _PARTS: Final[Mapping[str, type]] = {
 }
 
 
-#: Parts that a scene may lack.
+#: Optional parts of a scene.
 OPTIONAL_PARTS: Final[Mapping[str, type]] = {"wear": Wear, "friction": Friction, "support": Support}
 
 
 def check(scene: Scene) -> Iterator[Problem]:
-    """Yield every problem of a scene: types, ranges, choices, then conditions across fields."""
+    """Yield every problem of a scene: types, ranges and choices first; if there are none, conditions across fields."""
     found = list(_check_fields(scene, ""))
     yield from found
     if not found:
@@ -480,20 +480,20 @@ def _check_choice(key: str, value: Any, spec: Field[Any]) -> Iterator[Problem]:
 
 
 def must_be_given(spec: Field[Any]) -> bool:
-    """Return whether a scene must give the field, because its default is not a valid value."""
+    """Return whether a scene must give the field, since it has no default or its default is NaN."""
     if spec.default is MISSING:
         return spec.default_factory is MISSING
     return isinstance(spec.default, float) and math.isnan(spec.default)
 
 
 def describe(spec: Field[Any]) -> str:
-    """Return the admissible numbers in words, e.g. `a finite number > 0 [kg]`."""
+    """Describe the admissible numbers, e.g. `a finite number > 0 [kg]`."""
     signs = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
     bounds = [f"{sign} {spec.metadata[name]:g}" for name, sign in signs.items() if name in spec.metadata]
     return f"a finite number {' and '.join(bounds)}".rstrip() + f" [{spec.metadata['unit']}]"
 
 
-#: Largest factor lambda of 1 + lambda d' in s/m.
+#: Largest damping factor lambda in s/m that a scene can give, of 1 + lambda d'.
 MOST_DAMPING_FACTOR: Final = 1e9
 
 
@@ -510,9 +510,9 @@ def _check_wear(wear: Wear, contact: Contact) -> Iterator[Problem]:
 
 
 def fastest_travel(wear: Wear | None, contact: Contact) -> float:
-    """Return the largest speed along the face in m/s beside a damping C, A / (k_s C).
+    """Return the largest speed along the face in m/s for a damping C, A / (k_s C); inf without C or without wear.
 
-    Beyond it a force wears the pad faster than it moves the head, so that no contact lasts.
+    Above this speed a force wears the pad faster than it moves the head, so that no contact can last.
     """
     if wear is None or not LAWS[contact.law].additive:
         return math.inf
@@ -521,18 +521,18 @@ def fastest_travel(wear: Wear | None, contact: Contact) -> float:
 
 
 def check_travel_speed(scene: Scene, speed_m_s: float) -> None:
-    """Raise `ArgumentError` for a speed along the face at which a twin of the scene cannot go on.
+    """Check that a twin of the scene can run at a speed along the face.
 
     Parameters
     ----------
     scene : Scene
     speed_m_s : float
-        In m/s, of either sign.
+        Speed in m/s, of either sign.
 
     Raises
     ------
     ArgumentError
-        For a speed that is not finite, or at which a force would wear a pad faster than it moves the head.
+        The speed is not finite, or a force would wear a pad faster than it moves the head.
     """
     fastest = fastest_travel(scene.wear, scene.contact)
     if not math.isfinite(speed_m_s):
@@ -564,7 +564,7 @@ def _check_contact(contact: Contact) -> Iterator[Problem]:
     if law.exponent is not None and contact.exponent != law.exponent:
         yield Problem("contact.exponent", contact.exponent, f"{law.exponent:g} for {contact.law}")
     if not law.additive and contact.damping is not None and contact.damping > MOST_DAMPING_FACTOR:
-        # it stops a head at a depth of sqrt(2 m / (K lambda)), which double precision resolves by a few digits only
+        # a larger factor stops a head within sqrt(2 m / (K lambda)), a depth with few digits in double precision
         expected = f"at most {MOST_DAMPING_FACTOR:g} s/m for {contact.law}; a restitution gives at most 1e6"
         yield Problem("contact.damping", contact.damping, expected)
     if law.ramped != (contact.ramp_m is not None):
@@ -633,7 +633,7 @@ def _check_loads(loads: tuple[Load, ...]) -> Iterator[Problem]:
             yield from _check_table(f"loads[{index}]", load)
 
 
-#: Smallest time between two samples of a table in s; between closer ones the solver cannot step.
+#: Shortest time between two samples of a table in s; the solver cannot step between closer samples.
 LEAST_SPACING_S: Final = 1e-100
 
 
