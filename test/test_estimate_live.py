@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from multiprocessing import Pipe
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +24,14 @@ from std_srvs.srv import Trigger
 
 from plow_twin import Twin, Wear
 from plow_twin.cli.app import run as run_cli
+from plow_twin.estimate.answer import Asked
 from plow_twin.estimate.result import Estimate, Interval, State
 from plow_twin.estimate.window import Window, Windows
-from plow_twin.estimate.worker import Found, Worker
+from plow_twin.estimate.worker import Found, Worker, serve
 from plow_twin.live.estimation import Estimation, entry_of, message_of
 from plow_twin.live.parameters import settings
 from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.model.scene import Scene
 from plow_twin.record.estimated import live_estimates
 from plow_twin.record.messages import JointState as JointStateMessage
 from plow_twin.record.reader import RunReader
@@ -163,6 +166,7 @@ def test_the_live_estimate_is_published_and_given_again_by_the_journal(tmp_path:
         forces: list[JointState] = probe.listen(JointState, "window_forces")
         forecasts: list[JointState] = probe.listen(JointState, "forecast")
         assert value(probe.status[-1], "horizontal") == "prior"
+        probe.until_figure("estimate", "ready", "1", timeout_s=100.0)  # before any sample
         _play(running, truth, late=True)
         # windows end each 4 s; a slow machine leaves out one, but not the last
         last_s = (START_NS + round((truth.load.t[-1] - WAIT_S) * 1e9)) // round(INTERVAL_S * 1e9) * round(INTERVAL_S)
@@ -297,6 +301,21 @@ def test_other_pads_and_other_model_numbers_discard_earlier_estimates(
     assert estimation.poll(session) == {}
 
 
+def test_an_estimator_is_ready_only_once_it_is_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    near, far = Pipe()
+    compiled = []
+
+    def compile_all(scene: Scene) -> None:
+        compiled.append(scene)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("plow_twin.estimate.worker.warm_up", compile_all)
+    near.send((preset("paper"), Windows(10.0, 4.0, 1.0), Asked()))
+    with pytest.raises(KeyboardInterrupt):
+        serve(far)
+    assert len(compiled) == 1 and not near.poll()
+
+
 def test_a_frozen_worker_is_reported_and_costs_no_further_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("plow_twin.estimate.worker._MOST_WAITING", 20_000)
     worker = Worker(preset("paper"), Windows(10.0, 4.0, 1.0))
@@ -309,6 +328,7 @@ def test_a_frozen_worker_is_reported_and_costs_no_further_memory(monkeypatch: py
         # so slow that the source waits for it with less data than that
         time.sleep(0.1)
     assert worker.error == "the estimator did not read for 20000 samples"
+    assert not worker.ready
     worker.add_load(START_NS, (0.0, 0.0, 0.0))
     assert not worker._waiting
     worker.close()

@@ -8,15 +8,19 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from record_support import BASE_NS, paper_sample, record_run
+from rich.console import Console
 from ros_processes import ROOT
 
 from plow_twin.demo.comparison import compare_forces
-from plow_twin.demo.demo import program
+from plow_twin.demo.demo import Watch, _run, program
 from plow_twin.demo.excitation_publisher import plan
 from plow_twin.demo.run_summary import summarise
 from plow_twin.estimate.measurements import Poses
@@ -90,6 +94,36 @@ def test_the_demo_runs_to_its_end_without_loss(tmp_path: Path, speed: str) -> No
     assert 0.025 < low < horizontal < high
     for shares in summary.contact_sets.values():
         assert sum(shares.values()) == pytest.approx(1.0)
+
+
+def test_the_demo_takes_no_sample_before_the_estimator_is_compiled(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The processes are played: each look at the reports brings the next one."""
+    watch, seen = Watch(), list[str]()
+    reports = iter([
+        {"state": {"lifecycle": "active"}, "estimate": {"ready": "0"}}, {"estimate": {"ready": "0"}},
+        {"estimate": {"ready": "1"}}, {"estimate": {"ready": "1", "estimates": "1"}},
+    ])  # fmt: skip
+
+    def look() -> None:
+        watch.parts |= next(reports, {})
+        watch.reports += 1
+        seen.append(f"ready {watch.text('estimate', 'ready')}")
+
+    @contextmanager
+    def process(arguments: list[str], log: Path) -> Iterator[Mock]:
+        seen.append(arguments[0].rpartition(".")[2])
+        yield Mock(running=False, output=lambda: '{"sent": 15000}')
+
+    @contextmanager
+    def watching() -> Iterator[tuple[Watch, Callable[[], None]]]:
+        yield watch, look
+
+    monkeypatch.setattr("plow_twin.demo.demo._process", process)
+    monkeypatch.setattr("plow_twin.demo.demo._watching", watching)
+    assert _run("real", 15.0, tmp_path, Console(quiet=True), True, None) == (watch, 15000)
+    assert seen[:5] == ["main", "ready 0", "ready 0", "ready 1", "excitation_publisher"]
 
 
 def test_forces_are_compared_with_the_machine_s_and_the_time_of_each_estimate_is_named(tmp_path: Path) -> None:

@@ -162,6 +162,13 @@ def _run(
         twin = opened.enter_context(_process(node, folder / "node.log"))
         task = bar.add_task("compiling the solver", total=None)
         _until("active node", lambda: watch.text("state", "lifecycle") == "active", spin, twin, _START_TIMEOUT_S)
+        if estimating:
+            bar.update(task, description="compiling the estimator")
+            _until(
+                "compiled estimator",
+                lambda: watch.number("estimate", "ready") or watch.text("estimate", "error"),
+                spin, twin, _START_TIMEOUT_S,
+            )  # fmt: skip
         if screen is not None:
             command = ["plow_twin", "dashboard", "--ros", *screen]
             shown = opened.enter_context(_process(command, folder / "screen.log"))

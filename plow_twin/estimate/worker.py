@@ -1,8 +1,8 @@
 """The sliding estimate in its own process, so that it does not delay the samples.
 
 `Worker` is the near side: it queues data, which a thread sends. The far side, `python -m plow_twin.estimate.worker`,
-estimates each window that is due and sends the result back. A window that became due while another was computed is
-skipped for a newer one.
+compiles its kernels, says so, estimates each window that is due and sends the result back. A window that became due
+while another was computed is skipped for a newer one.
 """
 
 from __future__ import annotations
@@ -100,6 +100,8 @@ class Worker:
         self._connection.send((scene, windows, asked))
         self._waiting: deque[tuple[Any, ...]] = deque()
         self._restarts = 0
+        #: whether the far side has compiled its kernels
+        self.ready = False
         self._closed = threading.Event()
         #: reason why estimating has ended; empty before
         self.error = ""
@@ -149,7 +151,10 @@ class Worker:
             return None
         try:
             if self._connection.poll():
-                found: Found | str = self._connection.recv()
+                found: Found | str | None = self._connection.recv()
+                if found is None:
+                    self.ready = True
+                    return None
                 if isinstance(found, str):
                     self.ended = found
                     return None
@@ -191,6 +196,7 @@ def serve(connection: Connection) -> None:
     """Estimate until the other side closes the connection."""
     scene, windows, asked = connection.recv()
     warm_up(scene)
+    connection.send(None)  # ready
     guess: Guess = ()
     ended: str | None = None
     skipped = restarts = 0

@@ -97,6 +97,7 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "period_max_ms": "mean, standard deviation and largest of the period [ms]",
     },
     "estimate": {
+        "ready": "1 once the estimator is compiled; until then data wait",
         "estimates": "estimates since configure",
         "skipped": "windows skipped for a newer one: the machine is too slow for estimate_interval",
         "window_age_s": "the node's time minus the end of the newest window [s]",
@@ -383,6 +384,7 @@ class Health:
             return OK, "not estimating", values
         age_s = runtime.estimate_age_s()
         values |= {
+            "ready": str(int(found.ready)),
             "estimates": str(found.count),
             "skipped": str(found.skipped),
             "window_age_s": "" if age_s is None else f"{age_s:.3f}",
@@ -391,7 +393,8 @@ class Health:
             "error": found.error,
         }
         trouble = found.error or values["reasons"]
-        return (ERROR if found.error else WARN if trouble else OK), trouble or "estimating", values
+        doing = "estimating" if found.ready else "compiling the estimator"
+        return (ERROR if found.error else WARN if trouble else OK), trouble or doing, values
 
     def follow(self, runtime: Runtime) -> Part:
         """Return how the twin follows the machine, as a part of the diagnostics."""

@@ -72,6 +72,11 @@ class Estimation:
         """Reason why the estimation has ended; empty: it continues."""
         return self._worker.error
 
+    @property
+    def ready(self) -> bool:
+        """Whether the estimator is compiled; until then data wait."""
+        return self._worker.ready
+
     def finish(self) -> None:
         """Let the last window be estimated: the source has ended."""
         self._worker.finish()

@@ -133,7 +133,10 @@ class RunCurves:
                     self._newest_ns = stamp_ns
                 case Estimated(end_ns=end_ns, result=result):
                     if not self._estimated:
-                        self._change(end_ns, "first estimate")
+                        # from its arrival on it holds
+                        self._samples(batch.entries.stamp_ns[samples[(samples >= done) & (samples < index)]])
+                        done = index
+                        self._change(end_ns if self._newest_ns is None else self._newest_ns, "first estimate")
                     self._estimated, self._estimate = True, (int(batch.entries.sequence[index]), result)
                     found = json.loads(result)
                     self.states = {axis: found.get(axis, {}).get("state", "prior") for axis in self.states}
