@@ -1,4 +1,4 @@
-"""From a scene to the records of the kernels: only here do names and units of the scene meet the solver's arrays."""
+"""Conversion of a scene to the records of the kernels, in this module alone."""
 
 from __future__ import annotations
 
@@ -48,15 +48,16 @@ from plow_twin.solve.state import (
 
 #: Tightest and loosest tolerance.
 TOLERANCE_RANGE = (1e-13, 1e-1)
-#: Share of the tolerance that a step may spend, so that hundreds of steps and amplifying impacts stay within it.
+#: Error of a step as a share of the tolerance, so that hundreds of steps and amplifying impacts stay within it.
 STEP_SHARE = 3e-4
-#: Largest error of a step, as a share of the length scale: fewer steps suffice to exceed a loose tolerance.
+#: Largest error of a step over the length scale; with a loose tolerance `STEP_SHARE` alone would let errors add up.
 LARGEST_STEP_ERROR = 1e-6
-#: `STEP_SHARE` for exponents that are not integers: near a branch point the remainder of a series falls more slowly.
+#: `STEP_SHARE` for exponents that are not integers, since near a branch point a series converges more slowly.
 STEP_SHARE_FRACTION = 1e-6
-#: Mode changes at one instant after which the solver steps past it.
+#: Number of mode changes at one instant after which the solver steps beyond it.
 MAX_EVENTS_AT_ONCE = 64
-#: Harmonics up to this share of the load that presses the head to its walls may let it rest (`method.small_harmonics`).
+#: Rest is checked (`method.small_harmonics`) if the harmonics are at most this share of the load that presses the head
+#: to its walls.
 _SMALL_HARMONICS = 1e-2
 
 _Found = TypeVar("_Found")
@@ -66,7 +67,7 @@ _NO_TERMS = Terms(*[None] * len(Terms._fields))
 
 @dataclass(frozen=True)
 class CompiledScene:
-    """A scene at one tolerance, ready for the kernels."""
+    """A scene at one tolerance as records for the kernels."""
 
     scene: Scene
     params: Params
@@ -74,7 +75,7 @@ class CompiledScene:
     loads: LoadSet
 
     def initial_state(self, time: float = 0.0, wear_depth: Array | None = None) -> State:
-        """Return the scene's initial state, its pads worn by `wear_depth` [m] instead of the scene's initial depth."""
+        """Return the scene's initial state at `time`; `wear_depth` [m] replaces the pads' initial wear if given."""
         state = new_record(state_type(self.parts.terms))
         self.start(state)
         if wear_depth is not None:
@@ -84,7 +85,7 @@ class CompiledScene:
         return state
 
     def start(self, state: State | np.void) -> None:
-        """Write place, rates, damping and wear of the initial state to a record of zeros; its modes are not settled."""
+        """Write place, rates, damping and wear of the initial state to a record of zeros, without choosing modes."""
         state["y"][:] = geometry.state_of(self.scene, self.scene.initial.q, self.scene.initial.v)
         if self.parts.terms.hysteretic is not None:
             state["damping_factor"][:] = self.scene.contact.damping or 0.0
@@ -101,15 +102,15 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
     tol : float
         Tolerance of the pose relative to `geometry.length_scale`, 1e-13 .. 1e-1.
     sampled : bool
-        Leave the scene's loads out: the load comes as samples.
+        Whether the load is given as samples, so that the scene's own loads are left out.
 
     Raises
     ------
     ArgumentError
-        For a tolerance out of range.
+        The tolerance is out of range.
     """
     _check_tolerance(tol)
-    # a table of loads may be large: nothing keeps it when its scene has gone
+    # a table of loads may be large, so it must not be kept longer than its scene
     tables = any(isinstance(load, Table) for load in scene.loads)
     return _describe(scene, tol, sampled, _Shared() if tables else _LATELY).compiled()
 
@@ -120,14 +121,14 @@ def compile_scenes(scenes: Sequence[Scene], tol: float) -> tuple[NDArray[np.void
     Returns
     -------
     params : ndarray of `PARAMS`, shape (m,)
-        Constants of all scenes in one block; zeros for those with `Options`.
+        Constants of all scenes in one block; zeros for scenes with `Options`.
     compiled : list of CompiledScene
-        The scenes; their constants are the rows of `params`, or records of their own with `Options`.
+        The scenes; their constants are the rows of `params`, or separate records for scenes with `Options`.
 
     Raises
     ------
     ArgumentError
-        For a tolerance out of range.
+        The tolerance is out of range.
     """
     _check_tolerance(tol)
     shared, params = _Shared(), new_records(PARAMS, len(scenes))
@@ -153,9 +154,9 @@ def _check_tolerance(tol: float) -> None:
 
 
 class _Shared:
-    """Results that scenes share, computed once for each set of objects that they depend on.
+    """Results that scenes share, computed once for each set of objects on which they depend.
 
-    With `most` only that number of the newest are kept.
+    If `most` is given, only this number of the newest results is kept.
     """
 
     def __init__(self, most: float = math.inf) -> None:
@@ -163,11 +164,14 @@ class _Shared:
         self._known: OrderedDict[tuple[Any, ...], tuple[Any, Any]] = OrderedDict()
 
     def of(self, compute: Callable[..., _Found], *sources: object, given: tuple[Any, ...] | None = None) -> _Found:
-        """Return `compute` of the sources, or of the `given` that they decide; once for the same objects."""
+        """Return compute(*sources), or compute(*given), and keep the result for the next call with the same sources.
+
+        `given` must be determined by the sources.
+        """
         key = (compute, *map(id, sources))
         known = self._known.get(key)
         if known is None:
-            # the sources stay, and keep their identity
+            # the sources are kept too, so that no other object can get the id of one of them
             known = self._known[key] = sources, compute(*(sources if given is None else given))
             if len(self._known) > self._most:
                 self._known.popitem(last=False)
@@ -175,13 +179,13 @@ class _Shared:
         return found
 
 
-#: Parts of the scenes compiled last, to be used again: studies vary some parts of a scene and keep the others.
+#: Parts of the last compiled scenes for reuse, since studies vary some parts of a scene and keep the others.
 _LATELY: Final = _Shared(64)
 
 
 @dataclass(frozen=True)
 class _Description:
-    """A scene in the solver's terms; `values` are the fields of its `PARAMS`."""
+    """A scene as the solver describes it; `values` has the fields of its `PARAMS`."""
 
     scene: Scene
     values: dict[str, Any]
@@ -189,7 +193,7 @@ class _Description:
     loads: LoadSet
 
     def compiled(self, params: Params | None = None) -> CompiledScene:
-        """Return the compiled scene, its constants in `params` or in a record of its own."""
+        """Return the compiled scene, with its constants in `params` or in a new record."""
         if params is None:
             params = new_record(params_type(options(self.scene)))
             for name, value in self.values.items():
@@ -198,7 +202,7 @@ class _Description:
 
 
 class _Unchanged(NamedTuple):
-    """All that the clearance of a scene does not decide; `values` are fields of its `PARAMS`."""
+    """All results that do not depend on a scene's clearance; `values` has fields of its `PARAMS`."""
 
     loads: LoadSet
     acceleration: float  #: largest, in m/s^2
@@ -251,12 +255,12 @@ def _describe(scene: Scene, tol: float, sampled: bool, shared: _Shared) -> _Desc
     loads, acceleration, start_speed, harmonics, terms, unchanged = shared.of(
         _unchanged, scene.head, scene.frame, scene.contact, scene.gravity, scene.loads, scene.initial, scene.locked,
         scene.pairs, scene.wear, scene.friction, scene.support, sampled,
-        # the clearance matters here only to a head that starts off centre and may touch a wall
+        # the results depend on the clearance only if the head starts off centre, so that it may touch a wall
         scene.clearance if any(scene.initial.q) else None,
         given=(scene, sampled, shared),
     )  # fmt: skip
     length, radius = geometry.length_scale(scene), unchanged["radius"]
-    # the speed that the largest steady load gives the head over half the length scale
+    # the speed that the largest load would give the head over half the length scale
     speed = max(math.sqrt(length * acceleration), start_speed, 1e-3 * length)
     admissible = min(tol * (STEP_SHARE if terms.fraction is None else STEP_SHARE_FRACTION), LARGEST_STEP_ERROR)
     order = order_for(admissible)
@@ -281,7 +285,7 @@ def _describe(scene: Scene, tol: float, sampled: bool, shared: _Shared) -> _Desc
 
 
 def options(scene: Scene) -> Options:
-    """Return which options a scene has; its constants have fields for these."""
+    """Return which options a scene has, for which its constants need further fields."""
     falls = scene.contact.restitution_fall is not None or scene.contact.restitution_fall_along_s_m is not None
     return Options(scene.head.carries == "corners", scene.frame.corner_radius_m is not None, falls)
 
@@ -307,7 +311,7 @@ def _of_options(scene: Scene) -> dict[str, Any]:
 
 @cache
 def damping_numbers(law: str) -> Array:
-    """Return e D(e) of a law on a grid of restitutions from 0 to 1, shape (RESTITUTIONS + 1,)."""
+    """Return e D(e) of a law on an even grid of restitutions from 0 to 1, shape (RESTITUTIONS + 1,)."""
     grid = np.arange(RESTITUTIONS + 1) / RESTITUTIONS
     return grid * [LAWS[law].damping_number(float(e)) for e in grid]
 
@@ -327,9 +331,9 @@ def _scene_terms(
     if scene.friction is not None and scene.friction.coefficient != 0.0:
         present["slip" if scene.friction.stick_stiffness_n_m is None else "stick"] = True
     present["support"] = scene.support is not None
-    # with the loads' moment about another point than the centre of mass the flight has no elementary integral
+    # with an offset centre of mass the loads' moment depends on the angle, so that flight has no closed form
     present["flight"] = present["harmonics"] and not present["offset"] and not present["support"]
-    # a flight may be longer than a quarter turn of a block that tumbles
+    # a tumbling block could turn by more than a quarter turn within a flight
     present["flight"] &= scene.head.carries == "walls"
     creeps = present["wear"] or bool({"slip", "stick"} & present.keys())
     present["rest"] = not (creeps or present["support"])
@@ -351,7 +355,7 @@ def _wear_terms(wear: Wear | None) -> dict[str, bool]:
 
 
 def _harmonics_are_small(scene: Scene, loads: LoadSet, swing: Array) -> bool:
-    """Return whether the harmonics are small beside the steady loads and preload that press the head to its walls."""
+    """Return whether the harmonics are small compared with the steady loads and the preload at the walls."""
     mass, contact = scene.head.mass_kg, scene.contact
     arms = np.array([1.0, 1.0, 1.0 / geometry.half_diagonal(scene)])
     pressing = np.abs(loads.constant) @ arms + mass * abs(scene.gravity.acceleration_m_s2)
@@ -362,9 +366,9 @@ def _harmonics_are_small(scene: Scene, loads: LoadSet, swing: Array) -> bool:
 
 
 def _initial_depth(scene: Scene) -> float:
-    """Return the penetration in m of the pair that is deepest at the start, at least 0."""
+    """Return the largest penetration of a pair at the start in m, at least 0."""
     if not any(scene.initial.q):
-        return 0.0  # centred: no wall is reached
+        return 0.0  # the head is centred and reaches no wall
     y = geometry.state_of(scene, scene.initial.q, scene.initial.v)
     rows = geometry.penetration_rows(scene)
     return max(float((np.array([y[COS], y[SIN], y[X], y[Y], 1.0]) @ rows).max()), 0.0)
@@ -372,18 +376,18 @@ def _initial_depth(scene: Scene) -> float:
 
 @lru_cache(64)
 def _thresholds(admissible: float, order: int) -> Array:
-    """Return the admissible size of each term over that of the first term."""
+    """Return the admissible size of each term, relative to that of the first term."""
     sizes: Array = admissible ** (np.arange(MAX_ORDER + 1) / order)
     return sizes
 
 
 def order_for(admissible: float) -> int:
-    """Return the order for the admissible error of a step, the fastest in measurements of the bench scenes."""
+    """Return the series' order for an admissible error of a step, by a fit to the fastest order of the bench scenes."""
     return int(min(MAX_ORDER, max(8, round(6.0 - math.log10(admissible)))))
 
 
 def _lacuna(exponent: float) -> int:
-    """Return how many orders in a row can vanish: d^n adds n + 1 orders at a time while nothing else acts."""
+    """Return how many consecutive orders can vanish: without other terms d^n gives a term every n + 1 orders."""
     if not float(exponent).is_integer():
         return 6
     return 2 if exponent == 1.0 else int(exponent) + 1
@@ -396,12 +400,12 @@ def per_mass(scene: Scene, wrench: Array) -> Array:
 
 
 def inertias(scene: Scene) -> Array:
-    """Return mass, mass and inertia, shape (3,)."""
+    """Return (mass, mass, inertia) in kg, kg, kg m^2, shape (3,)."""
     return np.array([scene.head.mass_kg, scene.head.mass_kg, scene.head.inertia_kg_m2])
 
 
 def _segments(scene: Scene, pieces: Pieces) -> Segments:
-    """Return linear pieces per mass and inertia."""
+    """Return the linear pieces of a load divided by mass and inertia."""
     segments = np.zeros(len(pieces.knots), SEGMENT)
     segments["knot"] = pieces.knots
     segments["start"], segments["slope"] = per_mass(scene, pieces.start), per_mass(scene, pieces.slope)
@@ -409,7 +413,7 @@ def _segments(scene: Scene, pieces: Pieces) -> Segments:
 
 
 def law_terms(contact: Contact) -> tuple[Terms, float]:
-    """Return the terms of the law, all others absent, and D where lambda = D / v0 (otherwise -1)."""
+    """Return the terms of the law with all other terms absent, and D of lambda = D / v0 (-1 if lambda is constant)."""
     law, exponent = LAWS[contact.law], float(contact.exponent)
     viscous = law.additive and bool(contact.damping)
     number = -1.0 if contact.restitution is None else law.damping_number(contact.restitution)
@@ -429,10 +433,13 @@ def _flags(present: dict[str, bool]) -> dict[str, int]:
 
 
 def _harmonics(head: Head, loads: LoadSet) -> tuple[Array, Harmonics | None]:
-    """Return directions and harmonic loads: one direction (no S2) when all forces are parallel, otherwise x and y."""
+    """Return the directions of S1 and S2 and the harmonic loads.
+
+    If all forces are parallel, S1 alone has their direction; otherwise S1 is along x and S2 along y.
+    """
     if loads.omega.size == 0:
         return np.eye(2), None
-    # (h, 2, 3): sine and cosine amplitudes of Fx, Fy, M
+    # shape (h, 2, 3): sine and cosine amplitudes of Fx, Fy, M
     inertias = np.array([head.mass_kg, head.mass_kg, head.inertia_kg_m2])
     amplitudes = np.stack([loads.sine / inertias, loads.cosine / inertias], axis=1)
     acting = amplitudes.any(axis=(1, 2))
@@ -453,7 +460,7 @@ def _harmonics(head: Head, loads: LoadSet) -> tuple[Array, Harmonics | None]:
 
 
 def _largest_wrench(loads: LoadSet) -> Array:
-    """Return a bound of the loads, shape (3,)."""
+    """Return an upper bound of |Fx|, |Fy| [N] and |M| [N m], shape (3,)."""
     wrench: Array = np.abs(loads.constant) + np.abs(loads.sine).sum(axis=0) + np.abs(loads.cosine).sum(axis=0)
     if loads.pieces is not None:
         wrench = wrench + np.abs(loads.pieces.start).max(axis=0)
@@ -471,21 +478,22 @@ def _has_second(harmonics: Harmonics) -> bool:
 
 
 def _start_speed(scene: Scene) -> float:
-    """Return a bound in m/s of the head's speed at the start."""
+    """Return an upper bound of the head's speed at the start in m/s."""
     return float(np.hypot(*scene.initial.v[:2])) + geometry.half_diagonal(scene) * abs(scene.initial.v[2])
 
 
 def _largest_acceleration(scene: Scene, wrench: Array) -> float:
-    """Return a bound in m/s^2 of the acceleration by gravity and by loads of at most `wrench`."""
+    """Return an upper bound in m/s^2 of the acceleration by gravity and by loads of at most `wrench`."""
     acceleration = per_mass(scene, wrench)
     across = abs(scene.gravity.acceleration_m_s2) + float(np.hypot(acceleration[0], acceleration[1]))
     return across + geometry.half_diagonal(scene) * float(acceleration[2])
 
 
 def _release(scene: Scene, tol: float, length: float, speed: float) -> float:
-    """Return the penetration from which the impulse to separation is below a share of the velocity tolerance.
+    """Return the penetration in m below which the impulse until separation is negligible.
 
-    integral F dt = K d^(n+1) / ((n+1) v) at the speed v. There may be many separations, some a hundred times slower.
+    The impulse at the speed v is K d^(n+1) / ((n+1) v). It is held below a small share of the velocity tolerance, since
+    there may be many separations, some a hundred times slower.
     """
     exponent = scene.contact.exponent
     share = 1e-5 if exponent == 1.5 or float(exponent).is_integer() else 1e-8
@@ -493,17 +501,17 @@ def _release(scene: Scene, tol: float, length: float, speed: float) -> float:
     release = float((impulse * (exponent + 1.0) * speed / scene.contact.stiffness) ** (1.0 / (exponent + 1.0)))
     friction = scene.friction
     if friction is not None and friction.stick_stiffness_n_m is not None and friction.coefficient > 0.0:
-        # a released corner lets go of its wall, so the jump of its spring's force must be negligible too
+        # the spring of a sticking corner ends at its release, so the jump of its force must be negligible too
         stretch = max(1e-3 * tol * length, 1e-15 * geometry.half_diagonal(scene))
         held = stretch * friction.stick_stiffness_n_m / friction.coefficient
-        # the series of a corner that crosses it in less than 1e-11 s has non-finite terms
+        # the series of a corner that crosses the depth in less than 1e-11 s would have non-finite terms
         depth = max(float((held / scene.contact.stiffness) ** (1.0 / exponent)), 1e-11 * speed)
         release = min(release, depth)
     return release
 
 
 def _implicit(scene: Scene, terms: Terms, values: dict[str, Any]) -> Implicit | None:
-    """Return nodes and scratch space of implicit steps, where a contact's damping can outweigh its spring."""
+    """Return nodes and scratch space of implicit steps, or None if no damping can outweigh its spring."""
     contact = scene.contact
     mobility = 1.0 / scene.head.mass_kg + values["radius"] ** 2 / scene.head.inertia_kg_m2
     if scene.support is not None:
@@ -520,14 +528,14 @@ def _implicit(scene: Scene, terms: Terms, values: dict[str, Any]) -> Implicit | 
     if terms.slip is not None:
         damping += values["friction"] * largest_force / values["slip_speed"]
     overdamped = damping * mobility > OVERDAMPED_RATIO * math.sqrt(spring * mobility)
-    # or of a support
+    # the damping of a support can outweigh its springs too
     if scene.support is not None:
         overdamped |= bool((values["frame_damping"] > OVERDAMPED_RATIO * np.sqrt(values["frame_stiffness"])).any())
     return new_implicit(scene.support is not None) if overdamped else None
 
 
 def _rubbing(scene: Scene) -> dict[str, Any]:
-    """Return the numbers of sliding and running-in (`solve.rubbing`); zeros where they are off."""
+    """Return the constants of sliding and running-in (`solve.rubbing`), zeros if they are off."""
     wear, there, found = scene.wear, _wear_terms(scene.wear), dict[str, Any]()
     if wear is not None and there.get("sliding"):
         found["slip_rows"] = geometry.slip_rows(scene)
@@ -538,7 +546,7 @@ def _rubbing(scene: Scene) -> dict[str, Any]:
 
 
 def _slip(scene: Scene) -> dict[str, Any]:
-    """Return the numbers of friction; without friction only a non-zero speed, for scenes that run together."""
+    """Return the constants of friction, all zero without friction except the speed, by which kernels divide."""
     friction = scene.friction
     if friction is None:
         return {"slip_speed": 1.0}
@@ -554,7 +562,7 @@ def _slip(scene: Scene) -> dict[str, Any]:
 
 
 def _frame(scene: Scene) -> dict[str, Any]:
-    """Return the numbers of a `Support`."""
+    """Return the constants of a `Support`, zeros without one."""
     support = scene.support
     if support is None:
         return {}
@@ -565,5 +573,5 @@ def _frame(scene: Scene) -> dict[str, Any]:
 
 
 def wear_rate(wear: Wear, speed: float) -> float:
-    """Return the depth per impulse of a pad in m/(N s) at a speed along the face:  dh/dt = k_s F v / A (Archard)."""
+    """Return a pad's wear depth per impulse, k_s v / A in m/(N s), at a speed along the face (Archard's law)."""
     return wear.coefficient_m2_n * speed / wear.pad_area_m2

@@ -1,4 +1,4 @@
-"""Values at any time of the step under way: state, pose, wear, penetrations and forces."""
+"""State, wear, penetrations and forces at any time within the current step."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ def sigma_at(state, used):
     """Return sigma at `used` seconds into the step."""
     if used >= state.step_size:
         return state.sigma_end
-    if state.beta == 0.0 or used == 0.0:  # alpha is 0 too where a step begins at a touch
+    if state.beta == 0.0 or used == 0.0:  # at used = 0 the formula is 0 / 0 if a step begins at a touch (alpha = 0)
         return used
-    # the form of the root of alpha sigma + beta sigma^2 / 2 = used without cancellation
+    # the root of alpha sigma + beta sigma^2 / 2 = used, in the form without cancellation
     return 2.0 * used / (state.alpha + math.sqrt(max(state.alpha**2 + 2.0 * state.beta * used, 0.0)))
 
 
 @kernel(fast=True)
 def sum_series(support, state, w, sigma, out) -> None:
-    """Write the sum of the state's series at sigma to `out`, shape (8,), as seen from a frame on springs."""
+    """Write the state's series at sigma to `out`, shape (8,), relative to the frame if it is on springs."""
     order, series = state.order, w.series
     value = row(series, order)
     for k in range(order - 1, -1, -1):
@@ -58,7 +58,7 @@ def wear_depth_at(state, w, sigma, out) -> None:
     """Write each pad's wear depth at sigma of the step to `out`, shape (8,)."""
     wear_depth = row(state.wear_depth, 0)
     if any_penetrates(state):
-        # row 0 would be the wear depth itself; pairs without force do not wear
+        # row 0 is left out: the sum is only the growth over the step; pairs without force do not wear
         order = state.order
         growth = row(w.wear, order)
         for k in range(order - 1, 0, -1):
@@ -69,7 +69,7 @@ def wear_depth_at(state, w, sigma, out) -> None:
 
 @kernel(fast=True)
 def pair_outputs(p, state, wear_depth, y, penetration, rate, force) -> None:
-    """Write penetration, rate and force of the eight pairs, shape (8,) each, in body coordinates y."""
+    """Write penetration, rate and force of the eight pairs, shape (8,) each, at body coordinates y."""
     c, s, om = y[COS], y[SIN], y[OMEGA]
     set_row(
         penetration,

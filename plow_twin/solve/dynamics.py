@@ -1,4 +1,4 @@
-"""The equations of motion (paper, eq. 5) as they stand: values in world axes about the centre of mass."""
+"""The equations of motion (paper, eq. 5) as functions of the state, in world axes about the centre of mass."""
 
 from __future__ import annotations
 
@@ -27,7 +27,10 @@ from plow_twin.solve.state import ON, Harmonics, Segments
 
 
 class Acting(NamedTuple):
-    """Arguments of the equations of motion beside the law, of few types, so that scenes share compiled code."""
+    """Arguments of the equations of motion beside the law.
+
+    They have few different types, so that scenes share compiled code.
+    """
 
     harmonics: Harmonics | None
     segments: Segments | None
@@ -47,9 +50,9 @@ def acting(parts):
 
 @kernel()
 def push(p, slip, stick, state, frozen, pair, force, c, s, theta, omega, x, y, vx, vy):
-    """Return the effect of a pair that pushes with `force`, in body axes: force, moment, power of its friction.
+    """Return force, moment and power of friction of a pair that pushes with `force`, in body axes.
 
-    The wall's tangent is its normal turned by +90 degrees; the penetration's rows for X and Y are minus the normal.
+    The wall's tangent is its normal turned by +90 degrees. The rows for X and Y of a penetration are minus the normal.
     """
     fx, fy = -p.penetration_rows[2, pair] * force, -p.penetration_rows[3, pair] * force
     torque, power = row_value(p.arm_rows, pair, c, s, x, y) * force, 0.0
@@ -69,9 +72,9 @@ def push(p, slip, stick, state, frozen, pair, force, c, s, theta, omega, x, y, v
 
 @kernel(inline="source")
 def about_mass(p, c, s, load):
-    """Return the angular acceleration that a load through the cavity's centre gives about the centre of mass.
+    """Return the angular acceleration that a load through the cavity's centre causes about the centre of mass.
 
-    Gravity, which is part of the load, acts at the centre of mass.
+    Gravity is part of the load but acts at the centre of mass, so it is left out here.
     """
     across = (c * p.offset[0] - s * p.offset[1]) * (load[1] + p.gravity)
     return -(across - (s * p.offset[0] + c * p.offset[1]) * load[0]) * p.inverse_inertia / p.inverse_mass
@@ -79,10 +82,10 @@ def about_mass(p, c, s, load):
 
 @kernel()
 def accelerate(p, acts, frozen, state, t, z, load, out) -> None:
-    """Write the rate of z = (x, y, theta, vx, vy, omega); with a support, z is that of `support.to_world_both`.
+    """Write the rate of z = (x, y, theta, vx, vy, omega), or with a support of the z of `support.to_world_both`.
 
-    `acts` is an `Acting`. `frozen`: the pairs that are on act by their law, also where it would pull; otherwise the
-    pairs that penetrate push.
+    `acts` is an `Acting`. If `frozen`, the pairs that are on act by their law even where it would pull; otherwise the
+    pairs that penetrate act and never pull.
     """
     load_at(p, acts.harmonics, acts.segments, t, load)
     _accelerate(p, acts.offset, acts.free, acts.slip, acts.stick, acts.support, frozen, state, z, load, out)
@@ -90,7 +93,7 @@ def accelerate(p, acts, frozen, state, t, z, load, out) -> None:
 
 @kernel()
 def _contacts(p, slip, stick, frozen, state, c, s, theta, om, x, y, vx, vy):
-    """Return force in head axes and moment about the centre of mass of all pairs."""
+    """Return the sum of the pairs' forces in head axes and of their moments about the centre of mass."""
     fx = fy = torque = 0.0
     for pair in range(PAIR_COUNT):
         if p.enabled[pair] == 0:
@@ -126,7 +129,7 @@ def _accelerate(p, offset, free, slip, stick, support, frozen, state, z, load, o
 
 @kernel()
 def _accelerate_head(p, offset, free, c, s, load, along_x, along_y, torque, first, out) -> None:
-    """Write the head's three accelerations under the contacts' force in world axes to `out` from index `first` on."""
+    """Write the head's three accelerations to `out` from index `first` on; the contacts' force is in world axes."""
     out[first] = load[0] + along_x * p.inverse_mass
     out[first + 1] = load[1] + along_y * p.inverse_mass
     out[first + 2] = load[2] + torque * p.inverse_inertia
@@ -141,7 +144,7 @@ def _accelerate_head(p, offset, free, c, s, load, along_x, along_y, torque, firs
 def _accelerate_both(p, offset, free, slip, stick, frozen, state, z, load, out) -> None:
     """Write the rate of head and frame (`support.to_world_both`)."""
     c, s, om, spin = math.cos(z[2]), math.sin(z[2]), z[8], z[11]
-    # the head as seen from the frame
+    # the head relative to the frame
     angle = z[2] - z[5]
     x, y = to_body_axes(c, s, z[0] - z[3], z[1] - z[4])
     vx, vy = to_body_axes(c, s, z[6] - z[9], z[7] - z[10])

@@ -1,8 +1,8 @@
-"""The energy balance of a run: the change of energy and momentum against the work and impulse of the forces.
+"""The energy balance of a run compares the change of energy and momentum with the work and impulse of the forces.
 
-Forces are evaluated as values, independently of the series: loads at their time, contacts by `model.contact` and
-`model.friction`. Their power and impulse are integrated by Gauss-Legendre quadrature over each step of the series, by
-the trapezoidal rule over fixed steps. Kinetic energy and momentum come from the state alone.
+Forces are computed at single instants, independently of the series: loads from their time, contacts by `model.contact`
+and `model.friction`. Power and force are integrated by Gauss-Legendre quadrature over each step of the series, or by
+the trapezoidal rule over fixed steps. Kinetic energy and momentum are computed from the state alone.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from plow_twin.solve.loads import load_at
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, X, Y, new_record
 from plow_twin.solve.support import to_ground
 
-#: Nodes of the quadrature, exact to degree 15: more nodes do not reduce the imbalance, because over a step the higher
-#: terms of a series are as small as its error.
+#: Nodes of the quadrature, which is exact to degree 15. More nodes would not reduce the imbalance, because the higher
+#: terms of a step's series are as small as the series' error.
 _NODES = 8
-#: Radians of the fastest harmonic in a panel of a flight or rest: a product of two harmonics is then exact to 1e-13.
+#: Phase of the fastest harmonic [rad] over a panel of a flight or rest: products of two harmonics are exact to 1e-13.
 _PANEL_PHASE = 2.0
-# indices into the powers and impulses at one instant
+# indices into the powers [W] and forces [N, N m] at one instant
 LOADS, NORMAL, FRICTION, SUPPORT, LOAD_X, LOAD_Y, LOAD_M, CONTACT_X, CONTACT_Y, CONTACT_M, SIZE = range(11)
 
 #: Sums over a run.
@@ -44,13 +44,13 @@ SUMS = np.dtype(
 )
 
 
-#: Quadrature and sums; `None` in its place leaves the balance out of the compiled code.
+#: Quadrature, work space and sums; `None` instead of this record leaves the balance out of the compiled code.
 BALANCE = np.dtype(
     [
         ("nodes", "f8", (_NODES,)),
         ("weights", "f8", (_NODES,)),
         ("now", "f8", (SIZE,)),  # powers and forces at one instant
-        ("before", "f8", (SIZE,)),  # the same a step before
+        ("before", "f8", (SIZE,)),  # powers and forces one fixed step before
         ("body", "f8", (STATE_SIZE,)),  # body coordinates at a node
         ("ground", "f8", (STATE_SIZE,)),  # absolute body coordinates, with a support
         ("wear_depth", "f8", (PAIR_COUNT,)),  # wear depth at a node
@@ -85,7 +85,7 @@ def _powers(p, parts, state, wear_depth, y, frame, t, balance, out) -> None:
 
 @kernel()
 def _taken_by_support(p, support, frame):
-    """Return the power in W that the springs and dampers under a frame take."""
+    """Return the power in W that the springs and dampers under a frame absorb."""
     power = 0.0
     if support is not None:
         for j in range(3):
@@ -96,7 +96,7 @@ def _taken_by_support(p, support, frame):
 
 @kernel()
 def _on_ground(support, y, frame, balance):
-    """Return the absolute body coordinates."""
+    """Return the body coordinates relative to the ground; y is relative to the frame."""
     if support is not None:
         to_ground(y, frame, balance.ground)
         return balance.ground
@@ -136,7 +136,7 @@ def _powers_under(p, offset, free, slip, stick, state, wear_depth, y, ground, lo
 
 @kernel()
 def _balance(p, support, seen, frame, balance, start) -> None:
-    """Take energy and momentum from the state; note the largest imbalances."""
+    """Compute energy and momentum from the state, and record the largest imbalances so far."""
     sums, y = balance.sums, _on_ground(support, seen, frame, balance)
     m, inertia = 1.0 / p.inverse_mass, 1.0 / p.inverse_inertia
     c, s = along(p, math.cos(y[THETA]), math.sin(y[THETA]))
@@ -161,7 +161,7 @@ def _balance(p, support, seen, frame, balance, start) -> None:
 
 @kernel()
 def _frame_of(support, state):
-    """Return the state of a frame on springs."""
+    """Return the state of a frame on springs, None for a fixed frame."""
     if support is not None:
         return state.frame
     return None
@@ -169,7 +169,7 @@ def _frame_of(support, state):
 
 @kernel()
 def start_balance(p, parts, state, y, t, balance) -> None:
-    """Take the state that a run starts from."""
+    """Record energy, momentum, powers and forces at the start of a run."""
     frame = _frame_of(parts.terms.support, state)
     _balance(p, parts.terms.support, y, frame, balance, True)
     _powers(p, parts, state, state.wear_depth, y, frame, t, balance, balance.before)
@@ -185,7 +185,7 @@ def _add(balance, powers, weight) -> None:
 
 @kernel()
 def balance_step(p, parts, wear, flight, state, w, balance) -> None:
-    """Add the step under way, before it is finished."""
+    """Add the step that has been laid out but not yet completed."""
     y, wear_depth, end, support = balance.body, balance.wear_depth, state.sigma_end, parts.terms.support
     set_row(wear_depth, 0, row(state.wear_depth, 0))
     panels = 1

@@ -1,6 +1,7 @@
-"""The first event of a step. A guard is positive while a mode lasts; the event is where a guard first turns negative.
+"""The first event of a step.
 
-Guards are polynomials of the step; `polynomial.first_root` finds where one turns negative.
+A guard is a polynomial over the step that is positive as long as a mode lasts. The event is at the first point where a
+guard turns negative, found by `polynomial.first_root`.
 """
 
 from __future__ import annotations
@@ -12,14 +13,14 @@ from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.grip import grip_guard
 from plow_twin.solve.state import CLIPPED, CROSSING, OFF, ON, RATIO, RELEASED, SIGN
 
-#: Events are one instant when they are closer than this share of the step before them.
+#: Events are simultaneous if they are closer than this share of the step before them.
 _AT_ONCE = 1e-12
-#: Share of the release penetration at which a pair that is on is released.
+#: Penetration at which a pair that is on is released, as a share of `Params.release`, where it acts again.
 _LET_GO = 0.25
-#: Allowance for rounding in the proofs of many guards at once: of the sums, and beside the 1 of 1 + lambda d'.
+#: Allowances for rounding in the proofs for all guards at once: a factor on the sums, and an error of 1 + lambda d'.
 _ROUNDED, _ROUNDING = 1.0 + 1e-9, 1e-9
 _ALL_PAIRS = 2**PAIR_COUNT - 1
-#: Share of the release penetration below which a released pair rests on the wall.
+#: Penetration below which a released pair rests on the wall, as a share of the release penetration.
 _ON_THE_WALL = 1e-6
 
 
@@ -27,8 +28,8 @@ _ON_THE_WALL = 1e-6
 def _guards(p, state, w, order, penetrating, viscous, ramp) -> None:
     """Write each pair's first guard to `w.guard`.
 
-    off: -d >= 0; on: F / K = d + (C / K) d' >= 0 for Kelvin-Voigt, otherwise d >= 0 or a small penetration; others: d
-    >= 0.
+    The guard of a pair that is off is -d. The guard of a pair that is on is F / K = d + (C / K) d' for Kelvin-Voigt,
+    otherwise d, or d less a small penetration for exponents that are not integers. All other guards are d.
     """
     guard, weights = w.guard, w.per_pair
     for pair in range(PAIR_COUNT):
@@ -46,11 +47,10 @@ def _guards(p, state, w, order, penetrating, viscous, ramp) -> None:
     for pair in range(PAIR_COUNT):
         first = max(guard[0, pair], 0.0)
         if state.mode[pair] == ON:
-            # released below a quarter of the penetration at which it acts again, so that no pair alternates between the
-            # two
+            # a pair is released at a quarter of the depth at which it acts again, so that it cannot alternate
             first -= min(_LET_GO * p.release, 0.5 * first)
         elif state.mode[pair] == RELEASED and first <= _ON_THE_WALL * p.release:
-            # a pair that rests on the wall is let go a little outside
+            # the guard of a pair that rests on the wall ends a little outside the wall
             first = max(guard[0, pair] + _LET_GO * p.release, 0.0)
         guard[0, pair] = first if p.enabled[pair] == 1 else 1.0
 
@@ -59,7 +59,8 @@ def _guards(p, state, w, order, penetrating, viscous, ramp) -> None:
 def _second_guard(p, state, w, order, pair, viscous, hysteretic, integer, fraction, ramp) -> bool:
     """Write the second guard of a penetrating pair to `w.column[0]`; return whether it has one.
 
-    on: 1 + lambda d' >= 0, with a ramp F >= 0; clipped: the force would pull; released: d <= p.release.
+    The guard of a pair that is on is 1 + lambda d', or F with a ramp. A clipped pair's guard is positive as long as its
+    force would pull. A released pair's guard is p.release - d.
     """
     g, mode = w.column[0], state.mode[pair]
     g[order] = 0.0
@@ -97,7 +98,7 @@ def elastic_term(p, w, k, pair, integer, fraction):
 
 @kernel()
 def _pull(p, w, order, pair, mode, integer, fraction) -> None:
-    """Write the force of a ramped law, negative for a clipped pair, to `w.column[0]`."""
+    """Write the force of a ramped law to `w.column[0]`, with the opposite sign for a clipped pair."""
     g, sign = w.column[0], 1.0 if mode == ON else -1.0
     for k in range(order):
         elastic = elastic_term(p, w, k, pair, integer, fraction)
@@ -106,7 +107,7 @@ def _pull(p, w, order, pair, mode, integer, fraction) -> None:
 
 @kernel()
 def _ramp_guard(p, state, w, order, pair) -> None:
-    """Write the guard of a pair that stays on its side of the ramp's end to `w.column[0]`."""
+    """Write to `w.column[0]` a guard that is positive while the pair stays on its side of the ramp's end."""
     g, sign = w.column[0], 1.0 if state.beyond_ramp[pair] == 1 else -1.0
     for k in range(order + 1):
         g[k] = sign * w.penetration[k, pair]
@@ -117,7 +118,8 @@ def _ramp_guard(p, state, w, order, pair) -> None:
 def _unsafe_pairs(w, order, h):
     """Return a bit for each guard that is not proved to stay positive on [0, h].
 
-    The first proof is g_0 > sum max(-g_k, 0) h^k; where it fails, that no Bernstein coefficient is negative.
+    A guard stays positive if g_0 > sum max(-g_k, 0) h^k. If this fails for any guard, the guards are tested by the sign
+    of their Bernstein coefficients.
     """
     guard, b = w.guard, w.bernstein
     reach = splat(0.0)
@@ -146,8 +148,8 @@ def _unsafe_pairs(w, order, h):
 def _nothing_ends(p, state, w, order, h, penetrating, hysteretic) -> bool:
     """Return whether each pair of an integer law without a ramp surely keeps its mode on [0, h].
 
-    Make the first proof of `_unsafe_pairs` and the proof of `_stays` for all pairs side by side, with an allowance for
-    rounding: proofs that hold here also hold there.
+    It makes the first test of `_unsafe_pairs` and the test of `_stays` for all pairs side by side. An allowance for
+    rounding makes sure that guards that pass here would also pass there.
     """
     weights = w.per_pair
     for pair in range(PAIR_COUNT):
@@ -173,7 +175,7 @@ def _nothing_ends(p, state, w, order, h, penetrating, hysteretic) -> bool:
 
 @kernel(inline="code")
 def _next_mode(p, mode, viscous, fraction, ramp):
-    """Return the mode that follows when a pair's first guard ends it."""
+    """Return the mode that follows `mode` when the pair's first guard turns negative."""
     if mode == OFF:
         return ON if fraction is None or p.exponent == 1.5 else RELEASED
     if mode == ON and viscous is not None and ramp is None:
@@ -192,7 +194,7 @@ def _stays(column, order, h) -> bool:
 
 @kernel()
 def _sooner(state, w, order, best) -> float:
-    """Return where the guard in `w.column[0]` first turns negative before `best`, otherwise `best`."""
+    """Return the sigma at which the guard in `w.column[0]` first turns negative, or `best` if that comes first."""
     column = w.column[0]
     if _stays(column, order, best):
         return best
@@ -212,7 +214,7 @@ def _ends_with(column, order, at, within) -> bool:
 
 @kernel(fast=True)
 def _guards_end_with(w, order, at, within):
-    """Return a bit for each pair whose first guard `_ends_with` the event at `at`."""
+    """Return a bit for each pair whose first guard ends with the event at `at`, in the sense of `_ends_with`."""
     value, slope, zero = row(w.guard, order), splat(0.0), splat(0.0)
     for k in range(order - 1, -1, -1):
         slope = slope * at + value
@@ -226,7 +228,7 @@ def note_switches(
 ) -> None:
     """Write to `w.switch` the next mode of each pair that switches at the event, -1 for the others.
 
-    Changes that differ in time only by rounding happen together, so that a symmetric motion stays symmetric.
+    Pairs whose events differ in time only by rounding switch together, so that a symmetric motion stays symmetric.
     """
     column, within = w.column[0], _AT_ONCE * at
     ending = _guards_end_with(w, order, at, within)
@@ -253,7 +255,7 @@ def note_switches(
 
 @kernel()
 def first_event(p, state, w, order, sigma, penetrating, viscous, hysteretic, integer, fraction, ramp, stick):
-    """Return (sigma, pair, mode) of the first event in [0, sigma), or (sigma, -1, 0)."""
+    """Return (sigma, pair, next mode) of the first event in [0, sigma), or (sigma, -1, 0) without an event."""
     if viscous is None and fraction is None and ramp is None and stick is None:  # noqa: SIM102 - left out by types
         if _nothing_ends(p, state, w, order, sigma, penetrating, hysteretic):
             return sigma, -1, 0
@@ -266,7 +268,7 @@ def first_event(p, state, w, order, sigma, penetrating, viscous, hysteretic, int
             for k in range(order + 1):
                 column[k], w.halves[0, k] = w.guard[k, pair], w.bernstein[k, pair]
             if _stays(column, order, best):
-                # the event found before is earlier
+                # the event that has already been found comes first
                 continue
             state.guard_roots += 1
             root = first_root_within(column, order, sigma, w)

@@ -1,7 +1,7 @@
 """Fixed-step methods without event location: RK4 as in the paper, and semi-implicit Euler.
 
-They evaluate the equations of motion (paper, eq. 5) in world axes about the centre of mass, and check the steps and
-events of the series. Geometry and the value of the force are shared.
+They integrate the equations of motion (paper, eq. 5) in world axes about the centre of mass, as a check of the steps
+and events of the series. Only the geometry and the contact law are the same code.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _LOG_FULL = int(Status.LOG_FULL)
 
 @kernel()
 def _switch(p, state, penetration, rate, time, totals, log) -> None:
-    """Note which pairs touch or part, at the step's resolution."""
+    """Update the modes of pairs that have touched or parted by the step's end, and log these events."""
     for pair in range(PAIR_COUNT):
         inside = p.enabled[pair] == 1 and penetration[pair] > 0.0
         mode = ON if inside else OFF
@@ -58,7 +58,7 @@ def _add_to_totals(force_before, force, dt, totals) -> None:
 
 @kernel()
 def _runge_kutta(p, acts, state, t, dt, z, trial, k, load) -> None:
-    """Take one step of the classical Runge-Kutta method; z (n,) in place, the four stages stay in k (4, n)."""
+    """Take one step of the classical Runge-Kutta method; z (n,) is updated in place, k (4, n) gets the four stages."""
     accelerate(p, acts, False, state, t, z, load, k[0])
     for stage in range(1, 4):
         part = dt if stage == 3 else 0.5 * dt
@@ -72,11 +72,11 @@ def _runge_kutta(p, acts, state, t, dt, z, trial, k, load) -> None:
 
 @kernel()
 def end_coarsely(p, parts, state, totals, target, bound) -> int:
-    """Bring the state to `target` by the few Runge-Kutta steps of `bound`; estimate the error. Returns a `Status`.
+    """Advance the state to `target` by the few Runge-Kutta steps of `bound`, and estimate the error; return a `Status`.
 
-    The estimate is the difference of the two middle stages, |k2 - k3| dt / 3, one order below the method's, with errors
-    of the velocity multiplied by the remaining time. Where a pair has touched or parted within a step, the uncertain
-    impulse F dt / 2 counts, over the time in which the largest load crosses the clearance.
+    The estimate of a step is |k2 - k3| dt / 3 from the two middle stages, one order below the method's error; errors
+    of the velocity are multiplied by the remaining time. If a pair has touched or parted within a step, its impulse is
+    uncertain by F dt / 2; this error is multiplied by the time in which the largest load crosses the clearance.
     """
     terms = parts.terms
     acts, y, size = acting(parts), state.y, 6 if terms.support is None else 12
@@ -86,7 +86,7 @@ def end_coarsely(p, parts, state, totals, target, bound) -> int:
     dt = (target - start) / bound.steps
     _to_world(p, parts.terms.support, state, z)
     for pair in range(PAIR_COUNT):
-        # a pair that was clipped or released is also inside
+        # a clipped or released pair is inside its wall too
         state.mode[pair] = OFF if state.mode[pair] == OFF else ON
     pair_outputs(p, state, state.wear_depth, y, pen, rate, now)
     state.bounded += 1
@@ -130,10 +130,10 @@ def end_coarsely(p, parts, state, totals, target, bound) -> int:
 def integrate_fixed(
     p, parts, state, totals, log, z, done, steps, dt, euler, stride, q, v, penetration, force, frame, balance
 ) -> int:
-    """Take `steps` steps of `dt` from step `done[0]` on; row i is written after step i stride. Returns a `Status`.
+    """Take steps of `dt` from number `done[0]` up to `steps`, and write a row every `stride` steps; return a `Status`.
 
-    z (6,) or (12,) (`support.to_world_both`) keeps the integrated numbers from call to call: converting them back and
-    forth would lose the last bits.
+    z, shape (6,) or (12,) (`support.to_world_both`), keeps the integrated variables from call to call, since converting
+    them to body coordinates and back would lose the last bits.
     """
     trial, k = np.empty(z.size), np.empty((4, z.size))
     load, y, acts = np.empty(3), state.y, acting(parts)
@@ -150,7 +150,7 @@ def integrate_fixed(
         if not within_range(p, state, y):
             return _RANGE
         if n % stride == 0 or n == steps:
-            # the last row may lie closer than the others
+            # the last row may follow after fewer than `stride` steps
             row = (n + stride - 1) // stride
             pose_of(p, y, parts.terms.offset, q[row], v[row])
             if frame is not None:

@@ -1,14 +1,14 @@
 """Friction with stick: the force of sticking corners, and the conditions for slip and stick.
 
-A sticking corner holds its wall by a spring and a damper from an anchor a along the wall; a slipping corner drags it:
+A spring and a damper connect a sticking corner to its anchor a on the wall; a slipping corner drags the wall along:
 
     sticks    T = k (s - a) + c s'      while |T| <= mu_s N
     slips     T = +-mu N                while +-(k s' + c s'') >= mu N'
 
-s is the corner's place along the wall, N the normal force. The second condition: spring and damper, dragged along
-carrying mu N, would not carry less if the corner stuck now. Where mu_s = mu, T does not jump: accelerations are equal
-on both sides, so each pair decides alone. Sources: Cundall and Strack, Geotechnique 29 (1979) 47; Luding, Granul.
-Matter 10 (2008) 235, sec. 3.2.
+s is the corner's place along the wall, N the normal force. While a corner slips, the anchor follows it so that spring
+and damper carry mu N. It goes on slipping as long as their force would grow at least as fast as mu N if it stuck now.
+If mu_s = mu, T and the accelerations are continuous at the change, so each pair can be decided separately. Sources:
+Cundall and Strack, Geotechnique 29 (1979) 47; Luding, Granul. Matter 10 (2008) 235, sec. 3.2.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from plow_twin.solve.state import (
     Y,
 )
 
-#: A guard below this share of its terms at the step's start, or of the largest over the step, is zero up to rounding.
+#: A guard's first value is rounding error if below this share of its terms at the step's start, or over the step.
 _ROUNDING, _ROUNDING_OVER_STEP = 1e-10, 1e-13
-#: Rounding error of a corner's place along its wall, as a share of the frame, and of its rate.
+#: Rounding error of a corner's place along its wall (relative to the frame's size) and of its relative rate.
 _FINEST = 4e-15
 
 
@@ -56,7 +56,7 @@ def held_force(p, state, pair, place, rate):
 
 @kernel(inline="code")
 def tangential_force(p, state, frozen, pair, normal, place, rate):
-    """Return T in N for the normal force N. Without `frozen` a corner whose spring carries too much slips."""
+    """Return T in N for the normal force N; unless `frozen`, a corner slips if its spring carries too much."""
     grip = state.grip[pair]
     if state.mode[pair] != ON:
         return 0.0
@@ -77,33 +77,33 @@ def _anchor(p, state, pair, force, place, rate) -> None:
 
 @kernel(inline="code")
 def _normal_force(p, state, pair, depth):
-    """Return N of a pair that pushes, as in its series, also for a penetration that an error makes negative."""
+    """Return N of a pair that pushes, by the law of its series even if a rounding error makes the depth negative."""
     return max(law_force(p, state, pair, depth, rate_of(p, pair, state.y)), 0.0)
 
 
 @kernel()
 def grasp(p, state, pair, old) -> None:
-    """Let the corner of a pair that begins to push stick with a slack spring, or slip where this exceeds the limit.
+    """Let the corner of a pair that begins to push stick with a slack spring, or slip if T would exceed mu_s N.
 
-    The previous mode `old` gives the force exactly: at a touch the force at depth 0 (of Kelvin-Voigt's damper), and 0
-    where a clipped pair pushes again. The rounded depth would let rounding decide between stick and slip.
+    N is taken from the previous mode `old`, since with the rounded depth rounding would decide between stick and slip.
+    At a touch N is the force at depth 0 (of Kelvin-Voigt's damper); for a clipped pair that pushes again it is 0.
     """
     place, rate = _along(p, pair, state.y)
     depth = 0.0 if old == OFF else penetration_of(p, state, pair, state.y)
     normal = 0.0 if old == CLIPPED else _normal_force(p, state, pair, depth)
     state.anchor[pair], state.grip[pair] = place, 0
     held = p.stick_damping * rate
-    # without a force so far the rates of both decide, as in the guard of a slip
+    # without a normal force any sliding is slip, as in the guard of a slip
     if abs(held) > p.static_friction * normal or (normal <= 0.0 and rate != 0.0):
         state.grip[pair] = 1 if rate > 0.0 else -1
 
 
 @kernel()
 def switch_grip(p, state, pair, new) -> None:
-    """Let a corner slip or stick."""
+    """Change a corner's grip to stick or slip, as `new` says."""
     if new == STICKS:
         place, rate = _along(p, pair, state.y)
-        # at a touch Kelvin-Voigt's force acts at once, independent of the rounded depth
+        # at a touch Kelvin-Voigt's force acts at once, even if the rounded depth is not positive
         normal = _normal_force(p, state, pair, penetration_of(p, state, pair, state.y))
         _anchor(p, state, pair, state.grip[pair] * p.friction * normal, place, rate)
         state.grip[pair] = 0
@@ -113,11 +113,11 @@ def switch_grip(p, state, pair, new) -> None:
 
 @kernel()
 def settle_grips(p, state, force) -> None:
-    """Note after a fixed step which corners slip; `force` holds the normal forces, shape (8,)."""
+    """Update after a fixed step which corners slip; `force` holds the normal forces, shape (8,)."""
     for pair in range(PAIR_COUNT):
         place, rate = _along(p, pair, state.y)
         if state.mode[pair] != ON or force[pair] <= 0.0:
-            # it touches with a slack spring, as in `grasp`
+            # a new touch starts with a slack spring, as in `grasp`
             state.anchor[pair], state.grip[pair] = place, 0
             continue
         held = held_force(p, state, pair, place, rate)
@@ -130,7 +130,7 @@ def settle_grips(p, state, force) -> None:
 
 @kernel()
 def weigh_grips(p, state, w) -> None:
-    """Write the parts of a corner's T to `w.grip`: factors of its normal force, of its place and of its slip rate."""
+    """Write to `w.grip` the factors by which T depends on the normal force, the corner's place and its slip rate."""
     for pair in range(PAIR_COUNT):
         acts = state.mode[pair] == ON
         sticks = acts and state.grip[pair] == 0
@@ -141,7 +141,10 @@ def weigh_grips(p, state, w) -> None:
 
 @kernel(fast=True, inline="code")
 def grip_terms(p, state, w, k, place, rate):
-    """Return order k of T of the eight pairs from those of place and slip rate; the normal force's is in `w.force`."""
+    """Return order k of T of the eight pairs.
+
+    `place` and `rate` are order k of the corners' places and slip rates; `w.force` holds the normal forces.
+    """
     if k == 0:
         place = place - row(state.anchor, 0)
     return row(w.grip, 0) * row(w.force, k) + row(w.grip, 1) * place + row(w.grip, 2) * rate
@@ -149,10 +152,10 @@ def grip_terms(p, state, w, k, place, rate):
 
 @kernel()
 def grip_guard(p, state, w, order, pair, side) -> int:
-    """Write a guard of a corner's grip to `w.column[0]`; return the outcome when it turns negative, 0 without a guard.
+    """Write a guard of a corner's grip to `w.column[0]`; return the grip after it turns negative, 0 without a guard.
 
-    Sticks: mu_s N -+ T for the two sides; slips: the condition in the module's docstring times the time per sigma,
-    first side only.
+    The guard of a sticking corner is mu_s N -+ T, one for each side. The guard of a slipping corner is the condition of
+    the module's docstring times the time per sigma, for the first side only.
     """
     g, rate, force, drag = w.column[0], w.slip[0], w.force, w.slip[4]
     grip = state.grip[pair]
@@ -164,10 +167,10 @@ def grip_guard(p, state, w, order, pair, side) -> int:
         sign = 1.0 if side == 0 else -1.0
         for k in range(order):
             g[k] = p.static_friction * force[k, pair] - sign * drag[k, pair]
-        # a pair that is on is outside its wall at most by the error of the place of its touch
+        # clipped at 0: a pair that is on can be outside its wall by the error of the place of its touch
         g[0] = p.static_friction * max(force[0, pair], 0.0) - sign * drag[0, pair]
         size, noise = p.static_friction * abs(force[0, pair]) + abs(drag[0, pair]), 0.0
-        # it slips that much later, otherwise rounding would release it as soon as it sticks
+        # raise the guard by the rounding error of T, otherwise a corner could slip as soon as it sticks
         late = _FINEST * (p.stick_stiffness * p.leverage + p.stick_damping * p.threshold[0])
     else:
         for k in range(order - 1):
@@ -182,7 +185,7 @@ def grip_guard(p, state, w, order, pair, side) -> int:
         for k in range(1, order):
             power *= state.sigma_end
             noise = max(noise, _ROUNDING_OVER_STEP * abs(g[k]) * power)
-    # the other terms then decide
+    # a first value that is rounding error must not be negative: the other terms decide
     if abs(g[0]) <= _ROUNDING * size + noise:
         g[0] = max(g[0], 0.0)
     g[0] += late

@@ -1,4 +1,4 @@
-"""Products of the fundamental matrices of a motion's stretches, and how much an error has grown since earlier times."""
+"""Products of the fundamental matrices of a motion's stretches, and the growth of errors since earlier times."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from typing import Final
 
 from plow_twin.kernel.compiler import kernel
 
-#: Earlier times from which growth is kept; every second one is dropped beyond.
+#: Largest number of earlier times from which growth is followed; when it is reached, every second time is dropped.
 MOST_KEPT: Final = 256
-#: Squarings at most: singular values that are closer than 1e-6 count as one. The rest has rank one where the trace of
-#: its square exceeds this share of the square of its trace.
+#: Most squarings of a matrix, after which singular values closer than 1e-6 are not distinguished, and the trace of the
+#: square of a matrix with trace 1 above which its rank is taken as one.
 _SQUARINGS, _RANK_ONE = 18, 1.0 - 1e-9
 
 
@@ -27,10 +27,10 @@ def _multiply(a, b, out) -> None:
 
 @kernel(fast=True)
 def _larger_norm(a, height, most, gram, power, square) -> float:
-    """Return the largest singular value of the first rows of a matrix, or `most` where that is larger.
+    """Return the larger of `most` and the largest singular value of the first `height` rows of a matrix.
 
-    With G = A^T A it lies between trace(G^(m+1)) / trace(G^m) and the root m of trace(G^m), squared: G is squared
-    until the upper bound is below `most`, or the rest has rank one.
+    With G = A^T A the square of the singular value lies between trace(G^(m+1)) / trace(G^m) and trace(G^m)^(1/m). G is
+    squared until the upper bound is below `most`, or until the power has rank one.
     """
     size, trace = a.shape[1], 0.0
     for i in range(size):
@@ -68,7 +68,7 @@ def _larger_norm(a, height, most, gram, power, square) -> float:
 
 @kernel(fast=True)
 def _multiply_all(matrix, since, count, grown) -> None:
-    """Multiply matrices since[:, i, :] from the left, with all columns of all matrices in one long row."""
+    """Multiply the matrices since[:, i, :] from the left by `matrix`; row k of all of them is one row of `since`."""
     size = len(matrix)
     length = count * size
     for i in range(size):
@@ -82,9 +82,10 @@ def _multiply_all(matrix, since, count, grown) -> None:
 
 @kernel(fast=True)
 def _largest(grown, count, height, scratch) -> float:
-    """Return the largest spectral norm of the first rows of matrices grown[:, i, :], at least 1.
+    """Return the largest spectral norm of the first `height` rows of the matrices grown[:, i, :], at least 1.
 
-    The square of a norm is at most the sum of squares, so that after the largest sum few matrices remain to be checked.
+    The norm of the matrix with the largest sum of squares is computed first. A sum of squares is an upper bound of the
+    squared norm, so few of the other matrices then need their norm computed.
     """
     most, begin, size = 1.0, 0, len(grown)
     squares = scratch[5:].reshape(-1)
@@ -111,7 +112,7 @@ def _stretch_basis(matrix, basis, moved, logs) -> None:
     _multiply(matrix, basis, moved)
     for j in range(size):
         for i in range(2 * j):
-            # made orthogonal to all before twice, because once leaves rounding errors
+            # made orthogonal to the vectors before it twice, because once leaves rounding errors
             before, share = i % j, 0.0
             for k in range(size):
                 share += basis[k, before] * moved[k, j]
@@ -133,28 +134,32 @@ def follow_growth(matrices, changes, ends, since, kept, whole, basis, scratch, t
     Parameters
     ----------
     matrices : ndarray, shape (n, k, k)
-        Fundamental matrices since the last stretch that ended.
+        Fundamental matrices since the end of the last whole stretch.
     changes : ndarray, shape (n, p, k)
-        Effects of the parameters in each stretch.
+        Effects of the parameters since then.
     ends : ndarray of int64, shape (n,)
-        1 where a stretch ends; other rows describe the stretch so far. There growth counts places alone.
+        1 for the row at the end of a stretch. The other rows describe the stretch so far; their growth is that of
+        places, without rates.
     since : ndarray, shape (2, k, m, k)
-        Products since earlier times, since[0, :, i, :], of which there are `kept[0]`; the other half is scratch space.
+        since[0, :, i, :] are the products since earlier times, i < `kept[0]`; since[1] is scratch space.
+    kept : ndarray of int64, shape (1,)
+        Number of the earlier times.
     whole : tuple of ndarray, shapes (k, k) and (p, k)
-        Products of all whole stretches; changed where one ends.
+        Fundamental matrix and effects of the parameters over all whole stretches, renewed at the end of each.
     basis : ndarray, shape (k, k)
-        Orthonormal; changed where one ends.
+        Orthonormal basis, renewed at the end of each stretch.
     scratch : ndarray, shape (5 + s, k, k)
-        With at least m numbers beyond the first five.
+        Scratch space, with at least m numbers beyond the first five matrices.
     totals, rows, growth, logs : ndarray, shapes (n, k, k), (n, p, k), (n,) and (n, k)
-        Receive the products, the largest growth since an earlier time, and the logarithms of the basis' stretching.
+        Receive the products, the effects of the parameters, the largest growth since an earlier time, and the
+        logarithms of the basis' stretching.
     """
     most = since.shape[2]
     for index in range(len(matrices)):
         matrix, count = matrices[index], kept[0]
         grown, size = since[1], len(matrix)
         _multiply_all(matrix, since[0], count, grown)
-        # since the stretch's own beginning
+        # the product since the beginning of this stretch
         grown[:, count] = matrix
         ended = ends[index] == 1
         growth[index] = _largest(grown, count + 1, size if ended else size // 2, scratch)

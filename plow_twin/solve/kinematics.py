@@ -1,6 +1,6 @@
-"""Kinematics of the head: penetrations and their rates, and conversions between body and world axes.
+"""Kinematics of the head: penetrations, their rates, and conversions between body and world axes.
 
-All rows of `model.geometry` are linear in cosine, sine and place.
+`rows` are coefficients of cosine, sine and place (`model.geometry`).
 """
 
 from __future__ import annotations
@@ -14,24 +14,24 @@ from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import row, splat
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, X, Y
 
-#: A quarter turn in rad, after which each corner of a block takes the name of the next.
+#: A quarter turn in rad, after which each corner of a tumbling block takes the name of the next corner.
 QUARTER_TURN = 0.5 * math.pi
 
 
-#: 1 where the state is resolved along world axes (the head carries corners), otherwise None.
+#: 1 if the state is in world axes (the head carries corners), otherwise None.
 fixed_axes = by_field("tumbles", lambda p: 1, lambda p: None)
 #: Whether the head may turn beyond 45 degrees (`model.geometry.tumbles`).
 may_tumble = by_field("tumbles", lambda p: p.tumbles != 0.0, lambda p: False)
 
 
-#: 1 where the corners are rounded, otherwise None; then the angle moves the touching point along its wall.
+#: 1 if the corners are rounded, so that the angle moves the touching point along its wall; otherwise None.
 _is_rounded = by_field("roll", lambda p: 1, lambda p: None)
 _roll = by_field("roll", lambda p: p.roll, lambda p: 0.0)
 
 
 @kernel(inline="code")
 def along(p, c, s):
-    """Return cosine and sine of the angle of the axes of the state; the head's axes are at (c, s)."""
+    """Return cosine and sine of the angle of the state's axes, where (c, s) are those of the head's axes."""
     if fixed_axes(p) is not None:
         return 1.0, 0.0
     return c, s
@@ -39,7 +39,7 @@ def along(p, c, s):
 
 @kernel(inline="code")
 def spin_of_axes(p, omega):
-    """Return the rate in rad/s at which the axes of the state turn."""
+    """Return the angular velocity of the state's axes in rad/s."""
     if fixed_axes(p) is not None:
         return 0.0
     return omega
@@ -47,9 +47,9 @@ def spin_of_axes(p, omega):
 
 @kernel(inline="code")
 def named_angle(p, y, theta):
-    """Return theta without the quarter turns of the names of the corners in y.
+    """Return theta less the quarter turns by which the corners have been renamed (`solve.tumbling`).
 
-    Cosine and sine in y are those of that angle. Where the head carries walls it is theta itself.
+    y has the cosine and sine of this angle. The angle of a head that carries walls is theta itself.
     """
     if fixed_axes(p) is not None:
         turns = np.rint((y[THETA] - math.atan2(y[SIN], y[COS])) / QUARTER_TURN)
@@ -78,7 +78,7 @@ def row_rate(p, rows, pair, c, s, omega, x, y, vx, vy):
 
 @kernel(inline="code")
 def slip_place(p, pair, c, s, x, y, theta):
-    """Return the place in m, along its wall, of the touching point of a corner."""
+    """Return the place of a corner's touching point along its wall in m."""
     place = row_value(p.slip_rows, pair, c, s, x, y)
     if _is_rounded(p) is not None:
         place += _roll(p) * theta
@@ -87,7 +87,7 @@ def slip_place(p, pair, c, s, x, y, theta):
 
 @kernel(inline="code")
 def slip_rate(p, pair, c, s, omega, x, y, vx, vy):
-    """Return the rate in m/s at which that point slides along the wall."""
+    """Return the rate in m/s at which a corner's touching point slides along its wall."""
     rate = row_rate(p, p.slip_rows, pair, c, s, omega, x, y, vx, vy)
     if _is_rounded(p) is not None:
         rate += _roll(p) * omega
@@ -96,7 +96,7 @@ def slip_rate(p, pair, c, s, omega, x, y, vx, vy):
 
 @kernel(inline="code")
 def slip_arm(p, pair, c, s, x, y):
-    """Return the arm in m of a force along the wall at that point."""
+    """Return the arm in m of a force along the wall at a corner's touching point."""
     arm = row_value(p.slip_arm_rows, pair, c, s, x, y)
     if _is_rounded(p) is not None:
         arm -= _roll(p)
@@ -105,7 +105,7 @@ def slip_arm(p, pair, c, s, x, y):
 
 @kernel(fast=True, inline="code")
 def rolled(p, values, angle):
-    """Return places or slip rates of all pairs, with the part that the angle, or its rate, adds for rounded corners."""
+    """Add the part of rounded corners, proportional to the angle or its rate, to all pairs' places or slip rates."""
     if _is_rounded(p) is not None:
         values = values + splat(_roll(p) * angle)
     return values
@@ -113,7 +113,7 @@ def rolled(p, values, angle):
 
 @kernel(fast=True, inline="code")
 def slip_arms(p, arms, k):
-    """Return order k of the arms (`slip_arm`) of all pairs from those of sharp corners: the difference is constant."""
+    """Return order k of all pairs' arms (`slip_arm`) from the arms of sharp corners; only order 0 differs."""
     if _is_rounded(p) is not None and k == 0:
         arms = arms - splat(_roll(p))
     return arms
@@ -127,7 +127,7 @@ def penetration_at(p, state, pair, c, s, x, y):
 
 @kernel(inline="code")
 def penetration_of(p, state, pair, y):
-    """Return the penetration of one pair in body coordinates y, shape (8,)."""
+    """Return the penetration of one pair in m at body coordinates y, shape (8,)."""
     return penetration_at(p, state, pair, y[COS], y[SIN], y[X], y[Y])
 
 
@@ -139,19 +139,19 @@ def rate_at(p, pair, c, s, omega, x, y, vx, vy):
 
 @kernel(inline="code")
 def rate_of(p, pair, y):
-    """Return the rate of one pair's penetration in body coordinates y, shape (8,)."""
+    """Return the rate of one pair's penetration in m/s at body coordinates y, shape (8,)."""
     return rate_at(p, pair, y[COS], y[SIN], y[OMEGA], y[X], y[Y], y[VX], y[VY])
 
 
 @kernel(inline="source")
 def to_body_axes(c, s, x, y):
-    """Resolve a vector in world axes along body axes."""
+    """Convert a vector from world axes to body axes."""
     return c * x + s * y, c * y - s * x
 
 
 @kernel(inline="source")
 def to_world_axes(c, s, x, y):
-    """Resolve a vector in body axes along world axes."""
+    """Convert a vector from body axes to world axes."""
     return c * x - s * y, s * x + c * y
 
 

@@ -1,4 +1,4 @@
-"""The loop: step after step, read out at each time of output."""
+"""The loop that takes one step after another and reads the motion at each time of output."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _BUDGET, _LOG_FULL, _PAUSED = int(Status.BUDGET), int(Status.LOG_FULL), int(Stat
 
 @kernel(inline="source")
 def _unowned_loads(parts):
-    """Return the parts with loads that the caller keeps alive."""
+    """Return the parts with loads that are not reference counted; the caller keeps them alive."""
     return Parts(parts.terms, unowned(parts.harmonics), unowned(parts.segments), parts.implicit)
 
 
@@ -39,7 +39,7 @@ def _end(p, parts, state, w, totals, log) -> None:
 
 @kernel(inline="source")
 def _next(p, parts, state, w, stop_time, budget) -> int:
-    """Lay out the next step unless one is under way."""
+    """Lay out the next step, unless the motion is within a step."""
     if state.step_size >= 0.0:
         return _OK
     if state.steps >= budget:
@@ -51,7 +51,10 @@ def _next(p, parts, state, w, stop_time, budget) -> int:
 
 @kernel()
 def _present(p, harmonics, flight, support, state, w, y) -> None:
-    """Write the body coordinates at the present time to y, also within a step, and a frame on springs to `w`."""
+    """Write the body coordinates at the present time to y, and the state of a frame on springs to `w`.
+
+    The present time may lie within a step.
+    """
     if state.step_size >= 0.0:
         evaluate(p, harmonics, flight, support, state, w, sigma_at(state, state.elapsed), y)
     else:
@@ -62,9 +65,9 @@ def _present(p, harmonics, flight, support, state, w, y) -> None:
 
 @kernel()
 def _proceed(p, parts, state, w, totals, target, stop_time, budget) -> int:
-    """Bring the motion to `target`; steps may reach beyond it, up to `stop_time`. Returns a `Status`.
+    """Advance the motion to `target`, by steps that may reach beyond it up to `stop_time`; return a `Status`.
 
-    Without totals nothing is counted; the motion is the same.
+    Without totals nothing is counted, and the motion is the same.
     """
     while True:
         t0 = state.step_start
@@ -74,7 +77,7 @@ def _proceed(p, parts, state, w, totals, target, stop_time, budget) -> int:
         if code != _OK:
             return code
         low = sigma_at(state, state.elapsed)
-        # a step to a stop may end a rounding error beyond it; no remainder is left
+        # a step to a stop may end a rounding error beyond it, which must not be left for a further step
         stopped = state.ends_at_stop == 1 and target >= state.stop_time
         if target < t0 + state.step_size and not stopped:
             if totals is not None:
@@ -89,7 +92,7 @@ def _proceed(p, parts, state, w, totals, target, stop_time, budget) -> int:
 
 @kernel()
 def _worn_at(state, w, wear, sigma, out) -> None:
-    """Write each pad's wear depth at sigma of the step under way."""
+    """Write each pad's wear depth at sigma of the current step."""
     if wear is not None:
         wear_depth_at(state, w, sigma, out)
     else:
@@ -98,7 +101,7 @@ def _worn_at(state, w, wear, sigma, out) -> None:
 
 @kernel()
 def _worn_now(state, w, wear, out) -> None:
-    """Write each pad's wear depth at the present time, also within a step."""
+    """Write each pad's wear depth at the present time, which may lie within a step."""
     if state.step_size >= 0.0:
         _worn_at(state, w, wear, sigma_at(state, state.elapsed), out)
     else:
@@ -107,7 +110,7 @@ def _worn_now(state, w, wear, out) -> None:
 
 @kernel()
 def _clear(totals) -> None:
-    """Set the counts of an advance to zero."""
+    """Clear the sums of an advance."""
     if totals is not None:
         set_row(totals.peak, 0, splat(0.0))
         set_row(totals.impulse, 0, splat(0.0))
@@ -118,9 +121,9 @@ def _clear(totals) -> None:
 
 @kernel()
 def _undo(support, state, w, target) -> None:
-    """Set the time to `target` after a failed advance, with the head in the restored state from before it.
+    """Set the time to `target` after a failed advance, and the head to its place and wear before the advance.
 
-    A step under way ends at the time before the advance: its place and wear there are in `w.saved`.
+    If the advance began within a step, this step ends there: `w.saved` has the place and the wear.
     """
     set_row(state.y, 0, row(w.saved, 0))
     set_row(state.wear_depth, 0, row(w.saved, 1))
@@ -134,8 +137,9 @@ def _undo(support, state, w, target) -> None:
 def _advance(p, parts, states, index, saved, w, totals, target, stop_time, budget, bound, pace):
     """Start or continue an advance to `target`; return a `Status` and the steps taken.
 
-    Where it fails, the time becomes `target`, the head keeps its state, and nothing is counted. `saved` is an array of
-    one record. With a bound, a used-up budget is not a failure: the rest is computed coarsely.
+    If the advance fails, the time becomes `target`, the head keeps its state, and nothing is counted. `saved` is an
+    array of one record. With a bound, a used-up budget is no failure, because the rest is computed by a few coarse
+    steps.
     """
     state = states[index]
     if pace.underway == 0:
@@ -188,13 +192,13 @@ def _begin_slice(pace) -> None:
 
 @kernel(inline="source")
 def _is_over(pace) -> bool:
-    """Return whether the slice is used up between two advances."""
+    """Return whether the slice of work is used up, with no advance begun."""
     return bool(pace.left <= 0 and pace.underway == 0)
 
 
 @kernel(inline="source")
 def _follow_line(piece, start, time, before, sample) -> None:
-    """Let the load run straight from one sample, held at `start`, to the next one at `time`."""
+    """Make the load linear from the sample `before` at time `start` to the next `sample` at `time`."""
     span = time - start
     piece.knot = start
     for j in range(3):
@@ -206,28 +210,30 @@ def _follow_line(piece, start, time, before, sample) -> None:
 def advance_rows(
     params, parts, states, saved, work, totals, first, last, times, wrench, budget, rows, marks, snapshots, bound, pace
 ) -> bool:
-    """Advance members `first` to `last` - 1 to each time; one twin is a member alone and has the same bits.
+    """Advance members `first` to `last` - 1 to each time; a single twin is one member, with the same bits.
 
     Parameters
     ----------
     params, states : ndarray of records, shape (m,)
-        Of all members.
+        Constants and states of all members.
     saved, work, totals : ndarray of records, shape (1,)
-        The state before the advance under way, scratch space and sums. Without totals nothing is counted or read out,
-        and the motion is the same.
+        The state before the present advance, scratch space and sums. Without totals (None) nothing is counted or read
+        out, and the motion is the same.
     times : ndarray, shape (n,)
-        Times in s, never falling.
+        Times in s, not decreasing.
     wrench : ndarray, shape (m, n + 1, 3), or None
-        Load per mass and inertia: the last sample, then one at each time, joined by straight lines; each ends a step.
-        None: the scene's own loads.
+        Samples of the load per mass and inertia, joined by straight lines: the sample before, then a sample at each
+        time, which ends a step. None for the scene's own loads.
     rows : ndarray of `ROW`, shape (m, n), or None
         Receives the motion and the totals at each time; None without totals.
-    marks, snapshots
-        Numbers of advances from 1 on, rising, shape (k,); after each of them the state is copied to `snapshots`, (k,).
-    bound
+    marks : ndarray of int64, shape (k,)
+        Increasing numbers of advances, counted from 1, after which the state is copied.
+    snapshots : ndarray of records, shape (k,)
+        Receives these copies.
+    bound : record of `BOUND`, or None
         As in `_advance`.
-    pace
-        Place at which the call continues.
+    pace : record of `PACE`
+        Progress of the work, from which the call continues.
 
     Returns
     -------
@@ -268,7 +274,7 @@ def advance_rows(
 
 @kernel(entry=True)
 def interrupt_step(p, parts, state, w, totals) -> None:
-    """End the step under way at the present time, before a change from outside."""
+    """End the current step at the present time, before a change from outside."""
     if state.step_size < 0.0:
         return
     state.sigma_end = sigma_at(state, state.elapsed)
@@ -282,16 +288,16 @@ def interrupt_step(p, parts, state, w, totals) -> None:
 
 @kernel(entry=True)
 def lay_out_again(p, parts, state, w) -> None:
-    """Compute the step under way once more after a restore: its series are not part of the state.
+    """Compute the current step again after a restore, because its series are not part of the state.
 
-    A step is left under way only under the scene's own loads, where no stop time ends it.
+    Only under the scene's own loads can a saved state lie within a step, and these steps have no stop time.
     """
     if state.at_rest == 1:
         write_rest(p, state, w)
         return
     used, implicit = state.elapsed, parts.implicit
     if implicit is not None:
-        # fields that the layout of the step has changed
+        # restore the fields that the first layout of the step has changed
         state.implicit_size, state.decay_times = state.implicit_size_before, state.decay_times_before
         state.refused = state.refused_before
     steps, evaluations, guard_roots = state.steps, state.evaluations, state.guard_roots
@@ -306,7 +312,7 @@ def lay_out_again(p, parts, state, w) -> None:
 def _rows_in_flight(p, harmonics, flight, state, w, t, i, q, v, penetration, force):
     """Fill the rows within a step of free flight from row i on; return the first row after it.
 
-    This is no branch of `integrate`, because the loop over rows there is a tenth faster without the branch.
+    This is a function of its own, because the loop over rows in `integrate` is a tenth faster without this branch.
     """
     if flight is not None:
         t0, y, rate = state.step_start, np.empty(8), np.empty(8)
@@ -325,7 +331,7 @@ def integrate(
 ) -> int:
     """Advance to `t_end` and fill the rows of t, q, v, penetration, force from row `first[0]` on. Returns a `Status`.
 
-    `penetration`, `force`, `frame` (n, 6) and `balance` may be None. The rows' times do not change the steps.
+    `penetration`, `force`, `frame` (n, 6) and `balance` may be None. The steps do not depend on the rows' times.
     """
     parts, log = _unowned_loads(parts), unowned(log)
     q, v, pair_penetration, pair_force = unowned(q), unowned(v), unowned(penetration), unowned(force)

@@ -1,4 +1,4 @@
-"""The eight pairs: penetration, mode, contribution to the series, and the range in which the model holds."""
+"""The eight pairs: their penetrations, their modes, their factors in the series, and the model's range of validity."""
 
 from __future__ import annotations
 
@@ -33,20 +33,20 @@ from plow_twin.solve.state import (
     Y,
 )
 
-#: Share of the release penetration, and of the speed that reaches it, that counts as zero.
+#: Share of the release penetration, and of the speed needed to reach it, below which a value is taken as zero.
 _SHALLOW = 1e-3
-#: Rounds of the iteration between damping and speed of an impact under way.
+#: Iterations for the damping and speed of an impact under way, which depend on each other.
 _ROUNDS = 8
-#: Halvings of a bracket: to the last bit of a double.
+#: Halvings of a bracket, enough for the last bit of a double.
 _BISECTIONS = 60
-#: Largest |theta| in rad at which each corner still meets the walls that belong to it: 45 degrees, and some roundings.
+#: Largest |theta| in rad at which each corner meets the walls of its pairs: 45 degrees plus some rounding errors.
 LARGEST_ANGLE = 0.25 * math.pi + 1e-12
 _ALL_PAIRS = 2**PAIR_COUNT - 1
 
 
 @kernel()
 def penetration_and_rate(p, state, pair):
-    """Return penetration and its rate of one pair at the step's start."""
+    """Return the penetration of one pair and its rate at the step's start."""
     return penetration_of(p, state, pair, state.y), rate_of(p, pair, state.y)
 
 
@@ -56,7 +56,7 @@ def _fallen_number(p, y, pair, speed):
     arm = row_value(p.arm_rows, pair, y[COS], y[SIN], y[X], y[Y])
     mobility = 1.0 + p.free[2] * arm * arm * p.inverse_inertia / p.inverse_mass
     impact = speed * mobility**-p.fall_mass
-    # the penetration's rows for X and Y are along the wall's normal
+    # rows 2 and 3 of the penetration (X and Y) hold the wall's normal, so that this is the speed along the wall
     along = p.penetration_rows[2, pair] * y[VY] - p.penetration_rows[3, pair] * y[VX]
     e = p.restitution * max(impact / p.fall_speed, 1.0) ** -p.fall - p.fall_along * abs(along)
     at = max(e, 1.0 / RESTITUTIONS) * RESTITUTIONS
@@ -65,7 +65,7 @@ def _fallen_number(p, y, pair, speed):
     return (low + (at - index) * (high - low)) * RESTITUTIONS / at
 
 
-#: D of an impact, and whether it depends on the impact.
+#: D of an impact, computed from the impact if the restitution falls with it, otherwise constant.
 _damping_number = by_field(
     "fall", lambda p, y, pair, speed: _fallen_number(p, y, pair, speed), lambda p, y, pair, speed: p.damping_number
 )
@@ -74,7 +74,7 @@ _falls = by_field("fall", lambda p: 1, lambda p: None)
 
 @kernel()
 def touch(p, state, pair) -> None:
-    """Start a contact: read its impact speed, lambda = D / v0."""
+    """Start a contact: fix its lambda = D / v0 by the impact speed v0."""
     if p.damping_number >= 0.0:
         _, speed = penetration_and_rate(p, state, pair)
         number = _damping_number(p, state.y, pair, speed)
@@ -83,14 +83,15 @@ def touch(p, state, pair) -> None:
 
 @kernel()
 def _impact_speed(number, rate, energy) -> float:
-    """Return the speed of the impact that passes through a state inside a wall, given elastic energy per mass and rate.
+    """Return the speed v0 of the impact that led to a state inside a wall.
 
-    First integral of the free impact, u = D d' / v0:  u - ln(1 + u) + D^2 E / (m v0^2) = D - ln(1 + D).
+    `number` is D, `rate` the penetration rate d' in m/s, `energy` the elastic energy per mass E / m in m^2/s^2. First
+    integral of the free impact with u = D d' / v0:  u - ln(1 + u) + D^2 E / (m v0^2) = D - ln(1 + D).
     """
     if number <= 0.0 or (energy <= 0.0 and rate == 0.0):
         return 0.0
     full = number - math.log1p(number)
-    # an impact of this speed turns back at the energy; a pair that still moves inward had a faster impact
+    # an impact of this speed would reach the energy at its turning point (rate 0); with a rate it was faster
     low = math.sqrt(number * number * energy / full)
     high = max(low, abs(rate)) * (1.0 + number)
     low = max(low, rate, -number * rate)
@@ -107,14 +108,14 @@ def _impact_speed(number, rate, energy) -> float:
 
 @kernel()
 def _start_inside(p, state, pair, energy) -> None:
-    """Give a pair that starts inside its wall the damping of the impact that has brought it there.
+    """Give a pair that starts inside its wall the damping of the impact that would have brought it there.
 
-    `energy` is the elastic energy of all pairs, all of which may move the head.
+    `energy` is the elastic energy of all pairs, since all of it may have been the impact's.
     """
     if p.damping_number >= 0.0:
         y = state.y
         arm = row_value(p.arm_rows, pair, y[COS], y[SIN], y[X], y[Y])
-        # and of a frame on springs, with the arm about its own centre
+        # a frame on springs adds its mobility, with the arm about its own centre
         arm_of_frame = row_value(p.arm_rows, pair, y[COS], y[SIN], 0.0, 0.0)
         mobility = p.inverse_mass + p.free[2] * arm * arm * p.inverse_inertia
         mobility += p.frame_mobility[0] + arm_of_frame * arm_of_frame * p.frame_mobility[2]
@@ -122,7 +123,7 @@ def _start_inside(p, state, pair, energy) -> None:
         number = p.damping_number
         speed = _impact_speed(number, rate, energy * mobility)
         if _falls(p) is not None:
-            # the speed determines the damping, which determines the speed
+            # speed and damping depend on each other
             for _ in range(_ROUNDS):
                 number = _damping_number(p, y, pair, speed)
                 speed = _impact_speed(number, rate, energy * mobility)
@@ -131,7 +132,7 @@ def _start_inside(p, state, pair, energy) -> None:
 
 @kernel()
 def mode_inside(p, state, pair):
-    """Return the mode of a penetrating pair, and note on which side of the ramp's end it is."""
+    """Return the mode of a penetrating pair, and record on which side of the ramp's end it is."""
     penetration, rate = penetration_and_rate(p, state, pair)
     state.beyond_ramp[pair] = 1 if penetration > p.ramp else 0
     if law_force(p, state, pair, penetration, rate) < 0.0:
@@ -141,7 +142,7 @@ def mode_inside(p, state, pair):
 
 @kernel(entry=True)
 def settle_modes(p, state, stick) -> None:
-    """Choose each pair's mode from its penetration, where a motion starts."""
+    """Choose each pair's mode from its penetration at the start of a motion."""
     energy = 0.0
     for pair in range(PAIR_COUNT):
         if p.enabled[pair] == 1:
@@ -165,7 +166,10 @@ def settle_modes(p, state, stick) -> None:
 
 @kernel(entry=True)
 def settle_moved(params, states, which, places, time, stick) -> None:
-    """Set states `which` to body coordinates `places` at a time; a lasting contact keeps the damping of its touch."""
+    """Move the states `which` to the body coordinates `places` at `time`, and choose their modes.
+
+    A contact that lasts keeps the damping of its touch.
+    """
     touched = np.zeros(PAIR_COUNT, np.int64)
     damping = np.zeros(PAIR_COUNT)
     for i in range(which.size):
@@ -185,7 +189,7 @@ def settle_moved(params, states, which, places, time, stick) -> None:
 
 @kernel(entry=True)
 def settle_many(params, states, members) -> None:
-    """Do the work of `settle_modes` for some of many scenes without friction that sticks."""
+    """Call `settle_modes` for each of `members`; their scenes have no friction with stick."""
     for member in members:
         settle_modes(params[member], states[member], None)
 
@@ -201,7 +205,7 @@ def any_penetrates(state) -> bool:
 
 @kernel()
 def weigh_pairs(p, state, w, viscous, fraction, ramp, stick) -> bool:
-    """Write the factors of each acting pair per order to `w.per_pair`; return whether any pair penetrates."""
+    """Write the factors of each pair's force in the series to `w.per_pair`; return whether any pair penetrates."""
     mode, per_pair = state.mode, w.per_pair
     for pair in range(PAIR_COUNT):
         per_pair[BASE, pair] = 0.0
@@ -212,7 +216,7 @@ def weigh_pairs(p, state, w, viscous, fraction, ramp, stick) -> bool:
             if penetration > _SHALLOW * p.release:
                 per_pair[BASE, pair] = 0.5 / math.sqrt(penetration) if p.exponent == 1.5 else 1.0 / penetration
             else:
-                # interrupted right after its touch, too shallow for a series of its power
+                # the step after the touch was interrupted at a depth too shallow for a series of its power
                 mode[pair] = RELEASED
         acts = mode[pair] == ON
         per_pair[ACTS, pair] = p.stiffness if acts else 0.0
@@ -226,14 +230,14 @@ def weigh_pairs(p, state, w, viscous, fraction, ramp, stick) -> bool:
 
 @kernel(inline="source")
 def slow_touch(p) -> float:
-    """Return the speed of a touch below which a pair cannot reach the release penetration by that speed alone."""
+    """Return the speed of a touch in m/s which is too slow to carry a pair to the release penetration by itself."""
     acceleration = p.threshold[0] * p.weight / p.radius
     return _SHALLOW * math.sqrt(2.0 * acceleration * p.release)
 
 
 @kernel(fast=True)
 def _all_shallow(p, state, y) -> bool:
-    """Return whether the penetration of each pair, also of those that cannot touch, is less than half the cavity."""
+    """Return whether every penetration, also of pairs that cannot touch, is less than half the cavity."""
     penetration = row_values(p.penetration_rows, y[COS], y[SIN], y[X], y[Y])
     penetration = penetration + (row(p.penetration_rows, 4) - row(state.wear_depth, 0))
     return bool(below(penetration, splat(p.half_cavity)) == _ALL_PAIRS)
@@ -252,7 +256,7 @@ def read_range(p, state, y, out) -> None:
 
 @kernel()
 def within_range(p, state, y) -> bool:
-    """Return whether the model holds in body coordinates y: |theta| <= 45 degrees, no pair beyond half the cavity."""
+    """Return whether the model is valid at body coordinates y: |theta| <= 45 degrees, no corner beyond mid-cavity."""
     if _all_shallow(p, state, y):
         return abs(named_angle(p, y, y[THETA])) <= LARGEST_ANGLE
     deepest = 0.0

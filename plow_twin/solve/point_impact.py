@@ -1,6 +1,6 @@
-"""Single impacts of bodies that touch a wall at one point, many at once: velocities change, place and arms do not.
+"""Many separate impacts of bodies that touch a wall at one point; place and arms are constant during an impact.
 
-The contact is that of `model.contact`, friction is regularised (`model.friction`) or the spring of `solve.grip`.
+The normal force is that of `model.contact`; friction is regularised (`model.friction`) or the spring of `solve.grip`.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from plow_twin.kernel.compiler import kernel
 from plow_twin.model.contact import normal_force
 from plow_twin.model.friction import friction_force
 
-#: Numbers of the contact, per mass: stiffness K, exponent n, C, ramp [m]; mu, regularisation speed [m/s] (0: a spring),
-#: tangential stiffness and damping.
+#: Constants of the contact, per mass: stiffness K, exponent n, C, ramp [m], mu, regularisation speed [m/s] (0 for
+#: friction by a spring), tangential stiffness and damping.
 POINT = np.dtype(
     [
         (name, "f8")
@@ -23,7 +23,7 @@ POINT = np.dtype(
         )
     ]
 )  # fmt: skip
-#: Steps in the time that the undamped impact takes, and how many of these times an impact may last.
+#: Number of steps in the duration of the undamped impact, and the longest impact in such durations.
 _STEPS, _LONGEST = 800, 20
 
 
@@ -32,7 +32,7 @@ def _strike(point, damping, normal_arm, tangential_arm, inertia, speed, slip, ou
     normal = 1.0 + normal_arm * normal_arm / inertia
     along = 1.0 + tangential_arm * tangential_arm / inertia
     coupling = -normal_arm * tangential_arm / inertia
-    # depth and time without damping, up to a factor near 1
+    # depth and duration without damping, up to a factor near 1
     power = point.exponent + 1.0
     deepest = (power * speed * speed / (2.0 * point.stiffness * normal)) ** (1.0 / power)
     h = math.pi * deepest / (speed * _STEPS)
@@ -61,7 +61,7 @@ def _strike(point, damping, normal_arm, tangential_arm, inertia, speed, slip, ou
 
 @kernel(entry=True)
 def strike_points(point, damping, normal_arm, tangential_arm, inertia, speed, slip, impulse) -> None:
-    """Write the impulses of impacts along the wall and away from it, per mass, to `impulse`.
+    """Write each impact's impulses per mass, along the wall and away from it, to `impulse`.
 
     Parameters
     ----------
@@ -69,11 +69,11 @@ def strike_points(point, damping, normal_arm, tangential_arm, inertia, speed, sl
     damping : ndarray, shape (m,)
         lambda of each impact in s/m.
     normal_arm, tangential_arm : ndarray, shape (m,)
-        Place of the point that touches from the centre of mass, along the wall and away from it, in m.
+        Place of the touching point relative to the centre of mass, along the wall and away from it, in m.
     inertia : float
         Square of the radius of gyration in m^2.
     speed, slip : ndarray, shape (m,)
-        Rates at which the point approaches the wall (> 0) and moves along it, in m/s.
+        Speed of the point towards the wall (> 0) and along it, in m/s.
     impulse : ndarray, shape (m, 2)
         Receives the impulses in m/s.
     """

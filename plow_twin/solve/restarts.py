@@ -1,4 +1,4 @@
-"""One scene run many times, each time from a state of its own over an interval of its own, in one compiled call."""
+"""Many runs of one scene in one compiled call, each from its own state over its own interval of time."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ _OK, _LOG_FULL = int(Status.OK), int(Status.LOG_FULL)
 
 @kernel(entry=True)
 def run_restarts(p, parts, states, w, totals, log, edges, budgets, t, q, v) -> int:
-    """Run state m through the times t[edges[m]:edges[m + 1]]; fill the same rows of q and v.
+    """Run state m through the times t[edges[m]:edges[m + 1]], and fill the same rows of q and v.
 
-    The states' place, rates and clock are set; which pairs touch is settled here. Returns the first `Status` that is
-    not OK, after which no further state is run.
+    The caller sets each state's place, rates and time; the modes of its pairs are chosen here. Returns the first
+    `Status` that is not OK, after which no further state is run.
     """
     first = np.zeros(1, np.int64)
     for m in range(states.size):

@@ -1,8 +1,8 @@
-"""Many square blocks with rounded corners tossed on a table, each with numbers of its own: batches of short motions.
+"""Short motions of many square blocks with rounded corners that are tossed on a table, each with its own parameters.
 
-The contact is that of `model.contact` and the spring friction of `solve.grip`, with two features that a scene lacks: a
-restitution and a friction that fall with the impact, and a radius of the corners. Flight has linear drag. Steps are
-fixed, a fraction of the contact time in contact, and as long as no corner can reach the table in flight.
+Contacts have the normal force of `model.contact` and the spring friction of `solve.grip`. Here restitution and friction
+also fall with the impact, and their values are scattered from touch to touch. Flight has linear drag. In contact, steps
+are a fixed fraction of the contact time; in flight, a step is as long as no corner can reach the table.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import numpy as np
 from plow_twin.kernel.compiler import kernel
 from plow_twin.model.contact import normal_force
 
-#: Numbers of a block, per mass: half the distance between the centres of its corners' arcs [m], their radius [m],
+#: Parameters of a block, per mass: half the distance between the centres of its corners' arcs [m], their radius [m],
 #: radius of gyration [m], height of the table [m], stiffness K [1/s^2], tangential stiffness over K [1], tangential
-#: damping over the critical one [1], restitution and friction at 1 m/s, the power of the impact by which they fall, the
+#: damping over critical damping [1], restitution and friction at 1 m/s, the power of their fall with the impact, the
 #: power of the moving mass in the impact, gravity [m/s^2], drag of place and of angle [1/s].
 BLOCK = np.dtype(
     [
@@ -28,20 +28,20 @@ BLOCK = np.dtype(
     ]
 )  # fmt: skip
 CORNERS = 4
-#: Steps in half a period of the stiffest contact.
+#: Number of steps in half a period of the stiffest contact.
 _STEPS = 70.0
-#: Slowest touch in m/s that sets a restitution, least and largest restitution.
+#: Slowest touch in m/s that changes a restitution, least restitution, largest restitution.
 _SLOWEST, _LEAST, _LARGEST = 0.01, 0.05, 0.9
-#: Impact in m/s below which restitution and friction are constant.
+#: Impact speed in m/s below which restitution and friction are constant.
 _SMALLEST_IMPACT = 0.05
-#: Reference mobility of a corner on a mass of 1 for the powers of the moving mass: a uniform square that lands on the
-#: end of an edge.
+#: Reference mobility of a corner per mass, for the powers of the moving mass: that of a uniform square at one end of a
+#: landing edge.
 _USUAL_MOBILITY = 1.5
 
 
 @kernel(inline="code")
 def _number(table, restitution):
-    """Return the damping number D of a restitution from its values on a grid from 0 to 1."""
+    """Return the damping number D of a restitution, interpolated in a table over restitutions from 0 to 1."""
     at = restitution * (table.size - 1)
     index = min(int(at), table.size - 2)
     return table[index] + (at - index) * (table[index + 1] - table[index])
@@ -49,7 +49,7 @@ def _number(table, restitution):
 
 @kernel()
 def _fly(block, z, h) -> None:
-    """Let a block fly for h seconds, z = (x, z, theta, vx, vz, omega)."""
+    """Advance a block in flight by h seconds; its state is z = (x, z, theta, vx, vz, omega)."""
     for j in range(3):
         drag = block.spin_drag if j == 2 else block.drag
         rate = -drag * z[3 + j] - (block.gravity if j == 1 else 0.0)
@@ -89,7 +89,7 @@ def _toss(block, numbers, scatter, dt, rows) -> None:
                 if depth <= 0.0:
                     touching[corner] = 0
                     continue
-                # the arc rolls: the point that touches lies below its centre
+                # the arc rolls: its touching point lies one radius below its centre
                 arm = az - block.radius
                 slip, rate = z[3] - z[5] * arm, -z[4] - z[5] * ax
                 place = z[0] + ax + block.radius * z[2]
@@ -131,13 +131,14 @@ def toss_blocks(blocks, numbers, scatter, dt, rows) -> None:
     ----------
     blocks : ndarray of BLOCK, shape (m,)
     numbers : ndarray, shape (k,)
-        Damping number D of restitutions from 0 to 1, evenly spaced.
+        Damping numbers D of evenly spaced restitutions from 0 to 1.
     scatter : ndarray, shape (m, touches, 3)
-        Additions of each touch to restitution and to the logarithm of friction, and the distance [m] of its force from
-        the lowest point; later touches use the last row.
+        Scatter of each touch: addition to the restitution, addition to the logarithm of friction, and distance [m] of
+        the force from the lowest point. Later touches use the last row.
     dt : float
+        Interval of the rows in s.
     rows : ndarray, shape (m, n, 6)
-        x, z, theta and their rates; the first row of each block is given.
+        x, z, theta and their rates. The caller gives the first row of each block.
     """
     for member in range(len(blocks)):
         _toss(blocks[member], numbers, scatter[member], dt, rows[member])

@@ -1,9 +1,10 @@
-"""Effects on a pad's wear beside its force and the travel along the face: sliding in the plane, and running-in.
+"""Further effects on a pad's wear, beside its force and the travel along the face: in-plane sliding and running-in.
 
     dh/dt = (k_s v / A) F sqrt(1 + (s' / v)^2) (1 + a exp(-h / h0))
 
-s' is the rate at which the corner slides along its wall, across the travel; a standing plough does not wear. With v
-= 0 the distance would have a kink at s' = 0 that no series could follow, so v in the root is at least `SLOWEST_TRAVEL`.
+s' is the rate at which the corner slides along its wall, at right angles to the travel; a standing plough does not
+wear. At v = 0 the sliding distance has a kink where s' = 0, which no series could follow, so v in the root is at least
+`SLOWEST_TRAVEL`.
 """
 
 from __future__ import annotations
@@ -15,13 +16,13 @@ from plow_twin.kernel.compiler import kernel
 from plow_twin.solve.kinematics import slip_rate
 from plow_twin.solve.state import COS, OMEGA, SIN, VX, VY, X, Y
 
-#: Speed along the face in m/s below which the sliding in the plane counts as at this speed, times the speed's share.
+#: Least speed along the face in m/s in the factor of in-plane sliding; below it this wear falls in proportion to v.
 SLOWEST_TRAVEL: Final = 0.01
 
 
 @kernel(inline="code")
 def time_per_way(p, pair) -> float:
-    """Return 1 / v in s/m of a pad; 0 where sliding in the plane does not wear it."""
+    """Return 1 / v in s/m of a pad, or 0 if sliding in the plane does not wear it."""
     if p.speed_per_wear == 0.0:
         return 0.0
     return 1.0 / max(p.speed_per_wear * p.wear_per_impulse[pair], SLOWEST_TRAVEL)
@@ -29,7 +30,7 @@ def time_per_way(p, pair) -> float:
 
 @kernel()
 def rubbing(p, pair, y, depth, sliding, running_in) -> float:
-    """Return the factor by which a pad at a wear depth wears faster than by travel alone, at state y, shape (8,)."""
+    """Return the factor on a pad's wear by travel alone, for its wear depth in m and the state y, shape (8,)."""
     factor = 1.0
     if sliding is not None:
         rate = slip_rate(p, pair, y[COS], y[SIN], y[OMEGA], y[X], y[Y], y[VX], y[VY])

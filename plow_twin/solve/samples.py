@@ -1,4 +1,4 @@
-"""Samples in the form of the kernels: model times, and loads per mass and inertia."""
+"""Conversion of samples to the units of the kernels: model times, and loads per mass and inertia."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from plow_twin.kernel.compiler import kernel
 
 @kernel(entry=True)
 def lay_out(before, samples, inertias, per) -> bool:
-    """Write the last sample, shape (3,), and the following ones, (n, 3), per mass and inertia to `per`, (n + 1, 3).
+    """Divide the wrenches of samples by mass and inertia, and write them to `per`, shape (n + 1, 3).
 
-    Returns whether the latter are finite.
+    `before` is the sample before, shape (3,); `samples` are the new samples, shape (n, 3). Returns whether all new
+    samples are finite.
     """
     finite = True
     for j in range(3):

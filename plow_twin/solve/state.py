@@ -1,6 +1,6 @@
 """Records of the compiled kernels: constants of a scene, dynamic state, scratch space and totals.
 
-Parts that a scene lacks are `None`: the compiled signature then holds `none`, and their code is not compiled.
+A part that a scene lacks is `None`, which makes it a type of the compiled signature, so that its code is not compiled.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from plow_twin.model.pairs import PAIR_COUNT
 
 Array = NDArray[np.float64]
 
-#: Highest order of the series; the tolerance decides how many terms are used.
+#: Highest order of the series; the tolerance determines the order that is used.
 MAX_ORDER: Final = 30
 
 # indices into Work.per_pair
@@ -29,11 +29,11 @@ ACTS, DAMPS, BASE, SIGN, RATIO, SUM, FIRST, SECOND, RAMPS = range(9)
 OFF: Final = 0
 ON: Final = 1
 CLIPPED: Final = 2
-#: Penetrating less than `Params.release`, where the force is negligible (exponents that are not integers).
+#: A pair penetrates less than `Params.release`, so that its force is negligible (exponents that are not integers).
 RELEASED: Final = 3
-#: Not a mode but the outcome of an event: a pair crosses the end of its damping's ramp.
+#: Outcome of an event that is no mode: a pair crosses the end of its damping's ramp.
 CROSSING: Final = 4
-#: Further outcomes of an event: the corner slips along the wall, forward or backward, or sticks.
+#: Further outcomes that are no modes: the corner begins to slip along the wall, forward or backward, or to stick.
 SLIPS_FORWARD: Final = 5
 SLIPS_BACKWARD: Final = 6
 STICKS: Final = 7
@@ -48,13 +48,14 @@ class Status(IntEnum):
     Attributes
     ----------
     OK
-        The time asked for was reached.
+        The advance reached its time.
     OUT_OF_RANGE
-        abs(theta) above 45 degrees, or half the cavity penetrated: the pairs no longer describe the contacts.
+        abs(theta) exceeded 45 degrees, or a corner went beyond half the cavity, where the pairs no longer describe the
+        contacts.
     NON_FINITE
         A number became infinite or NaN.
     BUDGET
-        The steps that an advance may take were used up.
+        The number of steps that an advance may take was used up.
     LOG_FULL, PAUSED
         Internal; never the status of an advance.
     """
@@ -84,8 +85,8 @@ _STATUS_TEXT: Final = {
 }
 
 
-# Records rather than tuples of arrays: a kernel gets one pointer, shapes are constants, and nothing is reference
-# counted.
+# Records rather than tuples of arrays, because a kernel then gets one pointer, shapes are constants, and nothing is
+# reference counted.
 
 _ROWS: Final = MAX_ORDER + 1
 _WIDE: Final = (_ROWS, PAIR_COUNT)
@@ -94,7 +95,7 @@ _LINE: Final = 64
 
 
 def _in_lines(fields: list[tuple[Any, ...]]) -> np.dtype[np.void]:
-    """Return a record type that fills whole cache lines, so that each of many begins at one."""
+    """Return a record type padded to whole cache lines, so that each record of an array begins at a cache line."""
     packed = np.dtype(fields)
     names = packed.names or ()
     parts: Any = packed.fields
@@ -108,17 +109,17 @@ def _in_lines(fields: list[tuple[Any, ...]]) -> np.dtype[np.void]:
     )
 
 
-#: Steps of the grid of restitutions on which their damping numbers are known; a step is the least restitution.
+#: Intervals of the grid of restitutions with tabulated damping numbers; the least restitution is one interval.
 RESTITUTIONS: Final = 1000
 
-#: Constants of one scene and one tolerance, per mass and inertia where that saves work.
+#: Constants of one scene at one tolerance, divided by mass and inertia if that saves work.
 _PARAM_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("penetration_rows", "f8", (5, PAIR_COUNT)),  # penetration rows for c, s, X, Y, 1
     ("arm_rows", "f8", (4, PAIR_COUNT)),  # arm rows for c, s, X, Y
     ("slip_rows", "f8", (4, PAIR_COUNT)),  # place along the wall, rows for c, s, X, Y
     ("slip_arm_rows", "f8", (4, PAIR_COUNT)),  # arm about G of a force along the wall
     ("wear_per_impulse", "f8", (PAIR_COUNT,)),  # depth of each pad per impulse, k_s v / A
-    ("speed_per_wear", "f8"),  # A / k_s: turns depth per impulse into v; 0 where sliding in the plane does not wear
+    ("speed_per_wear", "f8"),  # A / k_s, v over depth per impulse; 0 if sliding in the plane does not wear
     ("running_in", "f8"),  # share by which a new pad wears faster
     ("running_in_rate", "f8"),  # 1 / h0 in 1/m, the rate at which this share falls with the depth
     ("enabled", "i8", (PAIR_COUNT,)),  # 1 where the pair can touch
@@ -144,16 +145,16 @@ _PARAM_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("frame_stiffness", "f8", (3,)),  # stiffness of the frame's support, per mass and inertia
     ("frame_damping", "f8", (3,)),
     ("order", "i8"),
-    ("lacuna", "i8"),  # orders in a row that may vanish while the series goes on
+    ("lacuna", "i8"),  # number of consecutive orders that may vanish before the end of a series
     ("threshold", "f8", (_ROWS,)),  # admissible size of term k of a velocity over a step
     ("velocity_tolerance", "f8"),  # admissible error of a velocity
     ("position_tolerance", "f8"),  # admissible error of a position
-    ("weight", "f8"),  # turns cos and sin into velocities
-    ("radius", "f8"),  # turns angles into lengths
+    ("weight", "f8"),  # velocity per cosine or sine, for the size of terms
+    ("radius", "f8"),  # length per angle
     ("release", "f8"),  # penetration below which the force is negligible
     ("fastest", "f8"),  # largest angular frequency of the harmonics
     ("leverage", "f8"),  # distance of a corner of the frame from its centre
-    ("half_cavity", "f8"),  # penetration that ends the model's range
+    ("half_cavity", "f8"),  # largest penetration for which the model is valid
     ("max_events", "i8"),  # events at one instant before recovery
 ]
 PARAMS: Final = _in_lines(_PARAM_FIELDS)
@@ -161,14 +162,14 @@ PARAMS: Final = _in_lines(_PARAM_FIELDS)
 #: Constants that only some scenes have, by their `Options`.
 _OPTION_FIELDS: Final[dict[str, list[tuple[Any, ...]]]] = {
     "corners": [("tumbles", "f8")],  # the head carries corners; 1 where the block may tumble
-    "rounded": [("roll", "f8")],  # distance of a rounded corner along its wall by the angle [m]
+    "rounded": [("roll", "f8")],  # distance of a rounded corner along its wall per angle [m/rad]
     "falling": [  # a restitution that falls with the impact
         ("damping_numbers", "f8", (RESTITUTIONS + 1,)),  # e D(e) on a grid from 0 to 1
-        ("restitution", "f8"),  # its value for impacts no faster than `fall_speed`
-        ("fall", "f8"),  # power by which it falls
+        ("restitution", "f8"),  # for impacts up to `fall_speed`
+        ("fall", "f8"),  # power of its fall with the impact
         ("fall_speed", "f8"),  # in m/s
         ("fall_mass", "f8"),  # power of the effective mass
-        ("fall_along", "f8"),  # rate at which it falls with the speed along the wall, in s/m
+        ("fall_along", "f8"),  # its fall per speed along the wall, in s/m
     ],
 }
 
@@ -189,45 +190,45 @@ def params_type(options: Options) -> np.dtype[np.void]:
     return _in_lines([*more, *_PARAM_FIELDS]) if more else PARAMS
 
 
-#: The whole state of the motion, and the step under way. Times in s.
+#: The whole state of the motion, and the current step. Times in s.
 _STATE_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("y", "f8", (STATE_SIZE,)),  # body coordinates at the step's start
     ("damping_factor", "f8", (PAIR_COUNT,)),  # lambda of each pair in s/m
     ("wear_depth", "f8", (PAIR_COUNT,)),  # wear depth of each pad in m
     ("mode", "i8", (PAIR_COUNT,)),
-    ("beyond_ramp", "i8", (PAIR_COUNT,)),  # 1 where the penetration is beyond the ramp
+    ("beyond_ramp", "i8", (PAIR_COUNT,)),  # 1 if the penetration is beyond the ramp
     ("step_start", "f8"),
-    ("elapsed", "f8"),  # time into the step under way
-    ("step_size", "f8"),  # size of the step under way, negative without a step
+    ("elapsed", "f8"),  # time since the start of the current step
+    ("step_size", "f8"),  # size of the current step, negative without a step
     ("sigma_end", "f8"),  # the series' variable at the step's end
-    ("alpha", "f8"),  # time runs as t = alpha sigma + beta sigma^2 / 2
+    ("alpha", "f8"),  # time since the step's start: alpha sigma + beta sigma^2 / 2
     ("beta", "f8"),
     ("stop_time", "f8"),  # where a step must end: a sample, a knot of the load, the end of the run
     ("last_step_size", "f8"),
     ("touch_time", "f8"),  # time of the last touch
     ("time", "f8"),  # the present time, bit for bit as the caller gave it
     ("implicit_size", "f8"),  # size of the next implicit step
-    ("decay_times", "f8"),  # that have passed in overdamped contact since a contact changed
-    ("implicit_size_before", "f8"),  # both before the step under way was laid out
+    ("decay_times", "f8"),  # number of decay times in overdamped contact since a contact changed
+    ("implicit_size_before", "f8"),  # both before the current step was laid out
     ("decay_times_before", "f8"),
-    ("order", "i8"),  # order of the series of the step under way
+    ("order", "i8"),  # order of the series of the current step
     ("event_pair", "i8"),  # the pair whose event ends the step, or -1
-    ("event_mode", "i8"),  # the mode that follows
-    ("touching", "i8"),  # a bit for each pair that touches at the step's start and needs the root of time
-    ("events_at_once", "i8"),  # events so far at one instant
-    ("piece", "i8"),  # piece of the sampled load
-    ("ends_at_stop", "i8"),  # 1 where the step ends at `stop_time`
+    ("event_mode", "i8"),  # the mode after the event
+    ("touching", "i8"),  # bits of pairs that touch at the step's start, whose series need the square root of time
+    ("events_at_once", "i8"),  # number of events at the present instant so far
+    ("piece", "i8"),  # index of the sampled load's present piece
+    ("ends_at_stop", "i8"),  # 1 if the step ends at `stop_time`
     ("refused", "i8"),  # failed attempts at implicit steps since a contact changed
-    ("refused_before", "i8"),  # the same before the step under way was laid out
+    ("refused_before", "i8"),  # `refused` before the current step was laid out
     ("in_flight", "i8"),  # 1 during a step of free flight
     ("at_rest", "i8"),  # 1 during a step of rest
     # counted since the start
     ("steps", "i8"),
-    ("evaluations", "i8"),  # evaluations of the equations of motion; an order of a series counts as one
+    ("evaluations", "i8"),  # evaluations of the equations of motion, one for each order of a series
     ("events", "i8"),
     ("guard_roots", "i8"),  # guards whose roots were searched for
-    ("recoveries", "i8"),  # times that modes flipped at one instant
-    ("bounded", "i8"),  # advances whose end was coarse
+    ("recoveries", "i8"),  # steps beyond an instant at which modes changed back and forth
+    ("bounded", "i8"),  # advances with a coarse end
     ("implicit_steps", "i8"),
 ]
 STATE: Final = _in_lines(_STATE_FIELDS)
@@ -236,11 +237,11 @@ _GRIP_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("anchor", "f8", (PAIR_COUNT,)),  # place along the wall in m where a sticking corner's spring is slack
     ("grip", "i8", (PAIR_COUNT,)),  # 0 sticks, 1 slips forward, -1 backward
 ]
-#: A frame on springs: x, y, theta from where its springs are slack, and their rates; y is then relative to it.
+#: A frame on springs: its displacement x, y, theta from equilibrium and their rates; `y` is relative to the frame.
 _FRAME_FIELDS: Final[list[tuple[Any, ...]]] = [("frame", "f8", (6,))]
 
-#: Scratch space: series of one step. Rows are orders, the eight columns state components or pairs: SIMD lanes. Arrays
-#: of eight columns come first, so that each of their rows fills a cache line.
+#: Scratch space, mainly the series of one step. Rows are orders; the eight columns (SIMD lanes) are state components or
+#: pairs. Arrays of eight columns come first, so that each of their rows fills a cache line.
 WORK: Final = np.dtype(
     [
         ("series", "f8", _WIDE),  # state
@@ -260,29 +261,29 @@ WORK: Final = np.dtype(
         ("frame", "f8", _WIDE),  # a frame on springs (`solve.support`)
         ("frame_left", "f8", (3, *_WIDE)),  # factors of its Cauchy products
         ("frame_right", "f8", (3, *_WIDE)),
-        ("seen", "f8", _WIDE),  # implicit steps: the head as seen from the frame
+        ("seen", "f8", _WIDE),  # implicit steps: the head relative to the frame
         ("frame_sum", "f8", (PAIR_COUNT,)),
-        ("grip", "f8", (3, PAIR_COUNT)),  # friction with stick: force per normal force, place and slip rate
+        ("grip", "f8", (3, PAIR_COUNT)),  # friction with stick: factors of normal force, place and slip rate
         ("per_pair", "f8", (9, PAIR_COUNT)),  # masks and sums of the eight pairs
         ("moved", "f8", (STATE_SIZE,)),
-        ("saved", "f8", (2, PAIR_COUNT)),  # y and wear depth at the time before an advance
-        ("frame_now", "f8", (6,)),  # state of the frame where the motion was last read
-        ("frame_saved", "f8", (6,)),  # and at the time before an advance
+        ("saved", "f8", (2, PAIR_COUNT)),  # y and wear depth at the start of an advance
+        ("frame_now", "f8", (6,)),  # state of the frame at the last reading of the motion
+        ("frame_saved", "f8", (6,)),  # state of the frame at the start of an advance
         ("load", "f8", (3, _ROWS)),  # S1, S2, M
         ("world", "f8", (4, _ROWS)),  # forces per mass in head and world axes
         ("column", "f8", (2, _ROWS)),  # one polynomial
         ("halves", "f8", (MAX_HALVINGS + 2, _ROWS)),
         ("bounds", "f8", (MAX_HALVINGS + 2, 2)),
-        ("wrench", "f8", (2, 3)),  # value and slope at the step's start of the load that is linear in time
-        ("flight", "f8", (6, 6)),  # start of a flight, what bounds it, scratch (`solve.method.flight`)
+        ("wrench", "f8", (2, 3)),  # linear load: value and slope at the step's start
+        ("flight", "f8", (6, 6)),  # start of a flight, its bounds, scratch (`solve.method.flight`)
         ("rest", "f8", (4, 6)),  # place, rates and load at rest (`solve.method.rest`)
         ("hessian", "f8", (3, 3)),
         ("term_size", "f8", (_ROWS,)),  # size of each order as a velocity
-        ("decay", "f8", (1,)),  # decay rate in 1/s of the damping, 0 where it does not bound steps
+        ("decay", "f8", (1,)),  # decay rate of the damping in 1/s, 0 if it does not limit steps
         ("switch", "i8", (PAIR_COUNT,)),  # modes that pairs take at the step's end, -1 for no change
         ("inverse", "f8", (_ROWS + 2,)),  # 1/k
-        ("damping", "f8", (3, 3)),  # by rate, at rest under harmonics
-        ("rub", "f8", (6, *_WIDE)),  # wear: s' / v, way per travel, force times it; running-in and its factors
+        ("damping", "f8", (3, 3)),  # rest under harmonics: minus the derivatives of the accelerations by rate
+        ("rub", "f8", (6, *_WIDE)),  # wear: s' / v, sliding distance per travel, force times it; running-in
         ("binomial", "f8", (_ROWS, _ROWS)),  # 1 / C(order, k)
         ("beyond", "f8", (3,)),  # newest advance out of range: angle [rad], largest penetration [m], its pair
     ]
@@ -304,7 +305,7 @@ TOTALS: Final = np.dtype(
 FOLLOWED: Final = 1
 WITH_INTERVALS: Final = 2
 
-#: The record that goes from the solver to the messages: the motion at a time, and the sums since the row before.
+#: The motion at a time and the sums since the row before, as passed from the solver to the messages.
 ROW: Final = np.dtype(
     [
         ("t", "f8"),
@@ -317,21 +318,21 @@ ROW: Final = np.dtype(
         ("steps", "i8"),
         ("status", "i8"),
         ("error_estimate", "f8"),
-        # in a published row (`solve.totals.publish`) touches count from the beginning, impulse and peak from the
-        # publication before
+        # in a published row (`solve.totals.publish`) `makes` counts touches since the beginning, impulse and peak are
+        # since the publication before
         ("stamp_ns", "i8"),
-        ("samples", "i8"),  # advances since then that ended at a sample
-        ("measured_peak", "f8", (PAIR_COUNT,)),  # largest force in these
-        ("held", "i8"),  # 1 where the motion at the stamp was computed without a sample
-        ("corrected", "i8"),  # 1 where late samples have been worked in since then
-        ("marked", "i8"),  # 1 where `held` or `corrected` is 1, here or in the publication before
+        ("samples", "i8"),  # number of advances since the publication before that ended at a sample
+        ("measured_peak", "f8", (PAIR_COUNT,)),  # largest force in these advances
+        ("held", "i8"),  # 1 if the motion at the stamp was computed with held loads, without a sample
+        ("corrected", "i8"),  # 1 if late samples have changed the motion since the publication before
+        ("marked", "i8"),  # 1 if `held` or `corrected` is 1, here or in the publication before
         ("orientation", "f8", (2,)),  # z and w of the head's quaternion
         ("twist", "f8", (3,)),  # rates along the head's own axes [m/s], about z [rad/s]
-        # written where the motion follows measurements: 5 % and 95 % points over the drawn twins; peak and impulse
-        # since the publication before; clearances [m] with their points
+        # written if the motion follows measurements: 5 % and 95 % points over the drawn twins (peak and impulse since
+        # the publication before), and the clearances [m] with their points
         ("followed", "i8"),  # `FOLLOWED`: clearances are filled; `WITH_INTERVALS`: all fields are filled
         *((f"{name}_{end}", "f8", (PAIR_COUNT,)) for name in ("force", "peak", "impulse") for end in ("low", "high")),
-        ("known_clearance", "f8", (6,)),  # horizontal, its points, vertical, its points
+        ("known_clearance", "f8", (6,)),  # horizontal clearance and its points, vertical clearance and its points
     ]
 )
 
@@ -353,10 +354,10 @@ Segments: TypeAlias = NDArray[np.void]
 
 
 class Terms(NamedTuple):
-    """Terms of the equations of motion: 1, or `None` for an absent term. Their numbers are in `Params`.
+    """Terms of the equations of motion: 1 for a term that is present, `None` otherwise. `Params` has their constants.
 
-    The types are part of the compiled signature. A kernel takes them as separate arguments, since only a separate
-    argument that is `None` leaves a branch out of the compiled code.
+    The types are part of the compiled signature. Kernels take the terms as separate arguments, since numba leaves a
+    branch out of the compiled code only if a separate argument is `None`.
     """
 
     harmonics: int | None
@@ -370,7 +371,7 @@ class Terms(NamedTuple):
     wear: int | None
     sliding: int | None  #: sliding in the plane wears too
     running_in: int | None  #: new pads wear faster
-    offset: int | None  #: the centre of mass is not the cavity's
+    offset: int | None  #: the centre of mass is not the cavity's centre
     free: int | None  #: some degree of freedom is locked
     slip: int | None  #: regularised friction
     stick: int | None  #: friction with stick
@@ -380,7 +381,7 @@ class Terms(NamedTuple):
 
 
 class Parts(NamedTuple):
-    """Parts that a scene may lack: terms of the equations, loads of any number, nodes and space of implicit steps."""
+    """Parts that a scene may lack: terms of the equations, loads, nodes and scratch space of implicit steps."""
 
     terms: Terms
     harmonics: Harmonics | None
@@ -388,12 +389,12 @@ class Parts(NamedTuple):
     implicit: Implicit | None
 
 
-#: Bounds of the work of an advance, and scratch space for its coarse end.
+#: Limit of the work of an advance, and scratch space for its coarse end.
 BOUND: Final = np.dtype(
     [
-        ("steps", "i8"),  # Runge-Kutta steps that are kept for the end
-        ("error", "f8"),  # estimate in m of the advance, 0 while the bound is not reached
-        ("z", "f8", (6, 12)),  # state, trial state, four stages; also of a frame on springs
+        ("steps", "i8"),  # number of Runge-Kutta steps reserved for the end
+        ("error", "f8"),  # estimated error of the advance in m, 0 if the limit was not reached
+        ("z", "f8", (6, 12)),  # state, trial state and four stages, with those of a frame on springs
         ("load", "f8", (3,)),
         ("pairs", "f8", (4, PAIR_COUNT)),  # penetration, rate, force, force before
     ]
@@ -402,15 +403,15 @@ BOUND: Final = np.dtype(
 #: One change of contact: time in s, pair, modes before and after, rate of penetration in m/s.
 EVENT: Final = np.dtype([("time", "f8"), ("pair", "i8"), ("mode_from", "i8"), ("mode_to", "i8"), ("rate", "f8")])
 
-#: How far a call for many advances has come; it comes back after each slice of work.
+#: Progress of a call for many advances, which returns after each slice of work.
 PACE: Final = np.dtype(
     [
         ("slice", "i8"),  # steps of a slice
         ("left", "i8"),  # steps left of the slice
-        ("row", "i8"),  # the next advance, members one after the other
-        ("underway", "i8"),  # 1 where the advance has begun
-        ("mark", "i8"),  # the next mark
-        ("failed", "i8"),  # advances that failed
+        ("row", "i8"),  # number of the next advance, counted through all members
+        ("underway", "i8"),  # 1 if this advance has begun
+        ("mark", "i8"),  # index of the next mark
+        ("failed", "i8"),  # number of failed advances
     ]
 )
 
@@ -425,7 +426,7 @@ def state_type(terms: Terms) -> np.dtype[np.void]:
 
 @cache
 def _state_type(stick: bool, support: bool) -> np.dtype[np.void]:
-    # further fields come first: numba takes a record with further fields at its end for the shorter type
+    # further fields come first, because numba takes a record with further fields at its end for the shorter type
     more = (_FRAME_FIELDS if support else []) + (_GRIP_FIELDS if stick else [])
     return _in_lines([*more, *_STATE_FIELDS]) if more else STATE
 
@@ -436,19 +437,19 @@ def new_record(dtype: np.dtype[np.void]) -> np.record:
 
 
 def first_of(records: NDArray[np.void]) -> np.record:
-    """Return the first of some records, in place."""
+    """Return a view of the first record."""
     record: np.record = records.view(_with_attributes(records.dtype))[0]
     return record
 
 
 @cache
 def _with_attributes(dtype: np.dtype[np.void]) -> np.dtype[np.void]:
-    """Return the record type whose fields are attributes."""
+    """Return the same record type with its fields as attributes."""
     return np.dtype((np.record, dtype))
 
 
 def new_records(dtype: np.dtype[np.void], count: int) -> NDArray[np.void]:
-    """Return records of zeros that start at a cache line: rows of eight numbers then lie in one line each."""
+    """Return records of zeros that start at a cache line, so that each row of eight numbers lies in one line."""
     memory = np.zeros(count * dtype.itemsize + _LINE, np.uint8)
     start = -memory.ctypes.data % _LINE
     return np.ndarray(count, dtype, memory.data, start)

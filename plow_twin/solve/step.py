@@ -1,7 +1,7 @@
-"""A step: series, step size, first event, totals, and the switch of a mode at its end.
+"""A step: its series, size, first event and totals, and the change of a mode at its end.
 
-A step never depends on where output is wanted. It ends at an event, at a knot of the load, or where its series stops
-being accurate.
+Steps do not depend on the times at which output is wanted. A step ends at an event, at a knot of the load, or where its
+series is no longer accurate.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ from plow_twin.solve.state import COS, CROSSING, OFF, ON, RELEASED, SIN, SLIPS_F
 from plow_twin.solve.totals import log_event
 from plow_twin.solve.tumbling import turn_at, turn_corners
 
-#: The methods in the order in which they are asked; a kernel calls each by its name.
+#: The methods in the order in which a step tries them; kernels call each by its name.
 METHODS: Final[tuple[Method, ...]] = (flight, rest, implicit, taylor)
-#: Longest step in s; keeps every power of it finite.
+#: Longest step in s, so that every power of a step is finite.
 LONGEST_STEP = 100.0
-#: Step in sigma past an instant at which modes would flip without end.
+#: Step in sigma beyond an instant at which modes would change back and forth without end.
 PAST_AN_INSTANT = 1e-9
-#: Two times in s closer than this share of them are one instant: some roundings.
+#: Times with a relative difference below this, some rounding errors, are the same instant.
 ONE_INSTANT = 1e-15
 
 
 @kernel()
 def _set_load(p, segments, state, w):
-    """Write the linear load at the step's start to `w.wrench`; return the time up to which it is linear."""
+    """Write the load at the step's start and its slope to `w.wrench`; return the time up to which they are valid."""
     for j in range(3):
         w.wrench[0, j], w.wrench[1, j] = p.constant[j], 0.0
     if segments is None:
@@ -76,7 +76,7 @@ def lay_out_step(p, parts, state, w, stop_time) -> bool:
     if flight.lay_out(p, parts, flight.own(parts), state, w, span, penetrating) or rest.lay_out(
         p, parts, rest.own(parts), state, w, span, penetrating
     ):
-        # no wall can be reached, or the head does not leave its walls
+        # the head cannot reach a wall (flight), or does not leave its walls (rest)
         state.step_size = state.sigma_end
     elif implicit.lay_out(p, parts, implicit.own(parts), state, w, span, penetrating) or taylor.lay_out(
         p, parts, taylor.own(parts), state, w, span, penetrating
@@ -92,7 +92,7 @@ def lay_out_step(p, parts, state, w, stop_time) -> bool:
 
 @kernel()
 def lay_out_series_step(p, parts, state, w, stop_time) -> bool:
-    """Lay out the next step by Taylor series, also where the head flies free or is at rest."""
+    """Lay out the next step by Taylor series, even if the head is in free flight or at rest."""
     terms = parts.terms
     span, penetrating = _begin_step(p, parts, state, w, stop_time)
     if not taylor.lay_out(p, parts, taylor.own(parts), state, w, span, penetrating):
@@ -105,11 +105,11 @@ def lay_out_series_step(p, parts, state, w, stop_time) -> bool:
 
 @kernel()
 def _end_at_event(p, state, w, span, penetrating, law, stick) -> None:
-    """Let the step that has been laid out end at its first event, if there is one; find its size in time."""
+    """Shorten a laid-out step to end at its first event, if there is one, and compute its size in s."""
     sigma, order = state.sigma_end, state.order
     end, pair, target = first_event(p, state, w, order, sigma, penetrating, *law, stick)
     if pair >= 0 and state.events_at_once > p.max_events:
-        # modes flip at one instant: step past it with the present modes
+        # modes change back and forth at one instant: step beyond it with the present modes
         state.recoveries += 1
         end, pair = max(end, min(sigma, PAST_AN_INSTANT)), -1
     turn = turn_at(p, state, w, order, end)
@@ -126,7 +126,7 @@ def _end_at_event(p, state, w, span, penetrating, law, stick) -> None:
 
 @kernel()
 def complete_step(p, harmonics, flight, support, state, w, totals, log, wear, fraction, stick) -> None:
-    """Move the state to the step's end and switch the mode that its event changes; totals and log may be None."""
+    """Move the state to the step's end and make the event's changes of mode; `totals` and `log` may be None."""
     y = state.y
     sigma = state.sigma_end
     if wear is not None:
@@ -163,7 +163,7 @@ def complete_step(p, harmonics, flight, support, state, w, totals, log, wear, fr
 
 @kernel()
 def _switch(p, state, pair, new, totals, log, fraction, stick) -> None:
-    """Let a pair change its mode; note it."""
+    """Change the mode of a pair, and record the change in the totals and the log."""
     old = state.mode[pair]
     if stick is not None and new >= SLIPS_FORWARD:
         switch_grip(p, state, pair, new)
@@ -190,7 +190,7 @@ def _switch(p, state, pair, new, totals, log, fraction, stick) -> None:
                 state.mode[pair] = RELEASED
     if stick is not None and state.mode[pair] == ON and old != ON:
         grasp(p, state, pair, old)
-    # to the outside a released pair is on
+    # the log shows a released pair as on
     old, new = ON if old == RELEASED else old, ON if new == RELEASED else new
     if log is not None and old != new:
         log_event(log, totals, state.step_start, pair, old, new, penetration_and_rate(p, state, pair)[1])

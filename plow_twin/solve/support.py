@@ -2,10 +2,11 @@
 
     m_f u'' = -k_x u - c_x u' - sum F_x      (v likewise)      I_f phi'' = -k_phi phi - c_phi phi' - sum (p x F)
 
-u, v, phi is the frame's displacement in world axes, F the force of a pair on the head, p its place from the frame's
-centre. The head's equations hold for its absolute place; penetrations, arms and slips are those of its
-place as seen from the frame. `State.y` keeps the latter, so modes, events and outputs do not depend on the frame.
-Both bodies are one system, solved together; the series of it is in `solve.method.series`.
+u, v, phi is the frame's displacement in world axes, F the force of a pair on the head, and p the place of this force
+relative to the frame's centre. The head's equations of motion are for its place relative to the ground; penetrations,
+arms and slips depend on its place relative to the frame. `State.y` is relative to the frame, so that modes, events and
+outputs are computed as for a fixed frame. Both bodies are solved as one system, by the series in
+`solve.method.series`.
 """
 
 from __future__ import annotations
@@ -20,14 +21,17 @@ from plow_twin.kernel.simd import row, set_row
 from plow_twin.solve.kinematics import to_body, to_body_axes, to_world
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, X, Y
 
-#: Lanes of the frame's series `w.frame`: displacement and velocity in world axes, spin, cosine and sine of the head's
-#: angle as seen from the frame, the frame's angle.
+#: Lanes of the frame's series `w.frame`: displacement and velocity in world axes, angular velocity, cosine and sine of
+#: the head's angle relative to the frame, the frame's angle.
 FRAME_X, FRAME_Y, FRAME_VX, FRAME_VY, SPIN, SEEN_COS, SEEN_SIN, FRAME_THETA = range(8)
 
 
 @kernel()
 def to_ground(y, frame, out) -> None:
-    """Write the head's absolute body coordinates from those seen from the frame, whose state is `frame`, shape (6,)."""
+    """Write the head's body coordinates relative to the ground from those relative to the frame.
+
+    `frame` is the frame's state, shape (6,).
+    """
     theta, spin = y[THETA] + frame[2], frame[5]
     c, s = math.cos(theta), math.sin(theta)
     bx, by = to_body_axes(c, s, frame[0], frame[1])
@@ -40,7 +44,7 @@ def to_ground(y, frame, out) -> None:
 
 @kernel()
 def from_ground(y, frame, out) -> None:
-    """Write the head's body coordinates as seen from the frame; inverse of `to_ground`, also in place."""
+    """Write the head's body coordinates relative to the frame; inverse of `to_ground`, which may work in place."""
     theta, spin = y[THETA], frame[5]
     c, s = math.cos(theta), math.sin(theta)
     bx, by = to_body_axes(c, s, frame[0], frame[1])
@@ -53,7 +57,7 @@ def from_ground(y, frame, out) -> None:
 
 @kernel()
 def to_world_both(p, y, frame, z) -> None:
-    """Write z = (x, y, theta, u, v, phi) and its rate, shape (12,), world axes, from the state seen from the frame."""
+    """Write z = (x, y, theta, u, v, phi) and its rate in world axes, shape (12,), from the states of head and frame."""
     absolute, head = np.empty(8), np.empty(6)
     to_ground(y, frame, absolute)
     to_world(p, absolute, head)
@@ -64,7 +68,7 @@ def to_world_both(p, y, frame, z) -> None:
 
 @kernel()
 def to_body_both(p, z, y, frame) -> None:
-    """Write the head's body coordinates as seen from the frame, and the frame's state; inverse of `to_world_both`."""
+    """Write the head's body coordinates relative to the frame, and the frame's state; inverse of `to_world_both`."""
     head = np.empty(6)
     for j in range(3):
         head[j], head[3 + j] = z[j], z[6 + j]
@@ -75,7 +79,7 @@ def to_body_both(p, z, y, frame) -> None:
 
 @kernel()
 def start_frame(state, w) -> None:
-    """Write the rows with which the series of both bodies start: the head's to `w.moved`, the frame's to `w.frame`."""
+    """Write the first rows of the series of both bodies: the head's to `w.moved`, the frame's to `w.frame`."""
     frame, here = state.frame, w.frame[0]
     to_ground(state.y, frame, w.moved)
     for j in range(2):
@@ -86,9 +90,9 @@ def start_frame(state, w) -> None:
 
 @kernel(fast=True)
 def see_from_frame(w, order, sigma, y) -> None:
-    """Turn the head's absolute body coordinates at sigma of a step into those seen from the frame.
+    """Convert the head's body coordinates at sigma of a step from relative to the ground to relative to the frame.
 
-    The frame's state there is written to `w.frame_now`.
+    The frame's state at sigma is written to `w.frame_now`.
     """
     value = row(w.frame, order)
     for k in range(order - 1, -1, -1):
@@ -101,7 +105,7 @@ def see_from_frame(w, order, sigma, y) -> None:
 
 
 def frame_at(series: NDArray[np.float64], order: int, sigma: float) -> NDArray[np.float64]:
-    """Return the frame's place and rate, shape (6,), from its series at sigma."""
+    """Return the frame's place and rate at sigma, shape (6,), from its series."""
     lanes = np.asarray(np.polynomial.polynomial.polyval(sigma, series[: order + 1]))
     found: NDArray[np.float64] = lanes[[FRAME_X, FRAME_Y, FRAME_THETA, FRAME_VX, FRAME_VY, SPIN]]
     return found

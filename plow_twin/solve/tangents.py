@@ -1,17 +1,20 @@
 """Derivatives of a motion by its state and parameters, from the linearised equations along each step's series.
 
-With the displacement of the centre of mass and of its velocity resolved in head axes, xi and eta, those of angle and
-rate, phi and psi, and the contacts' force f = (fx, fy) in head axes, each column obeys
+Each column holds one derivative: xi and eta of the position and velocity of the centre of mass (in head axes), phi and
+psi of the angle and its rate. With the contacts' force f = (fx, fy) in head axes, a column obeys
 
     xi'  = eta - omega J xi                   J = a quarter turn
     eta' = -omega J eta + (phi J f + df) / m  + the change of the load per mass
     phi' = psi,  psi' = (-fy xi_x + fx xi_y + phi dtau + sum arm dF) / I + the change of the moment per inertia
-    dd   = n . xi - arm phi + de,             dd' its rate,     dF = F_d dd + F_d' dd' + what the law's numbers change
+    dd   = n . xi - arm phi + de,             dd' its rate,     dF = F_d dd + F_d' dd' + the change by the law's numbers
 
-with n the row of a penetration for X and Y, de its change by a clearance, dtau the change of the contacts' moment with
-the angle. The factors are series that the step has: each order is a sum of Cauchy products, eight columns side by side.
-At a touch the force jumps by C d' (Kelvin-Voigt). The motion displaced by a column touches earlier by dd / d', and has
-received the impulse C dd when the motion itself touches. All other changes of contact leave the force continuous.
+where n is the row of a penetration for X and Y, de its change by a clearance, and dtau the derivative of the contacts'
+moment by the angle. The factors are known as series of the step, so each order of a column is a sum of Cauchy products;
+eight columns are computed side by side.
+
+At a touch the force jumps by C d' (Kelvin-Voigt). The motion displaced by a column touches earlier by dd / d', so it
+has received the impulse C dd by the time that the motion itself touches. At all other changes of contact the force is
+continuous.
 """
 
 from __future__ import annotations
@@ -30,22 +33,22 @@ from plow_twin.solve.modes import within_range
 from plow_twin.solve.state import COS, MAX_ORDER, OFF, OMEGA, ON, SIN, VX, VY, Status, X, Y
 from plow_twin.solve.step import complete_step, lay_out_series_step
 
-#: Columns side by side.
+#: Number of columns computed side by side.
 WIDTH: Final = 8
-#: Derivatives by the state: the first columns.
+#: Number of columns that are derivatives by the state; they come first.
 STATE_COLUMNS: Final = 6
-#: Places and rates of a column: x, y, theta and their rates.
+#: Indices of a column's components.
 PLACE_X, PLACE_Y, PLACE_THETA, RATE_X, RATE_Y, RATE_THETA = range(6)
 
 _ROWS: Final = MAX_ORDER + 1
 _EIGHT: Final = (PAIR_COUNT, WIDTH)
 _OF_PAIRS: Final = (PAIR_COUNT, _ROWS, WIDTH)
 
-#: Eight columns: their parameters, and their series over a step.
+#: Eight columns: how they depend on parameters, and their series over a step.
 COLUMNS: Final = np.dtype(
     [
         ("series", "f8", (6, _ROWS, WIDTH)),
-        ("depth", "f8", _OF_PAIRS),  # pairs that act: change of penetration, of its rate, of force
+        ("depth", "f8", _OF_PAIRS),  # of pairs that act: change of penetration, of its rate, of force
         ("rate", "f8", _OF_PAIRS),
         ("force", "f8", _OF_PAIRS),
         ("load", "f8", (3, _ROWS, WIDTH)),  # change of the load per mass and inertia, world axes
@@ -56,11 +59,11 @@ COLUMNS: Final = np.dtype(
         ("stiffness", "f8", (WIDTH,)),
         ("viscous", "f8", (WIDTH,)),
         ("number", "f8", (WIDTH,)),  # derivative of D in lambda = D / v0
-        ("loaded", "i8"),  # 1 where a column changes a load
+        ("loaded", "i8"),  # 1 if any of the columns changes a load
     ]
 )
 
-#: Series of one step that all columns share: factors of the Cauchy products. Eight wide are state components or pairs.
+#: Series of one step that all columns share, as factors of the Cauchy products; lanes are state components or pairs.
 ALONG: Final = np.dtype(
     [
         ("spin", "f8", (_ROWS, PAIR_COUNT)),  # omega in each lane
@@ -70,12 +73,12 @@ ALONG: Final = np.dtype(
         ("by_depth", "f8", (_ROWS, PAIR_COUNT)),  # derivatives of the force
         ("by_rate", "f8", (_ROWS, PAIR_COUNT)),
         ("elastic", "f8", (_ROWS, PAIR_COUNT)),  # d^n
-        ("slope", "f8", (_ROWS, PAIR_COUNT)),  # its derivative by d
+        ("slope", "f8", (_ROWS, PAIR_COUNT)),  # derivative of d^n by d
         ("lift", "f8", (_ROWS, PAIR_COUNT)),  # 1 + lambda d'
         ("damped", "f8", (_ROWS, PAIR_COUNT)),  # d^n d'
         ("push", "f8", (4, _ROWS)),  # fx, fy, derivative of the moment by the angle, -fy
         ("mode", "i8", (PAIR_COUNT,)),  # before the step's event
-        ("waiting", "i8"),  # ends of stretches in a row at which no stretch began
+        ("waiting", "i8"),  # number of ends in a row at which no stretch began
     ]
 )
 Along: TypeAlias = np.record
@@ -87,7 +90,7 @@ _OK, _RANGE, _NON_FINITE, _BUDGET = (
 
 @kernel(fast=True)
 def _product(a, b, k):
-    """Return order k of the eight products of the columns of a and b."""
+    """Return order k of the products of a's and b's series, column by column."""
     low, high = splat(0.0), splat(0.0)
     for j in range(k // 2 + 1):
         low = low + row(a, j) * row(b, k - j)
@@ -98,7 +101,7 @@ def _product(a, b, k):
 
 @kernel(fast=True)
 def _expand_along(p, state, w, along, order, viscous, hysteretic, integer, fraction) -> None:
-    """Write the factors that all columns share from the series of a step in which pairs act."""
+    """Write the factors that all columns share, from the series of a step in which pairs act."""
     for k in range(order):
         set_row(along.spin, k, splat(w.series[k, OMEGA]))
         turned = _product(along.spin, w.series, k)
@@ -117,7 +120,7 @@ def _expand_along(p, state, w, along, order, viscous, hysteretic, integer, fract
 
 @kernel(fast=True)
 def _expand_law(p, state, w, along, order, viscous, hysteretic, integer, fraction) -> None:
-    """Write the derivatives of a force that is not linear in penetration and rate, by both."""
+    """Write the derivatives by penetration and by rate of a force that is not linear in them."""
     for k in range(order):
         elastic, slope = row(w.penetration, k), splat(1.0 if k == 0 else 0.0)
         if integer is not None:
@@ -148,7 +151,7 @@ def _expand_law(p, state, w, along, order, viscous, hysteretic, integer, fractio
 
 @kernel()
 def _slope_at_touch(w, along, order, pair) -> None:
-    """Write (d^n)' / d' of a pair that touches at the step's start, where d begins with the square of sigma."""
+    """Write (d^n)' / d' of a pair that touches at the step's start, where d is of order sigma^2."""
     first = 2.0 * w.penetration[2, pair]
     for k in range(order):
         along.slope[k, pair] = 0.0
@@ -161,9 +164,9 @@ def _slope_at_touch(w, along, order, pair) -> None:
 
 @kernel()
 def _expand_waves(omegas, amplitudes, state, w, columns, order) -> None:
-    """Write the series of the change of the loads in a block of columns.
+    """Write the series of the loads' change in eight columns.
 
-    `amplitudes` (h, 2, 3, 8) are the changes of sine and cosine amplitudes along x, y and theta.
+    `amplitudes`, shape (h, 2, 3, 8), holds the change of the sine and cosine amplitudes along x, y and theta.
     """
     load, t, alpha, beta = columns.load, state.step_start, state.alpha, state.beta
     for k in range(order):
@@ -184,7 +187,7 @@ def _expand_waves(omegas, amplitudes, state, w, columns, order) -> None:
 
 @kernel()
 def _times(factor, pair, series, k):
-    """Return order k of a column of `factor` times the eight series."""
+    """Return order k of the eight `series`, each multiplied by column `pair` of `factor`."""
     value = exact_splat(0.0)
     for j in range(k + 1):
         value = fused(exact_splat(factor[j, pair]), exact_row(series, k - j), value)
@@ -193,7 +196,7 @@ def _times(factor, pair, series, k):
 
 @kernel()
 def _change_force(p, state, w, along, columns, pair, k, moved, moved_rate, viscous, hysteretic, curved):
-    """Write order k of the change of a pair's force and return it; `moved` and `moved_rate` are n . xi and its rate."""
+    """Write and return order k of the change of a pair's force; `moved` and `moved_rate` are n . xi and its rate."""
     depth, rate, force, series = columns.depth[pair], columns.rate[pair], columns.force[pair], columns.series
     changed, changed_rate, by_angle = exact_splat(0.0), exact_splat(0.0), exact_splat(0.0)
     for j in range(k + 1):
@@ -304,7 +307,7 @@ def _move_columns(columns, order, sigma) -> None:
 
 @kernel()
 def _second_rate(state, w, pair):
-    """Return the second rate in time of a penetration at the step's end."""
+    """Return the second derivative by time of a penetration at the step's end [m/s^2]."""
     sigma, slope, bend = state.sigma_end, 0.0, 0.0
     for k in range(state.order, 0, -1):
         bend = bend * sigma + slope
@@ -315,7 +318,7 @@ def _second_rate(state, w, pair):
 
 @kernel()
 def _touch(p, state, w, columns, pair, viscous) -> None:
-    """Let a pair touch in eight columns: the impulse of columns that touch sooner, the change of the impact speed."""
+    """Add the effects of a touch to eight columns: the impulse of an earlier touch, the change of the impact speed."""
     y, now = state.y, columns.now
     c, s, om = y[COS], y[SIN], y[OMEGA]
     arm = row_value(p.arm_rows, pair, c, s, y[X], y[Y])
@@ -341,9 +344,9 @@ def _touch(p, state, w, columns, pair, viscous) -> None:
 
 @kernel()
 def _start_columns(c, s, columns, first) -> None:
-    """Begin a stretch: the columns of the state with a displacement of 1 each, columns of parameters with 0.
+    """Begin a stretch: each column of the state starts with a displacement of 1, each column of a parameter with 0.
 
-    A contact whose impact speed is fixed keeps its change by the parameters.
+    A contact that has already fixed its impact speed keeps the derivatives of its lambda by the parameters.
     """
     for lane in range(WIDTH):
         column = first + lane
@@ -361,7 +364,7 @@ def _start_columns(c, s, columns, first) -> None:
 
 @kernel()
 def _read_columns(c, s, columns, first, out) -> None:
-    """Write eight columns in world axes to `out`, shape (6, columns)."""
+    """Convert eight columns to world axes and write them to `out`, shape (6, columns)."""
     for lane in range(min(WIDTH, out.shape[1] - first)):
         for i in range(6):
             out[i, first + lane] = columns.now[i, lane]
@@ -372,7 +375,10 @@ def _read_columns(c, s, columns, first, out) -> None:
 
 @kernel()
 def _is_clear(p, state, room) -> bool:
-    """Return whether a stretch may begin: every pair is `room` from its wall, no contact has fixed its impact speed."""
+    """Return whether a stretch may begin.
+
+    Every pair must be at least `room` from touching, and no contact may have a damping fixed by its impact speed.
+    """
     for pair in range(PAIR_COUNT):
         if p.enabled[pair] == 1:
             if abs(penetration_of(p, state, pair, state.y)) < room:
@@ -384,7 +390,7 @@ def _is_clear(p, state, room) -> bool:
 
 @kernel()
 def _step(p, parts, state, w, along, columns, omegas, amplitudes, curved, end) -> bool:
-    """Take a step and the columns with it; return False where it is not finite."""
+    """Take a step of the motion and of the columns; return False if it is not finite."""
     terms = parts.terms
     if not lay_out_series_step(p, parts, state, w, end):
         return False
@@ -413,30 +419,31 @@ def follow_columns(
     p, parts, state, w, along, columns, omegas, amplitudes, curved, ends, room, longest_wait, reached, budget, out,
     whole,
 ) -> int:  # fmt: skip
-    """Take a motion and the columns beside it through stretches up to `ends`; return a `Status`.
+    """Advance a motion and its columns to each of `ends`, and begin a stretch there if one may; return a `Status`.
 
     Parameters
     ----------
     columns : ndarray of `COLUMNS`, shape (b,)
-        In blocks of eight; the first six are displacements of the state.
+        Blocks of eight columns; the first six columns are derivatives by the state.
     omegas, amplitudes
-        Angular frequencies (h,) of the loads that columns change, and their amplitudes (b, h, 2, 3, 8).
+        Angular frequencies [rad/s], shape (h,), of the loads that columns change, and the changes of their amplitudes,
+        shape (b, h, 2, 3, 8).
     curved : int or None
-        1 where the force is not linear in penetration and rate.
+        1 if the force is not linear in penetration and rate, else None.
     ends : ndarray, shape (n,)
         Times in s.
     room : float
-        Distance in m from walls at which a stretch may begin.
+        Least distance in m of every pair from touching for a stretch to begin.
     longest_wait : int
-        Ends in a row at which no stretch may begin; then the next one begins anyway.
+        Number of ends in a row without a new stretch after which one begins even without `room`.
     reached : ndarray of int64, shape (1,)
-        Number of ends reached; a call continues from there.
+        Number of ends reached so far, from which the call continues.
     budget : int
-        Steps of the motion at most.
+        Largest number of steps of the motion.
     out : ndarray, shape (n, 6, columns)
-        Receives the derivatives since the stretch's beginning, world axes.
+        Receives the derivatives since the beginning of the stretch, in world axes.
     whole : ndarray of int64, shape (n,)
-        Receives 1 where a stretch ends.
+        Receives 1 for each end at which a stretch ends and the next begins.
     """
     columns, omegas, amplitudes, ends, out = (
         unowned(columns), unowned(omegas), unowned(amplitudes), unowned(ends), unowned(out),

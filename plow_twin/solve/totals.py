@@ -1,4 +1,4 @@
-"""Totals of a motion: peaks, impulses, times and sets of corners from the force polynomials, and its events."""
+"""Totals of a motion (peaks, impulses, times and sets of corners, from the force polynomials) and its event log."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from plow_twin.solve.state import FIRST, ON, SECOND, SUM
 
 @kernel()
 def _seal(row_of, window) -> None:
-    """Give a row the sums of its whole window, and begin the next window; the count of touches continues."""
+    """Write the sums of the whole window to a row, and begin the next window; the count of touches continues."""
     for pair in range(PAIR_COUNT):
         row_of.makes[pair], row_of.impulse[pair] = window.makes[pair], window.impulse[pair]
         row_of.peak[pair], row_of.measured_peak[pair] = window.peak[pair], window.measured_peak[pair]
@@ -35,27 +35,28 @@ def _seal(row_of, window) -> None:
 def publish(rows, stamps, held, taken, windows, waits) -> int:
     """Sum up advances; the rows taken for publication get the sums since the publication before.
 
-    A taken row that failed gets the sums of the good rows before it; without a good row its stamp becomes 0.
+    A taken row whose advance failed gets motion and sums of the good rows before it; if there are none, its stamp
+    becomes 0.
 
     Parameters
     ----------
     rows : ndarray of `ROW`, shape (n,)
-        In order; failed advances are left out.
+        Advances in the order of time; failed advances add nothing to the sums.
     stamps : ndarray of int64, shape (n,)
-        Their stamps [ns].
+        Stamps of the advances [ns].
     held : int
-        1 where they were computed without samples.
+        1 if the advances were computed without samples, with held loads.
     taken : ndarray of int64, shape (m,)
-        Rising numbers of the rows that are published.
+        Indices of the rows to publish, increasing.
     windows : ndarray of `ROW`, shape (1,)
-        Sums since the publication before, and the motion of the newest good advance that waits.
+        Sums since the publication before, and the motion of the newest good advance not yet published.
     waits : int
-        1 where an advance waits to be published.
+        1 if an advance waits to be published.
 
     Returns
     -------
     int
-        1 where an advance waits now.
+        1 if an advance still waits to be published.
     """
     window, place, newest = windows[0], 0, -1
     for n in range(rows.size):
@@ -115,13 +116,13 @@ def publish_window(windows, rows) -> None:
 
 @kernel(entry=True)
 def summary(rows, n) -> tuple[int, int, int, int, float, float, float, bool]:
-    """Return the facts of row `n` that every publication needs, in one call instead of a look at each field.
+    """Return the fields of row `n` that every publication needs, in one call, which is faster than single reads.
 
     Returns
     -------
     tuple
         Stamp [ns], whether it is marked, whether it is held, number of samples, x, y [m], the largest force of a pair
-        where there were samples [N], and whether pose, rates, contacts and sums are finite.
+        in advances with samples [N], and whether pose, rates, contacts and sums are finite.
     """
     row_of = rows[n]
     largest, total = row_of.measured_peak[0], 0.0
@@ -137,9 +138,9 @@ def summary(rows, n) -> tuple[int, int, int, int, float, float, float, bool]:
 
 @kernel(fast=True)
 def _sums(w, order, h) -> None:
-    """Write a bound of each force over [0, h] and its integrals: sum f_k h^k / (k+1), sum f_k h^k / (k+2).
+    """Write an upper bound of each force over [0, h], and the sums of f_k h^k / (k+1) and f_k h^k / (k+2).
 
-    Between its ends a function exceeds them by h^2 / 8 times its largest curvature at most.
+    The bound is the larger value at the two ends plus h^2 / 8 times a bound of the curvature.
     """
     end = bend = first = second = splat(0.0)
     for k in range(order, -1, -1):
@@ -156,7 +157,7 @@ def _sums(w, order, h) -> None:
 
 @kernel()
 def add_to_totals(state, w, low, high, totals) -> None:
-    """Add the motion between two sigmas of the step to the totals: peaks, impulses, times, sets of corners."""
+    """Add peaks, impulses, times and sets of corners of the motion from sigma `low` to `high` of the step."""
     mode = state.mode
     acting = 0
     for pair in range(PAIR_COUNT):
@@ -190,7 +191,10 @@ def add_to_totals(state, w, low, high, totals) -> None:
 
 @kernel()
 def add_set_times(totals, carrying, elapsed) -> None:
-    """Add a time to the sets of corners that carry force together, one for each sense; `carrying` has a bit a pair."""
+    """Add a time to the set of corners that carry force together, for each sense of rotation.
+
+    Bit i of `carrying` is set if pair i carries force.
+    """
     ccw = cw = 0
     for pair in range(PAIR_COUNT):
         if carrying >> pair & 1 == 1:
@@ -204,7 +208,7 @@ def add_set_times(totals, carrying, elapsed) -> None:
 
 @kernel()
 def log_event(log, totals, time, pair, mode_from, mode_to, rate) -> None:
-    """Write one change of contact to the event log, which has room for it."""
+    """Write one change of contact to the event log; the caller makes sure that the log has room."""
     event = log[totals.logged]
     event.time, event.pair, event.rate = time, pair, rate
     event.mode_from, event.mode_to = mode_from, mode_to

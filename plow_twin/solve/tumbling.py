@@ -1,8 +1,9 @@
-"""A block that tumbles: after each quarter turn its corners are renamed by their new places.
+"""A tumbling block: beyond 45 degrees, and after each further quarter turn, its corners are renamed by their places.
 
-Up to 45 degrees the corner named bottom left is the lower left corner. Beyond, another corner is, and the state of a
-pair (mode, damping, anchor) passes to the pair of that name on the same wall. A square block looks the same, so the
-geometry's rows stay; cosine and sine of the state start again 90 degrees before (`kinematics.named_angle`).
+Up to 45 degrees the corner named bottom left is the lower left corner. Beyond 45 degrees another corner is the lower
+left corner and gets this name. The state of each pair (mode, damping, anchor) is passed to the pair with the corner's
+new name at the same wall. A square block looks the same after a quarter turn, so the geometry's rows stay; the angle
+whose cosine and sine are in the state jumps back by 90 degrees (`kinematics.named_angle`).
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from plow_twin.solve.modes import penetration_and_rate
 from plow_twin.solve.state import COS, OFF, OMEGA, ON, RELEASED, SIN, THETA
 from plow_twin.solve.totals import log_event
 
-#: Pairs of each wall: first of the corner that leads in a counter-clockwise turn, then of the corner behind it.
+#: Two pairs of each wall: of the corner that leads in a counter-clockwise turn, and of the corner behind it.
 _HANDED_OVER = tuple(
     (PAIR_NAMES.index(leading), PAIR_NAMES.index(following))
     for leading, following in (
@@ -27,13 +28,13 @@ _HANDED_OVER = tuple(
         ("top_right_right", "bottom_right_right"),
     )
 )
-#: Angle in rad short of 45 degrees that counts as 45 degrees: some roundings of a root.
+#: Tolerance in rad for reaching 45 degrees: some rounding errors of a root.
 _THERE = 1e-12
 
 
 @kernel()
 def turn_at(p, state, w, order, best) -> float:
-    """Return where in a step the block reaches 45 degrees before `best`, otherwise `best`."""
+    """Return the sigma at which the block reaches 45 degrees, or `best` if that comes first."""
     if not may_tumble(p):
         return best
     column, angle = w.column[0], named_angle(p, state.y, state.y[THETA])
@@ -48,7 +49,7 @@ def turn_at(p, state, w, order, best) -> float:
 
 @kernel()
 def turn_corners(p, state, stick, totals, log) -> None:
-    """Let the corners of a block that has reached 45 degrees take their next names."""
+    """Rename the corners of a block that has reached 45 degrees."""
     if not may_tumble(p):
         return
     y = state.y
@@ -66,7 +67,7 @@ def turn_corners(p, state, stick, totals, log) -> None:
 
 @kernel()
 def _hand_over(p, state, stick, totals, log, old, new) -> None:
-    """Pass the state of pair `old` to pair `new` of the same wall; a pair that cannot touch takes over nothing."""
+    """Copy the state of pair `old` to pair `new` of the same wall, unless `new` cannot touch."""
     mode = state.mode[old] if p.enabled[new] == 1 else OFF
     if log is not None:
         rate = penetration_and_rate(p, state, old)[1]
@@ -84,7 +85,7 @@ def _hand_over(p, state, stick, totals, log, old, new) -> None:
 
 @kernel()
 def _log(log, totals, time, pair, old, new, rate) -> None:
-    # to the outside a released pair is on
+    # the log shows a released pair as on
     old, new = ON if old == RELEASED else old, ON if new == RELEASED else new
     if old != new:
         log_event(log, totals, time, pair, old, new, rate)

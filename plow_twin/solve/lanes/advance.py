@@ -1,7 +1,7 @@
-"""Many live twins under sampled loads in lanes: each goes from sample to sample and writes a row at each.
+"""Many live twins in lanes under sampled loads: a twin advances from sample to sample and writes a row at each sample.
 
-Under a frequently sampled load a step ends at the next sample, long before its series loses accuracy, so a series is
-cut where its terms vanish over that step (`series.expand`).
+If a load is sampled frequently, a step ends at the next sample long before its series loses accuracy. So a series is
+ended at the order whose terms vanish over this step (`series.expand`).
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ from plow_twin.solve.method.rest import slow_enough
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, Status, X, Y
 from plow_twin.solve.step import LONGEST_STEP
 
-#: Steps to a sample after which rest is checked under a constant load: the check costs as much.
+#: Number of steps to a sample after which rest is checked under a constant load; the check costs as much as they do.
 _MAY_REST: Final = 32
-#: Share of the last order's admissible size, below which a term has vanished (`method.series`).
+#: A term has vanished if it is below this share of the admissible size of the last order (`method.series`).
 _VANISHED: Final = 0.4
 _SHORTEST_SPAN: Final = 1e-100
 
@@ -56,19 +56,19 @@ _AT_SAMPLE: Final = 7
 
 
 class Samples(NamedTuple):
-    """The samples that twins are advanced through, and the progress of each twin."""
+    """The samples through which twins are advanced, and the progress of each twin."""
 
     params: NDArray[np.void]  #: parameters of all twins, shape (m,)
     states: NDArray[np.void]
     saved: NDArray[np.void]  #: states of the scenes in the lanes at the sample before, shape (8,)
-    totals: NDArray[np.void]  #: touches since then of the scenes in the lanes, shape (8,)
-    times: NDArray[np.float64]  #: times of the samples, shape (n,)
-    wrench: NDArray[np.float64]  #: per mass and inertia, the last sample first, shape (m, n + 1, 3)
-    rows: NDArray[np.void]  #: shape (m, n)
-    place: NDArray[np.int64]  #: samples that each twin has passed, shape (m,)
-    queue: NDArray[np.int64]  #: twins that wait for a lane
-    progress: NDArray[np.int64]  #: twins taken from the queue; twins that have left for another method
-    other: NDArray[np.int64]  #: their numbers, shape (m,)
+    totals: NDArray[np.void]  #: touches since the sample before of the scenes in the lanes, shape (8,)
+    times: NDArray[np.float64]  #: times of the samples in s, shape (n,)
+    wrench: NDArray[np.float64]  #: per mass and inertia, beginning with the last sample before, shape (m, n + 1, 3)
+    rows: NDArray[np.void]  #: rows to fill, shape (m, n)
+    place: NDArray[np.int64]  #: number of samples that each twin has passed, shape (m,)
+    queue: NDArray[np.int64]  #: numbers of the twins that wait for a lane
+    progress: NDArray[np.int64]  #: number of twins taken from the queue; number that left for another method
+    other: NDArray[np.int64]  #: numbers of the twins that left for another method, shape (m,)
 
 
 @kernel(inline="source")
@@ -82,7 +82,7 @@ def _unowned_samples(s):
 
 @kernel()
 def _begin_sample(s, lanes, lane) -> None:
-    """Let the load of a lane run straight to the next sample; save its present state."""
+    """Make the load of a lane linear up to the next sample, and save the lane's present state."""
     member = lanes.member[lane]
     i, state = s.place[member], s.states[member]
     lanes.stop[lane], lanes.knot[lane], lanes.before[lane] = s.times[i], lanes.time[lane], state.steps
@@ -97,7 +97,7 @@ def _begin_sample(s, lanes, lane) -> None:
 
 @kernel()
 def _load_next(s, lanes, lane) -> None:
-    """Move the next twin that waits into a lane."""
+    """Move the next waiting twin into a lane."""
     member = s.queue[s.progress[0]]
     s.progress[0] += 1
     p = s.params[member]
@@ -117,7 +117,7 @@ def _clear_sums(s, lanes, lane) -> None:
 
 @kernel()
 def _leave(s, lanes, lane) -> None:
-    """Take a twin out of its lane, with its state at the sample before."""
+    """Take a twin out of its lane, and set it back to its state at the sample before."""
     member = lanes.member[lane]
     _clear_sums(s, lanes, lane)
     save_lane(s.states[member], s.totals[lane], lanes, lane)
@@ -126,7 +126,7 @@ def _leave(s, lanes, lane) -> None:
 
 @kernel()
 def _fail(s, lanes, lane, code) -> None:
-    """Undo the advance of a lane, with its time at the next sample; its twin waits for a lane again."""
+    """Undo a failed advance: the twin keeps its state, with the time of the next sample, and waits for a lane again."""
     member = lanes.member[lane]
     i, steps = s.place[member], s.states[member].steps - lanes.before[lane]
     _leave(s, lanes, lane)
@@ -148,7 +148,7 @@ def _fail(s, lanes, lane, code) -> None:
 def _tell(lanes, reached, viscous, hysteretic) -> None:
     """Write pose, rates, penetrations, their rates and forces of all lanes to `lanes.out` and `lanes.told`.
 
-    The force at the sample raises the peak where a sample was `reached`.
+    In lanes that have `reached` a sample, the force at the sample raises the peak.
     """
     for i in range(COMPONENTS):
         set_row(lanes.out, i, exact_row(lanes.y, i))
@@ -212,9 +212,9 @@ def _clear_reached(s, lanes, reached) -> None:
 
 @kernel()
 def _go_on(s, lanes, lane) -> bool:
-    """Let a lane that has reached a sample go on to the next one, or its twin leave after the last.
+    """Begin the advance of a lane to its next sample; after the last sample its twin leaves.
 
-    Returns whether it can take a step at once, without another check.
+    Returns whether the lane can take a step at once, without another check.
     """
     member = lanes.member[lane]
     state = s.states[member]
@@ -237,7 +237,7 @@ def _is_steady(lanes, lane) -> bool:
 
 @kernel()
 def _look(s, rest, lanes, lane, budget, in_range) -> int:
-    """Return `OK` where a lane takes a step, `_AT_SAMPLE` where it has reached a sample, otherwise why it leaves."""
+    """Return `OK` if a lane can take a step, `_AT_SAMPLE` if it has reached a sample, else the code of its failure."""
     member = lanes.member[lane]
     p, state = s.params[member], s.states[member]
     if not in_range and not lane_in_range(lanes, p, state, lane):
@@ -258,7 +258,7 @@ def _look(s, rest, lanes, lane, budget, in_range) -> int:
 
 @kernel()
 def _get_ready(s, viscous, hysteretic, rest, lanes, budget) -> bool:
-    """Write rows of the reached samples and fill the lanes; return whether any lane has a step to take."""
+    """Write the rows of reached samples and fill empty lanes; return whether any lane has a step to take."""
     while True:
         in_range, reached, live, changed = bits_in_range(lanes), 0, False, False
         for lane in range(WIDTH):
@@ -324,11 +324,11 @@ def _step(s, viscous, hysteretic, order, lanes, w) -> None:
 
 @kernel(entry=True)
 def advance_lanes(s, viscous, hysteretic, rest, order, eight, work, budget, iterations) -> bool:
-    """Advance the twins in the queue through all samples, eight at a time; return False where `iterations` are used up.
+    """Advance the twins in the queue through all samples, eight at a time; return False if `iterations` are used up.
 
-    `eight` and `work`, (1,), are lanes and scratch space. `budget` are the steps that an advance to a sample may take.
-    Where an advance fails the twin keeps its state, and its time continues. A twin at rest leaves its lane before the
-    advance (`Samples.other`).
+    `eight` and `work`, shape (1,), are lanes and scratch space. `budget` is the largest number of steps of an advance
+    to a sample. If an advance fails, the twin keeps its state and its time goes on. A twin at rest leaves its lane
+    before the advance, for another method (`Samples.other`).
     """
     s, lanes, w = _unowned_samples(s), eight[0], work[0]
     for _ in range(iterations):

@@ -1,8 +1,8 @@
 """The first event of each lane's step.
 
-Few guards can turn negative within a step. Each lane lists its guards; each round searches eight of them, of any lanes.
-A pair whose force is clipped to zero ends no step when it parts, because no force changes; the rest of the step is
-searched for the pair's next touch.
+Few guards can turn negative within a step. Each lane lists these guards, and each round searches eight of them, of any
+lanes. If a clipped pair parts, the step does not end, because no force changes; the rest of the step is then searched
+for the pair's next touch.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from plow_twin.solve.lanes.record import (
 )
 from plow_twin.solve.state import CLIPPED, COS, OFF, ON, SIN, X, Y
 
-#: Events are one instant when they are closer than this share of the step before them.
+#: Events are simultaneous if they are closer than this share of the step before them.
 _AT_ONCE = 1e-12
-#: Change of a root that ends its search, as the next change is of the order of its cube, and rounding errors of the
-#: root.
+#: The search of a root ends if its relative change is below `_FOUND` and the curvature's part in it below `_STRAIGHT`,
+#: because the next change would be of the order of its cube, or if the change is a rounding error (`_ROUNDED`).
 _FOUND, _STRAIGHT, _ROUNDED = 1e-6, 1e-3, 2e-16
 _MOST_CHANGES = 80
-#: A root found over a longer step lies beyond the step by more than its rounding errors.
+#: Factor on the step beyond which a root found over a longer step lies surely after the step, in spite of rounding.
 _SURELY_LATER = 1.0 + 1e-9
-#: Rows of `lanes.chosen` after those of a penetration.
+#: Rows of `lanes.chosen` after the rows of a penetration.
 _DEPTH, _RATE, _CONSTANT = 5, 6, 7
 
 
@@ -41,7 +41,8 @@ _DEPTH, _RATE, _CONSTANT = 5, 6, 7
 def _list_guards(lanes, order, hysteretic) -> None:
     """Write to `lanes.todo` a bit for each guard of a lane that is not proved to stay positive.
 
-    off: -d; on: F / K = d + (C / K) d', or d and 1 + lambda d'; clipped: d, and the force with the other sign.
+    The guard of a pair that is off is -d. A pair that is on has the guard F / K = d + (C / K) d', or with lambda d' the
+    two guards d and 1 + lambda d'. The guards of a clipped pair are d and the force with the opposite sign.
     """
     for lane in range(WIDTH):
         lanes.todo[lane] = lanes.watched[lane]
@@ -108,11 +109,11 @@ def _row_of(array, k, places):
 
 @kernel()
 def _write_guard(lanes, places, rows, of_depth, of_rate, constant, guard, order, h):
-    """Write to `guard` the series of the guards `of_depth` d + `of_rate` d' + `constant`, d the penetrations.
+    """Write to `guard` the series of the guards `of_depth` d + `of_rate` d' + `constant`, with the penetrations d.
 
-    Returns a bit for each guard that may turn negative. `places` are the guards' lanes, None for one guard of each lane
-    in turn. A guard g is positive on [0, h] where g_0 and g_0 + g_1 h - sum over k > 1 of max(-g_k, 0) h^k are: that
-    bound is concave.
+    `places` has the guards' lanes; None means one guard of each lane in turn. Returns a bit for each guard that may
+    turn negative. A guard g stays positive on [0, h] if g_0 and g_0 + g_1 h - sum over k > 1 of max(-g_k, 0) h^k are
+    positive, because this lower bound is concave in h.
     """
     cosine, sine, x, y = lanes.series[COS], lanes.series[SIN], lanes.series[X], lanes.series[Y]
     reach = term = deeper = zero = exact_splat(0.0)
@@ -136,7 +137,7 @@ def _write_guard(lanes, places, rows, of_depth, of_rate, constant, guard, order,
 
 @kernel()
 def _choose_guards(lanes, at, hysteretic) -> int:
-    """Choose up to eight guards, the next of each lane first, then those after it; return their number."""
+    """Choose up to eight guards: first the next guard of each lane, then the guards after it; return their number."""
     count, before = 0, -1
     while before < count < WIDTH:
         before = count
@@ -155,7 +156,7 @@ def _choose_guards(lanes, at, hysteretic) -> int:
 
 @kernel()
 def _write_choice(lanes, lane, guard, i, hysteretic) -> None:
-    """Write the factors of guard `i` of a round and how far it is searched."""
+    """Write the factors of guard `i` of a round and the end of its search."""
     chosen, pair = lanes.chosen, guard % PAIR_COUNT
     mode, sign, constant, rate = lanes.mode[pair, lane], 1.0, 0.0, lanes.viscous[lane] / lanes.stiffness[lane]
     begin = 0.0
@@ -175,7 +176,7 @@ def _write_choice(lanes, lane, guard, i, hysteretic) -> None:
 
 @kernel()
 def _shift(lanes, guard, order, again) -> None:
-    """Let the guards of pairs that have parted begin at that point."""
+    """Shift the guards of pairs that have parted to begin at the time of parting."""
     x, zero = exact_row(lanes.begin, 0), exact_splat(0.0)
     for r in range(order):
         after = exact_row(guard, order)
@@ -187,9 +188,10 @@ def _shift(lanes, guard, order, again) -> None:
 
 @kernel()
 def isolate(lanes, column, w, order, bits):
-    """Return bits for lanes whose column has one root in [0, reach), and for several; write the chord's root to `root`.
+    """Return the bits of lanes whose column has one root in [0, reach), and of lanes that may have several.
 
-    The Bernstein coefficients have as many sign changes as roots, or an even number more.
+    The root of the chord is written to `root`. The number of sign changes of the Bernstein coefficients is the number
+    of roots, or larger by an even number.
     """
     h, b, zero = exact_row(lanes.reach, 0), lanes.bernstein, exact_splat(0.0)
     to_bernstein(lanes, column, w, order, h)
@@ -212,7 +214,7 @@ def isolate(lanes, column, w, order, bits):
 
 @kernel()
 def cross(lanes, column, order, bits) -> None:
-    """Follow each column to its only root in [0, reach] by Halley's method within the bracket (`polynomial`)."""
+    """Find each column's only root in [0, reach] by Halley's method kept within the bracket (`polynomial`)."""
     low, high, x = exact_splat(0.0), exact_row(lanes.reach, 0), exact_row(lanes.root, 0)
     zero, open_bits = exact_splat(0.0), bits
     for _ in range(_MOST_CHANGES):
@@ -241,7 +243,7 @@ def cross(lanes, column, order, bits) -> None:
 
 @kernel()
 def _leaves(guard, i, order, h) -> bool:
-    """Return whether a penetration surely falls all the time."""
+    """Return whether a penetration surely falls over the whole step."""
     rise = 0.0
     for k in range(order, 1, -1):
         rise = (rise + k * max(guard[k, i], 0.0)) * h
@@ -250,7 +252,7 @@ def _leaves(guard, i, order, h) -> bool:
 
 @kernel()
 def _note_root(lanes, lane, at, i, order) -> None:
-    """Use the root of a guard: it ends the step, or marks the parting of a pair."""
+    """Use the root of a guard to end the step, or to record the parting of a clipped pair."""
     guard, root = lanes.guarded[at, i], lanes.root[i] + lanes.begin[i]
     pair = guard % PAIR_COUNT
     if guard < SECOND and lanes.mode[pair, lane] == CLIPPED:
@@ -267,9 +269,10 @@ def _note_root(lanes, lane, at, i, order) -> None:
 
 @kernel()
 def first_events(states, lanes, w, order, full, hysteretic) -> None:
-    """Let each lane's step end at its first event; note the guard in `lanes.event`, -1 without one.
+    """Shorten each lane's step to end at its first event; write the guard to `lanes.event`, or -1 without an event.
 
-    `order` is the order of the series. Guards have `full` orders, the largest: Bernstein coefficients depend on them.
+    `order` is the order of the series. Guards always have `full` orders, the largest, because the bits of their
+    Bernstein coefficients depend on the number of orders.
     """
     never = exact_splat(np.inf)
     for pair in range(PAIR_COUNT):
@@ -278,7 +281,7 @@ def first_events(states, lanes, w, order, full, hysteretic) -> None:
     for lane in range(WIDTH):
         lanes.event[lane] = -1
     _list_guards(lanes, order, hysteretic)
-    # every round settles a guard of each lane that has any
+    # every round searches at least one guard of each lane that has any
     for at in range(GUARDS):
         lanes.rounds[0] = at
         count = _choose_guards(lanes, at, hysteretic)
@@ -311,7 +314,7 @@ def _write_chosen(lanes, at, order, full):
 
 @kernel()
 def _search(states, lanes, w, at, order, bits) -> None:
-    """Look for the first root of each guard; a guard whose step has become shorter is searched again if it matters."""
+    """Find the first root of each guard; a guard is searched again if its step has become shorter and this matters."""
     guard = lanes.guard[at]
     single, several = isolate(lanes, guard, w, order, bits)
     if single != 0:
@@ -339,7 +342,7 @@ def _search(states, lanes, w, at, order, bits) -> None:
 
 @kernel()
 def _next_mode(mode, viscous):
-    """Return the mode that follows when a pair's first guard ends it."""
+    """Return the mode that follows `mode` when the pair's first guard turns negative."""
     if mode == OFF:
         return ON
     return CLIPPED if mode == ON and viscous is not None else OFF
@@ -347,7 +350,7 @@ def _next_mode(mode, viscous):
 
 @kernel(inline="source")
 def _other_mode(mode):
-    """Return the mode that follows when a pair's second guard ends it."""
+    """Return the mode that follows `mode` when the pair's second guard turns negative."""
     return CLIPPED if mode == ON else ON
 
 
@@ -363,9 +366,9 @@ def _ends_with(guard, order, at, within):
 
 @kernel()
 def note_switches(lanes, order, viscous) -> None:
-    """Write the modes that pairs take at the end of the steps to `lanes.switch`, -1 for those that stay.
+    """Write the modes that pairs take at the end of the steps to `lanes.switch`, -1 for pairs that keep their mode.
 
-    Events that differ in time only by rounding happen together, so that a symmetric motion stays symmetric.
+    Pairs whose events differ in time only by rounding switch together, so that a symmetric motion stays symmetric.
     """
     ending = 0
     for lane in range(WIDTH):
@@ -383,7 +386,7 @@ def note_switches(lanes, order, viscous) -> None:
             guard, lane = lanes.guarded[at, i], lanes.owner[at, i]
             if lanes.event[lane] >= 0 and 0 <= guard < AGAIN:
                 pair = guard % PAIR_COUNT
-                # a first guard comes before a second
+                # a first guard takes precedence over a second guard
                 if lanes.switch[pair, lane] < 0 and lanes.parted[pair, lane] >= lanes.step[lane]:
                     _note_switch(lanes, lane, guard, viscous)
     for lane in range(WIDTH):
@@ -393,7 +396,7 @@ def note_switches(lanes, order, viscous) -> None:
 
 @kernel()
 def _note_switch(lanes, lane, guard, viscous) -> None:
-    """Note the mode that follows when a guard ends."""
+    """Record the mode that follows when a guard turns negative."""
     pair = guard % PAIR_COUNT
     mode = lanes.mode[pair, lane]
     if guard >= AGAIN:

@@ -1,4 +1,4 @@
-"""The loop over lanes: each takes its own steps through its own scene, and then takes the next scene."""
+"""The loop over lanes: each lane runs a scene by the scene's own steps, then takes the next scene."""
 
 from __future__ import annotations
 
@@ -34,36 +34,36 @@ from plow_twin.solve.step import LONGEST_STEP, ONE_INSTANT, PAST_AN_INSTANT
 
 
 class Members(NamedTuple):
-    """Arrays of all scenes of a run, whose first axis numbers the scenes."""
+    """Arrays of all scenes of a run; their first axis is the scene."""
 
     params: NDArray[np.void]
     states: NDArray[np.void]
     totals: NDArray[np.void]
     harmonics: NDArray[np.void]  #: harmonics of all scenes, one scene after the other
-    extent: NDArray[np.int64]  #: where the harmonics of each scene begin, and their number
+    extent: NDArray[np.int64]  #: index of each scene's first harmonic, number of its harmonics
     status: NDArray[np.int64]
-    first: NDArray[np.int64]  #: rows written
+    first: NDArray[np.int64]  #: number of rows written
     q: NDArray[np.float64]
     v: NDArray[np.float64]
 
 
 _OK, _RANGE, _NON_FINITE = int(Status.OK), int(Status.OUT_OF_RANGE), int(Status.NON_FINITE)
 _BUDGET, _PAUSED = int(Status.BUDGET), int(Status.PAUSED)
-#: Internal: another method takes the next step; the scene has reached the end.
+#: Internal results of a lane: another method must take the next step; the scene has reached the end.
 OTHER_METHOD: Final = 6
 _DONE: Final = 7
 
 
 @kernel()
 def lane_in_range(lanes, p, state, lane) -> bool:
-    """Return whether the model holds for the scene in a lane."""
+    """Return whether the model is valid at the state of a lane."""
     write_place(state, lanes, lane)
     return within_range(p, state, state.y)
 
 
 @kernel()
 def bits_in_range(lanes):
-    """Return a bit for each lane in which surely the model holds (`modes.within_range`)."""
+    """Return a bit for each lane in which the model is surely valid (`modes.within_range`)."""
     c, s, x, y = exact_row(lanes.y, COS), exact_row(lanes.y, SIN), exact_row(lanes.y, X), exact_row(lanes.y, Y)
     bits = below(magnitude(exact_row(lanes.y, THETA)), exact_splat(LARGEST_ANGLE))
     for pair in range(PAIR_COUNT):
@@ -73,7 +73,7 @@ def bits_in_range(lanes):
 
 @kernel()
 def _another_method(p, harmonics, extent, flight, rest, state, lanes, lane, w, span) -> bool:
-    """Return whether the next step of a lane may be free flight or rest, which the lanes do not take."""
+    """Return whether the next step of a lane may be free flight or rest, which lanes cannot compute."""
     if lanes.inside[lane] == 0:
         if flight is not None:
             for j in range(3):
@@ -90,7 +90,7 @@ def _another_method(p, harmonics, extent, flight, rest, state, lanes, lane, w, s
 
 @kernel()
 def _look(members, flight, rest, lanes, lane, w, t_end, budget, in_range) -> int:
-    """Return `OK` where the scene in a lane takes its next step there, otherwise the status it leaves with."""
+    """Return `OK` if the lane can take its scene's next step, otherwise the status with which the scene leaves."""
     member = lanes.member[lane]
     p, state = members.params[member], members.states[member]
     if not in_range and not lane_in_range(lanes, p, state, lane):
@@ -109,7 +109,7 @@ def _look(members, flight, rest, lanes, lane, w, t_end, budget, in_range) -> int
 
 @kernel()
 def _fill_rows(lanes, lane, order, t, i, end, q, v) -> int:
-    """Fill the rows within a lane's step from row i on, eight instants at once; return the first row after it."""
+    """Fill the rows within a lane's step from row i on, eight at once; return the first row after the step."""
     last, begin, sigma = i, lanes.time[lane], lanes.root
     while last < t.size and t[last] < end:
         last += 1
@@ -118,7 +118,7 @@ def _fill_rows(lanes, lane, order, t, i, end, q, v) -> int:
         for j in range(WIDTH):
             sigma[j] = max(t[i + min(j, count - 1)] - begin, 0.0)
         at = exact_row(sigma, 0)
-        # sums side by side need not wait for each other
+        # four sums side by side keep the processor busy, since no sum waits for another
         for first in range(0, COMPONENTS, 4):
             one, two = lanes.series[first], lanes.series[first + 1]
             three, four = lanes.series[first + 2], lanes.series[first + 3]
@@ -142,7 +142,7 @@ def _fill_rows(lanes, lane, order, t, i, end, q, v) -> int:
 
 @kernel()
 def turn(out, first, second) -> None:
-    """Resolve a vector at eight instants along world axes."""
+    """Convert a vector at eight instants to world axes."""
     c, s, x, y = exact_row(out, COS), exact_row(out, SIN), exact_row(out, first), exact_row(out, second)
     set_row(out, first, fused(c, x, s * y * -1.0))
     set_row(out, second, fused(s, x, c * y))
@@ -150,7 +150,7 @@ def turn(out, first, second) -> None:
 
 @kernel()
 def _part(state, sums, lanes, lane) -> None:
-    """Part the clipped pairs that leave their wall within a lane's step."""
+    """Set the clipped pairs that leave their wall within a lane's step to off."""
     for pair in range(PAIR_COUNT):
         if lanes.parted[pair, lane] < lanes.step[lane]:
             lanes.mode[pair, lane] = OFF
@@ -160,7 +160,7 @@ def _part(state, sums, lanes, lane) -> None:
 
 @kernel()
 def _touch(p, lanes, pair, lane) -> None:
-    """Start a contact: read its impact speed, lambda = D / v0 (`modes.touch`)."""
+    """Start a contact: fix its lambda = D / v0 by the impact speed v0 (`modes.touch`)."""
     if p.damping_number >= 0.0:
         y = lanes.y
         rate = rate_at(
@@ -171,7 +171,7 @@ def _touch(p, lanes, pair, lane) -> None:
 
 @kernel()
 def _switch(p, state, sums, lanes, lane, hysteretic) -> None:
-    """Let the pairs of a lane change their modes at the step's end."""
+    """Change the modes of a lane's pairs at the step's end."""
     for pair in range(PAIR_COUNT):
         new, old = lanes.switch[pair, lane], lanes.mode[pair, lane]
         if new < 0:
@@ -195,7 +195,7 @@ def end_of(lanes, lane):
 
 @kernel()
 def complete(p, state, sums, lanes, lane, hysteretic) -> None:
-    """Move the time, counts and modes of a lane to the end of its step; its state is there already."""
+    """Move the time, counts and modes of a lane to the end of its step; its state must already be there."""
     begin, parted = lanes.time[lane], False
     state.steps += 1
     state.evaluations += lanes.orders[lane]
@@ -222,7 +222,7 @@ def complete(p, state, sums, lanes, lane, hysteretic) -> None:
 
 @kernel()
 def move(lanes) -> None:
-    """Add the changes over the steps to the states; compute cosine and sine again from the angle."""
+    """Add the changes over the steps to the states, and recompute cosine and sine from the angle."""
     for component in range(COMPONENTS):
         set_row(lanes.y, component, exact_row(lanes.y, component) + exact_row(lanes.change, component))
     turn_lanes(lanes.y[THETA], lanes.y[COS], lanes.y[SIN])
@@ -230,7 +230,7 @@ def move(lanes) -> None:
 
 @kernel()
 def go_past_an_instant(params, states, lanes) -> None:
-    """Step past an instant at which modes would flip without end, keeping the present modes."""
+    """Step beyond an instant at which modes would change back and forth without end, with the present modes."""
     for lane in range(WIDTH):
         member = lanes.member[lane]
         if member >= 0 and lanes.event[lane] >= 0:
@@ -244,7 +244,7 @@ def go_past_an_instant(params, states, lanes) -> None:
 
 @kernel()
 def _leave(members, lanes, w, order, lane, code, t) -> None:
-    """Take the scene out of a lane, with its status; at the end write the remaining rows."""
+    """Take the scene out of a lane and record its status; if it is at the end, write the remaining rows."""
     member = lanes.member[lane]
     p, state = members.params[member], members.states[member]
     find_peaks(lanes, w, order - 1)
@@ -279,10 +279,10 @@ def _unowned_members(members):
 def run_lanes(
     members, waves, second, viscous, hysteretic, flight, rest, order, lanes, w, queue, t_end, budget, iterations, t
 ) -> bool:
-    """Advance the members numbered in `queue` to `t_end`, eight at a time; return False where `iterations` are used up.
+    """Advance the members numbered in `queue` to `t_end`, eight at a time; return False if `iterations` are used up.
 
-    `t` are the times of the rows, `order` is the series' order, `budget` the steps that each scene may take. A scene
-    leaves its lane with a `Status`, `OTHER_METHOD` or, where the iterations are used up, `PAUSED`.
+    `t` holds the times of the rows, `order` is the series' order, and `budget` the largest number of steps of a scene.
+    A scene leaves its lane with a `Status`, with `OTHER_METHOD` or, when the iterations are used up, with `PAUSED`.
     """
     members, queue, t = _unowned_members(members), unowned(queue), unowned(t)
     waiting = 0

@@ -1,4 +1,4 @@
-"""Eight scenes side by side: their series and constants, one number a lane in each row."""
+"""The record of eight scenes side by side: series and constants whose rows have one number for each scene (lane)."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.compiled_scene import CompiledScene, options
 from plow_twin.solve.state import CLIPPED, COS, MAX_ORDER, OFF, ON, Terms, new_records
 
-#: Scenes in a vector.
+#: Number of scenes in a vector.
 WIDTH: Final = 8
-#: Components of the state in a lane's series.
+#: Number of state components in a lane's series.
 COMPONENTS: Final = 8
-#: Indices of the factors of cosine, sine, X and Y in the moment.
+#: Indices of the moment's factors of cosine, sine, X and Y.
 DC, DS, DX, DY = range(4)
-#: First guards of the eight pairs, second guards of clipped pairs, pairs that part within the step and touch again.
+#: Numbers of guards: first guards of the eight pairs from 0, second guards from `SECOND`, and from `AGAIN` guards of
+#: pairs that part within the step and may touch again.
 SECOND: Final = PAIR_COUNT
 AGAIN: Final = 2 * PAIR_COUNT
 GUARDS: Final = 3 * PAIR_COUNT
@@ -33,24 +34,24 @@ LANES: Final = np.dtype(
         ("series", "f8", (COMPONENTS, _ROWS, WIDTH)),  # state
         ("moment", "f8", (4, _ROWS, WIDTH)),  # factors of cosine, sine, X and Y in the contacts' moment
         ("load", "f8", (3, _ROWS, WIDTH)),  # S1, S2, M
-        ("depth", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # with lambda d', the penetration of each slot's pairs
+        ("depth", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # with lambda d' only: penetrations of each slot's pairs
         ("push", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # F / K of each slot's pairs
-        ("guard", "f8", (GUARDS, _ROWS, WIDTH)),  # in each round eight guards of any lanes
+        ("guard", "f8", (GUARDS, _ROWS, WIDTH)),  # eight guards, of any lanes, for each round
         ("bernstein", "f8", (_ROWS, WIDTH)),
-        ("bulge", "f8", (_ROWS, WIDTH)),  # forces whose maximum may exceed their peak and is yet to be found
-        ("bulge_step", "f8", _LANES_OF),  # the steps that they are series of
+        ("bulge", "f8", (_ROWS, WIDTH)),  # forces whose maximum must still be found, as it may exceed the peak
+        ("bulge_step", "f8", _LANES_OF),  # sizes of these forces' steps
         ("rows", "f8", (PAIR_COUNT, 5, WIDTH)),  # penetration: factors of cosine, sine, X, Y, constant
         ("arms", "f8", (PAIR_COUNT, 2, WIDTH)),  # arm: factors of cosine and sine
         ("ratio", "f8", _PAIRS),  # C / K of pairs that are on
         ("factor", "f8", _PAIRS),  # lambda
-        ("gear", "f8", (PAIR_COUNT, 8, WIDTH)),  # for each slot's pairs: rows, arms, lambda
+        ("gear", "f8", (PAIR_COUNT, 8, WIDTH)),  # of each slot's pairs: rows, arms, lambda
         ("chosen", "f8", (8, WIDTH)),  # guards of a round: rows, factors of d and d', further constant
-        ("along", "f8", (2, 6, WIDTH)),  # higher orders of the forces, by c, s, X or Y and their rates
-        ("turn", "f8", (2, 8, WIDTH)),  # and of the factors in the moment, by c, s, X, Y and their rates
+        ("along", "f8", (2, 6, WIDTH)),  # forces along X and Y: factors of c, s, X or Y and of their rates
+        ("turn", "f8", (2, 8, WIDTH)),  # moment's factors of c and s: factors of c, s, X, Y and of their rates
         ("constant", "f8", (3, WIDTH)),
-        ("slope", "f8", (3, WIDTH)),  # sampled loads: rise from the last sample to the next one
-        ("sample", "f8", (3, WIDTH)),  # the last one
-        ("held", "f8", (3, WIDTH)),  # load at the step's start, the constant one with it
+        ("slope", "f8", (3, WIDTH)),  # sampled loads: slope from the last sample to the next sample
+        ("sample", "f8", (3, WIDTH)),  # sampled loads: the last sample
+        ("held", "f8", (3, WIDTH)),  # load at the step's start, including the constant loads
         ("knot", "f8", _LANES_OF),  # time of the last sample
         ("small", "f8", _LANES_OF),  # size below which a term over the longest wanted step has vanished
         ("direction", "f8", (4, WIDTH)),
@@ -63,18 +64,18 @@ LANES: Final = np.dtype(
         ("half_cavity", "f8", _LANES_OF),
         ("y", "f8", (COMPONENTS, WIDTH)),  # state at the step's start
         ("change", "f8", (COMPONENTS, WIDTH)),  # change of the state over the step
-        ("gained", "f8", (2, WIDTH)),  # one slot: impulse over the step, peak
-        ("sum", "f8", (4, WIDTH)),  # integrals of cosine, sine, X, Y over the step, less their values at its start
-        ("harmonic", "f8", (10, WIDTH)),  # one load: frequency, sine, cosine, amplitudes of S1, S2, M; phase
+        ("gained", "f8", (2, WIDTH)),  # of one slot: impulse over the step, peak
+        ("sum", "f8", (4, WIDTH)),  # integrals over the step of the changes of cosine, sine, X, Y
+        ("harmonic", "f8", (10, WIDTH)),  # of one load: frequency, sine, cosine, amplitudes of S1, S2, M; phase
         ("size", "f8", (2, WIDTH)),  # the terms of the last two orders, as velocities
         ("step", "f8", _LANES_OF),  # step size in s
         ("accurate", "f8", _LANES_OF),  # step size before an event ends the step
         ("stop", "f8", _LANES_OF),  # time at which a step must end
         ("whole", "f8", _LANES_OF),  # the longest step wanted
-        ("reach", "f8", _LANES_OF),  # guards of a round: how far each is searched
-        ("root", "f8", _LANES_OF),  # its first root
-        ("begin", "f8", _LANES_OF),  # when its pair has parted, else 0
-        ("parted", "f8", _PAIRS),  # when a clipped pair parts within the step, infinity where it does not
+        ("reach", "f8", _LANES_OF),  # guards of a round: end of the interval that is searched
+        ("root", "f8", _LANES_OF),  # guards of a round: first root
+        ("begin", "f8", _LANES_OF),  # guards of a round: time at which the pair has parted, else 0
+        ("parted", "f8", _PAIRS),  # time at which a clipped pair parts within the step, else infinity
         ("peak", "f8", _PAIRS),
         ("impulse", "f8", _PAIRS),
         ("time_in_contact", "f8", _PAIRS),
@@ -85,41 +86,40 @@ LANES: Final = np.dtype(
         ("mode", "i8", _PAIRS),
         ("switch", "i8", _PAIRS),  # modes that pairs take at the step's end, -1 for no change
         ("on", "i8", (PAIR_COUNT,)),  # a bit for each lane in which the pair is on
-        ("off", "i8", (PAIR_COUNT,)),  # and in which it is off and can touch
+        ("off", "i8", (PAIR_COUNT,)),  # a bit for each lane in which the pair is off and can touch
         ("taken", "i8", (PAIR_COUNT,)),  # a bit for each lane with a pair in the slot
         ("slot", "i8", _PAIRS),  # the pair in each slot
         ("watched", "i8", _LANES_OF),  # a bit for each guard that is always searched
-        ("inside", "i8", _LANES_OF),  # pairs that penetrate
+        ("inside", "i8", _LANES_OF),  # number of pairs that penetrate
         ("event", "i8", _LANES_OF),  # the guard that ends the step, or -1
         ("ends_at_stop", "i8", _LANES_OF),
         ("todo", "i8", _LANES_OF),  # a bit for each guard that remains to be searched
-        ("guarded", "i8", (GUARDS, WIDTH)),  # the guards of each round, or -1
-        ("owner", "i8", (GUARDS, WIDTH)),  # and their lanes
+        ("guarded", "i8", (GUARDS, WIDTH)),  # numbers of the guards of each round, or -1
+        ("owner", "i8", (GUARDS, WIDTH)),  # lanes of these guards
         ("row_place", "i8", _LANES_OF),  # places of a round's guards in `rows`
         ("bulge_pair", "i8", _LANES_OF),
         ("bulge_lane", "i8", _LANES_OF),
-        ("orders", "i8", _LANES_OF),  # order of the series of each lane; the terms beyond have vanished
-        ("before", "i8", _LANES_OF),  # steps before the sample
+        ("orders", "i8", _LANES_OF),  # order of each lane's series; the terms beyond have vanished
+        ("before", "i8", _LANES_OF),  # number of steps up to the last sample
         ("carrying", "i8", _LANES_OF),  # a bit for each pair that is on
         # single numbers last, so that every row before them fills a cache line
         ("parting", "i8", (1,)),  # a bit for each lane in which a clipped pair parts
         ("rounds", "i8", (1,)),
-        ("bulges", "i8", (1,)),  # number of the forces in `bulge`
+        ("bulges", "i8", (1,)),  # number of forces in `bulge`
         ("vanished", "i8", (1,)),  # a bit for each lane whose series ends early
-        ("stale", "i8", (1,)),  # 1 where modes or scenes have changed since the maps were summed
+        ("stale", "i8", (1,)),  # 1 if modes or scenes have changed since the maps were summed
     ]
 )
 
 
-#: Terms that the lanes cover: the force is linear in penetration and rate, nothing but harmonics drives the head.
+#: Terms that lanes can compute: damping of a force with exponent 1, harmonic loads, and the terms of flight and rest.
 _COVERED: Final = {"harmonics", "second", "viscous", "hysteretic", "flight", "rest"}
 
 
 def fits_lanes(compiled: CompiledScene, *, sampled: bool = False) -> bool:
-    """Return whether the lanes take the steps of a scene.
+    """Return whether a scene can run in lanes.
 
-    The lanes take a scene whose exponent is 1, whose only terms are damping and harmonics (or samples), and which sets
-    no `Options`.
+    Its exponent must be 1, it may have no other terms than damping and harmonics (or samples), and no `Options`.
     """
     parts = compiled.parts._replace(terms=compiled.parts.terms._replace(segments=None)) if sampled else compiled.parts
     there = (name for name, term in zip(Terms._fields, parts.terms, strict=True) if term is not None)
@@ -130,7 +130,7 @@ def new_lanes() -> NDArray[np.void]:
     """Return empty lanes, shape (1,)."""
     lanes = new_records(LANES, 1)
     lanes["member"] = -1
-    # an empty lane computes with a scene at rest
+    # the numbers in an empty lane are those of a scene at rest, so that they stay finite
     lanes["y"][:, COS] = lanes["half_cavity"] = lanes["whole"] = 1.0
     return lanes
 
@@ -165,7 +165,7 @@ def load_lane(p, state, totals, lanes, lane, member) -> None:
 
 @kernel()
 def write_place(state, lanes, lane) -> None:
-    """Write the place of a lane to a state's record."""
+    """Write the time and body coordinates of a lane to a state's record."""
     for i in range(COMPONENTS):
         state.y[i] = lanes.y[i, lane]
     state.step_start = lanes.time[lane]
@@ -173,7 +173,7 @@ def write_place(state, lanes, lane) -> None:
 
 @kernel()
 def write_state(state, lanes, lane) -> None:
-    """Write all that a lane has of a state to its record."""
+    """Write the whole state of a lane to a state's record."""
     write_place(state, lanes, lane)
     state.time = lanes.time[lane]
     for pair in range(PAIR_COUNT):
@@ -182,7 +182,7 @@ def write_state(state, lanes, lane) -> None:
 
 @kernel()
 def save_lane(state, totals, lanes, lane) -> None:
-    """Take a scene out of its lane."""
+    """Write the state and totals of a lane to their records, and empty the lane."""
     write_state(state, lanes, lane)
     for pair in range(PAIR_COUNT):
         totals.peak[pair], totals.impulse[pair] = lanes.peak[pair, lane], lanes.impulse[pair, lane]
@@ -202,7 +202,7 @@ def clear_lane(lanes, lane) -> None:
 
 @kernel()
 def note_modes(p, lanes, lane) -> None:
-    """Write the modes of a lane's pairs to its guards, and the pairs that are on to slots, one after the other."""
+    """Derive the guards of a lane from the modes of its pairs, and put the pairs that are on into slots."""
     bit, inside, carrying, taken, watched = 1 << lane, 0, 0, 0, 0
     for pair in range(PAIR_COUNT):
         mode, rest = lanes.mode[pair, lane], ~bit
@@ -224,7 +224,7 @@ def note_modes(p, lanes, lane) -> None:
 
 @kernel()
 def _take_slot(lanes, lane, pair, slot) -> None:
-    """Put a pair of a lane that is on into one of its slots."""
+    """Put a pair that is on into a slot of its lane."""
     gear = lanes.gear[slot]
     for i in range(5):
         gear[i, lane] = lanes.rows[pair, i, lane]
@@ -234,10 +234,10 @@ def _take_slot(lanes, lane, pair, slot) -> None:
 
 @kernel()
 def weigh_lanes(lanes) -> None:
-    """Sum over the acting pairs of each lane: the orders of all forces together are a linear map of the state's orders.
+    """Sum the linear maps from the state's orders to the forces' orders over the acting pairs of each lane.
 
-    Along a wall's normal  f = -n F,  F = K (a c + b s + n Z) + C (a c' + b s' + n Z'), Z = X or Y; the moment is
-    c Gc + s Gs - X fy + Y fx  with  Gc, Gs = sum of the arms' factors times F.
+    Along a wall's normal  f = -n F  with  F = K (a c + b s + n Z) + C (a c' + b s' + n Z'),  where Z is X or Y. The
+    moment is  c Gc + s Gs - X fy + Y fx,  where Gc and Gs are the sums of the arms' factors times F.
     """
     along, turn, zero = lanes.along, lanes.turn, exact_splat(0.0)
     for i in range(6):
@@ -259,7 +259,7 @@ def weigh_lanes(lanes) -> None:
 
 @kernel()
 def _add(there, rates, factor, gear, third, fourth, stiffness, viscous) -> None:
-    """Add a factor times the force of a slot to a linear map: its parts of cosine, sine and some further rows."""
+    """Add a factor times a slot's force to a linear map: to the rows of cosine, sine and of further components."""
     spring, damper = factor * stiffness, factor * viscous
     for i in range(rates):
         at = third if i == 2 else fourth if i == 3 else i
@@ -269,7 +269,7 @@ def _add(there, rates, factor, gear, third, fourth, stiffness, viscous) -> None:
 
 @kernel(inline="code")
 def places_of(numbers):
-    """Return eight whole numbers as places for `gathered`."""
+    """Return eight integers as the tuple of places that `gathered` takes."""
     return (
         numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], numbers[5], numbers[6], numbers[7],
     )  # fmt: skip
@@ -284,7 +284,7 @@ def penetration_at(rows, c, s, x, y):
 
 @kernel(inline="code")
 def linear_at(rows, c, s, x, y):
-    """Return the penetrations without their constant, as for later orders and for rates."""
+    """Return the penetrations without their constant term, for higher orders and for rates."""
     return fused(
         exact_row(rows, 0), c, fused(exact_row(rows, 1), s, fused(exact_row(rows, 2), x, exact_row(rows, 3) * y))
     )
@@ -297,7 +297,7 @@ def to_bernstein(lanes, column, w, order, h) -> None:
     for k in range(order + 1):
         set_row(b, k, exact_row(column, k) * (power * w.binomial[order, k]))
         power = power * h
-    # two sweeps at once halve the stores
+    # two sweeps at once halve the number of stores
     for r in range(1, order + 1, 2):
         before = exact_row(b, r)
         once = before + exact_row(b, r - 1)

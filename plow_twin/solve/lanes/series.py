@@ -1,9 +1,9 @@
-"""Taylor series of eight scenes side by side, contact modes frozen (equations in `method.series`).
+"""Taylor series of eight scenes side by side with the contact modes frozen (equations in `method.series`).
 
-Where the contacts' force is linear in penetration and rate, all acting pairs of a scene are one affine map of the
-state: an order takes twelve Cauchy products, for any number and choice of acting pairs. With lambda d' the force K
-d (1 + lambda d') is K (d + lambda / 2 (d^2)'): half a product more for each slot, which holds any one acting pair of
-each lane.
+If the contact force is linear in penetration and rate, the sum of a scene's acting pairs is one affine map of the
+state. An order then takes twelve Cauchy products, for any number and choice of acting pairs. With lambda d' the force
+K d (1 + lambda d') is K (d + lambda / 2 (d^2)'), which takes half a product more for each slot. A slot holds one acting
+pair of each lane, which may be another pair in each lane.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from plow_twin.solve.lanes.record import DC, DS, DX, DY, WIDTH, linear_at, penet
 from plow_twin.solve.lanes.waves import turn_lanes
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, X, Y
 
-#: A larger term is not finite, or its products would not be.
+#: Largest usable term; products of larger terms would not be finite.
 _FINITE = 1e300
 #: Fewest orders of a series that ends because its terms vanish.
 _FEWEST_ORDERS = 4
@@ -28,7 +28,7 @@ _ALL = 2**WIDTH - 1
 
 @kernel()
 def _gather_harmonic(harmonics, extent, lanes, i) -> None:
-    """Write number `i` of each lane's harmonics to `lanes.harmonic`: zeros where a scene has fewer."""
+    """Write harmonic number `i` of each lane to `lanes.harmonic`, zeros if the lane's scene has fewer harmonics."""
     there = lanes.harmonic
     for lane in range(WIDTH):
         member = lanes.member[lane]
@@ -46,7 +46,7 @@ def _gather_harmonic(harmonics, extent, lanes, i) -> None:
 
 @kernel()
 def _add_wave(load, k, lanes, first, sine, cosine) -> None:
-    """Add order k of a harmonic, its amplitudes in rows `first` and the next, to one of the loads."""
+    """Add order k of a harmonic to one of the loads; rows `first` and `first` + 1 hold its amplitudes."""
     wave = fused(exact_row(lanes.harmonic, first), sine, exact_row(load, k))
     set_row(load, k, fused(exact_row(lanes.harmonic, first + 1), cosine, wave))
 
@@ -55,7 +55,7 @@ def _add_wave(load, k, lanes, first, sine, cosine) -> None:
 def expand_loads(harmonics, extent, second, lanes, w, order) -> None:
     """Write the series of the harmonic loads S1, S2, M of each lane's scene.
 
-    sin and cos follow from one another. `extent` (n, 2) has the begin of each scene's harmonics, and their number.
+    `extent`, shape (n, 2), has the index of each scene's first harmonic and the number of its harmonics.
     """
     zero, most = exact_splat(0.0), 0
     for k in range(order):
@@ -80,8 +80,8 @@ def expand_loads(harmonics, extent, second, lanes, w, order) -> None:
 def expand(lanes, w, limit, waves, second, viscous, hysteretic, segments) -> int:
     """Write the series of the state; return the order.
 
-    Under sampled loads a lane's terms are zero beyond the order at which they vanish over the longest wanted step, so
-    that later orders of other lanes do not change its bits.
+    Under sampled loads the series of a lane ends at the order whose terms vanish over the longest wanted step. Its
+    further terms are zero, so that a lane's bits do not depend on the other lanes' orders.
     """
     series, moment = lanes.series, lanes.moment
     zero = exact_splat(0.0)
@@ -115,7 +115,7 @@ def expand(lanes, w, limit, waves, second, viscous, hysteretic, segments) -> int
                     order = k
                     break
             calm = quiet
-        # a product's newest orders come last: most of the sum need not wait for them
+        # the newest orders are added last, so that most of the sum need not wait until they are computed
         px = py = pvx = pvy = pc = ps = torque = other = wc = ws = zero
         for j in range(1, k):
             turned = exact_row(series[OMEGA], j)
@@ -135,7 +135,7 @@ def expand(lanes, w, limit, waves, second, viscous, hysteretic, segments) -> int
                 one = exact_row(load[0], j)
                 wc = fused(one, exact_row(series[COS], k - j), wc)
                 ws = fused(one, exact_row(series[SIN], k - j), ws)
-        share = 0.0 if k == 0 else 1.0  # order 0 is one product, not two
+        share = 0.0 if k == 0 else 1.0  # order 0 has a single product, which must not be added twice
         early = om0 * share
         px, py = fused(om, x0, fused(early, x, px)), fused(om, y0, fused(early, y, py))
         pvx, pvy = fused(om, vx0, fused(early, vx, pvx)), fused(om, vy0, fused(early, vy, pvy))
@@ -203,7 +203,7 @@ def expand(lanes, w, limit, waves, second, viscous, hysteretic, segments) -> int
 
 @kernel()
 def _live(lanes) -> int:
-    """Return a bit for each lane that has a scene; none of their series has ended."""
+    """Return a bit for each lane that has a scene, and mark no series as ended."""
     bits = 0
     for lane in range(WIDTH):
         bits |= 1 << lane if lanes.member[lane] >= 0 else 0
@@ -213,7 +213,7 @@ def _live(lanes) -> int:
 
 @kernel()
 def _end_series(lanes, active, ended, k) -> int:
-    """Note that the series of some lanes end at order k; return the others."""
+    """Record that the series of the lanes `ended` end at order k; return the bits of the other active lanes."""
     for lane in range(WIDTH):
         if (ended & active) >> lane & 1:
             lanes.orders[lane] = k
@@ -242,10 +242,10 @@ def _add_ends(load, k, c0, s0, c, s, share, wc, ws):
 
 @kernel()
 def _start(lanes, viscous, c, s, x, y, dc, ds, dx, dy):
-    """Return the contacts' forces along X and Y and their factors of cosine and sine in the moment at the start.
+    """Return order 0 of the contacts' forces along X and Y and of their factors of cosine and sine in the moment.
 
-    They are computed from the same penetrations as the guards: a sum of maps would be rounded differently, and the
-    walls of force and guard would lie 1e-17 m apart.
+    They are computed from the same penetrations as the guards. A sum of maps would be rounded differently, so that the
+    force would begin 1e-17 m away from the event.
     """
     fx = fy = gc = gs = exact_splat(0.0)
     for slot in range(PAIR_COUNT):
@@ -263,7 +263,7 @@ def _start(lanes, viscous, c, s, x, y, dc, ds, dx, dy):
 
 @kernel(inline="code")
 def _add_force(lanes, gear, push, fx, fy, gc, gs):
-    """Add the forces of a slot, from F / K, to those along X and Y and to the factors of c and s in the moment."""
+    """Add a slot's force, given as F / K, to the forces along X and Y and to the factors of c and s in the moment."""
     force = exact_row(lanes.stiffness, 0) * push
     return (
         fused(exact_row(gear, 2) * -1.0, force, fx), fused(exact_row(gear, 3) * -1.0, force, fy),
@@ -275,7 +275,8 @@ def _add_force(lanes, gear, push, fx, fy, gc, gs):
 def _push(lanes, w, k, acts, c, s, x, y, dc, ds, dx, dy):
     """Return order k of the forces along X and Y and of the factors of cosine and sine in the contacts' moment.
 
-    For F = K d (1 + lambda d'), slot by slot. Writes the penetrations of the next order and F / K.
+    This is the sum over the slots for F = K d (1 + lambda d'). The penetrations of the next order and F / K are written
+    to `lanes`.
     """
     fx = fy = gc = gs = exact_splat(0.0)
     for slot in range(PAIR_COUNT):
@@ -322,7 +323,7 @@ def _lever(row, viscous, c, s, x, y, dc, ds, dx, dy):
 
 @kernel(inline="code")
 def _size(lanes, vx, vy, om, c, s):
-    """Return the size of an order as a velocity."""
+    """Return the size of an order's terms as a velocity."""
     size = fused(exact_row(lanes.weight, 0), magnitude(c) + magnitude(s), magnitude(vx) + magnitude(vy))
     return fused(exact_row(lanes.radius, 0), magnitude(om), size)
 
@@ -331,7 +332,7 @@ def _size(lanes, vx, vy, om, c, s):
 def accurate_steps(params, lanes, order) -> int:
     """Write the step over which each lane's series meets its share of the tolerance to `lanes.step`.
 
-    As `method.step_size.accurate_step`. Returns a bit for each lane whose series is not finite.
+    The test is that of `method.step_size.accurate_step`. Returns a bit for each lane whose series is not finite.
     """
     infinite = 0
     for lane in range(WIDTH):
@@ -349,7 +350,7 @@ def accurate_steps(params, lanes, order) -> int:
             elif size > 0.0:
                 least = min(least, math.log(p.threshold[k] / size) / k)
         step = min(whole, math.exp(least))
-        # an error of velocity becomes one of position over a long step
+        # over a long step an error of velocity becomes an error of position
         stretch = step * p.velocity_tolerance / (p.position_tolerance * (order + 1))
         if stretch > 1.0 and step < whole:
             step *= math.exp(-math.log(stretch) / order)

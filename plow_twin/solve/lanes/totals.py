@@ -1,4 +1,4 @@
-"""Totals of the motions in the lanes: impulses, peaks and times from the series of one step of each."""
+"""Totals of the motions in the lanes: impulses, peaks and times, from the series of each lane's step."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from plow_twin.solve.lanes.record import COMPONENTS, WIDTH, linear_at, penetrati
 from plow_twin.solve.state import COS, SIN, X, Y
 from plow_twin.solve.totals import add_set_times
 
-#: Allowance for rounding in a force's bound, and between a peak and the maximum.
+#: Allowances for rounding: factor on the upper bound of a force, and between a peak and the maximum.
 _ROUNDED, _SAME = 1.0 + 1e-9, 1.0 + 1e-12
 
 
 @kernel()
 def sum_step(lanes, w, order) -> None:
-    """Write the change of the state over each lane's step, and the integrals of cosine, sine, X and Y.
+    """Write the change of the state over each lane's step, and the integrals of the changes of cosine, sine, X and Y.
 
-    The integrals are those of the change, without the values at the start.
+    A change is the difference from the value at the step's start.
     """
     h, zero = exact_row(lanes.step, 0), exact_splat(0.0)
-    # sums side by side need not wait for each other
+    # four sums side by side keep the processor busy, since no sum waits for another
     for i in range(0, COMPONENTS, 4):
         a = b = c = d = zero
         for k in range(order, 0, -1):
@@ -46,13 +46,13 @@ def sum_step(lanes, w, order) -> None:
 
 @kernel()
 def add_step(totals, lanes, w, order, full, viscous, hysteretic) -> None:
-    """Add the steps that have been laid out to the sums in the lanes, and the times of sets to totals if there are any.
+    """Add the laid-out steps to the sums in the lanes, and the times of sets of corners to `totals` unless it is None.
 
-    `order` and `full` are as for `first_events`.
+    `order` and `full` have the meaning that they have in `first_events`.
     """
     last = order - 1
     if totals is None and hysteretic is None:
-        # under samples the series of a lane may end earlier; its guard then has one more term
+        # under samples the series of a lane may end earlier, and its guard then has one more term
         last = order
     for slot in range(PAIR_COUNT):
         taken = lanes.taken[slot]
@@ -100,10 +100,11 @@ def _impulses(lanes, gear, viscous, hysteretic):
 
 @kernel()
 def _raise_peaks(totals, lanes, w, slot, order, full, on) -> int:
-    """Raise the peaks in `lanes.gained` by the series of F / K; return a bit for each lane that was looked at.
+    """Raise the peaks in `lanes.gained` by the series of F / K; return a bit for each lane that was checked.
 
-    First comes a bound; where it exceeds the peak, the larger end. A force whose maximum may lie in between is kept for
-    `find_peaks`; under samples, whose rows need their peaks at once and whose steps are short, it is looked at now.
+    If an upper bound of the force exceeds the peak, the larger value at the step's two ends is taken. A force whose
+    maximum may lie between the ends is kept for `find_peaks`. Under samples it is examined at once, because rows need
+    their peaks and steps are short.
     """
     h, zero, half, push = exact_row(lanes.step, 0), exact_splat(0.0), exact_splat(0.5), lanes.push[slot]
     end = bend = slope = zero
@@ -113,7 +114,7 @@ def _raise_peaks(totals, lanes, w, slot, order, full, on) -> int:
         if k > 1:
             size = magnitude(term)
             slope = fused(size, exact_splat(1.0 * k), slope) * h
-            # between its ends a function exceeds them at most by h^2 / 8 times its largest downward curvature
+            # a function exceeds the values at its ends by at most h^2 / 8 times its largest downward curvature
             bend = fused((size - term) * half, exact_splat(0.125 * k * (k - 1)), bend) * h
     start, stiffness, peak = exact_row(push, 0), exact_row(lanes.stiffness, 0), exact_row(lanes.gained, 1)
     most = choose(below(start, end), end, start)
@@ -175,9 +176,10 @@ def _keep_bulge(lanes, push, pair, lane, order) -> None:
 
 @kernel()
 def find_peaks(lanes, w, order) -> None:
-    """Raise the peaks by the maxima of the forces that were kept: forces of any lanes and steps.
+    """Raise the peaks by the maxima of the forces in `lanes.bulge`, which are of any lanes and steps.
 
-    A maximum is a root of F'. It does not depend on the peak so far, so that it has the same bits in any company.
+    A maximum is found as a root of F', independently of the peak so far, so that its bits do not depend on the other
+    lanes.
     """
     if lanes.bulges[0] == 0:
         return

@@ -9,7 +9,7 @@ from plow_twin.kernel.simd import below, choose, exact_row, exact_splat, fused, 
 
 #: Largest angle for which the product of the number of quarter turns and the first part of pi / 2 is exact.
 _LARGEST = 1e5
-#: Adding and subtracting this number rounds to a whole number.
+#: Adding and then subtracting this number rounds to an integer.
 _ROUNDS = 6755399441055744.0
 #: pi / 2 in three parts, the first two of 33 bits (fdlibm, e_rem_pio2.c).
 _QUARTERS = (0.6366197723675814, 1.57079632673412561417, 6.07710050630396597660e-11, 2.02226624879595063154e-21)
@@ -26,7 +26,7 @@ _COSINE = (
 
 @kernel()
 def turn_lanes(angle, cosine, sine) -> None:
-    """Write cosine and sine of the eight numbers in `angle`, each to a rounding or two."""
+    """Write cosine and sine of the eight numbers in `angle`, each exact to one or two rounding errors."""
     x = exact_row(angle, 0)
     turns = (x * _QUARTERS[0] + _ROUNDS) - _ROUNDS
     r = fused(turns, exact_splat(-_QUARTERS[1]), x)
@@ -39,7 +39,7 @@ def turn_lanes(angle, cosine, sine) -> None:
         c = fused(c, square, exact_splat(_COSINE[i]))
     s = fused(s * square, r, r)
     c = fused(c * square, square, fused(square, exact_splat(-0.5), exact_splat(1.0)))
-    # 0 to 3 quarter turns beside whole turns
+    # 0 to 3 quarter turns remain after the whole turns
     whole = (turns * 0.25 - 0.375 + _ROUNDS) - _ROUNDS
     quarter = turns - whole * 4.0
     first, half, last = (

@@ -1,4 +1,4 @@
-"""The equilibrium of a head that its contacts hold: its pairs, its stiffness, and the way to it."""
+"""The equilibrium of a head that is held by its contacts: modes of its pairs, stiffness, and distance to it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from plow_twin.solve.state import OFF, ON
 
 @kernel()
 def held(p, state, y, least) -> bool:
-    """Return whether each pair is on or off, and far from a change."""
+    """Return whether each pair is on or off, and its penetration or gap is larger than `least`."""
     for pair in range(PAIR_COUNT):
         if p.enabled[pair] == 1:
             penetration = penetration_of(p, state, pair, y)
@@ -25,9 +25,9 @@ def held(p, state, y, least) -> bool:
 
 @kernel()
 def stiffness_at(p, acts, state, w, gyration) -> None:
-    """Write the accelerations at `w.rest[0]` to `w.rest[1]`, minus their derivatives by place to `w.hessian` (3, 3).
+    """Write the accelerations at `w.rest[0]` to `w.rest[1]`, and minus their derivatives by place to `w.hessian`.
 
-    The angle times the radius of gyration counts as a place: the matrix is symmetric then.
+    The matrix has shape (3, 3). The angle is multiplied by the radius of gyration, which makes the matrix symmetric.
     """
     z, rate, moved, t = w.rest[0], w.rest[1], w.rest[2], state.step_start
     accelerate(p, acts, True, state, t, z, w.rest[3, :3], rate)
@@ -51,7 +51,7 @@ def stiffer_than(h, least) -> bool:
     a, b, c = h[0, 0] - least, h[1, 1] - least, h[2, 2] - least
     if not a > 0.0:
         return False
-    # Cholesky without roots; a locked degree of freedom is infinitely stiff
+    # Cholesky decomposition without roots; a locked degree of freedom is infinitely stiff
     b -= h[1, 0] * h[0, 1] / a
     if not b > 0.0:
         return False
@@ -62,7 +62,7 @@ def stiffer_than(h, least) -> bool:
 
 @kernel()
 def to_equilibrium(h, rate, z, gyration) -> float:
-    """Move z to where the accelerations vanish, by one Newton step x; return the energy x h x."""
+    """Move z by one Newton step x to the point where the accelerations vanish; return x h x, twice the energy."""
     a, b, c = rate[3], rate[4], rate[5] * gyration
     low10, low20 = h[1, 0] / h[0, 0], h[2, 0] / h[0, 0]
     d1 = h[1, 1] - low10 * h[0, 1]

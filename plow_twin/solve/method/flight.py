@@ -1,8 +1,8 @@
-"""Free flight in closed form: where no wall can be reached, a step of any size.
+"""Free flight in closed form: a step can have any size as long as the head cannot reach a wall.
 
-While no pair touches, the centre of mass and the angle follow from integrating the load twice: constants, linear pieces
-and harmonics have elementary integrals. The distance of the head within a time is bounded without following it
-(conservative advancement), and the bound limits the step. Near a wall the series take over, and meet it.
+If no pair touches, the centre of mass and the angle are the load's double integral, which is elementary for constants,
+linear pieces and harmonics. An upper bound of the distance that the head can move within a time limits the step
+(conservative advancement). Near a wall steps are Taylor series, which locate the touch.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from plow_twin.kernel.compiler import kernel
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.kinematics import penetration_of, to_body, to_world
 
-#: Radians of the fastest harmonic that a flight must span; a step of a series covers about two.
+#: Least phase of the fastest harmonic [rad] over a flight; a step of a series covers about 2 rad.
 _LEAST_PHASE = 8.0
-#: Share of the smallest gap that the bound may reach.
+#: Largest distance of a flight as a share of the smallest gap.
 _SAFE = 0.9
 
 
 @kernel(inline="code")
 def amplitudes(p, one, j):
-    """Return sine and cosine amplitude of a harmonic's acceleration along x, y or theta."""
+    """Return the sine and cosine amplitudes of a harmonic's acceleration along x, y or theta (j = 0, 1, 2)."""
     if j == 2:
         return one.moment[0], one.moment[1]
     sine = p.direction[0, j] * one.first[0] + p.direction[1, j] * one.second[0]
@@ -32,7 +32,7 @@ def amplitudes(p, one, j):
 
 @kernel()
 def _smallest_gap(p, state) -> float:
-    """Return the distance of the pair that is nearest to touching."""
+    """Return the smallest distance in m of a pair from touching."""
     y, nearest = state.y, np.inf
     for pair in range(PAIR_COUNT):
         if p.enabled[pair] == 1:
@@ -43,9 +43,10 @@ def _smallest_gap(p, state) -> float:
 
 @kernel()
 def _bounds(p, harmonics, t, z, w) -> None:
-    """Write bounds of the motion along x, y and theta to `w.flight[1:]`, shape (4, 3).
+    """Write upper bounds of the motion along x, y and theta to `w.flight[1:]`, shape (4, 3).
 
-    Rows: speed now; speed without the harmonics' swing; largest acceleration of the harmonics; reach of their swing.
+    The rows are the present speed, the speed without the harmonics' swing, the harmonics' largest acceleration, and the
+    amplitude of their swing.
     """
     for j in range(3):
         drift, push, swing = z[3 + j], 0.0, 0.0
@@ -62,7 +63,7 @@ def _bounds(p, harmonics, t, z, w) -> None:
 
 @kernel()
 def _reach(p, w, time, leverage) -> float:
-    """Return how far a point at most `leverage` from the centre of mass can get within `time`."""
+    """Return an upper bound in m of the motion within `time` of a point at most `leverage` from the centre of mass."""
     place = 0.0
     for j in range(3):
         steady = p.free[j] * (abs(w.wrench[0, j]) + abs(w.wrench[1, j]) * time / 3.0) * time * time / 2.0
@@ -74,13 +75,13 @@ def _reach(p, w, time, leverage) -> float:
 
 @kernel(inline="source")
 def own(parts):
-    """Return 1 where the scene may fly freely, otherwise None."""
+    """Return 1 if flights of the scene have a closed form, otherwise None."""
     return parts.terms.flight
 
 
 @kernel()
 def lay_out(p, parts, own, state, w, span, penetrating) -> bool:
-    """Lay out a step of free flight, where it is longer than one of a series."""
+    """Lay out a step of free flight if it is longer than a step of a series."""
     if own is None:
         return False
     size = 0.0 if penetrating else safe_time(p, parts.harmonics, state, w, span)
@@ -92,7 +93,7 @@ def lay_out(p, parts, own, state, w, span, penetrating) -> bool:
 
 @kernel()
 def safe_time(p, harmonics, state, w, span) -> float:
-    """Return a time of at most `span` within which no wall can be reached, or 0 where a series serves as well."""
+    """Return a time of at most `span` within which no wall can be reached, or 0 if a series can step as far."""
     least = _LEAST_PHASE / p.fastest
     if span < least:
         return 0.0
@@ -100,7 +101,7 @@ def safe_time(p, harmonics, state, w, span) -> float:
     z = w.flight[0]
     to_world(p, state.y, z)
     _bounds(p, harmonics, state.step_start, z, w)
-    # the walls' rows turn with the head: a place counts like a point of the head
+    # the walls turn with the head about its centre of mass, so the leverage includes the head's place
     leverage = p.leverage + math.hypot(z[0], z[1]) + max(gap, 0.0)
     time = span
     while time >= least:
@@ -126,7 +127,7 @@ def fly(p, harmonics, flight, state, w, time, y) -> None:
 
 @kernel()
 def _swing(p, harmonics, j, t, time):
-    """Return rate and distance that the harmonics add along x, y or theta within `time` from t on."""
+    """Return rate and distance that the harmonics add along x, y or theta from t to t + `time`."""
     rate = way = 0.0
     for i in range(harmonics.size):
         one = harmonics[i]

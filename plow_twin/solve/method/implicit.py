@@ -1,9 +1,9 @@
 """Implicit steps for overdamped contact: collocation at Radau points with the contact modes frozen.
 
-Where damping stops a pair long before its spring moves it, an explicit series is bound by stability: steps of a few
-decay times, even for a smooth motion. Radau IIA collocation (Hairer and Wanner, Solving ODEs II, sec. IV.5) is stable
-there. Its solution is also a polynomial in time: written as a series, it needs no events, output or statistics of its
-own.
+If damping stops a pair long before its spring moves it, stability limits the steps of an explicit series to a few decay
+times, however smooth the motion is. Radau IIA collocation (Hairer and Wanner, Solving ODEs II, sec. IV.5) is stable for
+longer steps. Its solution is a polynomial in time too, and is written as a series, so that events, output and totals
+are computed as for an explicit step.
 """
 
 from __future__ import annotations
@@ -48,16 +48,16 @@ from plow_twin.solve.support import (
     to_world_both,
 )
 
-#: Stages: the polynomials' degree. The order is 2 s - 1.
+#: Number s of stages, the degree of the polynomials; the method's order is 2 s - 1.
 STAGES = 9
-#: A contact is overdamped where its dampers act this many times faster than its springs; the same ratio decides at
-#: compile time whether a scene can need implicit steps.
+#: A contact is overdamped if its dampers act this many times faster than its springs. The same ratio decides, when the
+#: scene is compiled, whether the scene can need implicit steps.
 OVERDAMPED_RATIO = 20.0
-#: An implicit step costs as much as this many explicit steps; it is worth its cost where stability would need more.
+#: Cost of an implicit step in explicit steps; a shorter implicit step is not worth its cost.
 _WORTH = 30.0
-#: Share of the tolerance that an implicit step may spend, in shares of a step of the series: it replaces many.
+#: Admissible error of an implicit step over that of an explicit step, since it replaces many explicit steps.
 _GAIN = 100.0
-#: Rounding error of a velocity, as a share of the largest velocity: no step is refused for a smaller error.
+#: Rounding error of a velocity, as a share of the largest velocity; smaller errors are always admissible.
 _NOISE = 1e-12
 #: Rounding error of a guard of the corners' grip, as a share of its largest term.
 _GUARD_NOISE = 1e-6
@@ -66,9 +66,9 @@ _MOST_REFUSED = 12
 
 
 def _coefficients(nodes: NDArray[np.longdouble]) -> NDArray[np.longdouble]:
-    """Return c with sum_i c[k, i] f(nodes[i]) the coefficient k of the polynomial through the nodes, shape (n, n).
+    """Return the matrix that gives a polynomial's coefficients from its values at the nodes, shape (n, n).
 
-    Computed in extended precision, as the inverse of a Vandermonde matrix would lose half of the digits.
+    It is the inverse of a Vandermonde matrix, computed in extended precision because it loses half of the digits.
     """
     n = len(nodes)
     columns = np.zeros((n, n), np.longdouble)
@@ -86,8 +86,8 @@ def _coefficients(nodes: NDArray[np.longdouble]) -> NDArray[np.longdouble]:
 
 @cache
 def _rule() -> tuple[NDArray[np.float64], ...]:
-    """Return nodes, weights, and the coefficients from values at the start and the nodes, and at the nodes alone."""
-    # only stiff scenes need it, and its import takes a while
+    """Return the nodes, the weights, and the matrices `from_values` and `from_stages` of `_implicit_type`."""
+    # imported here, because the import is slow and only stiff scenes need it
     from scipy.special import roots_jacobi
 
     inner = 0.5 * (roots_jacobi(STAGES - 1, 1.0, 0.0)[0] + 1.0)
@@ -101,23 +101,23 @@ def _rule() -> tuple[NDArray[np.float64], ...]:
 
 @cache
 def _implicit_type(size: int) -> np.dtype[np.void]:
-    """Return the type of nodes, weights and scratch space of an implicit step of `size` places."""
+    """Return the record type of an implicit step (nodes, weights, scratch space) with `size` degrees of freedom."""
     shape = (STAGES + 1, STATE_SIZE)
     return np.dtype(
         [
             ("nodes", "f8", (STAGES,)),
             ("weights", "f8", (STAGES, STAGES)),
             ("from_values", "f8", (STAGES + 1, STAGES + 1)),  # coefficients from values at the start and at the nodes
-            ("from_stages", "f8", (STAGES, STAGES)),  # the same from values at the nodes
+            ("from_stages", "f8", (STAGES, STAGES)),  # coefficients from values at the nodes alone
             ("z", "f8", (STAGES + 1, 2 * size)),  # state at the start and at the nodes
-            ("rate", "f8", (2, 2 * size)),  # rates for a difference
+            ("rate", "f8", (2, 2 * size)),  # rates for a difference quotient
             ("accelerations", "f8", (STAGES, size)),
             ("jacobians", "f8", (STAGES, 2, size, size)),  # derivatives of the accelerations by place and by velocity
             ("matrix", "f8", (size * STAGES, size * STAGES)),
             ("residual", "f8", (size * STAGES,)),
             ("body", "f8", shape),  # body coordinates
-            ("seen", "f8", shape),  # the same as seen from a frame on springs
-            ("frame", "f8", shape),  # and that frame, in the lanes of `w.frame`
+            ("seen", "f8", shape),  # body coordinates relative to a frame on springs
+            ("frame", "f8", shape),  # this frame's state, in the lanes of `w.frame`
             ("pairs", "f8", (3, STAGES, PAIR_COUNT)),  # force, law's force (of clipped pairs too), rate, at the nodes
             ("wearing", "f8", (STAGES, PAIR_COUNT)),  # rate of wear at the nodes
             ("wear_depth", "f8", shape),  # at the start and at the nodes
@@ -127,7 +127,7 @@ def _implicit_type(size: int) -> np.dtype[np.void]:
 
 
 def new_implicit(support: bool) -> Implicit:
-    """Return nodes, weights and scratch space; `support` for a frame on springs."""
+    """Return nodes, weights and scratch space of implicit steps; `support` if the frame is on springs."""
     implicit = new_record(_implicit_type(6 if support else 3))
     for name, table in zip(("nodes", "weights", "from_values", "from_stages"), _rule(), strict=True):
         implicit[name] = table
@@ -136,9 +136,10 @@ def new_implicit(support: bool) -> Implicit:
 
 @kernel()
 def decay_rate(p, state, slip, stick, support) -> float:
-    """Return the sum of the rates in 1/s at which the pairs' dampers stop the head; 0 where their springs matter.
+    """Return the sum of the rates in 1/s at which the pairs' dampers stop the head, or 0 if it is not overdamped.
 
-    Friction that sticks is a damper too: its slope at the present slip.
+    Regularised friction acts as a damper too, with its slope at the present slip; so does the damper of a sticking
+    corner.
     """
     y, decay, spring = state.y, 0.0, 0.0
     c, s, om, x, yy, vx, vy = y[COS], y[SIN], y[OMEGA], y[X], y[Y], y[VX], y[VY]
@@ -175,21 +176,21 @@ def decay_rate(p, state, slip, stick, support) -> float:
 
 @kernel(inline="source")
 def _admissible(p):
-    """Return the error of a velocity in m/s that an implicit step may make."""
+    """Return the admissible error of an implicit step's velocity in m/s."""
     return max(_GAIN * p.threshold[p.order], _NOISE * p.threshold[0])
 
 
 @kernel(inline="source")
 def stable_decay(order):
-    """Return over how many decay times a series of this order is stable, with a margin."""
+    """Return the number of decay times over which a series of this order is stable, with a margin."""
     return 0.3 * order
 
 
 @kernel(inline="source")
 def has_decayed(p, state) -> bool:
-    """Return whether the motion after a change of contact has decayed, by the decay times passed since.
+    """Return whether enough decay times have passed since a change of contact for its fast motion to vanish.
 
-    Each attempt that failed doubles the wait.
+    Each failed attempt of an implicit step doubles the wait.
     """
     wait = 5.0 - math.log(p.velocity_tolerance / p.threshold[0])
     return bool(state.decay_times >= wait * 2.0**state.refused)
@@ -197,7 +198,7 @@ def has_decayed(p, state) -> bool:
 
 @kernel(inline="source")
 def note_decay(state, decay, step_size) -> None:
-    """Count the decay times that pass in a step."""
+    """Add a step to the count of decay times, or reset the count if nothing is overdamped."""
     if decay > 0.0:
         state.decay_times += decay * step_size
     else:
@@ -206,11 +207,11 @@ def note_decay(state, decay, step_size) -> None:
 
 @kernel()
 def _jacobian(p, acts, state, t, z, implicit, base, out) -> None:
-    """Write the accelerations at z to `base` (n,), their derivatives by place and by velocity to `out` (2, n, n)."""
+    """Write the accelerations at z to `base` (n,), and their derivatives by place and velocity to `out` (2, n, n)."""
     rate, moved, n = implicit.rate[0], implicit.rate[1], base.size
     accelerate(p, acts, True, state, t, z, implicit.load, rate)
     for j in range(2 * n):
-        # where the law is linear, any difference that is large compared with rounding suffices
+        # the law is nearly linear over this difference, which is large compared with rounding
         delta = 1e-8 / (p.radius if j % 3 == 2 else 1.0)
         saved = z[j]
         z[j] = saved + delta
@@ -224,7 +225,7 @@ def _jacobian(p, acts, state, t, z, implicit, base, out) -> None:
 
 @kernel()
 def _newton_matrix(implicit, h) -> None:
-    """Write d residual / d velocities: places follow from velocities, x_i = x_0 + h sum a_ij v_j."""
+    """Write the derivatives of the residual by the nodes' velocities, with places x_i = x_0 + h sum a_ij v_j."""
     a, jacobians, matrix, s = implicit.weights, implicit.jacobians, implicit.matrix, implicit.nodes.size
     n = implicit.accelerations.shape[1]
     for i in range(s):
@@ -240,7 +241,7 @@ def _newton_matrix(implicit, h) -> None:
 
 @kernel()
 def _eliminate(matrix, right) -> bool:
-    """Solve matrix x = right in place by Gaussian elimination; False instead of an exception when it is singular."""
+    """Solve matrix x = right in place by Gaussian elimination; return False if the matrix is singular."""
     n = right.size
     for j in range(n):
         pivot = j
@@ -268,7 +269,7 @@ def _eliminate(matrix, right) -> bool:
 
 @kernel()
 def _places(implicit, h) -> None:
-    """Write the places at the nodes from the velocities there."""
+    """Compute the places at the nodes from the velocities at the nodes."""
     z, a, s, n = implicit.z, implicit.weights, implicit.nodes.size, implicit.accelerations.shape[1]
     for i in range(s):
         for c in range(n):
@@ -280,7 +281,7 @@ def _places(implicit, h) -> None:
 
 @kernel()
 def _bodies(p, support, state, implicit, i) -> None:
-    """Write the body coordinates at the start (i = 0) or at a node, also as seen from a frame on springs."""
+    """Write the body coordinates at the start (i = 0) or at a node, also relative to a frame on springs."""
     z, y = implicit.z[i], implicit.body[i]
     if support is not None:
         seen, frame = implicit.seen[i], implicit.frame[i]
@@ -295,7 +296,7 @@ def _bodies(p, support, state, implicit, i) -> None:
 
 @kernel()
 def _seen(support, implicit):
-    """Return the body coordinates at the start and the nodes that the pairs depend on."""
+    """Return the body coordinates at the start and the nodes, relative to the frame, on which the pairs depend."""
     if support is not None:
         return implicit.seen
     return implicit.body
@@ -303,7 +304,7 @@ def _seen(support, implicit):
 
 @kernel()
 def _measure(p, support, state, implicit) -> None:
-    """Write force, law's force (also of clipped pairs) and rate of penetration of each pair at the nodes."""
+    """Write each pair's force, force by its law (which may pull) and rate of penetration at the nodes."""
     pairs, seen = implicit.pairs, _seen(support, implicit)
     for i in range(implicit.nodes.size):
         _bodies(p, support, state, implicit, i + 1)
@@ -320,7 +321,7 @@ def _measure(p, support, state, implicit) -> None:
 
 @kernel()
 def _wear_at_nodes(p, support, state, h, implicit, sliding, running_in) -> float:
-    """Write rate and depth of each pad's wear at the nodes from the forces there; return the largest change in m."""
+    """Compute the rate and depth of each pad's wear at the nodes; return the largest change of a depth in m."""
     worn, rates, a, s, change = implicit.wear_depth, implicit.wearing, implicit.weights, implicit.nodes.size, 0.0
     seen = _seen(support, implicit)
     _measure(p, support, state, implicit)
@@ -342,9 +343,9 @@ def _wear_at_nodes(p, support, state, h, implicit, sliding, running_in) -> float
 def _solve(p, acts, support, state, t, h, implicit, wear, sliding, running_in) -> bool:
     """Find the velocities at the nodes by Newton's method; return whether it converged.
 
-    The derivatives are taken at every node: as the head turns, so does the direction that is damped. The iteration goes
-    down to rounding: a strong damper turns a small error of a velocity into a large error of its force. Wear, which is
-    slow, is taken from the previous iterate.
+    The derivatives are computed at every node, since the damped direction turns with the head. The iteration goes on
+    down to rounding errors, since a strong damper turns a small error of a velocity into a large error of its force.
+    Wear is slow and is taken from the previous iterate.
     """
     z, s, a, residual = implicit.z, implicit.nodes.size, implicit.weights, implicit.residual
     n = implicit.accelerations.shape[1]
@@ -384,7 +385,7 @@ def _solve(p, acts, support, state, t, h, implicit, wear, sliding, running_in) -
                 * p.velocity_tolerance
                 / p.position_tolerance
             )
-        # the convergence is quadratic: the first iterate that does not improve is the last
+        # convergence is quadratic, so the iteration ends with the first iterate that does not improve
         if change < 1e-14 * p.threshold[0] or (change < 0.1 * p.velocity_tolerance and change > 0.1 * before):
             _places(implicit, h)
             return True
@@ -394,10 +395,10 @@ def _solve(p, acts, support, state, t, h, implicit, wear, sliding, running_in) -
 
 @kernel()
 def _interpolate(values, coefficients, h, out) -> None:
-    """Write the series of the polynomials of a step of size h that take eight values at each node.
+    """Write the series over a step of size h of eight polynomials from their values at the nodes.
 
-    It uses the differences from the last value: the coefficients are large and would cancel a common value only up to
-    rounding.
+    The differences from the last value are interpolated: the large coefficients would cancel the common value, which
+    leaves rounding errors.
     """
     scale, n = 1.0, len(coefficients)
     last = row(values, n - 1)
@@ -412,7 +413,7 @@ def _interpolate(values, coefficients, h, out) -> None:
 
 @kernel()
 def _series_seen(support, h, w, implicit):
-    """Return the series of the body coordinates that the pairs depend on; write those of a frame on springs."""
+    """Return the series of the body coordinates relative to the frame; write the series of a frame on springs."""
     if support is not None:
         frame, s, seen = implicit.frame, implicit.nodes.size, w.seen
         _interpolate(implicit.seen, implicit.from_values, h, seen)
@@ -428,7 +429,7 @@ def _series_seen(support, h, w, implicit):
 
 @kernel()
 def _frame_terms(p, support, w, implicit, scale):
-    """Return the frame's parts of two results of `_write_series`: velocity left out at the start, last term's size."""
+    """Return the frame's parts of `off` and `size` in `_write_series`: velocity left out at the start, last term."""
     off = size = 0.0
     if support is not None:
         s = implicit.nodes.size
@@ -442,10 +443,11 @@ def _frame_terms(p, support, w, implicit, scale):
 
 @kernel()
 def _write_series(p, support, state, h, w, implicit, ramp, wear, stick) -> float:
-    """Write the collocation polynomial of state, penetration, rate and force as series; return its last term's size.
+    """Write the collocation polynomials of state, penetration, rate and force as series; return the last terms' size.
 
-    Velocities and forces are those at the nodes, not at the start: a velocity at the start that a damper stops
-    at once would bend the polynomials between the nodes. The size is infinite where it is too large to leave out.
+    The polynomials of velocities and forces pass through the values at the nodes alone: a velocity at the start that a
+    damper stops at once would bend them between the nodes. If this velocity is too large to leave out, the returned
+    size is infinite.
     """
     s, body, pairs, scratch = implicit.nodes.size, implicit.body, implicit.pairs, w.left
     _bodies(p, support, state, implicit, 0)
@@ -487,7 +489,7 @@ def _write_series(p, support, state, h, w, implicit, ramp, wear, stick) -> float
     last, place = w.series[s - 1], w.series[s]
     size += 4.0 * (abs(last[VX]) + abs(last[VY]) + p.radius * abs(last[OMEGA]))
     size += scale * (abs(place[X]) + abs(place[Y]) + p.radius * abs(place[THETA])) + more
-    # its share on [0, h] that polynomials of lower degree cannot take over
+    # the part of the last term on [0, h] that polynomials of lower degree cannot represent
     return (size * h ** (s - 1) + grip * _GAIN * p.threshold[0]) * 2.0 ** (1 - 2 * s)
 
 
@@ -508,7 +510,10 @@ def _write_grip(p, state, h, w, implicit, seen, series) -> None:
 
 @kernel()
 def _last_of_guards(p, state, w, h) -> float:
-    """Return the largest share of a last term in its guard of a corner's grip, which matters for any small force."""
+    """Return the largest share of the last term in a guard of a corner's grip.
+
+    It is relative to the guard, since even a small force decides whether a corner slips.
+    """
     guard, share = w.column[0], 0.0
     for pair in range(PAIR_COUNT):
         for side in range(2):
@@ -526,10 +531,10 @@ def _last_of_guards(p, state, w, h) -> float:
 
 @kernel()
 def _write_ramp(p, h, w, implicit) -> float:
-    """Write the law's force as K times the elastic part, of which only d^1 has a series here, and C times the rest.
+    """Write the law's force as K times an elastic part plus C times a rest, and return the last term's size.
 
-    Return the last term's size, as a velocity per h^(STAGES - 1). The series of a clipped pair moves nothing, but gives
-    the time at which it pushes again.
+    The elastic part is d for the exponent 1, otherwise 0. The size is a velocity per h^(STAGES - 1). The series of a
+    clipped pair does not act on the head, but gives the time at which the pair pushes again.
     """
     s, largest = implicit.nodes.size, 0.0
     _interpolate(implicit.pairs[1], implicit.from_stages, h, w.damped)
@@ -548,7 +553,7 @@ def _write_ramp(p, h, w, implicit) -> float:
 
 @kernel(inline="source")
 def own(parts):
-    """Return nodes and space of implicit steps and the terms that they distinguish."""
+    """Return nodes and scratch space of implicit steps, and the terms for which they are compiled."""
     terms = parts.terms
     rubbing = terms.wear, terms.sliding, terms.running_in
     return parts.implicit, terms.ramp, rubbing, terms.slip, terms.stick, terms.support
@@ -556,7 +561,7 @@ def own(parts):
 
 @kernel()
 def lay_out(p, parts, own, state, w, span, penetrating) -> bool:
-    """Lay out an implicit step, where damping bounds explicit ones; `w.decay[0]` keeps its rate of decay."""
+    """Lay out an implicit step if damping limits explicit steps; `w.decay[0]` gets the decay rate."""
     return _lay_out(p, parts, *own, state, w, span, penetrating)
 
 
@@ -566,7 +571,7 @@ def _lay_out(p, parts, implicit, ramp, rubbing, slip, stick, support, state, w, 
         return False
     state.implicit_size_before, state.decay_times_before = state.implicit_size, state.decay_times
     state.refused_before = state.refused
-    # without contact the dampers of a support may still act
+    # the dampers of a support act without contact too
     damped = penetrating or support is not None
     w.decay[0] = decay_rate(p, state, slip, stick, support) if damped else 0.0
     if w.decay[0] <= 0.0 or state.touching != 0 or not has_decayed(p, state):
@@ -579,7 +584,7 @@ def _lay_out(p, parts, implicit, ramp, rubbing, slip, stick, support, state, w, 
 
 @kernel(inline="source")
 def at_most_stable(p, implicit, state, w, sigma):
-    """Return the part of `sigma` over which an explicit step is stable."""
+    """Return `sigma`, or the smaller value up to which an explicit step is stable."""
     if implicit is not None and w.decay[0] > 0.0 and state.beta == 0.0:
         sigma = min(sigma, stable_decay(p.order) / w.decay[0])
     return sigma
@@ -587,11 +592,11 @@ def at_most_stable(p, implicit, state, w, sigma):
 
 @kernel()
 def note_step(implicit, state, w, step_size, has_event) -> None:
-    """Note the consequences of a step laid out for the next implicit step."""
+    """Record what a laid-out step means for the next implicit step: the decay times passed, and its size."""
     if implicit is not None:
         note_decay(state, w.decay[0], step_size)
         if has_event:
-            # the polynomial of a long step can show an event where a pair only comes close to its wall
+            # the polynomial of a long step can show a false event if a pair only comes close to its wall
             state.implicit_size = min(state.implicit_size, 4.0 * step_size)
 
 
@@ -606,9 +611,9 @@ def _start(p, support, state, implicit) -> None:
 
 @kernel()
 def _collocate(p, parts, support, state, w, span, decay, implicit, ramp, wear, sliding, running_in, stick) -> float:
-    """Lay out an implicit step as series of order `STAGES`; return its size, or 0 when explicit steps are better.
+    """Lay out an implicit step as series of order `STAGES`; return its size in s, or 0 if explicit steps are better.
 
-    `decay` is the `decay_rate`.
+    `decay` is the result of `decay_rate` in 1/s.
     """
     least = _WORTH * stable_decay(p.order) / decay
     if span < least:
@@ -623,7 +628,7 @@ def _collocate(p, parts, support, state, w, span, decay, implicit, ramp, wear, s
             size = _write_series(p, support, state, h, w, implicit, ramp, wear, stick)
             better = 0.9 * (admissible / max(size, 1e-6 * admissible)) ** (1.0 / (STAGES - 1))
             if size <= admissible:
-                # a step cut short by a sample is no evidence against a longer step
+                # if a sample has cut the step short, the size before is still a good guess
                 longer = h * min(better, 4.0)
                 state.implicit_size = max(longer, state.implicit_size) if h == span else longer
                 state.implicit_steps += 1

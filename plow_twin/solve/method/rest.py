@@ -1,9 +1,9 @@
-"""Rest: the vanishing vibration of a head that its contacts hold is not followed.
+"""Rest: the dying vibration of a head that is held by its contacts need not be computed.
 
-With constant loads and no other drive, the sum of kinetic and potential energy cannot grow. Where the
-stiffness is positive definite it bounds for all time how far the head can get from its equilibrium. Once the bound is
-far below the tolerance the head is set to its equilibrium, and steps are as long as possible. Harmonics may act if they
-move the head no farther (`small_harmonics`).
+With constant loads and no other drive, the sum of kinetic and potential energy cannot grow. If the stiffness is
+positive definite, this sum bounds the head's distance from its equilibrium for all time. Once the bound is far below
+the tolerance, the head is set to its equilibrium, and steps are as long as possible. Harmonics may act if they move the
+head no farther (`small_harmonics`).
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from plow_twin.solve.method.equilibrium import held, stiffer_than, stiffness_at,
 from plow_twin.solve.method.small_harmonics import EVALUATIONS, stays_at_rest, without_harmonics
 from plow_twin.solve.state import OMEGA, ON, VX, VY
 
-#: Largest share of the tolerances for the omitted motion.
+#: Largest omitted motion, as a share of the tolerances.
 _SHARE = 1e-3
-#: Factor over that distance by which a pair must be deeper, or farther away.
+#: Least penetration or gap of every pair, as a multiple of the largest omitted motion.
 _MARGIN = 10.0
-#: Smallest such depth in m, for the difference quotients of the stiffness.
+#: Least penetration or gap in m, for the difference quotients of the stiffness.
 _DEEP = 1e-7
-#: Most evaluations of the equations of motion that the check takes.
+#: Largest number of evaluations of the equations of motion in the check.
 AT_REST = 5 + EVALUATIONS
 
 
@@ -48,7 +48,10 @@ def slow_enough(p, y) -> bool:
 
 @kernel()
 def _still(p, acts, harmonics, state, w) -> bool:
-    """Return whether the head stays within the share of the tolerances for all time; bring it to rest then."""
+    """Return whether the omitted motion would stay within its share of the tolerances for all time.
+
+    If so, the head is set to its equilibrium.
+    """
     y, z, rate = state.y, w.rest[0], w.rest[1]
     gyration, speed = _gyration(p), _speed(p, y)
     way, fast = _SHARE * p.position_tolerance, _SHARE * p.velocity_tolerance
@@ -60,7 +63,7 @@ def _still(p, acts, harmonics, state, w) -> bool:
     without_harmonics(p, harmonics, state.step_start, rate, w.rest[3, 3:])
     if not stiffer_than(w.hessian, 0.0):
         return False
-    # kinetic and potential energy bound the speed, and by the least stiffness how far the head can get
+    # the energy bounds the speed, and with the least stiffness the distance from equilibrium
     energy = speed * speed + to_equilibrium(w.hessian, rate, z, gyration)
     if not (2.0 * energy < fast * fast and stiffer_than(w.hessian, 2.0 * energy / (way * way))):
         return False
@@ -71,7 +74,7 @@ def _still(p, acts, harmonics, state, w) -> bool:
 
 @kernel()
 def _still_as_before(p, acts, harmonics, state, w) -> bool:
-    """Return whether place and load are unchanged since rest was found."""
+    """Return whether place and load are unchanged since the head was found at rest."""
     z, rate = w.rest[0], w.rest[1]
     to_world(p, state.y, z)
     accelerate(p, acts, True, state, state.step_start, z, w.rest[3, :3], rate)
@@ -83,13 +86,13 @@ def _still_as_before(p, acts, harmonics, state, w) -> bool:
 
 @kernel(inline="source")
 def own(parts):
-    """Return 1 where rest can be recognised, otherwise None."""
+    """Return 1 if rest can be recognised in the scene, otherwise None."""
     return parts.terms.rest
 
 
 @kernel()
 def lay_out(p, parts, own, state, w, span, penetrating) -> bool:
-    """Lay out a step of rest where the head is at rest and its load constant."""
+    """Lay out a step of rest if the head is at rest and its load is constant."""
     if own is None:
         return False
     steady = penetrating and w.wrench[1, 0] == 0.0 and w.wrench[1, 1] == 0.0 and w.wrench[1, 2] == 0.0
@@ -103,7 +106,7 @@ def lay_out(p, parts, own, state, w, span, penetrating) -> bool:
 
 @kernel()
 def _settle(p, acts, harmonics, state, w) -> bool:
-    """Bring the head to rest if it is found at rest; return whether it is."""
+    """Check whether the head is at rest, and if so set it to its equilibrium; return whether it is."""
     if not (state.at_rest == 1 and _still_as_before(p, acts, harmonics, state, w)):
         if not _still(p, acts, harmonics, state, w):
             return False
@@ -113,7 +116,7 @@ def _settle(p, acts, harmonics, state, w) -> bool:
 
 @kernel()
 def write_rest(p, state, w) -> None:
-    """Write the series of a head at rest: it stays where it is."""
+    """Write the constant series of a head at rest."""
     y = state.y
     set_row(w.series, 0, row(y, 0))
     for pair in range(PAIR_COUNT):

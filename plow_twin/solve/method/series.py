@@ -6,9 +6,10 @@ With the state in body coordinates (`model.geometry`) the equations of motion (p
     Y'  = VY - omega X            VY' = -omega VX - s (Fx/m) + c (Fy/m) + sum n_y F/m
     c'  = -omega s    s' = omega c    theta' = omega    omega' = M/I + sum arm F/I
 
-so each order of the series follows from the lower ones by Cauchy products (Jorba and Zou, Exp. Math. 14 (2005) 99).
-Time runs as t = alpha sigma + beta sigma^2 / 2. With (1, 0) sigma is time; with (0, 2) the root-like start of a contact
-force with exponent 1.5 becomes analytic.
+so each order of the series follows from the lower orders by Cauchy products (Jorba and Zou, Exp. Math. 14 (2005) 99).
+The series are in sigma, with the time t = alpha sigma + beta sigma^2 / 2 since the step's start. With (alpha, beta) =
+(1, 0) sigma is time; with (0, 2) it is the square root of time, in which a contact force with exponent 1.5 is analytic
+at its touch.
 """
 
 from __future__ import annotations
@@ -36,9 +37,10 @@ from plow_twin.solve.support import (
     start_frame,
 )
 
-#: A term has vanished where it is below this share of the admissible size of the last order.
+#: A term has vanished if it is below this share of the admissible size of the last order.
 _VANISHED = 0.4
-#: Factors in the rates of the state's components: of omega (S1 in lanes 4 and 7), and of components that are rates.
+#: For the rate of each state component: the component that omega multiplies (S1 in lanes 4 and 7), and the component
+#: that is its rate.
 _turned = permutation(Y, X, VY, VX, COS, SIN, COS, SIN)
 _rates_of = permutation(VX, VY, VX, VY, OMEGA, COS, SIN, OMEGA)
 
@@ -47,7 +49,7 @@ _rates_of = permutation(VX, VY, VX, VY, OMEGA, COS, SIN, OMEGA)
 def expand_harmonics(harmonics, second, t, alpha, beta, order, w) -> None:
     """Write the series of S1, S2 and M to `w.load`.
 
-    sin and cos along t(sigma) follow from one another:  (k+1) sin_{k+1} = omega (alpha cos_k + beta cos_{k-1}).
+    The series of sine and cosine in sigma give each other:  (k+1) sin_{k+1} = omega (alpha cos_k + beta cos_{k-1}).
     """
     load = w.load
     for k in range(order + 1):
@@ -72,9 +74,9 @@ def expand_harmonics(harmonics, second, t, alpha, beta, order, w) -> None:
 
 @kernel(fast=True)
 def _multiply_older(a, b, k):
-    """Return order k of the eight products of the columns of a and b, without the two terms of order k itself.
+    """Return order k of the products of a's and b's columns, without the terms with row k of a or b.
 
-    The oldest orders come first: most of the sum need not wait for the newest one.
+    The newest rows are added last, so that most of the sum need not wait until they are computed.
     """
     low, high = splat(0.0), splat(0.0)
     half = k // 2
@@ -89,9 +91,9 @@ def _multiply_older(a, b, k):
 
 @kernel(fast=True)
 def _join(a, b, k, a_k, b_k):
-    """Return order k of the eight products of the columns of a and b; a_k and b_k are their rows k.
+    """Return order k of the products of a's and b's columns; a_k and b_k are their rows k.
 
-    The newest rows are passed as values: reading them back would wait for their store.
+    The newest rows are passed as values, because reading them from memory would wait until they are stored.
     """
     if k == 0:
         return a_k * b_k
@@ -100,18 +102,18 @@ def _join(a, b, k, a_k, b_k):
 
 @kernel(fast=True)
 def _multiply(a, b, k):
-    """Return order k of the eight products of the columns of a and b."""
+    """Return order k of the products of a's and b's columns."""
     return _join(a, b, k, row(a, k), row(b, k))
 
 
 @kernel(fast=True, inline="code")
 def _raise(w, k, penetration, touching, exponent):
-    """Write order k of penetration^exponent of the pairs that act to `w.power[0]`, and return it.
+    """Write order k of penetration^exponent of the acting pairs to `w.power[0]`, and return it.
 
-    Row BASE of `w.per_pair` is 1 / d, for the exponent 1.5 half its root; it is zero for the other pairs.
+    Row BASE of `w.per_pair` is 1 / d, or half of the root of 1 / d for the exponent 1.5; it is zero for other pairs.
     """
     if exponent == 1.5:
-        # d^1.5 as d times its root: less work than the recurrence for any power
+        # d^1.5 is computed as d times its root, which is less work than the general recurrence
         if k == 0:
             for pair in range(PAIR_COUNT):
                 w.power[1, 0, pair] = math.sqrt(w.penetration[0, pair]) if w.per_pair[BASE, pair] != 0.0 else 0.0
@@ -137,7 +139,7 @@ def _raise(w, k, penetration, touching, exponent):
 
 @kernel(fast=True, inline="code")
 def _damp(p, elastic, w, k, elastic_k, rate, viscous, hysteretic, ramp):
-    """Return order k of the force from that of d^n:  K d^n (1 + lambda d')  or  K d^n + C psi d'."""
+    """Return order k of the force from order k of d^n:  K d^n (1 + lambda d')  or  K d^n + C psi d'."""
     force = row(w.per_pair, ACTS) * elastic_k
     if ramp is not None:
         _ramp(p, w, k)
@@ -150,7 +152,7 @@ def _damp(p, elastic, w, k, elastic_k, rate, viscous, hysteretic, ramp):
 
 @kernel(fast=True, inline="code")
 def _ramp(p, w, k) -> None:
-    """Write to `w.ramp[2]` order k of the acting share of C, which is constant for pairs beyond the ramp."""
+    """Write order k of the acting share of C to `w.ramp[2]`; it is constant for pairs beyond the ramp."""
     set_row(w.ramp[0], k, _multiply(w.penetration, w.penetration, k))
     set_row(w.ramp[1], k, _multiply(w.ramp[0], w.penetration, k))
     within = row(w.per_pair, RAMPS)
@@ -181,7 +183,7 @@ def _push(p, state, w, k, penetration, rate, viscous, hysteretic, integer, fract
 
 @kernel(fast=True)
 def _hold(p, w, k, fx, fy):
-    """Return order k of the force per mass in head axes, without its part along a locked world axis."""
+    """Return order k of the force per mass in head axes, less its component along a locked world axis."""
     if fixed_axes(p) is not None:
         return p.free[0] * fx, p.free[1] * fy
     w.world[0, k], w.world[1, k] = fx, fy
@@ -202,7 +204,7 @@ def _hold(p, w, k, fx, fy):
 def _loads(p, w, k, c, s, c1, s1, c2, s2, product, alpha, beta, harmonics, second, segments):
     """Return order k of the load per mass in head axes and of its moment per inertia.
 
-    c, s are the orders k of cosine and sine, c1, s1 and c2, s2 the orders k - 1 and k - 2; `product` has S1 c and S1 s.
+    c and s are order k of cosine and sine, c1 and s1 order k - 1, c2 and s2 order k - 2; `product` has S1 c and S1 s.
     """
     if fixed_axes(p) is not None:
         return _loads_along_world(p, w, k, alpha, beta, harmonics, second, segments)
@@ -210,7 +212,7 @@ def _loads(p, w, k, c, s, c1, s1, c2, s2, product, alpha, beta, harmonics, secon
     fx, fy = start[0] * c + start[1] * s, start[1] * c - start[0] * s
     moment = start[2] if k == 0 else 0.0
     if segments is not None:
-        # wrench start + slope t(sigma): its own series has the terms alpha slope and beta slope / 2
+        # the series of start + slope t(sigma) has the terms alpha slope and beta slope / 2
         fx += alpha * (slope[0] * c1 + slope[1] * s1) + 0.5 * beta * (slope[0] * c2 + slope[1] * s2)
         fy += alpha * (slope[1] * c1 - slope[0] * s1) + 0.5 * beta * (slope[1] * c2 - slope[0] * s2)
         if k == 1:
@@ -238,7 +240,7 @@ def _loads_along_world(p, w, k, alpha, beta, harmonics, second, segments):
     load, start, slope = w.load, w.wrench[0], w.wrench[1]
     held, rising = 1.0 if k == 0 else 0.0, 0.0
     if segments is not None:
-        # t(sigma) has the terms alpha and beta / 2
+        # the series of t(sigma) has the terms alpha and beta / 2
         rising = alpha if k == 1 else 0.5 * beta if k == 2 else 0.0
     fx, fy = held * start[0] + rising * slope[0], held * start[1] + rising * slope[1]
     moment = held * start[2] + rising * slope[2]
@@ -254,7 +256,7 @@ def _loads_along_world(p, w, k, alpha, beta, harmonics, second, segments):
 
 @kernel(fast=True, inline="source")
 def _applied(p, along_x, along_y, torque):
-    """Return the accelerations that forces in head axes and moments of the pairs give, in the lanes of the rates."""
+    """Return the accelerations by the pairs' forces (in head axes) and moments, in the lanes of the state's rates."""
     mass, inertia = p.inverse_mass, p.inverse_inertia
     pushed = spread_total(along_x) * pack(0.0, 0.0, mass, 0.0, 0.0, 0.0, 0.0, 0.0)
     pushed = pushed + spread_total(along_y) * pack(0.0, 0.0, 0.0, mass, 0.0, 0.0, 0.0, 0.0)
@@ -283,7 +285,7 @@ def _drag(p, w, k, c, s, x, y, om, dc, ds, dx, dy):
         set_row(rest, k, _multiply(tau, tau, k) * -1.0)
     force = _multiply(w.force, tau, k) * p.friction
     set_row(drag, k, force)
-    # t is the wall's normal turned by +90 degrees, the penetration's rows for X and Y are minus the normals
+    # the tangent is the wall's normal turned by +90 degrees; the penetration's rows for X and Y are minus the normal
     return _applied(
         p, row(p.penetration_rows, 3) * force, row(p.penetration_rows, 2) * force * -1.0, _multiply(arm, drag, k)
     )
@@ -307,7 +309,7 @@ def _hold_on(p, state, w, k, c, s, x, y, theta, om, dc, ds, dx, dy):
 def _slide(p, w, k, om, dc, ds, dx, dy) -> None:
     """Write order k of the force times the sliding distance of a corner per travel to `w.rub[2]`.
 
-    The distance is sqrt(q) with q = 1 + (s' / v)^2: 2 root_0 root_k = q_k - sum of root_j root_{k-j} without its ends.
+    The distance is the root r of q = 1 + (s' / v)^2, with 2 r_0 r_k = q_k - sum_{j=1}^{k-1} r_j r_{k-j}.
     """
     sliding, way = w.rub[0], w.rub[1]
     rate = rolled(p, row_values(p.slip_rows, dc, ds, dx, dy), om)
@@ -372,7 +374,7 @@ def _wear(p, state, w, k, alpha, beta, om, dc, ds, dx, dy, sliding, running_in) 
 
 @kernel(fast=True, inline="code")
 def _slide_size(p, w, k, sliding, running_in):
-    """Return the size of order k - 1 of the sliding speed of the pads that carry force: order k is not known yet."""
+    """Return the size of order k - 1 of the sliding speed of the pads that carry force; order k is not yet known."""
     size = 0.0
     if sliding is not None:
         for pair in range(PAIR_COUNT):
@@ -383,7 +385,7 @@ def _slide_size(p, w, k, sliding, running_in):
 
 @kernel(inline="source")
 def one_by_one(terms):
-    """Return the terms as plain tuples, to be passed on with a star: of the load, of the law, and the others."""
+    """Return the terms as plain tuples, for callers to unpack with a star: of the load, of the law, and the others."""
     load = terms.harmonics, terms.second, terms.segments
     rub = terms.sliding, terms.running_in
     return load, law_terms(terms), terms.wear, rub, terms.offset, terms.free, terms.slip, terms.stick, terms.support
@@ -391,7 +393,7 @@ def one_by_one(terms):
 
 @kernel(fast=True)
 def _turn_frame(w, k, there, c, s):
-    """Return order k of the frame's displacement and velocity turned into head axes, in four lanes."""
+    """Return order k of the frame's displacement and velocity, converted to head axes, in four lanes."""
     u, v, wx, wy = lane(there, FRAME_X), lane(there, FRAME_Y), lane(there, FRAME_VX), lane(there, FRAME_VY)
     left, right = pack(c, s, c, s, c, s, c, s), pack(u, v, v, -u, wx, wy, wy, -wx)
     set_row(w.frame_left[0], k, left)
@@ -403,10 +405,10 @@ def _turn_frame(w, k, there, c, s):
 
 @kernel(fast=True)
 def _seen_rates(w, k, there, turned, om, turning):
-    """Return order k of the rates of cosine, sine and place of the head as seen from the frame.
+    """Return order k of the rates of the head's cosine, sine and place relative to the frame.
 
-    `turned` is what `_turn_frame` returns: R^T u and R^T w, with (R^T u)' = R^T w + omega times R^T u turned by -90
-    degrees; `turning` has the rates of the head's absolute place.
+    `turned` is the result of `_turn_frame`, R^T u and R^T w, with (R^T u)' = R^T w + omega times R^T u turned by -90
+    degrees; `turning` has the rates of the head's place relative to the ground.
     """
     relative = om - lane(there, SPIN)
     left = pack(om, om, relative, relative, 0.0, 0.0, 0.0, 0.0)
@@ -421,10 +423,10 @@ def _seen_rates(w, k, there, turned, om, turning):
 
 @kernel(fast=True)
 def _push_frame(p, w, k, there, c, s, x, y, dc, ds, pushed):
-    """Return order k of the rates of the frame under its springs and dampers and the reaction of the contacts.
+    """Return order k of the frame's rates under its springs, its dampers and the contacts' reaction.
 
-    `pushed` is the pairs' accelerations of the head (`_applied`); their moment about the frame's centre is their moment
-    about the head's and the head's place (x, y) times their force.
+    `pushed` has the head's accelerations by the pairs (`_applied`). The pairs' moment about the frame's centre is their
+    moment about the head's centre of mass plus the cross product of the head's place (x, y) and their force.
     """
     fx, fy = lane(pushed, VX) / p.inverse_mass, lane(pushed, VY) / p.inverse_mass
     left, right = pack(c, s, s, c, x, y, 0.0, 0.0), pack(fx, fy, fx, fy, fy, fx, 0.0, 0.0)
@@ -449,7 +451,7 @@ def _push_frame(p, w, k, there, c, s, x, y, dc, ds, pushed):
 
 @kernel(fast=True, inline="source")
 def _turn_of_axes(p):
-    """Return the signs of the products with omega in the rates: of place and velocity, where the axes turn."""
+    """Return the factors of the products with omega in the state's rates; 0 for place and velocity in fixed axes."""
     if fixed_axes(p) is not None:
         return pack(0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 1.0, 0.0)
     return pack(1.0, -1.0, 1.0, -1.0, 0.0, -1.0, 1.0, 0.0)
@@ -475,8 +477,8 @@ def expand(
 ):
     """Write the series of state, penetration, rate and force up to order `limit` to `w`; return the order used.
 
-    Without `penetrating` no pair is inside its wall and the contacts are not computed. Orders whose terms vanish
-    at `sigma_limit`, the longest sigma of interest, are not computed.
+    If not `penetrating`, no pair is inside its wall, and the contacts are not computed. The series ends early if its
+    terms vanish at `sigma_limit`, the longest sigma of interest.
     """
     alpha, beta = state.alpha, state.beta
     left, right, load, inverse = w.left, w.right, w.load, w.inverse
@@ -491,7 +493,7 @@ def expand(
         set_row(w.series, k, here)
         x, yy, vx, vy = lane(here, X), lane(here, Y), lane(here, VX), lane(here, VY)
         om, c, s = lane(here, OMEGA), lane(here, COS), lane(here, SIN)
-        # as seen from the frame: the pairs depend on this
+        # the pairs depend on the state relative to the frame
         seen_c, seen_s, seen_x, seen_y = c, s, x, yy
         if support is not None:
             set_row(w.frame, k, there)
@@ -532,7 +534,7 @@ def expand(
         turning = turning + _rates_of(here) * pack(1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
         fx, fy, moment = _loads(p, w, k, c, s, c1, s1, c2, s2, product, alpha, beta, *load_terms)
         if offset is not None:
-            # the loads' moment is about the cavity's centre, gravity acts at the centre of mass
+            # the loads' moment is about the cavity's centre; gravity acts at the centre of mass and has no moment
             across = p.offset[0] * (fy + p.gravity * c) - p.offset[1] * (fx + p.gravity * s)
             moment -= across * p.inverse_inertia / p.inverse_mass
         applied = pack(0.0, 0.0, fx, fy, moment, 0.0, 0.0, 0.0)
@@ -563,7 +565,7 @@ def expand(
                 applied, pushed = applied + dragged, pushed + dragged
             if wear is not None:
                 _wear(p, state, w, k, alpha, beta, om, dc, ds, dx, dy, *rub_terms)
-            # the penetration of the next order needs only this order's rates, and need not wait for forces
+            # the penetration of the next order depends on this order's rates alone, so it need not wait for forces
             penetration = rate * steady + closing * bent
             closing = rate
         if support is not None:

@@ -1,14 +1,14 @@
 """Rest under harmonics: whether the motion of a head held by its contacts stays below the tolerance for all time.
 
-About its equilibrium such a head obeys  e'' + C e' + K e = r,  with e its distance from the linear answer to the
-harmonics (the angle counts as a place, times the radius of gyration) and r what the linear equations leave out. The
-answer is known in closed form, resonance included. With eps <= c / 2, s / (10 S), sqrt(s) / 10, where s and c are the
-least eigenvalues of K and C, and S is the largest one of C,
+About its equilibrium such a head obeys  e'' + C e' + K e = r.  Here e is its distance from the linear response to the
+harmonics, with the angle times the radius of gyration as third place, and r is the remainder of the linearisation. The
+response is known in closed form, resonance included. Let s and c be the least eigenvalues of K and C, and S the largest
+eigenvalue of C. With eps at most c / 2, s / (10 S) and sqrt(s) / 10,
 
     V = (e'e' + e K e) / 2 + eps (e e' + e C e / 2),  V' <= -eps W + r (1 + eps / sqrt(s)) sqrt(W),  W = e'e' + e K e
 
-is between 0.45 W and 0.55 W. So sqrt(W) stays below the larger of 1.2 times its present value and 1.4 r / eps for all
-time, and e below sqrt(W / s). Without damping nothing keeps r from swinging the head up.
+and V lies between 0.45 W and 0.55 W. So for all time sqrt(W) stays below the larger of 1.2 times its present value and
+1.4 r / eps, and e stays below sqrt(W / s). Without damping (c = 0) there is no such bound.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from plow_twin.solve.method.equilibrium import stiffer_than
 from plow_twin.solve.method.flight import amplitudes
 from plow_twin.solve.state import ON, X, Y
 
-#: Halvings after which an eigenvalue counts as zero.
+#: Number of halvings after which an eigenvalue is taken as zero.
 _HALVINGS = 40
-#: Evaluations of the equations of motion that the check takes.
+#: Evaluations of the equations of motion in this check.
 EVALUATIONS = 4
 
 
 @kernel()
 def without_harmonics(p, harmonics, t, rate, spare) -> None:
-    """Subtract the harmonics at t from the accelerations rate[3:]; `spare`, shape (3,), is written over."""
+    """Subtract the harmonics at t from the accelerations rate[3:]; `spare`, shape (3,), is scratch space."""
     if harmonics is not None:
         spare[0] = spare[1] = spare[2] = 0.0
         add_harmonics(p, harmonics, t, spare)
@@ -45,7 +45,7 @@ def without_harmonics(p, harmonics, t, rate, spare) -> None:
 
 @kernel()
 def _damping_at(p, acts, state, w, gyration) -> None:
-    """Write minus the derivatives of the accelerations at `w.rest[0]`, by rate to `w.damping`."""
+    """Write minus the derivatives of the accelerations by rate, at `w.rest[0]`, to `w.damping`."""
     z, rate, moved = w.rest[0], w.rest[1], w.rest[2]
     accelerate(p, acts, True, state, state.step_start, z, w.rest[3, :3], rate)
     for j in range(3):
@@ -63,7 +63,7 @@ def _damping_at(p, acts, state, w, gyration) -> None:
 
 @kernel()
 def _least_eigenvalue(h) -> float:
-    """Return a lower bound of the least eigenvalue, not far below half of it; 0 where it is not positive."""
+    """Return a lower bound of the least eigenvalue, at least about half of it; 0 if the eigenvalue is not positive."""
     least = 0.99 * min(h[0, 0], h[1, 1], h[2, 2])
     for _ in range(_HALVINGS):
         if stiffer_than(h, least):
@@ -83,7 +83,7 @@ def _trace(p, h) -> float:
 
 @kernel(inline="code")
 def _dynamic_stiffness(p, w, omega, i, j):
-    """Return an entry of K - omega^2 + i omega C, with a separate equation for a locked place."""
+    """Return entry (i, j) of K - omega^2 + i omega C, with the unit matrix's row and column for a locked place."""
     if p.free[i] == 0.0 or p.free[j] == 0.0:
         return complex(1.0 if i == j else 0.0, 0.0)
     return complex(w.hessian[i, j] - (omega * omega if i == j else 0.0), omega * w.damping[i, j])
@@ -91,7 +91,7 @@ def _dynamic_stiffness(p, w, omega, i, j):
 
 @kernel()
 def _answer(p, one, w, gyration):
-    """Return the amplitude in m of the linear answer to a harmonic, all three places together, and of sqrt(x K x)."""
+    """Return the amplitudes of |x| in m (over all places) and of sqrt(x K x) of the linear response x to a harmonic."""
     om = one.omega
     a, b, c = _dynamic_stiffness(p, w, om, 0, 0), _dynamic_stiffness(p, w, om, 0, 1), _dynamic_stiffness(p, w, om, 0, 2)
     d, e, f = _dynamic_stiffness(p, w, om, 1, 0), _dynamic_stiffness(p, w, om, 1, 1), _dynamic_stiffness(p, w, om, 1, 2)
@@ -100,21 +100,24 @@ def _answer(p, one, w, gyration):
     sy, cy = amplitudes(p, one, 1)
     st, ct = amplitudes(p, one, 2)
     x, y, t = p.free[0] * complex(cx, -sx), p.free[1] * complex(cy, -sy), p.free[2] * gyration * complex(ct, -st)
-    # by the adjugate
+    # the inverse by the adjugate
     first, second, third = e * k - f * h, f * g - d * k, d * h - e * g
     along_x = first * x + (c * h - b * k) * y + (b * f - c * e) * t
     along_y = second * x + (a * k - c * g) * y + (c * d - a * f) * t
     along_t = third * x + (b * g - a * h) * y + (a * e - b * d) * t
     size = math.sqrt(abs(along_x) ** 2 + abs(along_y) ** 2 + abs(along_t) ** 2)
     size /= abs(a * first + b * second + c * third)
-    # x K x is at most the work of harmonic and inertia along the path
+    # x K x is at most |x| times the amplitudes of the harmonic and of the inertia force
     load = math.sqrt(abs(x) ** 2 + abs(y) ** 2 + abs(t) ** 2)
     return size, math.sqrt(load * size) + om * size
 
 
 @kernel()
 def _left_out(p, state, w, reach, rate, gyration) -> float:
-    """Return a bound of r within distances `reach` and rates `rate`, by curvature and turning of the pairs' forces."""
+    """Return an upper bound of r for distances up to `reach` and rates up to `rate`.
+
+    The remainder r is due to the curvature of the pairs' forces and to their turning with the head.
+    """
     y, left_out = state.y, 0.0
     arm = (p.leverage + math.hypot(y[X], y[Y])) / gyration
     way = math.sqrt(1.0 + arm * arm)
@@ -132,9 +135,9 @@ def _left_out(p, state, w, reach, rate, gyration) -> float:
 
 @kernel()
 def stays_at_rest(p, acts, harmonics, state, w, distance, way, fast, gyration) -> bool:
-    """Return whether the head stays within the distance `way` of its equilibrium, and slower than `fast`, for all time.
+    """Return whether the head stays within `way` [m] of its equilibrium and slower than `fast` [m/s] for all time.
 
-    `distance` is the present sqrt(W) of the head without harmonics; `w.hessian` has its stiffness.
+    `distance` is the present sqrt(W) without the harmonics' response; `w.hessian` has the stiffness.
     """
     least = _least_eigenvalue(w.hessian)
     _damping_at(p, acts, state, w, gyration)

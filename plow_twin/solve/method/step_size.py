@@ -1,4 +1,4 @@
-"""The length of a step: up to where its series stops being accurate, and shorter where the series cannot show this."""
+"""The length of a step: as long as its series is accurate, and shorter if the series cannot show its own error."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from plow_twin.solve.method.series import expand, expand_harmonics, one_by_one
 from plow_twin.solve.modes import penetration_and_rate
 from plow_twin.solve.state import CLIPPED, ON
 
-#: Number of steps of the last size within which a parting is searched, and the order of its series.
+#: A parting is looked for within this many steps of the last size, by a series of this order.
 _PARTING_REACH, PARTING_ORDER = 1.3, 6
-#: The same with friction that sticks, where the remaining force is judged separately and steps are shorter.
+#: The reach with friction that sticks, since its guards make steps shorter.
 _PARTING_REACH_STICK = 8.0
-#: Newton steps to its root, and the relative change at which they end: the next step corrects the rest.
+#: Most Newton steps to the parting, and the relative change at which they end; the next step corrects the rest.
 _NEWTON_STEPS, _ROOT_FOUND = 6, 1e-9
-#: A larger term is not finite, or its products would not be.
+#: Largest usable term; products of larger terms would not be finite.
 _FINITE = 1e300
-#: How often a step is shortened (the largest term over it also shrinks), and the change that counts as zero.
+#: Most shortenings of a step, over which the largest term shrinks too, and the factor above which shortening ends.
 _SHORTER, _SHORT_ENOUGH = 20, 0.9
 
 
@@ -30,8 +30,8 @@ _SHORTER, _SHORT_ENOUGH = 20, 0.9
 def accurate_step(p, w, order, sigma_limit):
     """Return the sigma over which the series meets its share of the tolerance; NaN if it is not finite.
 
-    Term k may be as large as `threshold[k]`, which falls geometrically to the admissible error at the last order (root
-    test as by Jorba and Zou, sec. 3.2). All of the last `lacuna` orders are checked, since single orders can vanish.
+    Term k may be as large as `threshold[k]`, which falls geometrically with k to the admissible error at the last order
+    (the root test of Jorba and Zou, sec. 3.2). Single orders can vanish, so the last `lacuna` orders are all checked.
     """
     least = np.inf
     for k in range(order, order - max(p.lacuna, 2), -1):
@@ -41,7 +41,7 @@ def accurate_step(p, w, order, sigma_limit):
         if size > 0.0:
             least = min(least, math.log(p.threshold[k] / size) / k)
     sigma = min(sigma_limit, math.exp(least))
-    # an error of velocity becomes one of position over a long step
+    # over a long step an error of velocity becomes an error of position
     stretch = sigma * p.velocity_tolerance / (p.position_tolerance * (order + 1))
     if stretch > 1.0 and sigma < sigma_limit:
         sigma *= math.exp(-math.log(stretch) / order)
@@ -50,10 +50,11 @@ def accurate_step(p, w, order, sigma_limit):
 
 @kernel()
 def before_sticking(p, state, w, order, sigma) -> float:
-    """Return the part of `sigma` over which the series of tanh r converges well enough.
+    """Return `sigma`, or the smaller value up to which the series of tanh r converges well enough.
 
-    Far from sticking tanh r is constant to the last bit, and no coefficient shows its poles at r = +-i pi/2.
-    With |r - r_0| at most theta times their distance, the remainder of the series is below theta^order.
+    Far from sticking tanh r is constant to the last bit, so its coefficients do not show its poles at r = +-i pi/2. If
+    |r - r_0| is at most theta times the distance of r_0 from the poles, the remainder of the series is below
+    theta^order.
     """
     theta = (p.threshold[p.order] / p.threshold[0]) ** (1.0 / order)
     within = sigma
@@ -65,19 +66,19 @@ def before_sticking(p, state, w, order, sigma) -> float:
             change = (change + abs(w.slip[0, k, pair])) * within
         limit = theta * math.hypot(w.slip[0, 0, pair], 0.5 * math.pi)
         if change > limit:
-            # the change is convex in sigma
+            # the change is convex in sigma, so that it falls at least in proportion
             within *= limit / change
     return within
 
 
 @kernel()
 def before_pushing_again(p, state, w, order, sigma, integer, fraction) -> float:
-    """Return the part of `sigma` over which the series of the ramped force of clipped pairs is accurate.
+    """Return `sigma`, or the smaller value up to which the series of clipped pairs' ramped force is accurate.
 
-    This force does not act yet: only a guard depends on it, so no other check shortens a step for it. The root test of
-    the motion is applied to the velocity that the force would give. The acting share of C is a cubic, whose series ends
-    after the penetration's, and a force d^n has its branch point where the pair parts. The motion's own terms may have
-    ended early: the test uses the orders that exist.
+    This force does not act yet, and only a guard depends on it, so no other check limits its error. The motion's root
+    test is applied to the velocity that the force would give. This is needed because the acting share of C is a cubic,
+    whose series is longer than the penetration's, and because d^n has a branch point where the pair parts. If the
+    motion's series has ended early, the test uses the orders that exist.
     """
     least, share = np.inf, math.log(p.threshold[p.order] / p.threshold[0]) / order
     for pair in range(PAIR_COUNT):
@@ -93,9 +94,9 @@ def before_pushing_again(p, state, w, order, sigma, integer, fraction) -> float:
 
 @kernel()
 def before_gripping(p, state, w, order, sigma) -> float:
-    """Return the part of `sigma` over which the guards of stick and slip are accurate.
+    """Return `sigma`, or the smaller value up to which the guards of stick and slip are accurate.
 
-    A force far too small to move the head still decides whether its corner holds: the same root test, relative to the
+    Even a force too small to move the head decides whether its corner sticks. So the root test is made relative to the
     largest term of the guard.
     """
     guard = w.column[0]
@@ -109,9 +110,10 @@ def before_gripping(p, state, w, order, sigma) -> float:
 
 @kernel()
 def _relatively_accurate(g, order, lacuna, share, sigma) -> float:
-    """Return the part of `sigma` over which the last terms of a polynomial g are small beside its largest term.
+    """Return `sigma`, or the smaller value up to which g's last terms are small relative to its largest term.
 
-    Term k may be exp(share k) of it. Only the upper half counts: near a root the first terms are large beside the rest.
+    Term k may be exp(share k) times the largest term. Only the upper half of the terms is tested, because the lower
+    terms may be large near a root.
     """
     for _ in range(_SHORTER):
         largest, power = 0.0, 1.0
@@ -131,9 +133,9 @@ def _relatively_accurate(g, order, lacuna, share, sigma) -> float:
 
 @kernel()
 def time_to_separation(p, parts, state, w, span, harmonics, stick):
-    """Return the time until the first pair parts, where the parting shortens steps; otherwise 0.
+    """Return the time in s until the first pair parts if the parting is near enough to shorten steps, otherwise 0.
 
-    The root of a short series is enough: the next step corrects its error.
+    The root of a short series is accurate enough, because the next step corrects its error.
     """
     near, reach = False, _PARTING_REACH
     if stick is not None:

@@ -1,4 +1,4 @@
-"""A step by Taylor series: the variable of the series, the series, and its accurate length."""
+"""A step by Taylor series: choice of the series' variable, the series, and the length over which it is accurate."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from plow_twin.solve.method.step_size import (
     time_to_separation,
 )
 
-#: Number of steps of the last size for which a touch still shapes the series.
+#: Number of steps of the last size after a touch for which the root of time since the touch is the variable.
 _TOUCH_REACH = 2.5
 
 
 @kernel(inline="source")
 def own(parts):
-    """Return the terms that bound a step, and the nodes of implicit steps."""
+    """Return the terms for which the method is compiled, and the record of implicit steps."""
     terms = parts.terms
     return terms.slip, terms.ramp, terms.fraction, terms.stick, parts.implicit
 
 
 @kernel()
 def lay_out(p, parts, own, state, w, span, penetrating) -> bool:
-    """Lay out a step by Taylor series; False where it is not finite."""
+    """Lay out a step by Taylor series; return False if the series is not finite."""
     return _lay_out(p, parts, *own, state, w, span, penetrating)
 
 
@@ -57,7 +57,7 @@ def _lay_out(p, parts, slip, ramp, fraction, stick, implicit, state, w, span, pe
 
 @kernel()
 def _choose_map(p, parts, fraction, stick, state, w, span, penetrating):
-    """Choose the series' variable; return its value after `span`, and whether a step may be that long."""
+    """Choose the series' variable sigma; return its value after `span`, and whether a step may be that long."""
     if fraction is None:
         return span, True
     if state.touching != 0:
@@ -68,13 +68,13 @@ def _choose_map(p, parts, fraction, stick, state, w, span, penetrating):
         return span, True
     parting = time_to_separation(p, parts, state, w, span, parts.harmonics, stick)
     if parting > 0.0:
-        # a force that ends like d^1.5 is analytic in the root of the time left
+        # a force that ends like d^1.5 is analytic in the square root of the time left
         root = math.sqrt(parting)
         state.alpha, state.beta = 2.0 * root, -2.0
         return (root if parting <= span else root - math.sqrt(parting - span)), parting > span
     since = state.step_start - state.touch_time
     if 0.0 < since < _TOUCH_REACH * state.last_step_size:
-        # also some steps later in the root of the time since its start
+        # some steps after the touch the square root of the time since then is still the better variable
         root = math.sqrt(since)
         state.alpha, state.beta = 2.0 * root, 2.0
         return math.sqrt(since + span) - root, True
