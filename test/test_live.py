@@ -869,7 +869,7 @@ def test_failed_advances_are_no_success_in_any_view_of_a_run(
     assert run_cli(["live", str(path), "--scene", "paper", "--record", str(run)]) == 3
     said = capsys.readouterr().err
     assert "10 advances failed, without forces from 0.681 s to 0.690 s: the head turned to -45.3 degrees" in said
-    assert "the model holds up to 45; then the head began again in the initial position, with its wear" in said
+    assert "the model is valid up to 45; then the head began again in the initial position, with its wear" in said
     for arguments in (["info"], ["doctor"]):
         code = run_cli([*arguments, str(run), "--json"])
         assert (code, json.loads(capsys.readouterr().out)["failed_advances"]) == (3 * (arguments == ["info"]), 10)

@@ -182,7 +182,7 @@ def test_a_model_that_leaves_its_range_says_by_how_much_and_begins_again_as_soon
             assert failed.reason == direct.failure(status[-1]) and not status[:-1].any()
             failed_ns = T0 + index * MS
     angle = float(failed.reason.split()[4])
-    assert failed.reason.endswith("degrees; the model holds up to 45") and 45.0 < abs(angle) < 46.0
+    assert failed.reason.endswith("degrees; the model is valid up to 45") and 45.0 < abs(angle) < 46.0
     assert failed.count < 100 and counters(bench.driver)["resets"] == failed.stretches > 5 and not failed.lasts
     entries = [entry for entry in bench.journal if isinstance(entry, Failed)]
     assert sum(entry.advances for entry in entries) == failed.count

@@ -31,7 +31,7 @@ class _Column(Generic[Number]):
 
 
 class _View:
-    """Columns that are arrays even for a single row."""
+    """Columns of a row or of many rows; a column is an array even for a single row."""
 
     __slots__ = ("rows",)
 
@@ -116,7 +116,7 @@ class _Rows(_View):
 
 
 class AdvanceSeries(_Rows):
-    """Many advances at once: the fields of `Advance` with a leading axis of length n; `status` is an array of numbers.
+    """Results of n advances: the fields of `Advance` with a leading axis of length n; `status` is an array of integers.
 
     Attributes
     ----------
@@ -133,7 +133,7 @@ class AdvanceSeries(_Rows):
 
 
 class AdvanceBatch(_Rows):
-    """Advances of m twins: the fields of `AdvanceSeries`, all except `t` with a leading axis of length m."""
+    """Results of m twins: the fields of `AdvanceSeries`, all except `t` with a further leading axis of length m."""
 
     __slots__ = ()
 
@@ -151,7 +151,7 @@ _STATUS: Final = {int(status): status for status in Status}
 
 
 def check_times(now: float, times: NDArray[np.float64]) -> None:
-    """Raise `ArgumentError` for times that are not finite or go back."""
+    """Raise `ArgumentError` if times are not finite or decrease."""
     if times.ndim != 1 or not np.isfinite(times).all():
         raise ArgumentError(f"t: got {times!r}, expected finite times in s, shape (n,)")
     if len(times) and (times[0] < now or (times[1:] < times[:-1]).any()):

@@ -1,4 +1,4 @@
-"""Many live twins under sampled loads, advanced together; scenes that differ in numbers share one compiled call."""
+"""Many live twins under sampled loads, advanced together; scenes with equal terms share one compiled call."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ __all__ = ["TwinBatch"]
 
 _Array = NDArray[np.float64]
 _NO_MARKS = np.zeros(0, np.int64)
-#: Terms that have no effect when their numbers are zero.
+#: Terms that have no effect if their parameters are zero.
 _OPTIONAL = ("hysteretic", "wear", "sliding", "running_in", "offset", "free", "slip")
 
 
@@ -160,7 +160,7 @@ class TwinBatch:
         Parameters
         ----------
         t : array_like, shape (n,)
-            Model times in s, never falling.
+            Model times in s, not decreasing.
         wrench : array_like, shape (m, n, 3) or (n, 3)
             Fx, Fy [N] and M [N m] about the cavity's centre at each time, of each twin or of all.
 
@@ -256,19 +256,19 @@ class TwinBatch:
         settle_moved(self._params, self._states, index, places, self.time, self._stick)
 
     def change(self, which: ArrayLike, scenes: Sequence[Scene]) -> NDArray[np.bool_]:
-        """Go on with other numbers of some scenes, from the present places, wear and travel speed.
+        """Replace the scenes of some twins, which keep their places, wear and travel speed.
 
         Parameters
         ----------
         which : array_like of int, shape (k,)
-            Numbers of the twins; each has to be moved before its next advance.
+            Numbers of the twins; each must be moved by `move` before its next advance.
         scenes : sequence of Scene
-            Their scenes. A lasting contact keeps a damping that was set at its touch.
+            New scenes of these twins. A lasting contact keeps a damping that was set at its touch.
 
         Returns
         -------
         ndarray of bool, shape (k,)
-            False for a twin that stays as it was: the terms of its equations would change.
+            False for a twin that is unchanged because the terms of its equations would have changed.
         """
         changed = np.zeros(len(scenes), dtype=bool)
         own = list(self.scenes)

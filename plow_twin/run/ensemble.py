@@ -1,4 +1,4 @@
-"""Many scenes at once on all cores; clearance, stiffness, load or initial state differ from member to member.
+"""Runs of many scenes at once on all cores; members may differ in clearance, stiffness, load or initial state.
 
 Scenes with a linear contact force share SIMD vectors (`solve.lanes`); other scenes run one by one.
 """
@@ -161,7 +161,7 @@ class _Run:
         self.stopped, self.done = threading.Event(), 0
 
     def tasks(self, threads: int) -> tuple[list[Callable[[], None]], list[Callable[[], None]]]:
-        """Return the tasks to do first, one by one, and the tasks that threads then share."""
+        """Return the tasks to do first, one after another, and the tasks that the threads then share."""
         groups: dict[object, list[int]] = {}
         alone: list[Callable[[], None]] = []
         for index, one in enumerate(self._compiled):

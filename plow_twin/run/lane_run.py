@@ -1,4 +1,4 @@
-"""Running scenes in the lanes of a SIMD vector, in slices; the loop for a single scene takes steps of other methods."""
+"""Scenes run in the lanes of a SIMD vector, in slices; the loop for a single scene takes the steps of other methods."""
 
 from __future__ import annotations
 

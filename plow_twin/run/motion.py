@@ -1,4 +1,4 @@
-"""A run under way: slices of the compiled loop, between which limits, progress and Ctrl-C are handled."""
+"""A run in slices of the compiled loop, between which limits, progress and Ctrl-C are handled."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _FIRST_SLICE, _FIRST_SLICE_IMPLICIT = 2048, 64
 
 @dataclass
 class Motion:
-    """A run under way, and the arrays that it fills."""
+    """The progress of a run, and the arrays that it fills."""
 
     state: State
     totals: Totals
@@ -115,7 +115,7 @@ def run_fixed(
     done, size = np.zeros(1, np.int64), _FIRST_SLICE
     while True:
         begin = _time.perf_counter()
-        # the next slice overwrites the row at the end of this slice, unless it is due
+        # a slice writes a last row at its end; unless this row is due, the next slice overwrites it
         allowed = min(steps, budget, steps if look is None else int(done[0]) + size)
         code = int(fixed_step.integrate_fixed(
             compiled.params, compiled.parts, motion.state, motion.totals, motion.log, z, done, allowed, dt, euler,

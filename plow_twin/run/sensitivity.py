@@ -1,8 +1,8 @@
 """Growth of errors along a motion, which shows how long the tolerance is met.
 
-The columns of the fundamental matrix are solutions of the linearised equations (`solve.tangents`). For terms that these
-do not have, the columns are differences between the motion and displaced motions (shadows), which are followed over
-short stretches from states close to it. They include the jumps at touches and separations (saltation), because each
+The columns of the fundamental matrix are solutions of the linearised equations (`solve.tangents`). For scenes with
+other terms, the columns are differences between the motion and displaced motions (shadows), which start close to it and
+are followed over short stretches. These columns include the jumps at touches and separations (saltation), because each
 shadow has its own events.
 """
 
@@ -29,7 +29,7 @@ from plow_twin.solve.tangents import ALONG, STATE_COLUMNS, follow_columns
 
 Array = NDArray[np.float64]
 
-#: Displacement of a shadow as a share of the clearance, its smallest value near a wall, and the tolerance of a shadow.
+#: Displacement of a shadow as a share of the clearance, its least value near a wall, and the tolerance of a shadow.
 DISPLACEMENT: Final = 1e-7
 _LEAST_DISPLACEMENT: Final = 1e-10
 SHADOW_TOLERANCE: Final = 1e-12
@@ -147,7 +147,7 @@ def _scaled(load: Load, factor: float) -> Load:
 
 @dataclass(frozen=True)
 class ChangedScene:
-    """A scene with one number a little larger."""
+    """A scene with one parameter a little larger."""
 
     path: str
     compiled: CompiledScene
@@ -155,7 +155,7 @@ class ChangedScene:
 
     @staticmethod
     def of(scene: Scene, path: str, tol: float) -> ChangedScene:
-        """Increase the number at a path a little."""
+        """Return the scene with the parameter at a path a little larger."""
         value = sensitivity_parameters(scene)[path]
         length = path.startswith("clearance")
         change = DISPLACEMENT * geometry.length_scale(scene) if length else _RELATIVE_CHANGE * value
@@ -264,7 +264,7 @@ def sensitivity_of(scene: Scene, t_end: float, tol: float, parameters: Sequence[
         stretches = _by_shadows(scene, t_end, tol, parameters)
     totals, rows, growth, logs = follow(stretches)
     if tol < _EQUATIONS_TOLERANCE and _EQUATIONS_TOLERANCE * growth.max() > _LARGEST_ERROR:
-        # the motion along which the equations are linearised was too coarse
+        # the linearisation needs a more accurate motion
         stretches = _by_equations(scene, t_end, tol, parameters) or stretches
         totals, rows, growth, logs = follow(stretches)
     times, ends = _ends(t_end), stretches.ends
@@ -320,7 +320,7 @@ def _by_equations(scene: Scene, t_end: float, tol: float, parameters: Sequence[s
 
 def _by_shadows(scene: Scene, t_end: float, tol: float, parameters: Sequence[str]) -> _Stretches:
     """Follow displaced motions beside the motion."""
-    # a tolerance of a hundred-thousandth of a displacement
+    # the tolerance is 1e-5 of a displacement
     fine = min(max(SHADOW_TOLERANCE, TOLERANCE_RANGE[0]), tol)
     compiled = compile_scene(scene, fine)
     changed = [ChangedScene.of(scene, path, fine) for path in parameters]
@@ -394,8 +394,8 @@ def displacement_beside(
     Returns
     -------
     float or None
-        None if a pair is so near its wall that no displacement is small compared with the distance, or if a contact's
-        damping depends on the speed of its touch.
+        None if a pair is too near its wall for a displacement that is small compared with the distance, or if a
+        contact's damping depends on the speed of its touch.
     """
     if reads_speed and bool((penetration > 0.0).any()):
         return None

@@ -35,7 +35,7 @@ Array = NDArray[np.float64]
 #: Type of one contact event: time in s, pair, modes (0 off, 1 on, 2 clipped), rate of penetration in m/s.
 EVENT_DTYPE: Final = EVENT
 _ROWS_BY_DEFAULT = 1000
-#: Largest number of rows: each takes 176 bytes of memory.
+#: Largest number of rows; a row takes 176 bytes of memory.
 _MOST_ROWS: Final = 1e10
 
 
@@ -60,7 +60,8 @@ class Result:
         For each sense, `ccw` and `cw`: the share of its contact time in which exactly these corners carry force.
         Corners have the scene's labels, otherwise their names.
     solver : mapping
-        method, tol or dt, and the numbers of steps, evaluations (orders of series, or right-hand sides) and events.
+        method, tol or dt, and the numbers of steps, evaluations and events. An evaluation is an order of a series, or
+        for fixed steps an evaluation of the right-hand side.
     wear_depth : ndarray, shape (8,)
         Wear depth of each pad at the end in m.
     wall_s, compile_s : float
@@ -150,7 +151,7 @@ def simulate(
     t_end : float
         End in s, not negative.
     output_dt : float, optional
-        Distance of the output rows in s; a thousandth of the motion by default. The rows do not change the motion. For
+        Interval of the output rows in s, by default a thousandth of the motion. The rows do not change the motion. For
         the fixed-step methods, `output_dt` must be a whole multiple of `dt`.
     tol : float
         Tolerance of the pose relative to the clearance (`method="events"`).
@@ -285,14 +286,15 @@ def output_times(t_end: float, output_dt: float | None) -> Array:
     return times if t_end - times[-1] <= 1e-9 * output_dt else np.append(times, t_end)
 
 
-#: Scratch space of the last run; a simultaneous run, in another thread or from `on_progress`, makes its own.
+#: Scratch space of the last run, for reuse; a run at the same time (in another thread, or from `on_progress`) makes its
+#: own.
 _spare: Final[deque[Work]] = deque(maxlen=1)
 #: Kinds of run whose kernels this process has compiled or loaded.
 _ready: set[tuple[object, ...]] = set()
 
 
 def _make_ready(compiled: CompiledScene, energy_balance: bool, method: Method, dt: float | None) -> float:
-    """Compile or load the kernels of a kind of run by a run of no length; return the time in s, 0 if they are ready."""
+    """Compile or load the kernels of a kind of run, by a run up to t = 0; return the time in s, 0 if they are ready."""
     parts = compiled.parts
     loads = parts.harmonics is None, parts.segments is None, None if parts.implicit is None else parts.implicit.dtype
     kind = parts.terms, *loads, options(compiled.scene), method == "events", energy_balance
@@ -394,7 +396,7 @@ def contact_sets_of(scene: Scene, totals: Totals) -> dict[str, dict[str, float]]
     labels = [letters.get(corner, corner) for corner in CORNER_NAMES]
     joint = "" if letters else "+"
     senses = {}
-    # the force at a wall turns a block in the opposite sense to a cavity about a corner
+    # the force of a pair turns a block the opposite way to a cavity, so the two senses are exchanged
     order = ("ccw", "cw") if scene.head.carries == "walls" else ("cw", "ccw")
     for sense, times in sorted(zip(order, totals.set_time, strict=True), key=lambda item: item[0]):
         total = times.sum()

@@ -1,4 +1,4 @@
-"""The records of the columns of `solve.tangents`, made from scenes in which one number differs."""
+"""The columns of `solve.tangents`, made from a scene and from scenes with one changed parameter."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from plow_twin.solve.tangents import COLUMNS, STATE_COLUMNS, WIDTH
 
 _Array = NDArray[np.float64]
 
-#: Terms that the linearised equations have.
+#: Terms that the linearised equations can have.
 _COVERED: Final = {"harmonics", "second", "viscous", "hysteretic", "integer", "fraction", "flight", "rest"}
 
 
 def fits_tangents(compiled: CompiledScene) -> bool:
-    """Return whether the linearised equations have all terms of a scene; exponents must be integers or 1.5.
+    """Return whether the linearised equations can have all terms of a scene; its exponent must be an integer or 1.5.
 
-    The linearised equations have no implicit steps. A law with a restitution still qualifies, because its implicit
-    steps are only for slow touches.
+    There are no implicit steps of the linearised equations. A law with a restitution is nevertheless covered, because
+    it needs implicit steps for slow touches only.
     """
     terms, contact = compiled.parts.terms, compiled.scene.contact
     there = {name for name, term in zip(Terms._fields, terms, strict=True) if term is not None}
@@ -39,7 +39,7 @@ def is_curved(terms: Terms) -> int | None:
 def columns_beside(
     compiled: CompiledScene, changed: Sequence[tuple[CompiledScene, float]]
 ) -> tuple[NDArray[np.void], _Array, _Array]:
-    """Return columns for the state's displacements and for scenes that each have one number increased.
+    """Return columns for displacements of the state, and for scenes that each have one parameter increased.
 
     Returns
     -------

@@ -202,7 +202,7 @@ class Twin:
         Parameters
         ----------
         t : array_like, shape (n,)
-            Model times in s, never falling.
+            Model times in s, not decreasing.
         wrench : array_like, shape (n, 3)
             Fx, Fy [N] and M [N m] about the cavity's centre at each time.
 
@@ -235,13 +235,13 @@ class Twin:
         Parameters
         ----------
         t : ndarray, shape (n,)
-            Model times in s, never falling.
+            Model times in s, not decreasing.
         wrench : ndarray, shape (n, 3)
             Fx, Fy [N] and M [N m] about the cavity's centre at each time; not used with `excitation="scene"`.
         rows : ndarray of `ROW`, shape (n,), or None
             Receives a row for each time. With None the motion is the same, but no forces are computed for output.
         digest_after : ndarray of int64, shape (m,)
-            Rising numbers from 1 to n: counts of advances after which a digest is made.
+            Increasing numbers from 1 to n; after this many advances a digest is made.
 
         Returns
         -------
@@ -394,7 +394,7 @@ class Twin:
         Returns
         -------
         str
-            The reason; for `OUT_OF_RANGE` with the limit of the model and the value of the head.
+            The reason; for `OUT_OF_RANGE` it contains the head's value and the limit of the model.
         """
         if status != Status.OUT_OF_RANGE:
             return Status(status).text
@@ -403,9 +403,9 @@ class Twin:
         if abs(angle) <= LARGEST_ANGLE:
             return (
                 f"{PAIR_NAMES[int(pair)]} penetrated {1e3 * penetration:.1f} mm deep; "
-                f"the model holds up to half the cavity, {1e3 * limit:.1f} mm"
+                f"the model is valid up to half the cavity, {1e3 * limit:.1f} mm"
             )
-        return f"the head turned to {math.degrees(angle):.1f} degrees; the model holds up to 45"
+        return f"the head turned to {math.degrees(angle):.1f} degrees; the model is valid up to 45"
 
     @property
     def frame(self) -> NDArray[np.float64] | None:
@@ -415,8 +415,8 @@ class Twin:
             return None
         if state.step_size < 0.0:
             return np.array(state.frame)
-        # under the scene's own loads a step may be unfinished, and the row is read from its series, in which time is
-        # linear or quadratic in the parameter
+        # under the scene's own loads the present time may lie within a step; the frame is then read from the step's
+        # series, at the sigma of `dense_output.sigma_at`
         used, beta = float(state.elapsed), float(state.beta)
         sigma = 2.0 * used / (state.alpha + math.sqrt(max(state.alpha**2 + 2.0 * beta * used, 0.0)))
         return frame_at(work.frame, int(state.order), sigma)

@@ -1,4 +1,4 @@
-"""Growth of errors and effects of parameters along the motion of a live twin, from shadows advanced beside it."""
+"""Growth of errors and effects of parameters along a live twin's motion, from shadows that are advanced with it."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from plow_twin.solve.state import Status
 
 Array = NDArray[np.float64]
 
-#: Length of a stretch in s, and distance of a shadow, in displacements, at which a stretch ends earlier.
+#: Length of a stretch in s, and distance of a shadow (in displacements) at which a stretch ends earlier.
 _STRETCH_S, _FAR = 0.1, 100.0
 #: Longest stretch in s while a contact prevents the start of the next stretch.
 _LONGEST_S = 0.5
@@ -47,8 +47,8 @@ class TwinSensitivity:
     Attributes
     ----------
     t : float
-        Model time in s of the other attributes: the end of the last complete stretch, some 0.1 s before the twin's
-        time, during a contact up to 0.5 s.
+        Model time in s of the other attributes. It is the end of the last complete stretch, some 0.1 s before the
+        twin's time, or up to 0.5 s before it during a contact.
     from_start : ndarray, shape (k, k)
         Derivatives of the state at `t` by the initial state; a state has the places, then the rates, of the k / 2 free
         degrees of freedom.
