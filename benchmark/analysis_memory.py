@@ -1,6 +1,6 @@
-"""Memory that an analysis takes for a run of some hours: `python benchmark/analysis_memory.py [HOURS]`.
+"""Memory that the analysis of a run of some hours needs: `python benchmark/analysis_memory.py [HOURS]`.
 
-Rows at 1 kHz are computed once and fed in repeatedly, as in a long `--watch`.
+Rows at 1 kHz are computed once and fed to the analysis repeatedly, as in a long `--watch`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The two bench scenes with their reference trajectories, and their constants for solvers that take no `Scene`."""
+"""The two bench scenes, their reference trajectories, and their constants for solvers that cannot read a `Scene`."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from plow_twin.model.geometry import half_diagonal
 from plow_twin.scene_file import load_scene
 
 ROOT = Path(__file__).resolve().parent.parent
-#: The reference on a 1 ms grid is not included; it is used if it lies beside the project.
+#: Folder of the reference on a 1 ms grid, which is not part of the project and is used if it exists.
 FINE_REFERENCE = ROOT.parent / "shared" / "reference"
 NAMES = ("kv", "hc")
 T_END = 20.0
-#: Names of the output grids: distance of the rows in s.
+#: Intervals of the rows in s: of the sparse and of the dense output grid.
 SPARSE, DENSE = 0.1, 1e-3
 
 
@@ -48,9 +48,9 @@ def on_grid(name: str, output_dt: float) -> tuple[Array, int]:
 
 
 def constants(scene: Scene) -> Array:
-    """Return the 15 numbers of a bench scene.
+    """Return the 15 constants of a bench scene.
 
-    width, height, gx, gy, mass, inertia, gravity, arm, K, exponent, C or lambda, Fx, Fy, M, omega.
+    They are width, height, gx, gy, mass, inertia, gravity, arm, K, exponent, C or lambda, Fx, Fy, M, omega.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Measure this checkout beside an earlier commit, in one run: the same work in turn, one process after the other.
+"""Measure this checkout and an earlier commit in one run, by processes that do the same work in turn.
 
     python benchmark/beside.py COMMIT [--rounds 5]
 
@@ -20,7 +20,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "benchmark" / "results" / "beside.md"
-#: Uses only features of both commits: runs as in README.
+#: Program of a process, which uses only features that both commits have: runs as in README.
 _WORK = """
 import json, sys, time
 import numpy as np
@@ -94,7 +94,7 @@ def main() -> None:
             for number in range(chosen.rounds):
                 print(f"round {number + 1} of {chosen.rounds}", file=sys.stderr)
                 both = (before, tree, "before"), (now, ROOT, "now")
-                # the second process of a round would always be measured on the warmer machine
+                # the order alternates, because the second process of a round runs on the warmer machine
                 for times, place, cache in both if number % 2 == 0 else reversed(both):
                     times.append(measure(place, f"{folder}/{cache}"))
         finally:

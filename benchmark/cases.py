@@ -1,4 +1,4 @@
-"""Measurements: cases, interleaved timing, rows of the table."""
+"""Measurement of cases in turn, and the rows of the table."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Sample:
-    """One run: seconds taken, poses (rows, 3) or None, and counts."""
+    """Result of one run: its time in s, poses (rows, 3) or None, and counts."""
 
     wall_s: float
     q: Array | None = None
@@ -32,7 +32,7 @@ class Sample:
 
 @dataclass
 class Row:
-    """One line of the table; times in ms, median and smallest of `runs` runs. Empty cells do not apply."""
+    """One line of the table, with the median and the smallest time of `runs` runs in ms; cells may be empty."""
 
     section: str
     scene: str
@@ -57,7 +57,7 @@ class Row:
 
 @dataclass
 class Case:
-    """A row to be measured: `prepare` builds (and compiles) and returns the function to be timed by itself."""
+    """A row to be measured; `prepare` builds and compiles the work, and returns the function whose time is measured."""
 
     row: Row
     prepare: Callable[[], Callable[[], Sample]]
@@ -65,9 +65,9 @@ class Case:
     samples: list[Sample] = field(default_factory=list)
 
 
-#: A case stops being repeated once its runs have taken this long together.
+#: A case is not repeated any more after its runs have taken this time together.
 TIME_PER_CASE_S = 1.0
-#: A first run shorter than this is a warm-up and does not count; in a longer run start and cache do not matter.
+#: A first run shorter than this is a warm-up and is discarded; in a longer run warm-up makes no difference.
 WARM_UP_BELOW_S = 0.05
 #: Cases with runs shorter than this are always repeated.
 SHORT_S = 0.02
@@ -79,8 +79,8 @@ def measure(
 ) -> list[Row]:
     """Run every case once, then the chosen cases in turn, up to `repeats` runs each.
 
-    Taking turns spreads a change of the machine's speed evenly over the cases. `choose` returns the indices of the
-    cases on which a figure depends; without it all cases are chosen.
+    Runs in turn spread a change of the machine's speed evenly over the cases. `choose` returns the indices of the cases
+    on which a figure depends; without it all cases are chosen.
     """
     rows = [case.row for case in cases]
     ready: dict[int, Callable[[], Sample]] = {}
@@ -126,14 +126,14 @@ def _summarise(case: Case) -> None:
 
 
 def timed(function: Callable[[], Any]) -> tuple[float, Any]:
-    """Return the seconds a call took, and its result."""
+    """Return the time of a call in s, and its result."""
     begin = time.perf_counter()
     result = function()
     return time.perf_counter() - begin, result
 
 
 def pose_error(reference: Array, scale: Sequence[float]) -> Callable[[Array], float]:
-    """Return the measure of error: largest |q - reference| over `scale` (3,), infinite when not comparable."""
+    """Return a function for the largest |q - reference| / `scale` (3,), which is infinite if q is not comparable."""
 
     def error(q: Array) -> float:
         if q.shape != reference.shape or not np.isfinite(q).all():
@@ -175,7 +175,7 @@ def _text(value: Any) -> str:
 
 
 def machine_name() -> str:
-    """Return a name made of the CPU's model and the number of cores, nothing else of the machine."""
+    """Return a name made only of the CPU's model and the number of cores."""
     facts: dict[str, str] = {}
     try:
         for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").split("\n\n")[0].splitlines():
@@ -184,6 +184,6 @@ def machine_name() -> str:
     except OSError:
         pass
     name = facts.get("model name", "unknown cpu")
-    # virtual machines often hide the model's number
+    # virtual machines often hide the number in the model's name
     known = name if re.search(r"\d", name) else f"{name} f{facts.get('cpu family', 0)}m{facts.get('model', 0)}"
     return re.sub(r"[^a-z0-9]+", "_", f"{known} {os.cpu_count()}core".lower()).strip("_")

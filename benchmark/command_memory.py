@@ -1,7 +1,7 @@
 """Largest memory of the commands that read a recording: `python benchmark/command_memory.py [MINUTES ...]`.
 
-Records the paper's head with wear at 1 kHz, with a measured pose at 100 Hz, in a temporary folder (0.43 MB/s), then
-runs each command in a process of its own. Prints one line of JSON for each command and length.
+The paper's head with wear is recorded at 1 kHz in a temporary folder (0.43 MB/s), with a measured pose at 100 Hz. Then
+each command runs in a separate process. One line of JSON is printed for each command and length.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from plow_twin.scene_file.presets import scene_path
 from plow_twin.solve.state import ROW
 
 _BATCH = 8192
-#: Deviation of the measured pose, x, y [m], theta [rad].
+#: Standard deviation of the measured pose: x, y [m], theta [rad].
 _NOISE = (2e-5, 2e-5, 2e-5)
 COMMANDS = {
     "view --png": ("view", "run", "--png", "picture.png"),
@@ -38,7 +38,7 @@ COMMANDS = {
 
 
 def write_poses(path: Path, load: Path, count: int) -> None:
-    """Write the motion under a load, each tenth row, with noise."""
+    """Write each tenth pose of the motion under a load, with noise."""
     twin, rng = Twin(load_scene(scene_path("paper")), excitation="sampled"), np.random.default_rng(1)
     rows = np.zeros(_BATCH, ROW)
     with load.open() as loads, path.open("w") as file:
@@ -64,7 +64,7 @@ def run(folder: Path, *words: str) -> tuple[float, float]:
 
 
 def main() -> None:
-    """Print the memory."""
+    """Print the memory and the processor time of each command."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("minutes", type=int, nargs="*", default=[10, 60])
     scene = replace(load_scene(scene_path("paper")), wear=Wear(1e-14, pad_area_m2=0.02, travel_speed_m_s=0.5))

@@ -2,8 +2,8 @@
 
 With `--hours 0.5 --rate 100 --verb analyse` it measures `analyse` over many short runs.
 
-Ten minutes are computed once; each day's run repeats them with its own stamps. The number of windows, on which the
-memory depends, is that of a month at any rate.
+Ten minutes are computed once, and each day's run repeats them with its own stamps. The memory depends on the number of
+windows, which is that of a month at any sampling rate.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def write_days(folder: Path, days: int, hours: float, rate_hz: float) -> None:
 
 
 def _heights() -> np.ndarray:
-    """Return the height of the load in each of its periods."""
+    """Return the amplitude of the load in each of its periods."""
     return np.random.default_rng(1).normal(1.0, 0.08, len(np.arange(0.0, 2.0 * _SPAN_S, np.pi)))
 
 

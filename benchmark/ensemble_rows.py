@@ -1,4 +1,4 @@
-"""Many clearance pairs at once, against our own run at the tightest tolerance."""
+"""Runs of many clearance pairs at once, compared with the solver's own run at the tightest tolerance."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ SECTION = "ensemble"
 BATCH = f"{HEYOKA}, batch"
 COLUMNS, ROWS = 40, 25
 PAIRS = f"kv, {COLUMNS * ROWS} clearance pairs"
-#: From loose to tight; the first tolerance at which every pair is within `LISTED` is timed repeatedly.
+#: Tolerances from loose to tight; the first at which every pair is within `LISTED` is timed repeatedly.
 TOLERANCES = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5, 3e-6, 1e-6)
 _BATCH_TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
 EXACT = 1e-12
 #: Error in clearances beyond which a pair is listed.
 LISTED = 1e-4
-#: Displacement at t = 0 in clearances by which amplification is measured; not so small that rounding shows.
+#: Displacement at t = 0, in clearances, for the measurement of amplification; large compared with rounding.
 PERTURBATION = 1e-8
 
 
@@ -42,7 +42,7 @@ def clearance_pairs(columns: int, rows: int) -> list[Scene]:
 
 
 def ensemble_rows(columns: int, rows: int, lean_steps: Sequence[float], repeats: int, notify: Notify) -> Iterator[Row]:
-    """Yield a row for each tolerance down to the one that all pairs need, rows of the peers, and listed pairs.
+    """Yield a row for each tolerance down to the one that all pairs need, then rows of the peers and of listed pairs.
 
     The peers run only with `lean_steps`.
     """
@@ -72,13 +72,13 @@ def ensemble_rows(columns: int, rows: int, lean_steps: Sequence[float], repeats:
 
 
 def core_row(rows: Sequence[Row]) -> Row | None:
-    """Return the row of one core at the tolerance that all pairs need: the last one."""
+    """Return the row of one core at the tolerance that all pairs need, which is the last such row."""
     own = [row for row in rows if row.section == SECTION and row.solver == OURS and row.setting.endswith(", threads=1")]
     return own[-1] if own else None
 
 
 def batch_row(rows: Sequence[Row]) -> Row | None:
-    """Return the row of heyoka in batches at the tolerance that all pairs need, if it reached one."""
+    """Return the row of heyoka in batches at the tolerance that all pairs need, if there is such a tolerance."""
     found = [row for row in rows if row.section == SECTION and row.solver == BATCH and row.error is not None]
     return next((row for row in found if (row.error or 0.0) <= LISTED), None)
 
@@ -103,7 +103,7 @@ def _member_errors(scenes: Sequence[Scene], q: Array, exact: Array) -> Array:
 
 
 def _amplification(scenes: Sequence[Scene], exact: Array) -> Array:
-    """Return the largest growth of a displacement at t = 0, along x or along theta."""
+    """Return the larger growth of two displacements at t = 0, along x and along theta."""
     growth = np.zeros(len(scenes))
     for axis in (0, 2):
         moved = []
@@ -124,7 +124,7 @@ def _member_row(scene: Scene, tol: float, error: float, growth: float) -> Row:
 
 
 def _heyoka_rows(name: str, scenes: Sequence[Scene], exact: Array, notify: Notify) -> Iterator[Row]:
-    """Yield heyoka in batches from loose to tight, until a tolerance makes all pairs accurate enough."""
+    """Yield rows of heyoka in batches from loose to tight tolerances, until all pairs are accurate enough."""
     pairs = np.array([[scene.clearance.horizontal_m, scene.clearance.vertical_m] for scene in scenes])
     for tol in _BATCH_TOLERANCES:
         notify(f"ensemble heyoka in batches tol={tol:g}")

@@ -1,12 +1,13 @@
-"""The estimate on fresh synthetic truths, by group: errors, coverage, width and flags, compared with the range of
-motion.
+"""Errors, coverage, widths and flags of the estimate on fresh synthetic truths, by group.
+
+The errors are compared with those of the range of motion, the simplest estimate of a clearance.
 
     python benchmark/estimate.py --truths 50 --seed 5000          # all groups
     python benchmark/estimate.py --group plain --group hard --truths 20
 
-Each truth is written as soon as it is done, and truths in the file are not run again: a long benchmark can be stopped
-and continued. Thresholds of `plow_twin/estimate/tuning.py` were set on other seeds; the table of the pages is made by
-`tools/pages.py` from the seeds of `estimate_pages.TRUTHS`.
+Each truth is written as soon as it is done, and truths in the file are not run again, so that a long benchmark can be
+stopped and continued. The thresholds of `plow_twin/estimate/tuning.py` were set on other seeds. `tools/pages.py` makes
+the table of the pages from the seeds in `estimate_pages.TRUTHS`.
 """
 
 from __future__ import annotations
@@ -30,11 +31,11 @@ RESULTS = Path(__file__).resolve().parent / "results"
 
 
 def run_one(name: str, seed: int, periods: float | None = None) -> dict[str, Any]:
-    """Estimate one truth and compare."""
+    """Run the estimate on one truth, and return its errors as a row."""
     group = GROUPS[name]
     try:
         truth = draw(group if periods is None else type(group)(**{**vars(group), "periods": periods}), seed)
-    except SolverError as error:  # a wall has jumped through the head: such a machine does not exist
+    except SolverError as error:  # the head has passed through a wall, so no real machine is like this
         return {"group": name, "seed": seed, "not_drawn": str(error)}
     begin = time.process_time()
     result = estimate(truth.nominal, truth.load, truth.poses, forces=truth.forces)
@@ -63,7 +64,7 @@ def run_one(name: str, seed: int, periods: float | None = None) -> dict[str, Any
 
 
 def summary(name: str, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return the figures of a group; errors and coverage of the estimates that were not withdrawn."""
+    """Return the figures of a group; errors and coverage are those of the estimates that were not withdrawn."""
     out: dict[str, Any] = {"group": name, "truths": len(rows)}
     expected = GROUPS[name]
     out["as_expected"] = np.mean([(row["model"], row["sensor"]) == (expected.model, expected.sensor) for row in rows])
@@ -112,7 +113,7 @@ def as_markdown(groups: Sequence[dict[str, Any]]) -> str:
 
 
 def load_rows(path: Path) -> list[dict[str, Any]]:
-    """Return the rows that a file holds, with numbers converted; empty without a file."""
+    """Return the rows of a file with numbers converted; empty if there is no file."""
     if not path.exists():
         return []
     return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line]

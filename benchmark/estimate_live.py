@@ -1,9 +1,9 @@
-"""Share of a core that the estimate beside a live node takes: `answer` on windows of 32 s each 10 s, with 256 twins.
+"""Share of a core that the estimate of a live node needs, for a window of 32 s every 10 s, with 256 twins.
 
     python benchmark/estimate_live.py
 
-The load comes at 1 kHz: harmonic, harmonic with 1 % of white noise, and random in each sample. The first window is
-estimated without a start, each later window from the previous estimate, as in the node.
+The load has samples at 1 kHz and is harmonic, harmonic with 1 % of white noise, or random in each sample. As in the
+node, the first window is estimated without a starting value, each later window from the previous estimate.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from plow_twin.estimate.measurements import Load
 from plow_twin.estimate.window import Windows
 
 WINDOW_S, INTERVAL_S = 32.0, 10.0
-#: Length of the data [s]: windows form as in a node, and two later windows are measured.
+#: Length of the data [s], enough for the first windows and two later windows.
 _END_S = 55.0
 
 
 def shares(truth: Truth, load: Load, members: int) -> list[float]:
-    """Return the share of a core that each window takes."""
+    """Return the share of a core that the estimate of each window needs."""
     windows, found = Windows(WINDOW_S, INTERVAL_S, 2.0), []
     guess: Guess = ()
     poses = iter(zip(truth.poses.t, truth.poses.q, strict=True))
@@ -54,7 +54,7 @@ def shares(truth: Truth, load: Load, members: int) -> list[float]:
 @click.option("--members", default=256, show_default=True)
 @click.option("--seed", default=25_000, show_default=True)
 def main(members: int, seed: int) -> None:
-    """Print the share of a core by load."""
+    """Print the shares of a core for each load."""
     rng = np.random.default_rng(seed)
     click.echo(f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores")
     for name in ("plain", "stochastic"):

@@ -1,11 +1,11 @@
-"""The estimate on machines that differ from the model: how often it gives a result, its errors, its coverage.
+"""The estimate on machines that differ from the model: its errors, its coverage, and how often it gives a result.
 
     python benchmark/estimate_mismatch.py --truths 8 --seed 80000              # all kinds
     python benchmark/estimate_mismatch.py --kind friction_05 --truths 4
 
-Each kind differs mildly in one respect, `several` in most respects. The truth comes from `mismatched_machine.py`, whose
-equations and integrator are not those of the project. Each truth is written as soon as it is done, and truths in the
-file are not run again.
+Each kind differs mildly in one respect, `several` in most respects. The truth is simulated by `mismatched_machine.py`,
+which has its own equations and integrator. Each truth is written as soon as it is done, and truths in the file are not
+run again.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ Array = NDArray[np.float64]
 _FINE = 1e-3
 #: Penetration in m at which contacts of different exponents have the same force.
 _COMMON_DEPTH = 8e-3
-#: Largest pose in rad (or m) of a head that has not jumped through a wall.
+#: Largest component of the pose (rad or m) of a head that has not passed through a wall.
 _LARGEST_TURN = 0.6
 #: States in which the estimated clearance is published; an interval below `USEFUL_M` is useful.
 PUBLISHED = {"estimated", "rough"}
@@ -50,14 +50,14 @@ USEFUL_M = 4e-3
 
 @dataclass(frozen=True)
 class Kind:
-    """How a machine differs; shares and sizes are standard deviations where a sign is drawn."""
+    """The difference of a machine from the model; a share or size with a random sign is a standard deviation."""
 
     title: str
     stiffness: tuple[float, float] = (5e6, 3e7)
     periods: float = 10.0
     noise_m: float = 5e-4
     rate_hz: float = 100.0
-    #: shape of the given load: paper, cutting (paper and broad band), pressed, chatter, vertical
+    #: shape of the given load: paper, cutting (paper with a broad-band part), pressed, chatter, vertical
     shape: str = "paper"
     gain: float = 0.05
     #: shares of each load component's range: correlated error, third harmonic, constant
@@ -83,8 +83,8 @@ class Kind:
     theta_missing: bool = False
     theta_scale: float = 0.0
     clock: float = 0.0
-    #: held out from all tuning: bursts without poses, largest pose of a saturating sensor as a share of the motion's,
-    #: excess of gravity's arm, delay of the load, drift of the bias of x and y over the window
+    #: differences that no tuning used: number of bursts without poses, largest pose that the sensor shows as a share of
+    #: the motion's, excess of gravity's arm, delay of the load, drift of the bias of x and y over the window
     bursts: int = 0
     saturated: float = 0.0
     arm_m: float = 0.0
@@ -160,7 +160,7 @@ class Mismatch:
 
 
 def draw(kind: Kind, seed: int) -> Mismatch:
-    """Draw a machine whose head stays within its walls; the same seed gives the same one."""
+    """Draw a machine whose head stays within its walls; the same seed gives the same machine."""
     attempts = (
         _draw(kind, np.random.default_rng([20261123, seed, *again])) for again in ((), *((i,) for i in range(1, 20)))
     )
@@ -195,7 +195,7 @@ def _believed(kind: Kind, nominal: Scene, rng: np.random.Generator, t: Array) ->
     if kind.shape == "cutting":
         return paper + noise * [8e3, 4e3, 1.1e4]
     if kind.shape == "pressed":
-        # a steady push against one wall, and cutting about it
+        # a steady push against one wall, with a broad-band load about it
         return noise * [8e3, 4e3, 1.1e4] + [6e4, -5e3, 2e4]
     if kind.shape == "chatter":
         turn = 2.0 * np.pi * 8.0 * t
@@ -234,7 +234,7 @@ def _true_scene(kind: Kind, nominal: Scene, rng: np.random.Generator) -> Scene:
 
 
 def _by_wall(rng: np.random.Generator) -> Array:
-    """Return -1 or 1 for each pair: equal for both pads of a wall, but not for all walls."""
+    """Return -1 or 1 for each pair, equal for both pads of a wall but not for all walls."""
     signs: Array = rng.permutation([-1.0, -1.0, 1.0, 1.0])
     wall = np.where(NORMAL_X != 0.0, np.where(CORNER_X > 0.0, 0, 1), np.where(CORNER_Y > 0.0, 2, 3))
     return np.asarray(signs[wall], np.float64)
@@ -260,7 +260,7 @@ def _correlated(rng: np.random.Generator, t: Array, time_s: float = 0.5) -> Arra
 
 
 def _measured(kind: Kind, rng: np.random.Generator, t: Array, fine: Array, motion: Array) -> tuple[Array, Array]:
-    """Return stamps and poses as the sensor gives them."""
+    """Return the stamps and poses of the sensor."""
     turned = motion.copy()
     angle = rng.uniform(0.0, 2.0 * np.pi)
     arm = kind.lever_m * np.array([np.cos(angle), np.sin(angle)])
@@ -300,7 +300,7 @@ def _telemetry(kind: Kind, fine: Array, believed: Array) -> tuple[Array, Array]:
 
 
 def run_one(name: str, seed: int) -> dict[str, Any]:
-    """Estimate one machine and compare."""
+    """Run the estimate on one machine, and return its errors as a row."""
     truth = draw(KINDS[name], seed)
     begin = time.process_time()
     result = estimate(truth.nominal, truth.load, truth.poses)

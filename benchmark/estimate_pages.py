@@ -1,6 +1,6 @@
 """Tables of the estimate's results for the pages, from `benchmark/results/estimate.jsonl`.
 
-`TRUTHS` names the seeds of each group on which no threshold was set; the pages count only these.
+`TRUTHS` has the seeds of each group that were not used to set thresholds; the pages count only these truths.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from scipy.stats import beta
 
 from plow_twin.estimate.result import State
 
-#: Groups of the page, in its order, each with its first seeds and numbers of truths.
+#: Groups in the order of the page; a pair is a first seed and a number of truths.
 TRUTHS: dict[str, tuple[tuple[int, int], ...]] = {
     "plain": ((54000, 50),),
     "sensor": ((54000, 50),),
@@ -53,7 +53,7 @@ def truths(group: str, seeds: Sequence[tuple[int, int]]) -> list[dict[str, Any]]
 
 
 def right_models() -> str:
-    """Return errors and coverage of the truths that the model describes."""
+    """Return the table of errors and coverage for the truths that the model describes."""
     lines = [
         "| group | truths | RMSE gx, gy [mm] | asked | estimated gx, gy | 90 % interval holds gx | gy | "
         "median width [mm] | flagged | range of motion [mm] | CPU [s], most |",
@@ -80,14 +80,14 @@ def right_models() -> str:
 
 
 def narrowed(text: str, keep: Sequence[int]) -> list[list[str]]:
-    """Return the cells of some columns of a table of Markdown, without bounds in brackets; the head comes first."""
+    """Return the cells of some columns of a Markdown table, the head first, without the bounds in brackets."""
     lines = [line for line in text.splitlines() if line.startswith("| ") and "---" not in line]
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
     return [[row[column].partition(" (")[0] for column in keep] for row in rows]
 
 
 def right_sum() -> str:
-    """Return the groups that have an error target, without widths, bounds and cost, and the flagged truths."""
+    """Return a table of the groups with an error target, without widths, bounds and cost, and the flagged truths."""
     text = right_models()
     head, *rows = narrowed(text, (0, 1, 2, 3, 5, 6))
     lines = ["| " + " | ".join(row) + " |" for row in (head, *(row for row in rows if row[3]))]
@@ -95,7 +95,7 @@ def right_sum() -> str:
 
 
 def wrong_models() -> str:
-    """Return how often each deviation from the model is flagged."""
+    """Return the table of how often each deviation from the model is flagged."""
     lines = ["| deviation of the truth from the model | truths | flagged | share, 95 % interval |", "|---|---|---|---|"]
     for group, seeds in TRUTHS.items():
         if (GROUPS[group].model, GROUPS[group].sensor) != ("ok", "ok"):
@@ -106,7 +106,7 @@ def wrong_models() -> str:
 
 
 def wrong_sum() -> str:
-    """Return how many truths of wrong models are flagged: with soft contacts, and with hard contacts of another law."""
+    """Return a sentence on how many truths outside the model are flagged, for soft contacts and for hard contacts."""
     names = [name for name in TRUTHS if (GROUPS[name].model, GROUPS[name].sensor) != ("ok", "ok")]
     hard = "hard_kelvin_voigt"
     soft = [_flagged(row) for name in names if name != hard for row in truths(name, TRUTHS[name])]
@@ -122,7 +122,7 @@ def _flagged(row: dict[str, Any]) -> bool:
 
 
 def coverage(held: Sequence[bool]) -> str:
-    """Return a share with its interval after Clopper and Pearson."""
+    """Return a share with its Clopper-Pearson interval."""
     count, total = sum(held), len(held)
     if not total:
         return "-"
@@ -133,7 +133,7 @@ def coverage(held: Sequence[bool]) -> str:
 
 
 def mismatch() -> str:
-    """Return the estimates of machines that differ from the model."""
+    """Return the table of estimates for machines that differ from the model."""
     now = load_rows(RESULTS / "estimate_mismatch.jsonl")
     lines = [
         "| what differs | clearances | published | interval below 4 mm | RMSE [mm] | "
@@ -154,13 +154,13 @@ def mismatch() -> str:
 
 
 def mismatch_sum() -> str:
-    """Return the rows of all machines and of machines without a difference."""
+    """Return only the rows of `mismatch` for all machines and for machines without a difference."""
     head, line, *rows = mismatch().splitlines()
     return "\n".join([head, line, *rows[:2]])
 
 
 def filter_table(rows: Sequence[dict[str, Any]]) -> str:
-    """Return errors and coverage of the two filters, by group."""
+    """Return the table of errors and coverage of the two filters, by group."""
     lines = ["| group | filter | truths | RMSE gx, gy [mm] | coverage gx, gy | CPU [s] |", "|---|---|---|---|---|---|"]
     for name, method in dict.fromkeys((row["group"], row["method"]) for row in rows):
         own = [row for row in rows if (row["group"], row["method"]) == (name, method) and "failed" not in row]
@@ -176,7 +176,7 @@ def filter_table(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def filters() -> str:
-    """Return the two filters on the estimate's truths."""
+    """Return the table of the two filters on the estimate's truths."""
     return filter_table(load_rows(RESULTS / "filter_peers.jsonl"))
 
 

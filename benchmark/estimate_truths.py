@@ -1,7 +1,7 @@
 """Synthetic truths for the estimate: a scene, its motion, and the readings of a sensor and a load telemetry.
 
-The truth is simulated with its own tolerance and load sampling; in the groups outside the model its law, load shape,
-sensor or machine differs from the estimate's assumptions.
+The truth is simulated with another tolerance and load sampling than the estimate's. In the groups outside the model its
+law, load shape, sensor or machine differs from the estimate's assumptions.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ ROOT = Path(__file__).resolve().parent.parent
 PERIOD = np.pi
 #: Interval of the samples of the true load in s.
 _FINE = 1e-3
-#: Where a shift, a jam or a stuck sensor begins, as a share of the window.
+#: Time at which a shift, a jam or a fault of the sensor begins, as a share of the window.
 _FROM = 0.55
 
 
 @dataclass(frozen=True)
 class Group:
-    """How the truths of a group are drawn."""
+    """Parameters by which the truths of a group are drawn."""
 
     title: str
     noise_m: float = 5e-4
@@ -56,7 +56,7 @@ class Group:
     shift_m: float = 0.0
     stuck: bool = False
     noisier: float = 1.0
-    #: measured over true x, y, theta
+    #: scale of the sensor, measured over true value of x, y, theta
     sensor_scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
     #: wear coefficient of the truth; the estimate assumes no wear
     wear_m2_n: float = 0.0
@@ -132,7 +132,7 @@ class Truth:
     forces: ContactForces | None = None
 
     def write(self, folder: Path) -> None:
-        """Write the folder that `plow-twin estimate` takes."""
+        """Write the folder that `plow-twin estimate` reads."""
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "scene.yaml").write_text(dump_scene(self.nominal), encoding="utf-8")
         tables = [
@@ -148,7 +148,7 @@ class Truth:
 
 
 def draw(group: Group, seed: int) -> Truth:
-    """Draw a truth; the same seed gives the same one."""
+    """Draw a truth; the same seed gives the same truth."""
     rng = np.random.default_rng([20261121, seed])
     nominal = load_scene(ROOT / "config" / "paper.yaml")
     end = group.periods * PERIOD
@@ -195,7 +195,7 @@ def _contact(group: Group, rng: np.random.Generator) -> Contact:
 
 
 def cutting(rng: np.random.Generator, t: Array) -> Array:
-    """Return broad-band noise of unit variance, shape (n, 3): white noise through a low pass of 20 Hz, skewed."""
+    """Return skewed broad-band noise of unit variance, shape (n, 3), from white noise behind a low pass of 20 Hz."""
     decay = np.exp(-2.0 * np.pi * 20.0 * (t[1] - t[0]))
     drive = rng.gamma(4.0, 0.5, (len(t), 3)) - 2.0
     out = np.zeros((len(t), 3))
@@ -205,7 +205,7 @@ def cutting(rng: np.random.Generator, t: Array) -> Array:
 
 
 def _motion(scene: Scene, group: Group, times: Array, end: float) -> tuple[Array, Array, Array]:
-    """Return the true poses at `times`, (n, 3), the clearances at the end, (2,), and the forces every `_FINE` s."""
+    """Return the true poses at `times` (n, 3), the clearances at the end (2,), and the forces every `_FINE` s."""
     if not group.jam_m:
         run = simulate(scene, end, _FINE, 1e-6)
         q = np.stack([np.interp(times, run.t, column) for column in run.q.T], axis=1)
@@ -228,7 +228,7 @@ def _motion(scene: Scene, group: Group, times: Array, end: float) -> tuple[Array
 
 
 def _cells(group: Group, rng: np.random.Generator, force: Array, end: float) -> ContactForces:
-    """Return the readings of load cells for the true forces, (n, 8), given every `_FINE` s."""
+    """Return the readings of load cells from the true forces (n, 8) at intervals of `_FINE`."""
     t = np.arange(0.0, end, 1.0 / group.forces_hz)
     late = np.maximum(t - group.forces_delay_s * rng.uniform(), 0.0)
     true = np.stack([np.interp(late, _FINE * np.arange(len(column)), column) for column in force.T], axis=1)
@@ -250,7 +250,7 @@ def _sensor(group: Group, rng: np.random.Generator, t: Array, q: Array) -> Array
 
 
 def _kept(group: Group, rng: np.random.Generator, t: Array, measured: Array) -> NDArray[np.bool_]:
-    """Return which rows arrive; single components are blanked in place."""
+    """Return which rows arrive, and set single components of some rows to NaN in place."""
     keep = np.ones(len(t), dtype=bool)
     if group.gaps:
         for _ in range(4):

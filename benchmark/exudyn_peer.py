@@ -1,8 +1,8 @@
 """Exudyn on the bench scenes.
 
-Adaptation: no connector has this contact law, so each frame corner is a rigid-body spring-damper without stiffness
-whose force is a *symbolic* user function (compiled, no Python in the loop) of the corner's place and velocity in head
-axes; the loads are symbolic user functions of time.
+Exudyn has no connector with this contact law. So each frame corner is a rigid-body spring-damper without stiffness, and
+its force is a *symbolic* user function (compiled, no Python in the loop) of the corner's place and velocity in head
+axes. The loads are symbolic user functions of time.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def _build(p: Array) -> tuple[Any, Any, list[Any]]:
 
 
 def prepare(p: Array, solver: str, dt: float, rtol: float | None, output_dt: float) -> Callable[[], Sample]:
-    """Prepare an explicit solver with a fixed step, or with step control to `rtol`; each run builds its system anew."""
+    """Prepare an explicit solver with a fixed step, or with step control to `rtol`; each run builds a new system."""
 
     def run() -> Sample:
         mbs, exu, kept = _build(p)

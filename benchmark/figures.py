@@ -1,4 +1,4 @@
-"""The figures of the pages, as tables made from the files of `benchmark/results`; `tools/pages.py` writes them."""
+"""Tables of the pages, made from the files in `benchmark/results`; `tools/pages.py` writes them to the pages."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from levels import OWN, PEERS, fastest
 from work_precision import OURS_BARE, OURS_CALL
 
 RESULTS = ROOT / "benchmark" / "results"
-#: Holds the name of the machine of the newest complete run, whose table the pages quote.
+#: File with the name of the machine of the newest complete run, from which the pages quote.
 NEWEST = RESULTS / "newest.txt"
 _PEERS = (
     "CVODE from C", "CVODE from C, rootfinding", "heyoka", "best of SciPy and scikit-sundae", "lean jitted RK4",
@@ -30,7 +30,7 @@ _PEERS = (
 
 
 def table(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    """Return a table of Markdown."""
+    """Return a Markdown table."""
     body = ["| " + " | ".join(line) + " |" for line in (head, *lines)]
     return "\n".join([body[0], "|" + "---|" * len(head), *body[1:]])
 
@@ -41,7 +41,7 @@ def solver_rows() -> list[Row]:
 
 
 def speed() -> str:
-    """Return the time for 20 s of impacts at three errors, with the peers' times as multiples."""
+    """Return the table of times for 20 s of impacts at three errors, with the peers' times as multiples."""
     rows = solver_rows()
     lines = []
     for level in (1e-3, 1e-6, 1e-9):
@@ -52,7 +52,7 @@ def speed() -> str:
 
 
 def located() -> str:
-    """Return the same for output every 0.1 s, beside the two peers that locate every change of contact."""
+    """Return the table of times with output every 0.1 s, beside the two peers that locate every change of contact."""
     rows = solver_rows()
     lines = []
     for scene in ("kv", "hc"):
@@ -67,7 +67,7 @@ def located() -> str:
 
 
 def work() -> str:
-    """Return the throughput of one core."""
+    """Return the table of work that one core can do."""
     rows = solver_rows()
     (one,) = [row for row in rows if row.section == "sampled_load" and "256" not in row.scene]
     many = [row for row in rows if row.section == "sampled_load" and "256" in row.scene]
@@ -88,7 +88,7 @@ def work() -> str:
 
 
 def missed() -> str:
-    """Return the targets of the solver that were not reached; targets against the same peer share a line."""
+    """Return the table of the solver's missed targets; targets against the same peer share a line."""
     groups: dict[tuple[str, str], list[targets.Verdict]] = {}
     for verdict in targets.verdicts(solver_rows()):
         if not verdict.reached:
@@ -102,14 +102,14 @@ def missed() -> str:
 
 
 def random_scenes() -> str:
-    """Return the largest error of random scenes that amplify little, in a sentence for each tolerance."""
+    """Return a sentence for each tolerance with the largest error of the random scenes that amplify little."""
     rows = [verdict for verdict in targets.verdicts(solver_rows()) if "random scenes" in verdict.work]
     asked = [re.search(r"tol=([\d.e-]+)", row.work) for row in rows]
     return "\n".join(f"- at {tol[1]}: {row.measured}" for tol, row in zip(asked, rows, strict=True) if tol)
 
 
 def stored(name: str, columns: int | None = None) -> Callable[[], str]:
-    """Return the function that shows the first columns (by default all) of a small table of results."""
+    """Return a function that makes a Markdown table of the first columns (by default all) of a CSV file of results."""
 
     def shown() -> str:
         with (RESULTS / f"{name}.csv").open(newline="", encoding="utf-8") as file:
@@ -120,13 +120,13 @@ def stored(name: str, columns: int | None = None) -> Callable[[], str]:
 
 
 def measured_sum() -> str:
-    """Return the errors of the drops without scores and the bounces after the second."""
+    """Return the table of errors of the drops over two bounces, without scores."""
     _, *rows = estimate_pages.narrowed(measured_pages.measured_drops(), (0, 1, 2, 4))
     return table(["block", "off over one bounce", "over two", "inside the 90 % band after one"], rows)
 
 
 def life_table() -> str:
-    """Return the forecasts of synthetic lives."""
+    """Return the table of forecasts of synthetic lives."""
     return lives.summary(_lines("lives.jsonl"))
 
 
@@ -148,7 +148,7 @@ def life_sum() -> str:
 
 
 def month_table() -> str:
-    """Return the forecasts after a month of measurements, by kilometres a day."""
+    """Return the table of forecasts after a month of measurements, by travel per day."""
     rows = _lines("month.jsonl")
     days = list(dict.fromkeys(row["day_m"] for row in rows))
     tables = [month.summary([row for row in rows if row["day_m"] == day]).splitlines() for day in days]
@@ -157,7 +157,7 @@ def month_table() -> str:
 
 
 def follow_table() -> str:
-    """Return how well a twin follows its machine."""
+    """Return the table of how well a twin follows its machine."""
     return follow.as_markdown(_lines("follow.jsonl"))
 
 
@@ -168,7 +168,7 @@ def follow_sum() -> str:
 
 
 def siconos() -> str:
-    """Return the slider of the literature beside this solver: two references of Siconos."""
+    """Return the table that compares this solver with two references of Siconos for the slider of the literature."""
     with (RESULTS / "siconos.csv").open(newline="", encoding="utf-8") as file:
         rows = [row for row in csv.DictReader(file) if row["quantity"] != "largest gap function error"]
     names = [name for name in dict.fromkeys(row["reference"] for row in rows) if " against " not in name]

@@ -1,9 +1,9 @@
-"""Rows a second that `plow-twin live` reads from a complete CSV file, without and with a recording.
+"""Rows per second that `plow-twin live` reads from a complete CSV file, without and with a recording.
 
 python benchmark/file_rate.py [--rows N]
 
-Prints one line of JSON for each case: rows per second of CPU time and of elapsed time, without the start of the
-process.
+Prints one line of JSON for each case, with the rows per second of CPU time and of elapsed time. The time of the
+process's start is subtracted.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import time
 from pathlib import Path
 from typing import Final
 
-#: Rows of the file that measures the time of the start.
+#: Number of rows of the short file, by which the time of the start is measured.
 FEW: Final = 1000
 
 
@@ -33,7 +33,7 @@ def write_load(path: Path, rows: int) -> None:
 
 
 def measure(path: Path, *options: str) -> tuple[float, float]:
-    """Return CPU and time on the clock of a run [s]."""
+    """Return the CPU time and the elapsed time of a run in s."""
     command = [sys.executable, "-m", "plow_twin", "live", str(path), "--scene", "paper", "--quiet", *options]
     before, begin = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
     subprocess.run(command, check=True)

@@ -2,9 +2,10 @@
 
     python benchmark/filter_peers.py --truths 5 --seed 5000 --group plain
 
-State of both: pose, its rate, the clearances, softness, damping, load gains, the sensor's bias and delay. Both move
-their points with the project's own solver, know the sensor's noise, and begin at the nominal scene with the prior of
-the estimate. Rows are appended to `results/filter_peers.jsonl`; rows already there are not run again.
+The state of both filters has the pose, its rate, the clearances, softness, damping, load gains, and the sensor's bias
+and delay. Both filters use the project's solver as process model, know the sensor's noise, and begin at the nominal
+scene with the prior of the estimate. Rows are appended to `results/filter_peers.jsonl`; truths in the file are not run
+again.
 """
 
 from __future__ import annotations
@@ -52,15 +53,15 @@ TOLERANCE = 1e-4
 MEMBERS = 128
 #: Index of the estimate's first unknown in the state, after pose and rate.
 _FIRST = 6
-#: Process noise in each step: m, rad, m/s, rad/s; for the unknowns, a share of the prior's deviation. Set by hand and
-#: tried on seeds 200 and 201 only.
+#: Process noise in each step: x, y [m], theta [rad] and their rates; for the unknowns a share of the prior's standard
+#: deviation. Both were set by hand, with trials on seeds 200 and 201 only.
 _STATE_NOISE = np.array([1e-5, 1e-5, 4e-5, 3e-3, 3e-3, 1e-2])
 _UNKNOWN_NOISE = 3e-4
 
 
 @kernel(entry=True)
 def move(params, parts, states, saved, work, totals, times, wrench, rows, pace):  # type: ignore[no-untyped-def]
-    """Let all members settle and advance them; arrays as `advance_rows` takes them."""
+    """Choose the contact modes of all members and advance them; the arrays are those of `advance_rows`."""
     marks = np.zeros(0, np.int64)
     for m in range(states.size):
         settle_modes(params[m], states[m], parts.terms.stick)
@@ -71,7 +72,7 @@ def move(params, parts, states, saved, work, totals, times, wrench, rows, pace):
 
 
 class Members:
-    """Heads with numbers of their own, moved together from states that a filter has changed."""
+    """Heads with different parameters, advanced together from states that a filter has changed."""
 
     def __init__(self, truth: Truth, count: int) -> None:
         self.unknowns = Unknowns(truth.nominal)
@@ -82,7 +83,7 @@ class Members:
         self._params = new_records(PARAMS, count)
         self._params[:] = compiled.params
         clearance = scene.clearance
-        # rows are linear in the clearances
+        # the penetrations' rows are linear in the clearances
         self._rows = np.array(compiled.params["penetration_rows"])
         wider = (
             Clearance(clearance.horizontal_m + 1e-3, clearance.vertical_m),
@@ -97,7 +98,7 @@ class Members:
         self._masses = inertias(scene)
 
     def move(self, points: Array, start: float, end: float) -> Array:
-        """Return points (m, 17) moved from one time to another."""
+        """Return points (m, 17) advanced from one time to another."""
         out = points.copy()
         unknown = out[:, _FIRST:]
         unknown[:] = np.array([self.unknowns.within(row) for row in unknown])
@@ -117,7 +118,7 @@ class Members:
         wrench = ends * unknown[:, None, 4:7] / self._masses
         result = np.zeros((len(out), 1), ROW)
         pace = new_record(PACE)
-        pace.slice = 2**62  # in one go
+        pace.slice = 2**62  # all work in one slice
         move(
             self._params, self._parts, states, new_records(STATE, 1), self._work, self._totals, np.array([end]), wrench,
             result, pace,
@@ -135,14 +136,14 @@ class Members:
 
 
 def seen(point: Array) -> Array:
-    """Return the pose that the sensor shows at a state, with its delay and bias."""
+    """Return the pose that the sensor would show at a state, with the state's delay and bias."""
     unknown = point[_FIRST:]
     pose: Array = point[:3] + unknown[7:10] - point[3:6] * unknown[10]
     return pose
 
 
 class Ukf(UnscentedKalmanFilter):  # type: ignore[misc]
-    """filterpy's UKF, all sigma points moved in one call."""
+    """The UKF of filterpy, with all sigma points advanced in one call."""
 
     def __init__(self, truth: Truth) -> None:
         size = _FIRST + SIZE
@@ -154,14 +155,14 @@ class Ukf(UnscentedKalmanFilter):  # type: ignore[misc]
         self.now = float(truth.poses.t[0])
 
     def compute_process_sigmas(self, dt: float, fx: Any = None, **_: Any) -> None:
-        """Move the sigma points by `dt`."""
+        """Advance the sigma points by `dt` in s."""
         self.P = 0.5 * (self.P + self.P.T) + 1e-14 * np.eye(len(self.P))
         self.sigmas_f = self.members.move(self.points_fn.sigma_points(self.x, self.P), self.now, self.now + dt)
         self.now += dt
 
 
 class Enkf(EnsembleKalmanFilter):  # type: ignore[misc]
-    """filterpy's EnKF, all members moved in one call."""
+    """The EnKF of filterpy, with all members advanced in one call."""
 
     sigmas: Array
 
@@ -173,7 +174,7 @@ class Enkf(EnsembleKalmanFilter):  # type: ignore[misc]
         self.now = float(truth.poses.t[0])
 
     def predict(self, dt: float) -> None:
-        """Move the members by `dt`."""
+        """Advance the members by `dt` in s."""
         self.sigmas = self.members.move(self.sigmas, self.now, self.now + dt)
         self.sigmas += np.random.standard_normal(self.sigmas.shape) * np.sqrt(np.diag(self.Q))  # noqa: NPY002
         self.x = self.sigmas.mean(axis=0)
@@ -182,7 +183,7 @@ class Enkf(EnsembleKalmanFilter):  # type: ignore[misc]
 
 
 def run_one(name: str, method: str, seed: int) -> dict[str, Any]:
-    """Run one filter over one truth; errors at the end."""
+    """Run one filter over one truth, and return its errors at the end as a row."""
     truth = draw(GROUPS[name], seed)
     begin = time.process_time()
     one: Any = Ukf(truth) if method == "ukf" else Enkf(truth, seed)
@@ -194,7 +195,7 @@ def run_one(name: str, method: str, seed: int) -> dict[str, Any]:
     try:
         for t, q in zip(truth.poses.t[1:], truth.poses.q[1:], strict=True):
             one.predict(float(t) - one.now)
-            # a component that was not measured carries no information
+            # a component that was not measured gets so large a noise that it has no effect
             there = np.isfinite(q)
             one.update(np.where(there, q, 0.0), np.diag(np.where(there, noise, 1e3) ** 2))
     except np.linalg.LinAlgError as error:

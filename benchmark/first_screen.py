@@ -1,8 +1,8 @@
-"""Time an operator's steps from an empty virtual environment to numbers on the screen of a growing CSV file.
+"""Time of an operator's steps from an empty virtual environment to a screen that shows a growing CSV file.
 
 python benchmark/first_screen.py [FOLDER]
 
-Prints the seconds of each step as JSON.
+Prints the time of each step in s as JSON.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def main() -> None:
     folder = Path(sys.argv[1] if len(sys.argv) > 1 else tempfile.mkdtemp())
     took: dict[str, Any] = {}
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-    # compiled code of another installation does not count
+    # an empty cache, so that compiled code of another installation is not used
     environment["NUMBA_CACHE_DIR"] = environment["PLOW_TWIN_CACHE"] = str(folder / "cache")
 
     def step(name: str) -> None:

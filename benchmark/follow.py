@@ -1,10 +1,11 @@
-"""The twin that follows its machine, on fresh truths: forces, peaks, impulses and clearances beside the nominal twin's.
+"""The twin that follows its machine, on fresh truths: its forces, peaks, impulses and clearances.
 
     python benchmark/follow.py --group soft --group hard --truths 12 --seed 72000
-    python benchmark/follow.py --table                       # of what the file holds
+    python benchmark/follow.py --table                       # table of the truths in the file
 
-The result at a time uses only measurements up to that time. Everything was set on seeds below 72000. Each truth is
-written as soon as it is done; truths in the file are not run again.
+The errors are compared with those of the nominal twin. The result at a time uses only measurements up to that time. All
+thresholds were set on seeds below 72000. Each truth is written as soon as it is done, and truths in the file are not
+run again.
 """
 
 from __future__ import annotations
@@ -37,17 +38,17 @@ GROUPS = {
     "law": Group("law: Kelvin-Voigt", law="kelvin_voigt"),
     "shape": Group("load: third harmonic of 10 %", third_harmonic=0.1),
 }
-#: Forces count from the fifth load period on, for pairs with at least a hundredth of the largest impulse.
+#: Forces are compared from the fifth load period on, for pairs with at least a hundredth of the largest impulse.
 FIRST_PERIOD, LEAST_SHARE = 4, 0.01
-#: Distance in s of the rows that give the truth's peaks and impulses: the hardest contact lasts five of them.
+#: Interval in s of the rows from which the truth's peaks and impulses are computed, a fifth of the shortest contact.
 _FINE = 1e-4
 
 
 def run_one(name: str, seed: int, members: int) -> dict[str, Any]:
-    """Follow one truth and compare."""
+    """Follow one truth, and return the errors as a row."""
     try:
         truth = draw(GROUPS[name], seed)
-    except SolverError as error:  # a wall has jumped through the head: such a machine does not exist
+    except SolverError as error:  # the head has passed through a wall, so no real machine is like this
         return {"group": name, "seed": seed, "not_drawn": str(error)}
     true, nominal = (Motion(scene, truth) for scene in (truth.scene, truth.nominal))
     begin = time.process_time()
@@ -122,7 +123,7 @@ def _clearance(stretch: Stretch, truth: Truth) -> dict[str, float]:
 
 
 def as_markdown(rows: Sequence[dict[str, Any]]) -> str:
-    """Return the table of the page: medians over the truths, coverage as means."""
+    """Return the table of the page, with medians over the truths and means of the coverage."""
     lines = [
         "| group | truths | RMS error of the forces: nominal, followed | largest force a pair and period | "
         "impulse | "

@@ -2,7 +2,7 @@
 
     python benchmark/follow_latency.py
 
-A runtime of the node without its transport gets load and poses (100 Hz), and an estimate after half a second.
+A runtime of the node without its transport gets the load, poses at 100 Hz, and an estimate after half a second.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from plow_twin.stream.journal import Estimated
 from plow_twin.stream.topics import TOPICS
 
 _T0 = 1_795_000_000_000_000_000
-#: Sampling interval, length of the run, warm-up that does not count, and time of the estimate, in s.
+#: Sampling interval, length of the run, length of the warm-up (not measured), and time of the estimate, in s.
 _STEP, _END, _FIRST, _ESTIMATED = 1e-3, 6.0, 1.0, 0.5
 
 
 class _Front:
-    """A front that discards all messages."""
+    """A front end of the runtime that discards all messages."""
 
     name, follows_samples, sends_motion = "/plow_twin", False, True
     topics = {topic.name: f"/{topic.name}" for topic in TOPICS}  # noqa: RUF012
@@ -45,7 +45,7 @@ class _Front:
 
 
 def _known(truth: Truth) -> Estimated:
-    """Return an estimate as good as one from ten load periods."""
+    """Return an estimate as accurate as an estimate from ten load periods."""
     contact = truth.scene.contact
     assert contact.damping is not None
     horizontal, vertical = (Interval.normal(value, 3e-5) for value in truth.clearance)
@@ -59,11 +59,11 @@ def _known(truth: Truth) -> Estimated:
 
 
 def measured(truth: Truth, follow: str) -> tuple[list[int], list[int]]:
-    """Return the CPU times of samples in ns, until the first message and until the last."""
+    """Return the CPU times of samples in ns, until the first message and until the last message."""
     with tempfile.TemporaryDirectory() as folder:
         scene = Path(folder, "believed.yaml")
         scene.write_text(dump_scene(truth.nominal), encoding="utf-8")
-        # no estimate comes by itself
+        # windows and intervals too long for the runtime to make an estimate of its own
         given = parameters.settings(
             {"scene": str(scene), "estimate": True, "estimate_window": 600.0, "estimate_interval": 600.0}
             | {"follow": follow}
@@ -100,7 +100,7 @@ def _play(runtime: Runtime, truth: Truth) -> tuple[list[int], list[int]]:
 
 @click.command()
 def main() -> None:
-    """Print a table in ms."""
+    """Print the table of CPU times in ms."""
     click.echo("| contact | `follow` | forces out: median, 90 %, 99 % | all: median, mean |\n|---|---|---|---|")
     for title, stiffness in (("soft", (3e6, 3e8)), ("hard", (1e9, 1e11))):
         truth = draw(replace(GROUPS["plain"], stiffness=stiffness, periods=2.2), 71003)

@@ -1,4 +1,4 @@
-"""Forces with intervals: coverage of the true peaks and impulses, and the cost of 256 twins under 1 kHz samples.
+"""Intervals of forces: their coverage of the true peaks and impulses, and the cost of 256 twins under 1 kHz samples.
 
 python benchmark/force_intervals.py --truths 6 --seed 7000
 """
@@ -23,7 +23,7 @@ from plow_twin.estimate.forces import ForceEnsemble
 @click.option("--seed", default=7000, show_default=True, help="First seed.")
 @click.option("--members", default=256, show_default=True)
 def main(group: str, truths: int, seed: int, members: int) -> None:
-    """Estimate truths, let the ensemble follow samples of 1 kHz, and compare with the true forces."""
+    """Estimate truths, advance the ensemble under samples at 1 kHz, and compare its forces with the true forces."""
     for number in range(seed, seed + truths):
         truth = draw(GROUPS[group], number)
         found = estimate(truth.nominal, truth.load, truth.poses)

@@ -1,9 +1,10 @@
-"""heyoka: Taylor series in compiled code with event detection, called from Python; the nearest peer.
+"""heyoka, the most similar peer: compiled Taylor series with event detection, called from Python.
 
-Modes of the eight pairs are parameters of the equations. Python callbacks of terminal events set the modes: one event
-when the penetration of a pair changes sign, one when its force would pull, which contact cannot. The Hunt-Crossley
-force d^1.5 has no Taylor series at a touch, so it begins at a small penetration, at which it is negligible, and the
-steps grow from there. The batch integrator computes as many scenes at once as a SIMD vector has lanes.
+The modes of the eight pairs are parameters of the equations. Python callbacks of two terminal events for each pair set
+its mode: the first event is a change of sign of its penetration, the second is the point at which its force would pull.
+The Hunt-Crossley force d^1.5 has no Taylor series at a touch. So here the force begins at a small penetration, where it
+is negligible, and the steps grow from there. The batch integrator computes as many scenes at once as a SIMD vector has
+lanes.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ def _pairs(p: Array, state: Sequence[Any], hy: Any) -> list[tuple[Any, ...]]:
 
 
 def _equations(p: Array, begin: float) -> tuple[list[tuple[Any, Any]], list[tuple[Any, Any]]]:
-    """Return the rates of the state, and for each pair a function positive in contact, negative when it would pull."""
+    """Return the rates of the state, and for each pair a function that is positive until its force would pull."""
     import heyoka as hy
 
     names = ("x", "y", "th", "vx", "vy", "om")
@@ -55,7 +56,7 @@ def _equations(p: Array, begin: float) -> tuple[list[tuple[Any, Any]], list[tupl
             force = hy.par[i] * law
         else:
             law = 1.0 + p[10] * rate
-            # a base of 1 where the pair does not act: a negative number has no real power
+            # the base is 1 if the pair does not act, since a negative number has no real power
             force = hy.par[i] * p[8] * (hy.par[i] * d + (1.0 - hy.par[i])) ** p[9] * law
             d = d - begin
         fx, fy, torque = fx + along_x * force, fy + along_y * force, torque + arm * force
@@ -70,14 +71,14 @@ def _equations(p: Array, begin: float) -> tuple[list[tuple[Any, Any]], list[tupl
 
 
 def _begin_of(tol: float) -> float:
-    """Return the penetration in m at which a force d^1.5 begins; a touch loses the impulse below it."""
+    """Return the penetration in m at which a force d^1.5 begins; the impulse of smaller penetrations is lost."""
     return min(1e-6, max(1e-9, 1e-4 * math.pow(tol, 2.0 / 3.0)))
 
 
 def _events(guards: list[tuple[Any, Any]], inside: Array, event: Any) -> list[Any]:
     """Return the terminal events that set the modes: whether a pair touches, and whether its force would pull.
 
-    A batch tells its callbacks in which lane the event fired; `inside` has the shape of the modes.
+    A batch passes the lane of the event to its callbacks; `inside` has the shape of the modes.
     """
 
     def touches(pair: int) -> Callable[..., bool]:
@@ -106,7 +107,7 @@ def _events(guards: list[tuple[Any, Any]], inside: Array, event: Any) -> list[An
 
 @cache
 def _integrator(numbers: tuple[float, ...], tol: float) -> Any:
-    """Return an integrator, compiled once for both outputs, and which pairs are inside their walls."""
+    """Return an integrator, which is compiled once for both outputs, and the array of pairs inside their walls."""
     import heyoka as hy
 
     p = np.array(numbers)
@@ -140,7 +141,7 @@ def prepare(p: Array, tol: float, output_dt: float) -> Callable[[], Sample]:
 
 
 def prepare_batch(p: Array, clearances: Array, tol: float, output_dt: float) -> Callable[[], Sample]:
-    """Prepare runs with many clearances (n, 2), as many at once as heyoka recommends; poses are (rows, 3, n)."""
+    """Prepare runs with many clearances (n, 2), in batches of heyoka's recommended size; poses are (rows, 3, n)."""
     import heyoka as hy
 
     width = int(hy.recommended_simd_size())
@@ -154,7 +155,7 @@ def prepare_batch(p: Array, clearances: Array, tol: float, output_dt: float) -> 
     grid = np.arange(round(T_END / output_dt) + 1) * output_dt
     grids = np.ascontiguousarray(np.repeat(grid[:, None], width, axis=1))
     groups = -(-len(clearances) // width)
-    # the last group is filled up with its last pair
+    # the last batch is filled up with the last pair
     filled = np.concatenate([clearances, np.repeat(clearances[-1:], groups * width - len(clearances), axis=0)])
     poses = np.zeros((len(grid), 3, len(filled)))
 

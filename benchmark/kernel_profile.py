@@ -1,8 +1,8 @@
-"""Show where the time of a run goes, kernel by kernel: Linux `perf` with the symbols of numba's compiled code.
+"""Share of each kernel in the time of a run, by Linux `perf` with the symbols of numba's compiled code.
 
     python benchmark/kernel_profile.py bench_kv 1e-3 [--seconds 5]
 
-perf takes symbols from /tmp/perf-<pid>.map, which is written here from the object code of each library.
+perf reads symbols from /tmp/perf-<pid>.map, which this program writes from the object code of each library.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SHOWN = 24
 
 
 def _collect() -> None:
-    """Keep every library of compiled code together with its object code, fresh or from the cache."""
+    """Keep the object code of every library, whether it is compiled or read from the cache."""
     kind: Any = codegen.JITCodeLibrary
     fresh, cached = kind._finalize_specific, kind._unserialize.__func__
 

@@ -2,7 +2,7 @@
 
     python benchmark/lanes.py [--tol 1e-6] [--rounds 9]
 
-The runs take turns, so that the noise of other programs cancels; the least CPU time counts.
+The runs take turns, so that other programs disturb all of them alike; the least CPU time of each is printed.
 """
 
 from __future__ import annotations

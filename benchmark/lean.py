@@ -1,4 +1,4 @@
-"""The plain way: equations of motion in world axes and classical RK4, jitted, without counts or events."""
+"""A plain compiled solver: classical RK4 with the equations of motion in world axes, without statistics or events."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, Final
 from cases import Array
 from numba import njit
 
-#: Numba's types of its decorator do not declare compiled functions callable.
+#: Typed here, because numba's own types do not declare compiled functions as callable.
 compiled: Final[Callable[[Any], Any]] = njit
 fast: Final[Callable[[Any], Any]] = njit(fastmath=True)
 inlined: Final[Callable[[Any], Any]] = njit(inline="always", fastmath=True)
@@ -61,7 +61,7 @@ def rhs_into(t: float, y: Array, out: Array, p: Array) -> None:
 
 @fast
 def rk4(p: Array, dt: float, steps: int, stride: int, q: Array) -> None:
-    """March from rest at the origin; row i of `q` is the pose after i stride steps."""
+    """Integrate from rest at the origin; row i of `q` is the pose after i * stride steps."""
     x = y = th = vx = vy = om = 0.0
     half = 0.5 * dt
     for n in range(steps):

@@ -1,4 +1,4 @@
-"""Time at equal error: the time that each solver needs to stay below an error, from its ladder of settings."""
+"""Times at equal error: the time in which a solver reaches an error, found from its runs with different settings."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ LEVELS = (1e-2, 1e-3, 1e-6, 1e-9)
 OUTPUTS = (0.1, 1e-3)
 Member = Callable[[str], bool]
 
-#: Groups of peers compared as one: at each level the fastest member counts.
+#: Groups of peers; at each level of error the fastest member of a group is compared.
 PEERS: dict[str, Member] = {
     "CVODE from C": lambda solver: solver.startswith("CVODE") and solver.endswith("(C)"),
     "CVODE from C, rootfinding": lambda solver: "rootfinding" in solver,
@@ -26,14 +26,14 @@ PEERS: dict[str, Member] = {
     "our RK4": lambda solver: solver == OURS_RK4,
 }
 OWN: dict[str, Member] = {name: name.__eq__ for name in (OURS_BARE, OURS, OURS_CALL)}
-#: A solver slower than its group's fastest by more than this factor is measured once; so is a setting slower than its
-#: solver's fastest.
+#: A solver is measured only once if it is slower than the fastest solver of its group by more than this factor. The
+#: same applies to a setting and the fastest setting of its solver.
 _NEAR = 1.4
 
 
 @dataclass(frozen=True)
 class Reached:
-    """The time in ms in which a solver reaches an error, and the setting, or the two settings between which it lies."""
+    """The time in ms in which a solver reaches an error, with the setting or the two settings between which it lies."""
 
     wall_ms: float
     solver: str
@@ -41,7 +41,7 @@ class Reached:
 
 
 def ladders(rows: Sequence[Row], scene: str, output_s: float, member: Member) -> list[list[Row]]:
-    """Return the rows of each solver of a group, in the order of the settings: loosest first."""
+    """Return the rows of each solver of a group, with the loosest setting first."""
     found: dict[str, list[Row]] = {}
     for row in rows:
         if row.section == SECTION and row.scene == scene and row.output_s == output_s and member(row.solver):
@@ -50,9 +50,10 @@ def ladders(rows: Sequence[Row], scene: str, output_s: float, member: Member) ->
 
 
 def reach(ladder: Sequence[Row], level: float) -> Reached | None:
-    """Return the least time for an error of at most `level`: of a setting, or interpolated between two (log over log).
+    """Return the least time for an error of at most `level`, of a setting or interpolated between two settings.
 
-    It interpolates only between neighbours of which the first setting misses the level and the second reaches it.
+    The interpolation is linear in the logarithms of time and error, and only between neighbouring settings of which the
+    looser misses the level and the tighter reaches it.
     """
     done = [row for row in ladder if row.status == "ok" and row.error is not None and row.wall_ms is not None]
     times = [Reached(_wall(row), row.solver, row.setting) for row in done if _error(row) <= level]
@@ -71,7 +72,7 @@ def fastest(rows: Sequence[Row], scene: str, output_s: float, level: float, memb
 
 
 def contenders(rows: Sequence[Row]) -> set[int]:
-    """Return the indices of the rows on which a figure of the tables depends, after one run of each."""
+    """Return the indices of the rows that can change a figure of the tables, judged by one run of each row."""
     picked: list[Row] = []
     for scene in {row.scene for row in rows}:
         for output_s in OUTPUTS:

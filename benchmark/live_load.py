@@ -1,14 +1,14 @@
-"""The live node under load: loss, share of a core, age at a subscriber, beside a bare rclpy echo of three messages.
+"""The live node under load: loss, share of a core and age at a subscriber, compared with a bare rclpy echo.
 
 `python benchmark/live_load.py [--seconds N] [--repeats N]` runs every case once in each repeat, prints a line of JSON
 for each case with the medians of the repeats, and then the targets with the results. `--minutes N` instead runs the
 node with its recorder at 1 kHz (or `--rate`) for N minutes, and prints a line every ten seconds, the growth of each
 figure, and whether each message sent was used or counted. `--beside` runs the echo, the node and a recording node at
-once under the same samples: other load of the machine affects them alike, so that their ratios are valid even on a busy
+once under the same samples; other programs disturb all of them alike, so that their ratios are valid even on a busy
 machine. `--estimate` runs the node without and with the estimate and its 256 twins in turn, under the paper's load and
 a synthetic pose at 100 Hz, `--repeats` times each, for `--seconds` after the first window has been formed. `--opcua`
 runs `plow-twin live` beside an OPC UA server for `--minutes` (10) instead: see `opcua_load.py`. Publisher, node and
-subscriber share the machine: compare only the node and the echo of the same run.
+subscriber share the machine, so only figures of the same run can be compared.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ FORMED_S = 34.0
 
 
 class Case(NamedTuple):
-    """Publish mode of the node, or `echo` or `raw_echo`; rate of the samples [Hz]; whether it records."""
+    """A case: publish mode of the node (or `echo`, `raw_echo`), rate of the samples [Hz], whether the node records."""
 
     mode: str
     rate_hz: float
@@ -51,10 +51,10 @@ CASES = (ECHO, RAW_ECHO, ON_SAMPLE, RECORDED, FIXED, FIXED_RECORDED, Case("fixed
 
 
 def echo(raw: bool = False, namespace: str = "live_load") -> None:
-    """Answer each sample with three messages of the sizes that the node sends, and no others.
+    """Answer each sample with three messages as large as those of the node.
 
-    With `raw` the messages are bytes serialised in advance, and only the sample's stamp is written: the least work of
-    any rclpy node.
+    With `raw` the messages are serialised in advance, and only the sample's stamp is written into their bytes, which is
+    the least work that an rclpy node can do.
     """
     import rclpy
     from geometry_msgs.msg import WrenchStamped
@@ -94,7 +94,7 @@ def echo(raw: bool = False, namespace: str = "live_load") -> None:
 
 
 def send(rate_hz: float, seconds: float) -> None:
-    """Publish samples with the time of sending as their stamp."""
+    """Publish samples that are stamped with the time of sending."""
     import rclpy
     from geometry_msgs.msg import WrenchStamped
 
@@ -115,7 +115,7 @@ def send(rate_hz: float, seconds: float) -> None:
 
 
 class Probe:
-    """A node that hears the forces and the diagnostics."""
+    """A node that subscribes to the forces and the diagnostics."""
 
     def __init__(self) -> None:
         import rclpy
@@ -143,13 +143,13 @@ class Probe:
             self.figures.update({item.key: item.value for item in status.values})
 
     def spin(self, reached: Callable[[], bool], timeout_s: float) -> None:
-        """Listen until `reached` returns true, or time is up."""
+        """Listen until `reached` returns true, or until the timeout."""
         give_up = time.monotonic() + timeout_s
         while not reached() and time.monotonic() < give_up:
             self._executor.spin_once(timeout_sec=0.02)
 
     def close(self) -> None:
-        """Take the node down."""
+        """Shut the node down."""
         self._executor.remove_node(self.node)
         self.node.destroy_node()  # type: ignore[no-untyped-call]
         self.context.try_shutdown()
@@ -157,7 +157,7 @@ class Probe:
 
 @contextmanager
 def running(answerer: list[str]) -> Iterator[tuple[Probe, int]]:
-    """Start an answerer and wait until it answers; yields a probe and the answerer's process id."""
+    """Start an answering process and wait for its first answer; yields a probe and the process id."""
     probe = Probe()
     process = subprocess.Popen(answerer, env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
@@ -177,7 +177,7 @@ def source(rate_hz: float, seconds: float) -> subprocess.Popen[bytes]:
 
 
 def measure(answerer: list[str], rate_hz: float, seconds: float) -> dict[str, float]:
-    """Run an answerer at a rate; return samples sent, used and lost, its CPU, and the age at a subscriber."""
+    """Run an answering process at a rate; return samples sent, used and lost, its CPU time and the ages of messages."""
     with running(answerer) as (probe, process_id):
         sender, ages, figures = source(rate_hz, seconds), probe.ages, probe.figures
         try:
@@ -188,7 +188,7 @@ def measure(answerer: list[str], rate_hz: float, seconds: float) -> dict[str, fl
             probe.spin(lambda: sender.poll() is not None, seconds + 30.0)
             share = (_cpu_s(process_id) - busy) / (time.monotonic() - begin)
         finally:
-            sender.kill()  # a publisher without a subscriber would send to the next subscriber
+            sender.kill()  # otherwise it would go on and send to the subscriber of the next case
             sender.wait()
         figures.pop("samples_used", None)
         if "published" in figures:
@@ -207,7 +207,7 @@ def measure(answerer: list[str], rate_hz: float, seconds: float) -> dict[str, fl
 
 
 def environment() -> dict[str, str]:
-    """Return the environment of the processes."""
+    """Return the environment variables of the processes."""
     return os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
 
 
@@ -224,7 +224,7 @@ def _twin(mode: str, folder: str, namespace: str = "/live_load", given: dict[str
 
 
 def estimating(seconds: float, repeats: int) -> None:
-    """Print CPU and age without and with the estimate in turn, then the medians."""
+    """Print CPU time and age without and with the estimate in turn, then the medians."""
     runs: dict[bool, list[dict[str, float]]] = {False: [], True: []}
     for _ in range(repeats):
         for on, found in runs.items():
@@ -273,7 +273,7 @@ def _children(process_id: int) -> list[int]:
 
 
 def compare(seconds: float, repeats: int) -> None:
-    """Print each run as it ends, then the medians of all cases, and the targets with the results."""
+    """Print each run when it ends, then the medians of all cases, and the targets with the results."""
     runs: dict[Case, list[dict[str, float]]] = {case: [] for case in CASES}
     with tempfile.TemporaryDirectory() as folder:
         for repeat in range(repeats):
@@ -296,7 +296,7 @@ def compare(seconds: float, repeats: int) -> None:
 
 
 def _targets(rows: dict[Case, dict[str, float]]) -> Iterator[tuple[str, float, float]]:
-    """Yield the targets in words, the result, and the limit."""
+    """Yield for each target its description, the result and the limit."""
     bare = rows[ECHO]
     for case, how in ((ON_SAMPLE, ""), (RECORDED, ", recording")):
         row = rows[case]
@@ -308,7 +308,7 @@ def _targets(rows: dict[Case, dict[str, float]]) -> Iterator[tuple[str, float, f
 
 
 def beside(seconds: float) -> None:
-    """Print CPU and age of the echo, the node and a recording node that hear the same samples, and their ratios."""
+    """Print CPU time, ages and ratios of the echo, the node and a recording node, which get the same samples."""
     from sensor_msgs.msg import JointState
 
     probe, cases = Probe(), {"echo": ECHO, "on_sample": ON_SAMPLE, "recording": RECORDED}
@@ -359,7 +359,7 @@ def _append_age(ages: list[float], data: bytes) -> None:
 
 
 def _exact_cpu_s(process_id: int) -> float:
-    """Return the time on a processor of all threads, as the scheduler has it: `stat` counts ticks of 10 ms."""
+    """Return the CPU time of all threads in s from the scheduler, which is finer than the 10 ms ticks of `stat`."""
     tasks = Path(f"/proc/{process_id}/task").iterdir()
     return sum(int((task / "schedstat").read_text().split()[0]) for task in tasks) * 1e-9
 
@@ -406,9 +406,10 @@ def soak(minutes: float, rate_hz: float) -> bool:
 
 
 def _growth(minutes: list[float], sizes: list[float]) -> tuple[float, float]:
-    """Return slope per hour, after the first quarter, and half-width of its 95 % interval.
+    """Return the slope per hour after the first quarter, and the half-width of its 95 % interval.
 
-    From the means of six blocks: memory grows in steps, and neighbouring samples are not independent.
+    The slope is fitted to the means of six blocks, because memory grows in steps and neighbouring samples are not
+    independent.
     """
     import numpy as np
 
@@ -437,7 +438,7 @@ def _status(process_id: int, key: str) -> int:
 
 
 def main() -> None:
-    """Print the table, or the soak."""
+    """Run the measurement that the options choose."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--seconds", type=float, default=5.0)
     parser.add_argument("--repeats", type=int, default=5)

@@ -1,4 +1,4 @@
-"""The live twin: loads sampled at 1 kHz, many twins together, a cold and a second start."""
+"""Rows of live twins: one twin and many twins under loads sampled at 1 kHz, and starts with and without a cache."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _TWIN, _TWINS = "plow_twin Twin", "plow_twin TwinBatch"
 
 
 def sampled_rows(repeats: int, notify: Notify) -> Iterator[Row]:
-    """Yield one twin in one call (`value`: times real time), then 256 together (`value`: share of a core)."""
+    """Yield a row for one twin (`value`: times real time), then rows for 256 twins (`value`: share of a core)."""
     scene, t = bench_scene("kv"), 1e-3 * np.arange(1.0, 20_001.0)
     p = constants(scene)
     wrench = np.sin(p[14] * t)[:, None] * p[11:14]
@@ -60,7 +60,7 @@ def _one_twin(scene: Scene, t: Array, wrench: Array, repeats: int) -> Row:
 
 
 def _many_twins(scene: Scene, t: Array, wrench: Array, samples: int) -> float:
-    """Return the time in s that twins of different stiffness take together, called with a few samples at a time."""
+    """Return the time in s of all twins, which differ in stiffness, if each call has `samples` samples."""
     contacts = [
         dataclasses.replace(scene.contact, stiffness=scene.contact.stiffness * (1.0 + i / TWINS)) for i in range(TWINS)
     ]
@@ -75,7 +75,7 @@ def _many_twins(scene: Scene, t: Array, wrench: Array, samples: int) -> float:
     return timed(run)[0]
 
 
-#: A process that prepares a live twin and prints the time taken and the kernels that numba compiled or read.
+#: Program that prepares a live twin, and prints its times and the numbers of kernels that numba compiled or read.
 _START = """
 import json, sys, time
 begin = time.perf_counter()
@@ -100,7 +100,7 @@ print(json.dumps({
 
 
 def start_rows(notify: Notify) -> Iterator[Row]:
-    """Yield a start with an empty cache and the next start, each of a process; `value`: number of compiled kernels."""
+    """Yield rows for the start of a process with an empty cache and for the next start; `value`: compiled kernels."""
     with tempfile.TemporaryDirectory() as cache:
         for name in ("cold start", "second start"):
             notify(name)

@@ -2,11 +2,12 @@
 
     python benchmark/lives.py --lives 8
 
-Each life has a wear coefficient drawn from the prior and a load whose size the forecast does not know; the clearances
-are measured with noise at each visit. The truth follows the wear in steps a quarter as long as the forecast's.
+The wear coefficient of each life is drawn from the prior, and the forecast does not know the size of the load. The
+clearances are measured with noise at each visit. The true wear is computed in steps a quarter as long as the
+forecast's.
 
-Definitions: alpha-lambda accuracy and prognostic horizon as Saxena et al., Int. J. Prognostics Health Management 1
-(2010) 1; CRPS as Gneiting and Raftery, J. Am. Stat. Assoc. 102 (2007) 359.
+Alpha-lambda accuracy and prognostic horizon are defined in Saxena et al., Int. J. Prognostics Health Management 1
+(2010) 1, and the CRPS in Gneiting and Raftery, J. Am. Stat. Assoc. 102 (2007) 359.
 """
 
 from __future__ import annotations
@@ -30,16 +31,17 @@ Array = NDArray[np.float64]
 RESULTS = Path(__file__).resolve().parent / "results"
 #: 5 % and 95 % points of the prior, and of the drawn truth [m^2/N].
 PRIOR = (1e-15, 1e-14)
-#: Growth of a clearance that ends a life [m], noise of an estimate [m], visits in a life, shares of the life.
+#: Growth of a clearance that ends a life [m], noise of an estimate [m], number of visits in a life, and the shares of
+#: the life at which it is forecast.
 GROWTH, NOISE, VISITS, SHARES = 3e-3, 5e-5, 20, (0.3, 0.5, 0.7)
 #: Quantiles that bound the inner 80 % and the inner 90 %.
 _INNER, _INNER_90 = (0.1, 0.9), (0.05, 0.95)
-#: Relative error within which a forecast counts as right.
+#: Largest relative error of a right forecast.
 ALPHA = 0.2
 
 
 def truth(rng: np.random.Generator) -> tuple[Scene, float, life.Path]:
-    """Draw a machine, its coefficient, and the path of its wear."""
+    """Draw a machine; return its scene, its wear coefficient and the path of its wear."""
     paper = load_scene("paper")
     gain = 1.0 + 0.05 * rng.standard_normal()
     loads = tuple(
@@ -65,7 +67,7 @@ def limits(scene: Scene) -> tuple[float, float]:
 
 
 def one_life(seed: int) -> list[dict[str, Any]]:
-    """Forecast one life at several shares of it."""
+    """Forecast one life at each of `SHARES`, and return a row for each."""
     rng = np.random.default_rng([20261121, seed])
     scene, k_s, path = truth(rng)
     wear = scene.wear

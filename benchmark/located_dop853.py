@@ -1,8 +1,8 @@
-"""DOP853 compiled by numba, with every change of contact located on its dense output and a restart there.
+"""DOP853 compiled by numba, which locates every change of contact on its dense output and restarts there.
 
-The solver that an expert on the machine would write: Hairer's method and step control with SciPy's coefficients
-(Hairer, Norsett and Wanner, Solving ODEs I, sec. II.5 and II.6), contact modes frozen within a step, rows read from the
-dense output.
+This is the solver that an expert on the machine would write. It uses Hairer's method and step control with SciPy's
+coefficients (Hairer, Norsett and Wanner, Solving ODEs I, sec. II.5 and II.6). Contact modes are frozen within a step,
+and rows are read from the dense output.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _A = np.ascontiguousarray(table.A)
 _B, _C = np.ascontiguousarray(table.B), np.ascontiguousarray(table.C)
 _E3, _E5, _D = np.ascontiguousarray(table.E3), np.ascontiguousarray(table.E5), np.ascontiguousarray(table.D)
 _ROWS = len(_C)
-#: Poses are about 1e-2, velocities about 1: absolute tolerances relative to rtol.
+#: Absolute tolerances over rtol, since poses are about 1e-2 and velocities about 1.
 _ATOL = np.array([1e-3, 1e-3, 1e-3, 1e-1, 1e-1, 1e-1])
 _OFF, _ON, _CLIPPED = 0, 1, 2
 #: Number of equal parts of a step; guards are checked at the end of each part.
@@ -46,7 +46,7 @@ def _pair(i, c, s, bx, by, bvx, bvy, om, p):  # type: ignore[no-untyped-def]
 
 @fast
 def _rate(t: float, y: Array, mode: Indexes, p: Array, out: Array) -> None:
-    """Write the rate of y = (x, y, theta, vx, vy, omega); pairs that are on act by their law, also where it pulls."""
+    """Write the rate of y = (x, y, theta, vx, vy, omega); pairs that are on act by their law even where it pulls."""
     c, s, om = math.cos(y[2]), math.sin(y[2]), y[5]
     bx, by, bvx, bvy = c * y[0] + s * y[1], c * y[1] - s * y[0], c * y[3] + s * y[4], c * y[4] - s * y[3]
     fx = fy = torque = 0.0
@@ -67,7 +67,7 @@ def _rate(t: float, y: Array, mode: Indexes, p: Array, out: Array) -> None:
 
 @fast
 def _guards(y: Array, mode: Indexes, p: Array, out: Array) -> None:
-    """Write two numbers of each pair that stay positive while its mode lasts."""
+    """Write two guards of each pair, which are positive as long as its mode lasts."""
     c, s, om = math.cos(y[2]), math.sin(y[2]), y[5]
     bx, by, bvx, bvy = c * y[0] + s * y[1], c * y[1] - s * y[0], c * y[3] + s * y[4], c * y[4] - s * y[3]
     for i in range(8):
@@ -84,7 +84,7 @@ def _guards(y: Array, mode: Indexes, p: Array, out: Array) -> None:
 
 @fast
 def _dense(f: Array, y: Array, x: float, out: Array) -> None:
-    """Write the state at the share x of a step from its seven interpolation terms, shape (7, 6)."""
+    """Write the state at the share x of a step, from the step's seven interpolation terms, shape (7, 6)."""
     for j in range(6):
         value = 0.0
         for i in range(6, -1, -1):
@@ -136,7 +136,7 @@ def _interpolate(y: Array, new: Array, h: float, k: Array, f: Array) -> None:
 
 @compiled
 def _first_change(y: Array, f: Array, mode: Indexes, p: Array, at: Array, guards: Array):  # type: ignore[no-untyped-def]
-    """Return the share of the step at which a guard first turns negative and its number, or (2, -1)."""
+    """Return the share of the step at which a guard first turns negative and the guard's number, or (2, -1)."""
     for look in range(_LOOKS):
         low, high = look / _LOOKS, (look + 1) / _LOOKS
         _dense(f, y, high, at)
@@ -159,7 +159,7 @@ def _first_change(y: Array, f: Array, mode: Indexes, p: Array, at: Array, guards
 
 @compiled
 def integrate(p: Array, rtol: float, output_dt: float, q: Array) -> tuple[int, int, int]:
-    """Integrate from rest at the origin, fill the rows of q; return steps, evaluations, changes of contact."""
+    """Integrate from rest at the origin and fill the rows of q; return the numbers of steps, evaluations and events."""
     k, f = np.zeros((_ROWS, 6)), np.zeros((7, 6))
     y, new, trial, at, guards = np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(16)
     mode = np.zeros(8, np.int64)

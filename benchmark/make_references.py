@@ -1,4 +1,4 @@
-"""Draw the random scenes and run their references again; needs gcc with libquadmath."""
+"""Draw the random scenes again and run their references; this needs gcc with libquadmath."""
 
 from __future__ import annotations
 

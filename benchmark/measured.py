@@ -6,7 +6,7 @@
     python benchmark/measured.py --only table    height of the table by the estimate of each drop
     python benchmark/measured.py --plot     pictures of it in docs/images
 
-Parameters are fitted to one half of the data at a time, errors are those on the other half.
+Parameters are fitted to each half of the data, and errors are computed on the other half.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ FOLDER = Path(__file__).resolve().parent
 DATA = FOLDER / "data" / "measured"
 RESULTS = FOLDER / "results" / "measured.json"
 IMAGES = FOLDER.parent / "docs" / "images"
-#: Step of each unknown with which a fit begins.
+#: First step of each unknown in a fit.
 STEPS = {"tilt": 0.004, "fall": 0.1, "fall_along": 0.05, "slip_speed": 0.05, "restitution": 0.05, "friction": 0.03}
 PLAIN = replace(ELLIPSE, fall=0.0, fall_along=0.0, tilt=0.0, restitution=0.54)
 FRICTIONS: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
@@ -71,11 +71,11 @@ class Impacts:
         self.half = np.random.default_rng(1).permutation(len(self.before)) % 2
 
     def missed(self, found: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-        """Return the norm of the velocities' error in m/s, omega by the radius of gyration."""
+        """Return the norm of the velocities' error in m/s, where omega is multiplied by the radius of gyration."""
         return np.asarray(np.linalg.norm((found - self.after[chosen])[:, 3:] * [1.0, 1.0, GYRATION], axis=1))
 
     def fit(self, start: EllipseContact, names: tuple[str, ...], chosen: np.ndarray) -> EllipseContact:
-        """Fit the named numbers to the chosen impacts by the root of the mean square."""
+        """Fit the named parameters to the chosen impacts by the root mean square of their errors."""
         first = np.array([getattr(start, name) for name in names])
         steps = [STEPS.get(name, 0.2 * getattr(start, name) + 0.02) for name in names]
 
@@ -118,7 +118,7 @@ class Impacts:
         return errors(np.concatenate(missed))
 
     def floor(self) -> dict[str, Any]:
-        """Return the error that remains with the best impulse at the lowest point."""
+        """Return the error of the best possible impulse at the lowest point."""
         arm, up = contact_arms(self.before[:, 2])
         change = (self.after - self.before)[:, 3:] * [-1.0, 1.0, GYRATION]
         rows = np.zeros((len(change), 3, 2))
@@ -129,7 +129,7 @@ class Impacts:
 
 
 def errors(missed: np.ndarray) -> dict[str, Any]:
-    """Return the figures of errors in m/s."""
+    """Return the RMS and the median of errors in m/s."""
     return {"rms": round(float(np.sqrt((missed**2).mean())), 4), "median": round(float(np.median(missed)), 4)}
 
 
@@ -147,11 +147,11 @@ def rigid_impact(before: np.ndarray, model: Any, e: float, mu: float) -> np.ndar
 
 
 def routh(slip, rate, tt, nn, tn, e, mu, bit=2e-3, energetic=False):  # type: ignore[no-untyped-def]
-    """Return impulses after Routh: Coulomb's friction at each bit of the normal impulse.
+    """Return impulses by Routh's method, which applies Coulomb's friction to each increment of the normal impulse.
 
-    The impact ends by Poisson's restitution (of the impulses) or by Stronge's (of the work of the normal force). Routh,
-    Dynamics of a system of rigid bodies, 1860; Wang and Mason, J. Appl. Mech. 59 (1992) 635; Mirtich, thesis, Berkeley
-    1996.
+    The end of the impact is determined by Poisson's restitution (ratio of impulses) or by Stronge's (ratio of the
+    normal force's work). Routh, Dynamics of a system of rigid bodies, 1860; Wang and Mason, J. Appl. Mech. 59 (1992)
+    635; Mirtich, thesis, Berkeley 1996.
     """
     along, away, end = np.zeros_like(slip), np.zeros_like(slip), np.full_like(slip, np.inf)
     work, least = np.zeros_like(slip), np.zeros_like(slip)
@@ -173,12 +173,12 @@ def routh(slip, rate, tt, nn, tn, e, mu, bit=2e-3, energetic=False):  # type: ig
 
 
 def mirtich(slip, rate, tt, nn, tn, e, mu):  # type: ignore[no-untyped-def]
-    """Return impulses after Routh with Stronge's restitution of the work."""
+    """Return impulses by Routh's method with Stronge's restitution."""
     return routh(slip, rate, tt, nn, tn, e, mu, energetic=True)  # type: ignore[no-untyped-call]
 
 
 def drumwright_shell(slip, rate, tt, nn, tn, e, mu):  # type: ignore[no-untyped-def]
-    """Return impulses that leave the least kinetic energy within Coulomb's cone, with Poisson's restitution.
+    """Return the impulses within Coulomb's cone that leave the least kinetic energy, with Poisson's restitution.
 
     Drumwright and Shell, Algorithmic Foundations of Robotics IX (2010) 249.
     """
@@ -186,7 +186,7 @@ def drumwright_shell(slip, rate, tt, nn, tn, e, mu):  # type: ignore[no-untyped-
     away, along = (tn * slip - tt * rate) / determinant, (tn * rate - nn * slip) / determinant
     slides = np.abs(along) > mu * away
     side = np.sign(along)
-    # on the cone's edge, p = (side mu, 1) away: the least energy that leaves no approach
+    # the impulse on the cone's edge, in the direction (side mu, 1), with the least energy and no approach
     least = -(side * mu * slip + rate) / (tt * mu**2 + 2.0 * side * mu * tn + nn)
     stopped = -rate / (nn + tn * mu * side)
     away = np.where(slides, np.maximum(least, stopped), away)
@@ -194,7 +194,7 @@ def drumwright_shell(slip, rate, tt, nn, tn, e, mu):  # type: ignore[no-untyped-
 
 
 def anitescu_potra_newton(slip, rate, tt, nn, tn, e, mu):  # type: ignore[no-untyped-def]
-    """Return impulses of the complementarity problem with Newton's restitution, which scales both components."""
+    """Return impulses of the complementarity problem, both components scaled by Newton's restitution."""
     along, away = newton(slip, rate, tt, nn, tn, 0.0, mu)  # type: ignore[no-untyped-call]
     return (1.0 + e) * along, (1.0 + e) * away
 
@@ -230,7 +230,7 @@ RIGID = {
 
 
 def by_law(impacts: Impacts) -> dict[str, Any]:
-    """Return the errors of each law with each friction, all numbers fitted, and of extensions of one law."""
+    """Return the errors of each law with each friction, with all parameters fitted, and of extensions of one law."""
     found: dict[str, Any] = {"any impulse at the point": impacts.floor()}
     for name, model in RIGID.items():
         found[f"rigid: {name}"] = impacts.rigid(model)
@@ -264,7 +264,7 @@ def crps(members: np.ndarray, measured: np.ndarray) -> np.ndarray:
 
 
 def sharp() -> np.ndarray:
-    """Return the square with sharp corners, one restitution and one friction, fitted in the same way."""
+    """Return a square with sharp corners, constant restitution and constant friction, fitted like the preset."""
     block = SQUARE.copy()
     for name, value in dict(
         half=0.03, radius=0.0, gyration=0.06 / 6**0.5, table=-5e-4, restitution=0.4362, restitution_fall=0.0,
@@ -275,7 +275,7 @@ def sharp() -> np.ndarray:
 
 
 def without_drag() -> np.ndarray:
-    """Return a block of the outline of the preset `measured_square`, which has no drag and a constant friction."""
+    """Return a block without drag and with constant friction, whose outline is that of the preset `measured_square`."""
     frame, block = load_scene("measured_square").frame, SQUARE.copy()
     block["radius"] = frame.corner_radius_m
     block["half"] = 0.5 * frame.width_m - float(block["radius"])
@@ -284,21 +284,21 @@ def without_drag() -> np.ndarray:
     return block
 
 
-#: Numbers of the block that are fitted with the marker; stiffness and gravity are fixed.
+#: Parameters of the block that are fitted together with the marker; stiffness and gravity are fixed.
 FITTED = (
     "half", "radius", "gyration", "table", "restitution", "restitution_fall", "friction", "friction_fall", "mass_power",
     "tangential", "tangential_damping", "drag", "spin_drag",
 )  # fmt: skip
 
 
-#: Numbers of the preset `measured_square` that are fitted to motions.
+#: Parameters of the preset `measured_square` that are fitted to motions.
 PRESET_FITTED = (
     "gyration", "stiffness", "restitution", "restitution_fall", "mass_power", "friction", "tangential",
     "tangential_damping", "gravity",
 )  # fmt: skip
 #: Largest difference of two first flights that are nearly the same: angle [rad], rates [m/s, m/s, rad/s].
 NEAR_TWINS = (0.05, 0.15, 0.15, 1.5)
-#: Two corners hit at once within this time in s.
+#: Two corners hit at the same time if their touches are within this time in s.
 TWO_AT_ONCE_S = 1e-3
 
 
@@ -319,14 +319,17 @@ class Square:
         self.flights = np.array([fit_flight(drops.pose[i, : drops.flight_rows[i]]).state for i in self.usable])
 
     def errors(self, block: np.ndarray, marker: Marker, chosen: np.ndarray, bounces: int) -> np.ndarray:
-        """Return mean distance in m and angle in rad over `bounces` bounces, shape (k, 2), of drops with as many."""
+        """Return the mean distance in m and angle in rad over `bounces` bounces, shape (k, 2).
+
+        Only drops with as many bounces are included.
+        """
         enough = chosen[self.rows[chosen, bounces - 1] > 0]
         states = marker.state_of_block(self.flights[enough])
         tossed = toss(states, self.rows[enough, bounces - 1].max() + 1, np.full(len(enough), block, block.dtype))
         return self.off(marker.measured(tossed[:, :, :3]), enough, bounces)
 
     def off(self, poses: Iterable[np.ndarray], chosen: np.ndarray, bounces: int) -> np.ndarray:
-        """Return mean distance in m and angle in rad of poses (k, rows, 3) of the chosen drops, shape (k, 2)."""
+        """Return the mean distance [m] and angle [rad], shape (k, 2), of poses (k, rows, 3) from the chosen drops."""
         found = []
         for n, motion in zip(chosen, poses, strict=True):
             rows, first = self.rows[n, bounces - 1], self.first[n]
@@ -335,10 +338,10 @@ class Square:
         return np.array(found)
 
     def against_rigid(self) -> dict[str, Any]:
-        """Return errors over one bounce of rigid and compliant impacts, for all drops and for drops in which two
-        corners hit at once.
+        """Return the errors over one bounce of rigid and of compliant impacts.
 
-        Both have the marker, the rounded corners and the drag; e and mu of the rigid impacts are fitted to all drops.
+        They are given for all drops, and for drops in which two corners hit at the same time. Both kinds of impact have
+        the marker, the rounded corners and the drag; e and mu of the rigid impacts are fitted to all drops.
         """
         every = np.flatnonzero(self.rows[:, 0] > 0)
         states, rows = MARKER.state_of_block(self.flights[every]), int(self.rows[every, 0].max()) + 1
@@ -366,7 +369,7 @@ class Square:
     def fit(
         self, chosen: np.ndarray, start: np.ndarray, names: tuple[str, ...], rounds: int = 3
     ) -> tuple[np.ndarray, Marker]:
-        """Fit block and marker to the chosen drops: bounded distances over one bounce, with less weight over two."""
+        """Fit block and marker to bounded distances of the chosen drops, over one bounce and, with less weight, two."""
 
         def numbers(x: np.ndarray) -> tuple[np.ndarray, Marker]:
             block = start.copy()
@@ -382,7 +385,7 @@ class Square:
             distance = sum(share * (d / (1.0 + d / 0.02)).mean() for share, d in ((1.0, one), (0.3, two)))
             return float(1e3 * distance + 0.3 * np.minimum(angle, 1.0).mean())
 
-        # angle and heights at rest give the start for the marker
+        # the marker's initial values come from the angles and heights at rest
         x = np.array([-0.0335, 3.4e-4, 5.2e-4, *(float(start[name]) for name in names)])
         step = np.array([0.005, 3e-4, 3e-4, *(0.12 * abs(float(start[name])) + 1e-4 for name in names)])
         for turn in range(rounds):
@@ -391,7 +394,7 @@ class Square:
         return numbers(x)
 
     def of_preset(self) -> dict[str, Any]:
-        """Return the errors of the preset `measured_square` over 1, 2, 3 bounces, each drop computed whole."""
+        """Return the errors of the preset `measured_square` over 1, 2, 3 bounces, each drop simulated in one run."""
         scene, far = load_scene("measured_square"), []
         for bounces in (1, 2, 3):
             chosen, poses = np.flatnonzero(self.rows[:, bounces - 1] > 0), []
@@ -404,9 +407,10 @@ class Square:
         return medians(far)
 
     def near_twins(self) -> dict[str, Any]:
-        """Return how far apart measured drops are over one bounce whose first flights are nearly the same.
+        """Return the distance over one bounce between measured drops with nearly the same first flight.
 
-        They begin where the centre is 50 mm above the table, at the same x and quarter of a turn.
+        The drops are compared from the time when the centre is 50 mm above the table, after removal of the difference
+        in x and of whole quarter turns.
         """
         gravity, height = float(SQUARE["gravity"]), 0.05
         # time from the last row of the flight to that height
@@ -428,7 +432,7 @@ class Square:
         return {"pairs": len(apart), "distance_mm": round(1e3 * float(np.median(apart)), 1)}
 
     def held_out(self, start: np.ndarray = SQUARE, names: tuple[str, ...] = FITTED) -> dict[str, Any]:
-        """Fit to either half and return the errors on the other half over 1, 2, 3 bounces."""
+        """Fit to each half and return the errors on the other half over 1, 2, 3 bounces."""
         half = np.random.default_rng(1).permutation(len(self.usable)) % 2
         far: list[list[np.ndarray]] = [[], [], []]
         fitted = []
@@ -451,7 +455,7 @@ def medians(far: list[np.ndarray]) -> dict[str, Any]:
 
 
 def of_drops(drops: Drops) -> dict[str, Any]:
-    """Return distances over 1, 2, 3 bounces, coverage by bounce and score of the bands, for both blocks."""
+    """Return for both blocks the distances over 1, 2, 3 bounces, and coverage and score of the bands by bounce."""
     found: dict[str, Any] = {}
     kinds = {
         "rounded corners, what falls, marker": (SQUARE, MARKER),
@@ -477,7 +481,7 @@ def of_drops(drops: Drops) -> dict[str, Any]:
             edges = [start, *lows[1:3]]
             for bounce, (first, last) in enumerate(pairwise(edges)):
                 off = rows[: last - start, :3] - pose[start:last]
-                # over all bounces so far
+                # means over all bounces so far
                 far[bounce].append((float(np.hypot(off[:, 0], off[:, 1]).mean()), float(np.abs(off[:, 2]).mean())))
                 inside[bounce].append(holds[first:last].mean(axis=0))
             if len(lows) > 3:
@@ -496,7 +500,7 @@ def of_drops(drops: Drops) -> dict[str, Any]:
 
 
 def of_table(drops: Drops) -> dict[str, Any]:
-    """Return the estimate of the table's height in each drop, with a prior of 5 mm."""
+    """Return figures of the estimated height of the table in each drop, with a prior of 5 mm."""
     square, rng = load_scene("measured_square"), np.random.default_rng(1)
     marks = dict(square.marks)
     marks["clearance.vertical_m"] = replace(marks["clearance.vertical_m"], deviation=0.01)
@@ -525,7 +529,7 @@ def of_table(drops: Drops) -> dict[str, Any]:
 
 
 def of_heights(drops: Drops) -> dict[str, Any]:
-    """Return how the table's height differs from drop to drop, by the heights at rest and of impacts."""
+    """Return how much the table's height differs from drop to drop, by the heights at rest and at impacts."""
     square, t = load_scene("measured_square"), np.arange(drops.pose.shape[1]) / RATE_HZ
     nothing = Load(t[[0, -1]], np.zeros((2, 3)))
     places, rests, hits = [], [], []

@@ -1,4 +1,4 @@
-"""The tables of measurements, of `docs/measured.md` and beside the results, from `benchmark/results/measured.json`."""
+"""Tables of the comparison with measurements, for `docs/measured.md`, from `benchmark/results/measured.json`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def _lines(head: list[str], rows: list[list[str]]) -> str:
 
 
 def measured_laws() -> str:
-    """Return RMS and median of the errors of each law with each friction, in m/s."""
+    """Return the table of RMS and median errors in m/s of each law with each friction."""
     found = _part("ellipse")
 
     def figures(name: str) -> str:
@@ -35,7 +35,7 @@ def measured_laws() -> str:
 
 
 def measured_drops() -> str:
-    """Return distances, angles, coverage and scores of the drops."""
+    """Return the table of distances, angles, coverage and scores of the drops."""
     rows = []
     for name, one in _part("square").items():
         coverage = ["x {:.2f}, z {:.2f}, theta {:.2f}".format(*each) for each in one["coverage"]]
@@ -56,7 +56,7 @@ def measured_drops() -> str:
 
 
 def measured_rigid() -> str:
-    """Return the errors of rigid and compliant impacts, by whether two corners hit at once."""
+    """Return the table of errors of rigid and compliant impacts, with and without two corners that hit at once."""
     found = _part("square_rigid")
     e, mu = found["e, mu"]
     names = {
@@ -68,7 +68,7 @@ def measured_rigid() -> str:
 
 
 def measured_table() -> str:
-    """Return how the height of the table is estimated."""
+    """Return the table of errors of the estimated height of the drop table."""
     found = _part("table")
     row = [
         f"{found['estimated']} of {found['drops']}",

@@ -1,7 +1,7 @@
-"""A machine that differs from every scene: its own equations, integrated with fixed Runge-Kutta steps.
+"""A machine with properties that a scene lacks: its own equations, integrated with fixed Runge-Kutta steps.
 
-Independent of the solver: the walls may differ in stiffness, the corners may be round, the pads may lie askew, the
-frame may stand on a spring, the corners may rub. Only heads with `rotation: paper` are modelled.
+It does not use the solver. The walls may differ in stiffness, the corners may be round, the pads may lie askew, the
+frame may stand on a spring, and the corners may rub. Only heads with `rotation: paper` are modelled.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from plow_twin.model.scene import Scene
 
 Array = NDArray[np.float64]
 
-#: Steps in the shortest period of a contact's oscillation, and the longest step in s.
+#: Number of steps in the shortest period of a contact's oscillation, and the longest step in s.
 _STEPS_A_PERIOD, _LONGEST_STEP = 60.0, 1e-4
-#: Mass in kg of a frame on a spring, and its share of the critical damping.
+#: Mass in kg of a frame on a spring, and its damping ratio.
 _FRAME_MASS, _FRAME_DAMPING = 500.0, 0.1
 #: Speed in m/s below which friction is viscous.
 _CREEP = 0.005
@@ -33,13 +33,13 @@ class Machine:
     Attributes
     ----------
     stiffness_share, depth : ndarray, shape (8,)
-        Stiffness of each pair over the contact's, and distance by which its wall lies further out, in m.
+        Stiffness of each pair over the contact's stiffness, and distance in m by which its wall lies farther out.
     radius : float
         Radius of the corners in m.
     friction : float
         Coefficient of friction.
     spring : float
-        Stiffness in N/m of the spring under the frame, along x and along y; 0: the frame is fixed.
+        Stiffness in N/m of the spring under the frame, along x and along y; 0 for a fixed frame.
     """
 
     stiffness_share: Array
@@ -50,7 +50,7 @@ class Machine:
 
 
 def poses_of(scene: Scene, machine: Machine, t: Array, wrench: Array, asked: Array) -> Array:
-    """Return the poses at the times `asked` in s under a load (n, 3) at equal distances `t` in s: (k, 3)."""
+    """Return the poses at the times `asked` [s], shape (k, 3), under a load (n, 3) at evenly spaced times `t` [s]."""
     contact = scene.contact
     stiff = contact.stiffness * max(1.0, 0.01 ** (contact.exponent - 1.0) * contact.exponent)
     lever = 1.0 / scene.head.mass_kg + 0.05 / scene.head.inertia_kg_m2

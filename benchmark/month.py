@@ -1,8 +1,8 @@
 """The wear coefficient after a simulated month: `python benchmark/month.py --truths 20`.
 
-A head works a month under a broad-band load. On some days its pose is measured over ten load periods, by a noisy,
-biased and late sensor, beside a load that is off by 5 %; `estimate` finds the clearances from these data, and their
-growth gives the coefficient. The truth follows the wear in steps a quarter as long as the estimate's, with means over
+A head works for a month under a broad-band load. On some days its pose is measured over ten load periods by a noisy,
+biased and late sensor, together with a load that is 5 % off. `estimate` finds the clearances from these data, and their
+growth gives the coefficient. The true wear is computed in steps a quarter as long as the estimate's, with means over
 four times as many periods.
 """
 
@@ -38,7 +38,7 @@ SPEED_M_S, PAD_AREA_M2 = 2.0, 0.06
 PRIOR = (3e-16, 3e-15)
 #: The coefficient should be known within this factor.
 FACTOR = 1.3
-#: Samples of the load and of the pose [s]; the true load is finer.
+#: Sampling intervals of the true load, of the given load and of the pose [s].
 _FINE, _LOAD_STEP, _POSE_STEP = 1e-3, 2e-3, 1e-2
 _SPAN = 10.0 * PERIOD
 #: Standard deviation of the broad-band part of the load [N, N, N m], and of the sensor [m, m, rad].
@@ -47,7 +47,7 @@ _BROAD, _NOISE = np.array([8e3, 4e3, 1.1e4]), np.array([5e-4, 5e-4, 2e-3])
 
 @dataclass(frozen=True, eq=False)
 class Machine:
-    """Belief about a machine, and its true values."""
+    """The assumed and the true values of a machine."""
 
     believed: Scene
     scene: Scene
@@ -69,13 +69,13 @@ def machine(rng: np.random.Generator) -> Machine:
 
 
 def load_of(one: Machine, rng: np.random.Generator, span: float) -> tuple[Array, Array]:
-    """Return times and the load given to the estimate."""
+    """Return the times and the samples of the load that the estimate gets."""
     t = np.arange(0.0, span + _FINE, _FINE)
     return t, compile_loads(one.believed.loads).at(t) + cutting(rng, t) * _BROAD
 
 
 def visit(one: Machine, worn: Scene, rng: np.random.Generator) -> tuple[Load, Poses]:
-    """Return the measurements of a worn machine: the given load, and the poses that the sensor shows."""
+    """Return the measurements of a worn machine: the load given to the estimate, and the sensor's poses."""
     t, believed = load_of(one, rng, _SPAN)
     motion = simulate(replace(worn, loads=(Table("cutting", t, believed * one.gain),)), _SPAN, _FINE, 1e-6)
     at = np.arange(0.0, _SPAN, _POSE_STEP)
@@ -87,7 +87,7 @@ def visit(one: Machine, worn: Scene, rng: np.random.Generator) -> tuple[Load, Po
 
 
 def one_month(seed: int, day_m: float) -> dict[str, Any]:
-    """Estimate on each of the days, each with `day_m` along the face, and derive the coefficient."""
+    """Estimate the clearances on each of `DAYS`, with `day_m` of travel along the face per day, and the coefficient."""
     rng = np.random.default_rng([20261123, seed])
     one = machine(rng)
     path = true_path(one, rng, day_m)
@@ -117,7 +117,7 @@ def one_month(seed: int, day_m: float) -> dict[str, Any]:
 
 
 def true_path(one: Machine, rng: np.random.Generator, day_m: float) -> life.Path:
-    """Return the path of the true wear over the month, in finer steps and with longer means than in an estimate."""
+    """Return the path of the true wear over the month, computed in finer steps and with longer means than estimates."""
     jump, periods = tuning.JUMP, tuning.MEAN_PERIODS
     tuning.JUMP, tuning.MEAN_PERIODS = (jump[0] / 4.0, jump[1]), (periods[0], 4 * periods[1])
     try:
@@ -148,7 +148,7 @@ def summary(rows: list[dict[str, Any]]) -> str:
 @click.command()
 @click.option("--truths", default=12, show_default=True)
 @click.option("--seed", default=100, show_default=True, help="First seed.")
-@click.option("--day-km", default=75.0, show_default=True, help="Way along the face in a day: 300 passes of 250 m.")
+@click.option("--day-km", default=75.0, show_default=True, help="Travel along the face in a day: 300 passes of 250 m.")
 @click.option("--out", type=click.Path(path_type=Path), default=RESULTS / "month.jsonl", show_default=True)
 def main(truths: int, seed: int, day_km: float, out: Path) -> None:
     """Run the months; each is written as soon as it is done, and months in the file are not run again."""

@@ -1,4 +1,4 @@
-"""Compile the benchmark's C programs, once per change of source."""
+"""Compile the benchmark's C programs, again only after a change of their source."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ FLAGS = ("-O3", "-march=native", "-std=gnu11", "-Wall")
 
 
 class NotInstalled(Exception):
-    """Something that a peer needs is missing; the message names it."""
+    """A program or library that a peer needs is missing; the message names it."""
 
 
 def compile_c(source: str, libraries: Sequence[str], flags: Sequence[str] = FLAGS) -> str:
-    """Compile `source` of this folder and return the path of the program.
+    """Compile the file `source` of this folder, and return the path of the program.
 
     Raises
     ------

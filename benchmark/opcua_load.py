@@ -1,8 +1,8 @@
-"""`plow-twin live` beside an OPC UA server that writes three values at 1 kHz: loss, share of a core, age at the twin.
+"""`plow-twin live` on an OPC UA server that writes three values at 1 kHz: loss, share of a core, age at the twin.
 
 `python benchmark/live_load.py --opcua [--minutes 10]` first connects a bare asyncua client to the server for a tenth of
-the time, to measure the age that server and loopback alone cause. Both processes ask for SCHED_FIFO, so that other
-programs do not delay them; the load of the machine is printed with the figures.
+the time, to measure the age that the server and the loopback connection cause alone. Both processes ask for SCHED_FIFO,
+so that other programs do not delay them; the load of the machine is printed with the figures.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ NODES = ("Load.Fx", "Load.Fy", "Load.M")
 NAMESPACE = 2
 #: Publishing interval [ms] and queue length of the bare client, as the twin requests them.
 PUBLISHING_MS, QUEUE = 10.0, 10_000
-#: Time of silence after which the bare client has heard all [s].
+#: Time without a value after which the bare client ends [s].
 SILENCE_S = 3.0
 MAP = "excitation: {fx: {node: ns=2;s=Load.Fx}, fy: {node: ns=2;s=Load.Fy}, m: {node: ns=2;s=Load.M}}\n"
 #: Targets: largest age at the 99th percentile [ms], largest share of a core.
@@ -44,7 +44,7 @@ def at_once() -> bool:
 
 
 async def serve(port: int, rate_hz: float, seconds: float) -> None:
-    """Serve three nodes; once somebody listens, write values whose source timestamp is the time of writing."""
+    """Serve three nodes; when a client subscribes, write values whose source timestamp is the time of writing."""
     from asyncua import ua
     from asyncua.server.server import Server
     from asyncua.ua.status_codes import StatusCodes
@@ -78,7 +78,7 @@ async def serve(port: int, rate_hz: float, seconds: float) -> None:
 
 
 async def hear(port: int) -> None:
-    """Print the number of values that a bare client hears, and their age."""
+    """Print the number of values that a bare client receives, and their age."""
     from asyncua import ua
     from asyncua.client.client import Client
 
@@ -139,7 +139,7 @@ def _live(
         cwd=folder, env=os.environ | {"PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     assert server.stdout is not None and twin.stdout is not None
-    time.sleep(0.2 * seconds)  # the start does not count as part of the run
+    time.sleep(0.2 * seconds)  # the start is not measured
     begin, busy, machine = time.monotonic(), _cpu_s(twin.pid), _machine_s() - _cpu_s(server.pid)
     time.sleep(0.6 * seconds)
     passed_s, used_s = time.monotonic() - begin, _cpu_s(twin.pid) - busy
@@ -165,7 +165,7 @@ def _live(
 
 @contextmanager
 def _server(rate_hz: float, seconds: float) -> Iterator[tuple[subprocess.Popen[str], int]]:
-    """Run a server in a process of its own; yields it and its port."""
+    """Run a server in a separate process; yields the process and the server's port."""
     with socket.socket() as found:
         found.bind(("127.0.0.1", 0))
         port = int(found.getsockname()[1])
@@ -187,7 +187,7 @@ def _cpu_s(process_id: int) -> float:
 
 
 def _machine_s() -> float:
-    """Return the time that all processors have been busy."""
+    """Return the busy time of all processors in s."""
     fields = list(map(int, Path("/proc/stat").read_text().splitlines()[0].split()[1:9]))
     return (sum(fields) - fields[3] - fields[4]) / os.sysconf("SC_CLK_TCK")
 

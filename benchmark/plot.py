@@ -31,7 +31,7 @@ STYLES: dict[str, tuple[str, str]] = {
     "MuJoCo RK4": ("#8c510a", ">"),
     "Exudyn RK44": ("#dfa526", "h"),
 }
-#: Engines with rows only every 1 ms are drawn with the sparse rows of the others.
+#: Engines whose rows are all 1 ms apart; they are drawn with the other solvers' sparse rows.
 _DENSE_ONLY = ("MuJoCo", "Exudyn")
 
 

@@ -1,4 +1,4 @@
-"""The picture of the estimate: `python benchmark/plot_estimate.py`, from the lines of `benchmark/results`."""
+"""The picture of the estimate's results in `benchmark/results`: `python benchmark/plot_estimate.py`."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from lives import SHARES
 
 from plow_twin.estimate.result import NORMAL_P95, State
 
-#: Groups that are drawn, with their colours, in the order of the legend; first held-out seed.
+#: Groups that are drawn, with their colours, in the order of the legend, and the first seed that no tuning used.
 STYLES = {
     "plain": "#1f4e9c", "sensor": "#5aae61", "stochastic": "#dfa526", "middle": "#8c510a", "firm": "#35978f",
     "hard": "#d62728", "hard_sensor": "#9970ab",
 }  # fmt: skip
 _FRESH = 50_000
-#: Largest error that is drawn at its place [mm].
+#: Limit of the error axis [mm]; larger errors lie outside the picture.
 _MOST_MM = 0.5
 
 
@@ -58,7 +58,7 @@ def _draw_errors(panel: Any, rows: Sequence[dict[str, Any]], axis: str, color: s
     bars = np.array([1e3 * NORMAL_P95 * row[f"{axis}_sd_m"] for row in known])
     panel.errorbar(stiffness, errors, bars, fmt=".", color=color, label=title, linewidth=0.8, markersize=4)
     unknown = [row["stiffness"] for row in rows if row[f"{axis}_state"] != State.ESTIMATED.value]
-    # no estimate: a tick at the lower edge
+    # a truth without an estimate is a tick at the lower edge
     panel.plot(unknown, [-0.98 * _MOST_MM] * len(unknown), "|", color=color, markersize=9)
 
 

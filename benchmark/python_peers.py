@@ -10,7 +10,7 @@ from bench_scenes import T_END
 from cases import Array, Sample, timed
 from lean import rhs_into
 
-#: Poses are about 1e-2, velocities about 1: absolute tolerances relative to rtol.
+#: Absolute tolerances over rtol, since poses are about 1e-2 and velocities about 1.
 _ATOL = np.array([1e-3, 1e-3, 1e-3, 1e-1, 1e-1, 1e-1])
 
 
@@ -22,7 +22,7 @@ def _grid(output_dt: float) -> Array:
 
 
 def _rhs(p: Array) -> Rhs:
-    """Return the rate of the state, compiled."""
+    """Return a compiled function for the rate of the state."""
 
     def rhs(t: float, y: Array) -> Array:
         out = np.empty(6)

@@ -1,4 +1,4 @@
-"""The random scenes against their references."""
+"""Rows of the random scenes, compared with their references."""
 
 from __future__ import annotations
 
@@ -12,15 +12,16 @@ from work_precision import OURS_BARE, prepare_bare
 from plow_twin import Scene, SolverError
 
 TOLERANCES = (1e-3, 1e-6, 1e-9)
-#: Growth of a displacement at t = 0 above which a scene is listed separately: no step control can keep a tolerance.
+#: Growth of a displacement at t = 0 above which no step control can keep a tolerance, so that the scene is listed
+#: separately.
 AMPLIFIES = 1e4
 QUICK_COUNT = 10
 
 
 def random_rows(few: bool, notify: Callable[[str], None]) -> Iterator[Row]:
-    """Yield the random scenes: error in tolerances (`value`) against the reference, and the scene's amplification.
+    """Yield a row for each random scene with its error in tolerances (`value`) and its amplification.
 
-    `few` runs only some scenes, which need no kernel besides that of the KV bench scene.
+    With `few` only scenes are run that need no other kernel than the KV bench scene.
     """
     saved = random_scenes.load()
     chosen = [index for index, scene in enumerate(saved.scenes) if not few or _is_plain(scene)]
@@ -32,7 +33,7 @@ def random_rows(few: bool, notify: Callable[[str], None]) -> Iterator[Row]:
 
 
 def exponent_of(row: Row) -> float:
-    """Return the exponent of the contact law that the row's scene names."""
+    """Return the exponent of the contact law, from the name of the row's scene."""
     found = re.search(r" n=(\S+)", row.scene)
     assert found is not None
     return float(found[1])

@@ -23,7 +23,7 @@ HERE = Path(__file__).resolve().parent
 DATA = HERE / "data" / "random_scenes.npz"
 COUNT, SEED = 200, 20150419
 T_END, OUTPUT_DT = 1.0, 0.02
-#: Settings (tolerance of a step, longest step in contact): two of each arithmetic, which must agree.
+#: Settings (tolerance of a step, longest step in contact) of two runs in each arithmetic, which must agree.
 LONG_DOUBLE = (1e-16, 0.6), (1e-15, 1.0)
 QUAD = (1e-21, 0.6), (1e-19, 1.0)
 #: Disagreement in clearances above which the pair is run again in 113-bit arithmetic.
@@ -34,7 +34,7 @@ _KINDS = {"kelvin_voigt": 0, "hunt_crossley": 1, "exact_restitution": 2}
 
 @dataclass(frozen=True)
 class ReferenceRun:
-    """A reference trajectory: `q` (rows, 3), whether it was finished, and its cost."""
+    """A reference trajectory: poses `q` (rows, 3), whether the run was completed, and its cost."""
 
     q: NDArray[np.float64]
     finished: bool
@@ -45,10 +45,10 @@ class ReferenceRun:
 
 @dataclass(frozen=True)
 class RandomScenes:
-    """The scenes with reference poses `q` (n, rows, 3) at `t` (rows,).
+    """The scenes with reference poses `q` (n, rows, 3) at the times `t` (rows,).
 
-    `disagreement` (n,) is the largest distance between the two reference runs in clearances (see `distance`),
-    `amplification` (n,) the largest growth of a displacement of 1e-12 clearances at t = 0.
+    `disagreement` (n,) is the largest distance between the two reference runs in clearances (see `distance`), and
+    `amplification` (n,) is the largest growth of a displacement of 1e-12 clearances at t = 0.
     """
 
     scenes: Sequence[Scene]
@@ -59,18 +59,18 @@ class RandomScenes:
     events: NDArray[np.int64]
 
     def chaotic(self, tol: float) -> NDArray[np.bool_]:
-        """Return which scenes have no reference good enough for `tol`: the two runs differ by a tenth of it or more."""
+        """Return which scenes have no reference for `tol`, because their two runs differ by a tenth of it or more."""
         return ~(self.disagreement <= 0.1 * tol)
 
 
 def distance(scene: Scene, q: NDArray[np.float64], reference: NDArray[np.float64]) -> float:
-    """Return the largest pose error in terms of the smaller clearance; angles count by the half diagonal."""
+    """Return the largest pose error over the smaller clearance; angles are multiplied by the half diagonal."""
     scale = np.array([1.0, 1.0, half_diagonal(scene)]) / length_scale(scene)
     return float((np.abs(q - reference) * scale).max())
 
 
 def draw_scene(rng: np.random.Generator) -> Scene:
-    """Draw geometry, mass, law, stiffness, loads and initial velocity, again if softer than the model's range."""
+    """Draw geometry, mass, law, stiffness, loads and initial velocity; draw again if the contact is too soft."""
     while True:
         parameters = _draw(rng)
         head, frame, contact = parameters["head"], parameters["frame"], parameters["contact"]
@@ -149,7 +149,7 @@ def reference_run(
     *,
     quad: bool = False,
 ) -> ReferenceRun:
-    """Run the reference program on one scene, in 64-bit mantissa or (`quad`) 113-bit arithmetic."""
+    """Run the reference program on one scene, in arithmetic with a mantissa of 64 bits, or of 113 bits if `quad`."""
     program = (
         compile_c("reference.c", ["-lquadmath", "-lm"], (*FLAGS, "-DQUAD"))
         if quad
@@ -165,7 +165,7 @@ def reference_run(
 
 
 def make(progress: Callable[[], None] = lambda: None) -> None:
-    """Draw the scenes, run the references and save everything to `DATA`."""
+    """Draw the scenes, run their references and save both to `DATA`."""
     rng = np.random.default_rng(SEED)
     scenes = [draw_scene(rng) for _ in range(COUNT)]
     rows = round(T_END / OUTPUT_DT) + 1
@@ -195,7 +195,7 @@ def make(progress: Callable[[], None] = lambda: None) -> None:
 
 
 def load() -> RandomScenes:
-    """Read the saved scenes and references; the scenes come from the file, not from the generator."""
+    """Read the saved scenes and references; no scene is drawn again."""
     with np.load(DATA) as saved:
         restitution = json.loads(str(saved["restitution"]))
         scenes = [_scene_of(line, e) for line, e in zip(saved["lines"], restitution, strict=True)]
@@ -205,7 +205,7 @@ def load() -> RandomScenes:
 
 
 def _scene_of(line: str, restitution: float | None) -> Scene:
-    """Build a scene from its `reference_line`, which holds every number but the restitution."""
+    """Build a scene from its `reference_line`, which has every parameter except the restitution."""
     n = [float(word) for word in line.split()]
     law = list(_KINDS)[int(n[14])]
     damping = n[12] if restitution is None else None

@@ -1,10 +1,12 @@
-"""Replay beside plain reading of the same file, and the cost of a recording: `python benchmark/replay.py [SECONDS]`.
+"""Speed of replay and of reading the same file, and size of a recording: `python benchmark/replay.py [SECONDS]`.
 
-Records the paper's head at 1 kHz with all outputs, then prints size and replay multiples (all messages, digests alone),
-their bounds (the motion alone, decompressing alone), the same for a drawing thinned like that of an hour, and the time
-that `mcap` and `rosbags` take to read the same file. Times are processor time of one thread, the least of some runs.
-The start of a replay (scene, twin, loading of compiled code) has a row of its own. It is part of each time but not of
-the last column; it is negligible in an hour and a tenth of a replay of 100 s by digests alone.
+The paper's head is recorded at 1 kHz with all outputs. The program prints the size, the speed of replay as a multiple
+of real time (of all messages, and of digests alone), and its upper bounds (the motion alone, decompression alone). It
+also prints the speed of a drawing that is thinned like the drawing of an hour, and of reading the file with `mcap` and
+`rosbags`. Times are processor times of one thread, the least of some runs.
+
+The start of a replay (scene, twin, loading of compiled code) has its own row. It is included in each time but not in
+the last column. It is negligible for an hour, and takes a tenth of the replay of 100 s by digests alone.
 """
 
 from __future__ import annotations
@@ -36,7 +38,7 @@ _AMPLITUDE = np.array([32_000.0, -11_000.0, -45_495.0])
 _START_NS = 1_800_000_000_000_000_000
 _REPEATS = 5
 _BATCH = 8192
-#: Length of a recording whose replay is almost only the start [s].
+#: Length of a recording so short that its replay takes hardly longer than the start of a replay [s].
 _SHORT_S = 0.1
 
 
@@ -78,7 +80,7 @@ def _wrenches(index: NDArray[np.int64]) -> NDArray[np.float64]:
 
 
 def move(seconds: float, rows: bool) -> None:
-    """Advance a twin by the samples of the recording, with or without its publications."""
+    """Advance a twin by the samples of the recording, with or without the rows of its publications."""
     twin = Twin(load_scene(scene_path("paper")), excitation="sampled")
     index, memory = np.arange(round(1000 * seconds)), np.zeros(_BATCH, ROW)
     for begin in range(0, len(index), _BATCH):
@@ -101,7 +103,7 @@ def read_mcap(path: Path) -> None:
 
 
 def read_rosbags(folder: Path) -> None:
-    """Read all messages with `rosbags`, undecoded."""
+    """Read all messages with `rosbags`, without decoding them."""
     with Reader(folder) as reader:
         for _ in reader.messages():
             pass

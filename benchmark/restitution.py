@@ -1,4 +1,4 @@
-"""Restitution asked of each contact law against the restitution it delivers in a free impact, by our own solver.
+"""Nominal restitution of each contact law, compared with the restitution of a free impact that our solver computes.
 
 `python benchmark/restitution.py` writes `benchmark/results/restitution.csv`, the picture `docs/images/restitution.png`
 and the measured part of `benchmark/results/restitution.md`.
@@ -23,20 +23,20 @@ PICTURE = ROOT / "docs" / "images" / "restitution.png"
 PAGE = ROOT / "benchmark" / "results" / "restitution.md"
 BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
 
-#: Nominal restitutions: every hundredth in the CSV, these in the page.
+#: Nominal restitutions in the CSV file, and those in the page.
 ASKED = tuple(round(0.01 * k, 2) for k in range(101))
 SHOWN = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0)
 #: Damping ratios C / (2 sqrt(K m)) of the Kelvin-Voigt table.
 RATIOS = (0.0, 0.01, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 2.0)
 #: Ramp lengths of the ramped law, over the depth v sqrt(m/K) of the undamped impact.
 RAMPS = (0.001, 0.01, 0.1, 0.3, 1.0, 3.0, 10.0)
-#: A law counts as valid if it delivers the nominal restitution within this share.
+#: A law is valid where the delivered restitution is within this share of the nominal restitution.
 VALID = 0.05
 
 MASS_KG, SPEED_M_S, STIFFNESS, EXPONENT = 2.0, 1.0, 1e9, 1.5
 #: Stiffness [N/m] of the laws that add C d' to a linear spring.
 LINEAR_STIFFNESS = 1e6
-#: Impact speed [m/s] below which damping stays as it is, so low that all restitutions below 1 share compiled kernels.
+#: Floor of the impact speed for the damping [m/s], so low that all restitutions below 1 share compiled kernels.
 FLOOR = 1e-6
 
 
@@ -55,7 +55,7 @@ class Row:
 
 
 def free_impact(contact: Contact, mass: float = MASS_KG, speed: float = SPEED_M_S) -> float:
-    """Return speed after over speed before the impact of a point on a wall, free of any load."""
+    """Return the ratio of the speeds after and before the impact of a point mass on a wall, without any load."""
     scene = Scene(
         head=Head(mass, 1.0),
         frame=Frame(0.2, 0.2),
@@ -66,7 +66,7 @@ def free_impact(contact: Contact, mass: float = MASS_KG, speed: float = SPEED_M_
         locked=("x", "theta"),
         pairs=("top_left_top",),
     )
-    # 5 ms to the wall; the slowest rebound (D at its cap) takes some 50 ms
+    # the mass needs 5 ms to the wall; the slowest rebound (D at its cap) takes some 50 ms
     result = simulate(scene, 0.2 / speed, output_dt=0.2 / speed, tol=1e-11)
     if result.penetration[-1, 0] > 0.0 or result.statistics["top_left_top"]["makes"] != 1:
         raise RuntimeError(f"{contact}: not one whole impact")
@@ -74,7 +74,7 @@ def free_impact(contact: Contact, mass: float = MASS_KG, speed: float = SPEED_M_
 
 
 def damped(ratio: float, ramp: float, stiffness: float, mass: float, speed: float) -> Contact:
-    """Return Kelvin-Voigt of a damping ratio, ramped in over `ramp` undamped depths unless that is zero."""
+    """Return a Kelvin-Voigt contact with a damping ratio; if `ramp` > 0, C is ramped over `ramp` undamped depths."""
     damping = 2.0 * ratio * math.sqrt(stiffness * mass)
     if ramp == 0.0:
         return Contact("kelvin_voigt", stiffness, damping=damping)
@@ -82,7 +82,7 @@ def damped(ratio: float, ramp: float, stiffness: float, mass: float, speed: floa
 
 
 def measure(law: str, asked: Iterable[float], ramp: float = 0.0) -> list[Row]:
-    """Measure one law: by restitution or, if it adds C d', by damping ratio; Hertz has neither."""
+    """Measure one law for nominal restitutions, or for damping ratios if it adds C d'; Hertz has neither."""
     rows = []
     for value in asked:
         if LAWS[law].takes_restitution:
@@ -102,7 +102,7 @@ def restitution_laws() -> list[str]:
 
 
 def valid_ranges(rows: Sequence[Row]) -> str:
-    """Return in words where the restitution delivered is within 5 % of the nominal one (asked > 0)."""
+    """Return the ranges of the nominal restitution (> 0) in which the delivered restitution is within 5 % of it."""
     inside = [row.asked > 0.0 and abs(row.delivered / row.asked - 1.0) <= VALID for row in rows]
     edges = np.flatnonzero(np.diff([False, *inside, False])).reshape(-1, 2)
     parts = [
@@ -113,7 +113,7 @@ def valid_ranges(rows: Sequence[Row]) -> str:
 
 
 def page_table(rows: Sequence[Row]) -> list[str]:
-    """Return the Markdown table of delivered restitutions: a line for each law."""
+    """Return the Markdown table of delivered restitutions, with a line for each law."""
     lines = ["| law | " + " | ".join(f"{e:g}" for e in SHOWN) + " |", "|---|" + "---|" * len(SHOWN)]
     for law in restitution_laws():
         found = {row.asked: row.delivered for row in rows if row.law == law}
@@ -142,7 +142,7 @@ def ratio_table(rows: Sequence[Row]) -> list[str]:
 
 
 def ramp_table(rows: Sequence[Row]) -> list[str]:
-    """Return the Markdown table of the ramped law: damping ratio across, length of the ramp down."""
+    """Return the Markdown table of the ramped law: columns are damping ratios, lines are lengths of the ramp."""
     ratios = [row.asked for row in rows if row.law == "kelvin_voigt"]
     lines = [f"| ramp over v sqrt(m/K) | {' | '.join(f'{z:g}' for z in ratios)} |", "|---|" + "---|" * len(ratios)]
     for ramp in RAMPS:
@@ -152,7 +152,7 @@ def ramp_table(rows: Sequence[Row]) -> list[str]:
 
 
 def draw(rows: Sequence[Row], path: Path) -> None:
-    """Draw asked against delivered with the line on which both are equal."""
+    """Draw the delivered over the nominal restitution, and the line on which both are equal."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -186,12 +186,12 @@ def write_csv(rows: Sequence[Row], path: Path) -> None:
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["law", "asked", "ramp", "delivered"])
-        # nine digits, which the solver keeps on every machine
+        # nine digits are the same on every machine
         writer.writerows([row.law, f"{row.asked:g}", f"{row.ramp:g}", f"{row.delivered:.9f}"] for row in rows)
 
 
 def write_page(rows: Sequence[Row], path: Path) -> None:
-    """Replace the text between the marks of the page."""
+    """Replace the text of the page between `BEGIN` and `END`."""
     before, _, rest = path.read_text(encoding="utf-8").partition(BEGIN)
     _, _, after = rest.partition(END)
     parts = ["## Delivered", "", *page_table(rows), "", "## Validity", "", *laws_table(rows), ""]

@@ -12,9 +12,9 @@ import numpy as np
 
 from plow_twin.study.measured.square import RATE_HZ
 
-#: Time step in s: a corner moves at most 0.5 mm in a step.
+#: Time step in s, in which a corner moves at most 0.5 mm.
 STEP = 2e-4
-#: Impulse per mass in m/s of a bit of Routh's integration.
+#: Increment of the normal impulse per mass in Routh's integration, in m/s.
 BIT = 5e-3
 Impact = Callable[..., tuple[np.ndarray, np.ndarray]]
 
@@ -37,7 +37,7 @@ def rigid_toss(initial: np.ndarray, rows: int, block: np.ndarray, impact: Impact
 
 
 def deepest(z: np.ndarray, block: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return depth in m and arms (across, up) from the centre to each corner's lowest point, shape (m, 4) each."""
+    """Return each corner's depth in m and the arms (across, up) from the centre to its lowest point, (m, 4) each."""
     signs = np.array([[1.0, -1.0, -1.0, 1.0], [1.0, 1.0, -1.0, -1.0]]) * float(block["half"])
     c, s = np.cos(z[:, 2:3]), np.sin(z[:, 2:3])
     across, up = c * signs[0] - s * signs[1], s * signs[0] + c * signs[1] - float(block["radius"])
@@ -45,7 +45,7 @@ def deepest(z: np.ndarray, block: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
 
 
 def _hit(z: np.ndarray, block: np.ndarray, impact: Impact, e: float, mu: float) -> None:
-    """Let the corners that are in the table and approach it hit, the deepest first."""
+    """Apply an impact to each corner that is below the table's surface and moves down, the deepest first."""
     inertia = float(block["gyration"]) ** 2
     for _ in range(4):
         depth, across, up = deepest(z, block)
@@ -66,7 +66,7 @@ def _hit(z: np.ndarray, block: np.ndarray, impact: Impact, e: float, mu: float) 
 
 
 def two_at_once(tossed: np.ndarray, rows: np.ndarray, block: np.ndarray, within: float) -> np.ndarray:
-    """Return which motions, with a row every 0.25 ms, have two corners in contact within `within` s."""
+    """Return which motions (rows at intervals of 0.25 ms) have two corners in contact within `within` s."""
     found = np.zeros(len(tossed), bool)
     width = math.ceil(within * 16.0 * RATE_HZ)
     for index, motion in enumerate(tossed):

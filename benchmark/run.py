@@ -1,6 +1,6 @@
-"""Measure run time against error beside the peers; write the table, the picture and the figures of the pages.
+"""Measure run time against error of this solver and its peers; write the table, the picture and the pages' figures.
 
-One run: `make bench`. Everything is measured on one core unless a row says otherwise.
+`make bench` is one run. All rows are measured on one core unless a row says otherwise.
 """
 
 from __future__ import annotations
@@ -118,7 +118,7 @@ def _run(chosen: set[str], repeats: int, quick: bool, notify: Notify) -> list[Ro
 
 
 def _publish(rows: list[Row], measured: str) -> None:
-    """Draw the picture, write all tables beside the rows, and renew the figures of the pages."""
+    """Draw the picture, write all tables to the results, and renew the figures of the pages."""
     import figures
     import plot
 

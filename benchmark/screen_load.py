@@ -1,4 +1,4 @@
-"""CPU time of the operator's screen, in a twin at 1 kHz and in the screen's server, by number of open pages.
+"""CPU time that the operator's screen takes in a twin at 1 kHz and in its server, by number of open pages.
 
 python benchmark/screen_load.py [SECONDS]
 """
@@ -34,13 +34,13 @@ threading.Event().wait()
 
 
 def cpu_s(pid: int) -> float:
-    """Return the CPU time that a process has taken [s]."""
+    """Return the CPU time of a process so far in s."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def measured(pages: int, seconds: float) -> dict[str, float]:
-    """Return the shares of one core [%] that feed and server take."""
+    """Return the shares of one core [%] that the twin's feed and the server take."""
     rows = np.zeros(1, ROW)
     with Screen(PageAccess("127.0.0.1", 0), facts_of(load_scene(scene_path("paper")), {}, "")) as screen:
         screen.feed._load = lambda: np.zeros(3)

@@ -1,14 +1,15 @@
-"""A slider with clearance in its guide (Flores, Leine and Glocker 2010) against the reference data of Siconos.
+"""A slider with clearance in its guide, compared with the reference data of Siconos.
 
-Multibody Syst. Dyn. 23 (2010) 165, table 1. Siconos computes it with rigid contact and time stepping; its reference
-data are in github.com/siconos/siconos-tutorials, examples/mechanics/SliderCrank/*.ref (Apache-2.0, INRIA) and are not a
-part of this project. `python benchmark/siconos.py FOLDER` compares the `.ref` files of a copy of that folder and writes
+The slider is that of Flores, Leine and Glocker, Multibody Syst. Dyn. 23 (2010) 165, table 1. Siconos computes it with
+rigid contact and time stepping. Its reference data are in github.com/siconos/siconos-tutorials,
+examples/mechanics/SliderCrank/*.ref (Apache-2.0, INRIA) and are not a part of this project. The command `python
+benchmark/siconos.py FOLDER` compares the `.ref` files of a copy of that folder and writes
 `benchmark/results/siconos.csv`.
 
-Both models have four corners in a guide. Our slider is a free body under loads; theirs hangs on a crank and a rod. The
-effect of the mechanism without contact therefore acts on our slider as a load m a(t), where a(t) is the free
-acceleration of the slider across the guide in the reference's own state. Our solver then computes touches, restitution
-and rests.
+Both models have four corners in a guide. The slider of Siconos is driven by a crank and a rod; our slider is a free
+body under loads. The mechanism therefore acts on our slider as a load m a(t), where a(t) is the slider's acceleration
+across the guide without contact, in the state of the reference. Our solver then computes touches, restitution and
+rests.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ def gaps(y: Array, theta: Array) -> Array:
 
 
 def inertia_and_force(angles: Array, rates: Array) -> tuple[Array, Array]:
-    """Return the mass matrix (2, 2) and the generalised forces (2,) of crank and rod, the slider not turning."""
+    """Return the mass matrix (2, 2) and generalised forces (2,) of crank and rod, for a slider that does not turn."""
     first, second = angles
     (m1, m2, m3), (j1, j2, _) = MASSES, INERTIAS
     coupling = (0.5 * m2 + m3) * CRANK * ROD
@@ -69,7 +70,7 @@ def across(angles: Array) -> Array:
 
 
 def free_acceleration(angles: Array, rates: Array) -> tuple[float, float]:
-    """Return the acceleration across the guide without contact in m/s^2, and the mass that a contact feels in kg."""
+    """Return the acceleration across the guide without contact in m/s^2, and the effective mass in a contact in kg."""
     mass, force = inertia_and_force(angles, rates)
     row = across(angles)
     bent = CRANK * math.sin(angles[0]) * rates[0] ** 2 + ROD * math.sin(angles[1]) * rates[1] ** 2
@@ -78,9 +79,9 @@ def free_acceleration(angles: Array, rates: Array) -> tuple[float, float]:
 
 
 def rigid_motion(t_end: float, impacts: int) -> tuple[Array, Array, list[float]]:
-    """Integrate the mechanism with rigid, frictionless impacts located on the way.
+    """Integrate the mechanism with rigid, frictionless impacts that are located in time.
 
-    Return times (n,), states (n, 4) of angles and rates, and the times of the first impacts.
+    Returns times (n,), states (n, 4) of angles and rates, and the times of the first impacts.
     """
 
     def rate(_: float, state: Array) -> Array:
@@ -106,16 +107,16 @@ def rigid_motion(t_end: float, impacts: int) -> tuple[Array, Array, list[float]]
             row = across(state[:2])
             weight = np.linalg.solve(mass, row)
             state[2:] -= weight * (1.0 + RESTITUTION) * (row @ state[2:]) / (row @ weight)
-            # the rates jump: a knot just after the impact
+            # the rates jump, so a further time follows just after the impact
             times.append(math.nextafter(time, math.inf))
             states.append(state)
     return np.array(times), np.array(states), found
 
 
 def our_slider(t: Array, angles: Array, rates: Array, stiffness: float, output_dt: float) -> Result:
-    """Move our head in the guide under the load of the mechanism in given states, (n, 2) each.
+    """Simulate our head in the guide under the mechanism's load at given `angles` and `rates`, (n, 2) each.
 
-    Our head is the cavity that moves about the guide's block: its height is minus the slider's.
+    Our head is a cavity that moves about a fixed block, so its height is minus the slider's height.
     """
     free = np.array([free_acceleration(q, v)[0] for q, v in zip(angles, rates, strict=True)])
     wrench = np.stack([np.zeros_like(free), -free, np.zeros_like(free)], axis=1)
@@ -130,7 +131,7 @@ def our_slider(t: Array, angles: Array, rates: Array, stiffness: float, output_d
 
 @dataclass(frozen=True)
 class Comparison:
-    """One quantity of one reference: theirs, ours, unit."""
+    """One quantity of one reference, with its value by Siconos (`theirs`) and by our solver (`ours`)."""
 
     reference: str
     quantity: str
@@ -140,7 +141,7 @@ class Comparison:
 
 
 def phases(touching: NDArray[np.bool_], t: Array, shortest: float = 1e-3) -> list[tuple[float, float]]:
-    """Return the begin and end of each rest: contact without a break for `shortest` s or more."""
+    """Return begin and end of each rest, which is contact without a break for `shortest` s or more."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], touching.astype(int), [0]]))).reshape(-1, 2)
     whole = [(float(t[first]), float(t[last - 1])) for first, last in edges.tolist()]
     return [(begin, end) for begin, end in whole if end - begin >= shortest]

@@ -1,4 +1,4 @@
-"""From the rows of a run to all its tables, `benchmark/results/<machine>.md`."""
+"""All tables of a run, made from its rows: `benchmark/results/<machine>.md`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _WORDS = {0.1: "output each 0.1 s", 1e-3: "output each 1 ms"}
 
 
 def text(rows: Sequence[Row], machine: str, versions: dict[str, str]) -> str:
-    """Return everything measured as Markdown."""
+    """Return all measurements of a run as Markdown tables."""
     blocks = [
         f"Machine: `{machine}`; " + ", ".join(f"{name} {version}" for name, version in versions.items()) + ".",
         _target_table(rows), *_ratio_tables(rows), _random_table(rows), _amplifying_table(rows), _ensemble_table(rows),

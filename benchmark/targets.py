@@ -15,7 +15,7 @@ from workloads import HOUR_S
 
 @dataclass(frozen=True)
 class Verdict:
-    """One line: the work, the figure measured, the target, and whether it was reached."""
+    """One line of the table of targets: the work, the measured figure, the target, and whether it was reached."""
 
     work: str
     measured: str
@@ -25,7 +25,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Ratio:
-    """At least `times` as fast as a group of peers at equal error."""
+    """Target to be at least `times` as fast as a group of peers at equal error."""
 
     scene: str
     output_s: float
@@ -60,12 +60,12 @@ RATIOS = (
 )
 ENSEMBLE_S, WITHIN, REAL_TIME, CORE_SHARE = 0.5, 10.0, 1000.0, 0.25
 BATCH_TIMES = 5.0
-#: Definition of "next to no work": this share of an hour of the driven scene.
+#: Largest cost of an hour almost without events, as a share of the cost of an hour of the driven scene.
 IDLE_SHARE = 0.01
 
 
 def verdicts(rows: Sequence[Row]) -> Iterator[Verdict]:
-    """Yield every target for which there are rows."""
+    """Yield a verdict on every target for which there are rows."""
     for ratio in RATIOS:
         yield from _of_ratio(rows, ratio)
     yield from _of_ensemble(rows)

@@ -1,10 +1,10 @@
-"""How sensitive the estimate is to each chosen number: at half and twice its value, on a few held-out truths.
+"""Sensitivity of the estimate to each tuned number, at half and twice its value, on a few held-out truths.
 
-    python benchmark/tuning_sensitivity.py                     # what results/tuning.jsonl lacks
+    python benchmark/tuning_sensitivity.py                     # runs that results/tuning.jsonl lacks
     python benchmark/tuning_sensitivity.py --number HUBER
 
-Only numbers that an estimate reads are varied in it. The truths have four load periods and seeds that no tuning used;
-`tools/pages.py` makes the table of `benchmark/results/tuning.md` from the result.
+For each truth only the numbers that its estimate reads are varied. The truths have four load periods and seeds that no
+tuning used; `tools/pages.py` makes the table of `benchmark/results/tuning.md` from the result.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from plow_twin.estimate import tuning
 from plow_twin.estimate.estimate import estimate, warm_up
 from plow_twin.estimate.result import NORMAL_P95, State
 
-#: Groups of the truths, one truth each.
+#: Groups from which one truth each is drawn.
 CASES = ("plain", "shift", "exponent", "forces", "hard", "firm")
 SEED, PERIODS = 990100, 4.0
 FACTORS = (0.5, 2.0)
@@ -34,7 +34,7 @@ FILE = RESULTS / "tuning.jsonl"
 
 
 class _Watched(ModuleType):
-    """A module that remembers which of its names are read."""
+    """A module that records which of its names are read."""
 
     read: ClassVar[set[str]] = set()
 
@@ -44,7 +44,7 @@ class _Watched(ModuleType):
 
 
 def scaled(value: tuning.Value, factor: float, unit: str) -> tuning.Value:
-    """Return a number times a factor, all elements alike; for a quantile, scale the distance from 1."""
+    """Return a number, or all numbers of a tuple, times a factor; for a quantile, the distance from 1 is scaled."""
     if isinstance(value, tuple):
         return tuple(scaled(part, factor, unit) for part in value)
     if unit == "quantiles":
@@ -82,15 +82,15 @@ def known(row: dict[str, Any], axis: str) -> bool:
 
 
 def verdict(row: dict[str, Any]) -> list[Any]:
-    """Return the verdict on a truth, beside its numbers."""
+    """Return the verdicts of an estimate, apart from its figures."""
     return [row.get("failed"), row.get("model"), row.get("sensor"), *(row[axis][3] for axis in "hv" if axis in row)]
 
 
 def summary(name: str, factor: float, rows: list[dict[str, Any]]) -> str:
     """Return the effect of one variation on the clearances and verdicts.
 
-    The largest change of a clearance in its standard deviations, RMSE over that with the chosen value, intervals that
-    contain the truth among known clearances, and how many verdicts change.
+    They are the largest change of a clearance in its standard deviations, the RMSE over the RMSE with the chosen value,
+    the number of intervals that contain the truth among the known clearances, and the number of changed verdicts.
     """
     base = {row["group"]: row for row in rows if row["name"] == ""}
     own = [row for row in rows if row["name"] == name and row["factor"] == factor]
@@ -118,7 +118,7 @@ def summary(name: str, factor: float, rows: list[dict[str, Any]]) -> str:
 
 
 def table() -> str:
-    """Return all chosen numbers with their meaning, the data that they were set on, and their sensitivity."""
+    """Return the table of all tuned numbers with their meaning, the data on which they were set, and their effect."""
     rows = load_rows(FILE)
     count = {group: sum(row["group"] == group and row["name"] != "" for row in rows) for group in CASES}
     varied_in = ", ".join(f"`{group}` {number}" for group, number in count.items() if number)
@@ -143,7 +143,7 @@ def _short(value: tuning.Value) -> str:
 @click.option("--case", "cases", multiple=True, type=click.Choice(CASES), help="Only these truths.")
 @click.option("--out", type=click.Path(path_type=Path), default=FILE, show_default=True)
 def main(numbers: tuple[str, ...], cases: tuple[str, ...], out: Path) -> None:
-    """Vary the numbers and write one line of JSON an estimate."""
+    """Vary the numbers and write one line of JSON for each estimate."""
     done = {(row["group"], row["name"], row["factor"]) for row in load_rows(out)}
     warm_up(draw(replace(GROUPS["plain"], periods=1.0), 0).nominal)
     for group in cases or CASES:
@@ -162,7 +162,7 @@ def main(numbers: tuple[str, ...], cases: tuple[str, ...], out: Path) -> None:
 
 
 def watched(truth: Truth) -> tuple[dict[str, Any], list[str]]:
-    """Run with the chosen values; also return which of them were read."""
+    """Run with the chosen values, and return also the names of the numbers that were read."""
     _Watched.read.clear()
     before, tuning.__class__ = tuning.__class__, _Watched
     try:
@@ -173,7 +173,7 @@ def watched(truth: Truth) -> tuple[dict[str, Any], list[str]]:
 
 
 def write(out: Path, row: dict[str, Any]) -> None:
-    """Append a row."""
+    """Append a row to the file."""
     with out.open("a", encoding="utf-8") as file:
         file.write(json.dumps(row) + "\n")
 

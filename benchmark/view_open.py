@@ -1,6 +1,6 @@
-"""How long rerun's viewer takes to show a .rrd, and in how much memory: python benchmark/view_open.py RUN.rrd SECONDS.
+"""Time and memory that rerun's viewer needs to show a recording: `python benchmark/view_open.py RUN.rrd SECONDS`.
 
-The viewer shows the moment SECONDS after the first stamp; the memory is the resident memory of its processes.
+The viewer shows the time SECONDS after the first stamp. The memory is the resident memory of the viewer's processes.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def main() -> None:
 
 
 def measure(file: Path, at_s: float, home: Path) -> None:
-    """Open the file in a viewer whose settings lie in `home`, and print times and memory."""
+    """Open the file in a viewer with its settings in the folder `home`, and print times and memory."""
     port = free_port()
     viewer = start_viewer(port, home)
     try:

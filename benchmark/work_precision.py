@@ -36,14 +36,15 @@ def _decades(loosest: int, tightest: int, per_decade: int = 2) -> tuple[float, .
 
 
 TOLERANCES = _decades(1, 12)
-#: The subset for --quick.
+#: Tolerances of --quick.
 QUICK_TOLERANCES = (1e-3, 1e-6, 1e-9, 1e-12)
 FIXED_STEPS = (1e-3, 5e-4, 2e-4, 1e-4, 5e-5, 2e-5, 1e-5)
 LEAN_STEPS = (*FIXED_STEPS, 5e-6, 2e-6, 1e-6)
 _LADDER = _decades(2, 13)
-#: CVODE in C is run until it breaks down.
+#: Tolerances of CVODE in C, down to the tolerance at which it breaks down.
 _C_LADDER = _decades(2, 14)
-#: solve_ivp steps in Python, far from the fastest: sparse output only; Radau and BDF, which take seconds, by decades.
+#: Tolerances of `solve_ivp`, which is slow because its loop is in Python: it is run with sparse output only, and Radau
+#: and BDF, which take seconds, only at whole decades.
 _SOLVE_IVP = {"LSODA": _decades(3, 12), "DOP853": _decades(3, 12), "Radau": _decades(3, 8, 1), "BDF": _decades(3, 8, 1)}
 _MUJOCO = {"Euler": (1e-3, 5e-4, 2e-4, 1e-4), "implicitfast": (1e-3, 5e-4), "RK4": (1e-3, 5e-4, 2e-4)}
 _EXUDYN = {"VelocityVerlet": (1e-3, 5e-4, 2e-4, 1e-4), "RK44": (1e-3, 5e-4, 2e-4), "RK67": (1e-3, 5e-4)}
@@ -72,7 +73,7 @@ def prepare_simulate(
 ) -> Callable[[], Sample]:
     """Prepare `simulate` with all its outputs: poses, rates, forces, penetrations, events, statistics.
 
-    The time is that of the run as `simulate` itself reports it, or (`whole_call`) from call to return.
+    The time is the run's time as reported by `simulate`, or with `whole_call` the time from call to return.
     """
     method: Method = "events" if dt is None else "rk4"
 
@@ -93,7 +94,7 @@ def prepare_simulate(
 
 
 def prepare_bare(scene: Scene, output_dt: float, tol: float, t_end: float = T_END) -> Callable[[], Sample]:
-    """Prepare the compiled loop alone, with poses and rates as its only output, like the peers."""
+    """Prepare the compiled loop alone, with poses and rates as its only outputs, like those of the peers."""
     compiled, work, times = compile_scene(scene, tol), new_work(), output_times(t_end, output_dt)
 
     def solve() -> tuple[int, Motion]:
@@ -126,7 +127,7 @@ def _prepare_lean(p: Array, dt: float, output_dt: float) -> Callable[[], Sample]
 
 
 def own_cases(scene_name: str) -> Iterator[Case]:
-    """Yield the project's own solvers."""
+    """Yield cases of the project's own solvers."""
     scene = bench_scene(scene_name)
     for output_dt in (SPARSE, DENSE):
         for tol in TOLERANCES:
@@ -144,7 +145,7 @@ def own_cases(scene_name: str) -> Iterator[Case]:
 
 
 def quick_cases() -> Iterator[Case]:
-    """Yield a few own rows that need one compiled kernel."""
+    """Yield a few cases of the project's solver that need only one compiled kernel."""
     scene = bench_scene("kv")
     for output_dt in (SPARSE, DENSE):
         for tol in QUICK_TOLERANCES:
@@ -153,7 +154,7 @@ def quick_cases() -> Iterator[Case]:
 
 
 def lean_cases(scene_name: str) -> Iterator[Case]:
-    """Yield plain RK4."""
+    """Yield cases of the plain RK4 of `lean`."""
     p = constants(bench_scene(scene_name))
     for output_dt in (SPARSE, DENSE):
         for dt in LEAN_STEPS:
@@ -161,7 +162,7 @@ def lean_cases(scene_name: str) -> Iterator[Case]:
 
 
 def cvode_cases(scene_name: str) -> Iterator[Case]:
-    """Yield CVODE called from C, with and without its own rootfinding."""
+    """Yield cases of CVODE called from C, with and without its rootfinding."""
     p = constants(bench_scene(scene_name))
     for output_dt, method, roots, rtol in product((SPARSE, DENSE), ("adams", "bdf"), (False, True), _C_LADDER):
         name = "Adams" if method == "adams" else "BDF"
@@ -172,7 +173,7 @@ def cvode_cases(scene_name: str) -> Iterator[Case]:
 
 
 def python_cases(scene_name: str) -> Iterator[Case]:
-    """Yield solvers called from Python."""
+    """Yield cases of solvers called from Python."""
     p = constants(bench_scene(scene_name))
     for output_dt in (SPARSE, DENSE):
         for rtol in _LADDER:
@@ -192,7 +193,7 @@ def python_cases(scene_name: str) -> Iterator[Case]:
 
 
 def heyoka_cases(scene_name: str) -> Iterator[Case]:
-    """Yield heyoka."""
+    """Yield cases of heyoka."""
     p = constants(bench_scene(scene_name))
     for output_dt, tol in product((SPARSE, DENSE), _LADDER):
         prepare = partial(heyoka_peer.prepare, p, tol, output_dt)
@@ -200,7 +201,7 @@ def heyoka_cases(scene_name: str) -> Iterator[Case]:
 
 
 def located_cases(scene_name: str) -> Iterator[Case]:
-    """Yield DOP853 compiled by numba with its events located."""
+    """Yield cases of DOP853 compiled by numba with located events."""
     p = constants(bench_scene(scene_name))
     for output_dt, rtol in product((SPARSE, DENSE), _LADDER):
         prepare = partial(located_dop853.prepare, p, rtol, output_dt)
@@ -208,7 +209,7 @@ def located_cases(scene_name: str) -> Iterator[Case]:
 
 
 def multibody_cases(scene_name: str) -> Iterator[Case]:
-    """Yield MuJoCo and Exudyn; both write rows at each step or every 1 ms."""
+    """Yield cases of MuJoCo and Exudyn, which write rows at each step or every 1 ms."""
     p = constants(bench_scene(scene_name))
     for integrator, steps in _MUJOCO.items() if scene_name == "kv" else ():
         for dt in steps:
@@ -224,7 +225,7 @@ def multibody_cases(scene_name: str) -> Iterator[Case]:
 
 
 def unmodelled(scene_name: str) -> Iterator[Row]:
-    """Yield rows for cases that a peer cannot model."""
+    """Yield rows that say which scene a peer cannot model."""
     if scene_name == "hc":
         yield Row(
             SECTION, "hc", "MuJoCo", "", DENSE, T_END, status="not run: no contact force with d^1.5 (1 + lambda d')"

@@ -1,4 +1,4 @@
-"""Cost of work: stiff walls, long times, contact events, features."""
+"""Cases for the cost of stiff walls, of long motions, of contact events and of features."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ HOUR_S = 3600.0
 
 
 def stiffness_cases() -> Iterator[Case]:
-    """Yield the KV scene from soft to stiff at its damping ratio; error over 2 s against our own run at 1e-12."""
+    """Yield the KV scene with stiffnesses from soft to stiff and a constant damping ratio.
+
+    The error over 2 s is that against our own run at a tolerance of 1e-12.
+    """
     scene = bench_scene("kv")
     contact = scene.contact
     for exponent in range(5, 13):
@@ -40,12 +43,12 @@ def _against_own(scene: Scene, t_end: float) -> Callable[[Array], float]:
 
 
 def still_scene() -> Scene:
-    """Return the KV scene without its load: the head falls and comes to rest."""
+    """Return the KV scene without its load, in which the head falls and comes to rest."""
     return dataclasses.replace(bench_scene("kv"), loads=())
 
 
 def flight_scene() -> Scene:
-    """Return the KV scene without load and weight, so slow that no wall is met within hours."""
+    """Return the KV scene without load and weight, with a head so slow that it meets no wall within hours."""
     return dataclasses.replace(still_scene(), gravity=Gravity(0.0), initial=Initial(v=(1e-7, 1e-7, 0.0)))
 
 
@@ -56,11 +59,11 @@ def _harmonic(scene: Scene) -> Harmonic:
 
 
 def swaying_scene() -> Scene:
-    """Return the KV scene without weight, under a load too small to carry the head to a wall: driven flight."""
+    """Return the KV scene without weight under a load too small to move the head to a wall (driven flight)."""
     scene = bench_scene("kv")
     load = _harmonic(scene)
     omega = 20.0
-    # at rest in the mean: x = -(F / m omega^2) sin(omega t)
+    # the initial rates of x = -(F / m omega^2) sin(omega t), which has no drift
     force = (200.0, 50.0)
     mass, inertia = scene.head.mass_kg, scene.head.inertia_kg_m2
     v = (-force[0] / (mass * omega), -force[1] / (mass * omega), -10.0 / (inertia * omega))
@@ -69,7 +72,7 @@ def swaying_scene() -> Scene:
 
 
 def horizon_cases(longest: float) -> Iterator[Case]:
-    """Yield the KV scene over growing machine time, and an hour almost without events."""
+    """Yield the KV scene over longer and longer times, and hours almost without events."""
     scenes = [(bench_scene("kv"), "kv", t_end) for t_end in (1.0, 10.0, 60.0, 600.0, HOUR_S)]
     scenes += [
         (still_scene(), "at rest after the fall", HOUR_S),
@@ -83,7 +86,7 @@ def horizon_cases(longest: float) -> Iterator[Case]:
 
 
 def add_steps_per_hour(rows: Sequence[Row]) -> None:
-    """Fill `value` of machine-time rows."""
+    """Fill `value` of the machine-time rows with the steps per hour."""
     for row in rows:
         if row.steps is not None and row.simulated_s:
             row.value = row.steps * HOUR_S / row.simulated_s
@@ -107,14 +110,14 @@ def _event_case(name: str, scene: Scene) -> Case:
 
 
 def add_steps_per_event(rows: Sequence[Row]) -> None:
-    """Fill `value` of contact-event rows."""
+    """Fill `value` of the contact-event rows with the steps per event."""
     for row in rows:
         if row.steps is not None and row.events:
             row.value = row.steps / row.events
 
 
 def feature_cases() -> Iterator[Case]:
-    """Yield the KV scene plain, with energy and momentum balanced, with friction, with both, with derivatives."""
+    """Yield the KV scene plain, with the balance of energy, with friction, with both, and with derivatives."""
     scene = bench_scene("kv")
     rubbing = dataclasses.replace(scene, friction=Friction(coefficient=0.1))
     features = (("plain", scene, False), ("energy balance", scene, True), ("friction 0.1", rubbing, False))
@@ -130,7 +133,7 @@ def feature_cases() -> Iterator[Case]:
 
 
 def _shared_load_scene() -> Scene:
-    """Return the KV scene with its load in six equal parts: ten parameters with stiffness, damping and clearances."""
+    """Return the KV scene with its load split into six parts, so that there are ten parameters for derivatives."""
     scene = bench_scene("kv")
     load = _harmonic(scene)
     x, y = load.force_n
@@ -139,7 +142,7 @@ def _shared_load_scene() -> Scene:
 
 
 def add_ratios(rows: Sequence[Row]) -> None:
-    """Fill `value` of feature rows: times the first."""
+    """Fill `value` of the feature rows with the time over that of the first row."""
     plain = rows[0].wall_ms
     for row in rows:
         if plain and row.wall_ms is not None:
