@@ -144,7 +144,7 @@ def pose_error(reference: Array, scale: Sequence[float]) -> Callable[[Array], fl
 
 
 def write_csv(path: Path, rows: Iterable[Row]) -> None:
-    """Write the table, numbers with six digits."""
+    """Write the table, with six digits of each number."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")

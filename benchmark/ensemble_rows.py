@@ -42,7 +42,7 @@ def clearance_pairs(columns: int, rows: int) -> list[Scene]:
 
 
 def ensemble_rows(columns: int, rows: int, lean_steps: Sequence[float], repeats: int, notify: Notify) -> Iterator[Row]:
-    """Yield a row for each tolerance down to the one that all pairs need, then rows of the peers and of listed pairs.
+    """Yield rows for tolerances down to the tolerance that all pairs need, then rows of the peers and of listed pairs.
 
     The peers run only with `lean_steps`.
     """

@@ -113,7 +113,7 @@ def as_markdown(groups: Sequence[dict[str, Any]]) -> str:
 
 
 def load_rows(path: Path) -> list[dict[str, Any]]:
-    """Return the rows of a file with numbers converted; empty if there is no file."""
+    """Return the rows of a file with numbers converted, or an empty list if there is no file."""
     if not path.exists():
         return []
     return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line]

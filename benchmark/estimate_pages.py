@@ -80,7 +80,7 @@ def right_models() -> str:
 
 
 def narrowed(text: str, keep: Sequence[int]) -> list[list[str]]:
-    """Return the cells of some columns of a Markdown table, the head first, without the bounds in brackets."""
+    """Return the cells of some columns of a Markdown table, beginning with the head, without the bounds in brackets."""
     lines = [line for line in text.splitlines() if line.startswith("| ") and "---" not in line]
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
     return [[row[column].partition(" (")[0] for column in keep] for row in rows]

@@ -283,7 +283,7 @@ def compare(seconds: float, repeats: int) -> None:
                 command = answerer if case in (ECHO, RAW_ECHO) else _twin(case.mode, path)
                 found = measure(command, case.rate_hz, seconds)
                 print(json.dumps(case._asdict() | found), flush=True)
-                if found["messages"]:  # a case without an answer has no age, but is reported
+                if found["messages"]:  # a case without an answer has no age; it is reported below
                     runs[case].append(found)
     if not all(runs.values()):
         sys.exit("a case was never answered: no medians")

@@ -64,7 +64,7 @@ def varied(name: str, value: tuning.Value) -> Iterator[None]:
 
 
 def run(truth: Truth) -> dict[str, Any]:
-    """Return errors, intervals and states of one estimate; `failed` if it raises."""
+    """Return errors, intervals and states of one estimate, or the error as `failed` if it raises."""
     try:
         found = estimate(truth.nominal, truth.load, truth.poses, forces=truth.forces)
     except (ArithmeticError, ValueError, np.linalg.LinAlgError) as error:

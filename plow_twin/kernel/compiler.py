@@ -132,9 +132,10 @@ def kept(function: Callable[..., Any], **options: Any) -> Any:
 def share(cache_file: Any) -> None:
     """Make numba's cache of a function on disk safe for processes that compile at the same time.
 
-    Numba numbers the files of code by the index, and writes the index first. Two processes that compile two signatures
-    could leave the code of one under the signature of the other. Here the content names a file, and the index names
-    only files that exist. A race can still lose an entry of the index; its signature is then compiled again.
+    Numba names the files of code by numbers from the index, and writes the index first, so that of two processes that
+    compile different signatures one could store its code under the signature of the other. Here a file is named by a
+    hash of its content, and is written before the index. A race can still lose an entry of the index, and its signature
+    is then compiled again.
 
     Parameters
     ----------
@@ -175,9 +176,9 @@ def _save_or_warn(cache: Any) -> None:
 
 
 def for_arguments(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Callable[..., Any]:
-    """Return the entry compiled for the types of these arguments; its calls must keep these types, and check none.
+    """Return the entry compiled for the types of these arguments; it does not check the types of later arguments.
 
-    Numba needs more time to inspect the types of nested tuples and records than the twin needs for a sample.
+    Numba needs more time to check the types of nested tuples and records than the twin needs for a sample.
     """
     compile_for = getattr(function, "compile", None)
     if compile_for is None:

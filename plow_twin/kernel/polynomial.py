@@ -80,8 +80,8 @@ def first_root(g: Array, n: int, h: float, w) -> float:
 def first_root_within(g: Array, n: int, h: float, w) -> float:
     """Return the root that `first_root` finds, from the Bernstein coefficients in `w.halves[0]`.
 
-    An interval without a negative Bernstein coefficient has no root, and an interval with one sign change has one.
-    Every other interval is halved, and its left half is searched first.
+    An interval without a negative Bernstein coefficient has no root, and an interval with a single sign change has a
+    single root. Every other interval is halved, and its left half is searched first.
     """
     b, bounds = w.halves, w.bounds
     bounds[0, 0], bounds[0, 1] = 0.0, h
@@ -152,7 +152,7 @@ def maximum(g: Array, n: int, h: float, floor: float, w) -> float:
 
 @kernel()
 def shift_column(g: Array, lane: int, n: int, x: float, out: Array) -> None:
-    """Write the Taylor coefficients of g(x + t) of one column to the same column of `out`; g has them of g(t)."""
+    """Shift the polynomial in one column of g by x: write the coefficients of g(x + t) to that column of `out`."""
     for k in range(n + 1):
         out[k, lane] = g[k, lane]
     for r in range(n):

@@ -18,7 +18,7 @@ corner c = (cx, cy) lies at
 
     p_x = X + c cx - s cy              p_y = Y + s cx + c cy
 
-so penetrations and arms are linear again, and the same equations hold with other coefficients.
+so penetrations and arms are linear again, and the equations are the same with other coefficients.
 
 For a rounded corner C is the centre of its arc, and its walls are moved towards the cavity's centre by the radius.
 Friction acts at the touching point itself, one radius from the arc's centre (`roll`).

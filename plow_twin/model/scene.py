@@ -1,7 +1,7 @@
 """The constants of one head in one guide, as plain frozen dataclasses in SI units.
 
-The field names are the keys of the scene file. `metadata` of each number holds its unit, its meaning and its admissible
-range; the checks here, the file's schema and the documentation all come from it.
+The field names are the keys of the scene file. The `metadata` of a field has its unit, its meaning and its admissible
+range; the checks here, the file's schema and the documentation are made from them.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class Provenance:
 
 
 def _quantity(unit: str, doc: str, default: Any = ..., **bounds: float) -> Any:
-    """Declare a number (or a tuple of numbers) with its unit, meaning and range (`gt`, `ge`, `lt`, `le`)."""
+    """Declare a field for a number or a tuple of numbers, with its unit, meaning and range (`gt`, `ge`, `lt`, `le`)."""
     metadata = {"unit": unit, "doc": doc, **bounds}
     return field(metadata=metadata) if default is ... else field(default=default, metadata=metadata)
 
@@ -333,11 +333,11 @@ class Scene:
     contact : Contact
     gravity : Gravity
     loads : tuple of Harmonic, Constant or Table
-        Loads on the head beside gravity and contact.
+        Loads on the head, apart from gravity and contact.
     initial : Initial
         State at t = 0.
     locked : tuple of str
-        Degrees of freedom held: any of x, y, theta.
+        Locked degrees of freedom: any of x, y, theta.
     pairs : tuple of str
         The pairs that can touch, by default all.
     wear : Wear or None

@@ -103,7 +103,7 @@ class Advance(_View):
 
 
 class _Rows(_View):
-    """Columns of many rows, with the status as numbers."""
+    """Columns of many rows, with an array of integers for the status."""
 
     __slots__ = ()
 

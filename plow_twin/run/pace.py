@@ -18,7 +18,7 @@ _SLICE, _SLICE_IMPLICIT = 2048, 64
 
 
 class OutOfTimeError(Exception):
-    """The wall-clock time of a call is used up, or it was stopped."""
+    """The wall-clock time of a call is used up, or the call was stopped."""
 
 
 class Pace:

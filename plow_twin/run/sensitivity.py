@@ -376,8 +376,8 @@ def displacement_beside(
 ) -> float | None:
     """Return the largest displacement of shadows, in shares of the clearance, for a stretch that begins here.
 
-    A stretch does not begin in a contact with a spring, which would turn a displacement into a large velocity that no
-    error of the solver has. If a damper holds the head, a displacement persists, so that a small one is sufficient.
+    A stretch does not begin in a contact with a spring, which would turn a displacement into a larger velocity than any
+    error of the solver has. If a damper holds the head, a displacement persists, so a small displacement is sufficient.
 
     Parameters
     ----------
@@ -417,7 +417,7 @@ def _beside(
     before: Sequence[State],
     work: Work,
 ) -> list[State]:
-    """Return a state and its shadows: one displaced by `moved` for each free place or rate, one for each changed scene.
+    """Return a state and its shadows: one for each free place or rate, displaced by `moved`, and one per changed scene.
 
     Shadows of changed scenes are not displaced; they keep the damping that was set at a touch, given by `before`.
     """

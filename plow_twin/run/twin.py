@@ -124,7 +124,7 @@ class Twin:
         #: model time, as a view of the state
         self._time = self._states["time"]
         self._wrench = np.zeros(3)
-        #: loads of one sample per mass and inertia, and empty snapshots, made once for all single live samples
+        #: work space for the load of one sample, per mass and inertia, and an empty array of snapshots
         self._one_load, self._no_snapshots = np.empty((1, 2, 3)), self._states[:0]
         self._travel_speed = scene.wear.travel_speed_m_s if scene.wear is not None else 0.0
 

@@ -50,9 +50,9 @@ from plow_twin.solve.state import (
 TOLERANCE_RANGE = (1e-13, 1e-1)
 #: Error of a step as a share of the tolerance, so that hundreds of steps and amplifying impacts stay within it.
 STEP_SHARE = 3e-4
-#: Largest error of a step over the length scale; with a loose tolerance `STEP_SHARE` alone would let errors add up.
+#: Largest error of a step over the length scale, which limits `STEP_SHARE` of a loose tolerance.
 LARGEST_STEP_ERROR = 1e-6
-#: `STEP_SHARE` for exponents that are not integers, since near a branch point a series converges more slowly.
+#: `STEP_SHARE` for exponents that are not integers; it is smaller because near a branch point series converge slowly.
 STEP_SHARE_FRACTION = 1e-6
 #: Number of mode changes at one instant after which the solver steps beyond it.
 MAX_EVENTS_AT_ONCE = 64
@@ -319,7 +319,7 @@ def damping_numbers(law: str) -> Array:
 def _scene_terms(
     scene: Scene, law: Terms, loads: LoadSet, harmonics: Harmonics | None, segments: bool, shared: _Shared
 ) -> Terms:
-    """Return the terms of the law together with those of the rest of the scene."""
+    """Return the terms of the whole scene, including the terms of its law."""
     present = dict(
         harmonics=harmonics is not None,
         second=harmonics is not None and shared.of(_has_second, harmonics),
@@ -492,8 +492,8 @@ def _largest_acceleration(scene: Scene, wrench: Array) -> float:
 def _release(scene: Scene, tol: float, length: float, speed: float) -> float:
     """Return the penetration in m below which the impulse until separation is negligible.
 
-    The impulse at the speed v is K d^(n+1) / ((n+1) v). It is held below a small share of the velocity tolerance, since
-    there may be many separations, some a hundred times slower.
+    The impulse at the speed v is K d^(n+1) / ((n+1) v). It must be a small share of the velocity tolerance, since there
+    may be many separations, some of them a hundred times slower.
     """
     exponent = scene.contact.exponent
     share = 1e-5 if exponent == 1.5 or float(exponent).is_integer() else 1e-8

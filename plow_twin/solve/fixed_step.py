@@ -1,7 +1,7 @@
 """Fixed-step methods without event location: RK4 as in the paper, and semi-implicit Euler.
 
-They integrate the equations of motion (paper, eq. 5) in world axes about the centre of mass, as a check of the steps
-and events of the series. Only the geometry and the contact law are the same code.
+They integrate the equations of motion (paper, eq. 5) in world axes about the centre of mass, as a check of the series'
+steps and events. They share only the geometry and the contact law with the series.
 """
 
 from __future__ import annotations

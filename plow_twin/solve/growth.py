@@ -9,8 +9,8 @@ from plow_twin.kernel.compiler import kernel
 
 #: Largest number of earlier times from which growth is followed; when it is reached, every second time is dropped.
 MOST_KEPT: Final = 256
-#: Most squarings of a matrix, after which singular values closer than 1e-6 are not distinguished, and the trace of the
-#: square of a matrix with trace 1 above which its rank is taken as one.
+#: Largest number of squarings of a matrix (singular values closer than 1e-6 are not distinguished). The iteration ends
+#: earlier if the square of the matrix, scaled to trace 1, has a trace above `_RANK_ONE`, which means rank one.
 _SQUARINGS, _RANK_ONE = 18, 1.0 - 1e-9
 
 
@@ -129,7 +129,7 @@ def _stretch_basis(matrix, basis, moved, logs) -> None:
 
 @kernel(entry=True)
 def follow_growth(matrices, changes, ends, since, kept, whole, basis, scratch, totals, rows, growth, logs) -> None:
-    """Multiply by the fundamental matrices of n stretches, one after the other.
+    """Multiply the products by n fundamental matrices, one after another.
 
     Parameters
     ----------
@@ -138,8 +138,8 @@ def follow_growth(matrices, changes, ends, since, kept, whole, basis, scratch, t
     changes : ndarray, shape (n, p, k)
         Effects of the parameters since then.
     ends : ndarray of int64, shape (n,)
-        1 for the row at the end of a stretch. The other rows describe the stretch so far; their growth is that of
-        places, without rates.
+        1 for a row at the end of a stretch. The other rows describe the stretch so far, and their growth is computed
+        from places without rates.
     since : ndarray, shape (2, k, m, k)
         since[0, :, i, :] are the products since earlier times, i < `kept[0]`; since[1] is scratch space.
     kept : ndarray of int64, shape (1,)

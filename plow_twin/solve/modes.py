@@ -39,7 +39,7 @@ _SHALLOW = 1e-3
 _ROUNDS = 8
 #: Halvings of a bracket, enough for the last bit of a double.
 _BISECTIONS = 60
-#: Largest |theta| in rad at which each corner meets the walls of its pairs: 45 degrees plus some rounding errors.
+#: Largest |theta| in rad at which each corner meets the walls of its pairs, 45 degrees plus some rounding errors.
 LARGEST_ANGLE = 0.25 * math.pi + 1e-12
 _ALL_PAIRS = 2**PAIR_COUNT - 1
 

@@ -1,8 +1,9 @@
 """Short motions of many square blocks with rounded corners that are tossed on a table, each with its own parameters.
 
 Contacts have the normal force of `model.contact` and the spring friction of `solve.grip`. Here restitution and friction
-also fall with the impact, and their values are scattered from touch to touch. Flight has linear drag. In contact, steps
-are a fixed fraction of the contact time; in flight, a step is as long as no corner can reach the table.
+also fall with the impact, and their values are scattered from touch to touch. Flight has linear drag. In contact, a
+step is a fixed fraction of the contact time. In flight, a step is as long as possible without a corner reaching the
+table.
 """
 
 from __future__ import annotations
@@ -34,8 +35,8 @@ _STEPS = 70.0
 _SLOWEST, _LEAST, _LARGEST = 0.01, 0.05, 0.9
 #: Impact speed in m/s below which restitution and friction are constant.
 _SMALLEST_IMPACT = 0.05
-#: Reference mobility of a corner per mass, for the powers of the moving mass: that of a uniform square at one end of a
-#: landing edge.
+#: Reference mobility of a corner (times the mass) for the powers of the moving mass: the mobility of a uniform square
+#: that lands on the end of an edge.
 _USUAL_MOBILITY = 1.5
 
 

@@ -122,7 +122,7 @@ _PARAM_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("speed_per_wear", "f8"),  # A / k_s, v over depth per impulse; 0 if sliding in the plane does not wear
     ("running_in", "f8"),  # share by which a new pad wears faster
     ("running_in_rate", "f8"),  # 1 / h0 in 1/m, the rate at which this share falls with the depth
-    ("enabled", "i8", (PAIR_COUNT,)),  # 1 where the pair can touch
+    ("enabled", "i8", (PAIR_COUNT,)),  # 1 if the pair can touch
     ("inverse_mass", "f8"),
     ("inverse_inertia", "f8"),
     ("stiffness", "f8"),
@@ -159,9 +159,9 @@ _PARAM_FIELDS: Final[list[tuple[Any, ...]]] = [
 ]
 PARAMS: Final = _in_lines(_PARAM_FIELDS)
 
-#: Constants that only some scenes have, by their `Options`.
+#: Further constants of scenes with an option of `Options`.
 _OPTION_FIELDS: Final[dict[str, list[tuple[Any, ...]]]] = {
-    "corners": [("tumbles", "f8")],  # the head carries corners; 1 where the block may tumble
+    "corners": [("tumbles", "f8")],  # the head carries corners; 1 if the block may tumble
     "rounded": [("roll", "f8")],  # distance of a rounded corner along its wall per angle [m/rad]
     "falling": [  # a restitution that falls with the impact
         ("damping_numbers", "f8", (RESTITUTIONS + 1,)),  # e D(e) on a grid from 0 to 1
@@ -175,7 +175,7 @@ _OPTION_FIELDS: Final[dict[str, list[tuple[Any, ...]]]] = {
 
 
 class Options(NamedTuple):
-    """Fields of the constants that only some scenes have."""
+    """Options of a scene; each adds fields to the record of its constants."""
 
     corners: bool  #: the head carries corners
     rounded: bool  #: the corners are rounded
@@ -394,7 +394,7 @@ BOUND: Final = np.dtype(
     [
         ("steps", "i8"),  # number of Runge-Kutta steps reserved for the end
         ("error", "f8"),  # estimated error of the advance in m, 0 if the limit was not reached
-        ("z", "f8", (6, 12)),  # state, trial state and four stages, with those of a frame on springs
+        ("z", "f8", (6, 12)),  # state, trial state and four stages, of the head and of a frame on springs
         ("load", "f8", (3,)),
         ("pairs", "f8", (4, PAIR_COUNT)),  # penetration, rate, force, force before
     ]
@@ -408,7 +408,7 @@ PACE: Final = np.dtype(
     [
         ("slice", "i8"),  # steps of a slice
         ("left", "i8"),  # steps left of the slice
-        ("row", "i8"),  # number of the next advance, counted through all members
+        ("row", "i8"),  # index of the next advance, with the members one after another
         ("underway", "i8"),  # 1 if this advance has begun
         ("mark", "i8"),  # index of the next mark
         ("failed", "i8"),  # number of failed advances

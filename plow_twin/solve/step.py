@@ -31,7 +31,7 @@ METHODS: Final[tuple[Method, ...]] = (flight, rest, implicit, taylor)
 LONGEST_STEP = 100.0
 #: Step in sigma beyond an instant at which modes would change back and forth without end.
 PAST_AN_INSTANT = 1e-9
-#: Times with a relative difference below this, some rounding errors, are the same instant.
+#: Largest relative difference of two times that are taken as the same instant; it covers some rounding errors.
 ONE_INSTANT = 1e-15
 
 

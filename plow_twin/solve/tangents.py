@@ -419,7 +419,7 @@ def follow_columns(
     p, parts, state, w, along, columns, omegas, amplitudes, curved, ends, room, longest_wait, reached, budget, out,
     whole,
 ) -> int:  # fmt: skip
-    """Advance a motion and its columns to each of `ends`, and begin a stretch there if one may; return a `Status`.
+    """Advance a motion and its columns to each of `ends`, where a new stretch begins if possible; return a `Status`.
 
     Parameters
     ----------
@@ -435,7 +435,7 @@ def follow_columns(
     room : float
         Least distance in m of every pair from touching for a stretch to begin.
     longest_wait : int
-        Number of ends in a row without a new stretch after which one begins even without `room`.
+        Number of ends in a row without a new stretch after which a stretch begins even without `room`.
     reached : ndarray of int64, shape (1,)
         Number of ends reached so far, from which the call continues.
     budget : int

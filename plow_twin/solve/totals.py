@@ -35,8 +35,8 @@ def _seal(row_of, window) -> None:
 def publish(rows, stamps, held, taken, windows, waits) -> int:
     """Sum up advances; the rows taken for publication get the sums since the publication before.
 
-    A taken row whose advance failed gets motion and sums of the good rows before it; if there are none, its stamp
-    becomes 0.
+    If the advance of a published row failed, the row gets motion and sums of the good rows before it, or the stamp 0 if
+    there are no good rows.
 
     Parameters
     ----------

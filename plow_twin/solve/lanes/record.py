@@ -102,7 +102,7 @@ LANES: Final = np.dtype(
         ("orders", "i8", _LANES_OF),  # order of each lane's series; the terms beyond have vanished
         ("before", "i8", _LANES_OF),  # number of steps up to the last sample
         ("carrying", "i8", _LANES_OF),  # a bit for each pair that is on
-        # single numbers last, so that every row before them fills a cache line
+        # single numbers come last, so that every row before them fills a cache line
         ("parting", "i8", (1,)),  # a bit for each lane in which a clipped pair parts
         ("rounds", "i8", (1,)),
         ("bulges", "i8", (1,)),  # number of forces in `bulge`

@@ -3,7 +3,7 @@
 If the contact force is linear in penetration and rate, the sum of a scene's acting pairs is one affine map of the
 state. An order then takes twelve Cauchy products, for any number and choice of acting pairs. With lambda d' the force
 K d (1 + lambda d') is K (d + lambda / 2 (d^2)'), which takes half a product more for each slot. A slot holds one acting
-pair of each lane, which may be another pair in each lane.
+pair of each lane; the pairs of different lanes in a slot may differ.
 """
 
 from __future__ import annotations

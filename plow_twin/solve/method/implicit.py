@@ -55,7 +55,7 @@ STAGES = 9
 OVERDAMPED_RATIO = 20.0
 #: Cost of an implicit step in explicit steps; a shorter implicit step is not worth its cost.
 _WORTH = 30.0
-#: Admissible error of an implicit step over that of an explicit step, since it replaces many explicit steps.
+#: Factor on the admissible error of an implicit step compared with an explicit step, since it replaces many of them.
 _GAIN = 100.0
 #: Rounding error of a velocity, as a share of the largest velocity; smaller errors are always admissible.
 _NOISE = 1e-12

@@ -74,7 +74,7 @@ def _choose_map(p, parts, fraction, stick, state, w, span, penetrating):
         return (root if parting <= span else root - math.sqrt(parting - span)), parting > span
     since = state.step_start - state.touch_time
     if 0.0 < since < _TOUCH_REACH * state.last_step_size:
-        # some steps after the touch the square root of the time since then is still the better variable
+        # for some steps after a touch the square root of the time since the touch is the better variable
         root = math.sqrt(since)
         state.alpha, state.beta = 2.0 * root, 2.0
         return math.sqrt(since + span) - root, True
