@@ -2,8 +2,8 @@
 
     python benchmark/beside.py COMMIT [--rounds 5]
 
-Each round starts one process in a worktree of the commit and one in this checkout, in alternating order; a process
-warms up, repeats each case and reports its fastest time. The table (medians over the rounds, and their ratio) is
+Each round starts a process in a worktree of the commit and a process in this checkout, in alternating order. A process
+warms up, repeats each case and reports its fastest time. The table with the medians over the rounds and their ratio is
 benchmark/results/beside.md.
 """
 

@@ -126,13 +126,13 @@ def load_rows(path: Path) -> list[dict[str, Any]]:
 @click.option("--periods", type=float, help="Load periods of data; the group's by default.")
 @click.option("--out", type=click.Path(path_type=Path), default=RESULTS / "estimate.jsonl", show_default=True)
 def main(groups: tuple[str, ...], truths: int, seed: int, periods: float | None, out: Path) -> None:
-    """Run the groups and write one line of JSON a truth."""
+    """Run the groups and write one line of JSON for each truth."""
     warm_up(draw(type(GROUPS["plain"])("start", periods=1.0), 0).nominal)
     rows = load_rows(out)
     done = {(row["group"], row["seed"]) for row in rows}
     names = groups or tuple(GROUPS)
     seeds = range(seed, seed + truths)
-    # truth by truth, so that a run that is stopped early leaves groups of equal size
+    # all groups in turn, so that a run that is stopped early leaves groups of equal size
     for number in seeds:
         for name in names:
             if (name, number) not in done:

@@ -294,7 +294,7 @@ def _telemetry(kind: Kind, fine: Array, believed: Array) -> tuple[Array, Array]:
         return knots + kind.late_s, np.stack([np.interp(knots, fine, column) for column in believed.T], axis=1)
     rows = round(kind.averaged_s / _FINE)
     count = len(fine) // rows
-    # stamped in the middle of the averaged span
+    # an average has the stamp of the middle of its interval
     middle = fine[: count * rows].reshape(count, rows).mean(axis=1)
     return middle, believed[: count * rows].reshape(count, rows, 3).mean(axis=1)
 
@@ -325,7 +325,7 @@ def run_one(name: str, seed: int) -> dict[str, Any]:
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> dict[str, float]:
-    """Return the figures of a kind, both clearances together."""
+    """Return the figures of a kind, for both clearances together."""
     both = [
         {key: row[f"{axis}_{key}"] for key in ("error_m", "sd_m", "inside", "state")} for row in rows for axis in "hv"
     ]
@@ -368,7 +368,7 @@ def as_markdown(groups: dict[str, dict[str, float]]) -> str:
 @click.option("--seed", default=80000, show_default=True, help="First seed.")
 @click.option("--out", type=click.Path(path_type=Path), default=RESULTS / "estimate_mismatch.jsonl", show_default=True)
 def main(kinds: tuple[str, ...], truths: int, seed: int, out: Path) -> None:
-    """Run the kinds and write one line of JSON a truth."""
+    """Run the kinds and write one line of JSON for each truth."""
     warm_up(load_scene(ROOT / "config" / "paper.yaml"))
     rows = load_rows(out)
     done = {(row["kind"], row["seed"]) for row in rows}

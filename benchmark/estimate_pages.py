@@ -45,7 +45,7 @@ _LEVEL = 0.95
 
 
 def truths(group: str, seeds: Sequence[tuple[int, int]]) -> list[dict[str, Any]]:
-    """Return the newest row of each truth of a group."""
+    """Return the newest row of each truth in a group."""
     wanted = {seed for first, count in seeds for seed in range(first, first + count)}
     rows = load_rows(RESULTS / "estimate.jsonl")
     newest = {row["seed"]: row for row in rows if row["group"] == group and row["seed"] in wanted}

@@ -189,7 +189,7 @@ def _contact(group: Group, rng: np.random.Generator) -> Contact:
     stiffness = float(np.exp(rng.uniform(low, high)))
     damping = 0.72 * float(np.exp(rng.normal(0.0, 0.4)))
     if group.law == "kelvin_voigt":
-        # hard contacts get the same share of the critical damping
+        # hard contacts get the same damping ratio
         damping = 10.0 ** rng.uniform(4.5, 5.3) * max(1.0, np.sqrt(stiffness / 3e7))
     return Contact(law=group.law, stiffness=stiffness, exponent=group.exponent, damping=damping)
 

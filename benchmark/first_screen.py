@@ -39,7 +39,7 @@ def grow(path: Path, stop: threading.Event) -> None:
 
 
 def main() -> None:
-    """Take the steps of docs/how_to_screen.md and print how long each took."""
+    """Take the steps of docs/how_to_screen.md, and print the time of each."""
     folder = Path(sys.argv[1] if len(sys.argv) > 1 else tempfile.mkdtemp())
     took: dict[str, Any] = {}
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}

@@ -18,9 +18,9 @@ import numpy as np
 from bench_scenes import T_END
 from cases import Array, Sample, timed
 
-#: Time after an event in which heyoka does not look for it again [s]; the default would hide the next touch.
+#: Time after an event in which heyoka ignores the same event [s]; with the default it would miss the next touch.
 _COOLDOWN = 1e-7
-#: Parameters after the modes of the pairs: both clearances.
+#: Indices of the clearances in heyoka's parameters, after the modes of the pairs.
 _GX, _GY = 8, 9
 
 

@@ -59,7 +59,7 @@ def _write_map() -> None:
 
 
 def main() -> None:
-    """Run a bench scene over and over under perf and print each kernel's share."""
+    """Run a bench scene repeatedly under perf, and print each kernel's share."""
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     arguments.add_argument("scene")
     arguments.add_argument("tol", type=float)

@@ -303,7 +303,7 @@ TWO_AT_ONCE_S = 1e-3
 
 
 class Square:
-    """The measured drops and their simulation by a block with a marker."""
+    """The measured drops, and their simulation as drops of a block with a marker."""
 
     def __init__(self, drops: Drops) -> None:
         self.drops, self.usable = drops, np.array(drops.usable())
@@ -413,7 +413,7 @@ class Square:
         in x and of whole quarter turns.
         """
         gravity, height = float(SQUARE["gravity"]), 0.05
-        # time from the last row of the flight to that height
+        # time from the last row of the flight to the height of 50 mm
         z, fall = self.flights[:, 1], self.flights[:, 4]
         shift = (fall + np.sqrt(np.maximum(fall**2 + 2.0 * gravity * (z - height), 0.0))) / gravity
         turned = self.flights[:, 2] + shift * self.flights[:, 5]

@@ -130,7 +130,7 @@ def measure(minutes: float, rate_hz: float) -> bool:
 def _live(
     folder: Path, server: subprocess.Popen[str], port: int, rate_hz: float, seconds: float
 ) -> tuple[dict[str, float], float]:
-    """Run the twin until the server has written all; return its figures, and the load of everything else."""
+    """Run the twin until the server has written all values; return its figures, and the load of other programs."""
     (folder / "map.yaml").write_text(MAP)
     settings = [word for text in ("priority=10", f"expected_rate={rate_hz}") for word in ("--set", text)]
     twin = subprocess.Popen(

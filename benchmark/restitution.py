@@ -201,7 +201,7 @@ def write_page(rows: Sequence[Row], path: Path) -> None:
 
 
 def main() -> None:
-    """Measure all, write all."""
+    """Measure all laws, and write the CSV file, the picture and the page."""
     rows = [row for law in restitution_laws() for row in measure(law, ASKED)]
     rows += measure("kelvin_voigt", RATIOS) + measure("hertz", (1.0,))
     rows += [row for ramp in RAMPS for row in measure("ramped_damping", RATIOS, ramp)]

@@ -54,7 +54,7 @@ def scaled(value: tuning.Value, factor: float, unit: str) -> tuning.Value:
 
 @contextmanager
 def varied(name: str, value: tuning.Value) -> Iterator[None]:
-    """Give a number another value within a context."""
+    """Change the value of a number within a context."""
     before = getattr(tuning, name)
     setattr(tuning, name, value)
     try:

@@ -1,1 +1,1 @@
-"""The compiler, SIMD lanes and polynomials that every compiled function uses; independent of the machine."""
+"""Tools of all compiled functions (compiler, SIMD lanes, polynomials), which know nothing of the machine."""

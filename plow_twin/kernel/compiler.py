@@ -1,4 +1,4 @@
-"""The decorator of every compiled function: numba with a cache on disk that notices a change in any kernel.
+"""The decorator of compiled functions: numba with a cache on disk that is renewed after a change in any kernel.
 
 Numba's own cache checks only the file of the cached function and misses changes in the functions that it calls. Here
 each cached function is stamped with a digest of the source of all kernels.
@@ -21,7 +21,7 @@ from numba.np import linalg
 
 from plow_twin.kernel.linked import EntryCompiler, LinkedCompiler, garbage_kept, keep_from_python
 
-#: Value-preserving relaxations only: sums may be reordered and fused, but NaN and infinity keep their meaning.
+#: Relaxations of `fast` kernels: sums may be reordered and fused, but NaN and infinity are still handled correctly.
 FASTMATH: Final = frozenset({"contract", "reassoc", "nsz", "arcp"})
 
 #: The warning about the cache, after it has been issued once.
@@ -45,7 +45,7 @@ def _load_numba() -> None:
 
 _load_numba()
 
-#: Subpackages that hold compiled functions, with all their folders.
+#: Subpackages with compiled functions.
 KERNEL_FOLDERS: Final = ("kernel", "model", "solve")
 
 

@@ -49,7 +49,7 @@ class LinkedLibrary(JITCodeLibrary):
             self._dynamic_globals += library._dynamic_globals
             environments |= _environments(library._final_module)
         for name in self._exported:
-            # a caller keeps its own copy of the kernel, or drops the copy after inlining it
+            # with this linkage a caller gets its own copy of the kernel, and can drop the copy after inlining it
             whole.get_function(name).linkage = "linkonce_odr" if self.fast else "weak_odr"
         self._shared_module = whole
         self._final_module = _variables(self._codegen._create_empty_module(self.name), environments)

@@ -1,1 +1,1 @@
-"""The machine: parameters, geometry, contact laws, loads; independent of time stepping."""
+"""The machine: its parameters, geometry, contact laws and loads. Nothing here depends on the method of solution."""

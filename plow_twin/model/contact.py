@@ -1,4 +1,4 @@
-"""The normal force of a pair, compiled: once as a number, once as a power series in time.
+"""The normal force of a pair, compiled in two forms: as a number, and as a power series in time.
 
     additive laws     F = K d^n + C psi(d) d',  psi = 1 (Kelvin-Voigt) or u^2 (3 - 2 u), u = min(d / ramp, 1)
     all other laws    F = K d^n (1 + lambda d')

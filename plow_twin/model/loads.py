@@ -46,12 +46,16 @@ class Pieces:
 
 @dataclass(frozen=True)
 class LoadSet:
-    """All loads of a scene, summed.
+    """The sum of all loads of a scene.
 
-    constant : shape (3,), wrench Fx, Fy in N, M in N m
-    omega : shape (h,), rad/s, distinct
-    sine, cosine : shape (h, 3), amplitudes of sin(omega t) and cos(omega t)
-    pieces : the tables' sum, or None without tables
+    constant : ndarray, shape (3,)
+        Sum of the constant wrenches: Fx, Fy in N, M in N m.
+    omega : ndarray, shape (h,)
+        Distinct angular frequencies in rad/s.
+    sine, cosine : ndarray, shape (h, 3)
+        Amplitudes of sin(omega t) and cos(omega t) in N, N, N m.
+    pieces : Pieces or None
+        Sum of the tables, or None without tables.
     """
 
     constant: Array
@@ -74,7 +78,7 @@ class LoadSet:
 
 
 def wrench_of(force: tuple[float, float], moment: float, at: tuple[float, float]) -> Array:
-    """Return (Fx, Fy, M) of a force with its arm and a free moment, shape (3,):  M = x Fy - y Fx + moment."""
+    """Return Fx, Fy and M = x Fy - y Fx + moment of a force at (x, y) = `at` with a free moment, shape (3,)."""
     return np.array([force[0], force[1], at[0] * force[1] - at[1] * force[0] + moment])
 
 

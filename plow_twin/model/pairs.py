@@ -38,5 +38,5 @@ STOPS_COUNTER_CLOCKWISE: Final[NDArray[np.bool_]] = CORNER_X * NORMAL_Y - CORNER
 
 
 def corner_of(pair: int) -> str:
-    """Return the name of the corner that belongs to pair number `pair`."""
+    """Return the name of the corner of pair number `pair`."""
     return CORNER_NAMES[pair // 2]

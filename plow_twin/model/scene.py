@@ -32,7 +32,7 @@ class Mark(Enum):
     GIVEN
         Published, or stated by the maker of the machine.
     RECONSTRUCTED
-        Fitted to something published or measured.
+        Fitted to published or measured data.
     ASSUMED
         Chosen.
     MEASURED
@@ -118,7 +118,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Clearance:
-    """Total clearance: cavity size minus frame size. Negative is interference: both walls touch from the start."""
+    """Total clearances, cavity size minus frame size; if negative (interference), both walls touch from the start."""
 
     horizontal_m: float = _quantity("m", "cavity width minus frame width")
     vertical_m: float = _quantity("m", "cavity height minus frame height")
@@ -126,7 +126,7 @@ class Clearance:
 
 @dataclass(frozen=True)
 class Contact:
-    """Normal contact of every pair: one law and one uniform set of parameters.
+    """Normal contact, with one law and one set of parameters for all pairs.
 
     Exactly one of `damping` and `restitution` must be given, or neither for a law without damping. Impacts with the
     default law have exactly the given restitution.
@@ -152,20 +152,22 @@ class Contact:
         None,
         ge=0.0,
     )
-    restitution: float | None = _quantity("1", "restitution asked of the law", None, ge=0.0, le=1.0)
+    restitution: float | None = _quantity("1", "nominal restitution of the law", None, ge=0.0, le=1.0)
     impact_speed_floor_m_s: float = _quantity(
-        "m/s", "smallest impact speed v0 used in lambda = D(e)/v0, bounds the damping of a touch at rest", 1e-3, gt=0.0
+        "m/s", "least impact speed v0 in lambda = D(e)/v0, which bounds the damping of a slow touch", 1e-3, gt=0.0
     )
     ramp_m: float | None = _quantity("m", "ramped_damping: penetration over which C grows to its value", None, gt=0.0)
     restitution_fall: float | None = _quantity(
-        "1", "power by which it falls with the impact above restitution_speed_m_s", None, ge=0.0, le=1.0
+        "1", "power by which the restitution falls with impacts above restitution_speed_m_s", None, ge=0.0, le=1.0
     )
-    restitution_speed_m_s: float | None = _quantity("m/s", "impact up to which it does not fall", None, gt=0.0)
+    restitution_speed_m_s: float | None = _quantity(
+        "m/s", "impact up to which the restitution is constant", None, gt=0.0
+    )
     restitution_mass_power: float | None = _quantity(
-        "1", "power of the effective mass over the head's in the impact, 0 unless given", None, ge=0.0, le=4.0
+        "1", "power of the effective mass over the head's mass in the impact, 0 unless given", None, ge=0.0, le=4.0
     )
     restitution_fall_along_s_m: float | None = _quantity(
-        "s/m", "its fall with the speed of the centre of mass along the wall, 0 unless given", None, ge=0.0
+        "s/m", "fall of the restitution per speed of the centre of mass along the wall, 0 unless given", None, ge=0.0
     )
 
 
@@ -180,7 +182,7 @@ FALL_NAMES: Final = (
 
 @dataclass(frozen=True)
 class Friction:
-    """Tangential friction of every pair, by one of two laws.
+    """Tangential friction of all pairs, by one of two laws.
 
     Without `stick_stiffness_n_m` friction is regularised Coulomb, T = mu N tanh(slip rate / regularisation speed),
     under which bodies creep. With it friction is Coulomb's law with stick: a spring and a damper hold a corner to the
@@ -193,10 +195,16 @@ class Friction:
     """
 
     coefficient: float = _quantity("1", "mu", ge=0.0)
-    regularisation_speed_m_s: float = _quantity("m/s", "below it friction is viscous; not with stick", 0.01, gt=0.0)
+    regularisation_speed_m_s: float = _quantity(
+        "m/s", "slip speed below which friction is viscous; not with stick", 0.01, gt=0.0
+    )
     stick_stiffness_n_m: float | None = _quantity("N/m", "tangential stiffness of a corner that sticks", None, gt=0.0)
-    stick_damping_n_s_m: float | None = _quantity("N s/m", "its damping, 0 unless given", None, ge=0.0)
-    static_coefficient: float | None = _quantity("1", "mu up to which a corner sticks, mu unless given", None, ge=0.0)
+    stick_damping_n_s_m: float | None = _quantity(
+        "N s/m", "tangential damping of a corner that sticks, 0 unless given", None, ge=0.0
+    )
+    static_coefficient: float | None = _quantity(
+        "1", "friction coefficient up to which a corner sticks, mu unless given", None, ge=0.0
+    )
 
 
 @dataclass(frozen=True)
@@ -208,7 +216,9 @@ class Support:
     """
 
     mass_kg: float = _quantity("kg", "mass of the frame and of the parts that move with it", gt=0.0)
-    inertia_kg_m2: float = _quantity("kg m^2", "its moment of inertia about the frame's centre", gt=0.0)
+    inertia_kg_m2: float = _quantity(
+        "kg m^2", "moment of inertia of the frame and these parts about the frame's centre", gt=0.0
+    )
     horizontal_stiffness_n_m: float = _quantity("N/m", "horizontal spring, 0 for none", ge=0.0)
     vertical_stiffness_n_m: float = _quantity("N/m", "vertical spring, 0 for none", ge=0.0)
     rotational_stiffness_n_m_rad: float = _quantity("N m/rad", "spring against rotation, 0 for none", ge=0.0)
@@ -219,9 +229,9 @@ class Support:
 
 @dataclass(frozen=True)
 class Gravity:
-    """Gravity and, for `rotation: paper`, its constant moment -m g arm about the cavity's centre."""
+    """Gravity, and for `rotation: paper` its constant moment about the cavity's centre, minus m g times the arm."""
 
-    acceleration_m_s2: float = _quantity("m/s^2", "acceleration, acts along -y", 9.81)
+    acceleration_m_s2: float = _quantity("m/s^2", "acceleration along -y", 9.81)
     arm_m: float = _quantity("m", "arm of the constant moment, positive to the right", 0.0)
 
 
@@ -316,9 +326,11 @@ class Wear:
     pad_length_m: float | None = _quantity(
         "m", "length of a pad along the face, by which the slide wears", None, gt=0.0
     )
-    sliding: str = _choice("motion that wears: travel, or sliding in the plane too", ("travel", "total"), "travel")
+    sliding: str = _choice("motion that wears: travel, or in-plane sliding too", ("travel", "total"), "travel")
     running_in_ratio: float = _quantity("1", "coefficient of a new pad over k_s", 1.0, ge=1.0)
-    running_in_depth_m: float | None = _quantity("m", "wear depth over which that falls by e", None, gt=0.0)
+    running_in_depth_m: float | None = _quantity(
+        "m", "wear depth over which the excess of this ratio over 1 falls by a factor e", None, gt=0.0
+    )
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ Number = TypeVar("Number", bound=np.generic)
 
 
 class _Column(Generic[Number]):
-    """A field of the rows, as an array that shares their memory."""
+    """A field of the rows, as an array that shares the rows' memory."""
 
     def __init__(self, name: str = "") -> None:
         self._name = name

@@ -35,7 +35,7 @@ _OPTIONAL = ("hysteretic", "wear", "sliding", "running_in", "offset", "free", "s
 
 
 def _signature(parts: Parts, scene: Scene) -> tuple[bool, ...]:
-    """Return which terms and options the compiled code of a scene has."""
+    """Return for each term and option whether the compiled code of a scene has it."""
     return (*(part is not None for part in (*parts.terms, parts.implicit)), *options(scene))
 
 
@@ -400,7 +400,7 @@ class _Worker(NamedTuple):
         return _Worker(parts, work, new_records(TOTALS, 1), Pace(state_type(terms), stiff, max_wall_s), None)
 
     def with_lanes(self, batch: TwinBatch, terms: Terms, members: range) -> _Worker:
-        """Return a worker with lanes for some twins."""
+        """Return a worker with lanes for the twins `members`."""
         found = LaneTwins(batch._params, batch._states, terms, members, self.work, batch._max_steps)
         return self._replace(lanes=found)
 

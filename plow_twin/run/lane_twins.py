@@ -21,7 +21,7 @@ _Array = NDArray[np.float64]
 
 
 class LaneTwins:
-    """Twins that one thread advances side by side.
+    """Twins that one thread advances in lanes.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ class LaneTwins:
     def advance(
         self, times: _Array, wrench: _Array, rows: NDArray[np.void], pace: Pace, alone: Callable[[int, int], None]
     ) -> None:
-        """Advance to all times; `alone` advances a twin to one of these times by other methods.
+        """Advance all twins to all times; `alone` advances a single twin to one of these times by other methods.
 
         `wrench` and `rows` are as in `Samples`.
         """

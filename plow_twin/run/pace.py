@@ -22,7 +22,7 @@ class OutOfTimeError(Exception):
 
 
 class Pace:
-    """The slices of successive calls.
+    """Slices of work, for successive calls.
 
     Parameters
     ----------
@@ -37,12 +37,12 @@ class Pace:
     def __init__(self, state_type: np.dtype[np.void], implicit: bool, max_wall_s: float) -> None:
         self._records = new_records(PACE, 1)
         self.record = first_of(self._records)
-        #: the record for calls; numba asks a scalar record for an attribute, which numpy looks up in Python
+        #: the record as an argument of kernels; with `record` numba would look up an attribute in slow Python code
         self.argument = self._records[0]
         #: number of failed advances in the last call, shape (1,), as a view of the record
         self.failed = self._records["failed"]
         self.record.slice = _SLICE_IMPLICIT if implicit else _SLICE
-        # as bytes, because numpy copies a record field by field, five times as slowly
+        # bytes are copied five times as fast as a record, which numpy copies field by field
         self._bytes = self._records.view(np.uint8).data
         self._start = self._bytes.tobytes()
         self.saved = new_records(state_type, 1)
@@ -66,7 +66,7 @@ class Pace:
 
 def check_limits(max_steps: int, max_wall_s: float) -> None:
     """Raise `ArgumentError` for invalid limits."""
-    # a float would compile further kernels
+    # a float must be refused, because numba would compile further kernels for it
     if isinstance(max_steps, bool) or not isinstance(max_steps, (int, np.integer)) or not max_steps >= 1:
         raise ArgumentError(f"max_steps: got {max_steps!r}, expected an integer >= 1")
     if not max_wall_s > 0.0:

@@ -281,7 +281,7 @@ def sensitivity_of(scene: Scene, t_end: float, tol: float, parameters: Sequence[
 
 
 class _Stretches(NamedTuple):
-    """Derivatives at the times of `_ends` by the state at the end of the previous stretch, scaled by `scale_of`."""
+    """Derivatives at the times `_ends` by the state at the end of the last stretch before, scaled by `scale_of`."""
 
     matrices: Array  #: by the state, shape (n, k, k)
     changes: Array  #: by the parameters, shape (n, p, k)
@@ -319,7 +319,7 @@ def _by_equations(scene: Scene, t_end: float, tol: float, parameters: Sequence[s
 
 
 def _by_shadows(scene: Scene, t_end: float, tol: float, parameters: Sequence[str]) -> _Stretches:
-    """Follow displaced motions beside the motion."""
+    """Follow the motion and displaced motions."""
     # the tolerance is 1e-5 of a displacement
     fine = min(max(SHADOW_TOLERANCE, TOLERANCE_RANGE[0]), tol)
     compiled = compile_scene(scene, fine)
@@ -355,7 +355,7 @@ def _by_shadows(scene: Scene, t_end: float, tol: float, parameters: Sequence[str
 
 
 def _ends(t_end: float) -> Array:
-    """Return the ends of stretches in s; their distances are uneven so that they do not align with a period."""
+    """Return the ends of stretches in s, which are spaced unevenly so that they do not align with a period."""
     ends = np.arange(1, _STRETCHES + 1, dtype=np.float64)
     ends[:-1] += 0.4 * (np.mod(ends[:-1] * 0.5 * (math.sqrt(5.0) - 1.0), 1.0) - 0.5)
     ends *= t_end / _STRETCHES

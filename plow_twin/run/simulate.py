@@ -170,8 +170,9 @@ def simulate(
     sensitivity : bool or sequence of str
         Whether to follow the linearised motion too, which shows whether the tolerance is met (`Result.sensitivity`);
         `ToleranceWarning` is issued if errors grow too much. With paths of parameters (`sensitivity_parameters`), the
-        derivatives by these are computed too. This takes some five times the work of the run, and a hundred times and
-        more for scenes with friction, wear, a ramp, a table, a locked degree of freedom or overdamped contact.
+        derivatives by these parameters are computed too. This takes some five times the work of the run, and a hundred
+        times and more for scenes with friction, wear, a ramp, a table, a locked degree of freedom or overdamped
+        contact.
 
     Returns
     -------
@@ -376,7 +377,7 @@ def _result(
 def statistics_of(totals: Totals, duration: float) -> dict[str, dict[str, float]]:
     """Return the statistics of each pair over the motion (see `Result`)."""
     table = {}
-    # read once, because a record looks up its fields slowly
+    # each field is read once, because access to a record's field is slow
     sums = [totals[name].tolist() for name in ("peak", "impulse", "time_in_contact", "makes")]
     for name, peak, impulse, contact, makes in zip(PAIR_NAMES, *sums, strict=True):
         table[name] = {

@@ -1,4 +1,4 @@
-"""The live twin: one head that is advanced by any interval under sampled or analytic loads, saved and restored."""
+"""The live twin: one head that can be advanced by any interval under sampled or analytic loads, saved and restored."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ __all__ = ["Advance", "AdvanceSeries", "Status", "Twin"]
 
 #: Default number of steps after which an advance fails.
 DEFAULT_BUDGET = 50_000_000
-#: The compiled kernels by a key that determines the types of their arguments, because numba's dispatch takes
-#: milliseconds.
+#: The compiled kernels, by a key that determines the types of their arguments. They are kept because numba's dispatch
+#: takes milliseconds.
 _entries: dict[tuple[Any, ...], Callable[..., bool]] = {}
 _NO_DIGESTS = np.zeros(0, np.int64)
 _THE_ONE = np.zeros(1, np.int64)
@@ -119,7 +119,7 @@ class Twin:
         self._work, self._totals = first_of(self._works), first_of(self._all_totals)
         self._states[0] = compiled.initial_state(start)
         self._inertias = inertias(scene)
-        #: the kernels, by whether they write rows
+        #: the kernel that writes rows (True) and the kernel that does not (False)
         self._kernels: dict[bool, Callable[..., bool]] = {}
         #: model time, as a view of the state
         self._time = self._states["time"]
@@ -384,7 +384,7 @@ class Twin:
         return depth
 
     def failure(self, status: int) -> str:
-        """Return the reason why the newest failed advance failed.
+        """Return the reason for the newest failure of an advance.
 
         Parameters
         ----------
@@ -455,7 +455,7 @@ class Twin:
     def _stopped(
         self, stop: BaseException, count: int, samples: NDArray[np.float64] | None, rows: NDArray[np.void] | None
     ) -> NoReturn:
-        """Keep the state after the last of `count` advances that is finished, and raise."""
+        """Restore the state after the last complete one of `count` advances, and raise an error."""
         steps, done = self.steps, int(self._pace.record.row)
         self._go_back()
         if samples is not None and done > 0:
@@ -467,7 +467,7 @@ class Twin:
         raise (LimitError if late else RunInterrupted)(message, part, self.time) from None
 
     def _go_back(self) -> None:
-        """Undo the advance under way."""
+        """Undo the advance that was interrupted."""
         if self._pace.record.underway == 0:
             return
         self._states[0] = self._pace.saved[0]

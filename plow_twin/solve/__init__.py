@@ -1,1 +1,1 @@
-"""How the motion is advanced: series, events, the loop; fixed-step methods."""
+"""The solver: series, events and the loop that advances the motion, and fixed-step methods."""

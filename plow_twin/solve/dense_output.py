@@ -17,7 +17,7 @@ from plow_twin.solve.support import see_from_frame
 
 @kernel(inline="source")
 def time_along(alpha, beta, sigma):
-    """Return the time at a value of the series' variable: t = alpha sigma + beta sigma^2 / 2."""
+    """Return the time at sigma since the step's start, t = alpha sigma + beta sigma^2 / 2."""
     return alpha * sigma + 0.5 * beta * sigma * sigma
 
 

@@ -52,7 +52,7 @@ BALANCE = np.dtype(
         ("now", "f8", (SIZE,)),  # powers and forces at one instant
         ("before", "f8", (SIZE,)),  # powers and forces one fixed step before
         ("body", "f8", (STATE_SIZE,)),  # body coordinates at a node
-        ("ground", "f8", (STATE_SIZE,)),  # absolute body coordinates, with a support
+        ("ground", "f8", (STATE_SIZE,)),  # body coordinates relative to the ground, with a support
         ("wear_depth", "f8", (PAIR_COUNT,)),  # wear depth at a node
         ("pairs", "f8", (3, PAIR_COUNT)),  # penetration, rate, force
         ("sums", SUMS),
@@ -71,7 +71,7 @@ def new_balance() -> BalanceSums:
 
 @kernel()
 def _powers(p, parts, state, wear_depth, y, frame, t, balance, out) -> None:
-    """Write powers and forces at time t in body coordinates y; `frame` is the state of a frame on springs."""
+    """Write powers and forces at time t and body coordinates y; `frame` is the state of a frame on springs."""
     terms, load = parts.terms, out[LOAD_X : LOAD_M + 1]
     load_at(p, parts.harmonics, parts.segments, t, load)
     angle = named_angle(p, y, y[THETA])

@@ -88,7 +88,7 @@ def _second_guard(p, state, w, order, pair, viscous, hysteretic, integer, fracti
 
 @kernel(inline="code")
 def elastic_term(p, w, k, pair, integer, fraction):
-    """Return order k of d^n of a pair."""
+    """Return order k of the series d^n of a pair."""
     if integer is not None:
         return w.power[int(p.exponent) - 2, k, pair]
     if fraction is not None:
@@ -116,7 +116,7 @@ def _ramp_guard(p, state, w, order, pair) -> None:
 
 @kernel(fast=True)
 def _unsafe_pairs(w, order, h):
-    """Return a bit for each guard that is not proved to stay positive on [0, h].
+    """Return a bit for each guard that may turn negative on [0, h].
 
     A guard stays positive if g_0 > sum max(-g_k, 0) h^k. If this fails for any guard, the guards are tested by the sign
     of their Bernstein coefficients.
@@ -146,7 +146,7 @@ def _unsafe_pairs(w, order, h):
 
 @kernel(fast=True)
 def _nothing_ends(p, state, w, order, h, penetrating, hysteretic) -> bool:
-    """Return whether each pair of an integer law without a ramp surely keeps its mode on [0, h].
+    """Return whether every pair is proved to keep its mode on [0, h], for an integer exponent without a ramp.
 
     It makes the first test of `_unsafe_pairs` and the test of `_stays` for all pairs side by side. An allowance for
     rounding makes sure that guards that pass here would also pass there.

@@ -43,7 +43,7 @@ _FINEST = 4e-15
 
 @kernel(inline="code")
 def _along(p, pair, y):
-    """Return the place of a corner along its wall and the rate at which it slips, in body coordinates y."""
+    """Return the place of a corner along its wall and its slip rate, at body coordinates y."""
     place = slip_place(p, pair, y[COS], y[SIN], y[X], y[Y], y[THETA])
     return place, slip_rate(p, pair, y[COS], y[SIN], y[OMEGA], y[X], y[Y], y[VX], y[VY])
 

@@ -107,7 +107,7 @@ def _largest(grown, count, height, scratch) -> float:
 
 @kernel()
 def _stretch_basis(matrix, basis, moved, logs) -> None:
-    """Multiply a basis by a matrix and make it orthonormal again; write the logarithms of the stretching."""
+    """Multiply a basis by a matrix and orthonormalise it; write the logarithms of the factors of its extension."""
     size = len(matrix)
     _multiply(matrix, basis, moved)
     for j in range(size):

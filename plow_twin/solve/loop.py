@@ -135,7 +135,7 @@ def _undo(support, state, w, target) -> None:
 
 @kernel()
 def _advance(p, parts, states, index, saved, w, totals, target, stop_time, budget, bound, pace):
-    """Start or continue an advance to `target`; return a `Status` and the steps taken.
+    """Start or continue an advance to `target`; return a `Status` and the number of steps of the advance.
 
     If the advance fails, the time becomes `target`, the head keeps its state, and nothing is counted. `saved` is an
     array of one record. With a bound, a used-up budget is no failure, because the rest is computed by a few coarse
@@ -172,7 +172,7 @@ def _advance(p, parts, states, index, saved, w, totals, target, stop_time, budge
 
 @kernel()
 def _read_row(p, parts, state, w, totals, out) -> None:
-    """Write a `ROW`: the state at the present time and the totals, which are cleared."""
+    """Write the state at the present time and the totals to a `ROW`, and clear the totals."""
     y = w.moved
     _present(p, parts.harmonics, parts.terms.flight, parts.terms.support, state, w, y)
     pose_of(p, y, parts.terms.offset, out.q, out.v)

@@ -52,7 +52,7 @@ def penetration_and_rate(p, state, pair):
 
 @kernel()
 def _fallen_number(p, y, pair, speed):
-    """Return D of the restitution at an impact speed (`model.scene.Contact`)."""
+    """Return D for a restitution that falls with the impact (`model.scene.Contact`); `speed` is that of approach."""
     arm = row_value(p.arm_rows, pair, y[COS], y[SIN], y[X], y[Y])
     mobility = 1.0 + p.free[2] * arm * arm * p.inverse_inertia / p.inverse_mass
     impact = speed * mobility**-p.fall_mass
@@ -65,7 +65,7 @@ def _fallen_number(p, y, pair, speed):
     return (low + (at - index) * (high - low)) * RESTITUTIONS / at
 
 
-#: D of an impact, computed from the impact if the restitution falls with it, otherwise constant.
+#: Return D of an impact, which is constant unless the restitution falls with the impact.
 _damping_number = by_field(
     "fall", lambda p, y, pair, speed: _fallen_number(p, y, pair, speed), lambda p, y, pair, speed: p.damping_number
 )
@@ -245,7 +245,7 @@ def _all_shallow(p, state, y) -> bool:
 
 @kernel()
 def read_range(p, state, y, out) -> None:
-    """Write the numbers that `within_range` checks: angle [rad], largest penetration [m], number of its pair."""
+    """Write the values that `within_range` checks: angle [rad], largest penetration [m] and its pair."""
     out[0], out[1], out[2] = named_angle(p, y, y[THETA]), -np.inf, 0.0
     for pair in range(PAIR_COUNT):
         if p.enabled[pair] == 1:

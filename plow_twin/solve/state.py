@@ -43,7 +43,7 @@ X, Y, VX, VY, OMEGA, COS, SIN, THETA = range(STATE_SIZE)
 
 
 class Status(IntEnum):
-    """How an advance ended.
+    """The outcome of an advance.
 
     Attributes
     ----------
@@ -64,9 +64,9 @@ class Status(IntEnum):
     OUT_OF_RANGE = 1
     NON_FINITE = 2
     BUDGET = 3
-    #: internal: the event log is full; the caller makes room and continues
+    #: internal: the event log is full, so the caller must make room before it continues
     LOG_FULL = 4
-    #: internal: a slice of the work is done; the caller checks its limits and continues
+    #: internal: a slice of the work is done, so the caller checks its limits before it continues
     PAUSED = 5
 
     @property
@@ -127,10 +127,10 @@ _PARAM_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("inverse_inertia", "f8"),
     ("stiffness", "f8"),
     ("exponent", "f8"),
-    ("viscous", "f8"),  # C in N s/m, 0 without
-    ("damping_number", "f8"),  # D of lambda = D / v0, or a negative number when lambda is constant
+    ("viscous", "f8"),  # C in N s/m, or 0
+    ("damping_number", "f8"),  # D of lambda = D / v0, or a negative number if lambda is constant
     ("speed_floor", "f8"),  # smallest v0
-    ("ramp", "f8"),  # penetration over which C grows, 0 without
+    ("ramp", "f8"),  # penetration over which C grows, or 0
     ("gravity", "f8"),
     ("constant", "f8", (3,)),  # Fx/m, Fy/m - g, M/I of the constant loads
     ("direction", "f8", (2, 2)),  # directions (x, y) of the harmonic forces S1, S2
@@ -155,7 +155,7 @@ _PARAM_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("fastest", "f8"),  # largest angular frequency of the harmonics
     ("leverage", "f8"),  # distance of a corner of the frame from its centre
     ("half_cavity", "f8"),  # largest penetration for which the model is valid
-    ("max_events", "i8"),  # events at one instant before recovery
+    ("max_events", "i8"),  # largest number of events at one instant
 ]
 PARAMS: Final = _in_lines(_PARAM_FIELDS)
 
@@ -226,7 +226,7 @@ _STATE_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("steps", "i8"),
     ("evaluations", "i8"),  # evaluations of the equations of motion, one for each order of a series
     ("events", "i8"),
-    ("guard_roots", "i8"),  # guards whose roots were searched for
+    ("guard_roots", "i8"),  # number of searches for a guard's root
     ("recoveries", "i8"),  # steps beyond an instant at which modes changed back and forth
     ("bounded", "i8"),  # advances with a coarse end
     ("implicit_steps", "i8"),
@@ -250,7 +250,7 @@ WORK: Final = np.dtype(
         ("penetration", "f8", _WIDE),  # penetration
         ("rate", "f8", _WIDE),  # its rate in time
         ("arm", "f8", _WIDE),
-        ("damped", "f8", _WIDE),  # ramped damping: the ramp times the rate; other laws: not written
+        ("damped", "f8", _WIDE),  # ramped damping only: the ramp times the rate
         ("force", "f8", _WIDE),
         ("wear", "f8", _WIDE),  # growth of the wear depth
         ("guard", "f8", _WIDE),
@@ -285,11 +285,11 @@ WORK: Final = np.dtype(
         ("damping", "f8", (3, 3)),  # rest under harmonics: minus the derivatives of the accelerations by rate
         ("rub", "f8", (6, *_WIDE)),  # wear: s' / v, sliding distance per travel, force times it; running-in
         ("binomial", "f8", (_ROWS, _ROWS)),  # 1 / C(order, k)
-        ("beyond", "f8", (3,)),  # newest advance out of range: angle [rad], largest penetration [m], its pair
+        ("beyond", "f8", (3,)),  # of the newest advance out of range: angle [rad], largest penetration [m], its pair
     ]
 )
 
-#: Sums over the motion since they were last cleared.
+#: Sums over the motion since the last clearing.
 TOTALS: Final = np.dtype(
     [
         ("peak", "f8", (PAIR_COUNT,)),
@@ -301,7 +301,7 @@ TOTALS: Final = np.dtype(
     ]
 )
 
-#: Values of `ROW`'s `followed`.
+#: Values of the field `followed` of `ROW`.
 FOLLOWED: Final = 1
 WITH_INTERVALS: Final = 2
 
@@ -343,10 +343,10 @@ Totals: TypeAlias = np.record
 Implicit: TypeAlias = np.record
 
 
-#: Harmonic loads, per mass and inertia, sine and cosine amplitudes: forces S1 and S2 along `direction`, moment M.
+#: A harmonic load per mass and inertia: sine and cosine amplitudes of forces S1 and S2 along `direction`, of moment M.
 HARMONIC: Final = np.dtype([("omega", "f8"), ("first", "f8", (2,)), ("second", "f8", (2,)), ("moment", "f8", (2,))])
 
-#: Linear pieces of a sampled load, per mass and inertia: value at the knot and slope from there.
+#: A linear piece of a load per mass and inertia: its value at the knot and its slope from there on.
 SEGMENT: Final = np.dtype([("knot", "f8"), ("start", "f8", (3,)), ("slope", "f8", (3,))])
 
 Harmonics: TypeAlias = NDArray[np.void]
@@ -363,8 +363,8 @@ class Terms(NamedTuple):
     harmonics: int | None
     second: int | None  #: harmonic forces in two directions
     segments: int | None  #: linear pieces
-    viscous: int | None  #: C d'
-    hysteretic: int | None  #: lambda d', lambda from State.damping_factor
+    viscous: int | None  #: damping C d'
+    hysteretic: int | None  #: damping by lambda d', with lambda in `State.damping_factor`
     integer: int | None  #: an integer exponent of at least 2
     fraction: int | None  #: an exponent that is not an integer
     ramp: int | None  #: the viscous part is ramped over the penetration
@@ -457,13 +457,13 @@ def new_records(dtype: np.dtype[np.void], count: int) -> NDArray[np.void]:
 
 @cache
 def _inverses() -> Array:
-    """Return 0 and 1 / k, shape (orders + 2,)."""
+    """Return the table of 1 / k by k (0 for k = 0), shape (orders + 2,)."""
     return np.append(0.0, 1.0 / np.arange(1, _ROWS + 2))
 
 
 @cache
 def _inverse_binomials() -> Array:
-    """Return 1 / C(order, k), shape (orders, orders)."""
+    """Return the table of inverse binomial coefficients 1 / C(order, k), shape (orders, orders)."""
     table = np.zeros((_ROWS, _ROWS))
     for order in range(_ROWS):
         table[order, : order + 1] = [1.0 / math.comb(order, k) for k in range(order + 1)]

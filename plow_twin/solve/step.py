@@ -70,7 +70,7 @@ def _begin_step(p, parts, state, w, stop_time):
 
 @kernel()
 def lay_out_step(p, parts, state, w, stop_time) -> bool:
-    """Lay out the next step, at most to `stop_time`; return False when it is not finite."""
+    """Lay out the next step, which ends at `stop_time` at the latest; return False if it is not finite."""
     terms = parts.terms
     span, penetrating = _begin_step(p, parts, state, w, stop_time)
     if flight.lay_out(p, parts, flight.own(parts), state, w, span, penetrating) or rest.lay_out(
@@ -126,7 +126,7 @@ def _end_at_event(p, state, w, span, penetrating, law, stick) -> None:
 
 @kernel()
 def complete_step(p, harmonics, flight, support, state, w, totals, log, wear, fraction, stick) -> None:
-    """Move the state to the step's end and make the event's changes of mode; `totals` and `log` may be None."""
+    """Move the state to the step's end and change the modes as its event requires; `totals` and `log` may be None."""
     y = state.y
     sigma = state.sigma_end
     if wear is not None:

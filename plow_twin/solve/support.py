@@ -1,4 +1,4 @@
-"""A frame on springs: a second body on springs and dampers to ground, on which the contacts act with the opposite sign.
+"""A frame on springs: a second body on springs and dampers to ground, on which the reactions of the contacts act.
 
     m_f u'' = -k_x u - c_x u' - sum F_x      (v likewise)      I_f phi'' = -k_phi phi - c_phi phi' - sum (p x F)
 

@@ -109,7 +109,7 @@ def _copy_motion(row_of, target) -> None:
 
 @kernel(entry=True)
 def publish_window(windows, rows) -> None:
-    """Write a waiting window, (1,), to a row, (1,), and begin the next window."""
+    """Write a window that waits to be published to a row, shape (1,) each, and begin the next window."""
     rows[0] = windows[0]
     _seal(rows[0], windows[0])
 

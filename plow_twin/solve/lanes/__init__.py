@@ -1,1 +1,1 @@
-"""Many scenes in one SIMD vector: each lane is a scene with its own step, time, modes and events (`loop`)."""
+"""Eight scenes in one SIMD vector; each lane runs a scene with its own steps, times, modes and events (`loop`)."""

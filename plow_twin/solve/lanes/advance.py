@@ -60,8 +60,8 @@ class Samples(NamedTuple):
 
     params: NDArray[np.void]  #: parameters of all twins, shape (m,)
     states: NDArray[np.void]
-    saved: NDArray[np.void]  #: states of the scenes in the lanes at the sample before, shape (8,)
-    totals: NDArray[np.void]  #: touches since the sample before of the scenes in the lanes, shape (8,)
+    saved: NDArray[np.void]  #: states at the sample before, by lane, shape (8,)
+    totals: NDArray[np.void]  #: counts of touches since the sample before, by lane, shape (8,)
     times: NDArray[np.float64]  #: times of the samples in s, shape (n,)
     wrench: NDArray[np.float64]  #: per mass and inertia, beginning with the last sample before, shape (m, n + 1, 3)
     rows: NDArray[np.void]  #: rows to fill, shape (m, n)
@@ -146,7 +146,7 @@ def _fail(s, lanes, lane, code) -> None:
 
 @kernel()
 def _tell(lanes, reached, viscous, hysteretic) -> None:
-    """Write pose, rates, penetrations, their rates and forces of all lanes to `lanes.out` and `lanes.told`.
+    """Write poses and rates of all lanes to `lanes.out`; write penetrations, their rates and forces to `lanes.told`.
 
     In lanes that have `reached` a sample, the force at the sample raises the peak.
     """

@@ -39,7 +39,7 @@ _DEPTH, _RATE, _CONSTANT = 5, 6, 7
 
 @kernel()
 def _list_guards(lanes, order, hysteretic) -> None:
-    """Write to `lanes.todo` a bit for each guard of a lane that is not proved to stay positive.
+    """Write to `lanes.todo` a bit for each guard of a lane that may turn negative.
 
     The guard of a pair that is off is -d. A pair that is on has the guard F / K = d + (C / K) d', or with lambda d' the
     two guards d and 1 + lambda d'. The guards of a clipped pair are d and the force with the opposite sign.
@@ -243,7 +243,7 @@ def cross(lanes, column, order, bits) -> None:
 
 @kernel()
 def _leaves(guard, i, order, h) -> bool:
-    """Return whether a penetration surely falls over the whole step."""
+    """Return whether a penetration is proved to fall over the whole step."""
     rise = 0.0
     for k in range(order, 1, -1):
         rise = (rise + k * max(guard[k, i], 0.0)) * h

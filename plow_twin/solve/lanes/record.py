@@ -53,7 +53,7 @@ LANES: Final = np.dtype(
         ("sample", "f8", (3, WIDTH)),  # sampled loads: the last sample
         ("held", "f8", (3, WIDTH)),  # load at the step's start, including the constant loads
         ("knot", "f8", _LANES_OF),  # time of the last sample
-        ("small", "f8", _LANES_OF),  # size below which a term over the longest wanted step has vanished
+        ("small", "f8", _LANES_OF),  # size of a term over the longest wanted step below which it has vanished
         ("direction", "f8", (4, WIDTH)),
         ("inverse_mass", "f8", _LANES_OF),
         ("inverse_inertia", "f8", _LANES_OF),
@@ -69,9 +69,9 @@ LANES: Final = np.dtype(
         ("harmonic", "f8", (10, WIDTH)),  # of one load: frequency, sine, cosine, amplitudes of S1, S2, M; phase
         ("size", "f8", (2, WIDTH)),  # the terms of the last two orders, as velocities
         ("step", "f8", _LANES_OF),  # step size in s
-        ("accurate", "f8", _LANES_OF),  # step size before an event ends the step
+        ("accurate", "f8", _LANES_OF),  # step size without events
         ("stop", "f8", _LANES_OF),  # time at which a step must end
-        ("whole", "f8", _LANES_OF),  # the longest step wanted
+        ("whole", "f8", _LANES_OF),  # longest wanted step in s
         ("reach", "f8", _LANES_OF),  # guards of a round: end of the interval that is searched
         ("root", "f8", _LANES_OF),  # guards of a round: first root
         ("begin", "f8", _LANES_OF),  # guards of a round: time at which the pair has parted, else 0

@@ -1,4 +1,4 @@
-"""Sine and cosine of eight numbers side by side."""
+"""Sine and cosine of eight numbers in a SIMD vector."""
 
 from __future__ import annotations
 

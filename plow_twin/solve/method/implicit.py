@@ -61,7 +61,7 @@ _GAIN = 100.0
 _NOISE = 1e-12
 #: Rounding error of a guard of the corners' grip, as a share of its largest term.
 _GUARD_NOISE = 1e-6
-#: Number of failed attempts after which the wait no longer doubles.
+#: Number of failed attempts up to which each attempt doubles the wait.
 _MOST_REFUSED = 12
 
 
@@ -395,7 +395,7 @@ def _solve(p, acts, support, state, t, h, implicit, wear, sliding, running_in) -
 
 @kernel()
 def _interpolate(values, coefficients, h, out) -> None:
-    """Write the series over a step of size h of eight polynomials from their values at the nodes.
+    """Write the series of eight polynomials, given by their values at the nodes of a step of size h.
 
     The differences from the last value are interpolated: the large coefficients would cancel the common value, which
     leaves rounding errors.
@@ -512,7 +512,7 @@ def _write_grip(p, state, h, w, implicit, seen, series) -> None:
 def _last_of_guards(p, state, w, h) -> float:
     """Return the largest share of the last term in a guard of a corner's grip.
 
-    It is relative to the guard, since even a small force decides whether a corner slips.
+    The term is compared with its guard, since even a small force decides whether a corner slips.
     """
     guard, share = w.column[0], 0.0
     for pair in range(PAIR_COUNT):

@@ -35,7 +35,7 @@ class Method(Protocol):
     """A module with these two compiled functions; this module's docstring has the rules of `lay_out`."""
 
     def own(self, parts: Parts) -> Any:
-        """Return the parts of a scene that the method is compiled for, None for a part that the scene lacks."""
+        """Return the parts of a scene for which the method is compiled, with None for each part that it lacks."""
 
     def lay_out(self, p: Params, parts: Parts, own: Any, state: State, w: Work, span: float, penetrating: bool) -> bool:
         """Lay out the next step, at most `span` s long; return False to leave it to the next method."""

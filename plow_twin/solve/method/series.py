@@ -407,8 +407,9 @@ def _turn_frame(w, k, there, c, s):
 def _seen_rates(w, k, there, turned, om, turning):
     """Return order k of the rates of the head's cosine, sine and place relative to the frame.
 
-    `turned` is the result of `_turn_frame`, R^T u and R^T w, with (R^T u)' = R^T w + omega times R^T u turned by -90
-    degrees; `turning` has the rates of the head's place relative to the ground.
+    `turned` is the result of `_turn_frame`: R^T u and R^T w for the frame's displacement u and velocity w. The rate of
+    R^T u is R^T w plus omega times R^T u turned by -90 degrees. `turning` has the rates of the head's place relative to
+    the ground.
     """
     relative = om - lane(there, SPIN)
     left = pack(om, om, relative, relative, 0.0, 0.0, 0.0, 0.0)

@@ -1,4 +1,4 @@
-"""Rest under harmonics: whether the motion of a head held by its contacts stays below the tolerance for all time.
+"""Rest under harmonics: a check that the motion of a head held by its contacts stays below the tolerance for all time.
 
 About its equilibrium such a head obeys  e'' + C e' + K e = r.  Here e is its distance from the linear response to the
 harmonics, with the angle times the radius of gyration as third place, and r is the remainder of the linearisation. The
@@ -107,7 +107,7 @@ def _answer(p, one, w, gyration):
     along_t = third * x + (b * g - a * h) * y + (a * e - b * d) * t
     size = math.sqrt(abs(along_x) ** 2 + abs(along_y) ** 2 + abs(along_t) ** 2)
     size /= abs(a * first + b * second + c * third)
-    # x K x is at most |x| times the amplitudes of the harmonic and of the inertia force
+    # x K x is at most |x| times the sum of the amplitudes of the harmonic and of the inertia force
     load = math.sqrt(abs(x) ** 2 + abs(y) ** 2 + abs(t) ** 2)
     return size, math.sqrt(load * size) + om * size
 
