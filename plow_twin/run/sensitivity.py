@@ -45,8 +45,8 @@ _SHADOW_BUDGET: Final = 10**7
 #: Tolerance of the motion along which the equations are linearised. The error of the derivatives is some 1e-6 times the
 #: growth of errors; if it exceeds `_LARGEST_ERROR`, the tolerance of the run is used.
 _EQUATIONS_TOLERANCE, _LARGEST_ERROR = 1e-6, 1e-2
-#: Number of steps before the first look at the clock, and largest number of explicit steps if implicit steps are
-#: possible.
+#: Number of steps before the first check of the time limit, and largest number of explicit steps in a scene that can
+#: need implicit steps.
 _FIRST_SLICE, _MOST_WITHOUT_IMPLICIT = 2048, 200_000
 #: Growth above which an error is no longer within ten tolerances (`docs/solver.md`).
 TRUSTED_GROWTH: Final = 1e4

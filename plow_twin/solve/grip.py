@@ -5,10 +5,10 @@ A spring and a damper connect a sticking corner to its anchor a on the wall; a s
     sticks    T = k (s - a) + c s'      while |T| <= mu_s N
     slips     T = +-mu N                while +-(k s' + c s'') >= mu N'
 
-s is the corner's place along the wall, N the normal force. While a corner slips, the anchor follows it so that spring
-and damper carry mu N. It goes on slipping as long as their force would grow at least as fast as mu N if it stuck now.
-If mu_s = mu, T and the accelerations are continuous at the change, so each pair can be decided separately. Sources:
-Cundall and Strack, Geotechnique 29 (1979) 47; Luding, Granul. Matter 10 (2008) 235, sec. 3.2.
+s is the corner's place along the wall, N the normal force. While a corner slips, the anchor follows the corner so that
+spring and damper carry mu N. The corner slips as long as the force of spring and damper would grow at least as fast as
+mu N after a stick. If mu_s = mu, T and the accelerations are continuous at the change, so each pair can be decided
+separately. Sources: Cundall and Strack, Geotechnique 29 (1979) 47; Luding, Granul. Matter 10 (2008) 235, sec. 3.2.
 """
 
 from __future__ import annotations
