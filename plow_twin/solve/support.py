@@ -28,7 +28,7 @@ FRAME_X, FRAME_Y, FRAME_VX, FRAME_VY, SPIN, SEEN_COS, SEEN_SIN, FRAME_THETA = ra
 
 @kernel()
 def to_ground(y, frame, out) -> None:
-    """Convert the head's body coordinates y from relative to the frame to relative to the ground (`out`).
+    """Write the head's body coordinates relative to the ground to `out`; y has them relative to the frame.
 
     `frame` is the frame's state, shape (6,).
     """

@@ -39,8 +39,8 @@ from plow_twin.solve.support import (
 
 #: A term has vanished if it is below this share of the admissible size of the last order.
 _VANISHED = 0.4
-#: For the rate of each state component: the component that omega multiplies (S1 in lanes 4 and 7), and the component
-#: that is its rate.
+#: Lanes of two factors in the state's rates: the components that are multiplied by omega (lanes 4 and 7 hold S1), and
+#: the components that are rates of other components.
 _turned = permutation(Y, X, VY, VX, COS, SIN, COS, SIN)
 _rates_of = permutation(VX, VY, VX, VY, OMEGA, COS, SIN, OMEGA)
 
