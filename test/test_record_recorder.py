@@ -318,6 +318,32 @@ def test_an_incomplete_ring_is_not_written(tmp_path: Path, monkeypatch: pytest.M
     assert os.listdir(tmp_path / "new") == []
 
 
+def test_a_mark_at_the_news_of_a_lost_one_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    twin = Twin(load_scene(scene_path("paper")), excitation="sampled")
+    folder, write, failures = tmp_path / "ring", ring.write_metadata, [OSError(28, "No space left on device")]
+
+    def write_or_fail(*arguments: Any, **options: Any) -> None:
+        if failures:
+            raise failures.pop()
+        write(*arguments, **options)
+
+    monkeypatch.setattr(ring, "write_metadata", write_or_fail)
+    recorder = Recorder(
+        folder, RunHeader(dump_scene(twin.scene)), flush_period_s=0.01, ring_s=5.0,
+        on_error=lambda text: recorder.mark(),
+    )  # fmt: skip
+    session = Session(twin, on_entry=recorder.journal)
+    session.start()
+    recorder.mark()
+    give_up = time.monotonic() + 60.0
+    while recorder.counters.marks == 0 and time.monotonic() < give_up:
+        if recorder.snapshot_wanted:
+            recorder.journal(session.renew())
+        time.sleep(0.01)
+    recorder.close()
+    assert (recorder.counters.marks, recorder.counters.marks_lost, folder.exists()) == (1, 1, True)
+
+
 def test_a_ring_keeps_the_last_seconds_and_writes_them_at_a_mark(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

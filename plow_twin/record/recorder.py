@@ -208,7 +208,7 @@ class Recorder:
         with self._lock:
             lost = dict(self._lost)
             error = self._error or self._mark_error
-        marks = self._marks, self._marks_lost
+            marks = self._marks, self._marks_lost
         return RecorderCounters(self._written, self._queued, self._writer.bytes_written, lost, error, *marks)
 
     def mark(self) -> Path | None:
@@ -470,15 +470,19 @@ class Recorder:
         self._writer.split(lost, self._limits[2])
         self._part_since = time.monotonic()
         if self._ring is not None and self._mark is not None:
+            error = None
             try:
                 self._dump(self._ring, self._mark, lost)
-                self._marks += 1
-            except (OSError, RecordingError) as error:  # the ring stays in memory
-                self._marks_lost += 1
-                self._mark_error = f"{self._mark}: the last {self._ring_s:g} s not written: {error}"
-                if self._on_error is not None:
-                    self._on_error(self._mark_error)
-            self._mark = None
+            except (OSError, RecordingError) as failed:  # the ring stays in memory
+                error = f"{self._mark}: the last {self._ring_s:g} s not written: {failed}"
+            with self._lock:  # who sees the count may mark again
+                self._mark = None
+                if error is None:
+                    self._marks += 1
+                else:
+                    self._marks_lost, self._mark_error = self._marks_lost + 1, error
+            if error is not None and self._on_error is not None:
+                self._on_error(error)
 
     def _dump(self, ring: RingWriter, folder: Path, lost: Mapping[str, int]) -> None:
         from plow_twin.record.writer import in_free_folder
