@@ -118,7 +118,7 @@ def test_block_between_four_walls_with_a_turned_sensor_is_estimated() -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "word"), [((slice(0, 5), slice(None)), "whole ones"), ((slice(None), 2), "whole ones")]
+    ("change", "word"), [((slice(0, 5), slice(None)), "complete poses"), ((slice(None), 2), "complete poses")]
 )
 def test_poses_that_cannot_do_are_named(drops, change, word) -> None:
     pose = drops.pose[0] - [0.0, 1.0, 0.0]

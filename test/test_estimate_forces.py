@@ -99,7 +99,7 @@ def test_forces_of_another_law_make_the_model_suspect(truth: Truth, fitted: tupl
     force += 1e3 * np.random.default_rng(0).standard_normal(measured.shape)
     found = estimating._with_forces(result, problem, fit, ContactForces.of(t, force)[0], 1.0)
     assert (found.model, found.sensor, found.vertical_state) == ("suspect", "ok", State.WITHDRAWN)
-    assert found.stiffness == result.stiffness and "are left over" in found.reasons[-1]
+    assert found.stiffness == result.stiffness and "remain unexplained" in found.reasons[-1]
 
 
 def test_the_law_s_forces_are_those_of_the_solver() -> None:

@@ -253,7 +253,7 @@ def test_a_path_that_does_not_come_to_its_end_is_no_limit_never_reached() -> Non
     found = forecast(tight, Plan(0.002, 0.034, 1e3, draws=50))
     assert 0.0 < (found.quantile(0.5) or 0.0) < 1e3
     assert forecast(scene, Plan(0.02, 0.02, 1e3, stop_h=0.0, draws=50)).as_dict()["probability_before_stop"] == 1.0
-    with pytest.raises(LifeError, match="mm at the end of the path, expected ones with which the model runs"):
+    with pytest.raises(LifeError, match="mm at the end of the path, expected clearances with which the model runs"):
         mean_forces(scene, np.full(8, 0.5))
 
 
@@ -268,7 +268,7 @@ def test_a_clearance_hardly_known_is_not_below_zero() -> None:
         with pytest.raises(LifeError, match="expected a finite number >= 0"):
             Plan(*numbers)
     for facts in ({}, {"horizontal": 3}, {"horizontal": {"state": "fine"}}):
-        with pytest.raises(LifeError, match="expected what `plow-twin estimate --json` prints"):
+        with pytest.raises(LifeError, match="expected the output of `plow-twin estimate --json`"):
             with_estimate(scene, facts)
 
 
@@ -323,7 +323,7 @@ def test_unusable_input_of_a_forecast_is_refused_and_not_left_out(
         ("[" * 200_000, "expected JSON of an estimate"),
         (json.dumps({"horizontal": [1]}), "estimate: horizontal: got [1], expected what `plow-twin estimate"),
         (json.dumps({"horizontal": whole, "vertical": whole | {"state": "withdrawn"}}), "a withdrawn vertical"),
-        (json.dumps({"horizontal": whole, "vertical": whole | {"p05_m": float("nan")}}), "expected finite ones"),
+        (json.dumps({"horizontal": whole, "vertical": whole | {"p05_m": float("nan")}}), "expected finite values"),
     ):
         found.write_text(text)
         assert expected in " ".join(said("--estimate", str(found)).split())

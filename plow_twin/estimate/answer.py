@@ -1,4 +1,4 @@
-"""Answers from one window: the estimate and, on request, forces with intervals and the time to a limit."""
+"""Answers for one window: the estimate and, on request, forces with intervals and the time until a limit is reached."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from plow_twin.estimate.result import Estimate, State
 from plow_twin.estimate.window import Window
 from plow_twin.model.scene import Scene, Table
 
-#: Derived: load periods in which members forget their starts, and after which a compared motion counts.
+#: Derived: after one load period the members have forgotten their initial states.
 _SETTLE_PERIODS: Final = 1.0
-#: Derived: `tuning.LOAD_KNOT` is half the distance of 400 knots in the paper's period; shorter periods also have 400.
+#: Derived: a load period has at least 400 knots; `tuning.LOAD_KNOT` gives the paper's period about twice as many.
 _KNOT_SHARE: Final = 1.0 / 400.0
 
 
@@ -26,9 +26,9 @@ _KNOT_SHARE: Final = 1.0 / 400.0
 class Asked:
     """The answers to give beside the estimate.
 
-    members : twins that the forces' intervals are drawn from; 0: no forces
-    span_s : length of the end of a window for which forces are given [s]
-    plan : limits of the clearances; None: no forecast
+    members : number of twins from which the intervals of the forces are computed; 0 for no forces
+    span_s : duration at the end of a window for which forces are given [s]
+    plan : limits of the clearances; None for no forecast
     """
 
     members: int = 0
@@ -40,7 +40,8 @@ class Asked:
 class Answer:
     """The estimate, the guess for the next window, and the other requested answers, as JSON values.
 
-    also : `forces` and `forecast` on request; null, with `<name>_error`, where there is no answer
+    also : `forces` and `forecast` if requested; if one cannot be computed, it is null and `<name>_error` states the
+        reason
     """
 
     estimate: Estimate
@@ -72,7 +73,7 @@ def answer(scene: Scene, window: Window, guess: Guess, asked: Asked) -> Answer:
 
 def _forces(scene: Scene, result: Estimate, load: Load, asked: Asked) -> dict[str, Any]:
     if State.PRIOR in (result.horizontal_state, result.vertical_state):
-        raise ForcesError("estimate: got the prior, expected one to draw from")
+        raise ForcesError("estimate: got only the prior, expected an estimated clearance")
     period = load.period()
     settle, end = _SETTLE_PERIODS * period, float(load.t[-1])
     felt = followed(load.between(end - asked.span_s - settle, end), period)
@@ -87,24 +88,24 @@ def followed(load: Load, period: float) -> Load:
 
 
 def forecast_from(scene: Scene, result: Estimate, load: Load, plan: Plan) -> dict[str, Any]:
-    """Return the forecast from an estimate on, for JSON.
+    """Return the forecast that starts from an estimate, for JSON.
 
-    The load continues as in the window, with the estimated gains; as in the scene if the window is too short for a
-    period.
+    The forecast continues the window's load with the estimated gains. If the window is too short for a period, it uses
+    the scene's load.
 
     Raises
     ------
     LifeError
-        For a withdrawn estimate; where the scene has no wear or does not travel.
+        If the estimate is withdrawn, or if the scene has no wear or does not travel.
     """
     now, deviation = with_estimate(scene, result.as_dict())
     return forecast(under_load(now, result, load), plan, deviation).as_dict()
 
 
 def under_load(scene: Scene, result: Estimate, load: Load) -> Scene:
-    """Return the scene with the load of a window, times the estimated gains, in place of its own.
+    """Return the scene with its loads replaced by a window's load times the estimated gains.
 
-    Its own load stays where the window is too short for a period.
+    If the window is too short for a period, the scene is returned unchanged.
     """
     gains = [1.0 if gain is None else gain.mean for gain in (result.gain_fx, result.gain_fy, result.gain_m)]
     felt = load.thinned()

@@ -1,7 +1,7 @@
-"""Normal equations of swings: block tridiagonal with a border of the shared unknowns, solved in linear time.
+"""Normal equations of the swings, block tridiagonal with a border of shared unknowns, solved in linear time.
 
-Each swing has six unknowns and is linked to its neighbours at most, so the swings' part is factorised as a band matrix
-(Cholesky) and the border by its Schur complement.
+Each swing has six unknowns and is linked only to its neighbours. The part of the swings is therefore factorised as a
+band matrix (Cholesky), and the border by its Schur complement.
 
 Reference: Golub and Van Loan, Matrix Computations, ch. 4.3 and 3.2.6.
 """
@@ -16,17 +16,17 @@ from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_bande
 
 Array = NDArray[np.float64]
 
-#: Definition: unknowns of one swing, pose and rate at its start.
+#: Definition: number of unknowns of one swing, the pose and its rate at the start.
 OWN = 6
 
 
 @dataclass(frozen=True, eq=False)
 class Arrow:
-    """A symmetric matrix of k shared unknowns and six of each of s swings.
+    """A symmetric matrix for k shared unknowns and the six unknowns of each of s swings.
 
-    border : (k, k)
-    coupling : (6 s, k) of the swings' unknowns with the shared unknowns
-    bands : (12, 6 s) diagonals of the rest from the main one down, as LAPACK has them
+    border : (k, k) block of the shared unknowns
+    coupling : (6 s, k) block between the swings' unknowns and the shared unknowns
+    bands : (12, 6 s) main diagonal and subdiagonals of the swings' block, in LAPACK's band storage
     """
 
     border: Array
@@ -40,7 +40,7 @@ class Arrow:
         return Arrow(np.zeros((shared, shared)), np.zeros((size, shared)), np.zeros((2 * OWN, size)))
 
     def add(self, swing: int, block: Array) -> None:
-        """Add a block of the shared unknowns and of consecutive swings from `swing` on."""
+        """Add a block for the shared unknowns and the consecutive swings that begin with `swing`."""
         shared = len(self.border)
         self.border[:] += block[:shared, :shared]
         first = OWN * swing
@@ -54,7 +54,7 @@ class Arrow:
         return np.concatenate([np.diag(self.border), self.bands[0]])
 
     def plus(self, diagonal: Array) -> Arrow:
-        """Return the matrix with something added to its main diagonal."""
+        """Return the matrix with `diagonal` added to its main diagonal."""
         shared = len(self.border)
         bands = self.bands.copy()
         bands[0] += diagonal[shared:]
@@ -66,7 +66,7 @@ class Arrow:
         Raises
         ------
         numpy.linalg.LinAlgError
-            For a matrix that is not positive definite.
+            If the matrix is not positive definite.
         """
         band = cholesky_banded(self.bands, lower=True, check_finite=False)
         eliminated = cho_solve_banded((band, True), self.coupling, check_finite=False)
@@ -76,7 +76,10 @@ class Arrow:
 
 @dataclass(frozen=True, eq=False)
 class Factor:
-    """Cholesky factors of the swings' part and of the Schur complement; `eliminated` (6 s, k): swings^-1 coupling."""
+    """Cholesky factors of the swings' block and of the Schur complement.
+
+    `eliminated`, shape (6 s, k), is the inverse of the swings' block times the coupling.
+    """
 
     band: Array
     eliminated: Array
@@ -91,6 +94,6 @@ class Factor:
         return np.concatenate([first, own])
 
     def covariance(self) -> Array:
-        """Return the part of the inverse that belongs to the shared unknowns, shape (k, k)."""
+        """Return the inverse's block for the shared unknowns, shape (k, k)."""
         inverse: Array = cho_solve((self.schur, True), np.eye(len(self.schur)))
         return 0.5 * (inverse + inverse.T)

@@ -1,10 +1,11 @@
-"""Clearances around a block (`carries: corners`) from its impacts: where two flights meet, a corner meets its wall.
+"""Clearances around a block (`carries: corners`), computed from the places of its impacts.
 
-Between impacts the block flies: under load and gravity alone, up to drag and errors of the load. The flights before and
-after an impact are extrapolated to the time at which they are nearest to each other. At that time the deepest corner in
-the direction of the push is at the wall, or beyond it by the penetration. The places of all impacts are linear in the
-clearances, in the sensor's bias and lever arm, and in the yield of the contact. These are estimated together. The
-errors of the impacts have a Student-t distribution of unknown scale, so the intervals follow from the impacts' scatter.
+Between impacts the block flies: apart from drag and errors of the load, only load and gravity move it. The flights
+before and after an impact are extrapolated to the time at which they are nearest to each other. At that time the
+deepest corner is at the wall that pushed the block, or beyond the wall by the penetration. The places of all impacts
+are linear in the clearances, in the sensor's bias and lever arm, and in the compliance of the contact. All of them are
+estimated together. The errors of the impacts have a Student-t distribution of unknown scale, so the intervals follow
+from the impacts' scatter.
 
 Reference: Lange, Little and Taylor, J. Am. Stat. Assoc. 84 (1989) 881 (Student-t errors by reweighting).
 """
@@ -38,14 +39,14 @@ WALLS: Final = {
     "top": (GY, np.array([0.0, 1.0])),
     "bottom": (GY, np.array([0.0, -1.0])),
 }
-#: Derived: fewest rows of a flight, four for the three coefficients of a parabola. Bound: most rows of a fit.
+#: Derived: fewest rows of a flight, one more than the three coefficients of a parabola. Bound: most rows of a fit.
 _FLIGHT_ROWS: Final = (4, 9)
 #: Derived: degrees of freedom of the Student-t likelihood, the value that Lange et al. recommend.
 _FREEDOM: Final = 4.0
-#: Bound: scales of the likelihood on the grid, and rounds of reweighting for each scale.
+#: Bound: number of scales on the grid of the likelihood, and of reweighting rounds for each scale.
 _SCALES, _ROUNDS = 40, 30
-#: Definition: places in the vector of the linear problem: clearances, bias of x, y and theta, lever arm, penetration
-#: over that with the scene's stiffness.
+#: Definition: the unknowns of the linear problem are the clearances, the bias of x, y and theta, the lever arm, and the
+#: relative change of the penetration from its value with the scene's stiffness.
 _CLEARANCES, _BIAS, _LEVER, _DEPTH, _SIZE = slice(0, 2), slice(2, 5), slice(5, 7), 7, 8
 
 
@@ -60,13 +61,13 @@ class Impact:
     wall : str
         A name of `WALLS`.
     distance : float
-        Distance in m of the wall from the middle of the guide, taken as hard.
+        Distance in m of the wall from the middle of the guide, if the wall is rigid.
     deeper : float
-        The part of it that is penetration with the scene's stiffness, in m.
+        Part of this distance, in m, that is penetration if the wall has the scene's stiffness.
     restitution : float
-        Normal speed of the corner after the impact over that before.
+        Normal speed of the corner after the impact, divided by its speed before.
     gained : float
-        Kinetic energy after the impact over that before.
+        Kinetic energy after the impact, divided by the energy before.
     turned : ndarray, shape (2,)
         The wall's normal in the block's axes.
     arm : float
@@ -86,15 +87,16 @@ class Impact:
 def estimate_block(scene: Scene, load: Load, poses: Poses, known: Estimate) -> Estimate:
     """Estimate the clearances around a block from the places of its impacts.
 
-    Where an axis has impacts on one wall only, the poses count as measured from its middle, and its bias is None. A
-    clearance whose deviation exceeds half of the prior's is not observable; above 1 mm it is rough.
+    If an axis has impacts on one wall only, the poses are taken to be measured from the middle, and the bias of this
+    axis is None. A clearance is not observable if its deviation exceeds half of the prior deviation. An observable
+    clearance is rough if its deviation exceeds 1 mm.
 
     Parameters
     ----------
     scene : Scene
         A scene with `carries: corners`.
     load : Load
-        The load believed.
+        The believed load.
     poses : Poses
         The measured poses, in the axes of the guide.
     known : Estimate
@@ -105,7 +107,10 @@ def estimate_block(scene: Scene, load: Load, poses: Poses, known: Estimate) -> E
     level = noise_level(poses.q)
     unseen = State.NOT_OBSERVABLE
     if len(poses.t) < 2 * _FLIGHT_ROWS[0] or not level.all():
-        why = f"poses: got {len(poses.t)} whole ones, noise {level.tolist()}, expected {2 * _FLIGHT_ROWS[0]} and noise"
+        why = (
+            f"poses: got {len(poses.t)} complete poses with noise {level.tolist()}, expected at least "
+            f"{2 * _FLIGHT_ROWS[0]} with some noise in each component"
+        )
         return replace(known, horizontal_state=unseen, vertical_state=unseen, reasons=(why,))
     found, contacts = impacts(scene, load, poses, level)
     why = _unfit(found, contacts)
@@ -129,7 +134,7 @@ def estimate_block(scene: Scene, load: Load, poses: Poses, known: Estimate) -> E
             most = f"{tuning.OBSERVED_SHARE:.0%}"
             reasons.append(f"{name}: {counts} leave {share:.0%} of the prior's deviation, expected at most {most}")
         elif not all(count.values()):
-            reasons.append(f"{name}: {counts}: the poses are taken to be measured from the middle")
+            reasons.append(f"{name}: {counts}, so the poses are taken to be measured from the middle")
         if observed and not fine:
             got = f"a deviation of {1e3 * float(deviation[axis]):.3g} mm, expected at most {1e3 * tuning.OBSERVED:g} mm"
             reasons.append(f"{name}: rough, {counts} leave {got}")
@@ -150,10 +155,10 @@ def estimate_block(scene: Scene, load: Load, poses: Poses, known: Estimate) -> E
 
 
 def _unfit(found: list[Impact], contacts: int) -> str:
-    """Return why impacts do not determine the walls; empty if they do."""
+    """Return the reason why the impacts do not determine the walls; empty if they do."""
     gained = sum(one.gained >= tuning.GAINED for one in found)
     if gained > tuning.IMPACT_SHARE * len(found):
-        return f"{gained} of {len(found)} impacts return more energy than they had: the poses are too far apart in time"
+        return f"{gained} of {len(found)} impacts add energy: the poses are too far apart in time"
     if len(found) < tuning.IMPACT_SHARE * contacts:
         return (
             f"{len(found)} of {contacts} contacts are impacts between two flights, expected at least "
@@ -163,7 +168,7 @@ def _unfit(found: list[Impact], contacts: int) -> str:
 
 
 def _on_walls(scene: Scene, every: list[Impact], known: Estimate) -> tuple[list[Impact], list[str]]:
-    """Return the impacts at possible places of the walls, and a reason for each wall without enough impacts."""
+    """Return the impacts at plausible places of the walls, and a reason for each wall with impacts left out."""
     met: list[Impact] = []
     reasons = []
     for wall, (axis, _) in WALLS.items():
@@ -189,9 +194,10 @@ def _solve(scene: Scene, met: list[Impact], known: Estimate, level: Array) -> tu
     prior = np.zeros(_SIZE)
     prior[_CLEARANCES] = known.horizontal.deviation, known.vertical.deviation
     prior[_BIAS] = np.array([quantity.deviation for quantity in QUANTITIES])[BIAS]
-    # as for a machine of the paper's size
+    # the prior of the paper's machine, scaled to the machine's size
     prior[_LEVER] = UNSTATED["lever_x"] * geometry.half_diagonal(scene) / PAPER_LENGTH
-    # the prior is on the logarithm of the stiffness, of which the penetration is a power: the 95 % points agree
+    # the prior is for the logarithm of the stiffness, and the penetration is a power of the stiffness; this deviation
+    # keeps the 95 % point
     spread = deviation_of(scene, "contact.stiffness") / (scene.contact.exponent + 1.0)
     prior[_DEPTH] = math.expm1(NORMAL_P95 * spread) / NORMAL_P95
     for axis in (GX, GY):
@@ -208,9 +214,9 @@ def _solve(scene: Scene, met: list[Impact], known: Estimate, level: Array) -> tu
         design[row, axis] = 0.5
         design[row, _BIAS] = *normal, one.arm
         design[row, _LEVER] = one.turned
-    # a number held at zero takes no part
+    # an unknown with a prior deviation of zero keeps its value
     free = prior > 0.0
-    # corners are not points: each impact is off by at least the uncertainty of the frame
+    # corners are not points, so each impact is wrong by at least the uncertainty of the frame
     least = max(float(level[:2].max()), *(deviation_of(scene, f"frame.{side}") for side in ("width_m", "height_m")))
     scales = np.geomspace(least, max(float(prior[_CLEARANCES].max()), 2.0 * least), _SCALES)
     step, deviation = np.zeros(_SIZE), np.zeros(_SIZE)
@@ -219,10 +225,10 @@ def _solve(scene: Scene, met: list[Impact], known: Estimate, level: Array) -> tu
 
 
 def _student(design: Array, off: Array, prior: Array, scales: Array) -> tuple[Array, Array]:
-    """Return mean and deviations of x in off = design x + errors, x normal with deviations `prior`, errors Student-t.
+    """Return mean and deviations of x in off = design x + errors, with a normal prior of x and Student-t errors.
 
-    The scale is log-uniform over `scales`: for each one the mode by reweighting, its covariance, and its evidence by
-    Laplace's approximation.
+    The scale of the errors is log-uniform over `scales`. For each scale, reweighting gives the mode and its covariance,
+    and Laplace's approximation gives the evidence. The results of the scales are averaged with the evidence as weight.
     """
     modes, variances, log = [], [], []
     precision = np.diag(prior**-2.0)
@@ -250,7 +256,7 @@ def impacts(scene: Scene, load: Load, poses: Poses, level: Array) -> tuple[list[
     Parameters
     ----------
     scene, load : Scene, Load
-        The block, and the load believed.
+        The block, and the believed load.
     poses : Poses
         Whole poses.
     level : ndarray, shape (3,)
@@ -281,7 +287,7 @@ def impacts(scene: Scene, load: Load, poses: Poses, level: Array) -> tuple[list[
 
 
 def _runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Return first and last place of each run of true flags."""
+    """Return first and last index of each run of true flags."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]])))
     return [(int(first), int(last) - 1) for first, last in edges.reshape(-1, 2)]
 
@@ -295,14 +301,14 @@ def _of_mass(scene: Scene, q: Array) -> Array:
 
 
 def _free_acceleration(scene: Scene, load: Load, t: Array) -> Array:
-    """Return the load with the weight at some times, shape (n, 3), in N, N, N m."""
+    """Return load plus weight at the times `t`, shape (n, 3), in N, N, N m."""
     wrench = np.stack([np.interp(t, load.t, column) for column in load.wrench.T], axis=1)
     weight = scene.head.mass_kg * scene.gravity.acceleration_m_s2
     return wrench - weight * np.array([0.0, 1.0, scene.gravity.arm_m])
 
 
 def _kinks(t: Array, q: Array, free: Array, level: Array, unknown: Array) -> list[tuple[int, int]]:
-    """Return first and last row of each stretch of rows that do not accelerate as in free flight."""
+    """Return first and last row of each stretch whose acceleration is not that of a free flight."""
     one, two = np.diff(t)[:-1, None], np.diff(t)[1:, None]
     way = np.diff(q, axis=0)
     acceleration = 2.0 * (way[1:] / two - way[:-1] / one) / (one + two)
@@ -316,14 +322,14 @@ def _flight(t: Array, q: Array, free: Array, level: Array, unknown: Array) -> Ar
     basis = np.vander(t, 3, increasing=True)
     out = np.zeros((3, 3))
     for j in range(3):
-        # the acceleration is known up to its deviation
+        # the last row is the prior of the acceleration
         rows = np.vstack([basis / level[j], [0.0, 0.0, 2.0 / unknown[j]]])
         out[j] = np.linalg.lstsq(rows, np.append(q[:, j] / level[j], free[j] / unknown[j]), rcond=None)[0]
     return out
 
 
 def _meeting(scene: Scene, inertia: Array, flights: list[Array], room: float) -> Impact | None:
-    """Return the impact between two flights; None where they do not meet within `room` s, or no corner is pushed."""
+    """Return the impact between two flights; None if they do not meet within `room` s or no corner is pushed."""
     apart = flights[1] - flights[0]
     change = apart[:, 1]
     t = -float((inertia * apart[:, 0] * change).sum() / (inertia * change * change).sum())
@@ -353,17 +359,18 @@ def _meeting(scene: Scene, inertia: Array, flights: list[Array], room: float) ->
 
 
 def _corners(scene: Scene) -> Array:
-    """Return the corners from the centre of mass in the block's axes, shape (2, 4)."""
+    """Return the corners relative to the centre of mass, in the block's axes, shape (2, 4)."""
     corners = np.stack(geometry.corner_positions(scene))[:, ::2]
     found: Array = corners - np.array(scene.head.com_offset_m)[:, None]
     return found
 
 
 def _deeper(scene: Scene, mass: float, before: float, after: float) -> float:
-    """Return how far behind the wall two flights meet that a compliant contact joins, in m.
+    """Return how far beyond the wall, in m, two flights meet that a compliant contact connects.
 
-    Straight lines with the normal speeds v and e v before and after meet at v e T / (1 + e). The contact lasts
-    T = pi u / v with the largest penetration u (exact for a spring).
+    The corner approaches with the normal speed v, stays in contact for the time T and leaves with e v. The straight
+    lines of the two flights then meet v e T / (1 + e) beyond the wall. With the largest penetration u, T = pi u / v,
+    which is exact for a spring.
     """
     exponent = scene.contact.exponent
     largest = ((exponent + 1.0) * mass * before**2 / (2.0 * scene.contact.stiffness)) ** (1.0 / (exponent + 1.0))

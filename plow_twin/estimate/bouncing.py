@@ -1,10 +1,10 @@
-"""Clearances of a hard guide: features of the whole motion are compared, not the pose at each moment.
+"""Clearances with a hard contact, from features of the whole motion instead of the pose at each moment.
 
 Behind a hard contact the head bounces many times before it rests, so its pose at a moment cannot be predicted. The
-reach of the corners, and the scatter of the pose at each phase of the load, can be. Motions with drawn stiffness,
-damping and load gains are simulated and observed through the sensor's noise and gaps. A regression among those near the
-measured motion gives the difference between clearance and reach (approximate Bayesian computation with local-linear
-adjustment); its residuals give the interval.
+reach of the corners and the scatter of the pose at each phase of the load can be predicted. Motions with randomly drawn
+stiffness, damping and load gains are simulated and observed with the sensor's noise and gaps. A regression among the
+simulated motions near the measured one gives the difference between clearance and reach (approximate Bayesian
+computation with local-linear adjustment); its residuals give the interval.
 
 References: Beaumont, Zhang and Balding, Genetics 162 (2002) 2025; Fearnhead and Prangle, J. R. Stat. Soc. B 74 (2012)
 419; Wood, Nature 466 (2010) 1102; Blum and Francois, Stat. Comput. 20 (2010) 63.
@@ -32,35 +32,35 @@ from plow_twin.model import geometry
 
 Array = NDArray[np.float64]
 
-#: Derived: tried biases of theta in rad, eight deviations of the prior to both sides, and the range of the parabola
-#: about the best bias, three quarters of their distance.
+#: Derived: biases of theta that are tried, in rad, up to eight prior deviations to both sides. A parabola refines the
+#: best bias; its range to both sides is three quarters of their spacing.
 _TURNS: Final = np.linspace(-0.16, 0.16, 81)
 _FINEST_TURN: Final = 3e-3
 _NEAR_TURNS: Final = np.linspace(-_FINEST_TURN, _FINEST_TURN, 5)
-#: Bound: rows in which a bias is searched, and in the last part of the search.
+#: Bound: most rows in the search for a bias, and in its refinement.
 _MOST_ROWS, _MOST_NEAR_ROWS = 2000, 1200
 #: Derived: the mean of nine values has a third of their scatter.
 _FEWEST_OF_PHASE = 9
-#: Derived: delays in s of the measured path (two deviations of the prior to both sides) and of the drawn paths (a tenth
-#: as far), and the index of zero delay among the latter.
+#: Derived: delays in s that are tried for the measured path, up to two prior deviations to both sides, and for the
+#: drawn paths, up to a tenth of that. `_NO_LAG` is the index of zero delay among the delays of drawn paths.
 _LAGS_S: Final = np.linspace(-0.1, 0.1, 81)
 _OF_DRAWN_S: Final = np.linspace(-0.01, 0.01, 9)
 _NO_LAG = len(_OF_DRAWN_S) // 2
-#: Derived: powers of two, the distances in rows over which changes of pose and reaches are taken; the second also for
-#: each phase of the load.
+#: Derived: distances in rows, powers of two, over which changes are taken: of pose and reach in the whole motion, and
+#: of the pose at each phase of the load.
 _CHANGES: Final = (1, 2, 4, 8, 16, 32)
 _CHANGES_BY_PHASE: Final = (1, 4)
-#: Definition: the sides of the frame in a scene.
+#: Definition: paths of the frame's sides in a scene.
 _SIDES: Final = ("frame.width_m", "frame.height_m")
-#: Guard: a square that counts as zero, in m2 or rad2.
+#: Guard: squared scatter, in m2 or rad2, that keeps logarithms and quotients finite.
 _NO_SCATTER = 1e-14
-#: Bound: work of a longer motion, over the work of ten load periods.
+#: Bound: largest work for a motion, as a multiple of the work for ten load periods.
 _LONGER = 2.0
-#: Guard: bounds of the penetrations in m that are drawn for a hard and for a firm contact.
+#: Guard: smallest and largest penetration in m that is drawn for a hard and for a firm contact.
 _HARD_BOUNDS, _FIRM_BOUNDS = (8e-7, 6e-4), (2e-6, 2e-2)
-#: Bound: corrections of a draw's noise.
+#: Bound: number of corrections of a draw's noise.
 _NOISE_ROUNDS = 3
-#: Derived: fewest draws, more than the twenty features of a regression; fewest poses with a 99 % quantile.
+#: Derived: fewest draws for a regression with twenty features; fewest poses for a 99 % quantile.
 _FEWEST, _FEWEST_WHOLE = 30, 100
 
 
@@ -68,19 +68,20 @@ _FEWEST, _FEWEST_WHOLE = 30, 100
 class Bounced:
     """Result of a comparison.
 
-    clearance, clearance_deviation : (2,) in m; infinite where it could not be found
-    bias : (3,) of x, y in m and theta in rad with its deviation
-    ln_penetration, ln_damping : mean and standard deviation (of m under the reference force; the latter as `Unknowns`)
+    clearance, clearance_deviation : (2,) in m
+    bias, bias_deviation : (3,) of x, y in m and theta in rad
+    ln_penetration : mean and standard deviation of the logarithm of the penetration in m under the reference force
+    ln_damping : mean and standard deviation of the unknown for the damping, as in `Unknowns`
     noise : (3,) standard deviation of the measurements
-    distance : of the measured motion from nearby drawn motions, over the distance of drawn motions from each other
-    path : distance of mean and scatter of the pose over the load's period from the prediction by the drawn motions, as
-        as a normal deviate among the distances of the drawn motions
-    law : likeness of the motion to motions of another contact law, as a normal deviate among motions of the law
+    distance : distance of the measured motion from nearby drawn motions, relative to the distances among drawn motions
+    path : distance of the measured path (mean and scatter of the pose over the load's period) from its prediction by
+        the drawn motions, as a normal deviate among the same distances of the drawn motions
+    law : likeness of the motion to motions under another contact law, as a normal deviate among motions under the
         believed law; 0 if no other law is known
     odds : log odds of the other law; minus infinity if no other law is known
-    unseen : (2,) deviation of the clearances in m due to sides of the frame and theta's scale, which the motion does
-    not show
-    rounded : (2,) by how much corners rounded by `priors.ROUNDING` make them too large, in m
+    unseen : (2,) deviation of the clearances in m due to errors of the frame's sides and of theta's scale, which the
+        motion does not show
+    rounded : (2,) excess of the clearances in m if the frame's corners are rounded by `priors.ROUNDING`
     """
 
     clearance: Array
@@ -99,19 +100,19 @@ class Bounced:
 
 
 def bounces(unknowns: Unknowns, poses: Poses) -> bool:
-    """Return whether the contact is visibly so hard that the comparison is the right method."""
+    """Return whether the motion shows a contact so hard that whole motions must be compared."""
     return _reach_noise(unknowns, _whole(poses)) < tuning.POSSIBLE and _is_narrow(unknowns, poses)
 
 
 def _is_narrow(unknowns: Unknowns, poses: Poses) -> bool:
-    """Return whether the head stops at one place, within the noise: the walls do not yield."""
+    """Return whether the head always stops at the same place up to noise, so that the walls do not yield."""
     q = _whole(poses)
     reach = _reach(unknowns, q)
     return bool(np.median(reach[2] - reach[0]) < max(tuning.NARROW * _reach_noise(unknowns, q), tuning.FITTED))
 
 
 def _whole(poses: Poses) -> Array:
-    """Return the poses with all components measured; where these are few, all poses, bridged by straight lines."""
+    """Return the complete poses or, if they are few, all poses with gaps bridged by straight lines."""
     whole = np.isfinite(poses.q).all(axis=1)
     return poses.q[whole] if whole.sum() > _FEWEST_WHOLE else filled(poses)
 
@@ -123,10 +124,11 @@ def _reach_noise(unknowns: Unknowns, q: Array) -> float:
 
 
 def bias_of_hard(unknowns: Unknowns, poses: Poses) -> Array:
-    """Return the bias of a sensor behind a hard contact, x and y in m, theta in rad; zeros where the contact is soft.
+    """Return the sensor's bias of x and y in m and theta in rad if the contact is hard; zeros if it is soft.
 
-    Both corners that touch a hard wall find it at the same place; a biased theta shows two places. The bias is that
-    with which the farthest reaches lie closest together. When the head turns, a bias of y adds to its reach along x.
+    A hard wall stops both corners at the same place; with a biased theta the poses show two places. The bias of theta
+    is therefore chosen so that the farthest reaches lie closest together. The biases of x and y are removed first,
+    because they change the reaches of a turned head.
     """
     q = _whole(poses)
     bias = np.zeros(3)
@@ -138,7 +140,7 @@ def bias_of_hard(unknowns: Unknowns, poses: Poses) -> Array:
 
 
 def _near_bias(unknowns: Unknowns, q: Array) -> Array:
-    """Return a small bias, shape (3,), that is also estimated for drawn motions, so that its error is known."""
+    """Return a small bias, shape (3,); the same estimate on drawn motions shows its error."""
     q = _few(q, _MOST_NEAR_ROWS)
     bias = np.zeros(3)
     for _ in range(2):
@@ -151,18 +153,18 @@ def _near_bias(unknowns: Unknowns, q: Array) -> Array:
 
 
 def _few(q: Array, most: int) -> Array:
-    """Return every n-th row, at most `most`."""
+    """Return every n-th row, at most `most` rows."""
     return q[:: len(q) // most + 1]
 
 
 def _off_centre(reach: Array) -> Array:
-    """Return the offset of the middle between opposite reaches (right, left, top, bottom), shape (2,), in m."""
+    """Return half the difference of opposite reaches, left minus right and bottom minus top, shape (2,), in m."""
     right, left, top, bottom = reach
     return 0.5 * np.array([left - right, bottom - top])
 
 
 def _widths(unknowns: Unknowns, q: Array, turns: Array) -> Array:
-    """Return the spread of the farthest reaches for each bias of theta, summed over the walls, in m."""
+    """Return the spread of the farthest reaches for each bias of theta in `turns`, summed over the walls, in m."""
     count = len(q)
     (low, middle), (far, farthest) = (
         (int(start * count), max(int(end * count), int(start * count) + 1)) for start, end in tuning.TURN_WINDOWS
@@ -178,9 +180,10 @@ def _widths(unknowns: Unknowns, q: Array, turns: Array) -> Array:
 def compare(
     forward: Forward, unknowns: Unknowns, poses: Poses, period: float, near: Array | None = None, seed: int = 0
 ) -> Bounced | None:  # fmt: skip
-    """Compare the measured motion with drawn ones; None where too few can be run, or a hard contact is excluded.
+    """Compare the measured motion with drawn motions; None if too few can be run or the contact is not hard.
 
-    The drawn motions have hard contacts, or about the softness and damping of `near`, a vector of unknowns.
+    The drawn motions have hard contacts. With `near`, a vector of unknowns, they are drawn about its softness and
+    damping.
     """
     eye = MotionFeatures(unknowns, poses, period)
     measured = eye.features(eye.q)
@@ -201,7 +204,7 @@ def compare(
         features = np.array(drawn.features)
         if found is None:
             delay = path_delay(eye, features[:, 5:], drawn.q, measured[5:])
-            # the first round was drawn without a delay: shift the phase of its paths
+            # the first round was drawn without a delay, so the phase of its paths is shifted
             paths = [eye.paths(q, _OF_DRAWN_S - delay) for q in drawn.q]
             drawn.by_phase = [eye.changes_by_phase(q, -delay) for q in drawn.q]
         else:
@@ -224,7 +227,7 @@ def compare(
             if len(rounds) == 3 and count == tuning.DRAWS[2] and not followed:
                 rounds.append((tuning.DRAWS[3], tuning.DRAWN_CLEARANCE[3]))
     assert found is not None
-    # where it has not converged, the last corrections show by how much
+    # a large last correction shows that a clearance has not converged
     deviation = np.where(np.abs(moved) > tuning.ASTRAY, np.hypot(deviation, tuning.UNEXPLAINED_HARD), deviation)
     law, odds = 0.0, -math.inf
     if found.value[5] < math.log(tuning.FITTED):
@@ -240,16 +243,16 @@ def compare(
         found.distance,
         path_deviate(eye.paths(eye.q, _LAGS_S), features[:, 5:], paths, measured[5:]),
         law,
-        odds if near is None else -math.inf,  # the limit was set with draws of hard contacts
+        odds if near is None else -math.inf,  # the limit of the odds was set with hard contacts
         *hidden_by_geometry(unknowns, poses, period, measured[:2]),
     )
 
 
 def hidden_by_geometry(unknowns: Unknowns, poses: Poses, period: float, reach: Array) -> tuple[Array, Array]:
-    """Return `unseen` and `rounded` of `Bounced`, from the `reach` (2,) of the clearances in m.
+    """Return `unseen` and `rounded` of `Bounced`; `reach`, shape (2,), holds the sums of opposite reaches in m.
 
-    A head that rests touches three corners at one angle. Errors of sides, scale and corners change its reach at this
-    angle as another clearance would.
+    A resting head touches the frame at three corners, always at the same angle. At this angle, errors of the sides, the
+    scale and the corners change the reach as another clearance would.
     """
     scene = unknowns.scene
     width, height = (deviation_of(scene, path) for path in _SIDES)
@@ -296,7 +299,7 @@ class _Spread:
 
 
 class _Drawn:
-    """Draws of one law: features, targets, changes, and the observed motions until they are cleared."""
+    """Draws with one contact law: features, targets and changes, and the observed motions until they are cleared."""
 
     def __init__(
         self, forward: Forward, unknowns: Unknowns, eye: MotionFeatures, spread: _Spread, rng: np.random.Generator
@@ -309,7 +312,10 @@ class _Drawn:
         self.q: list[Array] = []
 
     def add(self, count: int, centre: Array, about: float, delay: float, most_work: int) -> None:
-        """Draw motions with clearances `about` `centre`, both in m, seen `delay` s late, until the work is done."""
+        """Draw motions that are seen `delay` s late, until there are `count` or the work reaches `most_work`.
+
+        The clearances have the mean `centre` and the deviation `about`, both in m.
+        """
         for _ in range(count):
             if self.forward.work > most_work:
                 return
@@ -325,19 +331,19 @@ class _Drawn:
                 self.q.append(q)
 
     def _numbers(self) -> Array:
-        """Return the logarithms of penetration and damping and three gains, shape (5,)."""
+        """Draw the logarithms of penetration and damping, and three load gains, shape (5,)."""
         mean = np.concatenate([self.spread.mean, np.ones(3)])
         drawn = self.rng.standard_normal(5)
         numbers: Array = mean + np.concatenate([self.spread.deviation, np.full(3, tuning.HARD_DRAWN[3])]) * drawn
         numbers[0] = np.clip(numbers[0], *np.log(self.spread.bounds))
         if self.unknowns.scene.contact.law in OTHER_LAW.values():
-            # a share of the critical damping of the head's mass, for any stiffness
+            # damping under the other law is drawn as a share of critical damping, for any stiffness
             critical = self.unknowns.critical_damping(self.unknowns.force / math.exp(numbers[0]))
             numbers[1] = math.log(tuning.LAW_DAMPING[1] * critical) + tuning.LAW_DAMPING[2] * drawn[1]
         return numbers
 
     def of_other_law(self) -> _Drawn | None:
-        """Return an empty set of draws of the other possible law; None without such a law."""
+        """Return an empty set of draws with the other possible law; None if there is no such law."""
         other = with_other_law(self.unknowns)
         return None if other is None else _Drawn(self.forward.of(other.scene), other, self.eye, self.spread, self.rng)
 
@@ -346,15 +352,15 @@ class _Drawn:
         return np.concatenate([np.array(self.features)[:, 5:], np.array(self.changes)], axis=1)
 
     def draws(self) -> Draws:
-        """Return the features of the motions, also by phase of the load, and the unknowns that they were drawn with."""
+        """Return the features of the motions, including features by phase of the load, and the drawn unknowns."""
         of_draw = np.array(self.targets)[:, [5, 6, 7, 8, 9, 0, 1]]
         return Draws(np.concatenate([self.like(), np.array(self.by_phase)], axis=1), of_draw)
 
 
 def _likeliest(features: Array, targets: Array, paths: Array, measured: Array, seen: Array) -> Array:
-    """Return the likeliest clearances minus the reach, of each drawn motion and the measured one, (n + 1, 2), in m.
+    """Return likeliest clearances minus reaches in m, shape (n + 1, 2), of n drawn motions and the measured motion.
 
-    Only the mean poses in `seen`, (lags, k), and `paths`, (n, lags, k), are used.
+    Of `seen`, (lags, k), and `paths`, (n, lags, k), only the mean poses are used.
     """
     before, after = _NO_LAG - 1, _NO_LAG + 1
     paths, seen = (path[..., : path.shape[-1] // 2] for path in (paths, seen))
@@ -384,16 +390,16 @@ def path_delay(eye: MotionFeatures, features: Array, drawn: list[Array], measure
         return 0.0
     value, left = _Near.to(features, measured).left_over(paths[:, there])
     off = ((seen[:, there] - value) ** 2 / ((left**2).mean(axis=0) + _NO_SCATTER)).sum(axis=1)
-    # a pose cannot be known before it is measured
+    # a delay cannot be negative, because no pose is known before it is measured
     return max(float(_LAGS_S[int(np.argmin(off))]), 0.0)
 
 
 def _of_other_law(drawn: _Drawn, centre: Array, delay: float, most_work: int) -> tuple[float, float]:
-    """Return the likeness of the measured motion to another law, and the log odds of that law.
+    """Return the likeness of the measured motion to motions under another law, and the log odds of that law.
 
     Goodness of fit does not separate laws with similar motions. A classifier of draws of both laws (Pudlo et al.,
-    Bioinformatics 32 (2016) 859) and the likelihood under each law separate them; each finds cases that the other
-    misses.
+    Bioinformatics 32 (2016) 859) and the likelihood under each law do separate them. Each of the two methods finds
+    cases that the other misses.
     """
     other, nothing = drawn.of_other_law(), (0.0, -math.inf)
     if other is None:
@@ -411,8 +417,8 @@ def _of_other_law(drawn: _Drawn, centre: Array, delay: float, most_work: int) ->
 def class_deviate(believed: Array, other: Array, measured: Array) -> float:
     """Return the likeness of features (m,) to `other` (k, m) rather than `believed` (n, m), as a normal deviate.
 
-    The label of the two classes, which weigh the same, is regressed on the features. The deviate is relative to the
-    cross-validated predictions of the believed class.
+    The class label is regressed on the features, with the same total weight for both classes. The deviate compares the
+    prediction with the cross-validated predictions of the believed class.
     """
     features = np.concatenate([believed, other])
     sizes = [len(believed), len(other)]
@@ -430,10 +436,10 @@ def class_deviate(believed: Array, other: Array, measured: Array) -> float:
 def path_deviate(seen: Array, features: Array, drawn: list[Array], measured: Array) -> float:
     """Return the distance of the measured path from the drawn motions as a normal deviate; 0 with too few measurements.
 
-    Nearby drawn motions are compared with the rest in the same way. This gives the distances of right models,
-    for any contact, noise and length of the window.
+    Nearby drawn motions are compared with the remaining drawn motions in the same way. Their distances are those of a
+    correct model, for any contact, noise and length of the window.
     """
-    # (n, lags, parts); stamps may be late or early: a delayed path counts as the same
+    # shape (n, lags, parts); stamps may be late or early, so a path is compared at several lags
     paths = np.array(drawn)
     there = np.isfinite(paths).all(axis=(0, 1)) & np.isfinite(seen).all(axis=0)
     if there.sum() < tuning.PATH_PHASES:
@@ -451,7 +457,7 @@ def path_deviate(seen: Array, features: Array, drawn: list[Array], measured: Arr
 def _distance_of_paths(features: Array, paths: Array, measured: Array, seen: Array) -> float:
     """Return the mean square distance of a seen path (lags, k) from the prediction by the drawn paths (n, lags, k).
 
-    The distance is Mahalanobis's, with the covariance of the drawn paths' residuals, shrunk toward equal variances
+    It is the Mahalanobis distance with the covariance of the drawn paths' residuals, shrunk toward equal variances
     (Ledoit and Wolf, J. Multivar. Anal. 88 (2004) 365).
     """
     near = _Near.to(features, measured)
@@ -461,7 +467,8 @@ def _distance_of_paths(features: Array, paths: Array, measured: Array, seen: Arr
     left *= np.sqrt(near.weight / near.weight.sum())[:, None] / deviation
     share, size = tuning.SHRINKAGE[1], left.shape[1]
     off = (seen - value) / deviation
-    # (a L^T L + b I)^-1 = (I - L^T (b/a I + L L^T)^-1 L) / b: there are fewer draws than numbers in a path
+    # (a L^T L + b I)^-1 = (I - L^T (b/a I + L L^T)^-1 L) / b inverts the smaller matrix: there are fewer draws than
+    # numbers in a path
     equal = share * float(np.square(left).sum()) / size
     among = left @ left.T + equal / (1.0 - share) * np.eye(len(left))
     along = left @ off.T
@@ -482,8 +489,8 @@ class _Near:
 
     distance, weight : (n,) distance of a draw from the measured features, and its weight
     scale : (m,) scatter of the features
-    basis, inverse : (n, m + 1), (m + 1, m + 1) of the normal equations
-    leverage : (n,)
+    basis, inverse : (n, m + 1), (m + 1, m + 1) basis, and inverse of the normal matrix
+    leverage : (n,) leverage of each draw
     """
 
     distance: Array
@@ -509,7 +516,7 @@ class _Near:
         return beta[0], targets - self.basis @ beta
 
     def left_over(self, targets: Array) -> tuple[Array, Array]:
-        """Return the result of `regress` with cross-validated residuals: each draw is predicted without itself."""
+        """Return the result of `regress` with cross-validated residuals: each draw is predicted from the others."""
         value, error = self.regress(targets)
         left: Array = error / (1.0 - np.minimum(self.leverage, 0.9))[:, None]
         return value, left
@@ -518,7 +525,7 @@ class _Near:
 def regress_near(features: Array, targets: Array, measured: Array) -> _Regressed:
     """Regress targets (n, k) on features (n, m), weighting draws near the measured features most.
 
-    The deviations belong to a prediction at `measured`, which may lie at the edge of the draws.
+    The deviations are those of a prediction at `measured`, which may lie at the edge of the draws.
     """
     near = _Near.to(features, measured)
     value, error = near.regress(targets)
@@ -532,7 +539,8 @@ def regress_near(features: Array, targets: Array, measured: Array) -> _Regressed
 def _scatter_at(basis: Array, weight: Array, error: Array, leverage: Array) -> Array:
     """Return the residual variance of a regression at the measured features, shape (k,).
 
-    It varies with softness and noise, so the logarithm of the squares is regressed too (Blum and Francois).
+    The variance depends on softness and noise, so the logarithm of the squared residuals is also regressed on the
+    features (Blum and Francois).
     """
     freed = 1.0 - np.minimum(leverage, 0.9)
     square = error**2 / freed[:, None]
@@ -547,7 +555,7 @@ def _scatter_at(basis: Array, weight: Array, error: Array, leverage: Array) -> A
 
 
 class MotionFeatures:
-    """How motions are seen: at the poses' times, with their gaps and noise, as a few numbers."""
+    """Features of motions as the sensor sees them, at the poses' times and with their gaps and noise."""
 
     def __init__(self, unknowns: Unknowns, poses: Poses, period: float) -> None:
         self._unknowns, self._t = unknowns, poses.t
@@ -555,7 +563,7 @@ class MotionFeatures:
         self.q = filled(poses)
         self.noise = noise_level(self.q)
         self._period, self._parts = period, tuning.PATH_PHASES // 2
-        #: by then a motion has forgotten its start, which a delay changes
+        #: poses from a period on, when the motion has forgotten its start, which a delay changes
         self._settled = poses.t - poses.t[0] >= period
         self._whole = self._there.all(axis=1)
         if self._whole.sum() <= _FEWEST_WHOLE:
@@ -568,12 +576,12 @@ class MotionFeatures:
         self, forward: Forward, unknowns: Unknowns, clearance: Array, numbers: Array, delay: float,
         rng: np.random.Generator,
     ) -> Array | None:  # fmt: skip
-        """Return a simulated motion as it is seen, `delay` s late; None where it cannot be run."""
+        """Return a simulated motion as the sensor sees it, `delay` s late; None if the model cannot be run."""
         vector = unknowns.nominal()
         vector[[GX, GY]], vector[DAMPING] = clearance, numbers[1]
         vector[GAIN] = np.clip(numbers[2:5], 0.7, 1.3)
         scene = unknowns.scene_of(vector)
-        # harder than a fit simulates; the decay of the bounces depends on it
+        # the contact may be harder than in a fit, because the decay of the bounces depends on the stiffness
         contact = replace(scene.contact, stiffness=unknowns.force / math.exp(numbers[0]) ** scene.contact.exponent)
         start = np.concatenate([self.q[0], np.zeros(3)])
         start += np.array([1e-3, 1e-3, 4e-3, 0.05, 0.05, 0.2]) * rng.standard_normal(6)
@@ -583,13 +591,13 @@ class MotionFeatures:
         return None if run is None else self._seen(run.q, white)
 
     def paths(self, q: Array, lags_s: Array) -> Array:
-        """Return the path for each of some lags, shape (lags, 240)."""
+        """Return the path for each lag, shape (lags, 240)."""
         return np.array([self._path(q, lag_s) for lag_s in lags_s])
 
     def _path(self, q: Array, lag_s: float) -> Array:
-        """Return mean pose, its mean taken away, and logarithm of the scatter at each phase of the load, shape (240,).
+        """Return the centred mean pose and the logarithm of its scatter at each phase of the load, shape (240,).
 
-        NaN where too few were measured. The scatter shows how fast bounces die out.
+        Phases with too few poses are NaN. The scatter shows how fast bounces die out.
         """
         parts = tuning.PATH_PHASES
         phase = ((self._t - self._t[0] - lag_s) / self._period % 1.0 * parts).astype(int) % parts
@@ -611,7 +619,8 @@ class MotionFeatures:
     def _seen(self, q: Array, white: Array) -> Array:
         """Return a motion with the noise that makes its quick changes as large as the measured ones.
 
-        Bounces also change the pose quickly, so these changes overestimate the noise, and with it the reach.
+        Bounces also change the pose quickly. Taken for noise alone, quick changes would overestimate the noise and the
+        reach.
         """
         noise = self.noise
         for _ in range(_NOISE_ROUNDS):
@@ -646,7 +655,7 @@ class MotionFeatures:
         return np.concatenate([sums, bias, *like])
 
     def changes(self, q: Array) -> Array:
-        """Return logarithms of the change of pose and reaches over some distances: the decay of the bounces."""
+        """Return logarithms of the changes of pose and reach over several distances, which show how bounces decay."""
         rows = np.concatenate([q, reaches(self._unknowns.scene, q)], axis=1)
         parts = []
         for apart in _CHANGES:
@@ -656,7 +665,7 @@ class MotionFeatures:
         return np.log(np.concatenate(parts) + 1e-12)
 
     def changes_by_phase(self, q: Array, lag_s: float = 0.0) -> Array:
-        """Return these logarithms of the pose at each phase of the load, for a motion that is `lag_s` late."""
+        """Return the logarithms of the pose's changes at each phase of the load, for a motion that is `lag_s` late."""
         phase = ((self._t - self._t[0] - lag_s) / self._period % 1.0 * self._parts).astype(int) % self._parts
         count = np.maximum(np.bincount(phase, minlength=self._parts), 1)
         parts = []
@@ -666,14 +675,14 @@ class MotionFeatures:
         return 0.5 * np.log(np.concatenate(parts) + _NO_SCATTER)
 
     def _averaged(self, q: Array) -> Array:
-        """Return the reaches as `_reach` of the pose averaged over a few rows, in which noise counts less."""
+        """Return `_reach` of poses that are averaged over a few rows to reduce their noise."""
         even = np.full(self._smooth, 1.0 / self._smooth)
         if self._smooth > 1:
             q = np.stack([np.convolve(column, even, "valid") for column in q.T], axis=1)
         return _reach(self._unknowns, q)
 
     def _by_phase(self, q: Array) -> Array:
-        """Return mean reaches in the phases of the load in which they are farthest and the head rests, shape (3, 4)."""
+        """Return mean reaches in the load phases with the farthest reaches, in which the head rests, shape (3, 4)."""
         reach, phase = reaches(self._unknowns.scene, q), self._reach_phase
         count = np.bincount(phase, minlength=tuning.PATH_PHASES + 1)
         known = count > 0
@@ -684,13 +693,13 @@ class MotionFeatures:
 
 
 def _second_difference(rows: Array, apart: int) -> Array:
-    """Return second differences of rows `apart`, shape (n - 2 apart, k)."""
+    """Return second differences over distances of `apart` rows, shape (n - 2 apart, k)."""
     change: Array = rows[2 * apart :] - 2.0 * rows[apart:-apart] + rows[: -2 * apart]
     return change
 
 
 def _reach(unknowns: Unknowns, q: Array) -> Array:
-    """Return mean reaches toward the right, left, top and bottom between quantiles, shape (3, 4), in m."""
+    """Return the reaches toward the right, left, top and bottom, averaged between quantiles, shape (3, 4), in m."""
     ordered = np.sort(reaches(unknowns.scene, q), axis=0)
     count = len(ordered)
     windows = [

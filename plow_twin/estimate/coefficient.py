@@ -1,8 +1,8 @@
-"""The wear coefficient from clearances that were estimated over weeks.
+"""The wear coefficient, from clearances that were estimated over weeks.
 
-The clearance grows along one path h(E) of the exposure E = k_s s / A (s the travel) for any coefficient k_s.
-So a history of clearances against travel gives k_s: its posterior follows on a grid of ln k_s from the log-normal prior
-of the scene's wear, with the clearance at the beginning integrated out.
+For any coefficient k_s the clearance follows the same path h(E) of the exposure E = k_s s / A, where s is the travel. A
+history of clearances against travel therefore determines k_s. Its posterior is computed on a grid of ln k_s, with the
+log-normal prior of the scene's wear; the clearance at the beginning is integrated out.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from plow_twin.model.scene import Clearance, Scene
 
 Array = NDArray[np.float64]
 
-#: Bound: points of the grid. Derived: range of the grid, four deviations of the prior to both sides: all but 6e-5 of
-#: its probability.
+#: Bound: number of points of the grid. Derived: range of the grid to both sides, in prior deviations; it leaves out a
+#: probability of 6e-5.
 _POINTS, _REACH = 801, 4.0
-#: Bound: how far the path is followed beyond the history, in multiples of the clearance's growth, plus a depth in m.
+#: Bound: the path ends when a clearance has grown by this multiple of the history's growth plus this depth in m.
 _FURTHER, _FURTHER_M = 2.0, 5e-4
 
 
@@ -33,8 +33,8 @@ _FURTHER, _FURTHER_M = 2.0, 5e-4
 class History:
     """Estimated clearances against travel.
 
-    travel : (n,) along the face since the first one, in m, never falling
-    clearance, deviation : (n, 2) horizontal and vertical with their standard deviations, in m
+    travel : (n,) travel along the face since the first row, in m, never decreasing
+    clearance, deviation : (n, 2) horizontal and vertical clearance, and their standard deviations, in m
     """
 
     travel: Array
@@ -42,7 +42,7 @@ class History:
     deviation: Array
 
     def __post_init__(self) -> None:
-        """Raise LifeError where the rows cannot be used."""
+        """Raise LifeError if the rows cannot be used."""
         shape, count = self.clearance.shape, len(self.travel)
         if shape != (count, 2) or self.deviation.shape != (count, 2) or count < 2:
             raise LifeError(f"history: got {count} travels and clearances {shape}, expected at least 2 rows of both")
@@ -50,8 +50,8 @@ class History:
         positive = (self.clearance > 0.0).all() and (self.deviation > 0.0).all()
         if not (finite and positive and (np.diff(self.travel) >= 0.0).all()):
             raise LifeError(
-                "history: got a row that is not finite, not above zero, without a deviation or back in travel, "
-                "expected none"
+                "history: got a row that is not finite, has a value not above zero or goes back in travel, expected "
+                "no such row"
             )
 
 
@@ -59,9 +59,9 @@ class History:
 class Coefficient:
     """Posterior of the wear coefficient, and the clearances at the end of the history.
 
-    value, weight : (m,) k_s in m^2/N on a grid, and its probabilities
-    clearance, deviation : (2,) in m
-    depth : (8,) of the pads in m, as the path of the history has it: they are not worn alike
+    value, weight : (m,) values of k_s in m^2/N on a grid, and their probabilities
+    clearance, deviation : (2,) clearances and their standard deviations in m
+    depth : (8,) wear depth of each pad in m, from the path of the history, because the pads wear differently
     """
 
     value: Array
@@ -75,7 +75,7 @@ class Coefficient:
         return Interval(self.quantile(0.5), self.quantile(0.05), self.quantile(0.95))
 
     def quantile(self, share: float) -> float:
-        """Return a point of the distribution in m^2/N, widened by `tuning.PATH_DEVIATION`."""
+        """Return the quantile `share` in m^2/N of the distribution, widened by `tuning.PATH_DEVIATION`."""
         middle, point = np.log(np.interp([0.5, share], np.cumsum(self.weight), self.value))
         off = math.hypot(point - middle, tuning.PATH_DEVIATION * float(ndtri(share)))
         return math.exp(float(middle) + math.copysign(off, share - 0.5))
@@ -92,17 +92,17 @@ def coefficient(scene: Scene, history: History) -> Coefficient:
     Parameters
     ----------
     scene : Scene
-        With wear, whose `prior_m2_n` is the prior; its clearances are replaced by the first of the history.
+        A scene with wear; `wear.prior_m2_n` is the prior. Its clearances are replaced by the first of the history.
     history : History
 
     Raises
     ------
     LifeError
-        Where the scene has no wear or no period, or the history cannot be used or contradicts the prior or wear itself.
+        If the scene has no wear or no period, or if the history contradicts the prior or is not explained by wear.
     """
     wear = scene.wear
     if wear is None:
-        raise LifeError("wear: got none, expected its parameters")
+        raise LifeError("wear: got no wear, expected a section `wear`")
     weight = 1.0 / history.deviation**2
     first = history.clearance[0]
     growth = np.ptp(history.clearance, axis=0)
@@ -127,8 +127,8 @@ def coefficient(scene: Scene, history: History) -> Coefficient:
     ends = np.exp(grid[[0, -1]])
     if max(share[0], share[-1]) > tuning.LEAST_PROBABLE[1]:
         raise LifeError(
-            f"history: got a growth that the prior of the coefficient does not allow, from {ends[0]:.2g} to "
-            f"{ends[1]:.2g} m^2/N, expected a wider wear.prior_m2_n"
+            f"history: got a growth that the coefficient's prior, {ends[0]:.2g} to {ends[1]:.2g} m^2/N, hardly allows, "
+            "expected a wider wear.prior_m2_n"
         )
     _check_fit(history, _growth(path, math.exp(float(grid[share.argmax()])) * history.travel / wear.pad_area_m2))
     clearance = share @ means
@@ -137,9 +137,9 @@ def coefficient(scene: Scene, history: History) -> Coefficient:
 
 
 def _check_fit(history: History, grown: Array) -> None:
-    """Raise LifeError where clearances deviate more from a growth, shape (n, 2), than their deviations allow.
+    """Raise LifeError if clearances differ from `grown`, shape (n, 2), by more than their deviations allow.
 
-    The growth itself is known to within `tuning.PATH_DEVIATION`.
+    The growth itself has the relative deviation `tuning.PATH_DEVIATION`.
     """
     weight = 1.0 / (history.deviation**2 + (tuning.PATH_DEVIATION * grown) ** 2)
     apart = history.clearance - grown
@@ -150,13 +150,13 @@ def _check_fit(history: History, grown: Array) -> None:
         name = ("horizontally", "vertically")[axis]
         raise LifeError(
             f"history: got clearances that no wear of this scene explains (chi^2 {square:.3g} with {freedom} degrees "
-            f"of freedom, row {row + 1} is {1e3 * apart[row, axis]:+.3g} mm off {name}), expected ones that grow, with "
-            "the deviations that they have"
+            f"of freedom, row {row + 1} is {1e3 * apart[row, axis]:+.3g} mm off {name}), expected growing clearances "
+            "with their true deviations"
         )
 
 
 def _growth(path: Path, exposure: Array) -> Array:
-    """Return how much the clearances have grown at each exposure, shape (n, 2); beyond the path by its last slope."""
+    """Return the growth of the clearances at each exposure, shape (n, 2), extrapolated with the path's last slope."""
     grown = path.clearance_growth()
     out = np.stack([np.interp(exposure, path.exposure, column) for column in grown.T], axis=1)
     if len(path.exposure) > 1:

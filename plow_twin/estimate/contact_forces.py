@@ -1,8 +1,8 @@
-"""Contact forces measured by load cells at the guides, which sharpen stiffness, damping and clearances.
+"""Contact forces measured by load cells at the guides; they narrow the intervals of contact and clearances.
 
-After the fit the motion is known at every moment, and the law gives each pair's force from it. If a cell contradicts
-its pair's force, the cell is named (if all do, the law), and the forces are not used. Otherwise poses and forces are
-fitted together (`force_fit`).
+After the fit the motion is known at every moment, and the contact law gives the force of each pair. If a cell
+contradicts the force of its pair, the forces are not used, and the reasons name the cell. If the cells together
+contradict the motion, the reasons name the law. Otherwise poses and forces are fitted together (`force_fit`).
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from plow_twin.solve.compiled_scene import compile_scene
 
 Array = NDArray[np.float64]
 
-#: Guard: a larger number is not a force [N].
+#: Guard: numbers beyond this are not forces [N].
 _LARGEST = 1e12
-#: Bound: delays at which the motion's forces are compared with those measured, the largest and their distance in s.
-#: Derived: three deviations of the prior of a sensor's delay.
+#: Bound: largest delay, and step of the delays, in s, at which measured forces and the motion's forces are compared.
+#: Derived: the largest delay is three prior deviations of a sensor's delay.
 _LARGEST_DELAY, _DELAY_STEP = 0.15, 2e-3
-#: The law as a Python function: Python cannot call the compiled one.
+#: The law as a Python function, because Python cannot call the compiled function.
 _LAW = getattr(free_force, "py_func", free_force)
 
 
@@ -54,7 +54,7 @@ class ContactForces:
         Raises
         ------
         ContactForcesError
-            For arrays of the wrong shape.
+            If an array has the wrong shape.
         """
         times, rows, left_out = usable_rows(t, force, _LARGEST, ("contact forces", "force"), ContactForcesError)
         return ContactForces(times, rows), left_out
@@ -87,10 +87,11 @@ class Felt:
 class Cells:
     """Usable cells.
 
-    pairs : (k,) numbers of their pairs
-    force : (n, 8) measured forces [N] less `offset`, (8,), the reading in flight
+    pairs : (k,) indices of their pairs
+    force : (n, 8) measured forces minus `offset` in N
+    offset : (8,) readings in flight in N
     noise : (8,) standard deviation in N
-    delay : of their stamps behind the motion, in s
+    delay : delay of the cells' stamps behind the motion in s
     """
 
     pairs: NDArray[np.int64]
@@ -113,7 +114,7 @@ class Feeling:
         self._depth = depth_of(turns)
 
     def at(self, shared: Array, states: Array, delay: float) -> Felt | None:
-        """Return penetrations and forces with these unknowns; None where the model cannot be run."""
+        """Return penetrations and forces with these unknowns; None if the model cannot be run."""
         own = shared.copy()
         own[BIAS], own[DELAY] = 0.0, delay
         point = self._problem.evaluate(own, states)
@@ -129,8 +130,8 @@ class Feeling:
 def forces_at(scene: Scene, q: Array, v: Array, depth: Array | None = None) -> tuple[Array, Array]:
     """Return penetrations in m and forces in N of the pairs, (n, 8) each, from poses and rates, (n, 3) each.
 
-    `depth`, shape (8,), is the outward displacement of each pad in m. The law's damping must be a number of the scene;
-    a restitution would make it depend on the speed of the touch.
+    `depth`, shape (8,), is the outward displacement of each pad in m. The scene must state the law's damping itself: a
+    damping from a restitution depends on the speed of each touch.
     """
     x, y, vx, vy, omega, c, s, _ = body_states(np.hstack((q, v)), scene.head.com_offset_m).T
     rows = penetration_rows(scene)
@@ -141,14 +142,14 @@ def forces_at(scene: Scene, q: Array, v: Array, depth: Array | None = None) -> t
     factor = 0.0 if viscous else float(scene.contact.damping or 0.0)
     numbers = float(params["stiffness"]), float(params["exponent"]), factor, viscous, float(params["ramp"])
     force, inside = np.zeros(penetration.shape), penetration > 0.0
-    linear = numbers[1] == 1.0 and not numbers[-1]  # the law takes arrays then
+    linear = numbers[1] == 1.0 and not numbers[-1]  # only then does the law accept arrays
     law = _LAW if linear else np.vectorize(_LAW, otypes=[np.float64])
     force[inside] = np.maximum(law(penetration[inside], rate[inside], *numbers), 0.0)
     return penetration, force
 
 
 def cells_of(feeling: Feeling, found: Fit, forces: ContactForces) -> tuple[Cells | None, list[str]]:
-    """Return the usable cells, None without any, and the reasons against the others."""
+    """Return the usable cells, or None if no cell can be judged, and the reasons against the other cells."""
     felt = feeling.at(found.shared, found.point.states, 0.0)
     if felt is None:
         return None, []
@@ -166,7 +167,7 @@ def cells_of(feeling: Feeling, found: Fit, forces: ContactForces) -> tuple[Cells
     measured = forces.force - offset
     found_out, pairs = [], []
     largest = float(np.nanmax(felt.force))
-    # resolution of a cell that shows 0 in flight
+    # a cell that shows 0 in flight still has this resolution
     noise = np.maximum(noise, 1e-4 * largest)
     for i, name in enumerate(PAIR_NAMES):
         there = np.isfinite(measured[:, i]) & (felt.swing >= 0)
@@ -183,7 +184,7 @@ def cells_of(feeling: Feeling, found: Fit, forces: ContactForces) -> tuple[Cells
 
 
 def _contradiction(measured: Array, felt: Array, pair: int, largest: float, noise: float) -> str:
-    """Return the reason against a cell, from (n, 8) measured and modelled forces at its times; empty without one."""
+    """Return the reason against a cell, or an empty text, from measured and modelled forces, shape (n, 8) each."""
     own = felt[:, pair]
     if (own > 0.0).sum() < FEWEST_IN_CONTACT:
         most = float(np.abs(measured[:, pair]).max())
@@ -194,7 +195,10 @@ def _contradiction(measured: Array, felt: Array, pair: int, largest: float, nois
     ends = np.flatnonzero(np.append(np.diff(value) != 0.0, True))
     for first, end in zip(np.append(0, ends[:-1] + 1), ends + 1, strict=True):
         if end - first >= tuning.STUCK[0] and np.ptp(own[first:end]) > max(tuning.CELL_SHARE * own.max(), 6.0 * noise):
-            return f"the same value {end - first} times in a row, while the motion gives {np.ptp(own[first:end]):.3g} N"
+            return (
+                f"the same value {end - first} times in a row, while the motion's force changes by "
+                f"{np.ptp(own[first:end]):.3g} N"
+            )
     if own.max() < 6.0 * noise:
         return ""
     like = np.array([correlation(value, felt[:, other]) for other in range(PAIR_COUNT)])
@@ -202,18 +206,17 @@ def _contradiction(measured: Array, felt: Array, pair: int, largest: float, nois
         best = int(np.argmax(like))
         other = f", {like[best]:.2f} with {PAIR_NAMES[best]}" if like[best] > tuning.LEAST_CORRELATION else ""
         return (
-            f"correlation of {like[pair]:.2f} with what the motion gives{other}, expected {tuning.LEAST_CORRELATION:g}"
+            f"correlation of {like[pair]:.2f} with the motion's force{other}, expected at least "
+            f"{tuning.LEAST_CORRELATION:g}"
         )
     gain = float(value @ own / (own @ own))
     if abs(gain - 1.0) > tuning.MOST_GAIN:
-        return (
-            f"{gain:.3g} times what the motion gives, expected {1.0 - tuning.MOST_GAIN:g} to {1.0 + tuning.MOST_GAIN:g}"
-        )
+        return f"{gain:.3g} times the motion's force, expected {1.0 - tuning.MOST_GAIN:g} to {1.0 + tuning.MOST_GAIN:g}"
     return ""
 
 
 def _delay(forces: ContactForces, felt: Felt) -> float:
-    """Return the delay with the largest correlation of measured forces and forces of the motion."""
+    """Return the delay in s with the largest correlation between measured forces and the motion's forces."""
     t, measured, given = forces.t, np.nan_to_num(forces.force), np.nan_to_num(felt.force)
     pairs = np.flatnonzero(given.any(axis=0) & measured.any(axis=0))
     lags = np.arange(-_LARGEST_DELAY, _LARGEST_DELAY + 0.5 * _DELAY_STEP, _DELAY_STEP)
@@ -222,7 +225,7 @@ def _delay(forces: ContactForces, felt: Felt) -> float:
 
 
 def correlation(one: Array, other: Array) -> float:
-    """Return the correlation of two series; 0 where one does not change."""
+    """Return the correlation of two series; 0 if one of them is constant."""
     one, other = one - one.mean(), other - other.mean()
     size = float(np.sqrt((one @ one) * (other @ other)))
     return float(one @ other) / size if size > 0.0 else 0.0

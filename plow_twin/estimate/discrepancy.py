@@ -1,11 +1,11 @@
-"""Discrepancy of machine and model: further unknowns beside a fit, an uncertain load, and the rest as noise.
+"""Discrepancy between machine and model: further unknowns beside a fit, an uncertain load, and correlated noise.
 
 No machine is exactly the model. Inertia, size of the frame, friction, exponent, differences of the walls and errors of
-the sensor are further unknowns, each with a prior. One linearised step beside a fit gives them, and Bayesian selection
-of variables draws which of them differ from the scene: a quantity without evidence stays at its value in the scene, and
-a quantity that the motion does not determine widens the interval. The load of each swing has a constant error, whose
-size is learned from all swings (empirical Bayes). The remaining residuals are noise: the variance of the measurements
-grows by their size and by the time for which they stay correlated (tempered likelihood).
+the sensor are further unknowns, each with a prior. One linearised step from a fit estimates them, and Bayesian variable
+selection draws which of them differ from the scene. A quantity without evidence keeps its value in the scene. A
+quantity that the motion does not determine widens the interval. The load of each swing has a constant error; the size
+of these errors is learned from all swings (empirical Bayes). The remaining residuals are treated as noise: large
+residuals, and residuals that stay correlated for long, increase the variance of the measurements (tempered likelihood).
 
 References: George and McCulloch, J. Am. Stat. Assoc. 88 (1993) 881 (selection by Gibbs sampling); Hoeting et al.,
 Stat. Sci. 14 (1999) 382 (averaging over models); Dempster, Laird and Rubin, J. R. Stat. Soc. B 39 (1977) 1 (the sizes
@@ -35,7 +35,7 @@ from plow_twin.model.scene import Friction, Scene
 
 Array = NDArray[np.float64]
 
-#: Step: of the difference quotients by quantities of a scene, by path; a fifth to a half of the prior's deviation.
+#: Step: of the difference quotients by quantities of a scene, a fifth to a half of their prior deviation, by path.
 STATED: Final = {
     "head.mass_kg": 0.02,
     "head.inertia_kg_m2": 0.02,
@@ -44,35 +44,35 @@ STATED: Final = {
     "contact.exponent": 0.02,
     "friction.coefficient": 0.01,
 }
-#: Step: of the stiffness of a wall, and of a constant load as a share of half the load's range.
+#: Step: of a wall's relative stiffness, and of a constant load in units of half the load's range.
 _WALL_STEP, _PUSH_STEP = 0.02, 5e-3
-#: Guard: least error of the load, as a share of half the load's range.
+#: Guard: smallest error of the load in units of half the load's range.
 _LEAST_PUSH = 1e-5
-#: Bound: rounds of expectation and maximisation, between which the noise is tempered.
+#: Bound: numbers of rounds of expectation-maximisation; the noise is tempered after each series of rounds.
 _ROUNDS = (8, 5, 3)
-#: Bound: sweeps of the sampler, and the first of them, which are not counted.
+#: Bound: number of sweeps of the sampler, and of the first sweeps that are discarded.
 _SWEEPS, _BURNT = 50, 10
-#: Bound: longest lag in rows over which residuals are compared.
+#: Bound: longest lag in rows at which the correlation of residuals is computed.
 _LONGEST_LAG = 60
 
 
 @dataclass(frozen=True, eq=False)
 class Graded:
-    """An estimate that holds where the machine is not exactly the model.
+    """An estimate that allows for a machine that differs from the model.
 
     Attributes
     ----------
     shared, covariance : ndarray, shape (SIZE,), (SIZE, SIZE)
-        The shared unknowns.
+        The shared unknowns and their covariance.
     differs : dict of str to (float, float, float)
-        Of each further quantity the probability that it differs from the scene, and the difference: mean and
-        standard deviation.
+        For each further quantity, the probability that it differs from the scene, and mean and standard deviation of
+        the difference.
     load : ndarray, shape (3,)
-        Standard deviation of the load's error in a swing as a share of half the load's range.
+        Standard deviation of the load's error in a swing, in units of half the load's range.
     inflation : ndarray, shape (3,)
         Factor by which the variance of x, y, theta exceeds the fit's noise.
     surprise : float
-        Mean square of the differences in deviations of their prior, at least 1.
+        Mean square of the differences in units of their prior deviations, at least 1.
     """
 
     shared: Array
@@ -89,16 +89,16 @@ def graded(problem: Problem, found: Fit, doubtful: bool = False, seed: int = 0) 
     Parameters
     ----------
     problem, found : Problem, Fit
-        The fit; it need not have come to its end.
+        The fit, which need not have reached an optimum.
     doubtful : bool
         Whether the fit itself shows that the machine differs.
     seed : int
-        Draws which quantities differ.
+        Seed of the sampler.
 
     Raises
     ------
     numpy.linalg.LinAlgError
-        Where the equations cannot be solved.
+        If the equations cannot be solved.
     """
     columns, pushes = _columns(problem, found)
     linear = _Linearised(problem, found, columns, pushes)
@@ -109,7 +109,7 @@ def graded(problem: Problem, found: Fit, doubtful: bool = False, seed: int = 0) 
     mean, covariance, often, exact = linear.averaged(np.random.default_rng(seed))
     surprise, named = linear.surprise(mean, often), linear.named(mean, often)
     if doubtful or not exact:
-        # if the machine differs, no quantity is exact
+        # if the machine differs, every quantity may differ
         mean, covariance = linear.free()
         surprise = max(surprise, linear.surprise(mean, np.ones(len(often))))
     step = mean[:SIZE]
@@ -124,9 +124,9 @@ def graded(problem: Problem, found: Fit, doubtful: bool = False, seed: int = 0) 
 
 @dataclass(frozen=True, eq=False)
 class _Column:
-    """A further quantity: the prior's deviation, the derivative of the prediction, (n, 3), and its value in the fit.
+    """A further quantity: prior deviation, derivative of the prediction, (n, 3), and value in the fit.
 
-    The value is None where the fit leaves the quantity as the scene has it.
+    The value is None if the fit uses the scene's value.
     """
 
     deviation: float
@@ -155,7 +155,7 @@ def _columns(problem: Problem, found: Fit) -> tuple[dict[str, _Column], Array]:
             out[path] = _Column(deviation, column)
     sides = [out[path].derivative for path in ("frame.width_m", "frame.height_m") if path in out]
     if len(sides) == 2 and scene.frame.corner_radius_m is None:
-        # at small angles a round corner acts as sides shorter by twice its radius
+        # at small angles a rounded corner acts like sides that are shorter by twice its radius
         out["corner_radius"] = _Column(ROUNDING, -2.0 * (sides[0] + sides[1]))
     for wall, pads in zip(("left", "right", "top", "bottom"), WALLS, strict=True):
         share, name = np.ones(PAIR_COUNT), f"stiffness_{wall}"
@@ -176,7 +176,7 @@ def _columns(problem: Problem, found: Fit) -> tuple[dict[str, _Column], Array]:
 
 
 def _of_sensor(problem: Problem, point: Point) -> Iterator[tuple[str, Array]]:
-    """Yield the derivatives of the prediction, (n, 3), by each scale and by the drift of the clock."""
+    """Yield the derivatives of the prediction, (n, 3), by each scale and by the clock's drift, with their names."""
     t = problem.window.poses.t
     for index, axis in enumerate(("x", "y", "theta")):
         column = np.zeros_like(point.predicted)
@@ -186,14 +186,14 @@ def _of_sensor(problem: Problem, point: Point) -> Iterator[tuple[str, Array]]:
 
 
 def variants(scene: Scene) -> tuple[Scene, ...]:
-    """Return the scene with the changes that need other compiled terms: another exponent, friction."""
+    """Return the changed scenes that need other compiled terms: with another exponent, and with friction."""
     return tuple(_moved(scene, path, STATED[path], 1.0) for path in ("contact.exponent", "friction.coefficient"))
 
 
 def _moved(scene: Scene, path: str, step: float, depth: float) -> Scene:
-    """Return a scene with a number changed by `step`: mass and inertia by a share of theirs.
+    """Return a scene with one number changed by `step`, a relative step for mass and inertia.
 
-    With another exponent the force at the penetration `depth`, in m, is kept.
+    A change of the exponent keeps the force at the penetration `depth` in m.
     """
     part, name = path.split(".")
     if part == "friction":
@@ -209,9 +209,9 @@ def _moved(scene: Scene, path: str, step: float, depth: float) -> Scene:
 
 
 class _Linearised:
-    """The linearised problem: the border holds the shared and the further unknowns, each swing its state and load.
+    """The linearised problem: its border holds shared and further unknowns; each swing has its state and load error.
 
-    inflation : (3,) of the variance of each component
+    inflation : (3,) factor on the variance of each component
     load : (3,) deviation of the load's error in a swing
     """
 
@@ -220,7 +220,7 @@ class _Linearised:
         self._found, self._swing = found, found.point.swing
         further = np.stack([one.derivative for one in every], axis=2)
         self._precision = np.concatenate([problem.deviation, [one.deviation for one in every]]) ** -2.0
-        #: (k,) values of the further quantities in the fit, and whether the fit holds them
+        #: (k,) values of the further quantities in the fit, and whether the fit includes these quantities
         self._value = np.array([one.value or 0.0 for one in every])
         self._held = np.array([one.value is not None for one in every])
         self._pull = np.concatenate([problem.mean - found.shared, -self._value]) * self._precision
@@ -262,7 +262,7 @@ class _Linearised:
         self._score = np.sum([score for _, score in self._blocks], axis=0) + self._pull
 
     def learn(self, rounds: int) -> None:
-        """Learn the size of the load's error in a swing (expectation and maximisation), all quantities being free."""
+        """Learn the size of the load's error in a swing by expectation-maximisation, with all quantities free."""
         for _ in range(rounds):
             self.eliminate()
             covariance = np.linalg.inv(self._normal)
@@ -280,7 +280,7 @@ class _Linearised:
             self.load = np.maximum(np.sqrt(square / len(self._swings)), _LEAST_PUSH)
 
     def temper(self) -> None:
-        """Weigh measurements down by the size of the residuals and by how long they stay correlated."""
+        """Inflate the variance by the size of the residuals and by how long they stay correlated."""
         left = np.full(self._found.point.residual.shape, np.nan)
         for rows, some, there in zip(self._rows, self._left, self._there, strict=True):
             left[rows] = np.where(there, some, np.nan).reshape(-1, 3)
@@ -294,14 +294,14 @@ class _Linearised:
             self.inflation[index] = max(1.0, square / usual) * _lasting(column, self._swing, square)
 
     def free(self) -> tuple[Array, Array]:
-        """Return mean and covariance of the border if every quantity differs."""
+        """Return mean and covariance of the border's unknowns if every quantity may differ."""
         covariance = np.linalg.inv(self._normal)
         return covariance @ self._score, covariance
 
     def averaged(self, rng: np.random.Generator) -> tuple[Array, Array, Array, bool]:
-        """Return mean, covariance and share of differences of the border over the draws, and if the scene may be exact.
+        """Return mean and covariance over the draws, how often each quantity differs, and if the scene may be exact.
 
-        The scene may be exact if any draw leaves it so. A quantity that the fit holds always differs.
+        The scene may be exact if it is exact in any draw. A quantity that the fit includes always differs.
         """
         count, size = len(self.names), len(self._precision)
         differs, log_precision = self._held.copy(), np.log(self._precision)
@@ -336,7 +336,7 @@ class _Linearised:
         return mean, second / counted - np.outer(mean, mean), often / counted, exact
 
     def scatter(self) -> float:
-        """Return the variance by the swings' scatter over that by the noise, for the unknowns of the motion."""
+        """Return the variance from the swings' scatter over the variance from noise, averaged over `MOVING`."""
         scores = np.stack([score[:SIZE] for _, score in self._blocks])
         scores = scores - scores.mean(axis=0)
         count, moving = len(scores), list(MOVING)
@@ -347,9 +347,12 @@ class _Linearised:
         return freed(count, len(moving)) * float(ratio[moving].mean())
 
     def surprise(self, mean: Array, often: Array) -> float:
-        """Return the mean square of the differences in deviations of their prior, at least 1; above 1: not linear."""
+        """Return the mean square of the differences in units of their prior deviations, at least 1.
+
+        If it is above 1, the linearisation is inaccurate.
+        """
         z = (self._value + mean[SIZE:]) * np.sqrt(self._precision[SIZE:])
-        # for each quantity, the mean over the draws in which the quantity differs
+        # the mean over the quantities is weighted by how often each of them differs
         return max(1.0, float((z**2 / np.maximum(often, 0.1)).sum() / max(often.sum(), 1.0)))
 
     def named(self, mean: Array, often: Array) -> dict[str, tuple[float, float, float]]:
@@ -362,7 +365,7 @@ class _Linearised:
 
 
 def _lasting(left: Array, swing: NDArray[np.int64], square: float) -> float:
-    """Return over how many rows residuals are alike: the sum of their correlations."""
+    """Return the number of rows over which residuals stay correlated, the sum of their correlations over the lags."""
     rows = 1.0
     for lag in range(1, _LONGEST_LAG):
         one, other = left[:-lag], left[lag:]

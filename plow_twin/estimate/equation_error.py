@@ -1,13 +1,13 @@
-"""Walls and stiffness from the equations of motion in weak form, without integrating a motion or errors of the load.
+"""Walls and stiffness from the weak form of the equations of motion.
 
-The equations are multiplied by short smooth functions psi and integrated by parts, which needs no derivative of a
-measured pose:
+No motion is simulated, so errors of the load do not accumulate. The equations are multiplied by short smooth functions
+psi and integrated by parts, so that no measured pose is differentiated:
 
     integral psi'' q  =  integral psi (load + contact) / M,
     contact = K sum n p (1 + d p'),   integral psi p p' = -1/2 integral psi' p^2,
 
-with the penetrations p behind four walls. Gauss-Newton steps find the walls, K and K d; the remaining acceleration
-counts as noise. The result is biased where a contact lasts a few samples; `uncertain_load` corrects it.
+with the penetrations p behind four walls. Gauss-Newton steps find the walls, K and K d; the remaining acceleration is
+treated as noise. The result is biased if contacts last only a few samples; `uncertain_load` corrects the bias.
 
 References: Shinbrot, Trans. ASME 79 (1957) 67 (modulating functions); Messenger and Bortz, J. Comput. Phys. 443 (2021)
 110525 (weak form).
@@ -32,21 +32,21 @@ from plow_twin.solve.compiled_scene import inertias
 
 Array = NDArray[np.float64]
 
-#: Definition: wall of each pair, in the order right, left, top, bottom.
+#: Definition: index of each pair's wall in the order right, left, top, bottom.
 _WALL: Final = np.argmax(np.stack(WALLS), axis=0)
-#: Bound: Gauss-Newton steps; a step in m below which they end, and the longest one.
+#: Bound: number of Gauss-Newton steps; size in m of a last step, and of the longest step.
 _STEPS, _SMALL, _LONGEST = 8, 2e-5, 3e-3
 #: Guard: shortest distance of rows in s, and fewest rows in half of a test function.
 _SHORTEST, _FEWEST = 5e-3, 3
-#: Derived: scale of the stiffness in N/m that gives its column the size of the others.
+#: Derived: unit of the stiffness in N/m in which its column is as large as the other columns.
 _UNIT = 1e7
-#: Derived: deviates beyond which Huber's function is linear; MAD to standard deviation.
+#: Derived: deviate beyond which Huber's function is linear; standard deviation over median absolute deviation.
 _HUBER, _MAD = 2.0, 1.4826
-#: Bound: starts of a search, as shares of the range of motion and as penetrations in m.
+#: Bound: starts of a search: clearances as shares of the range of motion, and penetrations in m.
 _SHARES, _DEPTHS = (0.25, 0.5, 0.75, 0.95), (3e-3, 6e-3, 12e-3, 20e-3)
 #: Guard: penetrations in m of the hardest and of the softest contact that is tried.
 DEPTHS: Final = (2e-4, 3e-2)
-#: Guard: columns without information.
+#: Guard: keeps quotients finite for columns without information.
 _SINGULAR = 1e-9
 
 
@@ -56,9 +56,9 @@ class Walls:
 
     reach : (4,) distance in m by which the corners move toward the right, left, top and bottom before they touch
     ln_depth : logarithm of the penetration in m under the reference force
-    damping : of Hunt and Crossley in s/m
-    left_over : (3,) logarithm of the remaining scatter over the scatter of the acceleration
-    loss : sum of the logarithms of the scatters
+    damping : damping of Hunt and Crossley's law in s/m
+    left_over : (3,) logarithm of the remaining scatter relative to the scatter of the acceleration
+    loss : sum of the logarithms of the remaining scatters
     """
 
     reach: Array
@@ -74,19 +74,19 @@ class Walls:
 
     @property
     def features(self) -> Array:
-        """The result as numbers that a regression compares, shape (7,): first the clearances."""
+        """Features of the result for a regression, shape (7,), the clearances first."""
         return np.concatenate([self.clearance, [self.ln_depth, np.clip(self.damping, -2.0, 3.0)], self.left_over])
 
 
 class EquationError:
-    """The equations of a scene under a load believed, for poses at some times.
+    """The weak form of a scene's equations under the believed load, for poses at given times.
 
     Parameters
     ----------
     unknowns : Unknowns
-        The scene, and the force to which penetrations refer.
+        The scene, and the reference force of penetrations.
     load : Load
-        The load believed.
+        The believed load.
     t : ndarray, shape (n,)
         Times of the poses in s.
     """
@@ -111,14 +111,14 @@ class EquationError:
         self._load = self._weighed(wrench, self._value) / self._inertia
 
     def search(self, q: Array, span: Array) -> Walls:
-        """Return the best fit to poses (n, 3) from several starts, with the range of motion (2,) in m."""
+        """Return the best fit to poses (n, 3) from several starts; `span`, shape (2,), is the range of motion in m."""
         found = [
             self.fit(q, np.repeat(0.5 * share * span, 2), math.log(depth)) for depth in _DEPTHS for share in _SHARES
         ]
         return min(found, key=lambda one: one.loss)
 
     def fit(self, q: Array, reach: Array, ln_depth: float) -> Walls:
-        """Return the fit to poses (n, 3) from walls (4,) in m and a penetration on."""
+        """Return the fit to poses (n, 3), which starts from reaches (4,) in m and the logarithm of a penetration."""
         poses = np.stack([np.interp(self._grid, self._t, column) for column in q.T], axis=1)
         corners, normals = self._geometry(poses)
         acceleration = self._weighed(poses, self._curve)
@@ -146,7 +146,7 @@ class EquationError:
         return np.array([step * beyond[:, wall].any(axis=1).sum() for wall in WALLS])
 
     def _geometry(self, q: Array) -> tuple[Array, Array]:
-        """Return reaches (n, 8) in m and accelerations (n, 3, 8) that a newton at each pair gives the head."""
+        """Return reaches (n, 8) in m, and the head's accelerations (n, 3, 8) due to a force of 1 N at each pair."""
         c, s = np.cos(q[:, 2]), np.sin(q[:, 2])
         body = np.stack([c, s, c * q[:, 0] + s * q[:, 1], -s * q[:, 0] + c * q[:, 1]], axis=1)
         x = c[:, None] * NORMAL_X - s[:, None] * NORMAL_Y
@@ -177,7 +177,7 @@ class EquationError:
         return found, target - columns @ found
 
     def _weighed(self, values: Array, kernel: Array) -> Array:
-        """Return the integrals of rows (n, ...) times the function, shape (m, ...)."""
+        """Return the integrals of `values` (n, ...) times a test function or its derivative, shape (m, ...)."""
         windows = np.lib.stride_tricks.sliding_window_view(values, len(kernel), axis=0)[:: self._apart]
         out: Array = windows @ kernel
         return out

@@ -1,4 +1,4 @@
-"""From measurements to an estimate: one call for a whole window."""
+"""Estimates from the measurements of a whole window."""
 
 from __future__ import annotations
 
@@ -46,18 +46,19 @@ if TYPE_CHECKING:
     from plow_twin.estimate.contact_forces import ContactForces
 
 Array = NDArray[np.float64]
-#: Shared unknowns, noise and differences of the window before, 21 numbers; empty: no guess.
+#: Shared unknowns, noise and differences from the previous window, 21 numbers; empty for no guess.
 Guess = tuple[float, ...]
 
-#: Bound: load periods and seconds of a window, whichever is longer, and the longest window of a node in s; of longer
-#: data the newest part is used, to bound the work.
+#: Bound: longest window in load periods and in s, of which the longer limit applies. Of longer data the newest part is
+#: used.
 MOST_PERIODS, MOST_SPAN_S = 20.0, 60.0
+#: Bound: longest data in s in which the load's period is searched, as long as the longest window of a node.
 _LONGEST_S = 600.0
-#: Derived: normal deviate that a right model exceeds in one of a hundred cases, to two digits.
+#: Derived: normal deviate that a correct model exceeds in one of a hundred cases, to two digits.
 MOST_OTHER_LAW = round(float(ndtri(0.99)), 2)
 #: Derived: 95 % point of a half-normal distribution, in standard deviations of the normal distribution.
 _HALF_NORMAL_P95 = float(ndtri(0.975))
-#: Guard: logarithms of the penetrations in m that a contact can have.
+#: Guard: logarithms of the smallest and the largest penetration of a contact in m.
 _LN_PENETRATIONS = (math.log(1e-9), math.log(0.12))
 #: Definition: pairs of the left, right, top and bottom walls of the cavity.
 _SIDES = {"left": (1, 7), "right": (3, 5), "top": (0, 2), "bottom": (4, 6)}
@@ -76,17 +77,17 @@ def estimate(
     Parameters
     ----------
     scene : Scene
-        The nominal scene: its clearances and contact parameters are priors only; geometry, masses and gravity hold.
+        The nominal scene. Its geometry, masses and gravity are taken as exact, its clearances and contact as priors.
     load : Load
-        The load believed.
+        The believed load.
     poses : Poses
         The measured poses.
     lost : int
-        Number of rows that were left out before.
+        Number of rows that were already left out.
     gaps : Gaps, optional
-        Measured gaps: they give the clearances directly, and the pose where it is not measured.
+        Measured gaps. They give the clearances directly, and the pose if it is not measured.
     forces : ContactForces, optional
-        Measured contact forces: they determine the contact better than the motion alone.
+        Measured contact forces. They determine the contact better than the motion alone.
     """
     return estimate_window(scene, load, poses, lost, gaps=gaps, forces=forces)[0]
 
@@ -100,9 +101,9 @@ def estimate_window(
     gaps: Gaps | None = None,
     forces: ContactForces | None = None,
 ) -> tuple[Estimate, Guess]:
-    """Estimate as `estimate` does, from the result of the window before; return the guess for the next one too.
+    """Estimate as `estimate` does, from the previous window's result; return also the guess for the next window.
 
-    Where the fit from `guess` does not hold, the whole search follows, as without a guess.
+    If the fit that starts from `guess` fails a check, the estimate is repeated with a full search, as without a guess.
     """
     if scene.head.carries == "corners":
         span = (float(load.t[0]), float(load.t[-1]))
@@ -115,7 +116,7 @@ def estimate_window(
     found, following = _estimate(units.scene(scene), *its, lost, guess, units.gaps(gaps), units.forces(forces))
     found = units.in_si(found, scene)
     if units.only_time and found.sensor == "ok":
-        # of the paper's size under a quicker or slower load: impacts last as long as in the paper
+        # the machine has the paper's size but a faster or slower load, so impacts last as long as in the paper
         period = min(load.period(), float(poses.t[-1] - poses.t[0]))
         unknowns = Unknowns.stated(scene, load, poses)
         found = under_uncertain_load(found, unknowns, thinned(load, period)[0], poses, period)
@@ -155,7 +156,7 @@ def _estimate(
         if _unexplained(result) and load.interval() > tuning.COARSEST:
             smooth = load.smooth(0.1 * tuning.COARSEST)
             other, following = _from_motion(scene, smooth, poses, lost, (), forces)
-            why = f"load: a sample each {load.interval():.2g} s, expected {tuning.COARSEST:g} s: taken as averages"
+            why = f"load: a sample every {load.interval():.2g} s, expected {tuning.COARSEST:g} s; taken as averages"
             result = replace(other, reasons=(why, *other.reasons)) if _known(other) else result
     except (np.linalg.LinAlgError, OverflowError) as error:
         result, following = _without_fit(Unknowns(scene), poses, lost, f"the fit cannot be computed: {error}"), ()
@@ -165,7 +166,7 @@ def _estimate(
 
 
 def _known(result: Estimate) -> bool:
-    """Return whether a clearance is known."""
+    """Return whether at least one clearance is known."""
     return result.horizontal_state.known or result.vertical_state.known
 
 
@@ -181,7 +182,10 @@ def _from_motion(
     span = float(load.t[0]), float(load.t[-1])
     unknowns = Unknowns.stated(scene, load, poses)
     if len(poses.t) < FEWEST_POSES:
-        few = f"got {len(poses.t)} poses from {span[0]:g} s to {span[1]:g} s, the load's span, expected {FEWEST_POSES}"
+        few = (
+            f"got {len(poses.t)} poses within the load's span, {span[0]:g} s to {span[1]:g} s, expected at least "
+            f"{FEWEST_POSES}"
+        )
         return replace(prior_of(unknowns, span, lost), reasons=(few,)), ()
     lacking = _lacking(poses)
     if lacking and _all_but_angle(poses) and not _is_dead(load, poses):
@@ -200,7 +204,7 @@ def _from_motion(
         return replace(nothing, horizontal_state=unseen, vertical_state=unseen, reasons=(why,)), ()
     if _rests(poses):
         return _without_fit(
-            unknowns, poses, lost, "the head rests under a load that changes: it, or its sensor, is stuck"
+            unknowns, poses, lost, "the head rests under a load that changes: the head or its sensor is stuck"
         ), ()
     period = min(load.period(), float(poses.t[-1] - poses.t[0]))
     felt, broad = thinned(load, period)
@@ -209,7 +213,7 @@ def _from_motion(
     if guess:
         numbers = np.array(guess)
         shared, noise, differences = np.split(numbers, [SIZE, SIZE + 3])
-        # a guess comes from a fit, and contacts harder than this are not fitted
+        # a guess from a fit is close to the optimum; contacts harder than `FITTED` are not fitted
         certain = unknowns.penetration_of(float(shared[SOFTNESS])) > tuning.FITTED
         near = refine(forward, unknowns, poses, period, unknowns.within(shared), noise, drift, differences, certain)
         verdict = judge(*near, period) if near else None
@@ -275,7 +279,7 @@ def _searched(
 
 
 def _fails(found: Fit, verdict: Verdict) -> bool:
-    """Return whether a fit has not come to its end or fails a check."""
+    """Return whether a fit has not reached an optimum or fails a check."""
     return bool(verdict.model or verdict.sensor) or not found.finished
 
 
@@ -287,11 +291,11 @@ def under_uncertain_load(
     period: float,
     fitted: tuple[Problem, Fit] | None = None,
 ) -> Estimate:
-    """Return an estimate with its withdrawn clearances replaced by values that allow for an unknown load or angle.
+    """Return an estimate with withdrawn clearances replaced by values that allow for errors of the load or no angle.
 
-    `result` comes from the load believed. It is returned unchanged if it has a clearance, or if the comparison finds
-    none. `fitted` is the fit of a machine that differs. Where the comparison agrees with this fit, the fit was not
-    caught in a false optimum, and both are combined.
+    `result` is the estimate under the believed load. It is returned unchanged if it has a clearance or if the
+    comparison finds none. `fitted` is a fit that failed and may be in a false optimum. Where the comparison agrees with
+    the fit, the optimum is not false, and both are combined.
     """
     if _known(result) or felt.interval() > tuning.COARSEST:
         return result
@@ -360,9 +364,9 @@ def with_bounced(result: Estimate, bounced: Bounced, spent: int) -> Estimate:
 def _with_differences(
     found: tuple[Problem, Fit], verdict: Verdict, period: float
 ) -> tuple[tuple[Problem, Fit], Verdict]:
-    """Let walls and sensor differ where the fit fails without, or shows that they do.
+    """Repeat a fit with differences of walls and sensor if the fit fails without them or shows them.
 
-    Walls taken for straight make the clearance too small, by 0.2 mm where pads differ by 1.2 mm.
+    A wall whose pads differ by 1.2 mm, if taken to be straight, makes the clearance 0.2 mm too small.
     """
     if verdict.sensor and not verdict.by_scale:
         return found, verdict
@@ -377,7 +381,7 @@ def _with_differences(
 
 
 def _moved_back(result: Estimate, bias: Array) -> Estimate:
-    """Return an estimate from poses with a bias removed."""
+    """Return an estimate with the bias added that was removed from the poses."""
     x, y, theta = (
         None if known is None else Interval(known.mean + by, known.p05 + by, known.p95 + by)
         for known, by in zip((result.bias_x, result.bias_y, result.bias_theta), bias.tolist(), strict=True)
@@ -387,12 +391,12 @@ def _moved_back(result: Estimate, bias: Array) -> Estimate:
 
 
 def with_gaps(result: Estimate, by_gaps: GapsFit) -> Estimate:
-    """Combine the estimates from motion and gap sensors; where they contradict each other, withdraw the values."""
+    """Combine the estimates from motion and gap sensors; if they contradict each other, withdraw the values."""
     found = []
     if by_gaps.contradiction > tuning.OUTLYING:
         found.append(
-            f"gaps: {by_gaps.contradiction:.1f} times their stated error from the clearances of all sensors, "
-            f"expected at most {tuning.OUTLYING:g}"
+            f"gaps: one sensor is {by_gaps.contradiction:.1f} times its stated error off the result of all sensors, "
+            f"expected at most {tuning.OUTLYING:g} times"
         )
     values, states = [], []
     for name, value, state, mean, deviation in zip(
@@ -407,7 +411,7 @@ def with_gaps(result: Estimate, by_gaps: GapsFit) -> Estimate:
         off = abs(value.mean - mean) / math.hypot(deviation, moved)
         if state.known and off > tuning.OUTLYING:
             found.append(
-                f"gaps: {name} {mean:.5f} m, by the motion {value.mean:.5f} m: {off:.1f} of their deviations apart"
+                f"gaps: {name} {mean:.5f} m by the gaps, {value.mean:.5f} m by the motion, {off:.1f} deviations apart"
             )
         if state.known:
             mean, deviation = _both((mean, deviation), (value.mean, moved))
@@ -430,14 +434,14 @@ def with_gaps(result: Estimate, by_gaps: GapsFit) -> Estimate:
 
 
 def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: int, work: int) -> Estimate:
-    """Turn the comparison of a hard contact's motion into values, intervals and states."""
+    """Turn the comparison of a motion with a hard contact into values, intervals and states."""
     sensor = judge_sensor(poses)
     found = (
         ("motion", bounced.distance, tuning.MOST_DISTANCE),
         ("path over the load's period", bounced.path, tuning.MOST_PATH),
     )
     model = [
-        f"{name} unlike those of the model: {value:.1f}, expected at most {most:g}"
+        f"{name} unlike the model's: distance {value:.1f}, expected at most {most:g}"
         for name, value, most in found
         if value > most
     ]
@@ -464,7 +468,7 @@ def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: 
         states.append(_state(bool(sensor), observed, rough))
     exponent = unknowns.scene.contact.exponent
     log = Interval.normal(*bounced.ln_penetration)
-    # an extrapolating regression gives no bound
+    # a regression that extrapolates is not bounded
     log = Interval(*np.clip([log.mean, log.p05, log.p95], *_LN_PENETRATIONS).tolist())
     mean, soft, hard = (unknowns.force / np.exp(value) ** exponent for value in (log.mean, log.p95, log.p05))
     bias = [Interval.normal(*pair) for pair in zip(bounced.bias, bounced.bias_deviation, strict=True)]
@@ -476,7 +480,7 @@ def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: 
         horizontal_state=states[0],
         vertical_state=states[1],
         apparent=(apparent[0], apparent[1]) if all(state.known for state in states) else None,
-        # only the bounces determine it: the hard side stays open
+        # only bounces determine the stiffness, so its interval is open to the hard side
         stiffness=Interval(float(mean), float(soft), max(float(hard), unknowns.hardest_believed)),
         damping=_damping(unknowns, Interval.normal(*bounced.ln_damping)),
         bias_x=bias[0],
@@ -498,7 +502,7 @@ def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: 
 
 
 def _both(one: tuple[float, float], other: tuple[float, float]) -> tuple[float, float]:
-    """Return mean and deviation of two independent measurements combined."""
+    """Return mean and deviation of the combination of two independent measurements."""
     weights = one[1] ** -2, other[1] ** -2
     return (one[0] * weights[0] + other[0] * weights[1]) / sum(weights), sum(weights) ** -0.5
 
@@ -524,10 +528,11 @@ def _figures(beside: Graded | None) -> dict[str, float]:
 
 
 def _graded(problem: Problem, fit: Fit, verdict: Verdict) -> Graded | None:
-    """Return the result of the fit where the machine may differ from the model; None where data contradict themselves.
+    """Return the result of the fit for a machine that may differ from the model, or None.
 
-    None too for linked swings while no check fails. A fit that has not converged may be in a false optimum: None if its
-    swings are linked, or if its residuals far exceed the noise.
+    The result is None if the data contradict themselves, or if swings are linked and no check fails. A fit that has not
+    reached an optimum may be near a false one, so it also gives None if its swings are linked or its residuals far
+    exceed the noise.
     """
     if verdict.broken:
         return None
@@ -541,7 +546,7 @@ def _graded(problem: Problem, fit: Fit, verdict: Verdict) -> Graded | None:
 
 
 def _if_it_differs(problem: Problem, fit: Fit, doubtful: bool = True) -> Graded | None:
-    """Return the result of a fit, even of one that has not converged, where the machine differs from the model."""
+    """Return the result of a fit for a machine that differs from the model; None if it cannot be computed."""
     try:
         return graded(problem, fit, doubtful)
     except np.linalg.LinAlgError:
@@ -553,7 +558,10 @@ def _next_guess(problem: Problem, fit: Fit) -> Guess:
 
 
 def thinned(load: Load, period: float) -> tuple[Load, bool]:
-    """Thin a load to the samples that move the head; return whether it is broad-band: nearly every sample counts."""
+    """Thin a load to the samples that move the head; return also whether it is broad-band.
+
+    Nearly every sample of a broad-band load moves the head.
+    """
     load = load.believable()
     most = tuning.KNOTS[0] * max(1.0, float(load.t[-1] - load.t[0]) / period)
     shares = (5e-4, 1e-3, 2e-3, 4e-3, 8e-3)
@@ -564,7 +572,7 @@ def thinned(load: Load, period: float) -> tuple[Load, bool]:
         if len(thin.t) <= most:
             break
     broad = len(thin.t) > most
-    # the mean values of a broad-band load move the head
+    # the head follows the mean values of a broad-band load
     felt = load.averaged(tuning.KNOTS[1] * int(most)) if len(thin.t) > tuning.KNOTS[1] * most else thin
     return replace(felt, unknown=load.unknown), broad
 
@@ -604,21 +612,21 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
     deviation = np.sqrt(np.diag(covariance))
     reasons = verdict.model + verdict.sensor
     if not finished and not suspect:
-        gain = f"{fit.gain_left:.0f} are left to gain, expected at most {tuning.OUTLYING**2:g}"
-        reasons = [f"the fit has not come to its end: {gain}"]
-    # compliant walls: largest distance of the head beyond them
+        gain = f"the cost would still fall by {fit.gain_left:.0f}, expected at most {tuning.OUTLYING**2:g}"
+        reasons = [f"the fit has not reached an optimum: {gain}"]
+    # largest penetration into compliant walls
     given = tuning.GIVEN * float(np.exp(shared[SOFTNESS] + NORMAL_P95 * min(deviation[SOFTNESS], 1.0)))
     least = range_of_motion(unknowns.scene, poses)[0] - given
     share = predicted(fit).sum(axis=0) / np.maximum(np.isfinite(fit.point.residual).sum(axis=0), 1)
     clearances, states = [], []
     untested: dict[int, Interval] = {}
     for index, sides in ((GX, ("left", "right")), (GY, ("top", "bottom"))):
-        # a moment that cannot be predicted contradicts no clearance; a bouncing head cannot be predicted for long
+        # only predicted moments test a clearance; hard contacts are exempt, as bounces cannot be predicted for long
         tested = share[index] > tuning.PREDICTED or unknowns.penetration_of(float(shared[SOFTNESS])) < tuning.HARD
         if not tested and finished and not suspect:
             reasons.append(
                 f"{'horizontal' if index == GX else 'vertical'} clearance not observable: {share[index]:.0%} of "
-                f"{COMPONENTS[index]} is predicted, expected {tuning.PREDICTED:.0%}"
+                f"{COMPONENTS[index]} is predicted, expected {tuning.PREDICTED:.0%} or more"
             )
         touched = min(float(fit.point.contact[:, _SIDES[side]].sum()) for side in sides)
         observed = tested and touched > tuning.TOUCHED
@@ -664,11 +672,11 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
 
 
 def _with_forces(result: Estimate, problem: Problem, fit: Fit, forces: ContactForces, widened: float) -> Estimate:
-    """Combine a fit with measured contact forces; where they contradict it, withdraw the values."""
+    """Combine a fit with measured contact forces; if they contradict the fit, withdraw the values."""
     from plow_twin.estimate.force_fit import fit_jointly
 
     if "suspect" in (result.model, result.sensor) or not fit.finished:
-        return replace(result, forces_measured=ForcesUsed(unused="the fit of the poses does not hold"))
+        return replace(result, forces_measured=ForcesUsed(unused="the fit of the poses fails a check"))
     joint = fit_jointly(problem, fit, forces, widened)
     result = replace(result, forces_measured=joint.used)
     if joint.model or joint.sensor:
@@ -708,17 +716,18 @@ def _numbers(unknowns: Unknowns, normal: list[Interval]) -> dict[str, Any]:
 
 
 def _plain(problem: Problem, fit: Fit) -> Array:
-    """Return the covariance due to noise, and to the uncertainty of the differences that the fit holds."""
+    """Return the covariance due to noise and to the uncertainty of the differences in the fit."""
     return fit.covariance + of_differences(problem, fit) if problem.differences.any() else fit.covariance
 
 
 def _covariance(problem: Problem, fit: Fit, verdict: Verdict, plain: Array) -> Array:
-    """Return the covariance of the shared unknowns: `plain` of the noise, or from the scatter of the swings if larger.
+    """Return the covariance of the shared unknowns: `plain`, widened if the swings scatter more than the noise.
 
-    One cause scatters all unknowns that move the head, so the mean of their ratios widens all of them; the ratio of one
-    unknown, from some tens of swings, would be chance. Linked swings contain it already. The scatter is
-    corrected for the unknowns fitted to it. Residuals beyond the noise are correlated for long, so deviations grow with
-    their size, not with its root. The remaining step of the fit counts as an unknown error.
+    All unknowns that move the head scatter for the same reason, so the mean of their variance ratios widens all of
+    them. The ratio of a single unknown, from some tens of swings, would be too random. The covariance of linked swings
+    already contains the scatter. The scatter is corrected for the unknowns fitted to it. Residuals beyond the noise
+    stay correlated for long, so deviations are multiplied by the ratio of the variances, not by its root. The remaining
+    step of the fit is treated as an unknown error.
     """
     size = len(fit.shared)
     covariance: Array = plain * _widened(problem, fit, verdict) + np.outer(fit.left[:size], fit.left[:size])
@@ -727,7 +736,7 @@ def _covariance(problem: Problem, fit: Fit, verdict: Verdict, plain: Array) -> A
 
 
 def _widened(problem: Problem, fit: Fit, verdict: Verdict) -> float:
-    """Return the variance over that of the noise, by the scatter of the swings and the colour of the residuals."""
+    """Return the factor on the noise's variance, from the scatter of the swings and the colour of the residuals."""
     ratio = 1.0 if len(problem.link) else max(1.0, _scatter(problem, fit, np.diag(fit.covariance)))
     colour = max(verdict.figures.get(f"colour_{name}", 1.0) for name in COMPONENTS)
     widened = max(1.0, colour) * (1.0 if fit.converged else tuning.UNFINISHED)
@@ -735,14 +744,14 @@ def _widened(problem: Problem, fit: Fit, verdict: Verdict) -> float:
 
 
 def _between_optima(unknowns: Unknowns, shared: Array) -> float:
-    """Return the addition to the standard deviation of a clearance where the contact is hard, or nearly so, in m."""
+    """Return the additional standard deviation in m of a clearance if the contact is hard or nearly hard."""
     if unknowns.is_hard(shared):
         return tuning.OPTIMA[0]
     return tuning.OPTIMA[1] if unknowns.penetration_of(float(shared[SOFTNESS])) < tuning.FIRM else 0.0
 
 
 def _scatter(problem: Problem, fit: Fit, variance: Array) -> float:
-    """Return the variance by the swings' scatter over that by the noise, for the unknowns of the motion."""
+    """Return the variance from the swings' scatter over the variance from noise, averaged over `MOVING`."""
     scattered = np.diag(sandwich(problem, fit, 1.0 / problem.deviation**2))
     swings, moving = problem.window.swings, list(MOVING)
     return freed(swings, len(moving)) * float((scattered / variance)[moving].mean())
@@ -757,10 +766,11 @@ def _groups(
     shared: Array,
     added: Array,
 ) -> dict[str, tuple[Interval, State]]:
-    """Return the clearance of each group of pads; not observable where the motion does not determine it.
+    """Return clearance and state of each group of pads; not observable if the motion does not determine the clearance.
 
-    `untested` has, by axis, the clearances that no predicted motion tests: the clearance of a group along this axis is
-    not known better. `added` is the covariance beyond the fit's; `shared` are unknowns and differences from the model.
+    `untested` holds, by axis, the clearances that no predicted motion tests; they replace the clearances of the groups
+    along that axis. `shared` are the unknowns of a machine that may differ from the model; `added` is their covariance
+    beyond the fit's.
     """
     out = {}
     for name, (value, deviation) in by_group(problem, fit, widened).items():
@@ -783,13 +793,13 @@ def _correlation(covariance: Array) -> tuple[tuple[float, ...], ...]:
 
 
 def _unobserved(unknowns: Unknowns, deviation: Array, index: int, reach: float, noise: Array) -> Interval:
-    """Return the prior's interval, cut off where the head has already been."""
+    """Return the prior's interval, truncated at the range in which the head has moved."""
     nominal, spread = unknowns.nominal()[index], max(unknowns.deviations()[index], deviation[index])
     return Interval.normal(nominal, spread).above(reach - 3.0 * float(np.hypot(noise[index], 1e-4)))
 
 
 def _stiffness(unknowns: Unknowns, psi: Interval) -> Interval:
-    """Return the stiffness; where the contact is too hard to be resolved, the interval is open to the hard side."""
+    """Return the stiffness; if the contact is too hard to be resolved, the interval is open to the hard side."""
     soft, hard = unknowns.stiffness_of(psi.p95), unknowns.stiffness_of(psi.p05)
     if unknowns.within(np.full(SIZE, psi.p05))[SOFTNESS] > psi.p05:
         hard = max(hard, unknowns.hardest_believed)
@@ -822,7 +832,7 @@ def prior_of(unknowns: Unknowns, span: tuple[float, float], lost: int) -> Estima
 
 
 def _lacking(poses: Poses) -> tuple[str, ...]:
-    """Return which components were hardly measured: a corner's place follows from all three only."""
+    """Return the components that were hardly measured; a corner's place follows only from all three."""
     useless = tuple(
         f"{name}: stated deviation {deviation:g}, expected at most {most:g}"
         for name, deviation, most in zip(COMPONENTS, poses.deviation, useless_deviation(), strict=True)
@@ -842,14 +852,14 @@ def _lacking(poses: Poses) -> tuple[str, ...]:
 
 
 def _all_but_angle(poses: Poses) -> bool:
-    """Return whether x and y were measured well, and theta was not."""
+    """Return whether x and y were measured well, and theta not at all."""
     counts, usable = np.isfinite(poses.q).sum(axis=0), np.array(poses.deviation) <= useless_deviation()
     good = (counts >= FEWEST_POSES) & usable
     return bool(good[:2].all() and not counts[2] and poses.interval() <= tuning.SPARSEST)
 
 
 def _is_dead(load: Load, poses: Poses) -> bool:
-    """Return whether a load that never changes must be absent: under a constant one the head comes to rest."""
+    """Return whether the load is not really measured: it never changes, but the head does not come to rest."""
     late = filled(poses)[len(poses.t) // 2 :]
     return not np.ptp(load.wrench, axis=0).any() and bool(
         (late.std(axis=0) > tuning.OUTLYING * noise_level(late)).any()
@@ -864,7 +874,7 @@ def _is_idle(scene: Scene, load: Load, poses: Poses) -> bool:
 
 
 def _rests(poses: Poses) -> bool:
-    """Return whether the pose, after its first value, is all noise."""
+    """Return whether the last three quarters of the poses are only noise."""
     q = filled(poses)[len(poses.t) // 4 :]
     return bool((q.std(axis=0) < tuning.RESTS * noise_level(q)).all())
 
@@ -872,7 +882,7 @@ def _rests(poses: Poses) -> bool:
 def _without_fit(
     unknowns: Unknowns, poses: Poses, lost: int, why: str = "no motion of the model comes near the measured one"
 ) -> Estimate:
-    """Return the estimate where there is no fit, with the reason."""
+    """Return the estimate without a fit, with the reason."""
     return replace(
         prior_of(unknowns, (float(poses.t[0]), float(poses.t[-1])), lost),
         horizontal_state=State.WITHDRAWN,

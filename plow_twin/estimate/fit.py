@@ -1,11 +1,11 @@
-"""Least squares of the measured motion over the unknowns and the state at the start of each swing.
+"""Least-squares fit of the unknowns, and of the state at the start of each swing, to the measured motion.
 
-The window is cut into swings, each begun in flight between the walls, where the state is known best and its errors
-matter least. Each is simulated from its own starting state (multiple shooting), so that errors of the load and of the
-last bounces of a hard contact do not grow from swing to swing. Levenberg-Marquardt minimises Huber's function of the
-residuals and the prior. Under a load that is unknown between its samples the swings are short, and each is linked to
-the next by the covariance of the unknown part of the load (weak constraints). Runs from displaced starting states give
-the variance of the prediction at each moment, which is added to the measurement's.
+The window is cut into swings that begin in flight between the walls, where the state is known best and its errors
+matter least. Each swing is simulated from its own starting state (multiple shooting), so that errors of the load and of
+the last bounces of a hard contact do not grow from swing to swing. Levenberg-Marquardt steps minimise Huber's function
+of the residuals plus the prior. If the load is unknown between its samples, the swings are short, and the covariance of
+the unknown part of the load links each swing to the next (weak constraints). Runs from displaced starting states give
+the variance of the prediction at each moment. It is added to the variance of the measurement.
 
 References: Bock, Recent advances in parameter identification techniques for ODE (1983); Nocedal and Wright, Numerical
 Optimization, ch. 10; Huber, Robust Statistics, ch. 7; Tremolet, Q. J. R. Meteorol. Soc. 132 (2006) 2483.
@@ -35,20 +35,21 @@ Array = NDArray[np.float64]
 
 #: Guard: precision of an unknown without a prior.
 NO_PRIOR = 1e-6
-#: Step: of the difference quotients by a starting state: m, m, rad, m/s, m/s, rad/s.
+#: Step: of the difference quotients by a starting state, in m, m, rad, m/s, m/s, rad/s.
 _DISPLACED = np.array([2e-4, 2e-4, 1e-3, 5e-3, 5e-3, 3e-2])
-#: Guard: a rate of 0.1 mm/s, or mrad/s, after a second; neither a solver nor a sensor resolves less.
+#: Guard: smallest spectral density of an unknown acceleration. It gives a rate of 0.1 mm/s or 0.1 mrad/s after a
+#: second; neither solver nor sensor resolves less.
 _LEAST_DRIFT = 1e-8
-#: Definition: walls by their two pads: left, right (top pad first), top, bottom (left pad first).
+#: Definition: the two pads of each wall: left and right with the top pad first, top and bottom with the left pad first.
 WALLS: Final = ((1, 7), (3, 5), (0, 2), (6, 4))
-#: Definition: differences of machine and sensor that a fit holds beside the shared unknowns: distances in m by which
-#: the first pad of a wall lies further out than the second (`WALLS`), the sensor's lever arm in m along x and y, and
-#: the square of the time constant in s2 of its low pass.
+#: Definition: differences of machine and sensor, which a fit uses beside the shared unknowns. They are the distances in
+#: m by which the first pad of each wall in `WALLS` lies farther out than the second, the sensor's lever arm in m along
+#: x and y, and the squared time constant of its low pass in s2.
 TURNS, LEVER, LAG = slice(0, 4), slice(4, 6), 6
 DIFFERENCES: Final = ("turn_left", "turn_right", "turn_top", "turn_bottom", "lever_x", "lever_y", "filter")
-#: Step: of their difference quotients.
+#: Step: of the difference quotients by these differences.
 DIFFERENCE_STEPS: Final = np.array([2e-4, 2e-4, 2e-4, 2e-4, 1e-3, 1e-3, 4e-6])
-#: Derived: a row has three numbers, the start of a swing six; fewer rows determine the start alone.
+#: Derived: fewest rows of a swing. Two rows of three numbers only determine the six numbers of the swing's start.
 FEWEST_OF_SWING = 4
 
 
@@ -66,8 +67,8 @@ def huber_weight(z: Array) -> Array:
 class Window:
     """Poses cut into swings.
 
-    starts : (s + 1,) model times in s at which swings begin, and the end of the last
-    states : (s, 6) guesses of x, y, theta and their rates there
+    starts : (s + 1,) model times in s at which the swings begin, and the end of the last swing
+    states : (s, 6) guesses of x, y, theta and their rates at these starts
     """
 
     poses: Poses
@@ -82,15 +83,15 @@ class Window:
 
 @dataclass(eq=False)
 class Point:
-    """One set of unknowns with its runs.
+    """A set of unknowns with the motion that it predicts.
 
-    shared, states : (SIZE,), (s, 6)
+    shared, states : (SIZE,), (s, 6) unknowns
     swing : (n,) swing of each pose, -1 outside of all swings
     predicted : (n, 3) predicted measurements without the bias; NaN outside all swings
     residual : (n, 3) measured minus predicted; NaN where not measured
-    rate : (n, 3) their rates
+    rate : (n, 3) rates of the predicted measurements
     contact : (s, 8) time in contact of each pair in s
-    defect : (s - 1, 6) from the end of each swing to the start of the next; (0, 6) where they are not linked
+    defect : (s - 1, 6) start of each swing minus end of the previous swing; (0, 6) if swings are not linked
     """
 
     shared: Array
@@ -106,7 +107,7 @@ class Point:
 
 @dataclass(frozen=True, eq=False)
 class Linear:
-    """Jacobians by the shared unknowns and the state of the own swing.
+    """Jacobians by the shared unknowns and by the starting state of the row's swing.
 
     rows : (n, 3, 17) of the predicted measurements
     ends : (s - 1, 6, 17) of the ends of linked swings
@@ -118,7 +119,7 @@ class Linear:
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """A part of the normal equations, for the shared unknowns and those of consecutive swings from `swing` on.
+    """A part of the normal equations, for the shared unknowns and the consecutive swings that begin with `swing`.
 
     rows, weighted : (m, 17) or (m, 23)
     residual : (m,)
@@ -131,7 +132,7 @@ class Piece:
 
     @property
     def own(self) -> slice:
-        """Places of the swings' unknowns among all."""
+        """Slice of these swings' unknowns in the vector of all unknowns."""
         first = SIZE + OWN * self.swing
         return slice(first, first + self.rows.shape[1] - SIZE)
 
@@ -143,9 +144,9 @@ class Fit:
     covariance : (SIZE, SIZE) of the shared unknowns
     factor : the factorised normal equations of all unknowns
     noise : (3,) standard deviation of the measurements
-    variance : (n, 3) variance of each measurement as weighted
-    jitter : (n, 3) variance that cannot be predicted
-    linear : its Jacobians
+    variance : (n, 3) variance with which each measurement is weighted
+    jitter : (n, 3) variance of the unpredictable part of the motion
+    linear : Jacobians at the point
     left : (SIZE + 6 s,) the remaining step, linearised; zero at an optimum
     gain_left : reduction of the cost by that step
     """
@@ -164,12 +165,12 @@ class Fit:
 
     @property
     def finished(self) -> bool:
-        """Whether it has reached an optimum, so that its residuals judge the model."""
+        """Whether the fit has reached an optimum, so that its residuals can be used to judge the model."""
         return self.gain_left < tuning.OUTLYING**2
 
     @property
     def loss(self) -> float:
-        """Twice the negative log likelihood; it compares fits to the same measurements."""
+        """Twice the negative log likelihood, by which fits to the same measurements are compared."""
         variance = self.noise**2 + tuning.JITTER_WEIGHT[1] * self.jitter
         there = np.isfinite(self.point.residual)
         z = np.abs(self.point.residual[there]) / np.sqrt(variance[there])
@@ -200,8 +201,9 @@ def depth_of(turns: Array) -> Array | None:
 class Problem:
     """A window of measurements, the prior and the forward model together.
 
-    `horizon` limits each swing to its first seconds; `differences` (7,) are those of `DIFFERENCES`; `drift` (3,) is the
-    spectral density of an unknown acceleration, in m2/s3 and rad2/s3, with which the swings are linked.
+    `horizon` is the longest simulated part of a swing in s; `differences`, shape (7,), are in the order of
+    `DIFFERENCES`. `drift`, shape (3,), is the spectral density of an unknown acceleration in m2/s3 and rad2/s3; it
+    links the swings.
     """
 
     def __init__(
@@ -228,11 +230,11 @@ class Problem:
         shared, states : ndarray, shape (SIZE,), (s, 6)
             The unknowns.
         differences : ndarray, shape (7,), optional
-            Others than the problem's.
+            Differences to use instead of the problem's.
         push, share : ndarray, optional
             As in `Forward.run`.
         change : callable, optional
-            Returns another scene, perhaps with other terms.
+            Function that returns a changed scene, perhaps with other compiled terms.
         """
         window, differences = self.window, self.differences if differences is None else differences
         lag = float(np.sqrt(differences[LAG]))
@@ -242,7 +244,7 @@ class Problem:
         swing[swing >= window.swings] = -1
         swing[times - window.starts[np.maximum(swing, 0)] > self.horizon] = -1
         rows = np.flatnonzero(swing >= 0)
-        # times rise, so a swing's rows lie together
+        # times rise, so the rows of a swing are consecutive
         inner = np.searchsorted(swing[rows], np.arange(window.swings + 1)).astype(np.int64)
         asked, ends, edges = times[rows], np.zeros(0, np.int64), inner
         if len(self.link):  # each swing but the last runs to the start of the next
@@ -275,7 +277,7 @@ class Problem:
     def cost(self, point: Point, variance: Array) -> float:
         """Return twice the negative logarithm of the posterior: Huber's function of the residuals and the prior.
 
-        A measurement that a point does not reach costs 1, the expected cost of a measurement that fits.
+        A measurement outside of all swings costs 1, the expected cost of a measurement that fits.
         """
         z = np.abs(point.residual) / np.sqrt(variance)
         loss = huber_loss(z)
@@ -297,14 +299,16 @@ class Problem:
         return Linear(rows, ends)
 
     def _scene_of(self, shared: Array) -> Scene:
-        """Return the scene of a vector; many in a row differ by other numbers than the scene's."""
+        """Return the scene of a vector, cached because many successive vectors have the same scene."""
         key = shared[: GAIN.start].tobytes()
         if self._scene[0] != key:
             self._scene = key, self.unknowns.scene_of(shared)
         return self._scene[1]
 
     def by_differences(self, point: Point) -> Array:
-        """Return the derivatives of the prediction by the differences, shape (n, 3, 7); zero where it cannot be run."""
+        """Return the derivatives of the prediction by the differences, shape (n, 3, 7); zero if the model cannot be
+        run.
+        """
         if self._columns[0] is not point:
             out = np.zeros((*point.residual.shape, len(DIFFERENCES)))
             resolved = self.window.poses.interval() <= RESOLVING
@@ -327,7 +331,7 @@ class Problem:
             change = moved[index] - point.shared[index]
             other = self.evaluate(moved, point.states) if abs(change) > 0.5 * step else None
             if other is not None:
-                # residuals fall where the prediction rises
+                # residuals decrease as the prediction increases
                 return np.nan_to_num((point.residual - other.residual) / change), (point.defect - other.defect) / change
         return np.zeros_like(point.residual), np.zeros_like(point.defect)
 
@@ -344,7 +348,7 @@ class Problem:
 
 
 def link_weights(spans: Array, drift: Array) -> Array:
-    """Return the inverse covariance that white noise of acceleration gives to pose and rate, shape (s, 6, 6)."""
+    """Return the inverse covariance of pose and rate after each span of white acceleration noise, shape (s, 6, 6)."""
     drift = np.maximum(drift, _LEAST_DRIFT)
     weights = np.zeros((len(spans), 6, 6))
     place = np.arange(3)
@@ -359,8 +363,8 @@ def fit(
 ) -> Fit | None:
     """Fit from a starting point; None where the model cannot be run there.
 
-    `noise`, shape (3,), is a first guess; a step that reduces the cost by less than the share `enough` is the last;
-    `seed` draws the displacements that probe the predictability.
+    `noise`, shape (3,), is the first guess of the noise. The first step that reduces the cost by less than `enough` is
+    the last. `seed` is the seed of the displacements that probe predictability.
     """
     point = problem.evaluate(problem.unknowns.within(shared), states)
     if point is None:
@@ -400,7 +404,7 @@ def pieces(problem: Problem, point: Point, linear: Linear, variance: Array) -> I
     z = np.abs(point.residual) / np.sqrt(variance)
     weight = np.nan_to_num(huber_weight(z) / variance) * np.isfinite(point.residual)
     weighted, residual = linear.rows * weight[:, :, None], np.nan_to_num(point.residual)
-    # times rise, so a swing's rows lie together
+    # times rise, so the rows of a swing are consecutive
     used = np.flatnonzero(point.swing >= 0)
     edges = np.searchsorted(point.swing[used], np.arange(problem.window.swings + 1))
     for index, (low, high) in enumerate(pairwise(edges.tolist())):
@@ -430,15 +434,15 @@ def normal_equations(problem: Problem, point: Point, linear: Linear, variance: A
 
 
 def freed(swings: int, unknowns: int) -> float:
-    """Return the factor by which a fit reduces the scatter of few swings, at most `tuning.MOST_FREED`."""
+    """Return the factor by which fitting reduces the scatter of few swings, at most `tuning.MOST_FREED`."""
     return swings / max(swings - unknowns, swings / tuning.MOST_FREED)
 
 
 def joint_step(problem: Problem, found: Fit, columns: Array, precision: Array, pull: Array) -> tuple[Array, Array]:
     """Return the linearised step of the shared and the further unknowns together, and its covariance.
 
-    `columns` (n, 3, k) are the derivatives of the prediction by the further unknowns, `precision` and `pull` (k,) the
-    prior's terms in their normal equations. Each swing's starting state is eliminated.
+    `columns`, shape (n, 3, k), are the derivatives of the prediction by the further unknowns. `precision` and `pull`,
+    shape (k,), are the prior's terms in their normal equations. The starting state of each swing is eliminated.
     """
     size = SIZE + len(precision)
     normal = np.diag(np.concatenate([1.0 / problem.deviation**2, precision]))
@@ -467,7 +471,7 @@ def joint_step(problem: Problem, found: Fit, columns: Array, precision: Array, p
 def _descend(
     problem: Problem, point: Point, variance: Array, normal: Arrow, gradient: Array, damping: float
 ) -> tuple[Point | None, float]:
-    """Return the next point, or None where no step gains, and the damping for the next step."""
+    """Return the next point, or None if no step reduces the cost, and the damping for the next step."""
     scale = normal.diagonal()
     deviations = np.concatenate([problem.deviation, np.tile(tuning.START_SPREAD, problem.window.swings)])
     for _ in range(6):
@@ -485,10 +489,10 @@ def _descend(
 
 
 def unpredicted(problem: Problem, point: Point, jacobian: Array, seed: int, probes: int = 3) -> Array:
-    """Return the variance by which the motion leaves its linearisation under small displacements, shape (n, 3).
+    """Return the variance of the motion about its linearisation under small displacements, shape (n, 3).
 
-    Displaced points are run and compared with the prediction of the Jacobian. Smooth motion differs little; after the
-    last bounces of a hard contact the difference is as large as the motion.
+    Points with random displacements are run and compared with the prediction of the Jacobian. A smooth motion differs
+    little. After the last bounces of a hard contact the difference is as large as the motion.
     """
     rng = np.random.default_rng(seed)
     total, count = np.zeros_like(point.residual), np.zeros_like(point.residual)
@@ -519,7 +523,7 @@ def _spread(variance: Array, reach: int = 2) -> Array:
 
 
 def noise_of(residual: Array, before: Array, jitter: Array) -> Array:
-    """Return the standard deviation of each component's residuals by their median, shape (3,)."""
+    """Return the standard deviation of each component's residuals from their median, shape (3,)."""
     out = before.copy()
     for i, column in enumerate(residual.T):
         there = np.isfinite(column)

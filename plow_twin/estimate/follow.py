@@ -1,12 +1,12 @@
 """The twin that follows its machine: members drawn from the prior or an estimate, moved by the measured poses.
 
 The members differ in clearances, contact and load gains. They are drawn from the prior at first, then from each valid
-estimate; new members begin at the places of the old. `members` holds them and their Kalman filter.
+estimate; new members start at the poses of the old members. The module `members` contains them and their Kalman filter.
 
-The first member has the middle value of each number and no drawn noise. It is the median twin: a real motion. Before
-the first estimate it is the nominal twin, which no pose moves: at the place of a machine with larger clearances it
-would press its own walls, with less accurate forces than without following. Until then the second member is a copy of
-it that the poses move: the first estimate begins at its place.
+The first member, the median twin, has the median of each parameter and no drawn noise, so its motion is physical.
+Before the first estimate it is the nominal twin, and poses do not move it: with the poses of a machine with larger
+clearances it would press its own walls, and its forces would be less accurate than without following. Until then, poses
+move the second member, a copy of the first. The median twin of the first estimate starts at the pose of this copy.
 """
 
 from __future__ import annotations
@@ -45,17 +45,17 @@ from plow_twin.stream.driven import MOST_MEASURED
 Array = NDArray[np.float64]
 Rows = NDArray[np.void]
 
-#: Definition: members by default.
+#: Definition: default number of members.
 MEMBERS: Final = 128
-#: Bound: least time in s between poses that are used: a nearer pose adds little and costs as much.
+#: Bound: shortest time in s between used poses. A pose that follows sooner adds little and costs as much.
 APART_S: Final = 4e-3
-#: Bound: number of poses whose quick changes give the noise: smallest, largest.
+#: Bound: smallest and largest number of poses from whose quick changes the noise is computed.
 _NOISE_ROWS: Final = (20, 400)
-#: Bound: samples of one call: the rows of all members stay in the processor's cache.
+#: Bound: samples in one call, so that the rows of all members stay in the processor's cache.
 _CALL: Final = 20
-#: Definition: rate in 1/s at which the clearances are determined, that of their publication.
+#: Definition: rate in 1/s at which the clearances are determined and published.
 _KNOWN_HZ: Final = 10.0
-#: Bound: poses that wait for the model to reach their stamps; as many as a session keeps to use again.
+#: Bound: most poses that wait for the model to reach their stamps, as many as a session keeps for going back.
 _MOST_DUE: Final = MOST_MEASURED
 #: Definition: arrays for one row with and without intervals, for no digest, and for constant clearances.
 _YES: Final = np.ones(1, bool)
@@ -77,7 +77,8 @@ class Span:
     start, end : float
         In s.
     peak, impulse : ndarray, shape (3, 8)
-        Largest force in N and impulse in N s of each pair: of the median twin, 5 % and 95 % points.
+        Largest force in N and impulse in N s of each pair. The rows are the median twin's values and the 5 % and 95 %
+        points.
     """
 
     start: float
@@ -87,10 +88,10 @@ class Span:
 
 
 class _Behind(NamedTuple):
-    """Samples that only the first member has used so far: times, loads, its rows.
+    """Samples that only the first member has used so far, with the rows of the first member.
 
-    `wanted` are the rows with intervals, `ends` the rows that end a span of peaks and impulses; with `begins` a span
-    begins with the first row.
+    `wanted` marks the rows that get intervals, and `ends` the rows that end a span of peaks and impulses. `begins`
+    states whether a span begins with the first row.
     """
 
     t: Array
@@ -102,33 +103,33 @@ class _Behind(NamedTuple):
 
 
 class Follower:
-    """A twin under sampled loads that follows one machine: it is given measured poses and estimates too.
+    """A twin under sampled loads that follows one machine with the help of measured poses and estimates.
 
-    It is driven like a `Twin`. Its motion is that of its first member, the median twin.
+    It is used like a `Twin`. Its motion is the motion of its first member, the median twin.
 
     Parameters
     ----------
     scene : Scene
         The nominal scene.
     members : int
-        Number of twins, at least 20; with 1 the parameters alone follow: no pose moves the twin, its forces have no
-        intervals.
+        Number of twins, at least 20. With 1, only the parameters follow the machine: no pose moves the twin, and its
+        forces have no intervals.
     tol : float
         As for `Twin`.
     start : float
-        Time in s at which the scene's initial state holds.
+        Time in s of the scene's initial state.
     seed : int
         Seed of the random numbers.
 
     Raises
     ------
     ArgumentError
-        For too few members.
+        If there are too few members.
     """
 
     excitation: Literal["scene", "sampled"] = "sampled"
     max_evaluations: int | None = None
-    #: advances cut short, which a follower never does
+    #: number of advances that were cut short, always 0 for a follower
     bounded = 0
 
     def __init__(
@@ -140,11 +141,11 @@ class Follower:
         self._members, self._seed = members, seed
         self._prior = prior(scene)
         self._speed = scene.wear.travel_speed_m_s if scene.wear is not None else 0.0
-        #: number of poses and estimates so far, used or not
+        #: number of poses and estimates so far, including those that were not used
         self.added = 0
         #: whether each row gets intervals of the forces, not only published rows
         self.every_row = False
-        #: whether a single published row goes out before the other members, which `catch_up` advances
+        #: whether a single published row is returned before `catch_up` advances the other members
         self.defers = False
         self._behind: _Behind | None = None
         #: smallest and largest load so far, shape (2, 3)
@@ -152,18 +153,19 @@ class Follower:
         self._ends, self._begins = _NO_DIGESTS, False
         self._span_start = start
         self._wrench = np.zeros(3)
-        #: poses that have moved the members, poses that are outliers, and poses that were dropped because too many wait
+        #: numbers of poses that moved the members, that were outliers, and that were dropped because too many were
+        #: waiting
         self.poses_used = self.poses_outlying = self.poses_dropped = 0
-        #: times that members were drawn anew
+        #: how often members were drawn anew
         self.drawn = 0
         self._draw("", start, self._unworn())
         self._forget()
 
     def _forget(self) -> None:
         """Forget all poses."""
-        #: poses and estimates that wait for their time, in order: time in s, number, pose or text of an estimate
+        #: waiting poses and estimates in order of time, each with time in s, number, and pose or text of the estimate
         self._due: list[tuple[float, int, list[float] | str]] = []
-        #: times of the poses used lately
+        #: times of recently used poses
         self._used: deque[float] = deque()
         self._noise_rows: deque[Array] = deque(maxlen=_NOISE_ROWS[1])
 
@@ -172,14 +174,14 @@ class Follower:
         return np.zeros(PAIR_COUNT) if wear is None else np.array(wear.initial_depth_m, dtype=np.float64)
 
     def _draw(self, text: str, time: float, worn: Array) -> None:
-        """Draw members from an estimate, JSON, or from the prior if it is empty, in the scene's initial state."""
+        """Draw members in the scene's initial state from an estimate (JSON), or from the prior if `text` is empty."""
         self._text = text
-        #: the estimate that is followed; None: the prior
+        #: the followed estimate; None for the prior
         self.estimate = Estimate.from_dict(json.loads(text)) if text else None
         self._load_share = _load_share(text)
         self._known = self._prior if self.estimate is None else _whole(self.estimate, self._prior)
         rng = np.random.default_rng([self._seed, self.drawn])
-        # an error of the load would be taken for other numbers
+        # with an uncertain load nothing is learned, because errors of the load would be taken for other parameters
         learns = not self._load_share.any()
         self._ensemble = Ensemble(self.scene, self._known, self._members, rng, time, self.tol, worn, learns)
         self._ensemble.set_travel_speed(self._speed)
@@ -220,7 +222,7 @@ class Follower:
 
     @property
     def lost(self) -> int:
-        """Members that have left the model's range."""
+        """Number of members that have left the model's range."""
         self.catch_up()
         return int((~self._ensemble.good).sum())
 
@@ -263,7 +265,7 @@ class Follower:
         Parameters
         ----------
         ends : ndarray of int64, shape (m,)
-            Rising numbers of the published rows, each of which ends a span of peaks and impulses.
+            Ascending indices of the published rows; each of these rows ends a span of peaks and impulses.
         begins : bool
             Whether a span begins with the first row.
         """
@@ -275,7 +277,8 @@ class Follower:
     ) -> Advanced:
         """Advance to given times, as `Twin.advance_rows`; a row uses all measurements before it.
 
-        With `defers`, the other members are left to `catch_up` after a row that is published by itself.
+        With `defers`, a row that is published by itself is returned at once, and `catch_up` advances the other members
+        later.
         """
         self.catch_up()
         if wrench.shape != (len(t), 3) or not np.isfinite(wrench).all():
@@ -309,7 +312,7 @@ class Follower:
     def _advance_first(
         self, t: Array, wrench: Array, rows: Rows, wanted: NDArray[np.bool_], ends: NDArray[np.bool_]
     ) -> int:
-        """Advance the median twin, and leave the others to `catch_up`; return how many advances failed."""
+        """Advance the median twin, leaving the other members to `catch_up`; return how many advances failed."""
         failed = self._ensemble.advance_first(t, wrench, rows)
         known = self._clearance.ravel()
         rows["known_clearance"] = known if self.scene.wear is None else known + self._moved(rows["wear_depth"])
@@ -319,7 +322,7 @@ class Follower:
         return failed
 
     def catch_up(self) -> None:
-        """Advance all members to the time of the first: its rows get their intervals, and due measurements act."""
+        """Advance all members to the first member's time, add the intervals to its rows, and use due measurements."""
         behind, self._behind = self._behind, None
         if behind is None:
             return
@@ -344,13 +347,15 @@ class Follower:
         return end
 
     def _moved(self, worn: Array) -> Array:
-        """Return by how much the wear `worn` (..., 8) of the pads widens the clearances and their points, (..., 6)."""
+        """Return the growth of the clearances and of their interval points, (..., 6), by the pads' wear `worn` (...,
+        8).
+        """
         if self.scene.wear is None:
             return _UNMOVED
         return np.repeat(widening(self.scene, worn), 3, axis=-1)
 
     def _note_clearance(self) -> None:
-        """Store the present clearances of unworn pads, by the prior, the estimate or the members."""
+        """Store the present clearances of unworn pads, from the prior, the estimate or the members."""
         self._cell = math.floor(self.time * _KNOWN_HZ)
         known = self._known
         if self.estimate is None and self._ensemble.moved:
@@ -367,7 +372,7 @@ class Follower:
         wear_depth: ArrayLike | None = None,
         pose: tuple[ArrayLike, ArrayLike] | None = None,
     ) -> None:
-        """Begin anew at model time `t`, as `Twin.reset`: measurements of the motion before no longer hold."""
+        """Begin anew at model time `t`, as `Twin.reset` does; earlier measurements are dropped."""
         self.catch_up()
         self.drawn += 1
         worn = self._unworn() if wear_depth is None else np.array(wear_depth, dtype=np.float64)
@@ -386,14 +391,14 @@ class Follower:
         self._ensemble.set_travel_speed(self._speed)
 
     def digest(self) -> str:
-        """Return 16 hexadecimal digits that stand for the exact state."""
+        """Return a digest of the exact state, 16 hexadecimal digits."""
         self.catch_up()
         learned = (part.tobytes() for part in self._ensemble.learned())
         state = [*self._ensemble.twins(), self._wrench.tobytes(), self._ensemble.square.tobytes(), *learned]
         return hashlib.blake2b(b"".join(state), digest_size=8).hexdigest()
 
     def snapshot(self) -> bytes:
-        """Return the exact state as bytes, to be restored by a follower of the same scene, members and seed."""
+        """Return the exact state as bytes, which a follower with the same scene, members and seed can restore."""
         self.catch_up()
         blobs, random = self._ensemble.state()
         noise = np.array(self._noise_rows).reshape(-1, 3)
@@ -413,7 +418,7 @@ class Follower:
         return begin + int(sum(facts["sizes"]))
 
     def restore(self, data: bytes) -> None:
-        """Take over a state saved by `snapshot`."""
+        """Restore a state saved by `snapshot`."""
         self._behind = None
         facts, begin = _facts(data)
         blobs = []
@@ -437,17 +442,18 @@ class Follower:
     # -- measurements ------------------------------------------------------------------------------------------------
 
     def add_pose(self, t: float, q: ArrayLike, known: float = -math.inf) -> None:
-        """Add a pose measured at `t` in s, shape (3,), NaN where not measured; it acts when the model reaches `t`.
+        """Add a pose measured at `t` in s, shape (3,), NaN where not measured.
 
-        It acts at `known` in s if that is later. A pose of the last `LATEST_S` acts at once.
+        The pose is used when the model reaches `t`, or `known` in s if that is later. A late pose is used at once, if
+        it is at most `LATEST_S` old.
         """
         self._add(max(t, known), [t, *np.asarray(q, dtype=np.float64).tolist()])
 
     def add_estimate(self, text: str, t: float) -> None:
-        """Add an estimate, JSON as in `Estimate.as_dict`, that is known from `t` in s on.
+        """Add an estimate that is known from time `t` in s on, as JSON of `Estimate.as_dict`.
 
-        It is followed if it has both clearances, or at least one while no estimate is followed. After a withdrawn
-        estimate the prior holds again.
+        An estimate with both clearances is followed. One clearance is enough while no estimate is followed. After a
+        withdrawn estimate the twin follows the prior again.
         """
         self._add(t, text)
 
@@ -475,7 +481,7 @@ class Follower:
 
     @property
     def known(self) -> str:
-        """The estimate that is followed, JSON; empty: the prior."""
+        """The followed estimate as JSON; empty for the prior."""
         return self._text
 
     def follow_estimate(self, known: str) -> None:
@@ -485,7 +491,7 @@ class Follower:
             self._begin_anew(known)
 
     def _begin_anew(self, text: str) -> None:
-        """Draw members from an estimate (JSON) or the prior; they begin at the places of the members before."""
+        """Draw members from an estimate (JSON) or the prior; they start at the poses of the previous members."""
         before = self._ensemble
         self.drawn += 1
         self._draw(text, self.time, self.wear_depth)
@@ -516,7 +522,7 @@ class Follower:
             self._noise_rows.append(q)
 
     def _load_error(self) -> Array:
-        """Return the error of the load, N and N m, that a rough estimate has found."""
+        """Return the load's error according to a rough estimate, shape (3,), in N, N, N m."""
         found: Array = tuning.LOAD_ERROR_SHARE * self._load_share * 0.5 * (self._range[1] - self._range[0])
         return found
 
@@ -553,7 +559,7 @@ class Follower:
         return found
 
     def held(self, t: float) -> Rows:
-        """Return the row, shape (1,), of a later time under the newest sample; the state stays."""
+        """Return the row, shape (1,), at a later time under the newest sample; the state does not change."""
         self.catch_up()
         rows = np.zeros(1, ROW)
         self._ensemble.held(t, rows)
@@ -562,12 +568,12 @@ class Follower:
 
 
 def follower(scene: Scene, follow: str, members: int, tol: float) -> Follower:
-    """Return the twin of a scene that follows `full`, with so many members, or `parameters` alone."""
+    """Return a twin of a scene; `follow` is `full`, with `members` twins, or `parameters`, without poses."""
     return Follower(scene, members) if follow == "full" else Follower(scene, 1, tol=tol)
 
 
 def _load_share(text: str) -> Array:
-    """Return the load's error in an estimate (JSON), in shares of half its range, (3,); zero unless it is rough."""
+    """Return the load's error in an estimate (JSON) over half the load's range, (3,); zero unless it is rough."""
     found = json.loads(text) if text else {}
     rough = State.ROUGH.value in [found.get(axis, {}).get("state") for axis in ("horizontal", "vertical")]
     figures = found.get("figures", {}) if rough else {}
@@ -596,7 +602,7 @@ def prior(scene: Scene) -> Estimate:
 
 
 def _whole(found: Estimate, known: Estimate) -> Estimate:
-    """Return an estimate, completed by damping and gains of the prior where these are missing."""
+    """Return an estimate with the prior's damping and gains in place of missing ones."""
     return replace(
         found,
         damping=found.damping or known.damping,

@@ -24,11 +24,11 @@ from plow_twin.stream.session import Session
 
 Array = NDArray[np.float64]
 
-#: Definition: length of the windows of the estimates and distance of their ends in s, as a node has them by default.
+#: Definition: length in s of the estimates' windows and interval in s of their ends, the defaults of a node.
 WINDOW_S, INTERVAL_S = 32.0, 10.0
 #: Definition: nanoseconds of a second.
 _NS: Final = 1e9
-#: Bound: seconds of load that are advanced at once; the rows of all members stay in the processor's cache.
+#: Bound: seconds of load that are advanced at once, so that the rows of all members stay in the processor's cache.
 _PART_S: Final = 0.02
 
 
@@ -54,14 +54,14 @@ class Followed:
 
     @classmethod
     def of(cls, t: Array, rows: NDArray[np.void]) -> Followed:
-        """Return them from the rows of a following twin."""
+        """Return forces and clearances from the rows of a following twin."""
         clearance = rows["known_clearance"].reshape(-1, 2, 3)
         return cls(t, rows["force"], rows["force_low"], rows["force_high"], clearance)
 
 
 @dataclass(frozen=True)
 class TakenOver:
-    """An estimate, and the time in s from which the twins are drawn from it, if `taken`."""
+    """An estimate and its time in s; `taken` states whether the twins are drawn from the estimate from then on."""
 
     t: float
     estimate: Estimate
@@ -70,7 +70,7 @@ class TakenOver:
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """Rows, the estimates in between, and peaks and impulses of each span."""
+    """The rows of a stretch, its estimates, and the peaks and impulses of each span."""
 
     rows: Followed
     taken_over: list[TakenOver]
@@ -97,11 +97,11 @@ def follow(
     load, poses, gaps : Load, Poses, Gaps
         Measurements on one clock. In the windows of the estimates, times count from the load's first sample.
     members : int
-        Twins.
+        Number of twins.
     dt : float, optional
-        Distance of the rows in s; one at each sample of the load by default.
+        Interval of the rows in s; by default there is a row at each sample of the load.
     span : float, optional
-        Seconds of a span of peaks and impulses; no spans by default.
+        Duration in s of a span of peaks and impulses; no spans by default.
     seed : int
         Seed of all draws.
     """
@@ -112,7 +112,7 @@ def follow(
 
 
 class _Steps:
-    """The loop over the load: a session, as of a live twin, gets all measurements in order of their stamps."""
+    """The loop over the load: as in a live twin, a session gets all measurements in order of their stamps."""
 
     def __init__(
         self, scene: Scene, load: Load, poses: Poses, gaps: Gaps | None, members: int, seed: int, span: float | None
@@ -125,7 +125,7 @@ class _Steps:
         deviation = 0.0 if gaps is None else gaps.deviation
         self._windows = Windows(WINDOW_S, INTERVAL_S, 0.0, poses.deviation, load.deviation, deviation, early=True)
         self._guess: Guess = ()
-        #: rows on a grid, poses and gaps added so far
+        #: numbers of rows on a grid, of added poses and of added gaps
         self._count = self._poses_added = self._gaps_added = 0
         self._span = span
         self.taken_over: list[TakenOver] = []
@@ -134,7 +134,7 @@ class _Steps:
     def rows(self, dt: float | None) -> Iterator[Followed]:
         """Yield the rows, part by part."""
         step = max(1, int(np.searchsorted(self._load.t, self._load.t[0] + _PART_S)))
-        # the first sample alone: there is no motion before it
+        # the first sample is a part by itself, because there is no motion before it
         for first in (0, *range(1, len(self._stamps), step)):
             part = slice(first, min(first + step, len(self._stamps)) if first else 1)
             if first:
@@ -150,7 +150,7 @@ class _Steps:
                     self._estimate(window)
 
     def _add_poses(self, until_ns: int) -> None:
-        """Add the poses up to a stamp; the model uses each when it reaches its time."""
+        """Add the poses up to a stamp; the model uses each pose when it reaches the pose's time."""
         last = int(np.searchsorted(self._pose_stamps, until_ns, side="right"))
         for index in range(self._poses_added, last):
             stamp, q = int(self._pose_stamps[index]), tuple(self._poses.q[index].tolist())

@@ -1,8 +1,8 @@
-"""Poses and contact forces fitted together: Gauss-Newton steps from the fit of the poses.
+"""Joint fit of poses and contact forces by Gauss-Newton steps, starting from the fit of the poses.
 
-Beside the shared unknowns are the delay of the forces and the logarithm of each cell's gain; the state at the start of
-each swing is eliminated. Moments that are hard to predict have less weight, Huber's function bounds the influence of a
-moment, and the scatter of the swings' scores widens the intervals (White 1982).
+The unknowns are the shared unknowns, the delay of the forces and the logarithm of each cell's gain. The state at the
+start of each swing is eliminated. Moments that are hard to predict have less weight, Huber's function limits the
+influence of each moment, and the scatter of the swings' scores widens the intervals (White 1982).
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from plow_twin.model.pairs import PAIR_NAMES
 
 Array = NDArray[np.float64]
 
-#: Bound: rows, some 200 a second of a window of ten load periods.
+#: Bound: most rows, about 200 a second for a window of ten load periods.
 _MOST_ROWS = 6000
-#: Bound: steps; first steps with draws that probe predictability, and number of draws; gain of the cost, that of noise,
-#: below which the steps end.
+#: Bound: number of steps; number of first steps in which predictability is probed, and draws of each probe; reduction
+#: of the cost, no more than noise, that ends the steps.
 _ROUNDS, _DRAWN_ROUNDS, _PROBES, _ENOUGH = 8, 3, 3, 0.5
-#: Step: of the difference quotients to both sides, of the delay in s and of a starting state. The longer one-sided
-#: steps of the poses gave clearances that were off by 4 of their deviations.
+#: Step: of the two-sided difference quotients by the delay in s and by a starting state. With the longer one-sided
+#: steps of the fit of the poses, clearances were wrong by 4 of their deviations.
 _DELAY_STEP = 2e-5
 _STATE_STEPS = np.array([1e-5, 1e-5, 5e-5, 2e-4, 2e-4, 1.4e-3])
 
@@ -37,7 +37,7 @@ _STATE_STEPS = np.array([1e-5, 1e-5, 5e-5, 2e-4, 2e-4, 1.4e-3])
 class JointFit:
     """Result of the joint fit of poses and contact forces.
 
-    shared, covariance : (SIZE,), (SIZE, SIZE); None where the forces were not used
+    shared, covariance : (SIZE,), (SIZE, SIZE); None if the forces were not used
     model, sensor : reasons against the model and against the sensor
     """
 
@@ -60,7 +60,7 @@ class _Place:
 
 @dataclass(frozen=True, eq=False)
 class _At:
-    """A place with its runs; `force` (m,) is the expected reading of the cells."""
+    """A place with the motion that it predicts; `force`, shape (m,), are the expected readings of the cells."""
 
     place: _Place
     point: Point
@@ -69,10 +69,12 @@ class _At:
 
 @dataclass(frozen=True, eq=False)
 class _Block:
-    """Normal equations of a swing, its starting state eliminated: normal (b, b), score (b,) of the other unknowns.
+    """Normal equations of a swing with its starting state eliminated.
 
-    `state`, `answer` : (6,), (6, b) step of the state alone, and its derivative by the steps of the other unknowns;
-    `root` draws it
+    normal, score : (b, b), (b,) for the other unknowns
+    state : (6,) step of the starting state if the other unknowns stay
+    answer : (6, b) derivative of this step by the steps of the other unknowns
+    root : (6, 6) Cholesky factor of the starting state's covariance, for random draws
     """
 
     normal: Array
@@ -96,16 +98,16 @@ class _Block:
 
 
 def not_used(why: str) -> JointFit:
-    """Return that the forces were not used, and why."""
+    """Return a result without forces, with the reason `why`."""
     return JointFit(ForcesUsed(unused=why))
 
 
 def fit_jointly(problem: Problem, found: Fit, forces: ContactForces, widened: float) -> JointFit:
-    """Fit poses and forces together, from a fit of the poses with `widened` times the variance of its noise."""
+    """Fit poses and forces together, from a fit of the poses; `widened` multiplies the variance of its noise."""
     if problem.unknowns.scene.contact.restitution is not None:
         return not_used("the law's damping follows from the speed of each touch")
     if len(problem.link):
-        return not_used("the load is broad-band: its swings are linked")
+        return not_used("the load is broad-band, so its swings are linked")
     if len(forces.t) < FEWEST_FOR_SCATTER:
         return not_used(f"got {len(forces.t)} messages in the window, expected at least {FEWEST_FOR_SCATTER}")
     forces = forces.thinned(_MOST_ROWS)
@@ -119,7 +121,7 @@ def fit_jointly(problem: Problem, found: Fit, forces: ContactForces, widened: fl
 
 
 class _Joint:
-    """The problem of the poses with entries (row, cell) of measured forces."""
+    """The fit of the poses, extended by the entries (row, cell) of measured forces."""
 
     def __init__(self, problem: Problem, found: Fit, feeling: Feeling, cells: Cells, widened: float) -> None:
         self._problem, self._found, self._feeling, self._cells = problem, found, feeling, cells
@@ -137,7 +139,7 @@ class _Joint:
         """Return the joint fit, starting from the fit of the poses."""
         found, cells = self._found, self._cells
         felt = self._feeling.at(found.shared, found.point.states, cells.delay)
-        assert felt is not None  # the cells were checked there
+        assert felt is not None  # `cells_of` has run the model there
         near = np.isfinite(cells.force) & (felt.penetration > -2.0 * tuning.HEAD_ROOM)
         near[:, np.setdiff1d(np.arange(near.shape[1]), cells.pairs)] = False
         self._row, self._pair = np.nonzero(near)
@@ -149,7 +151,7 @@ class _Joint:
             return not_used("the model cannot be run")
         linear, jacobian = self._linearised(at)
         for index in range(_ROUNDS):
-            if index < _DRAWN_ROUNDS:  # at first only the poses bound the draws
+            if index < _DRAWN_ROUNDS:  # at first the draws are limited by the poses alone
                 self._weigh(at.force)
                 known = self._blocks(at, linear, jacobian if index else 0.0 * jacobian)
                 self._jitter = self._unpredicted(at, jacobian, known)
@@ -183,7 +185,7 @@ class _Joint:
         return None if point is None or force is None else _At(place, point, force)
 
     def _away(self, place: _Place) -> Array:
-        """Return the distance of the border's unknowns from their expected values, expected minus present."""
+        """Return the expected values of the border's unknowns minus their present values."""
         late = self._cells.delay - place.delay
         return np.concatenate([self._problem.mean - place.shared, [late], -place.gain])
 
@@ -195,7 +197,9 @@ class _Joint:
         return self._problem.cost(at.point, self._variance) + float(np.nansum(loss) + np.isnan(loss).sum()) + prior
 
     def _linearised(self, at: _At) -> tuple[Linear, Array]:
-        """Return the Jacobians of the poses, and of the forces by the border and the swing's state, (m, b + 6)."""
+        """Return the Jacobians of the poses, and of the forces by the border and the swing's starting state, (m, b +
+        6).
+        """
         place, border = at.place, self._border
         out = np.zeros((len(self._row), border + 6))
         for j in MOVING:
@@ -252,7 +256,7 @@ class _Joint:
         return covariance @ score, covariance
 
     def _descended(self, at: _At, blocks: list[_Block]) -> _At | None:
-        """Return the next place, None where no step gains."""
+        """Return the next place, or None if no step reduces the cost."""
         before, place = self._cost(at), at.place
         step, _ = self._step(at, blocks)
         states = np.stack([block.state + block.answer @ step for block in blocks])
@@ -286,7 +290,7 @@ class _Joint:
         return total / _PROBES
 
     def _scatter(self, blocks: list[_Block], covariance: Array) -> float:
-        """Return the variance by the swings' scatter over that by the noise, for the unknowns of the motion."""
+        """Return the variance from the swings' scatter over the variance from noise, averaged over `MOVING`."""
         scores = np.stack([block.score for block in blocks])
         scores = scores - scores.mean(axis=0)
         count, unknown, moving = len(blocks), self._border - (SIZE - len(MOVING)), list(MOVING)
@@ -307,11 +311,11 @@ class _Joint:
         together = float(np.median(all_shares)) if all_shares else 0.0
         most, most_together = tuning.MOST_LEFT_OVER
         if together > most_together:
-            used = replace(used, unused="the law's forces are others")
-            why = f"contact forces: {together:.1%} of them are left over, expected at most {most_together:.0%}"
+            used = replace(used, unused="the law gives other forces")
+            why = f"contact forces: {together:.1%} of them remain unexplained, expected at most {most_together:.0%}"
             return JointFit(used, model=(why,))
         bad = tuple(
-            f"contact forces: {name}: {cell.left_over:.0%} are left over, expected at most {most:.0%}"
+            f"contact forces: {name}: {cell.left_over:.0%} remain unexplained, expected at most {most:.0%}"
             for name, cell in found.items()
             if cell.left_over > most
         )
@@ -323,14 +327,14 @@ class _Joint:
         return JointFit(used, place.shared, covariance[:SIZE, :SIZE])
 
     def _unfitted(self, at: _At) -> int:
-        """Return the number of swings whose forces are not the measured ones: their states are in a false optimum."""
+        """Return the number of swings whose forces do not fit, because their starting states are in a false optimum."""
         z = (self._measured - at.force) ** 2 / self._spread
         z, swing = z[np.isfinite(z)], self._swing[np.isfinite(z)]
         count, total = np.bincount(swing), np.bincount(swing, z)
         return int((total > tuning.MOST_MISFIT * np.maximum(count, 1)).sum())
 
     def _left_over(self, at: _At) -> list[list[float]]:
-        """Return for each cell, of each swing, the share of its force that is left over beyond its noise."""
+        """Return for each cell and swing the share of the force that remains unexplained beyond noise."""
         out: list[list[float]] = []
         residual, there = self._measured - at.force, np.isfinite(at.force)
         for k, pair in enumerate(self._cells.pairs.tolist()):

@@ -1,8 +1,8 @@
-"""Contact forces with intervals: full twins drawn from an estimate, advanced together under the load believed.
+"""Contact forces with intervals, from twins drawn from an estimate and advanced together under the believed load.
 
 Each member has its own clearances, contact parameters and load gains, drawn from the estimate with their correlation.
-The quantiles over the members are the interval. After some load periods the members have forgotten their starts, so
-their differences are the uncertainty.
+The quantiles over the members are the interval. After some load periods the members have forgotten their initial
+states, so their differences show the uncertainty of the estimate alone.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from plow_twin.run.batch import TwinBatch
 
 Array = NDArray[np.float64]
 
-#: Derived: members by default, of which a 5 % point has a standard error of 1.4 %.
+#: Derived: default number of members, with which a 5 % point has a standard error of 1.4 %.
 MEMBERS: Final = 256
 #: Definition: quantiles of an interval.
 POINTS: Final = (0.05, 0.5, 0.95)
 #: Derived: fewer members have no 5 % point.
 FEWEST: Final = 20
-#: Guard: least drawn clearance, in the estimated one.
+#: Guard: smallest drawn clearance, as a share of the estimated clearance.
 _LEAST_SHARE = 0.02
 #: Derived: tolerance of the members, equal to the fit's.
 TOLERANCE: Final = tuning.TOLERANCE
-#: Bound: samples advanced in one call; the rows of all members stay in the processor's cache.
+#: Bound: samples advanced in one call, so that the rows of all members stay in the processor's cache.
 _CALL = 10
 
 
@@ -46,11 +46,11 @@ class ForcesError(PlowTwinError):
 class Forces:
     """Quantiles over the members, in the order of `POINTS`.
 
-    start : time in s from which on they count
+    start : time in s at which peaks and impulses begin
     t : (n,) in s
     force : (3, n, 8) of each pair at these times in N
     peak, impulse : (3, 8) largest force in N and impulse in N s from `start` to the end
-    members, left_out : number of twins, and how many left the model's range
+    members, left_out : number of twins within the model's range, and of twins that have left it
     """
 
     start: float
@@ -85,9 +85,9 @@ class ForceEnsemble:
     Parameters
     ----------
     scene : Scene
-        The nominal scene: geometry, masses and gravity hold.
+        The nominal scene, whose geometry, masses and gravity all members have.
     found : Estimate
-        Its intervals are drawn from; a withdrawn one is refused.
+        The estimate that members are drawn from; it must not be withdrawn.
     members : int
         At least 20: fewer have no 5 % point.
     start : float
@@ -96,14 +96,14 @@ class ForceEnsemble:
     Raises
     ------
     ForcesError
-        For a withdrawn estimate, or too few members.
+        If the estimate is withdrawn or there are too few members.
     """
 
     def __init__(
         self, scene: Scene, found: Estimate, members: int = MEMBERS, *, seed: int = 0, start: float = 0.0
     ) -> None:
         if State.WITHDRAWN in (found.horizontal_state, found.vertical_state):
-            raise ForcesError(f"estimate: got a withdrawn one ({'; '.join(found.reasons)}), expected one that holds")
+            raise ForcesError(f"estimate: got a withdrawn one ({'; '.join(found.reasons)}), expected a valid one")
         if members < FEWEST:
             raise ForcesError(f"members: got {members}, expected at least {FEWEST}")
         scenes, self._gain = draw_scenes(scene, found, members, np.random.default_rng(seed))
@@ -114,14 +114,14 @@ class ForceEnsemble:
         return len(self._twins)
 
     def advance(self, t: Array, wrench: Array, *, over_time: bool = True) -> Forces:
-        """Advance all members through samples of the load believed; `t` (n,) in s, `wrench` (n, 3).
+        """Advance all members through samples of the believed load; `t` (n,) in s, `wrench` (n, 3).
 
-        Without `over_time` the forces at each sample stay 0: they would double the cost.
+        Without `over_time` the forces at each sample stay 0; computing them doubles the cost.
 
         Raises
         ------
         ForcesError
-            Where fewer than 20 members are within the model's range.
+            If fewer than 20 members are within the model's range.
         """
         start, force = self._twins.time, np.zeros((len(POINTS), len(t), PAIR_COUNT))
         peak, impulse = np.zeros((len(self), PAIR_COUNT)), np.zeros((len(self), PAIR_COUNT))
@@ -145,7 +145,7 @@ def quantiles(values: Array) -> Array:
     """Return the nearest-rank quantiles over the first axis, in the order of `POINTS`; no value is below zero."""
     places = [min(int(share * len(values)), len(values) - 1) for share in POINTS]
     out = np.zeros((len(POINTS), *values.shape[1:]))
-    # most pairs are apart in all members: nothing to sort
+    # most pairs are apart in all members and need no sorting
     there = values.any(axis=0)
     out[:, there] = np.partition(np.ascontiguousarray(values[:, there].T), places, axis=1)[:, places].T
     return out
@@ -154,12 +154,12 @@ def quantiles(values: Array) -> Array:
 def forces_of(
     scene: Scene, found: Estimate, load: Load, members: int, settle_s: float, *, over_time: bool = True
 ) -> Forces:
-    """Return the forces under a load from `settle_s` after its first sample on: until then the members settle."""
+    """Return the forces under a load, beginning `settle_s` after its first sample, when the members have settled."""
     ensemble = ForceEnsemble(scene, found, members, start=float(load.t[0]))
     load = load.with_knot(float(load.t[0]) + settle_s)
     first = int(np.searchsorted(load.t, load.t[0] + settle_s, side="right"))
     if first >= len(load.t):
-        raise ForcesError(f"load: got {load.t[-1] - load.t[0]:g} s, expected more than the {settle_s:g} s to settle in")
+        raise ForcesError(f"load: got {load.t[-1] - load.t[0]:g} s, expected more than the {settle_s:g} s of settling")
     if first:
         ensemble.advance(load.t[:first], load.wrench[:first], over_time=False)
     return ensemble.advance(load.t[first:], load.wrench[first:], over_time=over_time)

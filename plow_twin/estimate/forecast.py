@@ -1,6 +1,7 @@
-"""Remaining life: the time until a clearance reaches its limit, over coefficient, present clearance and load.
+"""Remaining life: the distribution of the time until a clearance reaches its limit.
 
-Scenarios repeat it with another load or wear coefficient, from the same draws.
+Wear coefficient, present clearances and load are drawn at random. Scenarios repeat the forecast with another load or
+wear coefficient and the same draws.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ Array = NDArray[np.float64]
 
 #: Definition: seconds of an hour.
 HOUR_S = 3600.0
-#: Guard: largest share of a clearance by which a drawn one is smaller.
+#: Guard: largest share of a clearance by which a drawn clearance may be smaller.
 _LEAST_SHARE = 0.9
 
 
@@ -45,7 +46,7 @@ class Scenario:
         Raises
         ------
         LifeError
-            For any other text, or a multiple that is not above 0.
+            If the text has another form, or a multiple is not above 0.
         """
         name, _, given = text.partition(":")
         numbers = {}
@@ -57,7 +58,7 @@ class Scenario:
                 numbers[key.strip()] = math.nan
         good = bool(name.strip()) and numbers.keys() <= {"load", "coefficient"}
         if not good or not all(0.0 < value < math.inf for value in numbers.values()):
-            raise LifeError(f"scenario: got {text!r}, expected NAME:load=X,coefficient=Y, one of them or both, above 0")
+            raise LifeError(f"scenario: got {text!r}, expected NAME:load=X,coefficient=Y, one or both, above 0")
         return Scenario(name.strip(), **numbers)
 
 
@@ -71,7 +72,7 @@ class Plan:
     stop_h: float | None = None
     face_length_m: float = 250.0
     shift_h: float = 8.0
-    #: standard deviation of the load's size, relative
+    #: relative standard deviation of the load's size
     load_deviation: float = 0.05
     draws: int = 2000
     seed: int = 0
@@ -103,9 +104,9 @@ class Forecast:
     """Hours to the limit.
 
     hours : (draws,) sorted; infinite where the limit is not reached within the horizon
-    path : wear from the believed clearances on
-    rate : (draws,) exposure in an hour in 1/N
-    now : (draws, 2) clearances now in m
+    path : wear from the present clearances on
+    rate : (draws,) exposure per hour in 1/N
+    now : (draws, 2) present clearances in m
     scenarios : forecast of each scenario of the plan, by name
     """
 
@@ -129,7 +130,7 @@ class Forecast:
     def clearances(self, hours: Array) -> Array:
         """Return P10, P50 and P90 of both clearances in m after some hours, shape (3, n, 2).
 
-        Infinite beyond the end of the path, where a limit has been reached.
+        They are infinite beyond the end of the path, where a limit has been reached.
         """
         grown = self.path.clearance_growth()
         exposure = np.multiply.outer(self.rate, hours)
@@ -140,7 +141,7 @@ class Forecast:
         return np.quantile(np.stack(each, axis=2), (0.1, 0.5, 0.9), axis=0, method="lower")
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the forecast for JSON; null: not reached within the horizon."""
+        """Return the forecast for JSON; times beyond the horizon are null."""
         plan = self.plan
         return {
             **self._times(),
@@ -183,19 +184,19 @@ def forecast(
     Parameters
     ----------
     scene : Scene
-        With wear; its clearances are the present ones, its loads the expected ones. `wear.prior_m2_n` gives the 5 % and
-        95 % points of the coefficient, which is taken as log-normal.
+        A scene with wear, with the present clearances and the expected loads. `wear.prior_m2_n` gives the 5 % and 95 %
+        points of the coefficient's log-normal distribution.
     plan : Plan
     deviation_m : tuple of float
-        Standard deviations of the clearances now, in m.
+        Standard deviations of the present clearances in m.
     known : Coefficient or None
-        Posterior of the wear coefficient from a history of clearances. It includes the uncertainty of the load, so that
-        only `tuning.PATH_DEVIATION` is drawn in addition. None: the prior.
+        Posterior of the wear coefficient from a history of clearances. It includes the uncertainty of the load, so only
+        `tuning.PATH_DEVIATION` is drawn in addition. None for the prior.
 
     Raises
     ------
     LifeError
-        Where the scene has no wear, does not travel or has no period, or its coefficient lies outside the prior.
+        If the scene has no wear, does not travel or has no period, or if its coefficient lies outside the prior.
     """
     others = {
         one.name: _forecast(with_load(scene, one.load), plan, deviation_m, known, one.coefficient)
@@ -212,7 +213,7 @@ def _forecast(
     if wear is None or wear.travel_speed_m_s <= 0.0:
         raise LifeError("wear: got none, or no travel speed, expected a section `wear` with travel_speed_m_s above 0")
     if not all(0.0 <= value < math.inf for value in deviation_m):
-        raise LifeError(f"deviations: got {deviation_m} m, expected two finite ones >= 0")
+        raise LifeError(f"deviations: got {deviation_m} m, expected two finite numbers >= 0")
     if known is None:
         check_prior(wear)
     low, high = (math.log(value) for value in wear.prior_m2_n)
@@ -224,7 +225,7 @@ def _forecast(
         coefficient, load = known.draw(plan.draws, rng), 1.0 + tuning.PATH_DEVIATION * rng.standard_normal(plan.draws)
     coefficient = coefficient * multiple
     size = np.array([scene.clearance.horizontal_m, scene.clearance.vertical_m])
-    # also a clearance that is hardly known is not negative
+    # even a clearance that is hardly known stays above zero
     now = np.maximum(rng.normal(0.0, 1.0, (plan.draws, 2)) * deviation_m, -_LEAST_SHARE * size)
     most = float(coefficient.max() * load.max()) * travel / wear.pad_area_m2
     # a smaller present clearance is further from its limit, so the path must be longer
@@ -245,24 +246,24 @@ def _forecast(
 
 
 def check_prior(wear: Wear) -> None:
-    """Raise LifeError for a coefficient that contradicts its prior, which a forecast without a history uses."""
+    """Raise LifeError if the coefficient lies outside its prior, from which a forecast without a history draws."""
     low, high = wear.prior_m2_n
     if not low <= wear.coefficient_m2_n <= high:
         raise LifeError(
             f"wear.coefficient_m2_n: got {wear.coefficient_m2_n:g} m^2/N, expected one within wear.prior_m2_n, {low:g} "
-            f"to {high:g}: the forecast draws from that prior"
+            f"to {high:g}: the forecast draws from this prior"
         )
 
 
 def _exposure_at(exposure: Array, clearance: Array, limit: Array) -> Array:
-    """Return the exposure at which a clearance that never falls reaches each limit, infinite where it does not."""
+    """Return the exposure at which a non-decreasing clearance reaches each limit, infinite if it does not reach it."""
     rising = np.maximum.accumulate(clearance) + 1e-15 * np.arange(len(clearance))
     at = np.interp(limit, rising, exposure)
     return np.where(limit > rising[-1], np.inf, np.where(limit <= rising[0], 0.0, at))
 
 
 def with_load(scene: Scene, multiple: float) -> Scene:
-    """Return the scene with all of its loads multiplied; gravity stays."""
+    """Return the scene with all of its loads multiplied; gravity does not change."""
 
     def times(values: tuple[float, float]) -> tuple[float, float]:
         return multiple * values[0], multiple * values[1]
@@ -281,8 +282,9 @@ def with_load(scene: Scene, multiple: float) -> Scene:
 def with_clearances(scene: Scene, horizontal_m: float, vertical_m: float, depth: Array | None = None) -> Scene:
     """Return the scene with the estimated clearances, which include all wear so far.
 
-    `depth`, shape (8,) in m, is the wear of the pads if known; the clearances before it follow.
-    With running-in the pads are worn by the growth of the clearances, because they no longer wear like new pads.
+    `depth`, shape (8,) in m, is the wear of the pads, if known; it is subtracted from the clearances to give those of
+    new pads. If it is not known and the scene has running-in, the growth of the clearances gives the wear, because worn
+    pads wear more slowly than new pads.
     """
     wear, new = scene.wear, scene.clearance
     if wear is None:
@@ -301,15 +303,15 @@ def with_clearances(scene: Scene, horizontal_m: float, vertical_m: float, depth:
 def with_estimate(scene: Scene, facts: Mapping[str, Any]) -> tuple[Scene, tuple[float, float]]:
     """Return the scene with the values of an estimate's JSON, and the standard deviations of the clearances in m.
 
-    The contact is the estimated one where a clearance was estimated with it: a softer contact loads other pads.
+    If a clearance was estimated, the scene gets the estimated contact too, because a softer contact loads other pads.
 
     Raises
     ------
     LifeError
-        For a withdrawn one, or JSON of something else.
+        If the estimate is withdrawn, or the JSON is not an estimate's.
     """
     if not isinstance(facts, Mapping):
-        raise LifeError(f"estimate: got {type(facts).__name__}, expected what `plow-twin estimate --json` prints")
+        raise LifeError(f"estimate: got {type(facts).__name__}, expected the output of `plow-twin estimate --json`")
     horizontal, vertical = (_estimated(name, facts.get(name)) for name in ("horizontal", "vertical"))
     known = any(State(facts[name]["state"]).known for name in ("horizontal", "vertical"))
     if known and "stiffness" in facts:
@@ -336,11 +338,11 @@ def _estimated(name: str, facts: Any) -> tuple[float, float]:
         mean, low, high = (float(facts[key]) for key in ("mean_m", "p05_m", "p95_m"))
     except (KeyError, TypeError, ValueError) as error:
         raise LifeError(
-            f"estimate: {name}: got {reprlib.repr(facts)}, expected what `plow-twin estimate --json` prints: state, "
+            f"estimate: {name}: got {reprlib.repr(facts)}, expected the output of `plow-twin estimate --json`: state, "
             "mean_m, p05_m, p95_m"
         ) from error
     if state is State.WITHDRAWN:
-        raise LifeError(f"estimate: got a withdrawn {name} clearance, expected one that holds")
+        raise LifeError(f"estimate: got a withdrawn {name} clearance, expected a valid one")
     if not (mean > 0.0 and -math.inf < low <= mean <= high < math.inf):
-        raise LifeError(f"estimate: {name}: got {mean} m from {low} to {high}, expected finite ones in order")
+        raise LifeError(f"estimate: {name}: got {mean} m from {low} to {high}, expected finite values in order")
     return mean, (high - low) / (2.0 * NORMAL_P95)

@@ -1,4 +1,4 @@
-"""The forward model of the estimate: motions of one scene with other numbers, under the load believed."""
+"""The forward model of the estimate: motions of one scene with varied parameters under the believed load."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from plow_twin.solve.state import EVENT, SEGMENT, TOTALS, Parts, Status, new_rec
 
 Array = NDArray[np.float64]
 
-#: Bound: a run may take so many steps for each second of motion, and so many more; rows of the log of a run.
+#: Bound: most steps of a run for each second of motion, and additional steps; rows in the log of a run.
 _STEPS_PER_SECOND, _STEPS = 20_000, 2_000
 _LOG_SIZE = 4096
-#: Bound: steps of the series that cost as much as an implicit one.
+#: Bound: number of series steps that cost as much as one implicit step.
 _IMPLICIT_WORK = 10
 
 
@@ -37,26 +37,28 @@ class Motions:
 
 
 class Forward:
-    """Runs one scene with varied numbers; all use one compiled kernel, since the terms stay.
+    """Runs one scene with varied parameters; all runs use one compiled kernel, because the terms do not change.
 
     Parameters
     ----------
     scene : Scene
-        The nominal scene; its loads and its wear are not used.
+        The nominal scene, whose loads and wear are not used.
     load : Load
-        The load believed.
+        The believed load.
 
     Raises
     ------
     EstimateError
-        For a scene with a `support`.
+        If the scene has a `support`, or if its `head.carries` is not `walls`.
     """
 
     def __init__(self, scene: Scene, load: Load) -> None:
         if scene.head.carries != "walls":
-            raise EstimateError(f"scene: got head.carries {scene.head.carries}, expected walls: the fit knows no block")
+            raise EstimateError(
+                f"scene: got head.carries {scene.head.carries}, expected walls, because the fit cannot use a block"
+            )
         if scene.support is not None:
-            raise EstimateError(f"scene: got {scene.support}, expected no support: the fit does not know its place")
+            raise EstimateError(f"scene: got {scene.support}, expected no support, whose place the fit does not know")
         nominal = compile_scene(replace(scene, loads=(), wear=None), tuning.TOLERANCE, sampled=True)
         self._terms = nominal.parts.terms
         self._implicit = nominal.parts.implicit
@@ -72,11 +74,11 @@ class Forward:
         self.work = 0
 
     def renewed(self) -> Forward:
-        """Return a copy with no work done."""
+        """Return a copy with a work of zero."""
         return Forward(self._scene, self.load)
 
     def of(self, scene: Scene) -> Forward:
-        """Return a model of another nominal scene under the same load, with no work done."""
+        """Return a model of another nominal scene under the same load, with a work of zero."""
         return Forward(scene, self.load)
 
     def run(
@@ -88,7 +90,7 @@ class Forward:
         Parameters
         ----------
         starts, states : ndarray, shape (s,), (s, 6)
-            Times in s and x, y, theta and their rates from which the runs begin.
+            Times in s at which the runs begin, and x, y, theta and their rates at these times.
         edges : ndarray of int64, shape (s + 1,)
             Run m fills the rows edges[m]:edges[m + 1].
         times : ndarray, shape (n,)
@@ -98,12 +100,12 @@ class Forward:
         push : ndarray, shape (3,), optional
             A constant load added to the believed load, in N, N, N m.
         share : ndarray, shape (8,), optional
-            Each pair's stiffness over the contact's.
+            Stiffness of each pair relative to the contact's stiffness.
 
         Returns
         -------
         Motions or None
-            None where the head leaves the model's range.
+            None if the head leaves the model's range.
         """
         params, segments = self._compiled(scene, gain, depth, push, share)
         records = new_records(state_type(self._terms), len(starts))
@@ -128,7 +130,7 @@ class Forward:
     def _compiled(
         self, scene: Scene, gain: Array, depth: Array | None, push: Array | None, share: Array | None
     ) -> tuple[Any, Any]:
-        """Return parameters and segments of the load; many runs in a row differ by their states or gains alone."""
+        """Return parameters, cached because successive runs often share them, and segments of the load."""
         walls = tuple(None if part is None else part.tobytes() for part in (depth, share))
         if self._params is None or self._params[:2] != (scene, walls):
             params = compile_scene(scene, tuning.TOLERANCE, sampled=True).params

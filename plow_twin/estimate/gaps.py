@@ -1,8 +1,8 @@
 """Clearances from gap sensors, independent of the contact law, and the pose where it is not measured.
 
-A gap is linear in the head's body coordinates and in the clearances (`model/geometry.py`), so each message with sensors
-at enough pairs gives both by least squares: at five pairs, or at four, one at each wall, with a measured theta. The
-constant errors of the sensors do not average out; they limit the result.
+A gap is linear in the head's body coordinates and in the clearances (`model/geometry.py`), so each message with enough
+gaps gives both by least squares. Five pairs are enough; with a measured theta, four pairs are enough, one at each wall.
+The constant errors of the sensors do not average out and limit the accuracy.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from plow_twin.model.scene import Clearance, Scene
 
 Array = NDArray[np.float64]
 
-#: Guard: a larger number is not a gap [m].
+#: Guard: numbers beyond this are not gaps [m].
 _LARGEST = 1e3
-#: Bound: rounds of reweighting.
+#: Bound: number of rounds, each of which corrects the pose by the nonlinear residual.
 _ROUNDS = 4
 #: Guard: singular value of the equations below which the sensors do not determine an unknown.
 _SINGULAR = 1e-6
-#: Definition: clearances between the pads that face each other, by the two pairs.
+#: Definition: for each clearance between facing pads, the two pairs.
 GROUPS: Final = {
     "horizontal_top": (1, 3),
     "horizontal_bottom": (7, 5),
@@ -46,7 +46,7 @@ class GapsError(PlowTwinError):
 class Gaps:
     """Measured gaps: `t` (n,) stamps in s, strictly increasing; `gap` (n, 8) in m, NaN where there is no sensor.
 
-    deviation : stated standard deviation of a sensor in m; 0: not stated
+    deviation : stated standard deviation of a sensor in m; 0 if not stated
     """
 
     t: Array
@@ -57,12 +57,12 @@ class Gaps:
     def of(t: ArrayLike, gap: ArrayLike, deviation: float = 0.0) -> tuple[Gaps, int]:
         """Return rows in order of time, and the number of rows left out.
 
-        Left out are rows without a finite stamp or any gap, with a gap beyond 1e3 m, or with a repeated stamp.
+        Rows are left out if their stamp is not finite or repeated, if they have no gap, or a gap beyond 1e3 m.
 
         Raises
         ------
         GapsError
-            For arrays of the wrong shape.
+            If an array has the wrong shape.
         """
         times, rows, left_out = usable_rows(t, gap, _LARGEST, ("gaps", "gap"), GapsError)
         return Gaps(times, rows, deviation), left_out
@@ -77,11 +77,11 @@ class Gaps:
 class GapsFit:
     """Clearances and poses computed from measured gaps.
 
-    poses : the poses where pose and clearances follow from each message
-    clearance, deviation : (2,) horizontal and vertical in m; infinite deviation where not determined
-    groups : the clearance between facing pads, where both have sensors
+    poses : poses from the gaps; empty if theta was taken from the measured poses
+    clearance, deviation : (2,) horizontal and vertical clearance, and their standard deviations, in m
+    groups : clearances between facing pads that both have sensors
     used : number of messages
-    contradiction : largest mean residual of a sensor, in constant errors; 0 where no sensor is redundant
+    contradiction : largest mean residual of a sensor in units of the constant error; 0 if no sensor is redundant
     """
 
     poses: Poses
@@ -93,9 +93,9 @@ class GapsFit:
 
 
 def fit_gaps(scene: Scene, gaps: Gaps, poses: Poses) -> GapsFit | None:
-    """Fit clearances and poses to gaps; theta comes from `poses` where the sensors alone do not give it.
+    """Fit clearances and poses to gaps, with theta from `poses` if the gaps do not determine it.
 
-    None where fewer than 20 messages have enough sensors.
+    Returns None if fewer than 20 messages have enough gaps.
     """
     error = gaps.deviation or tuning.CONSTANT_ERROR
     rows = penetration_rows(replace(scene, clearance=Clearance(0.0, 0.0)))
@@ -143,14 +143,14 @@ def _fit_one_set(
     inverse = np.linalg.pinv(equations)
     left = np.zeros_like(gap)
     for _ in range(_ROUNDS):
-        # theta is small: the equations at 0 serve all rounds, each of which reduces the residual
+        # theta is small, so the equations at theta = 0 are good enough for all rounds
         c, s = np.cos(unknown[:, 4]), np.sin(unknown[:, 4])
         reach = c[:, None] * rows[0, pairs] + s[:, None] * rows[1, pairs] + rows[4, pairs]
         left = gap - (unknown[:, :4] @ fixed.T - reach)
         unknown[:, : equations.shape[1]] += left @ inverse.T
     x, y = _displacement(unknown, scene)
     clearance = np.median(unknown[:, 2:4], axis=0)
-    # the errors of the sensors are constant, noise averages out
+    # the errors of the sensors are constant; noise averages out
     spread = error * np.sqrt((inverse[2:4] ** 2).sum(axis=1))
     noise = unknown[:, 2:4].std(axis=0) / np.sqrt(len(t))
     q = np.stack([x, y, unknown[:, 4]], axis=1)
@@ -174,7 +174,7 @@ def _displacement(unknown: Array, scene: Scene) -> tuple[Array, Array]:
 
 
 def _between(rows: Array, t: Array, gap: Array, pairs: NDArray[np.int64], pair: tuple[int, int], theta: Array) -> Array:
-    """Return the clearance between two pads that face each other, shape (n,), at any place of the head."""
+    """Return the clearance between two facing pads from each message, shape (n,), for any pose of the head."""
     first, second = (gap[:, int(np.flatnonzero(pairs == one)[0])] for one in pair)
     both = rows[:, list(pair)].sum(axis=1)
     clearance: Array = first + second + np.cos(theta) * both[0] + np.sin(theta) * both[1] + both[4]

@@ -1,8 +1,8 @@
-"""The odds of two laws of a hard contact, by the likelihood of the motion under each.
+"""The odds of two laws for a hard contact, from the likelihood of the motion under each law.
 
-The features of drawn motions of a law are a smooth function of their unknowns, a polynomial of few terms, plus normal
-noise. This gives the likelihood of a measured motion under each law, and the odds of the two (synthetic likelihood:
-Wood, Nature 466 (2010) 1102; the integral over the parameters after Laplace).
+Under each law, the features of drawn motions are modelled as a polynomial of the drawn parameters plus normal noise.
+This gives the likelihood of the measured motion under each law, and thus the odds (synthetic likelihood: Wood, Nature
+466 (2010) 1102). Laplace's method integrates over the parameters.
 """
 
 from __future__ import annotations
@@ -20,17 +20,18 @@ Array = NDArray[np.float64]
 
 #: Guard: least variance of a feature.
 _LEAST = 1e-9
-#: Definition: parameters that enter to the third power (penetration, damping), and parameters whose effect depends on
-#: them (clearances).
+#: Definition: parameters with terms up to the third degree (penetration, damping), and parameters whose effect depends
+#: on these (clearances).
 _CURVED, _CHANGING = (0, 1), (5, 6)
-#: Bound: steps to the likeliest parameters (Levenberg-Marquardt), damping of the first step, gain that ends the steps.
+#: Bound: number of Levenberg-Marquardt steps to the likeliest parameters, damping of the first step, gain that ends the
+#: steps.
 #: Step: of the difference quotients by the parameters.
 _STEPS, _DAMPED, _ENOUGH, _SMALL = 30, 1e-2, 1e-2, 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class Draws:
-    """Motions of one law: their features (n, m), and the unknowns that they were drawn with (n, 7).
+    """Motions under one law: their features (n, m), and the unknowns with which they were drawn (n, 7).
 
     The unknowns are the logarithms of penetration and damping, three gains of the load, and the differences of the two
     clearances from the reach.
@@ -41,7 +42,7 @@ class Draws:
 
 
 def log_odds(believed: Draws, other: Draws, measured: Array) -> float:
-    """Return the log odds of the other law for `measured`, shape (m,)."""
+    """Return the log odds of the other law given the features `measured`, shape (m,)."""
     both = np.concatenate([believed.like, other.like])
     middle, scale = both.mean(axis=0), both.std(axis=0) + _LEAST
     surfaces = [_Surface.through(law.drawn, (law.like - middle) / scale) for law in (believed, other)]

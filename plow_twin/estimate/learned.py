@@ -1,10 +1,10 @@
-"""Numbers of the members of a follower, learned from the poses that move them.
+"""Parameters of a follower's members, learned from the poses that move the members.
 
-The motion behind a hard contact is too irregular to be fitted, so its estimate leaves stiffness and load gains open.
-The predictions of the members differ by their numbers too: their regression on the numbers is the sensitivity of a
-pose, the remainder the covariance of a prediction with known numbers. So innovations determine the numbers as in a
-two-stage Kalman filter (Friedland, IEEE Trans. Autom. Control 14 (1969) 359). Behind a hard contact each rebound shows
-its duration pi sqrt(m / K).
+With a hard contact the motion is too irregular to be fitted, so an estimate hardly determines stiffness and load gains.
+The members' predictions differ partly because their parameters differ. Regression of the predictions on the parameters
+gives the sensitivity of a pose; the residuals give the covariance of a prediction with known parameters. The
+innovations then determine the parameters as in a two-stage Kalman filter (Friedland, IEEE Trans. Autom. Control 14
+(1969) 359). The duration pi sqrt(m / K) of each rebound from a hard contact shows the stiffness.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from plow_twin.model.scene import Clearance, Scene
 
 Array = NDArray[np.float64]
 
-#: Bound: members for each number that is learned.
+#: Bound: fewest members for each learned parameter.
 _MEMBERS: Final = 4
 #: Guard: largest restitution.
 _MOST_RESTITUTION = 0.999
 
 
 def numbers_of(scenes: Sequence[Scene], gain: Array) -> Array:
-    """Return the numbers of members in units of `tuning.LEARNED_TO`, shape (m, 7), from scenes and gains (m, 3).
+    """Return the parameters of members in units of `tuning.LEARNED_TO`, shape (m, 7), from scenes and gains (m, 3).
 
-    These are the logarithms of K^-1/2 and of the damping (or restitution), the clearances and the gains of the load.
+    They are the logarithms of K^-1/2 and of the damping (or restitution), the clearances and the load gains.
     """
     damping = [one.contact.damping if one.contact.restitution is None else one.contact.restitution for one in scenes]
     raw = np.column_stack([
@@ -46,7 +46,7 @@ def numbers_of(scenes: Sequence[Scene], gain: Array) -> Array:
 
 
 def with_numbers(scene: Scene, numbers: Array) -> tuple[Scene, Array]:
-    """Return a member's scene and gains of the load, (3,), with other numbers, (7,)."""
+    """Return a member's scene and load gains, (3,), with other parameters, (7,)."""
     softness, damping, horizontal, vertical, *gain = (numbers * np.array(tuning.LEARNED_TO)).tolist()
     number = None
     if scene.contact.restitution is not None:
@@ -58,14 +58,14 @@ def with_numbers(scene: Scene, numbers: Array) -> tuple[Scene, Array]:
 
 
 class Learner:
-    """Numbers of all members as the poses determine them: a normal distribution, in units of `tuning.LEARNED_TO`.
+    """The normal distribution of the members' parameters given the poses, in units of `tuning.LEARNED_TO`.
 
     Parameters
     ----------
     drawn : ndarray, shape (m, 7)
-        Numbers of the members as drawn from an estimate, of the median twin first.
+        Parameters of the members as drawn from an estimate, those of the median twin first.
     learned : ndarray of int, shape (k,)
-        The numbers that are learned.
+        Indices of the learned parameters.
     time : float
         Time of the estimate in s.
     """
@@ -76,7 +76,7 @@ class Learner:
         self._least, self._most = own.min(axis=0), own.max(axis=0)
         self.mean, self.covariance = own[0].copy(), np.cov(own.T).reshape(len(learned), -1)
         self._widest = np.sqrt(np.diag(self.covariance))
-        # the members' places in the distribution; the median twin's is the middle
+        # standardised differences of the members from the mean; the median twin is at the mean
         white = own - own.mean(axis=0)
         white[0] = 0.0
         self._white = white @ np.linalg.inv(np.linalg.cholesky(self.covariance)).T
@@ -84,17 +84,17 @@ class Learner:
 
     @classmethod
     def of(cls, drawn: Array, time: float) -> Learner | None:
-        """Return a learner of the numbers that an estimate knows worse than to a unit; None without such numbers."""
+        """Return a learner of the parameters whose deviation exceeds a unit; None without any, or with few members."""
         learned = np.flatnonzero(drawn[1:].std(axis=0) > 1.0)
         enough = len(drawn) >= _MEMBERS * (len(learned) + 1)
         return cls(drawn, learned, time) if len(learned) and enough else None
 
     def _begin(self) -> None:
-        """Forget the poses since the distribution was changed."""
+        """Forget the poses since the last update of the distribution."""
         self._precision, self._score = np.zeros((len(self.open), len(self.open))), np.zeros(len(self.open))
 
     def take_over(self, before: Learner) -> None:
-        """Combine what was learned before with the new estimate, unless the estimate contradicts it."""
+        """Combine the previous learner's distribution with the new estimate, unless they contradict each other."""
         both, here, there = np.intersect1d(self.open, before.open, return_indices=True)
         if not len(both):
             return
@@ -112,9 +112,9 @@ class Learner:
         Parameters
         ----------
         numbers : ndarray, shape (m, 7)
-            Of the members.
+            Parameters of the members.
         seen : ndarray, shape (m, c)
-            Their predictions, minus the mean.
+            Predictions of the members, minus their mean.
         off : ndarray, shape (c,)
             The pose minus the mean prediction.
         noise : ndarray, shape (c,)
@@ -128,22 +128,23 @@ class Learner:
         rest = seen - apart @ slope
         alone = rest.T @ rest / (len(own) - len(self.open) - 1)
         inverse = np.linalg.inv(alone + np.diag(noise**2))
-        # the scatter of the members alone gives a slope whose square looks like information
+        # scatter of the members alone already gives a random slope; the information that it seems to contain is
+        # subtracted
         self._precision += slope @ inverse @ slope.T - spread * np.trace(inverse @ alone)
         self._score += slope @ inverse @ (off - (self.mean - middle) @ slope)
 
     def learn(self, time: float) -> None:
-        """Change the distribution by the poses since the change before."""
+        """Update the distribution with the poses since the last update."""
         root = np.linalg.cholesky(self.covariance)
         value, axes = np.linalg.eigh(tuning.LEARNING * root.T @ self._precision @ root)
         turned = root @ axes
         before = np.sqrt(np.diag(self.covariance))
         self.covariance = (turned / (1.0 + value.clip(0.0))) @ turned.T
         step = tuning.LEARNING * (self.covariance @ self._score)
-        # linear within a deviation
+        # the linearisation is good within one deviation
         step /= max(1.0, float(np.abs(step / before).max()))
         self.mean = np.clip(self.mean + step, self._least, self._most)
-        # the machine changes; nothing is known better than a unit, nor worse than by the estimate
+        # the machine changes, so deviations grow with time; they stay between one unit and the estimate's deviation
         deviation = np.sqrt(np.diag(self.covariance))
         wider = np.maximum(deviation, 1.0) * np.exp(0.5 * (time - self.time) / tuning.LEARNED_FOR)
         share = np.minimum(wider, self._widest) / deviation
@@ -152,7 +153,7 @@ class Learner:
         self._begin()
 
     def numbers(self, which: NDArray[np.int64]) -> Array:
-        """Return the numbers of some members, shape (k, 7)."""
+        """Return the parameters of some members, shape (k, 7)."""
         found = self._all[which].copy()
         own = self.mean + self._white[which] @ np.linalg.cholesky(self.covariance).T
         found[:, self.open] = np.clip(own, self._least, self._most)

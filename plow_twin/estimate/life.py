@@ -1,8 +1,9 @@
-"""Wear over months in seconds: a few load periods give the mean force on each pad, then many periods are skipped.
+"""Wear over months, computed in seconds: some load periods give the mean force on each pad, then many are skipped.
 
-The wear rate of a pad is k_s <F> v / A (Archard), so depths depend on time, travel speed and coefficient only through
-the exposure E = k_s s / A in 1/N, s the travel in m:  dh/dE = <F>(h).  One path h(E) serves every coefficient. It is
-followed by Heun's method; the difference from Euler's step, and the change of the clearance in a step, bound the step.
+The wear rate of a pad is k_s <F> v / A (Archard). The depths therefore depend on time, travel speed and coefficient
+only through the exposure E = k_s s / A in 1/N, where s is the travel in m, and dh/dE = <F>(h). One path h(E) holds for
+every coefficient. Heun's method follows the path. The size of a step is limited by the difference from Euler's step and
+by the change of the clearance.
 
 References: Archard, J. Appl. Phys. 24 (1953) 981; Lemaitre and Doghri, Comput. Methods Appl. Mech. Eng. 115 (1994) 197
 (jump in cycles); ISO 13381-1 (prognosis).
@@ -26,7 +27,7 @@ from plow_twin.run.simulate import simulate
 
 Array = NDArray[np.float64]
 
-#: Guard: wear in m that measures the travel of sliding pads; too small to matter.
+#: Guard: wear in m by which the travel of sliding pads is measured, too small to change the motion.
 _TRACE_M = 1e-12
 #: Bound: rows inserted for each row of a path with running-in.
 _FINER = 16
@@ -37,7 +38,7 @@ _LEAST_CLEARANCE = 1e-3
 
 
 class LifeError(PlowTwinError):
-    """The scene does not wear, or has no period."""
+    """Wear over a machine's life cannot be computed from the input."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,9 +58,9 @@ class Path:
     error: float
 
     def clearance_growth(self) -> Array:
-        """Return how much the horizontal and the vertical clearance have grown, shape (n, 2), in m.
+        """Return the growth of the horizontal and the vertical clearance, shape (n, 2), in m.
 
-        A wall has two pads: the mean of the two moves it; left and right, top and bottom add up.
+        A wall moves by the mean wear of its two pads. The growth of a clearance is the sum over its two walls.
         """
         horizontal = 0.5 * self.depth @ np.abs(NORMAL_X)
         vertical = 0.5 * self.depth @ np.abs(NORMAL_Y)
@@ -67,19 +68,19 @@ class Path:
 
 
 def period_of(scene: Scene) -> float:
-    """Return the period in s of a scene's slowest harmonic load; without a harmonic load, of its table.
+    """Return the period in s of the slowest harmonic load or, if there is none, of the longest table.
 
     Raises
     ------
     LifeError
-        Without a load of either kind, or where the table is too short for means.
+        If there is neither, or if the table is too short for mean forces.
     """
     omegas = [load.omega_rad_s for load in scene.loads if isinstance(load, Harmonic)]
     if omegas:
         return 2.0 * math.pi / min(omegas)
     tables = [load for load in scene.loads if isinstance(load, Table)]
     if not tables:
-        raise LifeError("loads: got no harmonic load and no table, expected one whose period the cycles are counted by")
+        raise LifeError("loads: got no harmonic load and no table, expected a load with a period")
     longest = max(tables, key=lambda load: float(load.t[-1]))
     period = Load(longest.t, longest.wrench).period()
     periods = float(longest.t[-1]) / period
@@ -91,12 +92,12 @@ def period_of(scene: Scene) -> float:
 def mean_forces(scene: Scene, depth: Array, tol: float = 1e-6) -> tuple[Array, Array]:
     """Return the mean force of each pad in N with worn walls, shape (8,), and its standard error over the periods.
 
-    With wear by sliding in the plane, the force counts by the sliding distance per travel.
+    If pads also wear by sliding in the plane, each force is weighted by the sliding distance per travel.
 
     Raises
     ------
     LifeError
-        Where the scene has no period, or the head leaves the model's range.
+        If the scene has no period, or the head leaves the model's range.
     """
     period = period_of(scene)
     wear = scene.wear or Wear(0.0, 1.0, 0.0)
@@ -111,11 +112,11 @@ def mean_forces(scene: Scene, depth: Array, tol: float = 1e-6) -> tuple[Array, A
         except SolverError as error:
             widest = [1e3 * value for value in _clearances(scene, depth)]
             raise LifeError(
-                f"clearances: got {widest[0]:.1f} mm and {widest[1]:.1f} mm at the end of the path, expected ones with "
-                f"which the model runs: {error}"
+                f"clearances: got {widest[0]:.1f} mm and {widest[1]:.1f} mm at the end of the path, expected "
+                f"clearances with which the model runs: {error}"
             ) from error
         if trace:
-            # the wear by force and sliding, as an impulse that would cause the same wear by travel alone
+            # the impulse that would cause the same wear by travel alone
             impulses.append((result.wear_depth - depth) * (wear.pad_area_m2 / (trace * wear.travel_speed_m_s)))
         else:
             impulses.append(np.array([values["impulse"] for values in result.statistics.values()]))
@@ -124,7 +125,7 @@ def mean_forces(scene: Scene, depth: Array, tol: float = 1e-6) -> tuple[Array, A
 
 
 def _trace(scene: Scene, period: float) -> float:
-    """Return a wear coefficient in m^2/N that hardly moves the walls: `_TRACE_M` deep under the weight."""
+    """Return a wear coefficient in m^2/N so small that the head's weight wears a pad by about `_TRACE_M`."""
     wear = scene.wear
     if wear is None or wear.travel_speed_m_s <= 0.0:
         raise LifeError("wear: got none, or no travel speed, expected a section `wear` with travel_speed_m_s above 0")
@@ -133,16 +134,16 @@ def _trace(scene: Scene, period: float) -> float:
 
 
 def wear_path(scene: Scene, limit: tuple[float, float], most_exposure: float) -> Path:
-    """Follow the wear until a clearance is beyond its limit in m, or to `most_exposure` in 1/N.
+    """Follow the wear until a clearance reaches its limit in m, or the exposure reaches `most_exposure` in 1/N.
 
     Raises
     ------
     LifeError
-        Where the scene has no wear or no period, or the path does not end.
+        If the scene has no wear or no period, or the path does not end.
     """
     if scene.wear is None:
-        raise LifeError("wear: got none, expected its parameters")
-    # depths without running-in, so that one coefficient holds for all pads
+        raise LifeError("wear: got no wear, expected a section `wear`")
+    # depths without running-in, so that all pads have the same coefficient
     steady = without_running_in(scene.wear, np.array(scene.wear.initial_depth_m, dtype=np.float64))
     depth = with_running_in(scene.wear, steady)
     smallest = max(min(_clearances(scene, depth)), _LEAST_CLEARANCE)
@@ -155,7 +156,7 @@ def wear_path(scene: Scene, limit: tuple[float, float], most_exposure: float) ->
         euler = steady + step * force
         ahead, ahead_deviation = mean_forces(scene, with_running_in(scene.wear, euler))
         change = 0.5 * step * (ahead - force)
-        # noise of the means does not count as an error of the step
+        # noise of the mean forces is not an error of the step
         noise = 0.5 * step * np.hypot(deviation, ahead_deviation)
         off = float(np.maximum(np.abs(change) - 2.0 * noise, 0.0).max()) / smallest
         if off > tuning.JUMP[1] and step * float(force.max()) > 1e-3 * smallest:
@@ -177,7 +178,7 @@ def wear_path(scene: Scene, limit: tuple[float, float], most_exposure: float) ->
 
 
 def _finer(columns: list[Array]) -> list[Array]:
-    """Return columns with further rows on straight lines between each two; running-in between rows is neglected."""
+    """Return columns with linearly interpolated rows in between; running-in between rows is neglected."""
     at = np.arange(len(columns[0]), dtype=np.float64)
     more = np.linspace(0.0, at[-1], _FINER * (len(at) - 1) + 1)
     before = np.minimum(more.astype(int), max(len(at) - 2, 0))

@@ -1,10 +1,10 @@
-"""The clearances at which the path of the head over the load's period is likeliest.
+"""The clearances that make the measured path over the load's period most likely.
 
-The features of drawn motions, with their mean path over the period, are a quadratic function of their parameters plus
-normal noise (synthetic likelihood: Wood, Nature 466 (2010) 1102). The clearances of largest likelihood are then
-features of a regression, which weighs them by the drawn motions (semi-automatic approximate Bayesian computation:
-Fearnhead and Prangle, J. R. Stat. Soc. B 74 (2012) 419). A direct regression on the path is not possible: it has more
-parts than there are draws.
+The features of drawn motions, including their mean path over the period, are modelled as a quadratic function of the
+drawn parameters plus normal noise (synthetic likelihood: Wood, Nature 466 (2010) 1102). The clearances of largest
+likelihood are then features of a regression over the drawn motions (semi-automatic approximate Bayesian computation:
+Fearnhead and Prangle, J. R. Stat. Soc. B 74 (2012) 419). A regression on the path itself is not possible, because a
+path has more numbers than there are draws.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ Array = NDArray[np.float64]
 
 #: Guard: least variance of a feature, and least deviation of a drawn parameter.
 _LEAST, _SAME = 1e-14, 1e-12
-#: Definition: parameters that interact: clearances, softness and damping.
+#: Definition: pairs of parameters with a quadratic term, from clearances, softness and damping.
 _CURVED = tuple(combinations_with_replacement(range(4), 2))
-#: Definition: folds of the cross-validation.
+#: Definition: number of folds of the cross-validation.
 _PARTS = 10
-#: Bound: Gauss-Newton steps, and the longest one in deviations of the draws.
+#: Bound: number of Gauss-Newton steps, and the longest step in deviations of the draws.
 _STEPS, _LONGEST = 5, 1.5
-#: Guard: prior deviation of an unknown parameter, over the deviation of the draws.
+#: Guard: prior deviation of a parameter without a prior, in deviations of the draws.
 _FREE = 100.0
 
 
@@ -40,15 +40,16 @@ class Seen:
     late: Array
 
     def rows(self, which: NDArray[np.bool_]) -> Seen:
-        """Return some of the motions."""
+        """Return the selected motions."""
         return Seen(self.like[which], self.late[which])
 
 
 def likeliest(drawn: Array, gain: float, motions: Seen, measured: Seen) -> Array:
-    """Return the likeliest clearances in m of each of n motions, found from the others, (n + 1, 2).
+    """Return the likeliest clearances in m of n drawn motions and of the measured motion, shape (n + 1, 2).
 
-    The last row belongs to the measured motion. `drawn`, shape (n, 7), holds clearances, the logarithms of penetration
-    and damping, and the gains of the load, which have the deviation `gain`.
+    The clearances of a drawn motion are found from other draws; the last row belongs to the measured motion. `drawn`,
+    shape (n, 7), holds clearances, the logarithms of penetration and damping, and the load gains, whose deviation is
+    `gain`.
     """
     found = np.zeros((len(drawn) + 1, 2))
     found[-1] = _likeliest(drawn, gain, motions, measured)[0]
@@ -59,7 +60,7 @@ def likeliest(drawn: Array, gain: float, motions: Seen, measured: Seen) -> Array
 
 
 def _likeliest(drawn: Array, gain: float, motions: Seen, asked: Seen) -> Array:
-    """Return the likeliest clearances in m of the motions `asked` from drawn ones, (k, 2)."""
+    """Return the likeliest clearances in m of the motions `asked`, shape (k, 2), from drawn motions."""
     middle, scale = drawn.mean(axis=0), drawn.std(axis=0)
     scale[scale <= _SAME] = 1.0
     terms = _terms((drawn - middle) / scale)
@@ -69,7 +70,7 @@ def _likeliest(drawn: Array, gain: float, motions: Seen, asked: Seen) -> Array:
     error = (motions.like - terms @ surface) / np.sqrt(free)[:, None]
     whiten = np.linalg.inv(shrunk_root(error.T @ error / len(error), _LEAST)).T
     seen, late, surface = asked.like @ whiten, asked.late @ whiten, surface @ whiten
-    # priors of the gains, then the prior of the delay
+    # four parameters without a prior, then the gains and the delay
     mean = np.concatenate([np.zeros(4), (1.0 - middle[4:]) / scale[4:], np.zeros(1)])
     weight = np.concatenate([np.full(4, _FREE), gain / scale[4:], np.full(1, tuning.LATE)]) ** -2.0
     point = np.zeros((len(seen), len(mean)))
@@ -93,7 +94,7 @@ def _terms(points: Array) -> Array:
 
 
 def _slopes(points: Array) -> Array:
-    """Return the derivatives of the terms by each of the parameters, shape (n, 7, terms)."""
+    """Return the derivatives of the terms by each parameter, shape (n, 7, terms)."""
     count, size = points.shape
     slopes = np.zeros((count, size, 1 + size + len(_CURVED)))
     each = np.arange(size)

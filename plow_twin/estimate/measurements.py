@@ -18,16 +18,16 @@ from plow_twin.model.pairs import PAIR_COUNT
 
 Array = NDArray[np.float64]
 Deviation = tuple[float, ...]
-#: Definition: no deviation is stated.
+#: Definition: deviations that are not stated.
 UNSTATED: Deviation = (0.0, 0.0, 0.0)
-#: Derived: a standard deviation from n values is known to 1 / sqrt(2 n), which is 22 % for a cell in contact, 16 % for
-#: poses and gaps, 10 % for a scatter in a comparison.
+#: Derived: a standard deviation from n values has the relative error 1 / sqrt(2 n): 22 % for a cell in contact, 16 %
+#: for poses and gaps, 10 % for a scatter in a comparison.
 FEWEST_IN_CONTACT, FEWEST_POSES, FEWEST_FOR_SCATTER = 10, 20, 50
-#: Guard: longest distance in s of poses, or samples, between which the motion in a soft contact is near a cubic.
+#: Guard: longest interval in s of poses or samples within which the motion in a soft contact is nearly cubic.
 RESOLVING: Final = 0.02
 #: Bound: smallest number of points between two knots over which a load is averaged.
 _FINER = 8
-#: Guard: largest number that can be a head's pose, in m or rad, and a load, in N or N m.
+#: Guard: largest possible number of a pose, in m or rad, and of a load, in N or N m.
 _LARGEST_POSE, _LARGEST_LOAD = 1e6, 1e15
 
 
@@ -57,13 +57,13 @@ class Poses:
     def of(t: ArrayLike, q: ArrayLike, deviation: Deviation = UNSTATED) -> tuple[Poses, int]:
         """Return rows in order of time, and the number of rows left out.
 
-        Left out are rows without a finite stamp or any finite component, with a component beyond 1e6, or with a
-        repeated stamp.
+        Rows are left out if their stamp is not finite or repeated, if they have no finite component, or a component
+        beyond 1e6.
 
         Raises
         ------
         EstimateError
-            For arrays of the wrong shape, or an invalid deviation.
+            If an array has the wrong shape, or a deviation is invalid.
         """
         _check_deviation("poses", deviation)
         times, rows = np.asarray(t, dtype=np.float64), np.array(q, dtype=np.float64)
@@ -75,7 +75,7 @@ class Poses:
         return Poses(times[index], rows[index], deviation), len(times) - len(index)
 
     def interval(self) -> float:
-        """Return the distance in s between whole poses, with partial poses merged."""
+        """Return the interval in s between complete poses, with partial poses merged."""
         measured = int(np.isfinite(self.q).sum())
         return float(np.median(np.diff(self.t))) * self.q.size / max(measured, 1)
 
@@ -89,16 +89,17 @@ class Poses:
         return Poses(self.t, self.q + by, self.deviation)
 
     def without_spikes(self, level: Array) -> tuple[Poses, int]:
-        """Leave out values far from all four neighbours; return how many. `level`, shape (3,): noise from row to row.
+        """Leave out values far from all four neighbours, and return their number.
 
-        If there are many, the sensor is bad, and no row is left out.
+        `level`, shape (3,), is the noise from row to row. If there are many such values, the sensor is bad, and none is
+        left out.
         """
         if len(self.t) < FEWEST_FOR_SCATTER:
             return self, 0
         about = np.stack([np.roll(self.q, shift, axis=0) for shift in (-2, -1, 1, 2)])
         low, high = about.min(axis=0), about.max(axis=0)
         far = tuning.SPIKE[0] * level + (high - low)
-        # no comparison with NaN holds
+        # comparisons with NaN are false
         spikes = (self.q > high + far) | (self.q < low - far)
         spikes[[0, 1, -2, -1]] = False
         count = int(spikes.sum())
@@ -107,9 +108,10 @@ class Poses:
         return Poses(self.t, np.where(spikes, np.nan, self.q), self.deviation), count
 
     def fresh(self) -> Poses:
-        """Leave out repeated values of a sensor that is slower than its sender: they are late and share their noise.
+        """Leave out repeated values of a sensor that is slower than its sender, because they are late and share their
+        noise.
 
-        A value repeated for longer comes from a stopped sensor and is kept.
+        A value that is repeated for longer shows that the sensor has stopped; then all values are kept.
         """
         one, next_one = self.q[:-1], self.q[1:]
         again = ((one == next_one) | (np.isnan(one) & np.isnan(next_one))).all(axis=1)
@@ -124,7 +126,7 @@ class Poses:
 
 @dataclass(frozen=True, eq=False)
 class Load:
-    """The load believed, joined by straight lines; before the first and after the last sample the end value holds.
+    """The believed load: linear between its samples, constant before the first sample and after the last.
 
     Attributes
     ----------
@@ -135,7 +137,7 @@ class Load:
     deviation : tuple of 3 float
         Stated standard deviation of each component; 0 if not stated.
     unknown : tuple of 3 float
-        Spectral density of the part between the samples that is not known (`believable`), in N2 s and (N m)2 s.
+        Spectral density of the unknown part of the load between its samples (`believable`), in N2 s and (N m)2 s.
     """
 
     t: Array
@@ -147,12 +149,12 @@ class Load:
     def of(t: ArrayLike, wrench: ArrayLike, deviation: Deviation = UNSTATED) -> tuple[Load, int]:
         """Return samples in order of time, and the number of samples left out.
 
-        Left out are samples that are not finite, beyond 1e15, or have a repeated stamp.
+        Samples are left out if they are not finite, beyond 1e15, or have a repeated stamp.
 
         Raises
         ------
         EstimateError
-            For arrays of the wrong shape, without two usable samples, or for an invalid deviation.
+            If an array has the wrong shape, there are fewer than two usable samples, or a deviation is invalid.
         """
         _check_deviation("load", deviation)
         times, rows = np.asarray(t, dtype=np.float64), np.asarray(wrench, dtype=np.float64)
@@ -187,7 +189,7 @@ class Load:
         return Load(self.t[first:], self.wrench[first:], self.deviation)
 
     def interval(self) -> float:
-        """Return the usual distance of samples in s."""
+        """Return the median interval of the samples in s."""
         return float(np.median(np.diff(self.t)))
 
     def gain_deviations(self) -> Array:
@@ -201,7 +203,7 @@ class Load:
         return self.oscillation() or float(self.t[-1] - self.t[0]) / 10.0
 
     def oscillation(self) -> float | None:
-        """Return the period in s of the strongest oscillation, None without one."""
+        """Return the period in s of the strongest oscillation, or None without one."""
         span = float(self.t[-1] - self.t[0])
         count = int(min(max(64, 4 * len(self.t)), 8192))
         grid = np.linspace(self.t[0], self.t[-1], count)
@@ -225,9 +227,9 @@ class Load:
         return Load(np.insert(self.t, place, t), np.insert(self.wrench, place, value, axis=0), self.deviation)
 
     def smooth(self, step: float) -> Load:
-        """Return a cubic spline through the samples, each `step` s, with `tuning.COARSE_GAIN` as stated deviation.
+        """Return values of a cubic spline through the samples every `step` s, with the deviation `tuning.COARSE_GAIN`.
 
-        A sample taken so rarely may be an average, which reduces the amplitude and keeps the shape.
+        Rare samples may be averages, which reduce the amplitude and keep the shape.
         """
         t = np.linspace(self.t[0], self.t[-1], math.ceil((self.t[-1] - self.t[0]) / step) + 1)
         size = tuning.COARSE_GAIN * np.sqrt((self.wrench**2).mean(axis=0))
@@ -245,13 +247,13 @@ class Load:
     def significance(self, share: float) -> Array:
         """Return for each sample the smallest `share` at which `thinned` leaves it out, shape (n,).
 
-        Infinite for the ends; 0 for samples that `share` leaves out too.
+        It is infinite for the two ends, and 0 for samples that `share` itself leaves out.
         """
         scale = np.ptp(self.wrench, axis=0)
         rows = self.wrench / np.where(scale > 0.0, scale, 1.0)
         out = np.zeros(len(rows))
         out[[0, -1]] = np.inf
-        # all lines of a level at once; a line that is left out has no lower levels
+        # all lines of a level are split at once; a line that is not split has no lower levels
         left, right, least = np.array([0]), np.array([len(rows) - 1]), np.array([np.inf])
         while len(left):
             inner = right - left > 1
@@ -266,7 +268,7 @@ class Load:
             chord = rows[right] - rows[left]
             error = np.abs(rows[place] - rows[left][line] - along[:, None] * chord[line]).max(axis=1)
             largest = np.maximum.reduceat(error, first[:-1])
-            # the first of the largest of each line
+            # the first sample with the largest error of each line
             at = np.flatnonzero(error == largest[line])
             middle = place[at[np.unique(line[at], return_index=True)[1]]]
             least = np.minimum(least, largest)
@@ -280,10 +282,10 @@ class Load:
     def _roughness(self) -> tuple[Array, Array, Array]:
         """Return the correlation from sample to sample, and spectral densities of the load and of the lines, (3,) each.
 
-        The rough part of the load is taken for an Ornstein-Uhlenbeck process. If a is its correlation from sample to
-        sample, their mean square distance from the lines through their neighbours grows over twice the distance by
-        (1 + a) (3 - a^2) / (3 - a): by 2 for a process that is rough (a Brownian bridge is missed), by 1 for one that
-        is sampled too rarely, whose lines themselves are off.
+        The rough part of the load is modelled as an Ornstein-Uhlenbeck process with the correlation a from sample to
+        sample. Consider the mean square distance of samples from the straight lines through their neighbours. With
+        neighbours twice as far away, it grows by (1 + a) (3 - a^2) / (3 - a). The factor is 2 for a = 1, where the
+        lines miss a Brownian bridge, and 1 for a = 0, where samples are too rare and the lines themselves are wrong.
         """
         if len(self.t) < 5:
             return np.ones(3), np.zeros(3), np.zeros(3)
@@ -296,13 +298,13 @@ class Load:
         return a, -2.0 * variance / np.log(a), variance * (1.0 + a) / (1.0 - a)
 
     def believable(self) -> Load:
-        """Return the load as known best between its samples, with the spectral density of its unknown part.
+        """Return the best estimate of the load between its samples, with the spectral density of its unknown part.
 
-        Rare samples without correlation say little about the time between them: their strong oscillations alone are
+        Rare samples without correlation say little about the load between them, so only their strong oscillations are
         kept.
         """
         correlation, its, of_samples = self._roughness()
-        # not by three standard errors
+        # correlations within three standard errors of zero
         rare = (correlation < 3.0 / math.sqrt(len(self.t))) & (self.interval() > RESOLVING)
         fx, fy, moment = np.where(rare, its, of_samples - its).tolist()
         if not rare.any():
@@ -316,9 +318,9 @@ class Load:
         return Load(t, np.where(rare, mean + strong, wrench), self.deviation, (fx, fy, moment))
 
     def averaged(self, count: int) -> Load:
-        """Return `count` knots at equal distances whose lines are nearest to this load (least squares).
+        """Return `count` equidistant knots, joined by the straight lines that fit this load best (least squares).
 
-        The remainder has a mean of zero over some knots, so it does not move the head for long.
+        The remainder has a mean of zero over some knots, so it hardly moves the head.
         """
         knots = np.linspace(self.t[0], self.t[-1], count)
         within = max(_FINER, math.ceil(2.0 * len(self.t) / count))
@@ -326,7 +328,7 @@ class Load:
         times = self.t[0] + (self.t[-1] - self.t[0]) * place / (count - 1)
         left = np.minimum(place.astype(np.int64), count - 2)
         share = place - left
-        # the normal equations have three diagonals
+        # the normal equations are tridiagonal
         bands = np.zeros((2, count))
         bands[1] = np.bincount(left, (1.0 - share) ** 2, count) + np.bincount(left + 1, share**2, count)
         bands[0, 1:] = np.bincount(left, share * (1.0 - share), count)[:-1]
@@ -349,7 +351,7 @@ def _from_lines(t: Array, value: Array) -> Array:
 
 
 def filled(poses: Poses) -> Array:
-    """Return the poses with gaps of components bridged by straight lines; zeros for a component never measured."""
+    """Return the poses with missing values bridged by straight lines; zeros for a component that was never measured."""
     out = np.zeros_like(poses.q)
     for i, column in enumerate(poses.q.T):
         there = np.isfinite(column)
@@ -364,7 +366,7 @@ def own_deviations(brought: Iterable[tuple[float, ...]]) -> Array:
 
 
 def useless_deviation() -> Deviation:
-    """Return the stated deviations of x, y [m], theta [rad] from which a component counts as not measured."""
+    """Return the stated deviations of x, y [m], theta [rad] above which a component is treated as not measured."""
     return tuple(tuning.MUCH_WORSE * bias for bias in priors.BIAS)
 
 
@@ -394,7 +396,7 @@ def believed(stated: Deviation, q: Array, own: Array) -> tuple[Array, Deviation]
 
 def _check_deviation(name: str, deviation: Deviation) -> None:
     if len(deviation) != 3 or not all(0.0 <= value < math.inf for value in deviation):
-        raise EstimateError(f"{name}: got the deviations {deviation}, expected three finite ones >= 0")
+        raise EstimateError(f"{name}: got the deviations {deviation}, expected three finite numbers >= 0")
 
 
 def _in_order(times: Array, usable: Any) -> NDArray[np.int64]:
@@ -408,10 +410,10 @@ def _in_order(times: Array, usable: Any) -> NDArray[np.int64]:
 def usable_rows(
     t: ArrayLike, values: ArrayLike, largest: float, names: tuple[str, str], error: type[PlowTwinError]
 ) -> tuple[Array, Array, int]:
-    """Return stamps (n,) and rows of numbers by pair (n, 8) in order of time, and how many rows had to be left out.
+    """Return stamps (n,) and rows of numbers by pair (n, 8) in order of time, and the number of rows left out.
 
-    Left out are rows without a finite stamp or any number, with one beyond `largest`, or with a repeated stamp. `names`
-    are the words for the rows and for a number in the message of `error`, raised for arrays of the wrong shape.
+    Rows are left out if their stamp is not finite or repeated, if they have no number, or a number beyond `largest`.
+    Arrays of the wrong shape raise `error`; `names` are the words for the rows and for a number in its message.
     """
     times, rows = np.asarray(t, dtype=np.float64), np.array(values, dtype=np.float64)
     if times.ndim != 1 or rows.shape != (len(times), PAIR_COUNT):

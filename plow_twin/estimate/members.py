@@ -1,10 +1,11 @@
 """The members of a follower: twins drawn from a prior or an estimate, moved by an ensemble Kalman filter.
 
-A pose moves all members with perturbed observations (Burgers et al., Mon. Weather Rev. 126 (1998) 1719), a late pose
-through their covariance with the present. A correction that would press a wall with more than half of the head's weight
-is skipped for that member: behind a hard contact a tenth of a millimetre would cause a false impact.
+Each pose moves all members, with perturbed observations (Burgers et al., Mon. Weather Rev. 126 (1998) 1719). A late
+pose acts through the covariance of past and present states. A member skips a correction that would press a wall with
+more than half of the head's weight, because with a hard contact a tenth of a millimetre would cause a false impact.
 
-Numbers that an estimate leaves open are learned from the poses (`learned`), some members at each pose take theirs.
+Parameters that an estimate hardly determines are learned from the poses (`learned`). At each pose some members adopt
+their learned parameters.
 """
 
 from __future__ import annotations
@@ -35,34 +36,34 @@ from plow_twin.stream.outputs import clearances
 Array = NDArray[np.float64]
 Rows = NDArray[np.void]
 
-#: Bound: seconds of motion that are kept for poses that are late, their delay included.
+#: Bound: seconds of motion that are kept for late poses, including the sensor's delay.
 LATEST_S: Final = 0.25
-#: Bound: smallest distance in s between kept states of the motion.
+#: Bound: smallest interval in s between kept states of the motion.
 _PATH_S: Final = 2e-3
-#: Bound: outlying poses in a row after which they are used. A glitch does not last so long: the head has jumped.
+#: Bound: most outlying poses in a row that are ignored. A longer series is no glitch: the head has jumped.
 _MOST_OUTLYING: Final = 5
-#: Bound: fewest members that take other numbers at once: a call costs as much as three of them.
+#: Bound: fewest members that get other parameters at once, because a call costs as much as three members.
 _AT_ONCE: Final = 8
 #: Definition: all members.
 _ALL: Final = slice(None)
 _THETA: Final = DOF_NAMES.index("theta")
-#: Derived: places of c, s, X, Y in the solver's state.
+#: Derived: indices of c, s, X, Y in the solver's state.
 _PLACES: Final = (5, 6, 0, 1)
 
 
 class Ensemble:
-    """Twins drawn from a prior or an estimate; the first has the middle value of each number.
+    """Twins drawn from a prior or an estimate; the first twin has the median of each parameter.
 
     Parameters
     ----------
     scene, known
-        The nominal scene; prior, with clearances of unworn pads, or estimate, with the present clearances.
+        The nominal scene; the prior with the clearances of unworn pads, or an estimate with the present clearances.
     members, rng, start, tol
         Number of twins; generator of the random numbers; time in s of the scene's initial state; tolerance.
     worn : ndarray, shape (8,)
         Wear depth of the pads in m.
     learns : bool
-        Whether the poses may change numbers that an estimate leaves open.
+        Whether parameters that an estimate hardly determines are learned from the poses.
     """
 
     def __init__(
@@ -71,7 +72,7 @@ class Ensemble:
     ) -> None:  # fmt: skip
         scenes, gain = draw_scenes(scene, known, members, rng) if members > 1 else ([scene], np.ones((1, 3)))
         scenes[0], gain[0] = middle_of(scene, known)
-        #: whether poses move the first member, drawn from an estimate; otherwise its copy, the second
+        #: whether poses move the first member, as after an estimate; otherwise they move its copy, the second member
         self._steers_first = known.horizontal_state is not State.PRIOR
         if not self._steers_first and members > 1:
             scenes[1], gain[1] = scenes[0], gain[0]
@@ -81,17 +82,17 @@ class Ensemble:
             states = (known.horizontal_state, known.vertical_state)
             self.moved_before = np.where([[state.known] for state in states], widening(scene, worn)[:, None], 0.0)
             scenes = [_worn(one, scene, worn, self.moved_before[:, 0]) for one in scenes]
-        #: the first member, by itself: its forces need not wait for the others
+        #: the first member is advanced by itself, so that its forces need not wait for the other members
         self.first = Twin(scenes[0], tol=tol, excitation="sampled", start=start)
         self.others = TwinBatch(scenes[1:], tol=tol, start=start) if members > 1 else None
         self._scene, self._gain, self._rng, self._speed = scene, gain, rng, 0.0
         self._numbers = numbers_of(scenes, gain)
-        #: what the poses tell of numbers that an estimate leaves open, the member that takes its numbers next, and the
-        #: count of those whose turn has come
+        #: learner of the parameters that an estimate hardly determines; the next member to adopt learned parameters;
+        #: the number of members that are due to adopt them
         learns = learns and self._steers_first and members > 1
         self._learner = Learner.of(self._numbers.copy(), start) if learns else None
         self._turn, self._waiting = 0, 0.0
-        #: error of each member's load, N and N m, and time in s up to which it has drifted
+        #: error of each member's load in N and N m, and time in s up to which the errors have drifted
         self._load_off, self._drifted = np.zeros((members, 3)), start
         self._walls = np.stack([penetration_rows(one) for one in scenes])
         self._clearance = np.array([[one.clearance.horizontal_m, one.clearance.vertical_m] for one in scenes])
@@ -102,16 +103,16 @@ class Ensemble:
         #: force, and peak and impulse since the span's beginning
         self._sums = np.zeros((members, 3, PAIR_COUNT))
         self._peak, self._impulse = self._sums[:, 1], self._sums[:, 2]
-        #: squares of each member's normalised innovations
+        #: sum of the squares of each member's normalised innovations
         self.square = np.zeros(members)
-        #: degrees of freedom that are not locked, and outlying poses in a row
+        #: whether each degree of freedom is free, and number of outlying poses in a row
         self._free = np.array([name not in scene.locked for name in DOF_NAMES])
         self.outlying = 0
-        #: times and poses (m, 3) of the newest seconds, oldest first; present rates (m, 3), wear and penetration (m, 8)
+        #: recent times and poses (m, 3), oldest first; present rates (m, 3), wear and penetration (m, 8)
         self._path: deque[tuple[float, Array]] = deque([(start, np.tile(np.array(scene.initial.q), (members, 1)))])
         self._v, self.worn = np.tile(np.array(scene.initial.v), (members, 1)), np.tile(worn, (members, 1))
         self._depth = self._penetration(self._path[-1][1])
-        #: the newest rows of all members, until `settle`
+        #: the newest rows of all members, until `settle` copies them
         self._newest: Rows | None = None
 
     @property
@@ -125,7 +126,7 @@ class Ensemble:
         return self._path[-1][1]
 
     def set_travel_speed(self, speed_m_s: float) -> None:
-        """Set the speed along the face, of each member as far as its damping allows."""
+        """Set the speed along the face, for each member at most the speed that its wear and contact allow."""
         self._speed = speed_m_s
         speeds = np.minimum(speed_m_s, self._fastest)
         self.first.set_travel_speed(float(speeds[0]))
@@ -188,7 +189,7 @@ class Ensemble:
             row["followed"] = WITH_INTERVALS
 
     def held(self, t: float, row: Rows) -> None:
-        """Write the row of a later time under the newest sample; the state stays."""
+        """Write the row at a later time under the newest sample; the state does not change."""
         before = self.twins()
         row[:] = self.first.advance(t).rows
         self._sums[0, 0] = row["force"][0]
@@ -198,11 +199,11 @@ class Ensemble:
         self._add_intervals(row)
 
     def begin_span(self) -> None:
-        """Let peaks and impulses begin here."""
+        """Begin a new span of peaks and impulses."""
         self._peak[:], self._impulse[:] = 0.0, 0.0
 
     def span(self) -> tuple[Array, Array]:
-        """Return peaks and impulses since the span's begin: of the first member and the points, (3, 8) each."""
+        """Return peaks and impulses of the span: the first member's, and the 5 % and 95 % points, (3, 8) each."""
         return np.stack(self._points(self._peak)), np.stack(self._points(self._impulse))
 
     def _points(self, values: Array) -> tuple[Array, Array, Array]:
@@ -211,13 +212,13 @@ class Ensemble:
         return values[0].copy(), np.minimum(low, values[0]), np.maximum(high, values[0])
 
     def _used(self) -> NDArray[np.bool_]:
-        """Return which members determine intervals: those in the model's range, or all without such members."""
+        """Return the members that determine intervals: those in the model's range, or all if there are none."""
         return self.good if self.good.any() else np.ones(len(self.good), dtype=bool)
 
     def clearance(self) -> Array:
         """Return the clearances of unworn pads with their 5 % and 95 % points, (2, 3), weighted by the likelihoods.
 
-        The likelihoods of the members are tempered until enough of them carry the interval.
+        The likelihoods are tempered until enough members have a notable weight.
         """
         use = self._used()
         excess = np.clip(self.square - self.square[use].min(), 0.0, 1e9)
@@ -236,10 +237,11 @@ class Ensemble:
         return out
 
     def stand_like(self, before: Ensemble, wrench: Array) -> None:
-        """Take over the places of other members, in shares of the clearances, and their sums, under a load.
+        """Start at the poses of other members, scaled to the clearances, with their peaks and impulses, under a load.
 
-        The first member of an estimate takes the place of a prior's second member, which the poses have moved; the
-        second member of a prior takes the place of an estimate's first.
+        Poses move the second member of a prior, but the first member of an estimate. After a prior, the first member of
+        an estimate therefore starts at the second member's pose. After an estimate, the second member of a prior starts
+        at the first member's pose.
         """
         before.settle()
         from_ = np.where(before.good, np.arange(len(before.good)), int(np.argmax(before.good)))[: len(self.good)]
@@ -260,26 +262,28 @@ class Ensemble:
             self._learner.take_over(before._learner)
             self._take_numbers(np.arange(len(self.good)))
         elif self.others is None and before._learner is not None:
-            # the same estimate, followed by one twin from here on
+            # the estimate is the same, but from here on a single twin follows it
             self._set_numbers(np.zeros(1, np.int64), before._numbers[:1])
 
     def stand_about(self, q: Array, v: Array) -> None:
-        """Move the first member to a pose, the others to the same shares of their clearances."""
+        """Move the first member to a pose, and the other members to this pose scaled to their clearances."""
         places = q * self._shares(np.broadcast_to(self._room()[0], (len(self.good), 3)))
         force = self._force(self._penetration(places))[:1]
         self._stand(places, np.tile(v, (len(places), 1)), np.tile(force, (len(places), 1)))
 
     def _room(self) -> Array:
-        """Return the free space of the head: horizontal, vertical, and at its corners, shape (m, 3); 1 if locked."""
+        """Return the head's free space: horizontal, vertical and at its corners, shape (m, 3); 1 for a locked
+        direction.
+        """
         room = np.column_stack([self._clearance, self._clearance.min(axis=1)])
         return np.where(self._free, room, 1.0)
 
     def _shares(self, room: Array) -> Array:
-        """Return the free space of each member over another free space, shape (m, 3)."""
+        """Return the ratio of each member's free space to `room`, shape (m, 3)."""
         return np.divide(self._room(), room, out=np.ones_like(room), where=room > 0.0)
 
     def _stand(self, q: Array, v: Array, force: Array, which: NDArray[np.int64] | None = None) -> None:
-        """Move members to poses, but only so far from the middle that no pair bears more than its `force`, (m, 8)."""
+        """Move members to poses, but only so far from the middle that no pair bears much more than `force`, (m, 8)."""
         which = np.arange(len(q)) if which is None else which
         q, v, force = q[which], v[which], force[which]
         low, high = np.zeros(len(q)), np.ones(len(q))
@@ -296,10 +300,10 @@ class Ensemble:
         return np.where(self._free, share[:, None] * q, q)
 
     def correct(self, t: float, q: Array, noise: Array, load_error: Array) -> bool:
-        """Move the members toward a pose measured at `t`, by their covariance with it; return whether it was used.
+        """Move the members toward a pose measured at `t` by a step of the Kalman filter; return whether it was used.
 
-        Their loads err by `load_error`, N and N m, shape (3,), and the pose corrects these errors too. A pose that is
-        too late is not used, nor is an outlier unless several come in a row.
+        `load_error`, shape (3,), is the standard deviation of the members' load errors in N and N m, which the pose
+        also corrects. A pose that is too late is not used. Outliers are used only after several outliers in a row.
         """
         self.settle()
         there = np.flatnonzero(np.isfinite(q) & self._free)
@@ -349,7 +353,7 @@ class Ensemble:
         return True
 
     def _drift(self, load_error: Array) -> None:
-        """Let the errors of the loads drift as Ornstein-Uhlenbeck processes, the first member's without noise."""
+        """Advance the load errors as Ornstein-Uhlenbeck processes, without noise for the first member."""
         now, before = self.first.time, self._drifted
         self._drifted = now
         if load_error.any() or self._load_off.any():
@@ -359,10 +363,10 @@ class Ensemble:
             self._load_off = kept * self._load_off + math.sqrt(1.0 - kept**2) * load_error * white
 
     def _learn(self, since: float) -> None:
-        """Learn each `tuning.LEARNED_EACH`, and let members take the learned numbers.
+        """Learn every `tuning.LEARNED_EACH` seconds, and let members adopt the learned parameters.
 
-        The first member takes them at once, the others in turn, each about once in that time. `since` is the time since
-        the pose before [s].
+        The first member adopts them at once, the others in turn, each about once in this time. `since` is the time in s
+        since the previous pose.
         """
         learner, count = self._learner, len(self.good) - 1
         if learner is None:
@@ -379,14 +383,14 @@ class Ensemble:
             self._take_numbers(which)
 
     def _take_numbers(self, which: NDArray[np.int64]) -> None:
-        """Let members, in rising order from 0 on, go on with the numbers that were learned."""
+        """Give members, in ascending order, their learned parameters."""
         assert self._learner is not None
         self._set_numbers(which, self._learner.numbers(which))
 
     def _set_numbers(self, which: NDArray[np.int64], numbers: Array) -> None:
-        """Let members, in rising order, go on with other numbers, at the same shares of their clearances.
+        """Give members, in ascending order, other parameters, and scale their poses to the new clearances.
 
-        A member whose numbers would need other equations, as an overdamped contact does, keeps its own.
+        A member keeps its parameters if the new ones need other equations, as an overdamped contact does.
         """
         now = [self.first.scene, *(() if self.others is None else self.others.scenes)]
         changed = [with_numbers(now[place], own) for place, own in zip(which.tolist(), numbers, strict=True)]
@@ -414,7 +418,7 @@ class Ensemble:
         self._stand(self.pose, self._v, force, which)
 
     def _recover(self) -> None:
-        """Move members that have left the model's range to the places of others, unless all have left."""
+        """Move members that have left the model's range to the poses of other members, unless all have left."""
         lost, left = np.flatnonzero(~self.good), np.flatnonzero(self.good)
         self.good[:] = True
         if not len(lost) or not len(left):
@@ -431,7 +435,7 @@ class Ensemble:
         return found
 
     def _allowed(self, q: Array, force: Array, which: NDArray[np.int64] | slice = _ALL) -> NDArray[np.bool_]:
-        """Return which members may be moved to poses (m, 3): no pair bears much more than a force, (m, 8)."""
+        """Return which members may be moved to poses (m, 3), because no pair bears much more than `force`, (m, 8)."""
         there = self._force(self._penetration(q, which), which)
         return np.asarray((there < force + self._pressed).all(axis=1))
 
@@ -445,14 +449,14 @@ class Ensemble:
         self._depth[which] = self._penetration(q, which)
 
     def _penetration(self, q: Array, which: NDArray[np.int64] | slice = _ALL) -> Array:
-        """Return the penetration of each pair in m, (m, 8), with some members' clearances at poses of shape (m, 3)."""
+        """Return the penetration of each pair in m, (m, 8), for some members at poses of shape (m, 3)."""
         state = states_of(self._scene, np.concatenate([q, np.zeros_like(q)], axis=1))
         body = np.concatenate([state[:, _PLACES], np.ones((len(q), 1))], axis=1)
         found: Array = np.einsum("mi,mij->mj", body, self._walls[which]) - self.worn[which]
         return found
 
     def twins(self) -> list[bytes]:
-        """Return the exact states of the twins: of the first, and of the others."""
+        """Return the exact states of the first twin and of the others."""
         return [self.first.snapshot(), b"" if self.others is None else self.others.snapshot()]
 
     def set_twins(self, states: Sequence[bytes]) -> None:
@@ -462,7 +466,7 @@ class Ensemble:
             self.others.restore(states[1])
 
     def learned(self) -> tuple[Array, Array]:
-        """Return the numbers of all members, and the state of the learning (empty without a learner)."""
+        """Return the parameters of all members, and the state of the learner (empty without a learner)."""
         if self._learner is None:
             return self._numbers, np.zeros(0)
         return self._numbers, np.concatenate([[self._turn, self._waiting], self._learner.state()])
@@ -497,13 +501,13 @@ class Ensemble:
 
 
 def _bytes(rows: Rows) -> NDArray[np.uint8]:
-    """Return rows (m, n) as bytes: numpy copies a record field by field."""
+    """Return rows (m, n) as bytes, because numpy copies a record slowly, field by field."""
     found: NDArray[np.uint8] = np.ascontiguousarray(rows).view(np.uint8)
     return found
 
 
 def _off(q: Array, then: Array, there: NDArray[np.int64]) -> Array:
-    """Return a pose minus others (..., k) in the coordinates `there`, angles up to full turns."""
+    """Return a pose minus others (..., k) in the coordinates `there`, with angles from -pi to pi."""
     off: Array = q[there] - then
     turn = there == _THETA
     off[..., turn] = np.remainder(off[..., turn] + np.pi, 2.0 * np.pi) - np.pi
@@ -511,7 +515,7 @@ def _off(q: Array, then: Array, there: NDArray[np.int64]) -> Array:
 
 
 def _worn(one: Scene, scene: Scene, worn: Array, moved: Array) -> Scene:
-    """Return a member's scene with worn pads, whose wear is the part `moved` (2,) of its clearances."""
+    """Return a member's scene with worn pads; `moved` (2,) is the part of its clearances that is due to wear."""
     assert scene.wear is not None
     depths = tuple(worn.tolist())
     horizontal, vertical = one.clearance.horizontal_m - moved[0], one.clearance.vertical_m - moved[1]
@@ -527,7 +531,7 @@ def widening(scene: Scene, worn: Array) -> Array:
 
 
 def middle_of(scene: Scene, known: Estimate) -> tuple[Scene, Array]:
-    """Return the scene and the gains of the load, shape (3,), with the middle values of an estimate."""
+    """Return the scene and the load gains, shape (3,), with the median values of an estimate."""
     if known.horizontal_state is State.PRIOR:
         return replace(scene, loads=(), wear=None), np.ones(3)
 

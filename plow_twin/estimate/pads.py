@@ -1,9 +1,9 @@
-"""Walls that are turned, a sensor with a lever arm or a low pass, and the clearance by groups of pads.
+"""Turned walls, a sensor's lever arm and low pass, and the clearances by groups of pads.
 
-The two pads of a wall may be worn differently, which turns the wall. One linearised step beside a fit of the clearances
-finds these turns with the lever arm and the low pass of the sensor, all other unknowns eliminated; their intervals show
-whether the motion determines them. If they are so large that the fit does not hold, it is repeated with them. A pose
-cannot divide a clearance between the two sides of the head: the difference is the sensor's bias.
+The two pads of a wall may be worn differently, which turns the wall. One linearised step from a fit of the clearances
+estimates these turns together with the lever arm and the low pass of the sensor. Their intervals show whether the
+motion determines them. If they are so large that the fit fails a check, the fit is repeated with them. Poses cannot
+show how a clearance is divided between the two sides of the head, because a bias of the sensor has the same effect.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from plow_twin.estimate.unknowns import GX, GY, SIZE
 
 Array = NDArray[np.float64]
 
-#: Definition: groups by clearance, and the share of each wall's turn in it: top and bottom, left and right.
+#: Definition: for each group its clearance, and the share of the turns of the left, right, top and bottom wall in it.
 _MADE_OF: Final = {
     "horizontal_top": (GX, np.array([0.5, 0.5, 0.0, 0.0])),
     "horizontal_bottom": (GX, np.array([-0.5, -0.5, 0.0, 0.0])),
     "vertical_left": (GY, np.array([0.0, 0.0, 0.5, 0.5])),
     "vertical_right": (GY, np.array([0.0, 0.0, -0.5, -0.5])),
 }
-#: Bound: rounds of fits with differences, iterations of each.
+#: Bound: number of fits with differences, and iterations of each fit.
 _ROUNDS, _ITERATIONS = 6, 15
 assert list(_MADE_OF) == list(GROUPS)
 
 
 def deviations() -> Array:
-    """Return the prior's standard deviations of the differences in a fit, shape (7,)."""
+    """Return the prior standard deviations of the differences in a fit, shape (7,)."""
     out = np.array([UNSTATED[name] for name in DIFFERENCES])
     out[TURNS] = tuning.TURN
     return out
@@ -44,7 +44,7 @@ def deviations() -> Array:
 def by_group(problem: Problem, found: Fit, widened: float) -> dict[str, tuple[Interval, float]]:
     """Return the clearance of each group with its standard deviation in m.
 
-    `widened` multiplies the deviations of the fit for scatter beyond the noise.
+    `widened` multiplies the deviations of the fit to allow for scatter beyond the noise.
     """
     step, covariance = _joint_step(problem, found)
     out = {}
@@ -59,14 +59,14 @@ def by_group(problem: Problem, found: Fit, widened: float) -> dict[str, tuple[In
 
 
 def shown(problem: Problem, found: Fit) -> float:
-    """Return chi^2 of the linearised step of the differences: whether the motion shows them."""
+    """Return chi^2 of the linearised step of the differences; a large value means that the motion shows them."""
     step, covariance = _joint_step(problem, found)
     step, covariance = step[SIZE:], covariance[SIZE:, SIZE:]
     return float(step @ np.linalg.solve(covariance, step))
 
 
 def with_differences(problem: Problem, found: Fit) -> tuple[Problem, Fit] | None:
-    """Fit again with differences of machine and sensor, from a fit without; None where the model cannot be run."""
+    """Repeat a fit with differences of machine and sensor; None if the model cannot be run."""
     forward, most = problem.forward.renewed(), 0.5 * deviations()
     for _ in range(_ROUNDS):
         step, _ = _joint_step(problem, found)
@@ -89,7 +89,7 @@ def with_differences(problem: Problem, found: Fit) -> tuple[Problem, Fit] | None
 def of_differences(problem: Problem, found: Fit) -> Array:
     """Return the covariance of the shared unknowns due to the differences, shape (SIZE, SIZE).
 
-    If only one of two facing pads is touched, the distance of the others is unknown.
+    If the head touches only one pad of each wall, the places of the other pads are unknown.
     """
     _, covariance = _joint_step(problem, found)
     held = np.linalg.inv(covariance)[:SIZE, :SIZE]

@@ -1,4 +1,4 @@
-"""Prior deviations of the numbers of a scene: the stated one, or the default of the number's mark."""
+"""Prior deviations of a scene's numbers: the stated deviation, or the default for the number's mark."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from typing import Final
 
 from plow_twin.model.scene import Mark, Scene
 
-#: Prior: standard deviation of a number without a stated one, by mark. Drawings do not show the wear of a clearance,
-#: and a contact's numbers are seldom known unless measured. Mass and inertia follow from a drawing to some percent, a
-#: frame's sides to a tolerance and the rounding of its corners. The exponent belongs to an idealised law; friction is
-#: seldom documented. Units: m for lengths, the logarithm of stiffness and damping (the logit of a restitution), shares
-#: of mass and inertia, otherwise the number's own.
+#: Prior: standard deviation of a number that has no stated deviation, by kind and mark. Drawings do not show the wear
+#: of a clearance, and the numbers of a contact are seldom known unless measured. A drawing gives mass and inertia to
+#: some percent, and the sides of a frame up to a tolerance and the rounding of its corners. The exponent belongs to an
+#: idealised law; friction is seldom documented. Units are m for lengths, the logarithm for stiffness and damping (the
+#: logit for a restitution), a share for mass and inertia, and the number's own unit otherwise.
 DEFAULTS: Final[dict[str, dict[Mark, float]]] = {
     "clearance": {Mark.GIVEN: 8e-3, Mark.MEASURED: 2e-3, Mark.RECONSTRUCTED: 8e-3, Mark.ASSUMED: 8e-3},
     "stiffness": {Mark.GIVEN: 2.5, Mark.MEASURED: 0.5, Mark.RECONSTRUCTED: 2.5, Mark.ASSUMED: 2.5},
@@ -21,15 +21,15 @@ DEFAULTS: Final[dict[str, dict[Mark, float]]] = {
     "exponent": {Mark.GIVEN: 0.07, Mark.MEASURED: 0.03, Mark.RECONSTRUCTED: 0.07, Mark.ASSUMED: 0.07},
     "friction": {Mark.GIVEN: 0.05, Mark.MEASURED: 0.02, Mark.RECONSTRUCTED: 0.05, Mark.ASSUMED: 0.05},
 }
-#: Prior: deviation in m of the radius of corners, half-normal, where the scene states no radius.
+#: Prior: half-normal deviation in m of the corners' radius, if the scene states no radius.
 ROUNDING: Final = 3e-3
-#: Prior: standard deviations of a sensor's scales of x, y and theta; an angle often comes from two distances.
+#: Prior: standard deviations of a sensor's scales of x, y and theta; an angle is often computed from two distances.
 SCALES: Final = (5e-3, 5e-3, 1e-2)
 #: Prior: standard deviation of a sensor's constant error of x, y [m] and theta [rad].
 BIAS: Final = (5e-3, 5e-3, 0.02)
-#: Prior: deviations of quantities that no scene states. Walls: stiffness over the contact's, turn in m. Of the sensor:
-#: scales, lever arm in m, square in s2 of the time constant of its low pass (its mean delay is an unknown of the fit),
-#: drift of its clock.
+#: Prior: deviations of quantities that a scene cannot state. For each wall they are its stiffness relative to the
+#: contact's and its turn in m. For the sensor they are its scales, its lever arm in m, the squared time constant of its
+#: low pass in s2 (the low pass's mean delay is an unknown of the fit), and the drift of its clock.
 UNSTATED: Final = {
     **{f"stiffness_{wall}": 0.1 for wall in ("left", "right", "top", "bottom")},
     **{f"turn_{wall}": 1e-3 for wall in ("left", "right", "top", "bottom")},
@@ -38,7 +38,7 @@ UNSTATED: Final = {
     "filter": 4e-4,
     "clock": 1e-4,
 }
-#: Row of the table for each number.
+#: Row of `DEFAULTS` for each number, by path.
 KINDS: Final = {
     "clearance.horizontal_m": "clearance",
     "clearance.vertical_m": "clearance",
@@ -61,9 +61,9 @@ def is_stated(scene: Scene, path: str) -> bool:
 
 
 def deviation_of(scene: Scene, path: str) -> float:
-    """Return the prior's standard deviation of a number by its path, in the units of `DEFAULTS`.
+    """Return the prior standard deviation of the number at a path, in the units of `DEFAULTS`.
 
-    A number without a mark counts as assumed.
+    A number without a mark is treated as assumed.
     """
     kind, provenance = KINDS[path], scene.marks.get(path)
     if provenance is None or provenance.deviation is None:

@@ -29,8 +29,8 @@ class State(Enum):
     """Reliability of a value."""
 
     ESTIMATED = "estimated"
-    ROUGH = "rough"  #: the machine differs from the model, or the data leave more than 1 mm open
-    NOT_OBSERVABLE = "not_observable"  #: the motion does not determine it: the prior, with its interval
+    ROUGH = "rough"  #: the machine differs from the model, or the interval is wide
+    NOT_OBSERVABLE = "not_observable"  #: the prior's value, because the motion does not determine it
     PRIOR = "prior"  #: not measured
     WITHDRAWN = "withdrawn"  #: the sensor is broken, or the data contradict themselves or every motion of the model
 
@@ -73,11 +73,11 @@ class Interval:
 
 
 def _tail(least: float) -> tuple[float, float, float]:
-    """Return mean, 5 % and 95 % points of a standard normal number that is known to be above `least`.
+    """Return mean, 5 % and 95 % points of a standard normal variable that is above `least`.
 
-    In place of scipy's `truncnorm`, whose import takes half a second.
+    scipy's `truncnorm` is not used, because its import takes half a second.
     """
-    if least > _FAR:  # exponential there
+    if least > _FAR:  # the tail is exponential there
         return least + 1.0 / least, least - math.log(0.95) / least, least - math.log(0.05) / least
     share = 0.5 * math.erfc(least / math.sqrt(2.0))
     mean = math.exp(-0.5 * least * least) / (math.sqrt(2.0 * math.pi) * share)
@@ -88,10 +88,10 @@ def _tail(least: float) -> tuple[float, float, float]:
 class Cell:
     """Estimated properties of a load cell.
 
-    rows : rows in or near contact behind it
-    gain : measured over true force
-    offset, noise : its mean and standard deviation in flight, in N
-    left_over : share of its force that is left over beyond the noise
+    rows : number of rows in or near contact with its pair
+    gain : measured force over true force
+    offset, noise : mean and standard deviation of its readings in flight, in N
+    left_over : share of its force that the fit does not explain, beyond the noise
     """
 
     rows: int
@@ -105,9 +105,9 @@ class Cell:
 class ForcesUsed:
     """How measured contact forces were used.
 
-    cells : by pair
-    delay : of their stamps behind the motion, in s
-    unused : why they do not improve the estimate; empty where they do
+    cells : the cells, by pair
+    delay : delay of their stamps behind the motion in s
+    unused : reason why the forces do not improve the estimate; empty if they do
     """
 
     cells: dict[str, Cell] = field(default_factory=dict)
@@ -123,7 +123,7 @@ class ForcesUsed:
         return replace(self, cells=cells, delay=None if self.delay is None else self.delay.times(time))
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it for JSON."""
+        """Return the result for JSON."""
         cells = {
             name: {
                 "rows": cell.rows,
@@ -141,10 +141,10 @@ class ForcesUsed:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A measured motion beside the model's, as its sensor would show it: with bias and delay.
+    """A measured motion, and the model's motion as the sensor would show it, with bias and delay.
 
     t : (n,) stamps in s
-    measured, model : (n, 3) x, y in m, theta in rad; NaN where not measured, or the model was not fitted
+    measured, model : (n, 3) x, y in m, theta in rad; NaN where nothing was measured or the model was not fitted
     """
 
     t: Array
@@ -175,11 +175,11 @@ class Estimate:
     t_start, t_end : float
         The window in s.
     horizontal, vertical : Interval
-        Clearances in m; their states beside them.
+        Clearances in m. Their states are `horizontal_state` and `vertical_state`.
     stiffness, damping : Interval
-        K in N/m^n; the number that the law takes (its restitution, or its damping).
+        Stiffness K in N/m^n, and the law's damping or restitution.
     gain_fx, gain_fy, gain_m : Interval
-        Load over the load believed.
+        True load over believed load.
     bias_x, bias_y, bias_theta : Interval
         Measured minus true pose in m, m, rad.
     delay : Interval
@@ -191,20 +191,20 @@ class Estimate:
     lost : int
         Rows that could not be used.
     correlation : tuple of tuple of float
-        Correlation of `CORRELATED`; stiffness and clearance stand for each other in part.
+        Correlation matrix of the quantities in `CORRELATED`. An error of the clearance can partly be offset by an error
+        of the stiffness.
     groups : dict of str to (Interval, State)
-        Clearance between the pads that face each other: `horizontal_top`, `horizontal_bottom`, `vertical_left`,
-        `vertical_right`, in m.
+        Clearance between facing pads: `horizontal_top`, `horizontal_bottom`, `vertical_left`, `vertical_right`, in m.
     forces_measured : ForcesUsed, optional
-        How measured contact forces were used, where there were some.
+        How contact forces were used, if they were measured.
     differs : dict of str to (float, float, float)
         For each further quantity of machine and sensor: the probability that it differs from the scene, and mean and
         standard deviation of the difference if it does.
     apparent : tuple of (Interval, Interval), optional
-        The clearances in m of a machine with exactly the scene's frame that moves like the measured one, where these
-        are known better: twins are drawn from them.
+        Clearances in m with which a machine that has exactly the scene's frame would move like the measured machine.
+        They are given if they are known better than the true clearances; twins are then drawn from them.
     motion : Motion, optional
-        What was fitted; None where the motion is not known moment by moment. It is not part of `as_dict`.
+        The fitted motion; None if the motion is not known moment by moment. It is not part of `as_dict`.
     """
 
     t_start: float

@@ -1,8 +1,8 @@
-"""Test of the sensor's scales: an error of a scale is an error of the clearances.
+"""Test of the sensor's scales, because an error of a scale causes an error of the clearances.
 
-In flight the load over the mass is an acceleration in m/s2, gravity is known, and the reach of x and y at a turned
-head follows from the frame. Three scales are further unknowns beside a fit, found by one linearised step with all
-others eliminated (score test).
+The scales can be tested because accelerations in flight are known from the load, the mass and gravity, and because the
+frame determines the reach of x and y of a turned head. Three scales are further unknowns beside a fit. One linearised
+step estimates them, with all other unknowns eliminated (score test).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class Scales:
     """Estimated scales.
 
     scale : (3,) measured over true x, y, theta
-    chi2 : of the three; 3 on the average where they are right
+    chi2 : chi^2 of the three scales, on average 3 if they are right
     """
 
     scale: Array
@@ -31,7 +31,7 @@ class Scales:
 
 
 def scales_of(problem: Problem, found: Fit) -> Scales:
-    """Return the sensor's scales by the residuals of a fit."""
+    """Return the sensor's scales from the residuals of a fit."""
     motion = np.nan_to_num(problem.window.poses.q - found.point.residual - found.shared[BIAS])
     columns = motion[:, :, None] * np.eye(3)
     step, covariance = joint_step(problem, found, columns, np.full(3, NO_PRIOR), np.zeros(3))

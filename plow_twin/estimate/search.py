@@ -21,25 +21,26 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Stage:
-    """One round: the horizon as a share of the period, the iterations, and how many candidates stay after it."""
+    """One round: the horizon as a share of the period, the iterations, and the number of candidates kept afterwards."""
 
     horizon: float
     iterations: int
     keep: int
 
 
-#: Derived: rows within a horizon, and within a swing: more numbers than the six of its start in each component.
+#: Derived: fewest rows within a horizon and within a swing, so that each component has more values than the six of the
+#: swing's start.
 _FEWEST_ROWS = (8, 12)
-#: Prior: differences of a sensor with a slow low pass alone.
+#: Prior: differences of a machine whose sensor has a slow low pass, and nothing else.
 LOW_PASS: Final = np.array([0.0] * LAG + [UNSTATED["filter"]])
 #: Bound: rounds in which the candidates become fewer.
 STAGES: Final = (Stage(0.1, 4, 5), Stage(0.2, 3, 2))
-#: Bound: swings; the cost of a fit grows with them.
+#: Bound: most swings, because the cost of a fit grows with their number.
 _MOST_SWINGS = 350
 
 
 def candidate(forward: Forward, unknowns: Unknowns, poses: Poses, period: float) -> tuple[Problem, Fit] | None:
-    """Return the best fit to the beginnings of the first swings, or None where no start could be run."""
+    """Return the best fit to the beginnings of the first swings, or None if no start could be run."""
     interval = poses.interval()
     first = poses.between(float(poses.t[0]), float(poses.t[0]) + tuning.FIRST_PERIODS * period)
     window = cut(unknowns.scene, first, period, max(0.2 * period, _FEWEST_ROWS[1] * interval))
@@ -58,10 +59,10 @@ def candidate(forward: Forward, unknowns: Unknowns, poses: Poses, period: float)
 
 
 def behind_low_pass(problem: Problem, found: Fit) -> Fit | None:
-    """Fit the same swings again, with the sensor's low pass held at its prior's standard deviation.
+    """Fit the same swings again, with the sensor's low pass fixed at its prior standard deviation.
 
-    Returns None if this fit is not clearly better, or if the poses are too rare to show a low pass. Impacts last for
-    less than the time constant of a slow low pass, so a fit without a low pass does not lead to it.
+    Returns None if this fit is not clearly better, or if the poses are too rare to show a low pass. A fit without a low
+    pass does not lead to a slow one, because impacts are shorter than its time constant.
     """
     if problem.window.poses.interval() > RESOLVING:
         return None
@@ -76,26 +77,26 @@ def refine(
     forward: Forward, unknowns: Unknowns, poses: Poses, period: float, shared: Array, noise: Array, drift: Array | None,
     differences: Array | None = None, close: bool = False,
 ) -> tuple[Problem, Fit] | None:  # fmt: skip
-    """Fit all poses from a good start: the beginning of each swing first.
+    """Fit all poses from a good start, first the beginning of each swing only.
 
-    From a start `close` to the optimum, also long swings of a hard contact converge.
+    If the start is `close` to the optimum, long swings with a hard contact converge too.
 
-    `drift` (3,) is the spectral density of the acceleration by the unknown part of a broad-band load in m2/s3 and
-    rad2/s3, None for another load; `differences` (7,) are held.
+    `drift`, shape (3,), is the spectral density of the acceleration due to the unknown part of a broad-band load, in
+    m2/s3 and rad2/s3; None for any other load. `differences`, shape (7,), stay fixed.
     """
     hard = not close and bool(np.exp(shared[SOFTNESS]) < tuning.HARD)
     rows = poses.interval() * np.array(_FEWEST_ROWS)
     shortest = tuning.SHORTEST[0 if hard else 1 if drift is None else 2]
     horizon = tuning.HARD_HORIZON if hard else np.inf
     if drift is not None and not hard:
-        # the unknown part of the load moves the head by less than the sensor's noise
+        # within a swing, the unknown part of the load moves the head by less than the sensor's noise
         shortest = min(max(shortest, float(np.cbrt(3.0 * noise**2 / drift).min()) / period), tuning.SHORTEST[1])
     shortest = max(shortest * period, rows[1], float(poses.t[-1] - poses.t[0]) / _MOST_SWINGS)
     horizon = max(horizon * period, rows[0])
     window = cut(unknowns.scene, poses, period, shortest)
     near = Problem(forward, unknowns, window, horizon=min(max(0.2 * period, rows[0]), horizon), differences=differences)
     starts = [shared]
-    if unknowns.is_hard(shared):  # good for hard contacts only
+    if unknowns.is_hard(shared):  # this start is good for hard contacts only
         starts.append(range_of_hard(unknowns, poses, shared))
     fits = []
     for start in starts:
@@ -111,7 +112,7 @@ def refine(
 
 
 def range_of_hard(unknowns: Unknowns, poses: Poses, shared: Array) -> Array:
-    """Return a start in which the range of motion is all clearance and the contact is hard."""
+    """Return a start with a hard contact and with the range of motion as clearances."""
     start = unknowns.nominal()
     clearance, bias = range_of_motion(unknowns.scene, poses)
     start[[GX, GY]], start[BIAS][:2] = clearance, bias
@@ -121,14 +122,14 @@ def range_of_hard(unknowns: Unknowns, poses: Poses, shared: Array) -> Array:
 
 
 def states_at(window: Window, shared: Array) -> Array:
-    """Return the guesses of the starting states, freed of the bias, shape (s, 6)."""
+    """Return the guesses of the starting states without the bias, shape (s, 6)."""
     states = window.states.copy()
     states[:, :3] -= shared[BIAS]
     return states
 
 
 def better_states(problem: Problem, shared: Array, states: Array) -> Array:
-    """Replace each starting state by the end of the swing before, where that fits the swing's first poses better."""
+    """Replace each starting state by the end of the previous swing, if that fits the swing's first poses better."""
     window, scene = problem.window, problem.unknowns.scene_of(shared)
     gain = shared[4:7]
     out, scale = states.copy(), np.maximum(np.nanstd(window.poses.q, axis=0), 1e-6)

@@ -1,8 +1,8 @@
-"""A sensor that is not at the head's centre, and one that follows the pose with a lag.
+"""Sensors with a lever arm, and sensors that follow the pose with a lag.
 
-A sensor with a lever arm measures a point of the head that moves with its angle. A first-order low pass follows the
-pose u by tau dy/dt = u - y. Its mean delay tau counts as part of the delay of the stamps, so that for a small tau the
-rest is tau^2 / 2 times the acceleration.
+A sensor with a lever arm measures a point away from the head's centre, which also moves when the head turns. A
+first-order low pass y follows the pose u by tau dy/dt = u - y. Its mean delay tau is part of the stamps' delay. For a
+small tau the remaining difference is tau^2 / 2 times the acceleration.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from plow_twin.estimate.measurements import Poses, filled
 
 Array = NDArray[np.float64]
 
-#: Derived: rows of the parabola that gives a measured pose at a swing's start: a kink of a slow sensor spans as many.
+#: Derived: number of rows in the parabola for the measured pose at a swing's start. A kink of a slow sensor is as long.
 _ROWS: Final = 7
 
 
 def moved_by_lever(q: Array, v: Array, lever: Array) -> tuple[Array, Array]:
-    """Return poses and rates, (n, 3) each, as measured with a lever arm (2,) in m, less the arm itself."""
+    """Return poses and rates, (n, 3) each, as measured with a lever arm (2,) in m, without the constant arm itself."""
     c, s = np.cos(q[:, 2:]), np.sin(q[:, 2:])
     arm, across = lever, np.array([-lever[1], lever[0]])
     place, rate = q.copy(), v.copy()
@@ -31,7 +31,7 @@ def moved_by_lever(q: Array, v: Array, lever: Array) -> tuple[Array, Array]:
 
 
 class Memory:
-    """The measured pose as a smooth curve: where a low pass is at the start of a swing."""
+    """The measured pose as a smooth curve, which gives the state of a low pass at the start of a swing."""
 
     def __init__(self, poses: Poses) -> None:
         q = filled(poses)

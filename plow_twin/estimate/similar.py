@@ -1,7 +1,7 @@
-"""Machines of other sizes, estimated in units that give them the paper's size, for which thresholds were chosen.
+"""Machines of other sizes, estimated in units in which they have the size of the paper's machine.
 
-The equations of motion keep their form in other units of length, mass and time (mechanical similarity). Units are
-powers of two, so nothing is rounded.
+The thresholds were chosen for this size. The equations of motion keep their form in other units of length, mass and
+time (mechanical similarity). The units are powers of two, so that the conversion does not round.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from plow_twin.model.scene import Clearance, Contact, Friction, Initial, Provena
 if TYPE_CHECKING:
     from plow_twin.estimate.contact_forces import ContactForces
 
-#: Definition: the machine of the paper, half of the frame's diagonal [m], mass [kg], period of the load [s].
+#: Definition: half of the frame's diagonal [m], mass [kg] and load period [s] of the paper's machine.
 PAPER_LENGTH, _MASS, _PERIOD = 0.213, 2430.0, 3.14
 
 
@@ -37,7 +37,7 @@ class Units:
 
     @staticmethod
     def of(scene: Scene, load: Load) -> Units:
-        """Return units in which a machine is of the paper's size; SI units where it nearly is."""
+        """Return units in which a machine has the paper's size; SI units if it nearly has this size."""
         period = load.oscillation() or _PERIOD
         sizes = geometry.half_diagonal(scene) / PAPER_LENGTH, scene.head.mass_kg / _MASS, period / _PERIOD
         if scene.support is not None or all(
@@ -105,7 +105,7 @@ class Units:
         return Poses(poses.t / self.time, poses.q / length, deviation)
 
     def gaps(self, gaps: Gaps | None) -> Gaps | None:
-        """Return gaps in these units; the error of a sensor does not grow with the machine."""
+        """Return gaps in these units; a sensor's error in m is the same for a machine of any size."""
         if gaps is None:
             return None
         return Gaps(gaps.t / self.time, gaps.gap / self.length, (gaps.deviation or tuning.CONSTANT_ERROR) / self.length)
@@ -135,7 +135,10 @@ class Units:
                 return time**2
             return length if name.startswith(("frame.", "corner_", "turn_", "lever_")) else 1.0
 
-        scale = (f"all in units of {length:g} m, {self.mass:g} kg, {time:g} s: the machine is not of the paper's size",)
+        scale = (
+            f"the reasons are in units of {length:g} m, {self.mass:g} kg, {time:g} s, because the machine has not the "
+            "paper's size",
+        )
         return replace(
             found,
             t_start=found.t_start * time,
@@ -158,7 +161,7 @@ class Units:
         )
 
     def _damping(self, contact: Contact) -> float:
-        """Return the unit of the law's damping: N s/m, or s/m of a factor of the force."""
+        """Return the unit of the law's damping: N s/m, or s/m if the damping multiplies the elastic force."""
         return self.mass / self.time if LAWS[contact.law].additive else self.time / self.length
 
     def _contact(self, contact: Contact) -> Contact:

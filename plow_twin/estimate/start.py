@@ -1,4 +1,4 @@
-"""Starting points of a fit: swings cut in flight, clearances from the range of motion, several stiffnesses."""
+"""Starting points of a fit: swings cut in flight, clearances from the range of motion, and several stiffnesses."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 #: Definition: pairs of the walls to the right, left, top and bottom.
 WALLS: Final = (NORMAL_X > 0.0, NORMAL_X < 0.0, NORMAL_Y > 0.0, NORMAL_Y < 0.0)
-#: Bound: moments tried for the start of a swing.
+#: Bound: number of moments that are tried for the start of a swing.
 _CANDIDATES = 12
 
 
@@ -51,15 +51,15 @@ def smooth_width(poses: Poses, span: float = 0.06) -> int:
 
 
 def range_of_motion(scene: Scene, poses: Poses) -> tuple[Array, Array]:
-    """Return clearances (2,) and bias of x and y (2,) by the range of motion alone, in m."""
+    """Return clearances (2,) and bias of x and y (2,) from the range of motion alone, in m."""
     reach = reaches(scene, smoothed(filled(poses), smooth_width(poses)))
     right, left, top, bottom = np.quantile(reach, 0.99, axis=0)
-    # seen from the head the corner goes left when the measured head goes right
+    # when the head moves to the right, the frame moves to the left relative to the head
     return np.array([right + left, top + bottom]), 0.5 * np.array([left - right, bottom - top])
 
 
 def cut(scene: Scene, poses: Poses, period: float, shortest: float) -> Window:
-    """Cut poses into swings, each begun in flight: away from the walls and on a parabola.
+    """Cut poses into swings that begin in flight, away from the walls and on a parabola.
 
     No swing is shorter than `shortest` in s.
     """
@@ -67,7 +67,7 @@ def cut(scene: Scene, poses: Poses, period: float, shortest: float) -> Window:
     raw, t = filled(poses), poses.t
     width = smooth_width(poses, 0.04)
     reach = reaches(scene, smoothed(raw, width))
-    # distance from where the nearest wall touches
+    # distance from contact with the nearest wall
     room = -(reach - np.quantile(reach, 0.99, axis=0)).max(axis=1)
     noise = np.maximum(noise_level(raw), 1e-7)
     clear = tuning.OUTLYING * np.hypot(*(noise[[0, 2]] * [1.0, geometry.half_diagonal(scene)])) / np.sqrt(width)
@@ -76,7 +76,7 @@ def cut(scene: Scene, poses: Poses, period: float, shortest: float) -> Window:
     while t[-1] > starts[-1] + 2.0 * apart:
         near = np.flatnonzero((t > starts[-1] + apart) & (t < starts[-1] + 2.0 * apart) & (room > clear))
         if not len(near):
-            # long without a clear start: a swing is a whole period at most
+            # if no clear start comes for long, the swing ends after a whole period
             far = np.flatnonzero((t > starts[-1] + 2.0 * apart) & (room > clear))
             end = min(float(t[far[0]]) if len(far) else np.inf, starts[-1] + period)
             near = np.flatnonzero((t >= end) & (t < end + apart))
@@ -93,7 +93,7 @@ def cut(scene: Scene, poses: Poses, period: float, shortest: float) -> Window:
 def _parabola(t: Array, q: Array, start: float, noise: Array) -> tuple[Array, float]:
     """Return pose and rate at `start` by parabolas through the poses about it, shape (6,), and their misfit.
 
-    The longest span that fits to the noise is taken: an impact within it would spoil the rates.
+    The longest span that fits up to noise is used, because an impact within the span would falsify the rates.
     """
     near, misfit = np.zeros(0, np.int64), np.inf
     state = np.zeros(6)
@@ -115,7 +115,7 @@ def _parabola(t: Array, q: Array, start: float, noise: Array) -> tuple[Array, fl
 
 
 def noise_level(q: Array) -> Array:
-    """Return the standard deviation of white noise by third differences, shape (3,)."""
+    """Return the standard deviation of white noise from third differences, shape (3,)."""
     if len(q) < 8:
         return np.zeros(3)
     level: Array = 1.4826 * np.median(np.abs(np.diff(q, n=3, axis=0)), axis=0) / np.sqrt(20.0)
@@ -125,8 +125,8 @@ def noise_level(q: Array) -> Array:
 def first_vectors(problem: Problem, most: int) -> list[Array]:
     """Return the most promising starts of the shared unknowns, shape (SIZE,) each, best first.
 
-    For each of several stiffnesses and dampings the clearances are set so that the simulated range of motion is the
-    measured one, and the delay so that the motions agree best.
+    For each of several stiffnesses and dampings, the clearances are adjusted until the simulated range of motion is the
+    measured one.
     """
     unknowns, window = problem.unknowns, problem.window
     measured, bias = range_of_motion(unknowns.scene, window.poses)
@@ -145,7 +145,7 @@ def first_vectors(problem: Problem, most: int) -> list[Array]:
 
 
 def _matched(problem: Problem, vector: Array, measured: Array) -> list[tuple[float, Array]]:
-    """Match the range of motion from a vector on; return the best vector with its loss, if it can be run."""
+    """Adjust a vector's clearances to the measured range of motion; return the best vector with its loss, if any."""
     poses, unknowns = problem.window.poses, problem.unknowns
     found = []
     for _ in range(4):

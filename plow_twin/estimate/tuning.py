@@ -1,8 +1,8 @@
-"""The numbers of the estimator that were chosen rather than derived, each with the data that it was set on.
+"""The numbers of the estimator that were chosen instead of derived, each with the data on which it was set.
 
 They are read as `tuning.NAME` where they are used, so that `benchmark/tuning_sensitivity.py` can vary them;
-`benchmark/results/tuning.md` shows them with the sensitivity that it measured. Seeds: `benchmark/estimate.py`.
-Penetrations are those under the reference force of 100 kN.
+`benchmark/results/tuning.md` shows them with the sensitivity that it measured. Seeds: `benchmark/estimate.py`. All
+penetrations are penetrations under the reference force of 100 kN.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ class Tuned:
     Attributes
     ----------
     unit : str
-        Its unit; commas separate the units of several elements.
+        Unit of the number; commas separate the units of several elements.
     meaning : str
-        Where it acts.
+        Effect of the number.
     basis : str
-        The data that it was set on.
+        The data on which the number was set.
     """
 
     unit: str
@@ -45,99 +45,122 @@ OBSERVED: Annotated[
     float,
     Tuned(
         "m",
-        "largest deviation of an estimated clearance; twice it for a rough one, half of it for a group "
-        "of pads and as least change within the window",
+        "largest deviation of an estimated clearance; twice this for a rough clearance, half of this for a group "
+        "of pads and as the smallest reported change within a window",
     ),
 ] = 1e-3
 BOUNCED_MOST: Annotated[
     float,
     Tuned(
         "m",
-        "largest deviation behind a hard contact that is not rough: a wall touched too seldom gives wrong answers",
+        "largest deviation of a clearance that is not rough, with a hard contact: walls that are touched too "
+        "seldom give wrong clearances",
         "seeds 40400 to 40409",
     ),
 ] = 2e-4
-OBSERVED_SHARE: Annotated[float, Tuned("prior", "the same around a block")] = 0.5
+OBSERVED_SHARE: Annotated[
+    float,
+    Tuned(
+        "prior",
+        "largest deviation of an observable clearance around a block or under an uncertain load, in prior deviations",
+    ),
+] = 0.5
 MOST_INFLATED: Annotated[
     float,
     Tuned(
         "1",
-        "growth of the variance from which on an unfinished fit is withdrawn",
-        "`cutting_10hz`, seeds 80000, 80001, 81000: fits 9 to 15 mm off had 15 to 25; at 7.5, loads with "
-        "errors of 5 % would be withdrawn",
+        "inflation of the variance from which on the result of an unfinished fit is withdrawn",
+        "`cutting_10hz`, seeds 80000, 80001, 81000: fits that were 9 to 15 mm off had 15 to 25; with 7.5, "
+        "results under loads with errors of 5 % would be withdrawn",
     ),
 ] = 15.0
 SPARSEST: Annotated[
-    float, Tuned("s", "longest distance of poses; with fewer in a flight, its start is guessed wrong")
+    float, Tuned("s", "longest interval of poses; with fewer poses in a flight, its starting state is guessed wrong")
 ] = 0.125
-TOUCHED: Annotated[float, Tuned("s", "least time in contact of the walls of both sides")] = 0.02
-PREDICTED: Annotated[float, Tuned("1", "least share of the measured x, or y, that the model predicts")] = 0.08
+TOUCHED: Annotated[float, Tuned("s", "shortest time in contact with the walls of both sides")] = 0.02
+PREDICTED: Annotated[float, Tuned("1", "smallest share of the measured x, or y, that the model predicts")] = 0.08
 GIVEN: Annotated[
     float,
     Tuned(
         "1",
-        "largest penetration of both walls over that under the reference force",
-        "twice two walls; the paper's forces reach twice the reference",
+        "largest penetration of both walls together, relative to the penetration under the reference force",
+        "two walls, and the paper's forces reach twice the reference force",
     ),
 ] = 4.0
-RESTS: Annotated[float, Tuned("1", "scatter of the poses over their noise up to which the head rests")] = 1.3
-IDLE_LOAD: Annotated[float, Tuned("weights", "scatter of the load below which a head is expected to rest")] = 0.05
+RESTS: Annotated[float, Tuned("1", "largest scatter of the poses of a resting head, relative to their noise")] = 1.3
+IDLE_LOAD: Annotated[float, Tuned("weights", "scatter of the load below which the head is expected to rest")] = 0.05
 
 # Checks
 OUTLYING: Annotated[
     float,
     Tuned(
         "deviations",
-        "limit that noise does not reach: kinks of a flight, impacts away from a wall, gaps, poses, steps to "
-        "another law; its square for chi^2 of the turns of walls and for the gain left to a fit",
-        "one in 1.7 million normal values; chi^2 of the turns was 9 at most for right models (seeds 42000 to "
-        "42004); of 780 poses of three followed truths none was further off behind soft contacts, eight behind a "
-        "hard one",
+        "limit that noise does not reach, for kinks of a flight, impacts away from a wall, gaps, poses, and "
+        "steps to another law; its square is the limit for chi^2 of the turns of walls and for the remaining "
+        "gain of a fit",
+        "one in 1.7 million normal values exceeds it; chi^2 of the turns was at most 9 for correct models (seeds "
+        "42000 to 42004); among 780 poses of three followed machines, none exceeded it with soft contacts, and "
+        "eight with a hard contact",
     ),
 ] = 5.0
 MOST_RATIO: Annotated[
     float,
     Tuned(
         "1",
-        "residuals over their quick changes; their scatter over the load's phase over that within a "
-        "phase; noise of a part of the window over that of the rest",
+        "largest ratios: of the residuals to their quick changes; of their scatter between phases of the load to "
+        "their scatter within a phase; of the noise in one part of the window to the noise in the rest",
         "1 without a fault",
     ),
 ] = 2.0
-MOST_GAIN: Annotated[float, Tuned("1", "change of the load's or a cell's gain from which on it is suspect")] = 0.25
-MOST_SCALE: Annotated[float, Tuned("chi^2", "the sensor's three scales", "right models have 12 at most")] = 16.0
+MOST_GAIN: Annotated[
+    float, Tuned("1", "largest difference from 1 of the load's gain, or of a cell's gain, that is not suspect")
+] = 0.25
+MOST_SCALE: Annotated[
+    float, Tuned("chi^2", "largest chi^2 of the sensor's three scales", "correct models have at most 12")
+] = 16.0
 MORE_ASKEW: Annotated[
     float,
     Tuned(
         "1",
-        "chi^2 of turned walls, lever arm and low pass over that of the scales, each explaining the other in part",
+        "smallest ratio of chi^2 of turned walls, lever arm and low pass to chi^2 of the scales; each partly "
+        "explains the other",
         "walls worn askew: 5 and more (0.3 to 1 times the wear late in a life); low pass of 20 Hz: 2.2 and 7.3 "
         "(`filter_20`, seeds 99001, 98002); scales of 1.05: 0.4 to 1.6; frame, mass, scale of theta: 0.2 to 0.7",
     ),
 ] = 2.0
-CHANGE_CHI2: Annotated[float, Tuned("chi^2", "gain of a change within the window")] = 200.0
-CHANGE_SHARE: Annotated[float, Tuned("1", "least share of the excess residuals that such a change explains")] = 0.25
+CHANGE_CHI2: Annotated[float, Tuned("chi^2", "smallest gain in chi^2 of a change within the window")] = 200.0
+CHANGE_SHARE: Annotated[float, Tuned("1", "smallest share of the excess residuals that such a change explains")] = 0.25
 STUCK: Annotated[
-    tuple[float, ...], Tuned("rows, deviations", "rows with one value of a stuck sensor, and the motion meanwhile")
+    tuple[float, ...],
+    Tuned("rows, deviations", "smallest number of equal rows of a stuck sensor, and smallest motion meanwhile"),
 ] = (12, 6.0)
 PHASES: Annotated[int, Tuned("parts", "parts of a load period in which residuals are compared")] = 24
 LAW_DAMPING: Annotated[
     tuple[float, ...],
     Tuned(
         "critical, critical, 1",
-        "damping of the other law: in a fit; of drawn hard contacts, median and deviation of the logarithm",
+        "damping under the other law: in a fit; for drawn hard contacts the median, and the deviation of the logarithm",
     ),
 ] = (0.05, 0.2, 0.6)
-MOST_DISTANCE: Annotated[float, Tuned("1", "distance of a hard motion from the drawn ones, over theirs")] = 4.0
-MOST_PATH: Annotated[float, Tuned("deviations", "distance of its path over the load's period")] = 4.5
+MOST_DISTANCE: Annotated[
+    float,
+    Tuned(
+        "1",
+        "largest distance of a motion with a hard contact from drawn motions, relative to their distances from each "
+        "other",
+    ),
+] = 4.0
+MOST_PATH: Annotated[
+    float, Tuned("deviations", "largest distance of this motion's path over the load's period from drawn paths")
+] = 4.5
 MOST_ODDS: Annotated[
     tuple[float, ...],
     Tuned(
         "1",
-        "ln odds of another law: suspect above the first; a motion that looks like the other law is "
-        "accepted below the second",
-        "right models (seeds from 42200 on) have -7 at most; seed 46205, a right model, has -44 and "
-        "looks like the other by 2.43 deviations",
+        "log odds of another law: above the first the model is suspect; below the second a motion that resembles "
+        "the other law is accepted",
+        "correct models (seeds from 42200 on) have at most -7; seed 46205, a correct model, has -44 and "
+        "resembles the other law by 2.43 deviations",
     ),
 ] = (-3.0, -20.0)
 
@@ -146,43 +169,45 @@ MUCH_WORSE: Annotated[
     float,
     Tuned(
         "1",
-        "stated deviation over the prior of the bias, or over the median, from which on a component "
-        "counts as not measured",
+        "stated deviation, relative to the prior deviation of the bias or to the median deviation, above which a "
+        "component is treated as not measured",
     ),
 ] = 10.0
 SPIKE: Annotated[
-    tuple[float, ...], Tuned("deviations, 1", "distance of a spike from its neighbours; most rows that are spikes")
+    tuple[float, ...],
+    Tuned("deviations, 1", "smallest distance of a spike from its neighbours; largest share of rows that are spikes"),
 ] = (20.0, 0.1)
 REPEATING: Annotated[
-    tuple[float, ...], Tuned("1, 1", "least share of repeated rows of a slow sensor; longest repetition over the mean")
+    tuple[float, ...],
+    Tuned("1, 1", "smallest share of repeated rows of a slow sensor; longest repetition relative to the mean"),
 ] = (0.25, 3.0)
 LONGEST_GAP: Annotated[
     tuple[float, ...],
-    Tuned("s, 1", "longest silence of the load; in median distances of samples, for a load of few knots"),
+    Tuned("s, 1", "longest silence of the load; the same in median intervals of samples, for a load of few knots"),
 ] = (0.5, 20.0)
 
 # Fit
-HUBER: Annotated[float, Tuned("deviations", "residual from which on a measurement counts less")] = 3.0
+HUBER: Annotated[float, Tuned("deviations", "residual above which a measurement has less weight")] = 3.0
 JITTER_WEIGHT: Annotated[
     tuple[float, ...],
     Tuned(
         "1",
-        "weight of the variance that cannot be predicted: in a fit, where the Jacobian is noise too; in "
-        "comparing fits; with forces",
+        "weight of the variance of unpredictable motion: in a fit, where the Jacobian is noisy too; when fits "
+        "are compared; with measured forces",
     ),
 ] = (100.0, 5.0, 10.0)
 START_SPREAD: Annotated[
     Array, Tuned("m, m, rad, m/s, m/s, rad/s", "prior deviation of a starting state about its guess")
 ] = np.array([4e-3, 4e-3, 0.02, 0.2, 0.2, 1.0])
 PROBED_STATE: Annotated[
-    Array, Tuned("m, m, rad, m/s, m/s, rad/s", "deviation of the displaced starts that probe predictability")
+    Array, Tuned("m, m, rad, m/s, m/s, rad/s", "deviation of the displaced starting states that probe predictability")
 ] = np.array([2e-4, 2e-4, 8e-4, 6e-3, 6e-3, 3e-2])
-MOST_FREED: Annotated[float, Tuned("1", "most widening for unknowns fitted to few swings")] = 3.0
+MOST_FREED: Annotated[float, Tuned("1", "largest widening that allows for unknowns fitted to few swings")] = 3.0
 MOST_WORK: Annotated[
     tuple[int, ...],
     Tuned(
         "steps",
-        "work of a fit, of motions drawn in ten load periods, of those of another law",
+        "largest work of a fit, of drawn motions over ten load periods, and of motions drawn under another law",
         "a few seconds of a core",
     ),
 ] = (3_000_000, 3_500_000, 1_500_000)
@@ -193,23 +218,29 @@ FIRST_NOISE: Annotated[Array, Tuned("m, m, rad", "noise of x, y and theta in the
 SHORTEST: Annotated[
     tuple[float, ...], Tuned("periods", "shortest swing: hard contact, soft contact, broad-band load")
 ] = (0.04, 0.35, 0.03)
-HARD_HORIZON: Annotated[float, Tuned("periods", "horizon of a swing of a hard contact")] = 0.11
-ENOUGH: Annotated[float, Tuned("1", "gain in the cost that ends the fit to the beginnings of swings")] = 30.0
+HARD_HORIZON: Annotated[float, Tuned("periods", "horizon of a swing with a hard contact")] = 0.11
+ENOUGH: Annotated[float, Tuned("1", "reduction of the cost below which the fit to the beginnings of swings ends")] = (
+    30.0
+)
 HARD: Annotated[float, Tuned("m", "penetration below which the motion after some bounces cannot be predicted")] = 3e-3
 CERTAINLY_HARD: Annotated[
     float,
     Tuned(
-        "m", "penetration below which a fit also starts from the range of motion, and a comparison has the last word"
+        "m",
+        "penetration below which a fit also starts from the range of motion, and whole motions are compared in "
+        "any case",
     ),
 ] = 3e-4
 RESOLVED: Annotated[float, Tuned("m", "penetration that a pose cannot distinguish from zero")] = 1e-4
 SLOWEST_IMPACT: Annotated[
     float,
     Tuned(
-        "m/s", "impact speed below which damping does not follow D / v0: touches at rest would make the contact stiff"
+        "m/s",
+        "impact speed below which the damping D / v0 stays constant, because touches at rest would make the "
+        "contact stiff",
     ),
 ] = 0.03
-PENETRATIONS: Annotated[tuple[float, ...], Tuned("m", "penetrations that are tried as starts")] = (
+PENETRATIONS: Annotated[tuple[float, ...], Tuned("m", "penetrations with which fits are started")] = (
     1e-4,
     7e-4,
     1.5e-3,
@@ -227,8 +258,8 @@ PARABOLAS: Annotated[tuple[float, ...], Tuned("s", "spans of the parabolas that 
     0.09,
     0.06,
 )
-PARABOLA_FITS: Annotated[float, Tuned("deviations", "misfit of a parabola that is good enough")] = 1.4
-UNFINISHED: Annotated[float, Tuned("1", "widening of a fit that has not converged")] = 1.3
+PARABOLA_FITS: Annotated[float, Tuned("deviations", "largest misfit of an acceptable parabola")] = 1.4
+UNFINISHED: Annotated[float, Tuned("1", "factor on the deviations of a fit that has not converged")] = 1.3
 OPTIMA: Annotated[
     tuple[float, ...],
     Tuned(
@@ -237,35 +268,45 @@ OPTIMA: Annotated[
         "the benchmark's group `hard`; seeds 43201 to 43215 (K 3e7 to 1.4e8)",
     ),
 ] = (4e-4, 4.5e-5)
-FIRM: Annotated[float, Tuned("m", "penetration below which a contact is firm", "the same seeds")] = 3.5e-3
+FIRM: Annotated[float, Tuned("m", "penetration below which a contact is firm", "as for `OPTIMA`")] = 3.5e-3
 KNOTS: Annotated[
-    tuple[int, ...], Tuned("knots, 1", "knots of the load in a period; most of a broad-band load, in these")
+    tuple[int, ...],
+    Tuned("knots, 1", "largest number of knots of the load in a period; factor on this number for a broad-band load"),
 ] = (120, 3)
 LEFT_OPEN: Annotated[
     float,
     Tuned(
-        "1", "weight of a broad-band load's effect between its samples, which contacts turn from pose to rate and back"
+        "1",
+        "factor on the unknown effect of a broad-band load between its samples; contacts turn errors of the pose "
+        "into errors of the rate, and back",
     ),
 ] = 4.0
 
 # Machines that differ from the model
 PUSH: Annotated[float, Tuned("half range", "first guess of the load's error in a swing")] = 0.02
-UNCORRELATED: Annotated[float, Tuned("1", "correlation of residuals that ends the sum over lags")] = 0.05
+UNCORRELATED: Annotated[float, Tuned("1", "correlation of residuals below which the sum over lags ends")] = 0.05
 DIFFERS: Annotated[
     float,
-    Tuned("1", "probability that a quantity differs from the scene", "`none`, `frame`, `theta_scale`, seed 96000"),
+    Tuned(
+        "1", "prior probability that a quantity differs from the scene", "`none`, `frame`, `theta_scale`, seed 96000"
+    ),
 ] = 0.2
-BENT: Annotated[float, Tuned("1", "share of the linearised step by which it may be wrong")] = 0.3
+BENT: Annotated[float, Tuned("1", "error of a linearised step, relative to the step")] = 0.3
 BENT_BY_EXPONENT: Annotated[
     float,
     Tuned(
         "m",
-        "deviation of a clearance by the square of the exponent's change",
-        "`exponent` and `shape`, seeds 1 and 2: without it and the next, up to 9 deviations off",
+        "deviation of a clearance, to be multiplied by the squared change of the exponent",
+        "`exponent` and `shape`, seeds 1 and 2: without this and `UNEXPLAINED`, clearances are up to 9 deviations off",
     ),
 ] = 0.1
 UNEXPLAINED: Annotated[
-    float, Tuned("m", "deviation of a clearance by the root of the growth of the variance", "as above")
+    float,
+    Tuned(
+        "m",
+        "deviation of a clearance, to be multiplied by the root of the inflation minus 1",
+        "as for `BENT_BY_EXPONENT`",
+    ),
 ] = 1e-4
 TURN: Annotated[float, Tuned("m", "prior deviation of the turn of a wall in a fit")] = 4e-3
 
@@ -274,32 +315,39 @@ FITTED: Annotated[
     float,
     Tuned(
         "m",
-        "penetration from which on a fit moment by moment knows more; scatter of the largest reaches of a hard wall",
+        "penetration above which a fit of every moment is more accurate than a comparison of whole motions; "
+        "scatter of the farthest reaches below which a wall may be hard",
     ),
 ] = 8e-4
-NARROW: Annotated[float, Tuned("deviations", "scatter of the largest reaches of a hard wall, in noise")] = 1.58
-POSSIBLE: Annotated[float, Tuned("m", "noise of a reach above which a narrow reach is no sign of a hard wall")] = 1e-3
+NARROW: Annotated[
+    float, Tuned("deviations", "scatter of the farthest reaches, relative to noise, below which a wall may be hard")
+] = 1.58
+POSSIBLE: Annotated[
+    float, Tuned("m", "noise of a reach above which a small scatter of the reach does not show a hard wall")
+] = 1e-3
 REACH_WINDOWS: Annotated[
     tuple[tuple[float, float], ...],
-    Tuned("quantiles", "windows in which reaches are averaged, from the middle to the farthest"),
+    Tuned("quantiles", "windows in which reaches are averaged, from middle to farthest reaches"),
 ] = ((0.6, 0.8), (0.75, 0.95), (0.9, 0.99))
 TURN_WINDOWS: Annotated[
-    tuple[tuple[float, float], ...], Tuned("quantiles", "windows whose distance is least at the right bias of theta")
+    tuple[tuple[float, float], ...],
+    Tuned("quantiles", "two windows of the reach, whose distance is smallest with the correct bias of theta"),
 ] = ((0.4, 0.7), (0.9, 0.99))
-AVERAGED: Annotated[float, Tuned("s", "span over which the pose is averaged for a second look at the reach")] = 0.05
+AVERAGED: Annotated[float, Tuned("s", "time over which the pose is averaged for a second set of reaches")] = 0.05
 PATH_PHASES: Annotated[
-    int, Tuned("parts", "parts of a load period for paths and mean reaches; half of them for scatters")
+    int, Tuned("parts", "parts of a load period for paths and mean reaches; half as many for scatters")
 ] = 40
 FARTHEST_PARTS: Annotated[
-    tuple[float, ...], Tuned("1", "shares of a period, the farthest, whose mean reach is taken")
+    tuple[float, ...], Tuned("1", "shares of a period with the farthest reaches, over which the reach is averaged")
 ] = (0.1, 0.2, 0.33)
 OVERRATED: Annotated[Array, Tuned("m", "excess of the range of motion over the clearances")] = np.array(
     [0.8e-3, 1.0e-3]
 )
 DRAWS: Annotated[
-    tuple[int, ...], Tuned("motions", "draws of three rounds, of one more for firm contacts, of another law")
+    tuple[int, ...],
+    Tuned("motions", "number of draws in three rounds, in a fourth round for firm contacts, and under another law"),
 ] = (30, 30, 40, 100, 60)
-DRAWN_CLEARANCE: Annotated[tuple[float, ...], Tuned("m", "deviation of the clearances in these rounds")] = (
+DRAWN_CLEARANCE: Annotated[tuple[float, ...], Tuned("m", "deviation of the drawn clearances in the four rounds")] = (
     1.2e-3,
     3e-4,
     3e-4,
@@ -309,14 +357,16 @@ HARD_DRAWN: Annotated[
     tuple[float, ...],
     Tuned(
         "m, 1, 1, 1",
-        "draws of a hard contact: median penetration, deviations of its logarithm, of the damping's, of the gains",
+        "draws of a hard contact: median penetration, and deviations of the logarithm of penetration, of the "
+        "logarithm of damping, and of the gains",
     ),
 ] = (1.2e-5, 1.6, 0.7, 0.06)
 FIRM_SPREAD: Annotated[
     tuple[float, ...],
     Tuned(
         "1",
-        "deviation of the logarithms drawn for a firm contact: at first, over that of the round before, at least",
+        "deviation of the logarithms drawn for a firm contact: in the first round; relative to the previous "
+        "result; smallest",
         "seeds 43200 to 43215",
     ),
 ] = (0.5, 1.5, 0.1)
@@ -324,208 +374,260 @@ NOT_HARD: Annotated[
     float,
     Tuned(
         "1",
-        "distance of the first round from which on a contact is firm",
-        "seeds 46100 to 46209: 0.8 at most in ten hard ones, 1.3 to 3 in eight firm ones",
+        "distance in the first round above which a contact is firm, not hard",
+        "seeds 46100 to 46209: at most 0.8 for ten hard contacts, 1.3 to 3 for eight firm contacts",
     ),
 ] = 1.2
-ENOUGH_FOR_FIT: Annotated[float, Tuned("m", "deviation below which no further round comes before a fit")] = 1.2e-4
-ASTRAY: Annotated[float, Tuned("m", "correction of the last round from which on the next deviation counts")] = 1.5e-4
+ENOUGH_FOR_FIT: Annotated[float, Tuned("m", "deviation below which a fit follows without a further round")] = 1.2e-4
+ASTRAY: Annotated[float, Tuned("m", "correction in the last round above which `UNEXPLAINED_HARD` is added")] = 1.5e-4
 UNEXPLAINED_HARD: Annotated[
     float,
     Tuned(
         "m",
-        "deviation of a clearance where a hard motion has gone astray or, times its distance over the limit, differs",
-        "`hard_kelvin_voigt`, `hard_shape`: 0.1 off in the median",
+        "additional deviation of a clearance with a hard contact, if its rounds have not converged or if the "
+        "motion differs from the model; in the latter case times the motion's distance over the limit",
+        "`hard_kelvin_voigt`, `hard_shape`: median error of 0.1 mm",
     ),
 ] = 3e-4
 WIDENED_SOFTNESS: Annotated[
-    float, Tuned("1", "widening of the logarithm of stiffness, which has long tails", "seeds 40400 to 40409")
+    float,
+    Tuned(
+        "1",
+        "factor on the deviation of the logarithm of penetration, whose distribution has long tails",
+        "seeds 40400 to 40409",
+    ),
 ] = 1.6
-NEAR: Annotated[float, Tuned("1", "share of the draws that is regressed")] = 0.7
+NEAR: Annotated[float, Tuned("1", "share of the draws that a regression uses")] = 0.7
 RIDGE: Annotated[
     tuple[float, ...],
     Tuned("1", "ridge penalty of the regressions: reach, residual variance, label of the law, features"),
 ] = (0.3, 20.0, 1.0, 0.01)
 SHRINKAGE: Annotated[
     tuple[float, ...],
-    Tuned("1", "of a covariance of few draws: features toward their variances, a path toward equal ones"),
+    Tuned(
+        "1",
+        "shrinkage of a covariance from few draws: for features toward a diagonal matrix, for a path toward equal "
+        "variances",
+    ),
 ] = (0.4, 0.2)
-LEAST_FREE: Annotated[float, Tuned("1", "least share of a draw's residual that a fit with the draw leaves")] = 0.2
+LEAST_FREE: Annotated[
+    float, Tuned("1", "smallest share of a draw's residual that is taken to remain in a fit that includes the draw")
+] = 0.2
 FARTHEST: Annotated[
-    float, Tuned("deviations", "farthest a likeliest parameter of a law may lie from the middle of the draws")
+    float, Tuned("deviations", "largest distance of a law's likeliest parameters from the middle of the draws")
 ] = 3.5
-LATE: Annotated[float, Tuned("s", "deviation of the delay left in a path")] = 4e-3
+LATE: Annotated[float, Tuned("s", "deviation of the delay that remains in a path")] = 4e-3
 
 # Following
 PRESSED: Annotated[
     float,
     Tuned(
         "weights",
-        "force beyond a pair's own with which a correction may press it",
-        "seeds 71100 to 71102 of `benchmark/follow.py`: without a limit intervals of hard contacts hold 0.5 to 0.7",
+        "largest force that a correction may add to a pair",
+        "seeds 71100 to 71102 of `benchmark/follow.py`: without a limit, the intervals for hard contacts contain "
+        "0.5 to 0.7 of the forces",
     ),
 ] = 0.5
 LOAD_ERROR_SHARE: Annotated[
     float,
     Tuned(
         "1",
-        "error of the load in twins that follow, over its error in a swing by a rough estimate",
-        "groups `shape`, `law`, `friction` of `benchmark/follow.py`, seeds 71000 to 71002: at 1 and 3 intervals "
-        "hold 0.5 to 0.7, at 20 up to 1.0",
+        "error of the load in following twins, relative to its error in a swing according to a rough estimate",
+        "groups `shape`, `law`, `friction` of `benchmark/follow.py`, seeds 71000 to 71002: with 1 and 3, the "
+        "intervals contain 0.5 to 0.7 of the forces, with 20 up to 1.0",
     ),
 ] = 10.0
 LOAD_ERROR_LASTS: Annotated[
     float,
-    Tuned("s", "time for which that error is correlated", "the same seeds; 0.05 gives the same within 0.04"),
+    Tuned(
+        "s", "correlation time of this error", "as for `LOAD_ERROR_SHARE`; with 0.05 the shares change by at most 0.04"
+    ),
 ] = 0.2
 LEARNED_TO: Annotated[
     tuple[float, ...],
     Tuned(
         "1, 1, m, m, 1, 1, 1",
-        "deviation to which numbers of twins that follow are learned from the poses: logarithms of K^-1/2 and damping, "
-        "clearances, load gains",
-        "simulated hard contacts (benchmark/follow.py, seeds 71101, 71102): errors of the learned numbers",
+        "deviation to which parameters of following twins are learned from the poses: logarithms of K^-1/2 and "
+        "damping, clearances, load gains",
+        "errors of the learned parameters for simulated hard contacts (`benchmark/follow.py`, seeds 71101, 71102)",
     ),
 ] = (0.06, 0.12, 5e-5, 5e-5, 0.01, 0.01, 0.01)
 LEARNING: Annotated[
     float,
     Tuned(
         "1",
-        "weight of a pose when these numbers are learned",
-        "the same seeds: at 1 the learned numbers are two to three of their deviations off",
+        "weight of a pose when these parameters are learned",
+        "as for `LEARNED_TO`: with 1, the learned parameters are two to three of their deviations off",
     ),
 ] = 0.25
-LEARNED_FOR: Annotated[float, Tuned("s", "time after which what was learned counts less by e", "the same")] = 20.0
-LEARNED_EACH: Annotated[float, Tuned("s", "time between two changes of the twins' numbers", "the same")] = 1.0
+LEARNED_FOR: Annotated[
+    float, Tuned("s", "time in which the variance of a learned parameter grows by the factor e", "as for `LEARNED_TO`")
+] = 20.0
+LEARNED_EACH: Annotated[
+    float, Tuned("s", "time between two updates of the learned parameters", "as for `LEARNED_TO`")
+] = 1.0
 
 # Loads that do not explain the motion
 MODULATED: Annotated[
-    float, Tuned("s", "span of a function that the equations are multiplied by", "kinds `load_10`, `averages_1hz`")
+    float,
+    Tuned("s", "span of the test functions by which the equations are multiplied", "kinds `load_10`, `averages_1hz`"),
 ] = 0.12
 UNCERTAIN_DRAWS: Annotated[
-    tuple[int, ...], Tuned("motions", "draws of each of three rounds: with an angle, without one")
+    tuple[int, ...], Tuned("motions", "number of draws in each of three rounds: if theta was measured; if it was not")
 ] = (60, 120)
 UNCERTAIN_SPREAD: Annotated[
     tuple[float, ...],
-    Tuned("m, 1, 1", "first deviations of the clearances, and of the logarithms of penetration and damping"),
+    Tuned(
+        "m, 1, 1",
+        "deviations in the first round: of the clearances, of the logarithm of penetration, of the logarithm of "
+        "damping",
+    ),
 ] = (3e-3, 0.35, 0.7)
 UNCERTAIN_GAIN: Annotated[float, Tuned("1", "deviation of the gains of a load that does not explain the motion")] = 0.15
 UNCERTAIN_EXPONENT: Annotated[
-    float, Tuned("1", "deviation of the exponent beyond the scene's, in half of the draws", "truths with exponent 1.5")
+    float,
+    Tuned(
+        "1",
+        "deviation of the increase of the exponent, in half of the draws",
+        "simulated machines with the exponent 1.5",
+    ),
 ] = 0.3
 COARSEST: Annotated[
     float,
-    Tuned("s", "distance of the samples of a load up to which its error is no loss of amplitude", "`averages_1hz`"),
+    Tuned("s", "longest interval of a load's samples at which no amplitude is lost", "`averages_1hz`"),
 ] = 0.25
 COARSE_GAIN: Annotated[
     float,
     Tuned(
         "1",
-        "deviation of the gains of a load that is sampled more rarely",
+        "deviation of the gains of a load with longer intervals",
         "averages over a third of a period lose 0.16 of the amplitude",
     ),
 ] = 0.2
 AGREES: Annotated[
     float,
-    Tuned("deviations", "distance up to which such a comparison and a fit that has not converged agree"),
+    Tuned("deviations", "largest distance at which a comparison under an uncertain load and a failed fit agree"),
 ] = 2.0
-LOAD_ERRORS: Annotated[tuple[float, ...], Tuned("1", "least and largest error of a load over its amplitude")] = (
+LOAD_ERRORS: Annotated[
+    tuple[float, ...], Tuned("1", "smallest and largest error of a load relative to its amplitude")
+] = (
     0.01,
     0.3,
 )
-LOAD_CORRELATION: Annotated[tuple[float, ...], Tuned("s", "shortest and longest correlation of that error")] = (
+LOAD_CORRELATION: Annotated[tuple[float, ...], Tuned("s", "shortest and longest correlation time of this error")] = (
     0.15,
     1.5,
 )
 CORRECTED: Annotated[
     tuple[float, ...],
     Tuned(
-        "1, m", "share of the regression's correction that counts as a deviation, and least one", "seeds 80000 to 80003"
+        "1, m",
+        "share of the regression's correction that is added to the deviation, and a constant addition",
+        "seeds 80000 to 80003",
     ),
 ] = (0.3, 4e-4)
 
 # Forces
 HEAD_ROOM: Annotated[
-    float, Tuned("m", "head room from which on a pad is in flight; up to twice it a pad may touch")
+    float, Tuned("m", "distance from the wall above which a pad is in flight; up to twice this distance it may touch")
 ] = 1e-3
-LEAST_CORRELATION: Annotated[
-    float, Tuned("1", "correlation with the motion's force below which a cell does not measure it")
-] = 0.7
+LEAST_CORRELATION: Annotated[float, Tuned("1", "smallest correlation of a cell's force with the motion's force")] = 0.7
 CELL_SHARE: Annotated[
-    float, Tuned("largest force", "change of the motion's force at a stuck cell; most force of a cell in flight")
+    float,
+    Tuned(
+        "largest force",
+        "smallest change of the motion's force while a cell is stuck; largest force of a cell in flight",
+    ),
 ] = 0.2
 CELL_PRIOR: Annotated[tuple[float, ...], Tuned("1, s", "prior deviation of a cell's gain and delay")] = (0.05, 0.02)
-LAW_ERROR: Annotated[float, Tuned("1", "error of law and load in a force")] = 0.01
+LAW_ERROR: Annotated[float, Tuned("1", "relative error of a force due to law and load")] = 0.01
 MOST_LEFT_OVER: Annotated[
     tuple[float, ...],
     Tuned(
         "1",
-        "residual of one cell, and of all, beyond noise",
-        "seeds 62000 to 62004: 0.04 and 0.013 at most; Kelvin-Voigt 0.037 and more",
+        "largest unexplained share of the force of one cell, and of all cells",
+        "seeds 62000 to 62004: at most 0.04 and 0.013; with a Kelvin-Voigt contact 0.037 and more",
     ),
 ] = (0.1, 0.02)
 MOST_MISFIT: Annotated[
-    float, Tuned("1", "mean square residual beyond which a swing is left out", "0.5 to 0.85 for fitted swings")
+    float, Tuned("1", "mean square residual above which a swing is not fitted", "0.5 to 0.85 for fitted swings")
 ] = 1.5
 TOLERANCE: Annotated[
     float,
     Tuned(
         "clearance",
-        "tolerance of simulated poses; twice it, in the load's range, for thinned loads",
-        "a few micrometres, far below sensors' resolution; thinning takes the members' time to a fifth",
+        "tolerance of simulated poses; twice this, relative to the load's range, for thinned loads",
+        "a few micrometres, far below the resolution of sensors; thinning reduces the members' time to a fifth",
     ),
 ] = 1e-4
 LOAD_KNOT: Annotated[
     float,
     Tuned(
         "s",
-        "distance of the knots of a broad-band load",
-        "two loads: forces moved by a ninth of their interval (9 ms: all of it)",
+        "interval of the knots of a broad-band load",
+        "two loads: the forces change by a ninth of their interval (with 9 ms by the whole interval)",
     ),
 ] = 4e-3
 
 # Blocks
 DRAG: Annotated[float, Tuned("g", "deviation of an unknown acceleration in flight")] = 0.1
-BEYOND: Annotated[float, Tuned("rows", "how far outside their gap two flights may meet")] = 0.25
+BEYOND: Annotated[float, Tuned("rows", "how far outside the gap between them two flights may meet")] = 0.25
 GAINED: Annotated[
-    float, Tuned("1", "kinetic energy after an impact over that before; more means two impacts or a long contact")
+    float,
+    Tuned(
+        "1",
+        "largest ratio of the kinetic energies after and before an impact; a larger ratio means two impacts or a "
+        "long contact",
+    ),
 ] = 1.25
 IMPACT_SHARE: Annotated[
     float,
     Tuned(
         "1",
-        "most impacts that gain energy, and fewest contacts between two flights",
+        "largest share of impacts that gain energy; smallest share of contacts that are impacts between two flights",
         "measured drops: 0.01 and 0.5; at 50 Hz 0.5; behind a soft contact 0.05",
     ),
 ] = 0.25
 
 # Gaps, wear, windows
-CONSTANT_ERROR: Annotated[float, Tuned("m", "constant error of a gap's sensor: dirt on a worn pad")] = 1e-4
+CONSTANT_ERROR: Annotated[float, Tuned("m", "constant error of a gap sensor, by dirt on a worn pad")] = 1e-4
 PATH_DEVIATION: Annotated[
     float,
     Tuned(
         "1",
-        "deviation of the wear rate beside a history: means over few periods, unequal pads",
-        "lives with seeds below 1000 (`benchmark/lives.py`)",
+        "relative deviation of the wear rate beyond that of a history, due to means over few periods and unequal pads",
+        "simulated lives with seeds below 1000 (`benchmark/lives.py`)",
     ),
 ] = 0.03
 LEAST_PROBABLE: Annotated[
     tuple[float, ...],
-    Tuned("1", "probability below which a history contradicts wear; most probability at an end of the prior's range"),
+    Tuned(
+        "1", "probability below which a history contradicts wear; largest probability at an end of the prior's range"
+    ),
 ] = (1e-6, 0.02)
 MEAN_PERIODS: Annotated[
-    tuple[int, ...], Tuned("periods", "load periods that are left out, and that the mean force is taken over")
+    tuple[int, ...],
+    Tuned("periods", "numbers of load periods that are left out, and over which the mean force is taken"),
 ] = (2, 4)
-JUMP: Annotated[tuple[float, ...], Tuned("clearance", "largest change of a pad's depth in a jump, and its error")] = (
+JUMP: Annotated[
+    tuple[float, ...], Tuned("clearance", "largest change of a pad's depth in a jump, and largest error of this change")
+] = (
     0.02,
     1e-3,
 )
 WINDOW_SHARES: Annotated[
     tuple[float, ...],
-    Tuned("window, window, 1", "least part of a window that is estimated, of an early one, growth to the next"),
+    Tuned(
+        "window, window, 1",
+        "smallest part of a window that is estimated; smallest part of an early window; growth from one early window "
+        "to the next",
+    ),
 ] = (0.5, 0.1, 1.5)
 ALIKE: Annotated[
-    tuple[float, ...], Tuned("1", "ratio in length, mass and time up to which a machine is estimated in SI units")
+    tuple[float, ...],
+    Tuned(
+        "1", "largest ratio to the paper's machine in length, mass and time at which a machine is estimated in SI units"
+    ),
 ] = (2.5, 6.0, 4.0)
 
 

@@ -1,8 +1,9 @@
-"""Clearances where the load believed does not explain the motion, or where its angle was not measured.
+"""Clearances if the believed load does not explain the motion, or if theta was not measured.
 
-Motions with drawn clearances, contacts and errors of the load are simulated and seen as the sensor sees. A regression
-among the motions near the measured one corrects the result of `equation_error` (without an angle: the head's range) and
-gives its deviation (approximate Bayesian computation with local-linear adjustment, as in `bouncing`).
+Motions with randomly drawn clearances, contacts and load errors are simulated as the sensor would see them. A
+regression among the motions near the measured one corrects the result of `equation_error` and gives its deviation
+(approximate Bayesian computation with local-linear adjustment, as in `bouncing`). If theta was not measured, the head's
+range of motion replaces the result of `equation_error`.
 """
 
 from __future__ import annotations
@@ -25,15 +26,15 @@ from plow_twin.model import geometry
 
 Array = NDArray[np.float64]
 
-#: Derived: distance of the knots of a load's error, a third of its shortest correlation, in that correlation.
+#: Derived: interval of the knots of a load's error, a third of the error's shortest correlation time.
 _KNOTS = 1.0 / 3.0
-#: Derived: distance of the knots [s] of the load that samples miss, half the period of a soft contact (20 Hz).
+#: Derived: interval [s] of the knots of the load between samples, half the period of a soft contact (20 Hz).
 _KNOT = 0.025
-#: Bound: rounds of draws, the second and third about the result of the round before.
+#: Bound: number of rounds of draws; each later round is drawn about the result of the previous round.
 _ROUNDS = 3
-#: Bound: fewest draws that a regression is made of.
+#: Bound: fewest draws for a regression.
 _FEWEST = 40
-#: Guard: least clearance in m that is drawn.
+#: Guard: smallest drawn clearance in m.
 _LEAST_CLEARANCE = 5e-4
 
 
@@ -42,11 +43,11 @@ class Compared:
     """Result of a comparison.
 
     clearance, deviation : (2,) in m
-    touched : (2,) whether the head was seen to touch both walls of a direction
+    touched : (2,) whether the head touched both walls of a direction
     ln_depth, ln_damping : mean and deviation of the logarithms of the penetration in m under the reference force and
         of the damping
-    distance : of the measured motion from nearby drawn motions, over the distance of drawn motions from each other
-    load_error : error of the load over its amplitude
+    distance : distance of the measured motion from nearby drawn motions, relative to the distances among drawn motions
+    load_error : error of the load relative to its amplitude
     """
 
     clearance: Array
@@ -60,7 +61,7 @@ class Compared:
 
 @dataclass
 class _Spread:
-    """Distribution of the draws: centre of the clearances (2,) in m, means and deviations of the other numbers."""
+    """Distribution of the draws: clearances (2,) with deviation in m; mean and deviation of each logarithm."""
 
     centre: Array
     about: float
@@ -72,24 +73,24 @@ class _Spread:
 def compare_under_uncertain_load(
     felt: Load, unknowns: Unknowns, poses: Poses, period: float, seed: int = 0
 ) -> tuple[Compared | None, int]:
-    """Compare the measured motion with those under drawn errors of the load.
+    """Compare the measured motion with motions under randomly drawn errors of the load.
 
     Parameters
     ----------
     felt : Load
-        The load believed, thinned to the samples that move the head.
+        The believed load, thinned to the samples that move the head.
     unknowns : Unknowns
         The prior.
     poses : Poses
         The measured poses; theta may be missing.
     period : float
-        Of the load in s.
+        Period of the load in s.
     seed : int
-        Of the draws.
+        Seed of the draws.
 
     Returns
     -------
-    Compared, or None where too few motions could be run, and the work done.
+    Compared, or None if too few motions could be run, and the work done.
     """
     rng = np.random.default_rng(seed)
     seen = MotionFeatures(unknowns, poses, period)
@@ -141,7 +142,7 @@ _Look = tuple[Callable[[Array], Array], _Spread, NDArray[np.bool_]]
 
 
 def _with_angle(seen: MotionFeatures, felt: Load, unknowns: Unknowns, poses: Poses) -> _Look:
-    """Return the features, the first draws, and which directions were touched on both sides."""
+    """Return the features, the distribution of the first draws, and which directions were touched on both sides."""
     about, softness, damping = tuning.UNCERTAIN_SPREAD
     equations = EquationError(unknowns, felt, poses.t)
     first = equations.search(seen.q, range_of_motion(unknowns.scene, poses)[0])
@@ -161,7 +162,7 @@ def _with_angle(seen: MotionFeatures, felt: Load, unknowns: Unknowns, poses: Pos
 
 
 def _without_angle(seen: MotionFeatures, felt: Load, unknowns: Unknowns, poses: Poses) -> _Look:
-    """Return the look at the motion where only x and y were measured: the head's range replaces the walls."""
+    """Return the same as `_with_angle` if only x and y were measured: the range of motion replaces the walls."""
     nominal, deviations = unknowns.nominal(), unknowns.deviations()
 
     def features(q: Array) -> Array:
@@ -186,7 +187,7 @@ def _damping(unknowns: Unknowns) -> float:
 
 
 def _draw(spread: _Spread, rng: np.random.Generator) -> tuple[Array, Array, float]:
-    """Return clearances (2,) in m, logarithms of penetration and damping with three gains (5,), and of the error."""
+    """Draw clearances (2,) in m; (5,) logarithms of penetration and damping, and gains; logarithm of the load error."""
     white = rng.standard_normal(8)
     clearance = np.maximum(spread.centre + spread.about * white[:2], _LEAST_CLEARANCE)
     ln_depth = np.clip(spread.ln_depth[0] + spread.ln_depth[1] * white[2], *np.log(DEPTHS))
@@ -197,16 +198,17 @@ def _draw(spread: _Spread, rng: np.random.Generator) -> tuple[Array, Array, floa
 
 
 def _with_exponent(unknowns: Unknowns, rng: np.random.Generator) -> Unknowns:
-    """Return the prior about a scene; half of the draws have a larger exponent: no wall is stiffest at its face."""
+    """Return the prior with a larger exponent in half of the draws, because no wall is stiffest at its surface."""
     step = tuning.UNCERTAIN_EXPONENT * max(0.0, rng.standard_normal())
     contact = unknowns.scene.contact
     return replace(unknowns, scene=replace(unknowns.scene, contact=replace(contact, exponent=contact.exponent + step)))
 
 
 def _with_error(load: Load, share: float, rng: np.random.Generator) -> Load:
-    """Return a load with an error of a `share` of its amplitude, an Ornstein-Uhlenbeck process, and what samples miss.
+    """Return a load with a random error, and with the part that the samples miss.
 
-    The missed part is white noise of the density `load.unknown`.
+    The error is an Ornstein-Uhlenbeck process of `share` times the load's amplitude. The missed part is white noise of
+    the density `load.unknown`.
     """
     least, most = tuning.LOAD_CORRELATION
     time = math.exp(rng.uniform(math.log(least), math.log(most)))
@@ -218,7 +220,7 @@ def _with_error(load: Load, share: float, rng: np.random.Generator) -> Load:
         error[index] += keep * error[index - 1]
     amplitude = 0.5 * share * np.ptp(load.wrench, axis=0)
     within = np.arange(load.t[0], load.t[-1], _KNOT)
-    # the density is an upper bound: samples hardly tell how short the correlation of the missed part is
+    # the density is an upper bound, because samples hardly show how short the correlation of the missed part is
     missed = rng.standard_normal((len(within), 3)) * np.sqrt(rng.random() * np.array(load.unknown) / _KNOT)
     t = np.unique(np.concatenate([load.t, grid, within]))
     parts = ((load.t, load.wrench), (grid, amplitude * error), (within, missed))

@@ -1,8 +1,8 @@
 """The vector of unknowns, its prior, and the scene of a vector.
 
-Softness stands for the stiffness: u = (F0 / K)^(1/n) is the penetration in m under the reference force F0, and the
-unknown is psi = ln(u + u0). For soft contacts it acts as ln K, for hard contacts as the compliance: their motion only
-shows that K is large, and psi has a lower end.
+The unknown for the stiffness K is a softness, psi = ln(u + u0). Here u = (F0 / K)^(1/n) is the penetration in m under
+the reference force F0. For soft contacts psi is linear in ln K. For hard contacts it is linear in the compliance and
+has a lower limit, because their motion only shows that K is large.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ class Quantity:
     name : str
         Its name in an estimate.
     label, factor, digits : str, float, str
-        How it is printed: name with unit, factor, and format.
+        How the quantity is printed: its name with unit, the factor to this unit, and the format.
     deviation : float
         Standard deviation of the prior about the nominal scene, in the unknown's own unit.
     dimension : tuple of 3 int
-        Powers of length, mass and time in its published unit; the contact's follow from its law.
+        Powers of length, mass and time in its published unit; those of the contact's quantities follow from its law.
     step : float, optional
         Step of its difference quotient; None where the derivative is known exactly.
     fine_step : float, optional
-        Step with measured forces, which are less linear.
+        Step for measured forces, which are less linear.
     probe : float
         Standard deviation of the displacement that probes predictability.
     """
@@ -55,10 +55,10 @@ class Quantity:
     probe: float = 0.0
 
 
-#: Prior: the estimated quantities in the order of a vector of unknowns: the clearances in m, the softness psi
+#: Prior: the estimated quantities in the order of a vector of unknowns. They are the clearances in m, the softness psi
 #: (published as the stiffness), the logarithm of the damping (or the logit of a restitution), three gains of the load,
-#: three biases and the delay of the sensor. The quantities with a `step` move the head and come first; the others
-#: change the measurement of its motion.
+#: and three biases and the delay of the sensor. The quantities with a `step` move the head and come first; the others
+#: change only the measurement of the motion.
 QUANTITIES: Final = (
     Quantity("horizontal", "horizontal clearance [mm]", 1e3, ".3f", 8e-3, (1, 0, 0), 2e-4, 1e-5, 5e-5),
     Quantity("vertical", "vertical clearance [mm]", 1e3, ".3f", 8e-3, (1, 0, 0), 2e-4, 1e-5, 5e-5),
@@ -82,20 +82,20 @@ GX: Final = _place("horizontal")
 GY: Final = _place("vertical")
 SOFTNESS: Final = _place("stiffness")
 DAMPING: Final = _place("damping")
-#: Definition: places of the gains and of the biases in a vector of unknowns.
+#: Definition: slices of the gains and of the biases in a vector of unknowns.
 GAIN: Final = slice(_place("gain_fx"), _place("gain_m") + 1)
 BIAS: Final = slice(_place("bias_x"), _place("bias_theta") + 1)
 DELAY: Final = _place("delay")
 SIZE: Final = len(QUANTITIES)
-#: Places of the quantities that move the head.
+#: Indices of the quantities that move the head.
 MOVING: Final = tuple(place for place, quantity in enumerate(QUANTITIES) if quantity.step is not None)
 #: Standard deviations of the displacements that probe predictability, shape (SIZE,).
 PROBES: Final = np.array([quantity.probe for quantity in QUANTITIES])
 #: Names in the published correlation; softness is the penetration under a force.
 CORRELATED: Final = tuple("softness" if place == SOFTNESS else QUANTITIES[place].name for place in MOVING)
 
-#: Guard: smallest and largest simulated penetration in m; harder contacts all move the head alike, softer ones let it
-#: through the wall.
+#: Guard: smallest and largest simulated penetration in m. All harder contacts move the head alike; softer contacts let
+#: it through the wall.
 _HARDEST, _SOFTEST = 3e-5, 0.12
 #: Guard: smallest clearance in m that is simulated.
 _LEAST_CLEARANCE = 5e-4
@@ -123,9 +123,9 @@ class Unknowns:
     scene : Scene
         The nominal scene.
     deviation : ndarray, shape (SIZE,)
-        Standard deviations of the prior about it.
+        Standard deviations of the prior about the nominal scene.
     noise : tuple of 3 float
-        Smallest noise of the sensor that is believed: x, y [m], theta [rad].
+        Smallest noise that the sensor can have: x, y [m], theta [rad].
     force : float
         Force F0 in N to which the softness refers.
     """
@@ -181,7 +181,7 @@ class Unknowns:
         return bool(vector[SOFTNESS] < math.log(tuning.CERTAINLY_HARD + tuning.RESOLVED))
 
     def softness_of(self, stiffness: float) -> float:
-        """Return psi of a stiffness."""
+        """Return psi for a stiffness."""
         return math.log((self.force / stiffness) ** (1.0 / self.scene.contact.exponent) + tuning.RESOLVED)
 
     def penetration_of(self, psi: float) -> float:
@@ -189,7 +189,7 @@ class Unknowns:
         return math.exp(psi) - tuning.RESOLVED
 
     def stiffness_of(self, psi: float) -> float:
-        """Return the stiffness of psi, at most the hardest simulated contact's."""
+        """Return the stiffness for psi, at most that of the hardest simulated contact."""
         u = max(math.exp(psi) - tuning.RESOLVED, _HARDEST)
         return float(self.force / u**self.scene.contact.exponent)
 
@@ -236,7 +236,7 @@ class Unknowns:
 
 
 def contact_with(contact: Contact, stiffness: float, damping: float | None) -> Contact:
-    """Return a contact with another stiffness and damping number of its law (None: its own)."""
+    """Return a contact with another stiffness, and with another damping number of its law unless it is None."""
     contact = replace(contact, stiffness=stiffness)
     if damping is None:
         return contact
@@ -246,7 +246,7 @@ def contact_with(contact: Contact, stiffness: float, damping: float | None) -> C
 
 
 def with_other_law(unknowns: Unknowns) -> Unknowns | None:
-    """Return the prior about a scene with the other possible law of its contact, None without such a law."""
+    """Return the prior about a scene with the other possible law of its contact; None if there is no such law."""
     contact = unknowns.scene.contact
     law = OTHER_LAW.get(contact.law)
     if law is None or contact.exponent != 1.0:

@@ -1,6 +1,7 @@
-"""Tests whether the residuals are noise; if not, the model or the sensor is suspect.
+"""Tests whether the residuals are noise. If they are not, the model or the sensor is suspect.
 
-The thresholds were set on truths with seeds below 1000; docs/estimate.md lists the faults that they miss.
+The thresholds were set on simulated machines with seeds below 1000; docs/estimate.md lists the faults that the tests
+miss.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ Array = NDArray[np.float64]
 
 COMPONENTS = ("x", "y", "theta")
 
-#: Bound: approximate number of moments of a window that are tested for a change.
+#: Bound: approximate number of moments in a window that are tested for a change.
 MOMENTS = 60
 
 
@@ -46,7 +47,7 @@ class Verdict:
 
 
 def judge(problem: Problem, fit: Fit, period: float) -> Verdict:
-    """Test the residuals of a fit; `period` is the load's in s."""
+    """Test the residuals of a fit; `period` is the load's period in s."""
     verdict = Verdict()
     _stuck(problem, fit, verdict)
     _noise_change(fit, verdict)
@@ -58,18 +59,18 @@ def judge(problem: Problem, fit: Fit, period: float) -> Verdict:
         excess = (abs(gain - 1.0) - tuning.MOST_GAIN) / max(deviation, 1e-9)
         verdict.figures[f"gain_{name}"] = float(gain)
         if excess > 2.0:
-            verdict.model.append(f"load {name}: {gain:.2f} times the load believed")
+            verdict.model.append(f"load {name}: {gain:.2f} times the believed load")
     if not fit.converged:
         verdict.figures["not_converged"] = 1.0
     if verdict.sensor:
-        # a wrong sensor allows no verdict on the model
+        # with a faulty sensor the model cannot be judged
         verdict.model.clear()
     _scale(problem, fit, verdict)
     return verdict
 
 
 def judge_sensor(poses: Poses) -> list[str]:
-    """Return faults of the sensor seen in the poses alone: a constant value, changing noise."""
+    """Return faults of the sensor that the poses alone show: a constant value, or changing noise."""
     found = []
     for i, name in enumerate(COMPONENTS):
         column = poses.q[np.isfinite(poses.q[:, i]), i]
@@ -100,7 +101,7 @@ def _colour(fit: Fit, verdict: Verdict) -> None:
         if quick <= 0.0 or len(rows) < 50:
             continue
         ratio = float(np.mean(np.minimum(np.abs(rows), 5.0 * quick) ** 2) / quick**2)
-        # scatter of the ratio itself: mean square and median of third differences
+        # the last term allows for the scatter of the ratio, that of a mean square and of a median of differences
         limit = 1.0 + (tuning.MOST_RATIO - 1.0) + 4.0 * 2.5 / np.sqrt(len(rows))
         verdict.figures[f"colour_{name}"] = ratio
         if ratio > limit and not verdict.sensor:
@@ -143,8 +144,8 @@ def _repeated(problem: Problem, fit: Fit, period: float, verdict: Verdict) -> No
 def _other_law(problem: Problem, fit: Fit, verdict: Verdict) -> None:
     """Test whether another law explains the residuals (score test, linearised).
 
-    One more unknown mixes the motion of the other law, from the same states, into that of the law believed; all other
-    unknowns are eliminated.
+    An additional unknown mixes the motion under the other law, with the same starting states, into the motion under the
+    believed law. All other unknowns are eliminated.
     """
     unknowns = with_other_law(problem.unknowns)
     if unknowns is None or not fit.finished:
@@ -170,7 +171,7 @@ def _other_law(problem: Problem, fit: Fit, verdict: Verdict) -> None:
 
 
 def _scale(problem: Problem, fit: Fit, verdict: Verdict) -> None:
-    """Test the sensor's scales; other tests find a wrong model."""
+    """Test the sensor's scales; they are suspect only if no other test has found a fault."""
     if not fit.finished:
         return
     scales = scales_of(problem, fit)
@@ -185,7 +186,7 @@ def _scale(problem: Problem, fit: Fit, verdict: Verdict) -> None:
 
 
 def quick_noise(residual: Array, swing: NDArray[np.int64]) -> float:
-    """Return the standard deviation of a component by the changes between neighbours in a swing."""
+    """Return the standard deviation of a component from the changes between neighbouring rows in a swing."""
     there = np.isfinite(residual)
     value, part = residual[there], swing[there]
     if len(value) < 10:
@@ -217,7 +218,7 @@ def _stuck(problem: Problem, fit: Fit, verdict: Verdict) -> None:
 
 
 def _noise_change(fit: Fit, verdict: Verdict) -> None:
-    if not fit.finished:  # residual motion, more in one part than in another
+    if not fit.finished:  # the residuals still contain motion, more in one part than in another
         return
     for i, name in enumerate(COMPONENTS):
         residual, swing = fit.point.residual[:, i], fit.point.swing
@@ -257,21 +258,21 @@ def _change_within(problem: Problem, fit: Fit, verdict: Verdict) -> None:
         verdict.sensor.append(f"shifted within the window by {shift[0]:.2g} m, {shift[1]:.2g} m, {shift[2]:.2g} rad")
     elif clearance > bias and np.abs(growth).max() > 0.5 * tuning.OBSERVED:
         verdict.model.append(f"machine changed within the window: clearances by {growth[0]:.2g} m, {growth[1]:.2g} m")
-    # residuals of a wrong load or law also look like a change, but it explains little of them
+    # residuals of a wrong load or law also resemble a change, but a change explains little of them
     verdict.broken |= (
         len(verdict.sensor) + len(verdict.model) > found and share > tuning.CHANGE_SHARE and _felt(problem, fit)
     )
 
 
 def _felt(problem: Problem, fit: Fit) -> bool:
-    """Return whether the load is known so well that it moves the head in a swing as believed, up to the noise."""
+    """Return whether the load's unknown part moves the head in a swing less than noise, or links allow for it."""
     drift = np.array(problem.forward.load.unknown) / np.asarray(inertias(problem.unknowns.scene)) ** 2
     span = float(np.median(np.diff(problem.window.starts)))
     return len(problem.link) > 0 or bool((drift * span**3 / 3.0 < fit.noise**2).all())
 
 
 def _excess(fit: Fit) -> float:
-    """Return the sum of squared residuals beyond their quick noise, over the fit's variances."""
+    """Return the sum of squared residuals beyond their quick noise, relative to the fit's variances."""
     total = 0.0
     for i in range(3):
         quick = quick_noise(fit.point.residual[:, i], fit.point.swing)
@@ -281,7 +282,7 @@ def _excess(fit: Fit) -> float:
 
 
 def _changes(problem: Problem, fit: Fit, columns: NDArray[np.intp]) -> Iterator[tuple[Array, Array]]:
-    """Yield information and score of a change of some shared unknowns at each swing, all others eliminated."""
+    """Yield information and score of a change of some shared unknowns at each swing, other unknowns eliminated."""
     count = len(columns)
     size = SIZE + OWN * problem.window.swings
     cross, own, score = np.zeros((size, count)), np.zeros((count, count)), np.zeros(count)
@@ -301,7 +302,7 @@ def _changes(problem: Problem, fit: Fit, columns: NDArray[np.intp]) -> Iterator[
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Information (SIZE, SIZE) and score (SIZE,) of the shared unknowns in a swing, its starting state eliminated."""
+    """Information (SIZE, SIZE) and score (SIZE,) of the shared unknowns in a swing, without its starting state."""
 
     normal: Array
     score: Array
@@ -321,7 +322,7 @@ def swing_blocks(problem: Problem, fit: Fit) -> list[Block]:
 
 
 def sandwich(problem: Problem, fit: Fit, precision: Array) -> Array:
-    """Return the covariance of the shared unknowns that the scatter of the swings' scores gives, shape (SIZE, SIZE).
+    """Return the covariance of the shared unknowns from the scatter of the swings' scores, shape (SIZE, SIZE).
 
     Reference: White, Econometrica 50 (1982) 1: maximum likelihood of misspecified models.
     """

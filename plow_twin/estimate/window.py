@@ -1,8 +1,8 @@
 """Windows of the sliding estimate, formed from arriving samples and poses.
 
-The stamps alone determine the windows: each ends at a multiple of the interval and is formed once the load is ahead of
-it by the waiting time for late data. The order of arrival within that time has no effect, so the journal gives the same
-windows as the live node.
+The stamps alone determine the windows. Each window ends at a multiple of the interval, and is formed when the load is
+ahead of this end by the waiting time for late data. The order of arrival within the waiting time has no effect, so the
+journal gives the same windows as the live node.
 """
 
 from __future__ import annotations
@@ -30,17 +30,18 @@ Array = NDArray[np.float64]
 #: A stamp in ns and the measured values.
 Row = tuple[int, tuple[float, ...]]
 
-#: Bound: poses, and gaps, that are kept; more arrive if the load has stopped, or a clock is ahead by hours.
+#: Bound: most poses, and most rows of gaps, that are kept. More arrive only if the load has stopped or a clock is ahead
+#: by hours.
 MOST_KEPT = 600_000
 
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """Measurements in [start_ns, end_ns); times in s count from `start_ns`.
+    """Measurements in [start_ns, end_ns), with times in s from `start_ns` on.
 
     samples, poses : numbers of rows received; `poses` includes rows of gaps
     lost : rows left out
-    gaps : None without measured gaps
+    gaps : measured gaps; None if there are none
     """
 
     start_ns: int
@@ -59,13 +60,13 @@ class Windows:
     Parameters
     ----------
     length_s, interval_s, wait_s : float
-        Full length of a window, distance of their ends, and waiting time for late data, in s.
+        Full length of a window, interval of the windows' ends, and waiting time for late data, in s.
     poses, load : tuple of 3 float
-        Stated deviations: of the poses, at least; of the load, until `set_load_deviation` is called.
+        Smallest stated deviation of the poses, and stated deviation of the load until `set_load_deviation` is called.
     gaps : float
         Stated deviation of a gap sensor in m.
     early : bool
-        Whether windows of `tuning.WINDOW_SHARES[1]` of the length and more are formed until there are longer ones.
+        Whether shorter windows are formed at first, from the share `tuning.WINDOW_SHARES[1]` of the full length on.
     """
 
     def __init__(
@@ -89,7 +90,7 @@ class Windows:
         self._loads: list[Row] = []
         self._poses: deque[tuple[int, tuple[float, ...], tuple[float, ...]]] = deque(maxlen=MOST_KEPT)
         self._gaps: deque[tuple[int, tuple[int, ...], tuple[float, ...]]] = deque(maxlen=MOST_KEPT)
-        #: length [s] and rows of poses or gaps of the newest window that was checked
+        #: length [s] of the newest window that was checked, and its number of poses or gaps
         self._left = (0.0, 0)
         self._newest_ns: int | None = None
         self._end_ns: int | None = None
@@ -124,7 +125,7 @@ class Windows:
         return self._form(end_ns)
 
     def last(self) -> Window | str:
-        """Return the window that ends with the newest sample, at the end of the input, or why there is no window."""
+        """Return the window that ends with the newest sample, for the end of the input, or why there is none."""
         if self._newest_ns is None:
             return "got no load"
         window = self._form(self._newest_ns + 1)

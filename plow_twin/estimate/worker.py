@@ -1,8 +1,8 @@
 """The sliding estimate in its own process, so that it does not delay the samples.
 
-`Worker` is the near side: it queues data, which a thread sends. The far side, `python -m plow_twin.estimate.worker`,
-compiles its kernels, says so, estimates each window that is due and sends the result back. A window that became due
-while another was computed is skipped for a newer one.
+`Worker` is the near side. It queues data, and a thread sends them. The far side, `python -m plow_twin.estimate.worker`,
+compiles its kernels, reports that it is ready, estimates each window that is due and sends the result back. If several
+windows become due while another is computed, only the newest of them is estimated.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from plow_twin.model.scene import Scene
 
 #: Bound: interval at which queued data are sent [s].
 _SEND_S: Final = 0.05
-#: Bound: queued items; that many wait only if the far side has stopped reading.
+#: Bound: most queued items. So many wait only if the far side has stopped reading.
 _MOST_WAITING: Final = 1_000_000
 #: Bound: `nice` of the far side.
 _NICE: Final = 10
-#: Definition: the shortest slice that Linux gives in ns, and the number of the system call for it.
+#: Definition: shortest time slice in ns that Linux gives, and number of the system call that requests it.
 _SLICE_NS, _SCHED_SETATTR = 100_000, 314
-#: Bound: time in s for the far side to end.
+#: Bound: time in s in which the far side must end.
 _STOP_S: Final = 5.0
 _ESTIMATE_ALONE: Final = Asked()
 
@@ -57,8 +57,10 @@ ForkingPickler.register(MappingProxyType, lambda view: (_view, (dict(view),)))
 class Found:
     """The estimate of one window: its bounds [ns], numbers of rows, guess, and result.
 
-    wall_s : duration of the computation; skipped : windows dropped before it; restarts : restarts before it
-    text : the whole answer as JSON, with `forces` and `forecast` on request, which `also` holds too
+    wall_s : duration of the computation
+    skipped, restarts : numbers of skipped windows and of restarts before this window
+    text : the whole answer as JSON, with `forces` and `forecast` if requested
+    also : `forces` and `forecast` alone
     """
 
     start_ns: int
@@ -75,14 +77,14 @@ class Found:
 
 
 class Worker:
-    """A process that estimates; `add_load`, `add_pose` and `restart` return at once, `poll` returns a result.
+    """A process that estimates. `add_load`, `add_pose` and `restart` return at once; `poll` returns a result.
 
     Parameters
     ----------
     scene : Scene
         The nominal scene.
     windows : Windows
-        Forms the windows; empty, copied to the process.
+        Forms the windows. It must be empty, and is copied to the process.
     asked : Asked
         The answers to give beside the estimate.
     """
@@ -105,7 +107,7 @@ class Worker:
         self._closed = threading.Event()
         #: reason why estimating has ended; empty before
         self.error = ""
-        #: after `finish`, once all is done: why the last window could not be estimated, or empty
+        #: None until everything before `finish` is done; then why the last window could not be estimated, or empty
         self.ended: str | None = None
         self._thread = threading.Thread(target=self._send_queue, name="estimate", daemon=True)
         self._thread.start()
@@ -132,7 +134,10 @@ class Worker:
         self._waiting.append(("restart",))
 
     def finish(self) -> None:
-        """Let the last window be estimated, as the input has ended. When it is done, `ended` is no longer None."""
+        """Request the estimate of the last window, at the end of the input.
+
+        When the estimate is done, `ended` is no longer None.
+        """
         self._waiting.append(("end",))
 
     @property
@@ -145,7 +150,7 @@ class Worker:
         if self.error or self.ended is not None:
             return None
         if len(self._waiting) > _MOST_WAITING:
-            # the thread may wait for the far side to read
+            # the sending thread may be blocked until the far side reads
             self._process.kill()
             self._fail(f"the estimator did not read for {_MOST_WAITING} samples")
             return None
@@ -161,7 +166,7 @@ class Worker:
                 return found if found.restarts == self._restarts else None
         except (EOFError, OSError):
             code = self._process.poll()
-            if code is not None:  # otherwise it is about to end, and the next call finds the code
+            if code is not None:  # otherwise the process is about to end, and the next call gets the code
                 self._fail(f"the estimator ended with code {code}")
         return None
 
@@ -216,7 +221,7 @@ def serve(connection: Connection) -> None:
                     due = formed
         if due is None:
             connection.send(ended)
-            connection.recv()  # until the other side is gone
+            connection.recv()  # wait until the other side closes the connection
         assert due is not None
         begin = time.perf_counter()
         found = answer(scene, due, guess, asked)
@@ -241,7 +246,7 @@ def add(windows: Windows, item: tuple[Any, ...]) -> Window | None:
 
 
 def _request_short_slices() -> None:
-    """Ask for slices of 0.1 ms, after which a waiting process gets the core (Linux 6.12, x86-64; else longer ones)."""
+    """Request time slices of 0.1 ms, after which a waiting process gets the core (from Linux 6.12 on, x86-64 only)."""
     if platform.machine() == "x86_64" and sys.platform == "linux":
         # struct sched_attr: size, policy, flags, nice, priority, runtime [ns], deadline, period
         attributes = struct.pack("IIQiIQQQ", 48, os.SCHED_OTHER, 0, _NICE, 0, _SLICE_NS, 0, 0)
@@ -249,7 +254,7 @@ def _request_short_slices() -> None:
 
 
 def main() -> None:
-    """Run the far side; the arguments are the descriptor of its end, and modules of contact laws."""
+    """Run the far side; the arguments are the descriptor of its end of the pipe, and modules of contact laws."""
     # Ctrl-C goes to the whole group; the near side ends this process
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(_NICE)
