@@ -321,7 +321,7 @@ def test_unusable_input_of_a_forecast_is_refused_and_not_left_out(
     for text, expected in (
         ("null", "got NoneType, expected JSON of an estimate"),
         ("[" * 200_000, "expected JSON of an estimate"),
-        (json.dumps({"horizontal": [1]}), "estimate: horizontal: got [1], expected what `plow-twin estimate"),
+        (json.dumps({"horizontal": [1]}), "estimate: horizontal: got [1], expected the output of `plow-twin estimate"),
         (json.dumps({"horizontal": whole, "vertical": whole | {"state": "withdrawn"}}), "a withdrawn vertical"),
         (json.dumps({"horizontal": whole, "vertical": whole | {"p05_m": float("nan")}}), "expected finite values"),
     ):
