@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 #: Time to wait for a scheduler [s].
 CONNECT_TIMEOUT_S = 20.0
-#: Time to wait for a cluster without a worker [s], because the cluster may still grow.
+#: Time to wait for the first worker of a cluster [s], because a cluster may still grow.
 WORKER_TIMEOUT_S = 300.0
 #: Time between two checks for a worker while no result arrives [s].
 _LOOK_S: Final = 2.0

@@ -1,15 +1,16 @@
 """Numbers and words of a scene by path, such as `contact.stiffness`, `head.com_offset_m[0]`.
 
-Loads are called by name: `loads.fx1.phase_rad`. Four paths are settings of a study and not fields of a scene:
+A load is given by its name: `loads.fx1.phase_rad`. Four paths are settings of a study, not fields of a scene:
 
     loads.<name>.sign       sign of the load's force (its first component that is not zero); -1 turns the whole force
-    loads.<name>.arm_sign   the same for its point of action
-    loads.<name>.scale      factor of its force and free moment
+    loads.<name>.arm_sign   the same for the force's point of action
+    loads.<name>.scale      factor of the load's force and free moment
     clearance.scale         factor of both clearances: 1 for a total, 2 for a published clearance per side
 
-`frame.labels` takes one of eight words such as `bottom_right_ccw`: a at the bottom right, then b, c, d
-counter-clockwise. The four settings act after the other paths. `contact.damping` replaces a restitution, and the
-reverse. A scene without friction also has the paths of `friction`, and setting such a path switches friction on.
+`frame.labels` takes one of eight words such as `bottom_right_ccw`, which means a at the bottom right, then b, c, d
+counter-clockwise. The four settings act after the other paths. `contact.damping` replaces a restitution, and
+`contact.restitution` a damping. A scene without friction also has the paths of `friction`; setting one of them switches
+friction on.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from plow_twin.errors import PlowTwinError, Problem, SceneError
 from plow_twin.model.contact_laws import LAWS
 from plow_twin.model.scene import Friction, Head, Scene, Table
 
-#: Value of a parameter: a number, or a word for the paths `WORDS`.
+#: Value of a parameter: a word for the paths in `WORDS`, a number for all others.
 Value = float | str
 
 #: Paths whose values are words.
@@ -33,7 +34,7 @@ WORDS: Final = ("contact.law", "head.rotation", "frame.labels")
 _CORNERS_CCW: Final = ("bottom_right", "top_right", "top_left", "bottom_left")
 _PARTS: Final = ("head", "frame", "clearance", "contact", "gravity", "initial", "wear", "friction", "support")
 _DERIVED: Final = ("sign", "arm_sign", "scale")
-#: Friction without effect, with which a study of a scene without friction starts.
+#: Friction without effect, from which a study of a scene without friction starts.
 _NO_FRICTION: Final = Friction(0.0)
 _INDEX: Final = re.compile(r"(.+)\[(\d+)\]")
 
@@ -87,7 +88,7 @@ def check_path(scene: Scene, path: str) -> str:
 
 
 def nearest_of(path: str, known: Iterable[str]) -> str:
-    """Return a hint with the nearest known paths, or an empty text."""
+    """Return a hint with the nearest known paths, or an empty text if there are none."""
     near = get_close_matches(path, known, n=3, cutoff=0.6)
     return f"; nearest: {', '.join(near)}" if near else ""
 
@@ -111,14 +112,14 @@ def parameter_of(scene: Scene, path: str) -> Value | None:
 
 
 def with_parameters(scene: Scene, values: Mapping[str, Value]) -> Scene:
-    """Return the scene with new values, which lose their marks.
+    """Return the scene with new values, whose marks are removed.
 
     Raises
     ------
     StudyError
         The scene does not have a path, or a value is of the wrong kind.
-        SceneError
-            The scene cannot be used with these values; the error lists every problem.
+    SceneError
+        The scene cannot be used with these values; the error lists every problem.
     """
     known = parameter_paths(scene)
     for path, value in values.items():
@@ -129,7 +130,7 @@ def with_parameters(scene: Scene, values: Mapping[str, Value]) -> Scene:
             raise StudyError(f"{path}: got {value!r}, expected a {'word' if words else 'number'}")
     parts: dict[str, Any] = {name: getattr(scene, name) for name in _PARTS}
     loads = {load.name: load for load in scene.loads}
-    # fields first, because sign and scale act on the new values
+    # fields come first, because sign and scale act on the new values
     for path, value in sorted(values.items(), key=lambda item: item[0].rsplit(".", 1)[1] in _DERIVED):
         owner, field_name = path.rsplit(".", 1)
         if path == "frame.labels":
@@ -146,7 +147,7 @@ def with_parameters(scene: Scene, values: Mapping[str, Value]) -> Scene:
 
 
 def label_words() -> dict[str, dict[str, str]]:
-    """Return the eight orders of lettering the corners by their words."""
+    """Return the eight ways to letter the corners, by their words."""
     words = {}
     for turn, corners in (("ccw", _CORNERS_CCW), ("cw", _CORNERS_CCW[::-1])):
         for first in range(4):
@@ -247,7 +248,7 @@ def _load(scene: Scene, owner: str) -> Any:
 
 
 def _is_set(key: str, values: Mapping[str, Value], scene: Scene) -> bool:
-    """Return whether the values change the number at a key of `Scene.marks`, in which loads have indexes."""
+    """Return whether the values change the number at a key of `Scene.marks`, where loads have indexes."""
     match = re.match(r"loads\[(\d+)\]\.(.+)", key)
     path = f"loads.{scene.loads[int(match[1])].name}.{match[2]}" if match else key
     whole = path.partition("[")[0]

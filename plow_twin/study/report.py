@@ -20,13 +20,13 @@ if TYPE_CHECKING:
 
 
 def require(*modules: str) -> None:
-    """Raise `ModuleNotFoundError` if a module is missing, before minutes of work instead of after."""
+    """Raise `ModuleNotFoundError` if a module is missing, before work that may take minutes."""
     for module in modules:
         import_module(module)
 
 
 def write_html(path: Path, template: str, context: Mapping[str, Any], package: str = "plow_twin.study") -> None:
-    """Fill `templates/<template>` of a package and write the page; the template's filter `image` embeds a PNG file.
+    """Fill `templates/<template>` of a package and write the page. In a template, the filter `image` embeds a PNG file.
 
     Raises
     ------
@@ -82,7 +82,7 @@ def _plain(value: Any) -> Any:
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write rows that have the same keys, with the keys as header."""
+    """Write rows with equal keys as CSV, with the keys as header."""
     with whole_file(path) as stream, io.TextIOWrapper(stream, encoding="utf-8", newline="") as text:
         writer = csv.DictWriter(text, fieldnames=list(rows[0]))
         writer.writeheader()

@@ -1,6 +1,6 @@
-"""A run as one self-contained HTML file: summary, picture, curves, tables.
+"""A run as one self-contained HTML file with summary, picture, curves and tables.
 
-rerun's viewer is not in it, because its program for browsers is too large for a page (`docs/recording.md`).
+The file does not contain rerun's viewer, whose program for browsers is too large for a page (`docs/recording.md`).
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from plow_twin.view.run_curves import RunCurves
 
 Array = NDArray[np.float64]
 
-#: Largest number of rows of a table of the page; further rows are only counted.
+#: Largest number of rows of a table on the page; further rows are only counted.
 _MOST_ROWS: Final = 200
 _PADS: Final = np.array([CLEARANCE_NAMES.index(name) for name in PAD_NAMES])
 _LOADS: Final = ("Fx", "Fy", "M")
 
 
 def write_run_page(path: Path, out: Path) -> tuple[FileStatus, dict[str, int], int]:
-    """Write the page of a run; return the recording's status, counts of its losses, and the number of failed advances.
+    """Write the page of a run; return the recording's status, its losses, and the number of failed advances.
 
     Raises
     ------
@@ -184,7 +184,7 @@ def _by_pad(recording: Recording) -> list[dict[str, str]]:
 
 
 def _plots(reader: RunReader, curves: RunCurves) -> list[dict[str, Any]]:
-    """Return title, curves, bands, thresholds and columns of each plot with zoom."""
+    """Return title, curves, bands, thresholds and columns of each plot."""
     alarms = alarms_of(reader.header.parameters).alarms
     force, clearance = alarms["force"].thresholds, alarms["clearance"].thresholds
     ways = ("horizontal", "vertical")
@@ -215,7 +215,7 @@ def _plots(reader: RunReader, curves: RunCurves) -> list[dict[str, Any]]:
 
 
 def _columns(rows: Envelope, chosen: list[tuple[int, int]]) -> list[list[float | None]]:
-    """Return times and the least (0) or largest (1) values of the chosen columns, None where a line ends."""
+    """Return times and the least (side 0) or largest (side 1) values of chosen columns, None where a line ends."""
     times: Array | None = None
     columns: list[list[float | None]] = []
     order = np.zeros(0, np.int64)

@@ -1,16 +1,17 @@
 """Statistics of a run by path.
 
-    max.top_left_top                    of one pair max.ccw.a                           of the pair of corner a that
-    stops a counter-clockwise swing; cw: of its other pair max.a   max.ccw   max               over the pairs of a
-    corner, over the pairs of a sense, over all pairs contact_sets.ccw.ad                 share of the contact time of
-    that sense with force at exactly these corners contact_set_time.ccw.ad             the same in s
-    contact_points.ccw.2                share of that contact time with force at exactly two corners events   steps
-    contact changes; steps of the solver
+    max.top_left_top          largest force of one pair
+    max.ccw.a                 of the pair of corner a that stops a counter-clockwise swing; cw: of its other pair
+    max.a   max.ccw   max     of the pairs of a corner; of the pairs of a sense; of all pairs
+    contact_sets.ccw.ad       share of the contact time of this sense with force at exactly these corners
+    contact_set_time.ccw.ad   the same time in s
+    contact_points.ccw.2      share of this contact time with force at exactly two corners
+    events   steps            number of contact changes; number of steps of the solver
 
 Instead of `max` [N], a path may begin with `mean_in_contact` or `mean_over_time` [N], `impulse` [N s],
-`time_in_contact` [s], `makes` or `wear_depth` [m]. Of several pairs, the largest force and the deepest wear are used;
-impulses, times and touches are added, and means are computed from these sums. Corners have the scene's letters or their
-names; named corners of a set are joined by `+`.
+`time_in_contact` [s], `makes` or `wear_depth` [m]. For several pairs, `max` and `wear_depth` are the largest values;
+impulses, times and touches are added, and means are computed from these sums. A corner is named by the scene's letter
+or by its own name; the names in a set are joined by `+`.
 """
 
 from __future__ import annotations
@@ -31,14 +32,14 @@ from plow_twin.solve.state import Status
 from plow_twin.study.parameters import StudyError, nearest_of
 
 Array = NDArray[np.float64]
-#: Function from m runs to the statistic of each run, shape (m,).
+#: Function that returns the statistic of each of m runs, shape (m,).
 Statistic = Callable[[Ensemble], Array]
 
 SENSES: Final = ("ccw", "cw")
 
 
 def _sum(array: Array, columns: list[int]) -> Array:
-    """Add columns one by one, because numpy's order, and so the last bit, would depend on the number of rows."""
+    """Add columns one by one, because the last bit of numpy's sum depends on the number of rows."""
     total = np.zeros(len(array))
     for column in columns:
         total = total + array[:, column]

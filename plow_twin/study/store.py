@@ -3,7 +3,8 @@
     sweep.json          the arguments, and the number of members in a chunk
     chunks/00007.npz    status and statistics of the members of one chunk, and the build that computed them
 
-A chunk is written to another file, synced and renamed in one step, so that a killed run loses only the chunk under way.
+A chunk is first written to another file, which is synced and then renamed, so that a killed run loses only its
+unfinished chunk.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from plow_twin.study.sweep.table import Sweep, Table, chunks_of
 Array = NDArray[np.float64]
 
 FORMAT: Final = 1
-#: Name of a chunk, or of an incomplete chunk whose process was killed while writing it.
+#: Name of a chunk, or of an incomplete chunk whose process was killed.
 _CHUNK_NAME: Final = re.compile(r"\d{5,}\.npz|\.\d{5,}\.npz\.\d+")
 
 
@@ -37,14 +38,14 @@ class Store:
         Folder of the sweep; it is made if it does not exist.
     sweep : Sweep
     chunk : int
-        Number of members in a chunk; if the folder already has this sweep, its stored number is used.
+        Number of members in a chunk. If the folder already has this sweep, the stored number is used.
     fresh : bool
         Whether to discard any sweep in the folder.
 
     Raises
     ------
     StudyError
-        The folder has another sweep (the error names the difference) or something else.
+        The folder has another sweep (the error names the difference) or other contents.
     """
 
     def __init__(self, folder: Path, sweep: Sweep, chunk: int, fresh: bool = False) -> None:
@@ -82,7 +83,7 @@ class Store:
 
     @property
     def chunks(self) -> list[range]:
-        """Members of every chunk."""
+        """Members of each chunk."""
         return list(chunks_of(self.sweep.size, self.chunk))
 
     def missing(self) -> list[int]:

@@ -1,4 +1,4 @@
-"""Analysis of one recording: a run's journal is computed again; the load of any other recording passes the intake."""
+"""Analysis of one recording: a run's journal is computed again; the load of another recording passes the live intake."""
 
 from __future__ import annotations
 
@@ -51,11 +51,11 @@ _COLUMNS: Final = (
 )
 #: Tolerance of the run that the analysis computes from a recording of another program.
 _TOLERANCE: Final = 1e-9
-#: A measured stamp that is older than the newest stamp by more than this [ns] is a step of its clock.
+#: If a measured stamp is older than the newest stamp by more than this [ns], its clock has stepped.
 _STEP_NS: Final = 1_000_000_000
 #: Largest measured value, in any unit, because squares of larger values may overflow.
 _LARGEST: Final = 1e15
-#: Name of the scene that is in the header of a run.
+#: Name for the scene in a run's header.
 _OF_THE_RUN: Final = "of the run"
 _MAP: Final = "map_"
 #: Parameter that marks each run made by an analysis.
@@ -73,12 +73,12 @@ class Prediction:
     loads: LoadTotals
     longest: Thinned = field(default_factory=lambda: Thinned(len(_COLUMNS)))
     present: Thinned = field(default_factory=lambda: Thinned(len(_COLUMNS)))
-    #: number of resets of the motion so far, which is the number of the present stretch
+    #: number of resets of the motion so far, also the index of the present stretch
     resets: int = 0
-    #: first and last stamp [ns] of each stretch that has rows, by its number
+    #: first and last stamp [ns] of each stretch with rows, by index
     spans: dict[int, tuple[int, int]] = field(default_factory=dict)
     _longest_number: int = 0
-    #: clearances in the order of `CLEARANCE_NAMES`, of all stretches
+    #: clearances of all stretches, in the order of `CLEARANCE_NAMES`
     clearance: Thinned = field(default_factory=lambda: Thinned(len(CLEARANCE_NAMES)))
 
     def walked(self, part: Walked) -> None:
@@ -91,7 +91,7 @@ class Prediction:
         self.clearance.add(slow["stamp_ns"], slow["clearance"])
 
     def is_inside(self, signal: ThinnedSignal) -> NDArray[np.bool_]:
-        """Return, for each measured value, whether it is within the time of the load."""
+        """Return for each measured value whether it is within the time of the load."""
         stamps = signal.series()[0]
         if not self.spans:
             return np.ones(len(stamps), np.bool_)
@@ -116,7 +116,7 @@ class Prediction:
         return self.resets if self._longer() is self.present else self._longest_number
 
     def is_of_longest(self, signal: ThinnedSignal) -> NDArray[np.bool_]:
-        """Return, for each measured value, whether it belongs to the longest stretch.
+        """Return for each measured value whether it belongs to the longest stretch.
 
         A value belongs to the stretch that contains its stamp. If several stretches do, as after a step back of the
         clock, it belongs to the stretch in which it arrived.
@@ -143,13 +143,13 @@ class Prediction:
 
     @property
     def stride(self) -> int:
-        """One in `stride` rows of the longest stretch is kept for the signals."""
+        """Distance of the rows of the longest stretch that are kept for the signals."""
         return self._longer().stride
 
 
 @dataclass
 class Measured:
-    """Measured values by signal, in order of arrival; of very many values only every second, fourth, ... is kept."""
+    """Measured values by signal, in order of arrival; of very many values, only every second, fourth ... is kept."""
 
     signals: dict[str, ThinnedSignal] = field(default_factory=dict)
     #: stretch and stamp [ns] of the latest message of each role
@@ -158,10 +158,10 @@ class Measured:
     implausible: int = 0
 
     def add(self, role: str, stamp_ns: int, numbers: Mapping[str, float], stretch: int = 0) -> None:
-        """Add the numbers of one message in a stretch; a number that is not finite was not measured."""
+        """Add the numbers of one message in a stretch; numbers that are not finite were not measured."""
         before, newest = self._latest.get(role, (0, stamp_ns))
         back = newest - stamp_ns > _STEP_NS
-        # the clock of the measurement has stepped earlier than the clock of the load
+        # the measurement's clock may step back before the load's clock does
         stretch = max(stretch, before + back)
         self._latest[role] = stretch, stamp_ns if back else max(newest, stamp_ns)
         prefix = {"forces": "force_", "gaps": "gap_"}.get(role, "")
@@ -186,12 +186,12 @@ class Analysis:
     #: stretches without samples, in which the load is interpolated linearly
     silences: Silences
     wall_s: float = 0.0
-    #: other folders in the recording's folder: empty, or with recordings of their own
+    #: other folders in the recording's folder, empty or with recordings of their own
     left_out: tuple[Path, ...] = ()
 
     @property
     def lossy(self) -> bool:
-        """Whether something could not be read or used."""
+        """Whether any data could not be read or used."""
         return bool(self.lost)
 
     @property
@@ -221,7 +221,7 @@ class Analysis:
         return found
 
     def facts(self) -> dict[str, Any]:
-        """Return all facts for JSON, with the prediction of the scene at the top and other scenes under `with`."""
+        """Return all facts for JSON: the scene's prediction at the top level, and the other scenes under `with`."""
         first, *others = self.predictions
         return {
             "run": str(self.path),
@@ -256,7 +256,7 @@ class Analysis:
         return facts if confusion is None else facts | {"contact_set_confusion": confusion}
 
     def _confusion(self, prediction: Prediction) -> dict[str, dict[str, int]] | None:
-        """Return, by pair, how often contact was predicted and measured, or None without measured forces."""
+        """Return by pair how often contact was predicted and measured; None without measured forces."""
         stamps, columns = prediction.series()
         found = {}
         for name in PAIR_NAMES:
@@ -295,17 +295,17 @@ def analyse(
     Parameters
     ----------
     path
-        A run of plow_twin, another recording (MCAP, rosbag2's sqlite3, CSV), or a folder with its parts.
+        A run of plow_twin, another recording (MCAP, rosbag2's sqlite3, CSV), or a folder with the parts of a recording.
     scene
         Scene file or preset; by default the scene of a run, or `scene.yaml` beside another recording.
     mapping
         YAML that maps topics to roles.
     units
-        Units by name (fx, x, ..., t), which replace those of the mapping; only for another recording.
+        Units by name (fx, x, ..., t), which replace the units of the mapping; only for recordings of other programs.
     others
         Further scenes for predictions.
     out
-        Folder in which a run (`run`) is made from another recording.
+        Folder in which a run, `run`, is made from a recording of another program.
     tail, on_caught_up
         With a `Tail`, a run of plow_twin is followed while it is written; `on_caught_up` receives the analysis so far
         whenever everything has been read.
@@ -320,7 +320,7 @@ def analyse(
         raise RecordingError(f"{path}: no such recording")
     reader = own_run(path, tail)
     if tail is not None and reader is None:
-        raise RecordingError(f"{path}: expected a run of plow_twin: another recording cannot be followed")
+        raise RecordingError(f"{path}: expected a run of plow_twin: recordings of other programs cannot be followed")
     if reader is not None:
         own = reader.header.scene(reader.path)
         chosen, name = (own, _OF_THE_RUN) if scene is None else (load_scene(scene_path(str(scene))), str(scene))
@@ -493,7 +493,7 @@ def _holds(folder: Path, kinds: Sequence[str] = _KINDS) -> bool:
 
 
 def _is_recording(folder: Path, results: Sequence[Path]) -> bool:
-    """Return whether a folder is one recording: its files are parts of one recording, or no folder in it is a run."""
+    """Return whether a folder is one recording: its files are the parts of a recording, or no folder in it is a run."""
     if not _holds(folder):
         return False
     if (folder / "metadata.yaml").is_file() or any(folder.glob(f"{glob.escape(folder.name)}_*")):
@@ -516,9 +516,9 @@ def left_out(path: Path, results: Sequence[Path] = ()) -> list[Path]:
 
 
 def expand(paths: Sequence[Path], results: Sequence[Path] = ()) -> list[Path]:
-    """Return the recordings at some paths: a folder that is not a recording is replaced by the recordings in it.
+    """Return the recordings at some paths. A folder that is not a recording is replaced by the recordings in it.
 
-    `results` are folders with results of an earlier analysis, which are not recordings.
+    `results` are folders with results of an earlier analysis; they are not recordings.
 
     Raises
     ------
@@ -533,7 +533,7 @@ def expand(paths: Sequence[Path], results: Sequence[Path] = ()) -> list[Path]:
         inside = [
             item
             for item in sorted(path.iterdir())
-            # also a recording with missing parts, which its analysis names
+            # a recording with missing parts is analysed too; its analysis names them
             if item.suffix in (".mcap", ".db3") or _holds(item) or (item / "metadata.yaml").is_file()
         ]
         if not inside and any(path.glob(f"*{SUFFIX}")):  # a table beside recordings is the result of an analysis
@@ -545,7 +545,7 @@ def expand(paths: Sequence[Path], results: Sequence[Path] = ()) -> list[Path]:
 
 
 def counted_once(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
-    """Return the recordings without repetitions, and a sentence for each recording that is left out.
+    """Return the recordings without repetitions, and a sentence for each repetition.
 
     A recording is repeated if its path, or the random id of its run, occurs again.
     """

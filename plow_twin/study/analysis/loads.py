@@ -24,13 +24,13 @@ Array = NDArray[np.float64]
 CYCLE_BINS: Final = 16
 #: Length of a piece of the face [m].
 FACE_BIN_M: Final = 1.0
-#: Size of a pair's reversals that are kept in memory [B]: 131 072 reversals; further reversals are on the disk.
+#: Memory for the reversals of a pair [B], enough for 131 072 reversals; a longer series is on the disk.
 _IN_MEMORY: Final = 2**20
 
 
 @dataclass
 class Pass:
-    """One pass along the face: from one reversal of the travel to the next.
+    """One pass along the face, from one reversal of the travel to the next.
 
     Times in s since the first stamp, positions along the face in m, energy in J.
     """
@@ -45,7 +45,7 @@ class Pass:
 
 
 class Series:
-    """A series of any length that is written once and can be read repeatedly; a long series is on the disk."""
+    """A series of any length that is written once and can be read repeatedly. A long series is on the disk."""
 
     def __init__(self) -> None:
         self._file = tempfile.SpooledTemporaryFile(_IN_MEMORY)  # noqa: SIM115 (goes with this object)
@@ -117,7 +117,7 @@ class LoadTotals:
             self.sets[int(mask)] += int(count)
         for pair, kept in enumerate(self._reversals):
             turning = reversals(rows.peak[:, pair])
-            if turning.any() or kept.last != 0.0:  # a long time without contact needs only one zero
+            if turning.any() or kept.last != 0.0:  # one zero is enough for a long time without contact
                 kept.add(turning)
         loss = self._contact_loss(walked, steps)
         self.contact_loss_j += float(loss.sum())
@@ -126,10 +126,10 @@ class LoadTotals:
         self._last = (int(stamps[-1]), *(column[-1].copy() for column in last))
 
     def _contact_loss(self, walked: Walked, steps: Array) -> Array:
-        """Return the energy taken by the contacts between two rows [J]: work of load and gravity minus energy gained.
+        """Return the energy that contacts take between two rows [J]: the load's work minus the energy gained.
 
-        The work of the load is its mean times the distance. The energy gained is the kinetic energy and the energy
-        stored in the contacts.
+        The work of the load is its mean times the distance. The energy gained is kinetic, potential in gravity, and
+        elastic in the contacts.
         """
         now = walked.wrench, walked.rows.q, walked.rows.v, walked.rows.penetration
         first = (column[0] for column in now) if self._last is None else self._last[1:]
@@ -179,7 +179,7 @@ class LoadTotals:
     def _wear(self, depth: Array, speed: float, pieces: NDArray[np.int64]) -> None:
         """Add the wear of the pads and of the places of the slide that they pass, by direction.
 
-        A pad is in contact over the whole distance, a place of the slide only while the length of the pad passes it.
+        A pad wears over the whole distance, but a place of the slide only while the length of a pad passes it.
         """
         wear = self.scene.wear
         if wear is None or wear.coefficient_m2_n == 0.0:
@@ -206,7 +206,7 @@ class LoadTotals:
         if self.slide_wear:
             pieces = {piece for _, piece in self.slide_wear}
             total = np.sum(list(self.slide_wear.values()), axis=0) / len(pieces)
-            # mean over the pieces; its ratio to the wear of the pads is that of a pad's length to the face's length
+            # mean over the pieces; it is to the wear of the pads as a pad's length is to the face's length
             out["slide_mean_m"] = dict(zip(PAIR_NAMES, total.tolist(), strict=True))
             out["slide_pieces"] = len(pieces)
         return out

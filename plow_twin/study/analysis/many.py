@@ -1,4 +1,4 @@
-"""Analysis of many recordings on all cores or on a Dask cluster; no result is lost when a worker dies."""
+"""Analysis of many recordings on several cores or on a Dask cluster; no result is lost when a worker dies."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ _OnDone = Callable[[int, dict[str, Any]], object]
 def run_many(
     tasks: Sequence[RunTask], *, workers: int, dask: str | None = None, on_progress: OnProgress = lambda share: None
 ) -> list[dict[str, Any]]:
-    """Return the facts of each task (`error` if it failed); stored facts are used.
+    """Return the facts of each task, or `error` if the task failed; stored facts are used again.
 
     Parameters
     ----------
     workers
         Number of processes on this machine.
     dask
-        Address of a scheduler to use instead; its workers must see the same files.
+        Address of a scheduler to use instead; its workers must have access to the same files.
 
     Raises
     ------
@@ -55,7 +55,7 @@ def run_many(
 def _here(tasks: Sequence[RunTask], waiting: list[int], workers: int, done: _OnDone) -> None:
     while waiting:
         left = _round(tasks, waiting, workers, done)
-        if len(left) == len(waiting):  # a task has killed its worker: run each of the first tasks alone
+        if len(left) == len(waiting):  # a task has killed its worker, so the first tasks are run one by one
             left, first = left[workers:], left[:workers]
             for number in first:
                 if _round(tasks, [number], 1, done):
@@ -64,7 +64,7 @@ def _here(tasks: Sequence[RunTask], waiting: list[int], workers: int, done: _OnD
 
 
 def _round(tasks: Sequence[RunTask], waiting: list[int], workers: int, done: _OnDone) -> list[int]:
-    """Run tasks and return the lost tasks; when a worker dies, all unfinished tasks are lost."""
+    """Run tasks and return the lost ones; when a worker dies, all unfinished tasks are lost."""
     left = []
     others = active_children()
     pool = ProcessPoolExecutor(min(workers, len(waiting)), get_context("spawn"), _begin, (loaded_laws(),))
@@ -110,6 +110,6 @@ def _on_cluster(tasks: Sequence[RunTask], waiting: list[int], address: str, done
             number = futures[future]
             try:
                 done(number, future.result())
-            except Exception as error:  # any error, in any state of the worker
+            except Exception as error:  # any error may come from a worker
                 path = str(tasks[number].path)
                 done(number, {"run": path, "error": f"{path}: {type(error).__name__}: {error}"})

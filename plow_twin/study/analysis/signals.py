@@ -1,4 +1,4 @@
-"""Comparison of a predicted with a measured signal: bias, RMS, correlation, lag and coherence."""
+"""Comparison of a predicted and a measured signal: bias, RMS, correlation, lag and coherence."""
 
 from __future__ import annotations
 
@@ -82,12 +82,12 @@ def _correlation(one: Array, other: Array) -> float | None:
         return None
     one, other = one - one.mean(), other - other.mean()
     size = math.sqrt(float(one @ one) * float(other @ other))
-    # without these bounds, rounding could give more than 1
+    # rounding could give more than 1
     return min(1.0, max(-1.0, float(one @ other) / size)) if size > 1e-300 else None
 
 
 def _shifted(t: Array, predicted: Array, times: Array, lag_s: float) -> Array:
-    """Return the prediction at `times` minus `lag_s`, NaN outside its time."""
+    """Return the prediction at `times` minus `lag_s`, NaN outside the time of the prediction."""
     return _at(times - lag_s, t, predicted)
 
 
@@ -96,14 +96,15 @@ def _at(times: Array, t: Array, predicted: Array) -> Array:
 
 
 def _step(times: Array, span: float) -> float:
-    """Return the usual distance between stamps [s], at least so large that the number of points is bounded."""
+    """Return the median distance between stamps [s], or a larger distance that limits the number of points."""
     return max(float(np.median(np.diff(np.unique(times)))), span / _MOST_POINTS, 1e-6)
 
 
 def _correlations(longer: Array, shorter: Array) -> Array:
-    """Return Pearson's correlation of a series with each piece of a longer series, over the known part of the piece.
+    """Return Pearson's correlation of a series with each piece of a longer series, over the piece's known part.
 
-    The known part of the longer series, without NaN, is contiguous. The result is -1 if the known part is too short.
+    The known part of the longer series, without NaN, is contiguous. The result is -1 for a piece whose known part is
+    too short.
     """
     from scipy.signal import correlate
 
@@ -132,7 +133,7 @@ def _correlations(longer: Array, shorter: Array) -> Array:
 
 
 def _lag(t: Array, predicted: Array, times: Array, values: Array) -> float | None:
-    """Return the lag with the largest correlation, found on a grid and then refined between its points."""
+    """Return the lag with the largest correlation, found on a grid and refined between its points."""
     from scipy.optimize import minimize_scalar
 
     span = float(times[-1] - times[0])

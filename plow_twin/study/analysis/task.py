@@ -23,15 +23,15 @@ from plow_twin.scene_file.presets import scene_path
 from plow_twin.study.analysis.analyse import MAPPED_LOAD, analyse
 from plow_twin.study.analysis.report import write_report
 
-#: File with the inputs of an analysis, which is written last.
+#: File with the inputs of an analysis, written last.
 _ASKED: Final = "asked.json"
 _FILES: Final = (_ASKED, "analysis.json", "report.html", "measured.parquet")
-#: Names of the tables, of which each scene has its own.
+#: Names of the tables; each scene has its own tables.
 _TABLE: Final = re.compile(r"(predicted|clearance|face|slide_wear)(_\d+)?\.parquet")
 
 
 def names_apart(paths: Sequence[Path]) -> list[str]:
-    """Return a short name for each recording, the part of its path that distinguishes it from the others."""
+    """Return a short name for each recording: the end of its path that distinguishes it from the others."""
     whole = [path.absolute() for path in paths]
     stems = Counter(path if path.is_dir() else path.with_suffix("") for path in whole)
     parts = [
@@ -54,7 +54,7 @@ class RunTask(Protocol):
         """The recording."""
 
     def stored(self) -> dict[str, Any] | None:
-        """Return the facts if the same work has been done before."""
+        """Return the facts if the same work was done before, else None."""
 
     def run(self) -> dict[str, Any]:
         """Return the facts."""
@@ -69,13 +69,13 @@ class Task:
     mapping: Path | None
     others: tuple[Path, ...]
     out: Path | None
-    #: other contents of the recording's folder, named in the results
+    #: other contents of the recording's folder, which the results name
     left_out: tuple[Path, ...] = ()
-    #: units of measured numbers by name, which replace those of the mapping
+    #: units of measured numbers by name, which replace the units of the mapping
     units: Mapping[str, str] = field(default_factory=dict)
 
     def stored(self) -> dict[str, Any] | None:
-        """Return the facts of the same analysis if all its files exist."""
+        """Return the facts of the same analysis if it was completed before, else None."""
         if self.out is None:
             return None
         try:
@@ -86,12 +86,12 @@ class Task:
         return {**facts, "lossy": bool(facts["lost"])} if asked == self._asked() else None
 
     def clear(self, inputs: Sequence[Path] = ()) -> None:
-        """Remove all files of an earlier analysis; a run that a twin has recorded stays.
+        """Remove all files of an earlier analysis, but not a run that a twin has recorded.
 
         Raises
         ------
         RecordingError
-            A file to remove is an input of this analysis or of another analysis (`inputs`).
+            A file to remove is an input of this analysis or one of `inputs`, the inputs of other analyses.
         """
         old = self._old()
         self._keep(old, (*self._inputs(), *inputs))
@@ -106,7 +106,7 @@ class Task:
         self._keep(self._old(), inputs)
 
     def _old(self) -> list[Path]:
-        """Return the files of an earlier analysis; the first file marks the analysis as complete."""
+        """Return the files of an earlier analysis, first the file that marks the analysis as complete."""
         if self.out is None or not self.out.is_dir():
             return []
         found = sorted(path for path in self.out.iterdir() if path.name in _FILES or _TABLE.fullmatch(path.name))
@@ -134,7 +134,7 @@ class Task:
             The analysis cannot be made.
         """
         self.clear()
-        asked = self._asked()  # state of the inputs at the start of the analysis
+        asked = self._asked()  # the inputs as they were at the start of the analysis
         found = analyse(
             self.path,
             scene=self.scene,
@@ -151,12 +151,12 @@ class Task:
         return {**found.facts(), "lossy": found.lossy}
 
     def _asked(self) -> dict[str, Any]:
-        """Return the inputs of the result: the recording, the files beside it, mapping and units."""
+        """Return the inputs on which the result depends: recording, files beside it, scenes, mapping and units."""
         folder = self.path if self.path.is_dir() else self.path.parent
         beside = folder / "scene.yaml" if self.scene is None else None
         return {
             "run": _state(self.path, self.out),
-            # a single part may have measurements beside it, also in other parts
+            # measurements may be beside a single part, also in other parts
             "parts": [] if self.path.is_dir() else [_state(path, self.out) for path in _measured_near(folder)],
             "scene": _scene_state(self.scene),
             "scene_beside": _scene_state(beside) if beside is not None and beside.is_file() else None,
@@ -173,12 +173,12 @@ def _is_ours(file: Path) -> bool:
         return True
     if not re.fullmatch(r"run_\d+\.mcap", file.name):
         return False
-    if file.stat().st_size == 0:  # its process was killed before the first byte
+    if file.stat().st_size == 0:  # the process was killed before the first byte
         return True
     try:
         header = read_header(file)
         if header is None and next(iter(ChunkReader(file)), None) is None:
-            return True  # its process was killed before the header
+            return True  # the process was killed before the header
     except RecordingError:
         return False
     return header is not None and MAPPED_LOAD in header.parameters
@@ -210,16 +210,16 @@ def _scene_state(scene: Path | None) -> list[str] | None:
         return None
     try:
         text = dump_scene(load_scene(scene_path(str(scene))))
-    except (PlowTwinError, OSError, ValueError):  # the analysis reports it
+    except (PlowTwinError, OSError, ValueError):  # the analysis reports the error
         text = ""
     return [str(scene), hashlib.blake2b(text.encode(), digest_size=16).hexdigest()]
 
 
 def run_task(task: RunTask) -> dict[str, Any]:
-    """Return the facts of one task, `error` if it failed."""
+    """Return the facts of one task, or `error` if it failed."""
     try:
         return task.run()
     except PlowTwinError as error:
         return {"run": str(task.path), "error": str(error)}
-    except Exception as error:  # any error of one recording, so that the others continue
+    except Exception as error:  # whatever the error of one recording, the others continue
         return {"run": str(task.path), "error": f"{task.path}: {error!r}"}

@@ -1,4 +1,4 @@
-"""Rows and values in bounded memory: if there are too many, only every second, then every fourth, ... is kept."""
+"""Rows and values in bounded memory: if there are too many, only every second, then every fourth ... is kept."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-#: Largest number of rows that are kept: 150 MB of a prediction, 16 MB of a measured signal.
+#: Largest number of kept rows: 150 MB for a prediction, 16 MB for a measured signal.
 MOST_ROWS: Final = 1_000_000
 
 
 class Thinned:
-    """Rows of several columns with their stamps; of the `rows` received, one in `stride` is kept."""
+    """Rows of several columns with their stamps. Of the `rows` received, one in `stride` is kept."""
 
     def __init__(self, columns: int) -> None:
         self._stamps: list[NDArray[np.int64]] = [np.zeros(0, np.int64)]
@@ -36,7 +36,7 @@ class Thinned:
             self._kept, self.stride = len(self._stamps[0]), 2 * self.stride
 
     def series(self) -> tuple[NDArray[np.int64], Array]:
-        """Return the stamps [ns] and the rows that are kept, shapes (m,) and (m, columns)."""
+        """Return the stamps [ns] and the kept rows, shapes (m,) and (m, columns)."""
         self._stamps, self._values = [np.concatenate(self._stamps)], [np.concatenate(self._values)]
         return self._stamps[0], self._values[0]
 
@@ -65,7 +65,7 @@ class ThinnedSignal:
         return self._came
 
     def series(self) -> tuple[NDArray[np.int64], Array]:
-        """Return the stamps [ns] and the values that are kept, shape (m,) each."""
+        """Return the stamps [ns] and the kept values, shape (m,) each."""
         return np.array(self._stamps, np.int64), np.array(self._values)
 
     def stretches(self) -> NDArray[np.int64]:

@@ -1,11 +1,11 @@
-"""Fit of unknowns of a scene to an objective by many independent starts, each first global, then local.
+"""Fit of a scene's unknowns to an objective by independent starts, each of which searches globally, then locally.
 
-One start has three stages: (1) `screen` random points of the unit cube, of which the best become the first population
-of (2) a differential evolution (Storn and Price, J. Global Optim. 11 (1997) 341; scipy), in which each generation is
-one ensemble of runs. (3) The best point is polished in the unknowns that have a range, by least squares (trust region
-reflective, scipy) with a finite-difference Jacobian from one ensemble, and then, for residuals with kinks, by Nelder
-and Mead's simplex. Every start has its own random generator, spawned from the seed, so that the same seed gives the
-same bits with any number of threads.
+One start has three stages. (1) `screen` random points of the unit cube are evaluated; the best of them are the first
+population of (2) a differential evolution (Storn and Price, J. Global Optim. 11 (1997) 341; scipy), in which each
+generation is one ensemble of runs. (3) The best point is polished in the unknowns that have a range, by least squares
+(trust region reflective, scipy) with a finite-difference Jacobian from one ensemble. For residuals with kinks, Nelder
+and Mead's simplex follows. Every start has its own random generator, spawned from the seed, so that the same seed gives
+the same bits with any number of threads.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ OnProgress = Callable[[float, float], None]
 
 @dataclass(frozen=True)
 class Search:
-    """Effort of one start: points screened, population, generations, evaluations of the simplex (0: no simplex)."""
+    """Effort of one start: points screened, population, generations, and evaluations of the simplex (0 for none)."""
 
     screen: int = 200
     population: int = 30
     generations: int = 40
     simplex: int = 0
-    #: spread of the population's objective, relative to its mean, at which the evolution ends
+    #: spread of the population's objectives, relative to their mean, at which the evolution ends
     spread: float = 1e-3
     #: step of the Jacobian in the unit cube
     step: float = 1e-6
@@ -58,7 +58,7 @@ class Calibration:
     starts: tuple[Start, ...]
     seed: int
     runs: int
-    #: all points of the last populations, among which are points that fit almost as well as the best
+    #: all points of the last populations; some of them fit almost as well as the best point
     population: Array = field(repr=False)
     population_objective: Array = field(repr=False)
 
@@ -88,7 +88,7 @@ def calibrate(
     search : Search, optional
         Effort of each start.
     first : ndarray, shape (n,), optional
-        A point that is put into the first population of the first start, such as that of the given scene.
+        A point for the first population of the first start, such as the point of the given scene.
     on_progress : callable, optional
         Called after every generation.
     """
@@ -107,7 +107,7 @@ def calibrate(
         points, values = _evolve(space, objective, rng, search, known, report)
         point, best = polish(space, objective, points[np.argmin(values)], search)
         populations.append((points, values))
-        # otherwise the best point of the population is kept
+        # if polishing has not improved the best point of the population, that point is kept
         if values.min() < best:
             point, best = points[np.argmin(values)], float(values.min())
         point = space.settled(point)
@@ -200,7 +200,7 @@ def polish(space: Space, objective: Objective, point: Array, search: Search) -> 
 
 
 def jacobian(space: Space, objective: Objective, point: Array, step: float) -> Array:
-    """Return dr/dz in the unit cube, shape (r, n), by central differences (one-sided at the walls of the cube).
+    """Return dr/dz in the unit cube, shape (r, n), by central differences, one-sided at the walls of the cube.
 
     Columns of choices are zero.
     """

@@ -1,4 +1,4 @@
-"""The result of a calibration as tables and files: the fitted scene with its marks, the targets met, the uniqueness."""
+"""The result of a calibration as tables and files: the fitted scene with marks, the targets, and the uniqueness."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class TargetRow:
 def fitted_scene(scene: Scene, values: Mapping[str, Value], source: str) -> Scene:
     """Return the scene with the fitted values; every number that they change is marked as reconstructed.
 
-    An unchanged number keeps its mark; a number of which only the sign changed keeps the source of its size.
+    An unchanged number keeps its mark. A number whose sign alone has changed keeps the source of its size.
     """
     fit = with_parameters(scene, values)
     marks = dict(fit.marks)
@@ -76,7 +76,7 @@ def _number_at(scene: Scene, key: str) -> Any:
 
 
 def target_rows(objective: TargetObjective, values: Mapping[str, Value]) -> list[TargetRow]:
-    """Return every target with the value of the candidate."""
+    """Return every target with the values that the candidate gives."""
     numbers, paths = objective.table(values)
     settings = list(objective.targets.settings)
     rows = []

@@ -1,4 +1,4 @@
-"""Objectives of a calibration: residuals of a candidate from targets or from a recorded motion, as one row."""
+"""Objectives of a calibration: a candidate's residuals from targets or from a recorded motion, as one row."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Objective(Protocol):
     def residuals(self, candidates: Sequence[Values], cut: float = np.inf) -> Array:
         """Return the weighted residuals of m candidates, shape (m, r); the objective is their sum of squares.
 
-        A candidate whose objective surely exceeds `cut` need not be evaluated to the end.
+        A candidate need not be evaluated to the end if its objective surely exceeds `cut`.
         """
 
 
@@ -46,7 +46,7 @@ class TargetObjective:
     runs: int = 0
 
     def __post_init__(self) -> None:
-        # the marks of a candidate are never read, and without marks it is made in a third of the time
+        # marks are never read, and a candidate without marks is made in a third of the time
         self.scene = replace(self.scene, marks={})
 
     def residuals(self, candidates: Sequence[Values], cut: float = np.inf) -> Array:
@@ -84,7 +84,7 @@ class TargetObjective:
                 try:
                     scenes.append(with_parameters(self.scene, {**self.targets.settings[column], **candidates[row]}))
                 except SceneError:
-                    continue  # an impossible candidate gets the residuals of a failure
+                    continue  # impossible candidates get the residuals of a failure
                 places.append((row, column))
         if not scenes:
             return
@@ -109,7 +109,7 @@ class TargetObjective:
 
 @dataclass
 class RecordingObjective:
-    """Distance from a recorded motion: (q - q recorded) / clearance at every row.
+    """Distance from a recorded motion, (q - q recorded) / clearance at every row.
 
     Angles are multiplied by the half diagonal. The rows are divided by the square root of their number, so that the
     objective is the mean square error of x, y and theta together, relative to the clearance of the scene before the

@@ -1,4 +1,4 @@
-"""Picture of a calibration: fitted motion or figures, and the near-optimal values of each unknown within its range."""
+"""Picture of a calibration: fitted motion or figures, and near-optimal values of each unknown within its range."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from plow_twin.view.figures import signed, write_png
 from plow_twin.view.fitted import FittedPicture, FittedValue
 from plow_twin.view.fitted_file import write_fit_picture
 
-#: Larger residuals are drawn at this value, because those of failed runs are in the thousands.
+#: Larger residuals, such as those of failed runs, are drawn at this value.
 _MOST: Final = 5.0
 
 
 def draw_motion(fit: Fit, space: Space, objective: RecordingObjective, title: str, path: Path) -> None:
-    """Draw the recorded and the fitted motion as a PNG, or for rerun if the suffix is .rrd.
+    """Draw the recorded and the fitted motion as a PNG, or as a file for rerun if the suffix is .rrd.
 
     Raises
     ------
@@ -66,7 +66,7 @@ def _notes(fit: Fit, space: Space) -> list[str]:
 
 
 def draw_targets(fit: Fit, space: Space, title: str, path: Path) -> None:
-    """Draw the residual of each figure, and the range in which the figure is met, as a PNG.
+    """Draw the residual of each figure, coloured by whether the figure is met, as a PNG.
 
     Raises
     ------

@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 COLUMNS: Final = ("t", "x", "y", "theta")
 #: Largest unpacked size of an archive [B].
 _LARGEST_ARCHIVE: Final = 2**28
-#: Largest number of rows of a simulated motion, which is interpolated to the recorded times.
+#: Largest number of rows of a simulated motion; it is interpolated to the recorded times.
 _MOST_ROWS: Final = 20_000
 
 
@@ -39,7 +39,7 @@ class PoseRecording:
 
     @property
     def output_dt(self) -> float:
-        """Distance of the simulated rows in s: that of the recording, but at least t_end / 20000."""
+        """Interval of the simulated rows in s: the recording's, but at most 0.01 s and at least t_end / 20000."""
         end = float(self.t[-1])
         step = float(np.median(np.diff(self.t))) if len(self.t) > 1 else end
         return max(min(step, 0.01), end / _MOST_ROWS)
@@ -117,7 +117,7 @@ def _read_npz(path: Path) -> tuple[Array, Array, None]:
 
 
 def _read_mcap(path: Path) -> tuple[Array, Array, Table | None]:
-    """Read the poses that the node published (`head_state`) and the load samples that it used."""
+    """Read the poses that the node published (`head_state`), and the load samples that it used."""
     recording = read_recording(path)
     (stamps, poses), (sampled, wrench) = recording["head_state"].numpy(), recording["excitation"].numpy()
     origin = recording.header.origin_ns

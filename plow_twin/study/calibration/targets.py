@@ -7,9 +7,9 @@ Each target gives one residual r of a candidate, 0 if it is met exactly:
     above              r = max(0, largest of the others - s) / (tolerance |largest|)          met: r = 0
     trend              r = (steps the wrong way + shortfall of the rise or fall) / (tolerance mean)   met: r = 0
 
-where s is the statistic of the run with the target's `set` of parameters (the smallest if several statistics are
-named). A trend is a sequence of runs along one parameter; for `rises_then_falls` the turn with the smallest violation
-is used. Rise and fall must each be at least `margin` times the mean. The objective is the sum of weight times r^2.
+Here s is the statistic of the run with the target's `set` of parameters, or the smallest if several statistics are
+named. A trend is a sequence of runs along one parameter. For `rises_then_falls` the turn with the smallest violation is
+used. Rise and fall must each be at least `margin` times the mean. The objective is the sum of weight times r^2.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ class Target:
 
 
 def _wrong_way(s: Array, least: Array) -> Array:
-    """Return the sum of downward steps of a sequence that should rise, plus its shortfall from the smallest rise."""
+    """Return the sum of downward steps of a sequence that should rise, plus its shortfall from the least rise."""
     down = np.maximum(0.0, -np.diff(s, axis=1)).sum(axis=1)
     return np.asarray(down + np.maximum(0.0, least - (s[:, -1] - s[:, 0])))
 
@@ -107,7 +107,7 @@ class TargetSet:
     t_end_s: float
     tol: float = 1e-6
     source: str = ""
-    #: unknowns that the file proposes, in the form of the command line
+    #: unknowns that the file proposes, as texts of the command line
     unknowns: tuple[str, ...] = ()
     settings: tuple[Mapping[str, Value], ...] = field(init=False)
 

@@ -17,9 +17,9 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Identifiability:
-    """Singular values of dr/dz at the optimum, for the unknowns with a range (z: places 0..1 in their ranges).
+    """Singular values of dr/dz at the optimum, where z are the places 0..1 of the unknowns with a range.
 
-    `weakest` is the singular vector of the smallest value, the combination of unknowns that the data determine least.
+    `weakest` is the singular vector of the smallest value: the data determine this combination of unknowns least.
     """
 
     paths: tuple[str, ...]
@@ -50,7 +50,7 @@ def identifiability(space: Space, objective: Objective, point: Array, step: floa
     if free.size == 0:
         return Identifiability((), (), {})
     _, singular, right = np.linalg.svd(jacobian(space, objective, point, step)[:, free], full_matrices=False)
-    # the sign of a singular vector is arbitrary: make the largest component positive
+    # the sign of a singular vector is arbitrary, so its largest component is made positive
     weakest = right[-1] * np.sign(right[-1][np.argmax(np.abs(right[-1]))])
     return Identifiability(
         paths, tuple(map(float, singular)), {path: float(x) for path, x in zip(paths, weakest, strict=True)}

@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Unknown:
-    """A parameter to find, between `low` and `high` (uniform in the logarithm if `log`), or one of `choices`."""
+    """A parameter to find: a number from `low` to `high` (uniform in the logarithm if `log`), or one of `choices`."""
 
     path: str
     low: float = 0.0
@@ -43,7 +43,7 @@ class Unknown:
         return float(self.low + (self.high - self.low) * place)
 
     def place(self, value: Value) -> float:
-        """Return the place 0..1 of a value; the place of a choice is the middle of its share."""
+        """Return the place 0..1 of a value; a choice has the middle of its share."""
         if self.choices:
             return (self.choices.index(value) + 0.5) / len(self.choices)
         number = float(value)
@@ -144,7 +144,7 @@ class Space:
 
 
 def check_usable(space: Space, scene: Scene, trials: int = 100) -> None:
-    """Raise the `SceneError` of the first random point if all of `trials` random points fail."""
+    """Raise the first point's `SceneError` if all of `trials` random points fail."""
     points = np.random.default_rng(0).random((trials, space.size))
     if not any(is_usable(scene, values) for values in space.values_of(points)):
         with_parameters(scene, space.values(points[0]))

@@ -12,29 +12,29 @@ from scipy.stats import t as student
 
 Array = NDArray[np.float64]
 
-#: Number of bootstrap draws; the 2.5 % point of an interval is then known to 0.5 % of probability.
+#: Number of bootstrap draws, with which the 2.5 % point of an interval has a standard error of 0.5 %.
 _DRAWS: Final = 1000
 #: Smallest number of windows that can distinguish a change from chance.
 FEWEST: Final = 8
-#: Smallest variation of the load within groups, relative to its mean, that shows how a quantity depends on it.
+#: Smallest variation of the load within groups, relative to the mean load, that shows how a quantity depends on it.
 _LEAST_VARIATION: Final = 0.01
 #: Loads of two groups that differ by less than this share are treated as equal.
 _EQUAL_LOAD: Final = 0.01
-#: Percentiles between which the loads of two groups must overlap [%], because a slope is not valid far from its loads.
+#: Percentiles [%] between which the loads of two groups must overlap, because a slope is valid only near its loads.
 _USUAL: Final = (5.0, 95.0)
 #: Probability below which a change is more than chance.
 _LEVEL: Final = 0.05
 #: Number of windows drawn at once, which bounds the memory.
 _AT_ONCE: Final = 2**21
-#: Share by which means of equal numbers may differ because of rounding.
+#: Relative difference that rounding can cause between means of equal numbers.
 _ROUNDING: Final = 1e-12
-#: A window that starts within this many window lengths is the next window.
+#: Largest distance of the starts of two neighbouring windows, in window lengths.
 _NEXT: Final = 1.5
 
 
 @dataclass(frozen=True)
 class Change:
-    """Change of a mean from one group to another, as shares of the first mean.
+    """Change of a mean from one group to another, relative to the first mean.
 
     Attributes
     ----------
@@ -42,7 +42,7 @@ class Change:
         The change and its 95 % interval.
     chance : float
         Probability of such a change by chance, adjusted for the number of cells that are judged together (Benjamini and
-        Hochberg): one in twenty of the cells below 0.05 is there by chance.
+        Hochberg). Of the cells below 0.05, one in twenty is there by chance.
     machine, machine_low, machine_high, machine_chance : float or None
         The same numbers at equal load; None if the load varies too little to show how the quantity depends on it, or if
         the loads of the groups do not overlap.
@@ -76,9 +76,9 @@ def points(values: Array) -> dict[str, float]:
 def with_neighbours(load: Array, start_ns: NDArray[np.int64]) -> Array:
     """Return the load of each window, of the window before and of the window after, shape (n, 3).
 
-    A missing neighbour has the window's own load. A window cuts through changes of the load, and the head's motion
-    still depends on the previous load. Therefore the effect of a lasting change is not the slope over a window's own
-    load, but the sum of the slopes over all three loads.
+    A missing neighbour gets the window's own load. The load may change within a window, and the head's motion still
+    depends on the load before. The effect of a lasting change of the load is therefore the sum of the slopes over all
+    three loads, not the slope over the window's own load.
     """
     steps = np.diff(start_ns)
     joined = (steps > 0) & (steps < _NEXT * np.median(steps)) if len(steps) else steps > 0
@@ -88,7 +88,7 @@ def with_neighbours(load: Array, start_ns: NDArray[np.int64]) -> Array:
 
 
 class Drawn:
-    """Moments of a group: of all its windows in the first row, then of each draw from the windows.
+    """Moments of a group: the first row for all its windows, each other row for a draw from the windows.
 
     Parameters
     ----------
@@ -98,8 +98,8 @@ class Drawn:
         Load of the windows, shape (n,), or the loads of `with_neighbours`, shape (n, 3).
     random
         Generator of the draws.
-        draws
-            Number of draws.
+    draws
+        Number of draws.
 
     Attributes
     ----------
@@ -124,7 +124,7 @@ class Drawn:
         centred = whole - usual
         means, products = [np.zeros((1, whole.shape[1]))], [centred[:, :width].T @ centred / self.size]
         done = 0
-        while done < draws:  # as many draws at a time as the memory allows
+        while done < draws:  # as many draws at once as the memory allows
             count = min(draws - done, max(1, _AT_ONCE // self.size))
             done += count
             times = np.stack(
@@ -142,8 +142,8 @@ class Drawn:
 def changes(before: Drawn, after: Drawn) -> list[Change | None]:
     """Return the changes of quantities between two groups of windows, None if there are too few windows.
 
-    Means are compared by a bootstrap over windows. At equal load, the part that depends on the load is subtracted, with
-    the slopes over the load's variation within the groups (analysis of covariance).
+    Means are compared by a bootstrap over windows. For the comparison at equal load, the part that depends on the load
+    is subtracted; its slopes are those of the load's variation within the groups (analysis of covariance).
 
     References
     ----------
@@ -169,9 +169,9 @@ def changes(before: Drawn, after: Drawn) -> list[Change | None]:
 
 
 def _tested(differences: Array, mean: Array, fewest: int) -> tuple[Array, Array, Array, Array]:
-    """Return share, low, high and adjusted chance of each difference; the first row is the value, the others are draws.
+    """Return share, low, high and adjusted chance of each difference; the first row has the values, the others draws.
 
-    Student's t with the degrees of freedom of the smaller group gives too large rather than too small chances.
+    Student's t has the degrees of freedom of the smaller group, so that chances are rather too large than too small.
     """
     drawn = np.divide(differences, mean, out=np.full_like(mean, np.nan), where=mean > 0.0)
     low, high = np.nanpercentile(drawn[1:], (2.5, 97.5), axis=0)

@@ -19,7 +19,7 @@ from plow_twin.study.comparison.windows import FULL, QUANTITIES, Windows, window
 
 #: Stamps before this [ns] are not dates: 1e18 ns is in the year 2001.
 _DATES_NS: Final = 10**18
-#: Share of a window that may be without messages; rates that differ by less are treated as equal.
+#: Share of a window that may be without messages.
 _MISSING: Final = 1.0 - FULL
 #: Default start times of the shifts.
 SHIFTS: Final = (time(6), time(14), time(22))
@@ -41,11 +41,12 @@ class Comparison:
     changes : dict
         `Change` by group (except the first), pair and quantity; None if there are too few windows.
     clearance_changes : dict
-        `Change` by group (except the first) and by horizontal and vertical, likewise.
+        The same by group (except the first) and by `horizontal` and `vertical`.
     scenes : list of str
         Names of the scenes of all runs.
     notes : list of str
-        Doubts about the runs: stretches without samples, times that several runs cover, different sample rates.
+        Doubts about the runs: stretches without samples, times covered by several runs, different sample rates or
+        scenes.
     """
 
     groups: dict[str, Windows]
@@ -109,8 +110,8 @@ def by_time(kind: str, shifts: Sequence[time] = SHIFTS, zone: tzinfo = UTC) -> L
         `day` or `shift`.
     shifts
         Times at which shifts begin.
-        zone
-            Time zone of days and shifts.
+    zone
+        Time zone of days and shifts.
 
     Raises
     ------
@@ -205,7 +206,7 @@ def _overlapping(windows: Windows, others: Windows) -> np.ndarray[Any, Any]:
         return np.zeros(len(windows.start_ns), bool)
     order = np.argsort(others.start_ns)
     (begins, ends), (starts, stops) = (
-        # the range of stamps in which a window certainly has messages
+        # the span in which a window surely has messages
         ((part.start_ns + _MISSING * part.length_ns), (part.start_ns + FULL * part.length_ns))
         for part in (windows, others)
     )
@@ -243,7 +244,7 @@ class WindowsTask:
         return None
 
     def run(self) -> dict[str, Any]:
-        """Return the windows (`windows`), the run's losses (`lost`), and the name and contents of its scene (`scene`).
+        """Return the windows (`windows`), the run's losses (`lost`), and name and contents of its scene (`scene`).
 
         Raises
         ------

@@ -20,7 +20,8 @@ from plow_twin.view.section import PAIR_COLORS
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: Largest number of groups drawn as boxes; largest number of names side by side, which have the length of a date.
+#: Largest number of groups drawn as boxes, of names beside each other, and of letters in a line of a name that is not
+#: slanted.
 _MOST_BOXES: Final = 6
 _MOST_LABELS: Final = 12
 _WIDEST: Final = 10
@@ -75,7 +76,7 @@ def _figure(found: Comparison) -> Figure:
 
 
 def _lines(axis: Any, found: Comparison) -> None:
-    """Draw lines of the median and the 95 % point of each pair's peaks over many groups, whose boxes would overlap."""
+    """Draw median and 95 % point of each pair's peaks as lines over many groups, because their boxes would overlap."""
     peaks = [windows.pairs["peak"] / 1e3 for windows in found.groups.values()]
     places = np.arange(len(peaks))
     median, high = (np.array([np.percentile(values, point, axis=0) for values in peaks]) for point in (50.0, 95.0))
@@ -102,7 +103,7 @@ def _title(found: Comparison) -> str:
 
 
 def _write_windows(found: Comparison, path: Path) -> None:
-    """Write a row group for each group of windows, so that only one group is copied in memory at a time."""
+    """Write a row group for each group of windows, so that memory holds a copy of only one group at a time."""
     import pyarrow as pa
     import pyarrow.parquet
 

@@ -32,7 +32,7 @@ QUANTITIES: Final[Mapping[str, str]] = {
 _PERIOD_SPAN_S: Final = 60.0
 #: Length of a window if the load has no period [s].
 _NO_PERIOD_S: Final = 10.0
-#: Smallest share of a full window's messages; a window with fewer messages, cut by an end or a gap, is left out.
+#: Smallest share of a full window's messages. Windows with fewer messages, cut by an end or a gap, are left out.
 FULL: Final = 0.9
 _PADS: Final = np.array([CLEARANCE_NAMES.index(name) for name in PAD_NAMES])
 _TOTALS: Final = np.array([CLEARANCE_NAMES.index(name) for name in ("horizontal", "vertical")])
@@ -70,7 +70,7 @@ class Windows:
     silent: int = 0
 
     def chosen(self, which: NDArray[np.bool_]) -> Windows:
-        """Return the windows of a mask, shape (n,); if it selects all, without a copy."""
+        """Return the windows selected by a mask, shape (n,), without a copy if it selects all."""
         if which.all():
             return self
         return Windows(
@@ -105,7 +105,7 @@ class _Sums:
     rows: dict[int, Array] = field(default_factory=dict)
 
     def add(self, window: Indexes, values: Array, reduce: Any = np.add) -> None:
-        """Add values, shape (n, width), of the windows numbered `window`, shape (n,), never falling."""
+        """Add values, shape (n, width), to the windows numbered `window`, shape (n,), which never decreases."""
         if not len(window):
             return
         first = np.flatnonzero(np.r_[True, np.diff(window) != 0])
@@ -177,7 +177,7 @@ def windows_of(recording: Recording, window_s: float | None = None) -> Windows:
                 f"{recording.path}: got no {name}, expected a run with outputs: plow-twin replay --write"
             )
     full = FULL * float(np.median([row[0] for row in messages.rows.values()]))
-    # the messages at the end of a silence cover the whole silence
+    # messages at the end of a silence cover the whole silence, so all its windows are left out
     known, silent = np.array(sorted(messages.rows)), set[int]()
     for begin, end in silent_ns:
         first, last = np.searchsorted(known, begin // window_ns), np.searchsorted(known, end // window_ns, side="right")
@@ -185,8 +185,8 @@ def windows_of(recording: Recording, window_s: float | None = None) -> Windows:
     numbers = sorted(number for number, row in messages.rows.items() if row[0] >= full and number not in silent)
     if not numbers:
         raise RecordingError(
-            f"{recording.path}: got a stretch without samples in each window, expected windows without: "
-            "excitation_timeout is the longest time between samples that is not such a stretch"
+            f"{recording.path}: each window has a stretch without samples, expected some complete windows; "
+            "samples further apart than excitation_timeout are such a stretch"
         )
     seconds = window_ns * 1e-9
     sums, touched = moved.of(numbers), contact.of(numbers)
@@ -224,7 +224,7 @@ def _risen(part: Batched, window: Indexes) -> tuple[Batched, Indexes]:
 
 
 def _powers(part: Batched, newest: tuple[Indexes, Array] | None) -> tuple[Indexes, Array, Array]:
-    """Return stamps, power into each contact [W] and whether it has force; the previous row, `newest`, is put first."""
+    """Return stamps, power into each contact [W] and whether it has force; the previous row, `newest`, is the first."""
     stamps, values = part.stamp_ns, part.values
     if newest is not None and newest[0][0] < stamps[0]:
         stamps, values = np.concatenate((newest[0], stamps)), np.concatenate((newest[1], values))

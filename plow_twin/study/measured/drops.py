@@ -1,4 +1,4 @@
-"""Measured drops of the square: end of the first flight, bounces, and check of the predicted bands."""
+"""Measured drops of the square: end of the first flight, bounces, and comparison with the predicted bands."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ Array = NDArray[np.float64]
 
 #: Half the side of the square in m.
 _HALF: Final = 0.03
-#: Criteria of an impact: fall [m/s^2], deviation of the accelerations of z [m/s^2] and theta [rad/s^2] from a flight,
-#: and largest gap [m].
+#: Criteria of an impact: acceleration of fall [m/s^2], deviations of the accelerations of z [m/s^2] and theta [rad/s^2]
+#: from a flight, and largest gap [m].
 _FALL, _JERK, _TWIST, _NEAR = 9.0, 9.0, 300.0, 0.03
 #: Smallest rise in m between two separate bounces.
 _RISE: Final = 0.003
@@ -33,7 +33,7 @@ class Drops:
     flight_rows : ndarray, shape (n,)
         Number of rows before the first impact.
     bounces : tuple of tuple of int
-        Rows of each drop at which it is lowest between rises of 3 mm.
+        Rows of each drop with the lowest places between rises of 3 mm.
     """
 
     pose: Array
@@ -55,16 +55,16 @@ class Drops:
         return cls(pose, flights, tuple(_bounces(one[:, 1]) for one in pose))
 
     def usable(self) -> list[int]:
-        """Return the drops whose flight can be fitted and that bounce at least twice."""
+        """Return the drops with at least two bounces and with a flight that can be fitted."""
         enough = [i for i, given in enumerate(self.flight_rows) if given > LEAST_ROWS and len(self.bounces[i]) > 1]
         return enough
 
     def until(self, index: int, bounce: int) -> int:
-        """Return the row before bounce number `bounce` (from 0), or before the last bounce if there are fewer."""
+        """Return the row of bounce number `bounce` (from 0), or of the last bounce if there are fewer."""
         return self.bounces[index][min(bounce, len(self.bounces[index]) - 1)]
 
     def inside(self, index: int, bounce: int = 2) -> NDArray[np.bool_]:
-        """Return whether measured x, z and theta are in their 90 % bands, shape (rows, 3), up to a bounce."""
+        """Return whether measured x, z and theta are in their 90 % bands up to a bounce, shape (rows, 3)."""
         rows = self.until(index, bounce) + 1
         points = bands(self.pose[index, : self.flight_rows[index]], rows)
         found: NDArray[np.bool_] = (self.pose[index, :rows] >= points[:, 0]) & (self.pose[index, :rows] <= points[:, 2])

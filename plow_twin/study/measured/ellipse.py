@@ -21,20 +21,20 @@ Array = NDArray[np.float64]
 #: Semi-axes and radius of gyration in m.
 SEMI_AXES: Final = (0.035, 0.025)
 GYRATION: Final = 0.0192
-#: Stiffness per mass in 1/s^2; it affects only the duration, because place and arms are constant during an impact.
+#: Stiffness per mass in 1/s^2. It affects only the duration, because place and arms are constant during an impact.
 _STIFFNESS: Final = 1e9
 #: Speed of approach in m/s for which restitutions are given, the middle of the measured speeds.
 USUAL_SPEED: Final = 2.5
 _LEAST, _LARGEST = 0.05, 0.98
 #: Upper bound for rates in m/s or rad/s, which no measured body reaches.
 _FASTEST: Final = 1e4
-#: Gap in m at which a simulated impact starts, and time in s after which it is over: 13 half periods of the contact.
+#: Gap in m at which a simulated impact starts, and time in s after which it is over, 13 half periods of the contact.
 _GAP, _WHOLE = 1e-9, 40.0 / _STIFFNESS**0.5
 
 
 @dataclass(frozen=True)
 class EllipseContact:
-    """The numbers of an impact of the ellipse.
+    """The parameters of an impact of the ellipse.
 
     Attributes
     ----------
@@ -43,12 +43,12 @@ class EllipseContact:
     exponent : float
         n in F = K d^n.
     restitution : float
-        Restitution of an impact at 2.5 m/s without motion along the surface. For a law without restitution: its damping
+        Restitution of an impact at 2.5 m/s without motion along the surface. For a law without restitution, its damping
         number lambda v0, or C relative to the critical damping.
     fall : float
-        Exponent q of the fall of the restitution with the speed of approach v, (v / 2.5 m/s)^-q.
+        Exponent q of the decrease (v / 2.5 m/s)^-q of the restitution with the speed of approach v.
     fall_along : float
-        Fall of the restitution with the speed of the centre of mass along the surface, in s/m.
+        Decrease of the restitution with the speed of the centre of mass along the surface, in s/m.
     friction : float
         Coefficient of friction mu.
     slip_speed : float
@@ -78,7 +78,7 @@ ELLIPSE: Final = EllipseContact()
 
 
 def contact_arms(theta: Array) -> tuple[Array, Array]:
-    """Return the place in m of the lowest point from the centre, along and away from the surface, shape (n,) each.
+    """Return the lowest point relative to the centre in m, along and away from the surface, shape (n,) each.
 
     Parameters
     ----------
@@ -97,10 +97,10 @@ def impact(before: ArrayLike, contact: EllipseContact = ELLIPSE) -> Array:
     Parameters
     ----------
     before : array_like, shape (n, 6)
-        x, y [m], theta [rad], vx, vy [m/s], omega [rad/s] as measured: y away from the surface; theta and x as in the
-        data, where a positive theta turns y towards x.
+        x, y [m], theta [rad], vx, vy [m/s], omega [rad/s] in the axes of the data: y points away from the surface, and
+        a positive theta turns y towards x.
     contact : EllipseContact
-        Numbers of the contact; by default the fitted numbers.
+        Parameters of the contact; by default the fitted ones.
 
     Returns
     -------
@@ -154,7 +154,7 @@ def _states(before: ArrayLike) -> Array:
 def _to_surface(x: Array, y: Array, tilt: float) -> tuple[Array, Array]:
     """Resolve vectors in the axes of the data into components along and away from the surface.
 
-    The map is its own inverse. The x axis of the data is reversed, so that its theta is counter-clockwise otherwise.
+    The map is its own inverse. It reverses the x axis of the data, so that a positive theta is counter-clockwise.
     """
     c, s = np.cos(tilt), np.sin(tilt)
     return s * y - c * x, s * x + c * y
@@ -205,7 +205,7 @@ def simulated_impact(before: ArrayLike) -> Array:
         scene = impact_scene(state)
         motion = simulate(scene, t_end=_WHOLE, output_dt=_WHOLE)
         (vx, vy, omega), theta = motion.v[-1], motion.q[-1, 2]
-        # the offset of the centre of mass is half a metre, so its turning during the impact matters
+        # the centre of mass is half a metre from the origin, so the turn during the impact matters
         x, y = scene.head.com_offset_m
         c, s = np.cos(theta), np.sin(theta)
         state[3:5] = _to_surface(vx - omega * (s * x + c * y), vy + omega * (c * x - s * y), ELLIPSE.tilt)
@@ -214,7 +214,7 @@ def simulated_impact(before: ArrayLike) -> Array:
 
 
 def _numbers(contact: EllipseContact, speed: Array, along: Array, normal_arm: Array) -> tuple[Array, NDArray[np.void]]:
-    """Return the damping factor lambda [s/m] of each impact, and the parameters of contact that all impacts share."""
+    """Return the damping factor lambda [s/m] of each impact, and the contact's parameters, which all impacts share."""
     law, wanted = LAWS[contact.law], contact.restitution
     e = np.clip(wanted * (speed / USUAL_SPEED) ** -contact.fall - contact.fall_along * np.abs(along), _LEAST, _LARGEST)
     viscous, damping = 0.0, np.zeros_like(speed)

@@ -20,13 +20,13 @@ RATE_HZ: Final = 250.0
 _DT: Final = 1.0 / RATE_HZ
 #: Number of steps in the table of damping numbers.
 _NUMBERS: Final = 1000
-#: Number of touches of a motion that each have their own scatter.
+#: Number of touches of a motion with their own scatter.
 _TOUCHES: Final = 64
-#: Change of the turn from row to row in rad that only an impact causes.
+#: Difference in rad between a row's angle and its extrapolation that only an impact causes.
 _TURN_IN_A_ROW: Final = 0.1
 #: Smallest number of rows of a first flight, from which its speeds are fitted.
 LEAST_ROWS: Final = 4
-#: Largest number of rows of bands, 4 s (a block rests after 1 s), and speed in m/s that no drop reaches.
+#: Largest number of rows of bands, 4 s (a block rests after 1 s); speed in m/s that no drop reaches.
 _MOST_ROWS, _FASTEST = 1000, 100.0
 
 #: Fitted to drops with odd numbers.
@@ -39,8 +39,8 @@ SQUARE: Final = np.array(
 class Marker:
     """The tracked frame on the block, whose pose the sensor measures.
 
-    In 242 of 250 drops the block lies flat at rest while its tracked angle is 33 mrad less. The tracked height at rest
-    depends on the side on which the block lies.
+    In 242 of 250 drops the tracked angle of the block at rest is 33 mrad less than that of a block that lies flat. The
+    tracked height at rest depends on the side on which the block lies.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class Marker:
         return self._moved(measured - [0.0, 0.0, self.turn, 0.0, 0.0, 0.0], -1.0)
 
     def measured(self, block: Array) -> Array:
-        """Return the poses or states of the marker, shape (..., 3) or (..., 6), from those of the block."""
+        """Return the poses or states of the marker, shape (..., 3) or (..., 6), from the block's."""
         turned = np.zeros(block.shape[-1])
         turned[2] = self.turn
         return self._moved(block, 1.0) + turned
@@ -131,7 +131,7 @@ def toss(initial: Array, n_rows: int, blocks: NDArray[np.void], scatter: Array |
     n_rows : int
         Number of rows at 250 Hz; the first row is the start.
     blocks : ndarray of `solve.rounded_block.BLOCK`, shape (m,)
-        Numbers of each block.
+        Parameters of each block.
     scatter : ndarray, shape (m, touches, 3), optional
         Scatter of each touch (`solve.rounded_block.toss_blocks`); by default no scatter.
 
@@ -157,7 +157,7 @@ class Flight:
     covariance : ndarray, shape (3, 2, 2)
         Covariance of place and rate at the last row, for each of x, z, theta.
     times : ndarray, shape (k,)
-        Times of the rows relative to the last row in s, in which lost rows are taken into account.
+        Times of the rows relative to the last row in s; lost rows are taken into account.
     """
 
     state: Array
@@ -166,7 +166,7 @@ class Flight:
 
 
 def fit_flight(first_flight: ArrayLike, block: NDArray[np.void] = SQUARE, scatter: Scatter = SCATTER) -> Flight:
-    """Fit a flight with drag to rows at 250 Hz, robustly.
+    """Fit a flight with drag to rows at 250 Hz, with robust weights.
 
     Parameters
     ----------
@@ -211,7 +211,7 @@ def fit_flight(first_flight: ArrayLike, block: NDArray[np.void] = SQUARE, scatte
 
 
 def _leaves_flight(rows: Array) -> bool:
-    """Return whether the last row is after an impact: the rate of turning has changed, or the block rises again."""
+    """Return whether the last row is after an impact, because the rate of turning has changed or the block rises."""
     t = np.arange(-3.0, 1.0)
     turn = float(np.polyval(np.polyfit(t[:3], rows[-4:-1, 2], 1), t[3]))
     return bool(
@@ -220,7 +220,7 @@ def _leaves_flight(rows: Array) -> bool:
 
 
 def _row_times(rows: Array, gravity: float) -> Array:
-    """Return the times of the rows in s, 0 at the last row; a lost row doubles the distance to the next row."""
+    """Return the times of the rows in s, 0 at the last row. A lost row shows by twice the distance to the next row."""
     way = np.hypot(*np.diff(rows[:, :2], axis=0).T)
     steps = np.ones(len(way))
     for _ in range(3):
@@ -284,9 +284,9 @@ def ensemble(
     members, seed : int
         Number of motions, and seed of the draws.
     block : ndarray of BLOCK, shape ()
-        Numbers of the block.
+        Parameters of the block.
     scatter : Scatter
-        Deviations of the numbers from touch to touch and from drop to drop.
+        Scatter of the parameters from touch to touch and from drop to drop.
     marker : Marker
         The tracked frame.
 
@@ -324,7 +324,7 @@ def bands(first_flight: ArrayLike, n_rows: int) -> Array:
     Returns
     -------
     ndarray, shape (n_rows, 3, 3)
-        For each row the 5 %, 50 % and 95 % points (second axis) of x, z and theta (last axis), theta unwrapped.
+        For each row the 5 %, 50 % and 95 % points (second axis) of x, z and unwrapped theta (last axis).
 
     Raises
     ------

@@ -26,9 +26,9 @@ _COUNTS: Final = ("makes", "events", "steps")
 
 
 def write_parquet(table: Table, path: Path) -> None:
-    """Write one row for each member: its parameters, status (0: done), status in words, and statistics.
+    """Write one row for each member: parameters, status (0 if done), status in words, and statistics.
 
-    The metadata under `plow_twin` is JSON: arguments with the scene as YAML text, package version, builds.
+    The metadata under `plow_twin` is JSON with the arguments (the scene as YAML), units, package version and builds.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -53,7 +53,7 @@ def write_parquet(table: Table, path: Path) -> None:
 
 
 def draw(table: Table, path: Path, title: str) -> None:
-    """Draw a curve (one parameter) or a heat map (two) for each statistic; failed members are crosses."""
+    """Draw each statistic as a curve (one parameter) or a heat map (two parameters), and mark failed members."""
     from matplotlib.figure import Figure
 
     count = len(table.sweep.statistics)
@@ -81,7 +81,7 @@ def _curve(axes: Axes, table: Table, index: int) -> None:
 
     (axis,) = table.sweep.axes
     numbers, places = _scaled(table, index), _places(axis)
-    # no line, because there are no values between words
+    # words are not joined by lines, because there are no values between them
     style = "none" if isinstance(axis.values[0], str) else "-"
     axes.plot(places, numbers, marker="o", markersize=3 if style == "-" else 6, linestyle=style)
     for member in table.failed:
@@ -130,7 +130,7 @@ def _places(axis: Axis) -> np.ndarray[Any, np.dtype[np.float64]]:
 
 
 def _edges(axis: Axis) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Return the borders of the fields around the values, halfway between them (in the logarithm on a log axis)."""
+    """Return the borders of the cells, halfway between the values (in the logarithm on a log axis)."""
     places = np.log(_places(axis)) if axis.log else _places(axis)
     if len(places) == 1:
         half = 0.5 * abs(places[0]) or 0.5

@@ -1,4 +1,4 @@
-"""Computation of the missing chunks of a sweep's folder, on this machine or a Dask cluster, by the same code."""
+"""Computation of the missing chunks in a sweep's folder, on this machine or on a Dask cluster, by the same code."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def run_on_cluster(store: Store, address: str, on_progress: OnProgress | None = 
             try:
                 table, build = future.result()
             except Exception as error:
-                # after any error of a worker, stored chunks are kept and the call can be repeated
+                # whatever the error of a worker, stored chunks are kept, and the call can be repeated
                 raise StudyError(f"dask: chunk {index}: {type(error).__name__}: {error}") from error
             store.write(index, table, build)
             done += len(chunks[index])
@@ -70,7 +70,7 @@ def run_on_cluster(store: Store, address: str, on_progress: OnProgress | None = 
 
 
 def _task(sweep: Sweep, members: list[int]) -> tuple[Array, str]:
-    """Compute a chunk on a worker, each of whose threads runs one task."""
+    """Compute a chunk on a worker with a single thread, because each thread of a worker runs a task."""
     return run_members_of(sweep, members, workers=1), _build()
 
 

@@ -21,9 +21,9 @@ from plow_twin.study.statistics import statistic, statistics_of
 
 Array = NDArray[np.float64]
 
-#: Status of a member with values that are impossible in a scene.
+#: Status of a member whose values are impossible in a scene.
 UNUSABLE: Final = -1
-#: Largest number of members of a sweep, because the table and the list of chunks are in memory.
+#: Largest number of members of a sweep, because its table and its list of chunks are kept in memory.
 _MOST_MEMBERS: Final = 1_000_000
 
 
@@ -63,7 +63,7 @@ def parse_axis(text: str, scene: Scene) -> Axis:
                 raise ValueError
             if int(count) > _MOST_MEMBERS:
                 raise StudyError(f"axis: got {int(count)} values of {path}, expected at most {_MOST_MEMBERS}")
-            # these functions include the bounds exactly
+            # both functions include the bounds exactly
             spaced = (np.geomspace if log else np.linspace)(float(low), float(high), int(count))
             values = tuple(map(float, spaced))
     except StudyError:
@@ -77,7 +77,7 @@ def parse_axis(text: str, scene: Scene) -> Axis:
 
 @dataclass(frozen=True)
 class Sweep:
-    """The arguments of a sweep as plain data, which can be stored and sent; `scene_yaml` is self-contained."""
+    """The arguments of a sweep as plain data, which can be stored and sent. `scene_yaml` is self-contained."""
 
     scene_yaml: str
     axes: tuple[Axis, ...]
@@ -103,7 +103,7 @@ class Sweep:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Number of values of each axis; in the order of members the last axis varies fastest."""
+        """Number of values of each axis. In the order of the members, the last axis varies fastest."""
         return tuple(len(axis.values) for axis in self.axes)
 
     @property
@@ -163,7 +163,7 @@ def run_members_of(
 ) -> Array:
     """Compute the members with these numbers; return status and statistics, shape (k, 1 + statistics).
 
-    A member has the same bits in any chunk, thread or machine of the same build.
+    A member has the same bits in any chunk, in any thread, and on any machine of the same build.
     """
     scene = replace(sweep.scene(), marks={})
     table = np.full((len(members), 1 + len(sweep.statistics)), np.nan)
