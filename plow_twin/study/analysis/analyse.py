@@ -1,4 +1,4 @@
-"""Analysis of one recording: a run's journal is computed again; the load of another recording passes the live intake."""
+"""Analysis of one recording: a run's journal is computed again; any other recording's load passes the live intake."""
 
 from __future__ import annotations
 
