@@ -1,4 +1,4 @@
-"""Bags of other programs for the tests: the paper's load, and poses from a sensor with a bias, a delay and noise."""
+"""Bags of other programs for the tests, with the paper's load and with poses from a biased, late and noisy sensor."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def motion() -> Motion:
 
 
 def measured(motion: Motion) -> Iterable[tuple[float, np.ndarray]]:
-    """Yield time and pose at 100 Hz: late, biased, with noise."""
+    """Yield time and pose at 100 Hz, late, biased and noisy."""
     times, _, q = motion
     rng = np.random.default_rng(4)
     for t in np.arange(0.1, times[-1], 0.01):

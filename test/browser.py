@@ -27,7 +27,7 @@ _OPTIONS = (
 
 
 class Page:
-    """An open page; `requests` are the requested addresses, `errors` its messages of errors."""
+    """An open page; `requests` are the addresses that it requests, `errors` its error messages."""
 
     def __init__(self, socket: ClientConnection) -> None:
         self._socket = socket
@@ -38,7 +38,7 @@ class Page:
             self.call(f"{domain}.enable")
 
     def call(self, method: str, **params: Any) -> dict[str, Any]:
-        """Call the browser and return its answer; events that come meanwhile are noted."""
+        """Call the browser and return its answer; events that arrive meanwhile are kept."""
         self._number += 1
         self._socket.send(json.dumps({"id": self._number, "method": method, "params": params}))
         while True:
@@ -65,7 +65,7 @@ class Page:
             self.errors.append(str(message["params"]["exceptionDetails"]))
         elif message.get("method") == "Log.entryAdded":
             entry = message["params"]["entry"]
-            if entry["level"] == "error" and entry["source"] != "network":  # in `requests`
+            if entry["level"] == "error" and entry["source"] != "network":  # network errors are in `requests`
                 self.errors.append(str(entry))
 
     def evaluate(self, expression: str) -> Any:

@@ -21,7 +21,7 @@ def plow_twin(*arguments: str | Path, cwd: Path | None = None) -> subprocess.Com
 
 @contextmanager
 def started(command: Sequence[str], **options: Any) -> Iterator[subprocess.Popen[str]]:
-    """Run a program beside the test, and kill it at the end if it still runs: `Popen` alone would wait for ever."""
+    """Run a program beside the test, and kill it at the end if it still runs; `Popen` alone would wait for ever."""
     with subprocess.Popen(command, text=True, **options) as process:
         try:
             yield process
@@ -31,7 +31,7 @@ def started(command: Sequence[str], **options: Any) -> Iterator[subprocess.Popen
 
 
 def plow_twin_here(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    """Run a command in this process, with the same output and exit code: a start costs a second."""
+    """Run a command in this process, with the same output and exit code, because starting a process takes a second."""
     given, out, err = [*map(str, arguments)], StringIO(), StringIO()
     with chdir(cwd or Path.cwd()), redirect_stdout(out), redirect_stderr(err):
         code = run(given)

@@ -1,6 +1,6 @@
-"""Plugin of `pytest --compiles`: kernels that test processes compiled, with processor time and the first test of each.
+"""Plugin of `pytest --compiles`: the kernels that tests compile, with their processor time and their first test.
 
-Kernels that tests share are compiled by the first of them; processes that a test starts are not seen.
+A kernel that several tests share is compiled by the first of them. Processes that a test starts are not included.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ PROPERTY = "compiled"
 
 
 class Compiles(event.Listener):
-    """Note each kernel that Python calls in the report of the test that has it compiled."""
+    """Note each kernel that Python calls in the report of the test that compiles it."""
 
     def __init__(self) -> None:
         self._test: list[tuple[str, object]] = []
@@ -29,7 +29,7 @@ class Compiles(event.Listener):
 
     def on_end(self, event: Any) -> None:
         took = time.thread_time() - self._begun.pop()
-        if not self._begun:  # otherwise a kernel that this one calls
+        if not self._begun:  # otherwise this kernel is compiled for its caller
             function = event.data["dispatcher"].py_func
             self._test.append((PROPERTY, (took, f"{function.__module__}.{function.__qualname__}")))
 
@@ -38,7 +38,7 @@ class Compiles(event.Listener):
         self._test = item.user_properties
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        if report.when == "teardown":  # its properties are those of all phases
+        if report.when == "teardown":  # this report has the properties of all phases
             for name, value in report.user_properties:
                 if name == PROPERTY:
                     self._found.append((*value, report.nodeid))  # type: ignore[misc]

@@ -1,4 +1,4 @@
-"""Set-up of every test process: ROS kept to this machine, skips accounted for."""
+"""Set-up of every test process: ROS stays on this machine, and skips are accounted for."""
 
 from __future__ import annotations
 
@@ -24,27 +24,27 @@ LOCKS = "PLOW_TWIN_COMPILING"
 
 
 def _prepare_environment() -> None:
-    """Set what child processes inherit; runs before rclpy and numpy are imported anywhere."""
+    """Set the environment that child processes inherit, before rclpy and numpy are imported."""
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.environ.pop("ROS_LOCALHOST_ONLY", None)
-    # 1..101 avoids the ephemeral ports; each process of each run has its own
+    # domains 1..101 avoid the ephemeral ports; each process of each run has its own domain
     worker = os.environ.get("PYTEST_XDIST_WORKER", "")
     number = 8 * (os.getppid() if worker else os.getpid()) + int(worker.removeprefix("gw") or 0)
     os.environ["ROS_DOMAIN_ID"] = str(1 + number % 101)
-    # the processes of a suite take all cores: threads of linear algebra would wait for each other at full speed
+    # the processes of a suite use all cores, so threads of linear algebra would only wait for each other, at full load
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
     logs = tempfile.mkdtemp(prefix="plow_twin-ros-log-")
     atexit.register(shutil.rmtree, logs, ignore_errors=True)
     os.environ["ROS_LOG_DIR"] = logs
-    # a suite that a shell has started in the background would ignore Ctrl-C, also in the tests that press it
+    # a suite that a shell has started in the background ignores Ctrl-C, even in the tests that send it
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def _compile_once() -> None:
-    """Have the processes of a suite wait for each other's kernels instead of compiling the same ones beside each other.
+    """Let the processes of a suite wait for each other's kernels instead of compiling the same kernels in parallel.
 
-    Each signature of a kernel has a file that its compiler locks. Locks are taken along calls, and by one thread of a
-    process only, so no two wait for each other.
+    Each signature of a kernel has a file, which the compiling process locks. Locks are taken in the order of calls and
+    by only one thread of a process, so that no two processes wait for each other.
     """
     if "PYTEST_XDIST_WORKER" not in os.environ:
         os.environ[LOCKS] = tempfile.mkdtemp(prefix="plow_twin-compiling-")
@@ -68,7 +68,7 @@ def _compile_once() -> None:
 _prepare_environment()
 _compile_once()
 settings.register_profile("plow_twin", deadline=None, derandomize=True, database=None)
-# the profile of `make stress`, which prints the seed: new examples each time, shrunk on failure
+# the profile of `make stress`, which prints the seed, draws new examples each time and shrinks failures
 FRESH = (Phase.explicit, Phase.generate, Phase.shrink)
 settings.register_profile("stress", deadline=None, derandomize=False, database=None, print_blob=True, phases=FRESH)
 settings.load_profile("plow_twin")
@@ -118,6 +118,6 @@ def _skipped(reporter: pytest.TerminalReporter) -> list[tuple[str, str]]:
 
 
 def _listed(file: Path) -> list[str]:
-    """Text before the first bar of each line, without comments."""
+    """Return the text before the first bar of each line, without comments."""
     lines = (line.partition("#")[0].strip() for line in file.read_text(encoding="utf-8").splitlines())
     return [line.partition("|")[0].strip() for line in lines if line]

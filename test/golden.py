@@ -1,4 +1,4 @@
-"""Motions whose bits are pinned, hashed by their results and not by the solver's state.
+"""Motions whose bits are pinned by hashes of their results, not of the solver's state.
 
     python test/golden.py
 
@@ -28,12 +28,12 @@ from plow_twin.model.loads import compile_loads
 
 Figures = dict[str, Any]
 
-#: Numbers of a law on the bench scene's head.
+#: Damping of a law for the bench scene's head.
 _DAMPING = {"kelvin_voigt": 6e4, "ramped_damping": 6e4}
 
 
 def build_name() -> str:
-    """Return a name of processor, compiler and mathematical library, which decide bits beside the sources."""
+    """Return a name of processor, compiler and mathematical library, on which bits depend beside the sources."""
     libc = "".join(platform.libc_ver())
     return f"{llvmlite.binding.get_host_cpu_name()}-numba{version('numba')}-numpy{version('numpy')}-{libc}"
 

@@ -67,7 +67,7 @@ def _header() -> dict[str, str]:
 
 
 def run(*entries: str, more: bytes = b"", **changed: str) -> bytes:
-    """Return a run of ours: 20 samples, these entries of the journal, further records; changed keys of its header."""
+    """Return a run of plow_twin with 20 samples, given journal entries, further records and changed header keys."""
     samples = [WrenchStamped(_T0 + n * 1_000_000, "slide_frame", (1e3 * n, 0.0, 0.0), (0.0,) * 3) for n in range(20)]
     body = b"".join(message(1, n, encode(sample)) for n, sample in enumerate(samples))
     body += b"".join(message(2, 20 + n, encode(Text(entry))) for n, entry in enumerate(entries))
@@ -78,7 +78,7 @@ def run(*entries: str, more: bytes = b"", **changed: str) -> bytes:
 
 
 def foreign(text: str, channels: int = 1) -> bytes:
-    """Return a recording of another program: a topic /load of a type of its own with this text, and further topics."""
+    """Return a recording of another program: a topic /load of an own type, defined by a text, and further topics."""
     declared = schema(1, "a/msg/A", text) + b"".join(
         channel(n % 65536, 1, f"/load{n - 1 if n > 1 else ''}") for n in range(1, channels + 1)
     )
@@ -87,7 +87,7 @@ def foreign(text: str, channels: int = 1) -> bytes:
 
 
 def bag(path: Path, *statements: str) -> None:
-    """Write a sqlite3 file of rosbag2 with a topic /load; its messages are made by the statements."""
+    """Write a sqlite3 file of rosbag2 with a topic /load, whose messages the statements insert."""
     with sqlite3.connect(path) as base:
         base.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT)")
         base.execute("INSERT INTO topics VALUES(1, '/load', 'geometry_msgs/msg/WrenchStamped')")
@@ -147,7 +147,7 @@ MADE: dict[str, Callable[[Path], object]] = {
     "channels.mcap": lambda path: path.write_bytes(
         run(more=b"".join(channel(n % 65536, 1, f"/t{n}") for n in range(100_000)))
     ),
-    # 170 kB that unpack to 5 GB, in chunks that are too large singly or only together
+    # 170 kB that unpack to 5 GB, in chunks that are too large by themselves or only together
     "large_chunks.mcap": lambda path: path.write_bytes(run(more=20 * chunk(bytes(250 * 2**20)))),
     "many_chunks.mcap": lambda path: path.write_bytes(run(more=100 * chunk(bytes(50 * 2**20)))),
     "lying_zstd.mcap": lambda path: path.write_bytes(

@@ -31,7 +31,7 @@ SOURCES = (
 
 
 def copy_sources(target: Path) -> Path:
-    """Copy the inputs of a build, without leftovers of an earlier build or run."""
+    """Copy the inputs of a build, without remains of an earlier build or run."""
     target.mkdir(parents=True)
     for name in SOURCES:
         if (ROOT / name).is_dir():
@@ -42,15 +42,15 @@ def copy_sources(target: Path) -> Path:
 
 
 def clean_environment(**extra: str) -> dict[str, str]:
-    """Return this process's environment without the variables by which another installation would be found."""
+    """Return this process's environment without the variables that lead to another installation."""
     hidden = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV", "AMENT_PREFIX_PATH", "COLCON_PREFIX_PATH")
-    # the ROS wheels restart Python with these; a child in another environment must not inherit them
+    # the ROS wheels restart Python with these variables, which a child in another environment must not inherit
     hidden += ("LD_LIBRARY_PATH", "_ROS_WHEELS_BOOTSTRAP_COMPLETE", "NUMBA_CACHE_DIR")
     return {key: value for key, value in os.environ.items() if key not in hidden} | extra
 
 
 def run(*command: str | Path, cwd: Path, env: dict[str, str] | None = None, code: int = 0) -> str:
-    """Run a command that must end with `code`; return its standard output (error if `code`), or show all output."""
+    """Run a command that must end with `code`. Return its standard output, or standard error if `code` is not 0."""
     done = subprocess.run(
         [str(part) for part in command],
         cwd=cwd,
@@ -79,9 +79,9 @@ def install(python: Path, *requirements: str) -> None:
 
 
 def lend_kernels(python: Path) -> None:
-    """Copy what the tree has compiled beside the sources that an environment has installed.
+    """Copy the kernels that this source tree has compiled to the sources installed in an environment.
 
-    The kernels are used if sources and versions are the same, and compiled otherwise.
+    They are used if sources and versions are the same, and compiled anew otherwise.
     """
     (package,) = python.parent.parent.glob("lib/python*/site-packages/plow_twin")
     for kernel in (to_bernstein, power_term, integrate, expand):

@@ -1,4 +1,4 @@
-"""The first bytes of a recording, written by hand, by which a file counts as a recording."""
+"""The first bytes of a recording, written by hand, which make a file a recording."""
 
 from __future__ import annotations
 

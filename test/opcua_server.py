@@ -1,6 +1,6 @@
-"""A real OPC UA server: `opcua_server.py PORT [CERTIFICATE KEY [USER]]`; commands on its input.
+"""A real OPC UA server, `opcua_server.py PORT [CERTIFICATE KEY [USER]]`, which reads commands from its input.
 
-With `MORE_NAMESPACES` in the environment, its nodes have another namespace number.
+With `MORE_NAMESPACES` in the environment, the nodes have another namespace number.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class OneUser(UserManager):
         self._known = None if read is None else read.public_bytes(Encoding.DER)
 
     def get_user(self, iserver: Any, username: Any = None, password: Any = None, certificate: Any = None) -> Any:
-        # without a token of the user the certificate is that of the client's program
+        # without a user token, the certificate is the client program's
         known = (username, password) == ("plough", "s3cret") or (username is None and certificate == self._known)
         return User(UserRole.User) if known else None
 
@@ -60,7 +60,7 @@ class Plant:
             await asyncio.sleep(pause_s)
 
     async def number(self, more: int) -> None:
-        """Let each subscription skip numbers, as if messages had been lost, or repeat a number."""
+        """Let each subscription skip sequence numbers, as if messages had been lost, or repeat a number."""
         for found in self._server.iserver.subscription_service.subscriptions.values():
             found._notification_seq += more
 

@@ -1,4 +1,4 @@
-"""Recordings for the tests: a real twin, session and recorder in this process, and files rewritten."""
+"""Recordings for the tests, made by a real twin, session and recorder in this process, and rewritten files."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ from plow_twin.stream.session import Session
 
 BASE_NS = 1_800_000_000_000_000_000
 STEP_NS = 1_000_000
-#: largest loads of the paper together: N, N, N m
+#: amplitudes of the paper's loads in N, N, N m
 PAPER_AMPLITUDE = (32_000.0, -11_000.0, -45_495.0)
 
 
 def paper_sample(index: int, first_ns: int = BASE_NS) -> Sample:
-    """The paper's load at 1 kHz."""
+    """Return a sample of the paper's load at 1 kHz."""
     phase = float(np.sin(2e-3 * index))
     fx, fy, moment = (phase * amplitude for amplitude in PAPER_AMPLITUDE)
     return Sample(first_ns + index * STEP_NS, (fx, fy, moment))
 
 
 def paper_entries(count: int) -> list[Entry]:
-    """Samples with an entry of each other kind in between, and a reset half way."""
+    """Return samples with an entry of every other kind in between, and a reset half way."""
     half = count // 2
     entries: list[Entry] = [Parameter("hold", "hold"), *map(paper_sample, range(half))]
     entries.insert(half // 2, Travel(BASE_NS, 2.5))
@@ -93,7 +93,7 @@ def record_run(
         if recorder.snapshot_wanted:
             journal(session.snapshot())
         if pause_every and index % pause_every == 0:
-            time.sleep(0.02)  # leaves the thread time to empty the queue
+            time.sleep(0.02)  # gives the thread time to empty the queue
     session.close()
     run.loss = recorder.close()
     return run
@@ -107,7 +107,7 @@ def rewrite(
     *,
     metadata_last: bool = False,
 ) -> Path:
-    """Copy an MCAP file by other tools than the package's; `change` may return other bytes for a message."""
+    """Copy an MCAP file with other tools than the package's; `change` may return other bytes for a message."""
     with source.open("rb") as stream, target.open("wb") as out:
         writer = Writer(out, chunk_size=64 * 1024)
         writer.start(profile="ros2", library="test")
@@ -138,7 +138,7 @@ def rewrite(
 
 
 def chunk_spans(file: Path, *, journal: bool | None = None) -> list[tuple[int, int]]:
-    """Offset and length of the data of each chunk of a file: of the journal's chunks only, or of all others."""
+    """Return offset and length of the data of each chunk in a file, for the journal's chunks or for all others."""
     spans, topics = [], {}
     with file.open("rb") as stream:
         for record in StreamReader(stream, emit_chunks=True).records:

@@ -34,7 +34,7 @@ ROOT = Path(__file__).resolve().parent.parent
 START_S = 200.0
 #: Long enough for discovery on a machine that does other work [s].
 WAIT_S = 60.0
-#: Twice the longest time of a stop: three processes share two cores [s].
+#: Twice the longest time of a stop while three processes share two cores [s].
 STOP_S = 10.0
 _numbers = itertools.count()
 
@@ -65,19 +65,19 @@ class Process:
         return self._process.wait(timeout_s)
 
     def stop(self, number: signal.Signals = signal.SIGINT) -> int:
-        """Ask for a stop; more than `STOP_S` is a failure."""
+        """Request a stop; it fails if it takes longer than `STOP_S`."""
         self._process.send_signal(number)
         return self._process.wait(STOP_S)
 
     def stop_again_and_again(self, number: signal.Signals) -> int:
-        """Ask for a stop until the process has ended."""
+        """Request a stop again and again until the process has ended."""
         while self.running:
             self._process.send_signal(number)
             time.sleep(0.002)
         return self._process.wait()
 
     def close(self) -> None:
-        """End the process; a killed one would leave its shared memory behind."""
+        """End the process without killing it, because a killed process leaves its shared memory behind."""
         if self.running:
             self._process.terminate()
             try:
@@ -89,14 +89,14 @@ class Process:
 
 @cache
 def _context() -> Context:
-    """Return the only ROS participant of this process: on localhost only 32 are discovered."""
+    """Return the only ROS participant of this process, because only 32 are discovered on localhost."""
     context = Context()
     context.init(args=[])
     return context
 
 
 class Probe:
-    """A node of the test process: publishes, listens, calls, waits."""
+    """A node of the test process that publishes, listens, calls services and waits."""
 
     def __init__(self, namespace: str) -> None:
         self.context = _context()
@@ -115,7 +115,7 @@ class Probe:
         self.reports.append({status.name: status for status in message.status})
 
     def listen(self, kind: type, topic: str) -> list[Any]:
-        """Return a list to which all later messages are added."""
+        """Return a list to which all messages from now on are added."""
         heard: list[Any] = []
         subscription = self.node.create_subscription(kind, topic, heard.append, QoSProfile(depth=20000))
         self.until(lambda: subscription.get_publisher_count() > 0, f"a publisher of {topic}")
@@ -152,7 +152,7 @@ class Probe:
             raise AssertionError(f"{error}; last {part} {self.figures(part)}") from None
 
     def publisher(self, kind: type, topic: str, profile: QoSProfile | int = 1000) -> Any:
-        """Return a publisher, once the twin says that it is connected to it."""
+        """Return a publisher, as soon as the twin reports its connection to it."""
         key = f"publishers_{topic}"
         before = value(self.status[-1], key)
         publisher = self.node.create_publisher(kind, topic, profile)
@@ -161,7 +161,7 @@ class Probe:
         return publisher
 
     def excitation(self, reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE) -> Callable[..., None]:
-        """Return a function that publishes a sample, once the twin reads it."""
+        """Return a function that publishes a sample, as soon as the twin reads the topic."""
         publisher = self.publisher(WrenchStamped, "excitation", QoSProfile(depth=5000, reliability=reliability))
 
         def send(stamp_ns: int, wrench: Sequence[float], **components: float) -> None:
@@ -176,7 +176,7 @@ class Probe:
         return send
 
     def pace(self, index: int) -> None:
-        """Rest after each 50 samples: best-effort readers drop messages that come faster than they read."""
+        """Pause after each 50 samples, because best-effort readers drop messages that come faster than they read."""
         if index % 50 == 49:
             self.pause(0.04)
 
@@ -187,7 +187,7 @@ class Probe:
             self._executor.spin_once(timeout_sec=0.02)
 
     def call(self, kind: type, service: str, request: Any) -> Any:
-        # one client for all calls: the answer to a client that the server has not discovered yet is lost
+        # one client makes all calls, because the answer to a client that the server has not yet discovered is lost
         if service not in self._clients:
             self._clients[service] = self.node.create_client(kind, service)
         client = self._clients[service]
@@ -206,7 +206,7 @@ class Bench:
 
     def __init__(self, folder: Path, parameters: dict[str, Any], arguments: Sequence[str] = ()) -> None:
         self.namespace = f"/t{os.getpid()}_{next(_numbers)}"
-        # {ns} in a name of a parameter is replaced by the namespace
+        # {ns} in the name of a parameter is replaced by the namespace
         named = {name.replace("{ns}", self.namespace): given for name, given in parameters.items()}
         self.folder = folder
         self._publishers: list[Process] = []

@@ -24,7 +24,7 @@ def reference(name: str) -> dict[str, np.ndarray]:
 
 
 def pose_error(scene: Scene, q: np.ndarray, reference_q: np.ndarray) -> float:
-    """Return the largest error relative to the clearance; angles by the half diagonal."""
+    """Return the largest error relative to the clearance, with angles multiplied by the half diagonal."""
     gx, gy = scene.clearance.horizontal_m, scene.clearance.vertical_m
     radius = 0.5 * np.hypot(scene.frame.width_m, scene.frame.height_m)
     return float((np.abs(q - reference_q) / np.array([gx, gy, gx / radius])).max())
@@ -47,7 +47,7 @@ def wall_and_point(
     gap: float = 0.01,
     pairs: tuple[str, ...] = ("top_left_top",),
 ) -> Scene:
-    """A mass that can only move vertically, `gap / 2` above the corner on which it falls."""
+    """Return a mass that can only move vertically and starts `gap / 2` above the corner on which it falls."""
     return Scene(
         head=Head(mass, 1.0),
         frame=Frame(0.2, 0.2),

@@ -1,4 +1,4 @@
-"""The benchmark runs, names peers that it cannot run, and its errors are within the tolerances; no time is judged."""
+"""The benchmark runs, names the peers that it cannot run, and keeps its errors within the tolerances."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_the_ensemble_ends_at_the_tolerance_that_every_pair_needs(rows: list[dic
     pairs = [row for row in rows if row["section"] == "ensemble" and not row["wall_ms"]]
     assert float(timed[-1]["error"]) <= 1e-4 and float(timed[-1]["value"]) == 0.0
     assert len(pairs) == 6 and all(float(row["amplification"]) > 0.1 for row in pairs)
-    # every pair again, singly, with its error computed in another way
+    # every pair is run again by itself, and its error is computed in another way
     code = (
         "import numpy as np, ensemble_rows as e; from plow_twin import simulate, simulate_many\n"
         "for scene in e.clearance_pairs(3, 2):\n"
@@ -81,7 +81,7 @@ def test_the_ensemble_ends_at_the_tolerance_that_every_pair_needs(rows: list[dic
 
 
 def test_work_grows_with_contact_events_not_with_time(rows: list[dict[str, str]]) -> None:
-    """From 80 to 1089 events in the same 20 s: a few steps for each event, and few between events."""
+    """With 80 to 1089 events in the same 20 s, there are a few steps for each event and few between events."""
     driven = [row for row in rows if row["section"] == "contact_events"]
     steps, events = ([int(row[name]) for row in driven] for name in ("steps", "events"))
     assert events == sorted(events) and events[-1] > 10 * events[0] > 0
@@ -116,7 +116,7 @@ def test_a_target_is_reached_when_the_peer_takes_so_many_times_as_long() -> None
         "print(sorted(levels.contenders([row(w.OURS_BARE, 'tol', 1.0, 1e-7), *ladder])))\n"
     )
     within, beyond, without, contenders = run(f"exec({code!r})").strip().splitlines()
-    # at 1e-6 a thirtieth is 0.667 ms; at 1e-9 the peer has no row, which is reported and counts as reached
+    # at 1e-6 a thirtieth is 0.667 ms; at 1e-9 the peer has no row, which is reported and treated as reached
     assert within == "[True, True]" and beyond == "[False, True]"
     assert without == "[]" and contenders == "[0, 1, 2]"
 
@@ -134,7 +134,7 @@ def test_a_peer_that_is_missing_is_named() -> None:
 
 
 def test_the_independent_reference_agrees_with_the_shipped_one(tmp_path: Path) -> None:
-    """`reference.c` on both bench scenes against trajectories made by another program."""
+    """The results of `reference.c` for both bench scenes agree with trajectories of another program."""
     code = (
         "import numpy as np, random_scenes as r, bench_scenes as b\n"
         "from native import NotInstalled\n"
@@ -156,7 +156,7 @@ def test_the_independent_reference_agrees_with_the_shipped_one(tmp_path: Path) -
 
 
 def test_saved_references_belong_to_the_saved_scenes() -> None:
-    """Rows start at the initial pose, and a scene that is calm has a reference."""
+    """The rows start at the initial pose, and every calm scene has a reference."""
     with np.load(BENCHMARK / "data" / "random_scenes.npz") as saved:
         q, lines = saved["q"], saved["lines"]
         assert q.shape == (200, 51, 3) and len(lines) == 200

@@ -1,4 +1,4 @@
-"""Mistakes of a stranger at verbs beside `live`: each ends with one clear message and an exit code."""
+"""A new user's mistakes with verbs other than `live`: each ends with one clear message and an exit code."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def _write(
 
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with files of a stranger."""
+    """A folder with a new user's files."""
     folder = tmp_path_factory.mktemp("desk")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
@@ -129,7 +129,7 @@ def test_a_stranger_s_mistake_is_named_in_a_message(
     assert cli(arguments) == code
     shown = capsys.readouterr().err
     assert said in " ".join(shown.split()), shown
-    # one line names the mistake, without content of the file, and no file is left behind
+    # one line names the mistake without the file's contents, and no file is left behind
     assert len([line for line in shown.splitlines() if not line.startswith("Usage")]) <= 3 and len(shown) < 500
     assert sorted(desk.rglob("*")) == before
 
@@ -138,7 +138,7 @@ def test_a_load_that_looks_like_kilonewtons_is_named_before_it_is_estimated(
     desk: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(desk)
-    # the estimate has gains of the load, so that such a load is a warning, and gives no result
+    # the estimate has gains of the load, so such a load causes a warning and gives no clearance
     assert cli(["estimate", "kN", "--json"]) == 0
     shown = capsys.readouterr()
     assert "fx, fy: got 30, expected some 3.2e+04 N as in the scene; they look like kN: convert the file" in shown.err

@@ -171,7 +171,7 @@ def test_view_writes_to_the_given_file(run: Run, tmp_path: Path) -> None:
 
 
 def ports_of(address: str) -> list[int]:
-    """The ports of a page and of its data."""
+    """Return the ports of a page and of its data."""
     return [int(port) for port in re.findall(r"127\.0\.0\.1(?::|%3A)(\d+)", address)]
 
 
@@ -200,7 +200,7 @@ def test_view_names_a_port_that_is_taken(run: Run, tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def served(run: Run, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """The address that `view --web` names, while it serves."""
+    """Yield the address that `view --web` names, while it is serving."""
     out = tmp_path_factory.mktemp("served") / "run.rrd"
     command = [sys.executable, "-m", "plow_twin", "view", str(run.folder), "--out", str(out), "--web", "--quiet"]
     process = subprocess.Popen(
@@ -233,18 +233,18 @@ def test_view_serves_a_page_on_the_loopback_address_alone(served: str) -> None:
 def test_a_browser_shows_the_run_at_the_address_that_view_names(served: str, tmp_path: Path) -> None:
     with browser.page(tmp_path, served) as page:
         deadline = time.monotonic() + 90
-        # the cross-sections have a dark ground, unlike the viewer's own pages
+        # the cross-sections have a dark background, unlike the viewer's own pages
         while _dark(page.picture()) < 0.15:
             assert time.monotonic() < deadline, f"no picture: {page.errors}, {page.requests}"
             time.sleep(0.5)
         assert not page.errors
-        # in the dark theme with any theme of the browser: hardly a dot is white
+        # the page has the dark theme whatever the browser's theme, so hardly any pixel is white
         dots = np.asarray(Image.open(BytesIO(page.picture())).convert("L"))
         assert (dots > 230).mean() < 0.05
         assert any("ReadMessages" in request for request in page.requests)
 
 
 def _dark(png: bytes) -> float:
-    """The share of a picture's dots that have the ground of the cross-sections."""
+    """Return the share of a picture's pixels with the background colour of the cross-sections."""
     dots = np.asarray(Image.open(BytesIO(png)).convert("RGB")).astype(int)
     return float((np.abs(dots - (24, 26, 30)).max(axis=2) <= 3).mean())

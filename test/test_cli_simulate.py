@@ -1,4 +1,4 @@
-"""The command line: files, JSON, exit codes; as a program where that matters, otherwise in this process."""
+"""The command line: files, JSON and exit codes. It runs as a program where that matters, otherwise in this process."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_csv_and_json_keep_the_contract(tmp_path: Path) -> None:
         header, *rows = csv.reader(file)
     assert header == ["t", "x", "y", "theta", "vx", "vy", "omega", *(f"force_{name}" for name in PAIR_NAMES)]
     expected = np.column_stack([result.t, result.q, result.v, result.force])
-    np.testing.assert_array_equal(np.array(rows, dtype=float), expected)  # 17 digits are exact
+    np.testing.assert_array_equal(np.array(rows, dtype=float), expected)  # 17 digits represent a number exactly
 
     answer = json.loads(done.stdout)
     assert answer.keys() == {"scene", "t_end", "pairs", "contact_sets", "solver", "wall_s", "compile_s"}
@@ -245,7 +245,7 @@ def test_info_lists_marks_and_versions() -> None:
 
 
 def test_the_energy_balance_closes() -> None:
-    call = ["simulate", "bench_kv", *RUN[2:], "--energy-balance"]  # its kernels are those of the pinned motions
+    call = ["simulate", "bench_kv", *RUN[2:], "--energy-balance"]  # this scene uses the kernels of the pinned motions
     done = plow_twin_here(*call, "--json")
     assert done.returncode == 0, done.stderr
     balance = json.loads(done.stdout)["energy_balance"]

@@ -1,4 +1,4 @@
-"""The operator's screen: it shows the twin's numbers, and its readers do not affect the twin."""
+"""The operator's screen shows the twin's numbers, and its readers do not affect the twin."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_a_feed_without_a_reader_does_not_wait_and_keeps_the_peaks() -> None:
             updates.append(update)
         feed.turn()
         updates.append(far.receive() or {})
-        # the first update has the facts; the first update after there is room has the largest force of the refused ones
+        # the first update has the facts; the first update after a refusal has the largest force of the refused updates
         assert updates[0]["facts"]["can_ask"] is False and len(updates) == feed.taken
         assert max(update["motion"]["peak"][0] for update in updates) == 7e5
         assert updates[-1]["not_taken"] == feed.not_taken and updates[-1]["motion"]["t"] == pytest.approx(2.999)
@@ -80,7 +80,7 @@ def test_each_second_of_a_file_has_its_update_on_the_screen_and_a_way_out_keeps_
     for by_second, expected in ((True, [float(second) for second in range(1, 30)]), (False, [])):
         link, theirs = pair()
         feed = Feed(link, FACTS, by_second=by_second)
-        for index in range(580):  # at 20 Hz of stamps, as fast as computed
+        for index in range(580):  # stamps at 20 Hz, sent as fast as possible
             feed.publication(_published(1.0 + 0.05 * index, 1.0 + index // 20))
         with theirs:
             far, peaks = Link(theirs), []
@@ -138,7 +138,7 @@ def test_the_clearances_of_an_estimate_after_the_last_publication_are_shown_with
             clearance = (far.receive() or {})["motion"]["clearance"]
             return clearance["horizontal/p05"], clearance["vertical/p05"]
 
-        publish(1.0, 0.0057)  # summed up with later publications: it came before the estimate
+        publish(1.0, 0.0057)  # this came before the estimate and is summed up with later ones
         feed.part("estimate", (0, "", numbers))
         feed.part("status", (0, "", {"horizontal": "estimated", "vertical": "not_observable"}))
         feed.part("estimate", (0, "estimating", {"estimates": "1"}))
@@ -274,13 +274,13 @@ def _row(index: int) -> str:
 
 
 COUNT = 6000
-#: An alarm that the load raises; silence is not held, for the samples bring their own time.
+#: An alarm that the load raises, and a long timeout: the samples have their own stamps, so silence is not held.
 OPTIONS = ("--scene", "paper", "--set", "excitation_timeout=3600", "--set", "alarm_force=[1.5e5,1e9]", "--json")
 
 
 @contextmanager
 def _twin(*options: str | Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """Start a twin with its screen on standard input."""
+    """Start a twin with a screen, which reads standard input."""
     command = [sys.executable, "-m", "plow_twin", "live", "-", *OPTIONS, "--dashboard", "--listen", "127.0.0.1:0"]
     pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
     with started([*command, *map(str, options)], **pipes) as process:
@@ -291,7 +291,7 @@ def _twin(*options: str | Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
 
 
 def _said(process: subprocess.Popen[str], begin: str) -> str:
-    """Return the line on standard error with this beginning."""
+    """Return the line on standard error that begins with a text."""
     assert process.stderr is not None
     while line := process.stderr.readline():
         if line.startswith(begin):
@@ -309,7 +309,7 @@ def _feed(process: subprocess.Popen[str], begin: int = 0, end: int = COUNT) -> N
 
 
 def _stopped(process: subprocess.Popen[str]) -> dict[str, Any]:
-    """End the input and the twin; return its diagnostics and its output meanwhile."""
+    """End the input and the twin; return the twin's diagnostics, and its output meanwhile."""
     assert process.stdin is not None
     process.stdin.close()
     process.stdin = None
@@ -364,7 +364,7 @@ def test_an_operator_acknowledges_and_marks_and_the_journal_has_both(tmp_path: P
         see(lambda: told.get("motion", {}).get("t", 0) >= 0.999e-3 * COUNT)
         assert told["alarms"]["force_latched"] == "warn" and told["motion"]["clearance"]["horizontal"] > 0.02
         page.send("no JSON")
-        page.send(json.dumps({"do": "reset"}))  # not a request of the page
+        page.send(json.dumps({"do": "reset"}))  # the page never sends this request
         page.send(json.dumps({"do": "mark", "text": "x" * 1000}))
         page.send(json.dumps({"do": "mark", "text": "<b>shift</b> " + "x" * 180}))
         page.send(json.dumps({"do": "acknowledge"}))
@@ -393,7 +393,7 @@ def test_a_killed_server_is_reported_once_and_the_twin_continues(tmp_path: Path)
         assert process.stdin is not None
         process.stdin.close()
         process.stdin = None
-        out, err = process.communicate(timeout=60)  # no page remains for which the server would wait
+        out, err = process.communicate(timeout=60)  # the server waits for no page any more
     assert process.returncode == 0 and json.loads(out)["input"]["samples_used"] == str(COUNT)
     assert "server of the screen" not in err
 
@@ -443,7 +443,7 @@ def test_a_recording_s_inputs_are_counted_by_name(tmp_path: Path) -> None:
     }  # fmt: skip
 
 
-#: Text of the page, read by scripts in it.
+#: Script that returns texts of the page.
 _SEEN = """JSON.stringify({pads: document.querySelectorAll('#pads tbody tr').length,
     colors: [...document.querySelectorAll('#section rect.pad')].map((pad) => pad.getAttribute('fill')),
     alarms: document.getElementById('alarms').innerText, clearance: document.getElementById('clearance').innerText,
@@ -453,7 +453,7 @@ _SEEN = """JSON.stringify({pads: document.querySelectorAll('#pads tbody tr').len
     seconds: screenState.seconds.length, fooled: Boolean(window.fooled)})"""
 
 
-#: The smallest contrast of a text with its background, as WCAG 2 defines it, disabled controls apart.
+#: Script that returns the smallest contrast of a text with its background by WCAG 2, without disabled controls.
 _CONTRAST = """(() => {
     const parts = (color) => color.match(/[\\d.]+/g).map(Number);
     const light = (color) => parts(color).slice(0, 3).map((part) => part / 255)
@@ -476,7 +476,7 @@ _CONTRAST = """(() => {
 
 
 def _check_readable(page: browser.Page) -> None:
-    """Check contrast in both themes, and that a phone need not scroll sideways."""
+    """Check the contrast in both themes, and that the page needs no sideways scrolling on a phone."""
     for theme in ("dark", "light"):
         page.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": theme}])
         assert page.evaluate(_CONTRAST) >= 4.5, theme
@@ -492,7 +492,7 @@ def test_a_browser_shows_the_twin_takes_names_as_text_and_fetches_nothing_from_e
     scene = tmp_path / f"{name.replace('/', '')}.yaml"
     scene.write_text(dump_scene(load_scene("paper")))
     given = ("--scene", scene, "--set", f"hardware_id={name}", "--token-file", tmp_path / "token")
-    given += ("--record", tmp_path / "run")  # a mark is refused without one
+    given += ("--record", tmp_path / "run")  # without a recording a mark is refused
     (tmp_path / "token").write_text(TOKEN + "\n")
     with _twin(*given) as (process, said), ExitStack() as opened:
         url = said.partition("#")[0]

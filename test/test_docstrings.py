@@ -1,4 +1,4 @@
-"""The reference is complete: every parameter, field and result of a public name is described, arrays with shape."""
+"""The reference is complete: every parameter, field and result of a public name is described, with an array's shape."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import griffe
 import pytest
 from scenes import ROOT
 
-#: Declared with unit and meaning in the source; the site shows both.
+#: Field that is declared with its unit and meaning in the source; the site shows both.
 DECLARED = re.compile(r"_(quantity|choice)\(")
 DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 ARRAYS = re.compile(r"NDArray|ArrayLike|\bArray\b")
@@ -23,7 +23,7 @@ def package() -> griffe.Module:
 
 
 def public(package: griffe.Module) -> Iterator[tuple[str, Any]]:
-    """Yield public functions and classes, and the public methods and properties of these."""
+    """Yield public functions and classes, and the public methods and properties of the classes."""
     for name in re.findall(r"^::: plow_twin\.(\w+)$", (ROOT / "docs" / "api.md").read_text(), re.MULTILINE):
         found = package[name]
         found = found.final_target if found.is_alias else found
@@ -98,7 +98,7 @@ def test_errors_that_a_function_raises_are_documented(package: griffe.Module) ->
 
 
 def test_no_docstring_begins_with_a_word_that_names_nothing() -> None:
-    """A docstring begins with a verb, or with the name of its thing; `Tell whether` is `Return whether`."""
+    """A docstring begins with a verb or with the name of its subject; `Return whether` replaces `Tell whether`."""
     found = []
     for folder in ("plow_twin", "test", "benchmark", "tools", "studies", "examples", "launch"):
         for path in (ROOT / folder).rglob("*.py"):

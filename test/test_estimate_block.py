@@ -19,7 +19,7 @@ from plow_twin.study.measured.drops import Drops
 
 DATA = Path(__file__).resolve().parent.parent / "benchmark" / "data" / "measured" / "square_drops.npz"
 SQUARE = load_scene("measured_square")
-#: The prior of the clearance is that of a table whose height is known to 5 mm.
+#: Prior deviation of the clearance in m; the height of the table, half of it, is known to 5 mm.
 DEVIATION = 0.01
 
 
@@ -29,7 +29,7 @@ def drops() -> Drops:
 
 
 def unknown_table(off: float) -> Scene:
-    """Return the square's scene with its table `off` metres lower."""
+    """Return the square's scene with the table `off` metres lower."""
     marks = dict(SQUARE.marks)
     marks["clearance.vertical_m"] = replace(marks["clearance.vertical_m"], deviation=DEVIATION)
     clearance = Clearance(SQUARE.clearance.horizontal_m, SQUARE.clearance.vertical_m + 2.0 * off)
@@ -48,12 +48,12 @@ def test_height_of_the_table_follows_from_measured_drops(drops) -> None:
     known = [one for one in found if one.vertical_state.known]
     assert len(known) > 0.9 * len(found)
     true = SQUARE.clearance.vertical_m
-    # the height is half of the clearance
+    # the height of the table is half of the clearance
     off = 0.5 * np.array([one.vertical.mean - true for one in known])
     assert np.median(np.abs(off)) < 5e-4
     inside = np.mean([one.vertical.p05 < true < one.vertical.p95 for one in known])
     assert 0.8 < inside < 0.99
-    # a height that the data do not determine to half a millimetre has a flag that says so
+    # a height that the data do not determine to half a millimetre is marked as rough
     rough = np.array([one.vertical_state is State.ROUGH for one in known])
     assert (rough | (np.abs(off) < 5e-4)).mean() > 0.85
     for one, flagged in zip(known, rough, strict=True):
@@ -69,11 +69,11 @@ def test_walls_that_are_never_met_are_not_observable(drops) -> None:
         "clearance.horizontal_m": replace(width, deviation=2e-3),
     }
     found = of_drop(drops, 0, scene=replace(scene, marks={**scene.marks, **stated}))
-    # no wall tells a bias from a clearance alone
+    # with impacts on one wall only, a bias cannot be distinguished from a clearance
     assert found.bias_x is None and found.bias_y is None and found.bias_theta is not None
     assert found.horizontal_state is State.NOT_OBSERVABLE
     assert found.horizontal.mean == SQUARE.clearance.horizontal_m
-    # the deviations that the scene states
+    # the scene states this deviation
     assert found.horizontal.deviation == pytest.approx(2e-3)
     assert found.stiffness is not None and found.stiffness.deviation == pytest.approx(1e6, rel=0.05)
     assert any("0 impacts on the right wall" in reason for reason in found.reasons)
@@ -157,7 +157,7 @@ def test_command_estimates_a_drop(drops, tmp_path) -> None:
 
 @pytest.fixture(scope="module")
 def elastic() -> dict[float, tuple[np.ndarray, np.ndarray]]:
-    """Return times and poses, each 4 ms, of a block in a guide of 30 mm and 22 mm, by its contact's stiffness."""
+    """Return by stiffness the times and poses, every 4 ms, of a block in a guide with clearances of 30 mm and 22 mm."""
     found = {}
     for stiffness in (1e4, 1e8):
         motion = simulate(guide(stiffness), t_end=12.0, output_dt=0.004, tol=1e-6)
@@ -192,7 +192,7 @@ def test_a_stiffness_that_is_not_known_widens_the_interval(elastic) -> None:
 
 @pytest.mark.parametrize(("stiffness", "every"), [(1e4, 1), (1e8, 5)])
 def test_contacts_that_are_no_impacts_between_two_poses_determine_nothing(elastic, stiffness, every) -> None:
-    """A soft contact lasts many rows; at 50 Hz two impacts look like one."""
+    """A soft contact lasts for many rows, and at 50 Hz two impacts look like one."""
     t, q = elastic[stiffness]
     found = of_guide(t[::every], q[::every], stiffness)
     assert found.horizontal_state is State.NOT_OBSERVABLE
@@ -201,7 +201,7 @@ def test_contacts_that_are_no_impacts_between_two_poses_determine_nothing(elasti
 
 @pytest.mark.parametrize("too_stiff", [300.0, 30.0])
 def test_a_contact_far_softer_than_believed_leaves_the_clearance_in_its_interval(too_stiff) -> None:
-    """The impacts scatter more than rigid impacts would, and the interval is wide accordingly."""
+    """The impacts scatter more than rigid impacts, and the interval is accordingly wide."""
     motion = simulate(guide(1e7), t_end=12.0, output_dt=0.004, tol=1e-6)
     noise = np.random.default_rng(1).normal(0.0, [3e-5, 3e-5, 2e-4], motion.q.shape)
     found = of_guide(motion.t, motion.q + noise, 1e7 * too_stiff)

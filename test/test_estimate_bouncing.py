@@ -44,9 +44,9 @@ def test_a_hard_contact_is_estimated_by_its_bounces() -> None:
 
 
 def test_the_deviate_of_a_path_is_normal_for_a_right_model_and_large_for_a_wrong_one() -> None:
-    """Paths scatter far along a few common directions, where a right path is as far off as any drawn path.
+    """Paths scatter widely along a few common directions, so a correct path may be far off along these.
 
-    A wrong path that is off in another direction is found, although its mean square over the phases is smaller.
+    A wrong path deviates in another direction. It is found, although its mean square over the phases is smaller.
     """
     rng = np.random.default_rng(5)
     modes, slopes = rng.standard_normal((3, 60)), rng.standard_normal((14, 60))
@@ -77,7 +77,7 @@ def test_a_method_that_disagrees_widens_the_interval() -> None:
     both = with_bounced(fitted, bounced, 0)
     assert both.horizontal.deviation == pytest.approx(2.4e-5)
     assert both.horizontal.mean == pytest.approx(0.0300108)
-    # 8 deviations apart: both intervals hold
+    # the two results are 8 deviations apart, and the interval contains both
     assert both.vertical.p05 < 0.0201 and both.vertical.p95 > 0.0202
     assert both.vertical.deviation == pytest.approx(8.0 * 2.4e-5)
     unlike = with_bounced(fitted, replace(bounced, distance=2.0 * tuning.MOST_DISTANCE), 0)
@@ -86,7 +86,7 @@ def test_a_method_that_disagrees_widens_the_interval() -> None:
 
 @pytest.mark.parametrize("turn", [0.0, -0.1])
 def test_the_bias_of_a_sensor_behind_a_hard_contact_is_found(turn: float) -> None:
-    """Half a degree of bias withdrew the estimate; 9 mm along y made the horizontal clearance 1 mm too large."""
+    """If it is not found, half a degree withdraws the estimate, and 9 mm along y make a clearance 1 mm too large."""
     truth = draw(replace(GROUPS["hard"], periods=4.0), 3)
     bias = np.array([1e-3, -9e-3, turn])
     found = bias_of_hard(Unknowns(truth.nominal), truth.poses.moved(bias))
@@ -94,7 +94,7 @@ def test_the_bias_of_a_sensor_behind_a_hard_contact_is_found(turn: float) -> Non
 
 
 def test_a_bias_changes_the_other_features_of_a_hard_motion_hardly_at_all() -> None:
-    """A remaining common turn of 3e-4 rad moved the measured motion relative to the drawn ones, which have no turn."""
+    """A remaining turn of 3e-4 rad would move the measured motion away from the drawn motions, which are not turned."""
     truth = draw(replace(GROUPS["hard"], periods=4.0), 3)
     eye = MotionFeatures(Unknowns(truth.nominal), truth.poses, truth.load.period())
     bias = np.array([1e-4, -1e-4, 6e-4])
@@ -119,7 +119,7 @@ def test_the_delay_is_the_lag_at_which_the_measured_path_is_nearest_to_drawn_pat
 
 
 def test_a_classifier_of_drawn_motions_finds_another_law() -> None:
-    """The classes differ along one direction of little scatter, where no single feature separates them."""
+    """The classes differ along one direction of little scatter, and no single feature separates them."""
     rng = np.random.default_rng(5)
     across = np.array([1.0, -1.0, 0.0, 0.0, 0.0, 0.0]) / np.sqrt(2.0)
 
@@ -138,7 +138,7 @@ def test_a_classifier_of_drawn_motions_finds_another_law() -> None:
 
 
 def test_log_odds_find_another_law_among_motions_whose_drawn_numbers_matter_more() -> None:
-    """The drawn numbers move the motions along a curve, by some ten times the effect of law and noise."""
+    """The drawn parameters move the features along a curve, about ten times as far as law and noise do."""
     rng = np.random.default_rng(5)
     slope, curve, apart = rng.standard_normal((3, 40))
 
@@ -165,7 +165,7 @@ def test_a_hard_contact_is_estimated_from_a_sensor_with_bias_delay_and_gaps() ->
 
 
 def test_a_contact_of_any_hardness_gives_finite_numbers() -> None:
-    """An extrapolating regression gave a softness of e^800 m, which JSON cannot hold."""
+    """A regression that extrapolates can give a softness of e^800 m, which JSON cannot represent."""
     unknowns = Unknowns(preset("paper"))
     poses, _ = Poses.of(np.arange(100) * 0.01, np.zeros((100, 3)))
     two = np.full(2, 1e-2)
@@ -189,7 +189,7 @@ def test_a_motion_like_those_of_another_law_is_suspect_unless_that_law_is_unlike
 
 
 def test_what_a_hard_motion_hides_widens_the_clearances_and_not_the_twins() -> None:
-    """Corners rounded by 5 mm made clearances 0.7 mm too large, ten of their deviations."""
+    """Corners rounded by 5 mm make clearances 0.7 mm too large, by ten of their deviations."""
     truth = draw(replace(GROUPS["hard"], periods=4.0), 3)
     unknowns, period = Unknowns(truth.nominal), truth.load.period()
     eye = MotionFeatures(unknowns, truth.poses, period)
@@ -209,7 +209,7 @@ def test_what_a_hard_motion_hides_widens_the_clearances_and_not_the_twins() -> N
     assert back.apparent == result.apparent
     scenes, _ = draw_scenes(truth.nominal, back, 50, np.random.default_rng(0))
     assert np.std([scene.clearance.horizontal_m for scene in scenes]) < 7e-5
-    # a scene that states the deviation of its sides includes its corners
+    # a deviation of the sides that the scene states includes the corners
     exact = Provenance(Mark.MEASURED, deviation=0.0)
     marks = {**truth.nominal.marks, "frame.width_m": exact, "frame.height_m": exact}
     stated = replace(unknowns, scene=replace(truth.nominal, marks=marks))
@@ -228,7 +228,7 @@ def test_a_hard_motion_unlike_the_model_is_rough() -> None:
 
 
 def test_the_likeliest_clearances_are_found_from_paths_with_more_parts_than_drawn_motions() -> None:
-    """The clearances of each drawn motion are found as for a new motion, for any drawn numbers and any delay."""
+    """The clearances of each drawn motion are found as for a new motion, for any drawn parameters and any delay."""
     rng = np.random.default_rng(5)
     slopes, curve, common, late = (rng.standard_normal((rows, 150)) for rows in (7, 1, 3, 1))
     scale, middle = np.array([3e-4, 3e-4, 0.3, 0.3, 0.06, 0.06, 0.06]), np.array([0.02, 0.03, -7.0, 0.0, 1.0, 1.0, 1.0])

@@ -1,4 +1,4 @@
-"""`plow-twin estimate`: its contract, mapped bags, and which part of a recording counts."""
+"""`plow-twin estimate`: its contract, mapped bags, and the part of a recording that it uses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The twin that follows its machine: forces and clearances at each time, from measurements up to it."""
+"""The twin that follows its machine: forces and clearances at each time from earlier measurements."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from estimate_truths import GROUPS, PERIOD, Truth, draw
 
 Array = NDArray[np.float64]
 MEMBERS = 48
-#: A soft contact; the horizontal clearance is 8 mm larger than believed, the gains are up to 10 % off.
+#: A machine with a soft contact, a horizontal clearance 8 mm larger than believed, and load gains up to 10 % off.
 SEED = 71003
 
 
@@ -53,7 +53,7 @@ def followed(truth: Truth) -> Stretch:
 
 
 def _known(truth: Truth, state: State = State.ESTIMATED) -> Estimate:
-    """An estimate with the accuracy of ten load periods."""
+    """Return an estimate with the accuracy of ten load periods."""
     clearance, contact = truth.scene.clearance, truth.scene.contact
     assert contact.damping is not None
     fx, fy, m = (Interval.normal(gain, 0.003) for gain in truth.gain)
@@ -66,7 +66,7 @@ def _known(truth: Truth, state: State = State.ESTIMATED) -> Estimate:
 
 
 def _run(follower: Follower, truth: Truth, end: float, begin: float = -1.0, late: float = 0.0) -> Array:
-    """Continue to a time with load and poses, the latter `late` s late; return the forces of the median twin."""
+    """Continue to a time with load and poses, where poses are `late` s late; return the forces of the median twin."""
     load, poses = truth.load, truth.poses
     there = np.flatnonzero((load.t > begin) & (load.t <= end))
     rows, place = np.zeros(len(there), ROW), int(np.searchsorted(poses.t + late, begin, side="right"))
@@ -105,7 +105,7 @@ def test_intervals_hold_from_the_first_row_on_and_narrow(truth: Truth, followed:
     for axis, true in enumerate(truth.clearance):
         value, low, high = clearance[:, axis].T
         assert ((low <= true) & (true <= high)).mean() > 0.85
-        assert 0.02 < high[0] - low[0] < 0.04  # the prior's
+        assert 0.02 < high[0] - low[0] < 0.04  # the prior's interval
         assert (low <= value).all() and (value <= high).all()
         assert high[-1] - low[-1] < 1e-3
 
@@ -207,7 +207,7 @@ def test_late_poses_correct_too_and_later_poses_have_no_effect(truth: Truth, for
 
 
 def test_the_load_error_of_a_rough_estimate_lets_the_intervals_hold(truth: Truth, forces: Array) -> None:
-    """A constant force of 4 kN, an eighth of the load's amplitude, that the believed load lacks."""
+    """The believed load lacks a constant force of 4 kN, an eighth of the load's amplitude."""
     figures = {f"load_error_{name}": 0.01 for name in ("fx", "fy", "m")}
     rough = replace(_known(truth, State.ROUGH), figures=figures)
     wrench = truth.load.wrench + np.array([4e3, 0.0, 0.0])
@@ -245,7 +245,7 @@ def test_a_machine_without_gravity_is_steered_too(truth: Truth, monkeypatch: pyt
     monkeypatch.setattr(TwinBatch, "move", counted)
     nominal = replace(truth.nominal, gravity=replace(truth.nominal.gravity, acceleration_m_s2=0.0))
     _run(Follower(nominal, MEMBERS), truth, 1.0)
-    assert np.mean(moved) > MEMBERS / 3  # with a limit of zero no pose is kept
+    assert np.mean(moved) > MEMBERS / 3  # with a limit of zero no member would be moved
 
 
 def test_a_member_is_never_pushed_into_a_hard_wall() -> None:
@@ -275,9 +275,9 @@ def test_stiffness_and_gains_of_a_hard_contact_are_learned_from_the_poses() -> N
     follower.span()
     _run(follower, truth, 5.0, 4.0)
     peak = simulate(truth.scene, 5.0, 1e-4, 1e-6).force[40_000:].max()
-    # with the stiffness of the estimate it is less than half of it
+    # with the estimate's stiffness the peak is less than half as large
     assert follower.span().peak[0].max() == pytest.approx(peak, rel=0.25)
-    # and the twin that only the parameters follow has the numbers learned
+    # a twin that follows by its parameters alone keeps the learned parameters
     follower.follow_parameters()
     _run(follower, truth, 5.02, 5.0)
     alone = Follower(truth.nominal, 1)

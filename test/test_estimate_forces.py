@@ -1,4 +1,4 @@
-"""Measured contact forces beside the poses: their information, and the evidence against them."""
+"""Measured contact forces beside the poses: the information in them, and the evidence against them."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_forces_of_another_law_make_the_model_suspect(truth: Truth, fitted: tupl
     assert truth.forces is not None
     result, problem, fit = fitted
     t, measured = truth.forces.t, truth.forces.force
-    # the motion follows the law believed: poses alone show no fault
+    # the motion follows the believed law, so poses alone show no fault
     own = fit.shared.copy()
     own[[*range(SIZE)[BIAS], DELAY]] = 0.0
     window = Window(Poses(t, np.zeros((len(t), 3))), problem.window.starts, problem.window.states)
@@ -120,7 +120,7 @@ def test_a_folder_without_forces_runs_no_code_of_forces(
 ) -> None:
     short = replace(truth, load=truth.load.between(0.0, 4.0), poses=truth.poses.between(0.0, 4.0), forces=None)
     short.write(tmp_path)
-    # files of `--out` are not measurements
+    # files that `--out` writes are not measurements
     (tmp_path / "forces.csv").write_text("t,force_top_left_top/p05\n0,1\n")
     for name in ("contact_forces", "force_fit"):
         monkeypatch.setitem(sys.modules, f"plow_twin.estimate.{name}", None)  # the import of this module fails

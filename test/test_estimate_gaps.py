@@ -19,7 +19,7 @@ SENSOR_ERROR = 1e-4
 
 @pytest.fixture(scope="module")
 def gapped() -> tuple[Truth, np.ndarray]:
-    """A truth and the gaps measured at all pairs, each sensor with a constant error, noise and gaps in time."""
+    """Return a simulated machine and the gaps measured at all pairs, with constant errors, noise and missing times."""
     truth = known()[0][0]
     still = draw(replace(truth.group, noise_m=0.0), 2).poses.q
     rng = np.random.default_rng(6)

@@ -1,4 +1,4 @@
-"""Wear over a life: known answers, the direct run, and a forecast with honest quantiles."""
+"""Wear over a life: known answers, comparison with a direct run, and a forecast with correct quantiles."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from plow_twin.scene_file import dump_scene
 from plow_twin.stream.journal import Estimated, SetModel, SetWear
 from plow_twin.stream.session import Session
 
-#: Wear so fast that a life fits into a simulation of a minute: 1 mm in some 20 s.
+#: Wear so fast that a life fits into a simulation of a minute, about 1 mm in 20 s.
 FAST = Wear(1e-8, 1.0, 0.2)
 
 
@@ -42,7 +42,7 @@ def test_the_jump_agrees_with_the_direct_run() -> None:
 
 
 def test_the_jump_agrees_with_the_direct_run_with_sliding_in_the_plane_and_running_in() -> None:
-    """At a hundredth of the usual travel the sliding in the plane outweighs it; new pads wear three times as fast."""
+    """Travel is a hundredth of the usual, so sliding in the plane outweighs it; new pads wear three times as fast."""
     slow = replace(FAST, travel_speed_m_s=0.02, coefficient_m2_n=3e-9, sliding="total")
     scene = replace(preset("paper"), wear=replace(slow, running_in_ratio=3.0, running_in_depth_m=2e-4))
     assert scene.wear is not None
@@ -53,18 +53,18 @@ def test_the_jump_agrees_with_the_direct_run_with_sliding_in_the_plane_and_runni
     assert path.depth[-1] == pytest.approx(direct, rel=0.03, abs=1e-5)
     travel_only = wear_path(replace(preset("paper"), wear=replace(slow, sliding="travel")), (1.0, 1.0), exposure)
     assert direct.max() > 1.5 * travel_only.depth[-1].max() > 1e-4
-    # one path serves every coefficient, also at a quarter, where running-in is under way
+    # one path holds for every coefficient, also for a quarter of it, with which running-in is not complete
     quarter = simulate(replace(scene, wear=replace(scene.wear, coefficient_m2_n=7.5e-10)), span, span, 1e-6).wear_depth
     early = [np.interp(0.25 * exposure, path.exposure, pad) for pad in path.depth.T]
     assert early == pytest.approx(quarter, rel=0.05, abs=1e-5)
-    # a head whose clearances have grown has run in
+    # the pads of a head whose clearances have grown have run in
     grown = with_clearances(scene, scene.clearance.horizontal_m + 2e-3, scene.clearance.vertical_m)
     assert grown.wear is not None and grown.clearance == scene.clearance
     assert grown.wear.initial_depth_m == pytest.approx(1e-3 * np.abs(NORMAL_X))
 
 
 def test_constant_force_wears_as_archard_says() -> None:
-    """Where wear does not change the force, h = F E."""
+    """If wear does not change the force, h = F E."""
     scene = replace(preset("paper"), wear=FAST)
     force, deviation = mean_forces(scene, np.zeros(8))
     path = wear_path(scene, (1.0, 1.0), 1e-10)
@@ -79,7 +79,7 @@ def test_quantiles_scale_with_the_coefficient_and_the_horizon_cuts(tmp_path: Pat
     life = forecast(scene, plan)
     p10, p50, p90 = (life.quantile(share) for share in (0.1, 0.5, 0.9))
     assert p10 is not None and p50 is not None and p90 is not None and p10 < p50 < p90
-    # log-normal: the prior fixes the ratio of the 10 % and 90 % points of 1/k_s
+    # the prior is log-normal, which determines the ratio of the 10 % and 90 % points of 1/k_s
     assert np.log(p90 / p10) == pytest.approx(np.log(4.0) * 1.2816 / 1.6449, rel=0.1)
     doubled = replace(scene, wear=replace(slow, prior_m2_n=(1e-14, 4e-14)))
     assert forecast(doubled, plan).quantile(0.5) == pytest.approx(0.5 * p50, rel=0.02)
@@ -127,7 +127,7 @@ def test_scenarios_are_forecasts_of_their_own_from_the_same_draws() -> None:
 
 
 def test_a_table_of_enough_periods_is_a_load_to_forecast_under() -> None:
-    """The load as in a recording: the sampled harmonic load gives the same mean forces."""
+    """A sampled harmonic load, as in a recording, gives the same mean forces."""
     scene = preset("paper")
     t = np.arange(0.0, 20.0, 0.01)
     sampled = replace(scene, loads=(Table("recorded", t, compile_loads(scene.loads).at(t)),))
@@ -139,7 +139,7 @@ def test_a_table_of_enough_periods_is_a_load_to_forecast_under() -> None:
 
 
 def test_an_estimated_clearance_holds_the_wear_that_there_is() -> None:
-    """Pads worn by 2 mm and a clearance estimated with that: the forecast must not count the wear twice."""
+    """The estimated clearance includes 2 mm of wear of the pads; the forecast must not add this wear again."""
     worn = replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0, initial_depth_m=(2e-3,) * 8))
     facts = {
         name: {"mean_m": mean, "p05_m": mean - 1e-4, "p95_m": mean + 1e-4, "state": "estimated"}
@@ -164,7 +164,7 @@ def test_of_a_run_the_pads_as_it_left_them_count_and_no_estimate_of_others(tmp_p
     scene, newest = left_by(RunReader(tmp_path / "set"))
     assert newest is None and scene.clearance.vertical_m == 0.031
     assert scene.wear is not None and scene.wear.initial_depth_m == pytest.approx(depth, abs=1e-12)
-    # the first snapshot of a run holds its initial wear, from the folder that keeps it
+    # the first snapshot of a run contains its initial wear, which comes from the folder of the wear
     session = Session(Twin(scene, excitation="sampled"), wear_depth=depth)
     record_run(tmp_path / "kept", [session.snapshot(), paper_sample(0), of_old_pads], wear=Wear(1e-14, 0.015, 2.0))
     scene, newest = left_by(RunReader(tmp_path / "kept"))
@@ -184,7 +184,7 @@ def test_a_scene_without_wear_or_period_is_refused() -> None:
 
 
 def test_a_history_of_clearances_determines_the_coefficient(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The truth is a direct run without jumps of wear; its coefficient is not the prior's middle."""
+    """The true history is a direct run without jumps, with a coefficient away from the middle of the prior."""
     true_k = 1.8e-9
     scene = replace(preset("paper"), wear=replace(FAST, coefficient_m2_n=1e-9, prior_m2_n=(2.5e-10, 4e-9)))
     worn = replace(scene, wear=replace(FAST, coefficient_m2_n=true_k))
@@ -198,11 +198,11 @@ def test_a_history_of_clearances_determines_the_coefficient(tmp_path: Path, caps
     known = coefficient(scene, history)
     found = known.interval()
     assert found.p05 < true_k < found.p95 and found.p95 / found.p05 < 1.3**2
-    # clearances without noise would not make their path certain
+    # even clearances without noise do not make the path certain
     sure = replace(known, weight=np.eye(len(known.value))[len(known.value) // 2]).interval()
     assert sure.p95 / sure.p05 > math.exp(3.2 * tuning.PATH_DEVIATION)
     assert np.abs(known.clearance - [0.025, 0.030] - grown[-1]).max() < 4.0 * noise
-    # the forecast continues along the path, whose pads are worn unequally
+    # the forecast continues along the path with its unequally worn pads
     assert known.depth == pytest.approx(depth[-1], rel=0.1, abs=5e-5)
     ahead = with_clearances(scene, *map(float, known.clearance), known.depth)
     assert ahead.wear is not None and ahead.wear.initial_depth_m == pytest.approx(known.depth)
@@ -228,7 +228,7 @@ def test_a_history_of_clearances_determines_the_coefficient(tmp_path: Path, caps
 
 
 def test_a_forecast_wears_the_pads_by_the_contact_that_was_estimated() -> None:
-    """Another contact loads other pads; the believed contact kept wearing, against the estimate."""
+    """Another contact loads other pads, so the forecast must not use the believed contact."""
     wear = Wear(1e-14, 0.015, 2.0, prior_m2_n=(5e-15, 2e-14))
     believed = replace(preset("paper"), wear=wear)
     hard = replace(believed, contact=replace(believed.contact, stiffness=2.4 * believed.contact.stiffness))
@@ -247,7 +247,7 @@ def test_a_forecast_wears_the_pads_by_the_contact_that_was_estimated() -> None:
 
 
 def test_a_path_that_does_not_come_to_its_end_is_no_limit_never_reached() -> None:
-    """From a clearance of a micrometre 400 steps made no progress, which was reported as `not reached`."""
+    """From a clearance of a micrometre, 400 steps make no progress; this must not be reported as `not reached`."""
     scene = replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0, prior_m2_n=(5e-15, 2e-14)))
     tight = replace(scene, clearance=Clearance(1e-6, 0.030))
     found = forecast(tight, Plan(0.002, 0.034, 1e3, draws=50))
@@ -258,7 +258,7 @@ def test_a_path_that_does_not_come_to_its_end_is_no_limit_never_reached() -> Non
 
 
 def test_a_clearance_hardly_known_is_not_below_zero() -> None:
-    """Drawn from its prior, a clearance was -70 mm, from which the path to the limit left the model's range."""
+    """A clearance drawn from its prior can be -70 mm, from which the path to the limit leaves the model's range."""
     scene = replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0, prior_m2_n=(5e-15, 2e-14)))
     found = forecast(scene, Plan(0.026, 0.031, 1e3, draws=50), (0.03, 0.03))
     assert found.now.min() > 0.0
@@ -273,7 +273,7 @@ def test_a_clearance_hardly_known_is_not_below_zero() -> None:
 
 
 def test_a_history_that_the_prior_does_not_allow_is_refused() -> None:
-    """All of the posterior lay at the end of the grid: an interval of no width, without the truth."""
+    """The whole posterior is at the end of the grid, where the interval has no width and does not contain the truth."""
     scene = replace(preset("paper"), wear=replace(FAST, coefficient_m2_n=1e-9, prior_m2_n=(2.5e-10, 4e-9)))
     travel = np.arange(5) * 10.0
     still = np.tile([0.025, 0.030], (5, 1))
@@ -284,7 +284,7 @@ def test_a_history_that_the_prior_does_not_allow_is_refused() -> None:
 
 
 def test_a_history_that_shrinks_is_refused() -> None:
-    """By 20 of its deviations, the result was a coefficient near 0 with a narrow interval."""
+    """A clearance that shrinks by 20 of its deviations must not give a coefficient near 0 with a narrow interval."""
     scene = replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0))
     travel, shrunk = np.array([0.0, 1e4]), np.array([[0.025, 0.030], [0.0245, 0.0295]])
     with pytest.raises(LifeError, match=r"no wear of this scene explains.*row 2 is -0\.2\d+ mm off"):
@@ -295,11 +295,11 @@ def test_a_history_that_shrinks_is_refused() -> None:
 def test_unusable_input_of_a_forecast_is_refused_and_not_left_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A stop beyond the horizon, an empty estimate and a missing contact used to give a forecast."""
+    """A stop beyond the horizon, an empty estimate and a missing contact give no forecast."""
     scene = replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0, prior_m2_n=(5e-15, 2e-14)))
     file, found, history = (tmp_path / name for name in ("scene.yaml", "estimate.json", "history.csv"))
     file.write_text(dump_scene(scene))
-    # as a spreadsheet writes it
+    # a file as spreadsheets write it
     sheet = "\ufeffkm;horizontal_mm;horizontal_sd_mm;vertical_mm;vertical_sd_mm\n0,0;25;1;30;1\n9;25;1;30;1\n"
     history.write_text(sheet)
     limits = ["--limit-horizontal", "28", "--limit-vertical", "34"]

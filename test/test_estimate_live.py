@@ -1,4 +1,4 @@
-"""The estimate beside the live node: real processes, late data, and the same estimate from the journal."""
+"""The estimate beside the live node, with real processes and late data, and the same estimate from the journal."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ from estimate_truths import GROUPS, Truth, draw
 #: Stamp of the first sample [ns].
 START_NS = 1_700_000_000_000_000_000
 WINDOW_S, INTERVAL_S, WAIT_S = 10.0, 4.0, 2.0
-#: A busy machine loses no sample and no pose: a window with holes is another window.
+#: Settings with which a busy machine loses no sample and no pose, because a window with holes is another window.
 RELIABLE = {
     f"qos_overrides.{{ns}}/{topic}.subscription.reliability": "reliable"
     for topic in ("excitation", "head_pose", "gaps")
@@ -56,7 +56,7 @@ RELIABLE = {
 
 
 def _windows(loads: list[tuple[int, tuple[float, ...]]], poses: list[tuple[int, tuple[float, ...]]]) -> list[Window]:
-    """Feed a collector with samples and poses, each pose before the sample at its place."""
+    """Feed a collector with samples and poses, each pose before the sample with the same index."""
     windows, found = Windows(4.0, 1.0, 0.5), []
     for index, load in enumerate(loads):
         if index < len(poses):
@@ -73,7 +73,7 @@ def test_windows_do_not_depend_on_the_order_of_arrival() -> None:
     stamps = START_NS + np.arange(0, 800) * 10_000_000
     loads = [(int(stamp), tuple(rng.standard_normal(3).tolist())) for stamp in stamps]
     poses = [(int(stamp) + 3, tuple(rng.standard_normal(3).tolist())) for stamp in stamps]
-    # each is late by up to 0.4 s, less than the wait
+    # each row is late by up to 0.4 s, less than the waiting time
     late = [sorted(rows, key=lambda row: row[0] + int(rng.integers(0, 400_000_000))) for rows in (loads, poses)]
     ordered, mixed = _windows(loads, poses), _windows(*late)
     assert [window.end_ns for window in ordered] == [window.end_ns for window in mixed]
@@ -91,7 +91,7 @@ def test_windows_do_not_depend_on_the_order_of_arrival() -> None:
 
 
 def test_measurements_without_a_load_do_not_pile_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A load that has stopped, or poses from a clock that is hours ahead."""
+    """The load may have stopped, or the poses may have a clock that is hours ahead."""
     monkeypatch.setattr("plow_twin.estimate.window.MOST_KEPT", 100)
     windows = Windows(4.0, 1.0, 0.5)
     for index in range(300):
@@ -115,7 +115,7 @@ def test_a_window_begins_behind_a_silence_of_the_load() -> None:
 
 
 def _play(running: Bench, truth: Truth, late: bool) -> None:
-    """Send load and poses of a truth, faster than their stamps say; `late`: some poses come 1 s after their stamp."""
+    """Send load and poses of a simulated machine faster than their stamps; with `late`, some poses come 1 s late."""
     probe = running.probe
     send = probe.excitation()
     pose, gap = probe.publisher(PoseStamped, "head_pose"), probe.publisher(JointState, "gaps")
@@ -166,15 +166,15 @@ def test_the_live_estimate_is_published_and_given_again_by_the_journal(tmp_path:
         forces: list[JointState] = probe.listen(JointState, "window_forces")
         forecasts: list[JointState] = probe.listen(JointState, "forecast")
         assert value(probe.status[-1], "horizontal") == "prior"
-        probe.until_figure("estimate", "ready", "1", timeout_s=100.0)  # before any sample
+        probe.until_figure("estimate", "ready", "1", timeout_s=100.0)  # before the first sample
         _play(running, truth, late=True)
-        # windows end each 4 s; a slow machine leaves out one, but not the last
+        # windows end every 4 s; a slow machine may leave out a window, but not the last one
         last_s = (START_NS + round((truth.load.t[-1] - WAIT_S) * 1e9)) // round(INTERVAL_S * 1e9) * round(INTERVAL_S)
         probe.until(lambda: heard and heard[-1].header.stamp.sec == last_s, "the last window's estimate", 100.0)
         probe.until_figure("estimate", "estimates", *map(str, range(1, 9)))
         probe.until(lambda: value(probe.status[-1], "horizontal") == "estimated", "the flag")
         found = dict(zip(heard[-1].name, heard[-1].position, strict=True))
-        # the next slow publication, under the hold policy
+        # with the next slow publication, under the hold policy
         probe.until(lambda: abs(clearances[-1].position[0] - found["horizontal"]) < 1e-9, "the clearance")
         last = dict(zip(clearances[-1].name, clearances[-1].position, strict=True))
         status: DiagnosticStatus = probe.status[-1]
@@ -195,10 +195,10 @@ def test_the_live_estimate_is_published_and_given_again_by_the_journal(tmp_path:
     facts = json.loads(done.stdout)
     assert facts["live"]["repeated"] is True and facts["live"]["estimates"] >= 1
     assert facts["horizontal"]["mean_m"] == found["horizontal"]
-    # gaps were measured too: they give the groups of pads
+    # gaps were measured too, and give the clearances of the groups of pads
     group = facts["groups"]["horizontal_top"]
     assert group["mean_m"] == pytest.approx(truth.clearance[0], abs=3e-4) and group["p95_m"] - group["p05_m"] > 4e-4
-    # the results that follow from the estimate are the same too
+    # the results that depend on the estimate are the same too
     assert facts["forecast"] == json.loads(answer.message)
     told = dict(zip(forecasts[-1].name, forecasts[-1].position, strict=True))
     assert told["seconds/p50"] == pytest.approx(3600.0 * facts["forecast"]["p50"]["hours"])
@@ -236,12 +236,12 @@ def test_an_estimate_stays_until_it_is_withdrawn_or_the_pads_are_changed() -> No
     assert [now[f"horizontal{point}"] for point in ("", "/p05", "/p95")] == pytest.approx(
         [0.02, 0.019, 0.021], abs=1e-6
     )
-    # a late sample goes back beyond the estimate, which stays
+    # a late sample takes the model back to a time before the estimate; the estimate remains
     clearance(0.6)
     session.apply(Sample(START_NS + 100_000_000, (4e4, -1e4, 0.0)))
     later = clearance(1.8)
     assert later["vertical"] == pytest.approx(0.03, abs=1e-6)
-    # and its interval widens like the wear's prior
+    # its interval widens by the prior of the wear
     assert later["horizontal/p95"] - later["horizontal/p05"] > now["horizontal/p95"] - now["horizontal/p05"]
     second = entry_of(_found(State.NOT_OBSERVABLE, State.WITHDRAWN), session, first)
     assert second.shift == (*first.shift[:3], 0.0, 0.0, 0.0)
@@ -251,7 +251,7 @@ def test_an_estimate_stays_until_it_is_withdrawn_or_the_pads_are_changed() -> No
 
 
 class _Finished:
-    """Replaces the process: its results are given by hand."""
+    """A replacement of the process, whose results the test gives."""
 
     def __init__(self, *_: Any) -> None:
         self.found: list[Found] = []
@@ -283,17 +283,17 @@ def test_other_pads_and_other_model_numbers_discard_earlier_estimates(
         return estimation.poll(session)
 
     assert told()["forecast"].name == ("seconds/p50",)
-    # an estimate of the previous machine is under way
+    # an estimate of the previous machine is being computed
     estimation._worker.found.append(_found(State.ESTIMATED, State.ESTIMATED))
     session.apply(SetModel(START_NS, json.dumps({"clearance.horizontal_m": 0.026})))
-    # the clearance is the model's again: beside a clearance that is not observable no estimate is kept
+    # the clearance is the model's again, because no estimate is kept beside a clearance that is not observable
     assert estimation.entry is None and set(estimation.states.values()) == {State.PRIOR}
     assert estimation.forecast is not None and estimation.poll(session) == {}
     told()
     session.apply(SetWear(START_NS + 1, (0.0,) * 8, "new pads"))
     assert (estimation.forecast, estimation.reasons, estimation.end_ns) == (None, (), None)
     assert estimation.forecast_error and set(estimation.trust.values()) == {""}
-    # and releases latched alarms
+    # latched alarms are released too
     messages = estimation.poll(session)
     assert {topic: (message.stamp_ns, message.name) for topic, message in messages.items()} == dict.fromkeys(
         ("estimate", "forecast"), (START_NS + 1, ())
@@ -325,7 +325,7 @@ def test_a_frozen_worker_is_reported_and_costs_no_further_memory(monkeypatch: py
         for _ in range(1000):
             worker.add_load(START_NS, (0.0, 0.0, 0.0))
         assert worker.poll() is None
-        # so slow that the source waits for it with less data than that
+        # the worker is so slow that the source waits for it even with less data
         time.sleep(0.1)
     assert worker.error == "the estimator did not read for 20000 samples"
     assert not worker.ready
@@ -339,7 +339,7 @@ def test_the_death_of_a_worker_is_reported_and_stops_nothing() -> None:
     worker = Worker(preset("paper"), Windows(10.0, 4.0, 1.0))
     os.kill(worker._process.pid, signal.SIGSTOP)
     worker._connection.close()
-    assert worker.poll() is None and not worker.error  # the test does not wait for its end
+    assert worker.poll() is None and not worker.error  # the test does not wait for the worker's end
     worker._process.kill()
     give_up = time.monotonic() + 20.0
     while not worker.error and time.monotonic() < give_up:
@@ -373,7 +373,7 @@ context.try_shutdown()
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.timeout(600)  # twin and worker compile 65 s of processor time each first time
+@pytest.mark.timeout(600)  # at first, twin and worker each compile for 65 s of processor time
 @pytest.mark.parametrize(("rows", "code"), [(None, 0), (100, 3)])
 def test_of_a_file_that_ends_the_last_window_is_estimated_or_too_few_data_are_named(
     rows: int | None, code: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -401,7 +401,7 @@ def test_of_a_file_that_ends_the_last_window_is_estimated_or_too_few_data_are_na
         )
         assert found == []
         return
-    last_s = truth.load.t[-1] + 1.0  # the stamps of times from 0 are moved by a second
+    last_s = truth.load.t[-1] + 1.0  # stamps that begin at 0 are moved by a second
     window = found[-1].window
     assert window is not None and window.end_ns == pytest.approx(last_s * 1e9 + 1, abs=1.0)
     assert "Estimate of the window" in shown.out and "horizontal clearance" in shown.out.lower()

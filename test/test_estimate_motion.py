@@ -1,4 +1,4 @@
-"""The estimate from measured motion: intervals that hold on synthetic truths, or a stated reason."""
+"""The estimate from measured motion: intervals that contain a simulated machine's values, or a stated reason."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_effects_outside_the_model_are_flagged_and_rough_at_best(name: str) -> N
 def test_a_sensor_beside_the_centre_or_behind_a_low_pass_is_found_and_the_interval_holds(
     name: str, seed: int, names: tuple[str, ...], size: float
 ) -> None:
-    """Without them the fit did not converge, or clearances were 0.4 mm and 1.9 mm off, up to 8 deviations."""
+    """Without these unknowns the fit does not converge, or clearances are 0.4 mm and 1.9 mm off, up to 8 deviations."""
     truth = mismatched(replace(KINDS[name], periods=6.0), seed)
     result = estimate(truth.nominal, truth.load, truth.poses)
     for value, state, true in zip(
@@ -104,7 +104,7 @@ def test_the_vertical_clearance_of_a_head_that_never_moves_sideways_is_estimated
 
 @pytest.mark.parametrize("seed", [pytest.param(43202, marks=pytest.mark.stress), 43210])
 def test_intervals_hold_between_soft_and_hard_contacts(seed: int) -> None:
-    # one was taken for hard and flagged, the fit of the other did not converge
+    # one of these contacts could be taken for hard, and the fit of the other need not converge
     truth = draw(GROUPS["middle"], seed)
     result = estimate(truth.nominal, truth.load, truth.poses)
     for value, state, true in zip(
@@ -135,7 +135,7 @@ def test_the_fit_finds_the_bias_of_a_sensor_behind_a_soft_contact() -> None:
 
 
 def test_a_wall_never_touched_is_not_observable() -> None:
-    """Pressed to the right for good, the head never meets the left wall: gx is as before."""
+    """A head that is always pressed to the right never meets the left wall, so gx keeps its prior."""
     nominal = preset("paper")
     t = np.arange(0.0, 20.0, 0.01)
     wrench = np.stack([5e4 + 2e4 * np.sin(2.0 * t), 0.0 * t, -1e3 * np.sin(2.0 * t)], axis=1)
@@ -158,14 +158,17 @@ def test_a_motion_that_can_hardly_be_predicted_is_no_evidence_of_a_clearance(mon
     assert (result.model, result.sensor) == ("ok", "ok") and before.horizontal_state is State.ESTIMATED
     assert all("is predicted, expected 110% or more" in reason for reason in result.reasons)
     assert [reason.split()[0] for reason in result.reasons] == ["horizontal", "vertical"]
-    # no group of pads is known better than the whole clearance
+    # no group's clearance is known better than the whole clearance
     assert {value for value, _ in result.groups.values()} == {result.horizontal, result.vertical}
     assert result.horizontal.deviation > 10.0 * before.horizontal.deviation
 
 
 @pytest.mark.stress
 def test_a_clearance_without_evidence_is_not_estimated() -> None:
-    """With theta locked the head stays at the top walls: the result was 6.8 mm, not 27.1, with a deviation of 0.4."""
+    """With theta locked the head stays at the top walls.
+
+    A fit would give 6.8 mm instead of 27.1 mm, with a deviation of 0.4 mm.
+    """
     nominal = replace(preset("paper"), locked=("theta",))
     rng = np.random.default_rng([77, 2])
     fine = np.arange(0.0, 10.0 * np.pi + 1e-3, 1e-3)
@@ -186,7 +189,7 @@ def test_a_clearance_without_evidence_is_not_estimated() -> None:
 
 
 def test_stated_deviations_of_the_measurements_are_believed() -> None:
-    """The stated noise is a lower bound, which intervals and the prior of the load's gains reflect."""
+    """The stated deviations are lower bounds; intervals and the prior of the load's gains follow from them."""
     scene = preset("paper")
     t = np.arange(0.0, 10.0, 0.01)
     wrench = compile_loads(scene.loads).at(t)
@@ -210,7 +213,7 @@ def test_without_measurements_the_prior_is_returned() -> None:
 
 
 def test_poses_too_sparse_for_a_fit_are_refused() -> None:
-    """At 5 Hz, or 200 Hz of which 1.5 % arrive, a swing's start is undetermined: the fit was wrong and narrow."""
+    """A swing's start is undetermined at 5 Hz, or at 200 Hz with 1.5 % of the poses; a fit would be wrong and narrow."""
     nominal = preset("paper")
     load, _ = Load.of([0.0, 20.0], np.ones((2, 3)))
     rng = np.random.default_rng(1)
@@ -248,7 +251,7 @@ def test_a_pose_with_a_large_stated_deviation_does_not_make_the_model_suspect() 
 
 
 def test_a_silence_of_the_load_is_not_bridged() -> None:
-    """With a line drawn across a lost period the sensor counted as bad."""
+    """With a straight line across a lost period, the sensor would be suspect."""
     truth, _ = known()[0]
     there = (truth.load.t < 11.0) | (truth.load.t > 14.0)
     load = Load(truth.load.t[there], truth.load.wrench[there])
@@ -281,11 +284,11 @@ def test_a_machine_at_rest_does_not_make_the_model_suspect() -> None:
         result = estimate(truth.nominal, Load.of(t, load)[0], Poses.of(t, rests)[0])
         assert result.horizontal_state is result.vertical_state is State.NOT_OBSERVABLE
         assert (result.model, result.sensor) == ("ok", "ok") and "the head rests" in result.reasons[0]
-    # a head that has just come to rest shows the noise of a hard wall, and no other sign of it
+    # a head that has just come to rest has the small scatter of a hard wall, but no other sign of it
     rests[:200] += np.linspace(1e-2, 0.0, 200)[:, None]
     result = estimate(truth.nominal, Load.of(t, idle)[0], Poses.of(t, rests)[0])
     assert (result.horizontal_state, result.model) == (State.NOT_OBSERVABLE, "ok")
-    # if a pushed head does not move, it or its sensor is stuck
+    # if a head that is pushed does not move, the head or its sensor is stuck
     pushed = Load.of(t, idle + np.outer(np.sin(2.0 * t), [3e4, 1e4, 4e4]))[0]
     result = estimate(truth.nominal, pushed, Poses.of(t, rests)[0])
     assert result.horizontal_state is State.WITHDRAWN
@@ -316,12 +319,12 @@ def test_a_rough_load_costs_little_accuracy() -> None:
     found = estimate(truth.nominal, truth.load, truth.poses)
     assert (found.model, found.sensor) == ("ok", "ok")
     for value, true in zip((found.horizontal, found.vertical), truth.clearance, strict=True):
-        # unlinked swings leave an interval twice as wide, and were 0.2 mm off
+        # without links, the interval would be twice as wide, and the clearance 0.2 mm off
         assert value.p95 - value.p05 < 2.5e-4 and abs(value.mean - true) < 1.5e-4
 
 
 def test_ten_poses_a_second_are_fitted_to_the_end_and_the_sensor_is_not_suspect() -> None:
-    """The residual motion of a fit that had not converged was taken for a temporarily noisier sensor."""
+    """The residual motion of a fit that has not converged must not be taken for a sensor that is noisier at times."""
     truth = draw(GROUPS["slow"], 33001)
     result = estimate(truth.nominal, truth.load, truth.poses)
     assert (result.sensor, result.horizontal_state) == ("ok", State.ESTIMATED), result.reasons
@@ -329,7 +332,7 @@ def test_ten_poses_a_second_are_fitted_to_the_end_and_the_sensor_is_not_suspect(
 
 
 def test_a_load_with_a_little_noise_is_followed_in_long_swings() -> None:
-    """With the short swings of a load that changes at each sample this right model was withdrawn."""
+    """With the short swings of a load that changes at each sample, this correct model would be withdrawn."""
     truth = draw(replace(GROUPS["plain"], load_step=1e-3, periods=8.0), 42004)
     noise = 0.01 * truth.load.wrench.std(axis=0) * np.random.default_rng(1).standard_normal(truth.load.wrench.shape)
     result = estimate(truth.nominal, Load(truth.load.t, truth.load.wrench + noise), truth.poses)

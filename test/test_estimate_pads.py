@@ -26,12 +26,12 @@ def test_the_motion_gives_the_clearance_of_each_group_of_pads() -> None:
     assert held >= 6, "of 8, whose errors go together"
 
 
-#: Wear of the pads in m towards the end of a life under the paper's load.
+#: Wear of the pads in m near the end of a life under the paper's load.
 UNEVEN = np.array([2.8, 3.3, 4.5, 2.3, 2.2, 2.2, 3.2, 1.3]) * 1e-3
 
 
 def worn_askew(depth: np.ndarray, seed: int) -> tuple[Estimate, dict[str, float]]:
-    """Return the estimate of a machine whose pads are worn unevenly, and the true clearance of each group."""
+    """Return the estimate of a machine with unevenly worn pads, and the true clearance of each group."""
     nominal = preset("paper")
     t = np.arange(0.0, 5.0 * np.pi, 0.01)
     wrench = compile_loads(nominal.loads).at(t)
@@ -46,26 +46,26 @@ def worn_askew(depth: np.ndarray, seed: int) -> tuple[Estimate, dict[str, float]
 
 
 def test_walls_worn_askew_are_estimated_and_the_model_is_not_suspect() -> None:
-    """Pads as uneven as near the end of life, where a fit with even pads fails."""
+    """The pads are as uneven as near the end of a life, where a fit with even pads fails."""
     result, true = worn_askew(UNEVEN, 1)
     assert (result.model, result.horizontal_state) == ("ok", State.ESTIMATED), result.reasons
     assert result.horizontal.mean == pytest.approx(0.5 * (true["horizontal_top"] + true["horizontal_bottom"]), abs=3e-4)
     assert result.vertical.mean == pytest.approx(0.5 * (true["vertical_left"] + true["vertical_right"]), abs=3e-4)
     for name, (value, state) in result.groups.items():
         assert state is State.ESTIMATED and abs(value.mean - true[name]) < 1.5 * (value.p95 - value.p05)
-    # distinguished: the walls are askew by 2 mm
+    # walls askew by 2 mm are distinguished
     assert result.groups["horizontal_top"][0].p05 > result.groups["horizontal_bottom"][0].p95
 
 
 def test_walls_worn_less_askew_do_not_make_the_clearance_too_small() -> None:
-    """Here a fit with even pads passes all checks: it was 0.26 mm too small, with a deviation of 0.29 mm."""
+    """A fit with even pads passes all checks here, but it is 0.26 mm too small, with a deviation of 0.29 mm."""
     result, true = worn_askew(0.6 * UNEVEN, 2)
     off = result.vertical.mean - 0.5 * (true["vertical_left"] + true["vertical_right"])
     assert abs(off) < 1.5e-4 and result.vertical.deviation < 2e-4
 
 
 def test_pads_that_are_not_touched_leave_a_clearance_between_askew_walls_open() -> None:
-    """The lower left pad is never reached: neither the distance of the lower pads nor the mean of all is determined."""
+    """The lower left pad is never touched, so neither the lower nor the mean horizontal clearance is determined."""
     truth, _ = known()[0]
     depth = tuple(1e-3 * value for value in (3.0, 0.0, 0.0, 2.0, 0.0, 4.0, 1.0, 0.0))
     scene = replace(
@@ -79,7 +79,7 @@ def test_pads_that_are_not_touched_leave_a_clearance_between_askew_walls_open() 
     noise = np.random.default_rng(1).standard_normal(run.q.shape) * [5e-4, 5e-4, 2e-3]
     result = estimate(truth.nominal, truth.load, Poses.of(run.t, run.q + noise)[0])
     assert run.statistics["bottom_left_left"]["time_in_contact"] == 0.0
-    # it was 1.1 mm too large, under a deviation of 0.03 mm
+    # an overconfident fit would be 1.1 mm off, with a deviation of 0.03 mm
     assert abs(result.horizontal.mean - 0.0354) < 3.0 * result.horizontal.deviation
     assert abs(result.vertical.mean - 0.0205) < 3.0 * result.vertical.deviation < 4e-4
     assert result.groups["horizontal_bottom"][1] is State.NOT_OBSERVABLE

@@ -1,4 +1,4 @@
-"""A machine of another size is estimated in the paper's units, to the same bits."""
+"""A machine of another size is estimated in units of the paper's size, with the same bits."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from plow_twin.estimate.similar import Units
 
 def test_a_machine_of_another_size_is_estimated_as_one_of_the_paper_s_size() -> None:
     truth, result = known()[0]
-    desk = Units(8.0, 1024.0, 4.0)  # an eighth as large, a thousandth as heavy, four times as fast
+    desk = Units(8.0, 1024.0, 4.0)  # a machine an eighth as large, a thousandth as heavy, four times as fast
     scene = desk.scene(truth.nominal)
     found = estimate(scene, desk.load(truth.load), desk.poses(truth.poses))
     assert found.t_end == result.t_end / 4.0 and found.bias_x is not None and found.delay is not None
-    # in units that are powers of two each number keeps its bits
+    # a conversion to units that are powers of two keeps each number's bits
     back = desk.in_si(found, truth.nominal)
     assert back == replace(result, lost=back.lost) and found.horizontal.mean == result.horizontal.mean / 8.0
     assert back.motion is not None and result.motion is not None
@@ -38,7 +38,7 @@ def test_a_machine_of_another_size_is_estimated_as_one_of_the_paper_s_size() -> 
 def test_a_scene_in_other_units_moves_alike(friction: Friction) -> None:
     thrown = Initial((1e-3, 0.0, 1e-3), (0.4, 0.3, 0.5))
     units, scene = Units(8.0, 1024.0, 4.0), replace(preset("bench_kv"), friction=friction, initial=thrown)
-    # with a load that moves nothing, and the balance, the kernels of other tests are used again
+    # a load that moves nothing, and the energy balance, let other tests' kernels be used again
     nothing, balance = (Harmonic("nothing to speak of", (1e-9, 0.0), 2.0),), friction.stick_stiffness_n_m is not None
     run, other = (
         simulate(replace(one, loads=nothing), span, span / 40.0, 1e-9, energy_balance=balance)

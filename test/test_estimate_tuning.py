@@ -1,4 +1,4 @@
-"""The numbers of the estimator: each is chosen in one documented table, or its comment says where it comes from."""
+"""The numbers of the estimator: each number is in the documented table, or a comment states its origin."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from scenes import ROOT
 from plow_twin.estimate import tuning
 
 FOLDER = ROOT / "plow_twin" / "estimate"
-#: Permitted reasons for a number outside the table.
+#: Permitted origins of a number outside the table.
 ORIGIN = re.compile(r"\b(Definition|Derived|Bound|Guard|Step|Prior): ")
 
 
 def unexplained(source: str) -> list[str]:
-    """Return the numeric constants of a module whose comment does not say where they come from.
+    """Return the numeric constants of a module whose comments do not state their origin.
 
-    A comment holds for the assignments that follow it without another comment or an empty line.
+    A comment applies to the assignments after it, up to another comment or an empty line.
     """
     lines, found, explained_until = source.split("\n"), [], -1
     for node in ast.parse(source).body:

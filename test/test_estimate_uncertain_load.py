@@ -1,4 +1,4 @@
-"""Rough clearances where the load does not explain the motion, or where no angle was measured."""
+"""Rough clearances if the load does not explain the motion, or if no angle was measured."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_without_an_angle_the_range_of_the_head_gives_a_rough_clearance_whose_in
 
 
 def test_a_quick_load_is_no_reason_to_look_at_the_poses_in_its_own_time() -> None:
-    """Chatter of 8 Hz made poses at 100 Hz too sparse in units in which its period was the paper's."""
+    """In units that give chatter of 8 Hz the paper's period, poses at 100 Hz would be too sparse."""
     truth = mismatched(replace(KINDS["chatter"], periods=6.0), 80001)
     result = estimate(truth.nominal, truth.load, truth.poses)
     assert result.horizontal_state is State.ROUGH and _holds(result, truth.clearance)

@@ -1,4 +1,4 @@
-"""Priors and deviations of the unknowns: stated in the scene, by its marks, or defaults."""
+"""Prior deviations of the unknowns: stated in the scene, given by marks, or defaults."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def test_the_prior_is_the_scene_s_or_that_of_the_mark() -> None:
         "contact.damping": Provenance(Mark.ASSUMED, "", 0.2 * (scene.contact.damping or 0.0)),
     }
     stated = Unknowns.stated(replace(scene, marks=marks), load, poses).deviations()
-    # 10 % of the stiffness is 10 % of the penetration; 0.1 mm of it counts as zero
+    # 10 % of the stiffness are 10 % of the penetration; a penetration of 0.1 mm is treated as zero
     np.testing.assert_allclose(stated[:4], [2e-3, 2e-3, 0.1, 0.2], rtol=0.02)
-    # the same in the units of a machine of another size
+    # the deviations are the same in the units of a machine of another size
     units = Units(0.5, 2.0, 0.25)
     other = units.scene(replace(scene, marks=marks))
     far = Unknowns.stated(other, units.load(load), units.poses(poses)).deviations()

@@ -1,7 +1,7 @@
-"""Pinned motions: bits and counts of steps, evaluations and events change only on purpose.
+"""Pinned motions: their bits, and their numbers of steps, evaluations and events, change only on purpose.
 
-`pytest test/test_golden.py --golden-update` pins them again for the present build. A build without its own file must
-reach the counts of another build: rounding moves single events, not the work.
+`pytest test/test_golden.py --golden-update` pins them again for the present build. A build without a file of its own
+must reach another build's counts, because rounding moves single events but not the work.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ PROGRAM = Path(__file__).resolve().parent / "golden.py"
 #: Largest change of a count by rounding on another build.
 OTHER_BUILD = 0.02
 
-# all kernels are compiled first
+# compiling all kernels takes long
 pytestmark = pytest.mark.timeout(600)
 
 
 @pytest.fixture(scope="module")
 def found() -> dict[str, Any]:
-    """Compute the figures; processes that compile the kernels and that load them must agree."""
+    """Compute the figures; a process that compiles the kernels and a process that loads them must agree."""
     runs: list[dict[str, Any]] = []
     for _ in range(2):
         done = subprocess.run([sys.executable, PROGRAM], capture_output=True, text=True, check=False)
@@ -38,7 +38,7 @@ def found() -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def pinned() -> dict[str, Any]:
-    """Return the figures of this build, or of another build without digests."""
+    """Return the figures of this build or, without digests, those of another build."""
     own = FOLDER / f"{build_name()}.json"
     path = own if own.exists() else sorted(FOLDER.glob("*.json"))[0]
     figures: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))

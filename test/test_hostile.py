@@ -1,4 +1,4 @@
-"""Untrusted files: lines that expand to millions of values, endless nesting, names that act on a terminal."""
+"""Untrusted files: lines that expand to millions of values, endless nesting, and names with commands for a terminal."""
 
 from __future__ import annotations
 
@@ -35,19 +35,19 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def nested(opening: str, levels: int) -> str:
-    """Open collections without closing one."""
+    """Return collections that are opened and never closed."""
     return opening * levels
 
 
 def laughs(levels: int, times: int = 9) -> str:
-    """Return lists of aliases to lists of aliases: `times` to the power of `levels` values."""
+    """Return nested lists of aliases that stand for `times` to the power of `levels` values."""
     lines = ["a0: &a0 [x]"]
     lines += [f"a{level}: &a{level} [{', '.join([f'*a{level - 1}'] * times)}]" for level in range(1, levels + 1)]
     return "\n".join(lines)
 
 
 def merges(levels: int, times: int = 9) -> str:
-    """Return mappings that merge mappings that merge mappings."""
+    """Return mappings that merge other merging mappings, level by level."""
     lines = ["a0: &a0 {k: 1}"]
     lines += [
         f"a{level}: &a{level} {{<<: [{', '.join([f'*a{level - 1}'] * times)}]}}" for level in range(1, levels + 1)
@@ -56,7 +56,7 @@ def merges(levels: int, times: int = 9) -> str:
 
 
 def keys(count: int) -> str:
-    """Return a mapping of so many keys."""
+    """Return a mapping with `count` keys."""
     return "\n".join(f"key{number:07d}: 1" for number in range(count))
 
 
@@ -78,7 +78,7 @@ FILES: dict[str, Callable[[], str]] = {
 }
 #: Readable files without the expected content.
 WITHIN = {"unknown keys", "a scalar of 20 MB"}
-#: Each reader of YAML that a user names: arguments of `plow-twin`.
+#: Every reader of YAML files given by a user, as arguments of `plow-twin`.
 READERS = {
     "scene": ["simulate", "FILE", "--t-end", "1"],
     "mapping": ["live", "load.csv", "--map", "FILE"],
@@ -88,7 +88,7 @@ READERS = {
 
 @pytest.mark.parametrize("reader", READERS)
 def test_files_that_stand_for_too_much_are_refused_in_a_line(reader: str, tmp_path: Path) -> None:
-    """Each ends with exit code 2 and a line; all of them take 60 s of processor time at most, and no signal."""
+    """Each ends with exit code 2 and one line, without a signal; all of them take at most 60 s of processor time."""
     for name, make in FILES.items():
         (tmp_path / f"{name}.yaml").write_text(make())
     (tmp_path / "load.csv").write_text("t,fx,fy,m\n0,0,0,0\n1,0,0,0\n")
@@ -168,7 +168,7 @@ def test_thousands_of_unknown_keys_are_listed_up_to_a_number(tmp_path: Path) -> 
 
 
 MAP = "excitation: {topic: /load, fields: {fx: x, fy: x, m: x}, stamp: log}"
-#: Commands that read recordings, by the ending of their files.
+#: Commands that read recordings, by the suffix of their files.
 COMMANDS = {
     "run": [["info", "FILE"], ["replay", "FILE", "-q"], ["export", "FILE", "-q", "--to", "npz", "--out", "OUT.npz"]],
     "foreign": [["analyse", "FILE", "--scene", "paper", "--map", "map.yaml", "--json"]],
@@ -179,12 +179,12 @@ COMMANDS = {
     ],
 }
 FOREIGN = {"array", "texts", "nothing", "itself", "tree", "chain", "empty_lines", "topics"}
-#: Files above a bound, and files of which the rest is used.
+#: Files above a limit, and files of which the usable rest is used.
 ABOVE = {"channels", "many_chunks", "topics", "columns", "line", "row", "unpacked"}
 WITH_LOSS = {"large_chunks", "lying_zstd", "lying_lz4", "lying_length"}
-#: Most memory of a command [MB]: compiled code and libraries take 200.
+#: Largest memory of a command [MB], of which compiled code and libraries take 200.
 MOST_MB = 700
-#: Runs each command in a process of its own, which may take 20 s of processor time and 6 GB of addresses.
+#: Program that runs each command in its own process, with at most 20 s of processor time and 6 GB of addresses.
 RUNNER = """
 import json, os, resource, sys
 from plow_twin.cli.app import run
@@ -213,7 +213,7 @@ for name, words in json.load(sys.stdin):
 
 @pytest.mark.parametrize("kind", COMMANDS)
 def test_absurd_recordings_end_with_one_line(kind: str, tmp_path: Path) -> None:
-    """No signal, no traceback, one line at most for an error, and bounded processor time and memory."""
+    """There is no signal, no traceback, at most one line for an error, and limited processor time and memory."""
     asked = []
     for file, make in MADE.items():
         name, _, ending = file.partition(".")
@@ -236,7 +236,7 @@ def test_absurd_recordings_end_with_one_line(kind: str, tmp_path: Path) -> None:
                     ],
                 )
             )
-    if kind == "run":  # compiling does not count in the processor time
+    if kind == "run":  # the processor time is measured without compiling
         (tmp_path / "plain.mcap").write_bytes(recorded())
         subprocess.run(
             [sys.executable, "-m", "plow_twin", "replay", "plain.mcap", "-q"],
@@ -255,7 +255,7 @@ def test_absurd_recordings_end_with_one_line(kind: str, tmp_path: Path) -> None:
     assert len(answers) == len(asked), done.stderr[-2000:]
     for name, words, code, text, memory_mb in answers:
         where = (name, words[0], code, memory_mb, text[-500:])
-        unread = name == "header_file" and words[0] != "replay"  # the scene is not needed
+        unread = name == "header_file" and words[0] != "replay"  # these commands need no scene
         assert code in ((3,) if name in WITH_LOSS else (2,) if name in ABOVE else (0,) if unread else (1, 2)), where
         assert memory_mb < MOST_MB and "Traceback" not in text, where
         assert code == 3 or len(text.strip().splitlines()) <= 2, where
@@ -284,7 +284,7 @@ def _on_a_terminal(*arguments: str, folder: Path) -> str:
     try:
         while data := os.read(ours, 1 << 16):
             written += data
-    except OSError:  # its end
+    except OSError:  # the terminal has ended
         pass
     os.close(ours)
     process.wait()

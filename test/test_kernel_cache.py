@@ -16,13 +16,13 @@ from plow_twin.kernel.compiler import kernel, share
 from plow_twin.model import contact
 
 ROOT = Path(__file__).resolve().parent.parent
-#: Number of machine-code functions of a kernel that only `settle_modes` calls.
+#: Program that prints the number of machine-code functions of a kernel that only `settle_modes` calls.
 LINKED = (
     "from plow_twin import load_scene; from plow_twin.solve import compiled_scene, modes; "
     "compiled_scene.compile_scene(load_scene('paper'), 1e-6).initial_state(); "
     "(overload,) = modes.mode_inside.overloads.values(); print(len(list(overload.library.get_defined_functions())))"
 )
-#: A kernel that Python calls holds its own copies of the kernels that it calls.
+#: Program that prints whether a kernel called by Python contains its own copies of the kernels that it calls.
 ENTRY = (
     "from plow_twin import load_scene; from plow_twin.solve import compiled_scene, modes; "
     "compiled_scene.compile_scene(load_scene('paper'), 1e-6).initial_state(); "
@@ -43,7 +43,7 @@ def run(cache: Path, program: str = MISSES) -> str:
 
 
 def test_an_index_of_other_sources_is_replaced_unread(tmp_path: Path) -> None:
-    """After an upgrade an index may name removed types, which would raise an error when read."""
+    """After an upgrade, an index may name removed types, which would raise an error when it is read."""
     assert run(tmp_path) == "1" and run(tmp_path) == "0"
     (index,) = tmp_path.rglob("contact.power_term*.nbi")
     index.write_bytes(pickle.dumps("another version") + b"cannot be read")
@@ -57,7 +57,7 @@ def cache_file(folder: Path, sources: str) -> Any:
 
 
 def test_processes_that_save_at_once_do_not_exchange_code(tmp_path: Path) -> None:
-    """The second process has read the index before, and saves between the two writes of the first."""
+    """The second process reads the index first, and saves between the two writes of the first process."""
     first, second = (cache_file(tmp_path, "sources") for _ in range(2))
     write, opened = first._open_for_write, []
 
@@ -85,17 +85,17 @@ def test_code_of_other_sources_is_removed(tmp_path: Path) -> None:
 
 
 def test_a_kernel_that_only_kernels_call_has_no_machine_code(tmp_path: Path) -> None:
-    """Compiled again in each caller, it took a third of the time."""
+    """Compiling it in addition to each caller would take a third of the time."""
     assert run(tmp_path, LINKED) == "0"
 
 
 def test_an_entry_holds_its_own_copy_of_every_kernel_it_calls(tmp_path: Path) -> None:
-    """Otherwise bits would depend on which entry a process loads first, and on whether it compiles or loads them."""
+    """Otherwise bits would depend on which entry a process loads first, and on whether it compiles or loads entries."""
     assert run(tmp_path, ENTRY) == "True False"
 
 
 def test_a_call_from_python_of_a_kernel_without_machine_code_is_an_error() -> None:
-    assert normal_force(1e-3, 0.0, 1e7, 1.0, 0.0, 0.0, 0.0) == 1e4  # compiles it for its caller
+    assert normal_force(1e-3, 0.0, 1e7, 1.0, 0.0, 0.0, 0.0) == 1e4  # this call compiles the kernel for its caller
     with pytest.raises(TypeError, match="normal_force is for kernels to call"):
         contact.normal_force(1e-3, 0.0, 1e7, 1.0, 0.0, 0.0, 0.0)
 

@@ -1,6 +1,6 @@
-"""Restitution of the contact laws: the identity of the exact law, the published tables, and the page made from them.
+"""Restitution of the contact laws: the identity of the exact law, published tables, and the page made from the results.
 
-The free impact of a point on a wall; cases 1 and 2 of docs/known_answers.md.
+A free point hits a wall; cases 1 and 2 of docs/known_answers.md.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from scipy.integrate import solve_ivp
 from plow_twin import Contact
 from plow_twin.model.contact_laws import LAWS, exact_damping_number
 
-# delivered restitution at nominal .1 .. .9, .95; published tables of the laws
+# nominal restitutions, and the restitutions that the laws deliver for them by published tables
 ASKED = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
 DELIVERED = {
     "lankarani_nikravesh": (0.6653, 0.6723, 0.6842, 0.7016, 0.7252, 0.7561, 0.7960, 0.8471, 0.9132, 0.9535),
@@ -42,7 +42,7 @@ restitution = load_benchmark("restitution")
 @pytest.mark.parametrize("n", [1.0, 1.5, 2.2, 3.0])
 @pytest.mark.parametrize("e", [0.05, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99])
 def test_exact_restitution_is_returned_for_any_stiffness_exponent_and_mass(n: float, e: float) -> None:
-    """D (1 + e) = ln((1 + D) / (1 - D e)) holds for every exponent, stiffness, mass and speed."""
+    """The identity D (1 + e) = ln((1 + D) / (1 - D e)) is valid for every exponent, stiffness, mass and speed."""
     for stiffness, mass, speed in ((1e7, 2.0, 1.0), (1e9, 300.0, 0.2)):
         stiff = stiffness * 1e3 ** (n - 1.0)
         contact = Contact("exact_restitution", stiff, n, restitution=e, impact_speed_floor_m_s=restitution.FLOOR)
@@ -54,7 +54,7 @@ def test_exact_restitution_is_returned_for_any_stiffness_exponent_and_mass(n: fl
 )
 @pytest.mark.parametrize("n", [1.0, 2.2])
 def test_a_constant_factor_of_the_published_d_returns_its_restitution(e: float, d: float, n: float) -> None:
-    """D = lambda v0, given as plain damping, so that the law does not use the identity."""
+    """D = lambda v0 is given as plain damping, so that the law does not use the identity."""
     speed = 0.4
     contact = Contact("hunt_crossley", 1e9, n, damping=d / speed)
     # the table gives six decimals of D; de/dD is at most 0.35 there
@@ -82,9 +82,9 @@ def test_kelvin_voigt_without_pull(z: float, e: float) -> None:
 
 
 def test_kelvin_voigt_is_the_closed_form() -> None:
-    """exp(-z / r (pi - atan(2 z r / (1 - 2 z^2)))), r = sqrt(1 - z^2), for z < 1 / sqrt(2).
+    """The restitution is exp(-z / r (pi - atan(2 z r / (1 - 2 z^2)))) with r = sqrt(1 - z^2), for z < 1 / sqrt(2).
 
-    Schwager and Poeschel, Granular Matter 9 (2007) 465; it follows from F = 0 on the damped sine.
+    The formula follows from F = 0 on the damped sine (Schwager and Poeschel, Granular Matter 9 (2007) 465).
     """
     for z in (0.02, 0.15, 0.4, 0.6):
         root = math.sqrt(1.0 - z * z)
@@ -94,12 +94,15 @@ def test_kelvin_voigt_is_the_closed_form() -> None:
 
 @pytest.mark.parametrize(("z", "ramp"), [(0.1, 0.1), (0.3, 1.0), (2.0, 0.3)])
 def test_ramped_damping_is_that_of_another_integrator(z: float, ramp: float) -> None:
-    """u'' = -max(0, u + 2 z s u'), s the ramp: the law scaled by depth v sqrt(m/K) and time sqrt(m/K), with SciPy."""
+    """SciPy integrates u'' = -max(0, u + 2 z s u') with the ramp s.
+
+    This is the law with depth in units of v sqrt(m/K) and time in units of sqrt(m/K).
+    """
 
     def rates(_t: float, state: list[float]) -> tuple[float, float]:
         u, rate = state
         share = min(max(u / ramp, 0.0), 1.0)
-        # clipped on the way out, it pushes again where the ramp has let the damping go
+        # a contact that is clipped on the way out pushes again when the ramp has reduced the damping
         return rate, -max(0.0, u + 2.0 * z * share * share * (3.0 - 2.0 * share) * rate)
 
     def parted(_t: float, state: list[float]) -> float:
@@ -124,7 +127,7 @@ def test_the_page_shows_the_results_of_the_solver() -> None:
     tables = (restitution.page_table, restitution.laws_table, restitution.ratio_table, restitution.ramp_table)
     for line in (line for table in tables for line in table(rows)):
         assert f"{line}\n" in page, line
-    # damped, as in the tests above: without damping each law returns 1, by other kernels
+    # the laws are damped as in the tests above; without damping each law returns 1 and needs other kernels
     for law in ("zhiying_qishao", "kelvin_voigt"):
         stored = {row.asked: row.delivered for row in rows if row.law == law}
         for again in restitution.measure(law, list(stored)[5:-1:10]):

@@ -1,8 +1,8 @@
 """The slider with clearance in its guide of Flores, Leine and Glocker, Multibody Syst. Dyn. 23 (2010) 165.
 
-Same topology as ours, four corners in a guide. The paper's gap functions are compared with our penetrations; its
-mechanism with rigid impacts, integrated here with located events, with our solver. Siconos' own data:
-docs/known_answers.md.
+It has the same topology, four corners in a guide. The paper's gap functions are compared with our penetrations. Its
+mechanism with rigid impacts, integrated here with located events, is compared with our solver. For Siconos' own data
+see docs/known_answers.md.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ siconos = load_benchmark("siconos")
 
 
 def penetrations(y: float, theta: float) -> np.ndarray:
-    """Our penetrations with the head as the guide, seen from the slider: the pose is the inverse of the slider's."""
+    """Return our penetrations with the head as the guide, whose pose is the inverse of the slider's."""
     scene = replace(
         preset("paper"), frame=Frame(2.0 * siconos.HALF_LENGTH, 2.0 * siconos.HALF_HEIGHT),
         clearance=Clearance(1.0, 2.0 * siconos.GAP), initial=Initial((-np.sin(theta) * y, -np.cos(theta) * y, -theta)),
@@ -30,7 +30,7 @@ def penetrations(y: float, theta: float) -> np.ndarray:
 
 
 def test_gap_functions_are_our_penetrations() -> None:
-    """g1, g2: the upper corners left and right at the upper wall; g3, g4: the lower ones at the lower wall."""
+    """g1 and g2 belong to the upper left and right corners at the upper wall, g3 and g4 to the lower ones below."""
     random = np.random.default_rng(2010)
     for y, theta in zip(random.uniform(-2e-3, 2e-3, 200), random.uniform(-0.05, 0.05, 200), strict=True):
         depth = penetrations(y, theta)
@@ -38,7 +38,7 @@ def test_gap_functions_are_our_penetrations() -> None:
 
 
 def test_touches_are_those_of_the_rigid_mechanism() -> None:
-    """Times of the first five touches, and thus the speeds after them, are late by the contact's duration, K^-1/2."""
+    """The first five touches, and thus the speeds after them, are late by the contact's duration, which is as K^-1/2."""
     t, states, impacts = siconos.rigid_motion(0.009, 5)
     assert len(impacts) >= 5 and impacts[0] == pytest.approx(2.69e-3, abs=2e-5)
     late = []
@@ -47,7 +47,7 @@ def test_touches_are_those_of_the_rigid_mechanism() -> None:
         events = ours.events[ours.events["mode_from"] == 0]
         touches = events["time"][events["pair"] == events["pair"][0]]
         late.append(touches[:5] - impacts[:5])
-    # the load is joined by straight lines over 10 us: 2e-8 s
+    # the load is linear between samples 10 us apart, which delays a touch by 2e-8 s
     assert late[2] == pytest.approx(0.0, abs=7e-6) and late[2][0] == pytest.approx(0.0, abs=3e-8)
     for softer, stiffer in itertools.pairwise(late):
         assert softer[1:] / stiffer[1:] == pytest.approx(np.sqrt(10.0), rel=0.02)

@@ -1,4 +1,4 @@
-"""The live twin without ROS: files, standard input and MQTT feed the same session, counters and recording."""
+"""The live twin without ROS: files, standard input and MQTT supply the same session, counters and recording."""
 
 from __future__ import annotations
 
@@ -75,12 +75,12 @@ def _csv(path: Path, count: int, more: str = "", times: float = 1.0) -> Path:
     return path
 
 
-#: Texts of damaged numbers.
+#: Damaged numbers as texts.
 STRAY = ("5000000", "1e30", "0", "-7", "nan")
 
 
 def _run(path: Path, mapping: Path | None = None, reports: list[Part] | None = None, **values: Any) -> dict[str, Part]:
-    """Feed a twin from a file and return its diagnostics; reports of its state in between go to `reports`."""
+    """Feed a twin from a file and return its diagnostics; its reports meanwhile are added to `reports`."""
     settings = parameters.settings(values)
     said: list[str] = []
 
@@ -112,7 +112,7 @@ def test_a_file_is_fed_recorded_and_replayed_and_every_row_is_counted(
     report = replay(tmp_path / "run")
     assert (report.samples, report.exit_code, report.first_divergence) == (1000, 0, None)
     assert report.compared["contact_forces"] == 1000
-    # the file agrees with the counters of unused messages, and has their content
+    # the file agrees with the counters of unused messages, and contains these messages
     told = {key.removeprefix("dropped_"): int(count) for key, count in dropped.items()}
     assert report.inputs == examine(tmp_path / "run").inputs == {"excitation": {"used": 1000, **told}}
     unused = {found["reason"]: found for found in unused_messages(tmp_path / "run")}
@@ -130,7 +130,7 @@ def test_a_file_is_fed_recorded_and_replayed_and_every_row_is_counted(
 def test_a_time_that_stands_alone_is_no_clock_and_no_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     date = "2026-01-01T00:00:{:06.3f}".format
     rows = [f"{date(index * 1e-3)},1,2,3\n" for index in range(300)]
-    rows[150:150] = ["2080-01-01,1,2,3\n"]  # a stamp that does not continue
+    rows[150:150] = ["2080-01-01,1,2,3\n"]  # a stamp that does not continue the stamps before
     rows[200:200] = ["9999-12-31,1,2,3\n", "9999-12-31,1,2,3\n"]
     path = tmp_path / "load.csv"
     path.write_text("time,fx,fy,m\n" + "".join(rows))
@@ -190,7 +190,7 @@ def test_bounded_work_is_reported_with_its_error_and_repeated_by_the_journal(tmp
     given = {"scene": "bench_kv", "max_evaluations": 16, "record_path": str(tmp_path / "run")}
     reports: list[Part] = []
     parts = _run(_csv(tmp_path / "load.csv", 1500), reports=reports, **given)
-    # each report covers the time since the report before it
+    # each report covers the time since the previous report
     largest = max(float(values["error_estimate_m"]) for _, _, values in (*reports, parts["state"]))
     assert int(parts["state"][2]["coarse_advances"]) > 0 and 0.0 < largest < 1e-3
     report = replay(tmp_path / "run")
@@ -221,7 +221,7 @@ def test_the_alarms_of_a_run_are_computed_again_and_compared(tmp_path: Path) -> 
         return False
 
     assert front.run(acknowledge) == [] and acknowledged
-    # beside the recorded changes of a level, the alarms are reported once a second
+    # alarms are reported once a second, in addition to the recorded changes of a level
     alarms = [part[2] for name, part in said if name == "alarms"]
     assert any(values["residual_latched"] == "warn" for values in alarms)
     recorded = [
@@ -239,7 +239,7 @@ def test_the_alarms_of_a_run_are_computed_again_and_compared(tmp_path: Path) -> 
     file = next((tmp_path / "run").glob("*.mcap"))
     report = replay(rewrite(file, tmp_path / "other.mcap", metadata=other_thresholds))
     assert report.exit_code == 1 and report.first_divergence is not None
-    # the alarm of the residual has ended: it was raised, and released
+    # the alarm of the residual was raised and then released
     found = report.first_divergence
     assert (report.divergences, found.topic, found.recorded, found.computed) == (2, "alarms", "a message", "none")
 
@@ -250,7 +250,7 @@ def test_the_alarms_of_a_run_are_computed_again_and_compared(tmp_path: Path) -> 
     assert report.first_divergence is not None
     found = report.first_divergence
     assert (found.topic, found.recorded, found.computed) == ("alarms", "none", "warn") and "_l" in found.field
-    # where outputs are missing, alarms are not compared
+    # without outputs, alarms are not compared
     few = given | {"record_path": str(tmp_path / "few"), "record_outputs": "none"}
     _run(path, mapping, **few)
     report = replay(tmp_path / "few")
@@ -270,12 +270,13 @@ def test_the_senders_own_numbers_show_loss_repetition_and_a_new_start(tmp_path: 
     lines = [
         json.dumps({"time": 1000 + index, "load": {"f": [index, 2, 3]}, "n": n}) for index, n in enumerate(numbers)
     ]
-    # messages of others between them have no number, and take none from the next message; nor do two damaged ones
+    # messages of other senders in between have no number and take none from the next message, nor do two damaged
+    # messages
     lines[150], lines[151] = '{"n": 152, "load"', '{"n"'
     for place, other in ((60, '{"hello": 1}'), (40, "garbage"), (20, '{"n": "x", "status": 3}')):
         lines.insert(place, other)
     path = tmp_path / "plough.csv"
-    # an unreadable message before the first number does not count as number 1
+    # an unreadable message before the first number is not taken for number 1
     path.write_text("\n".join(["{}", "nothing", *lines, '{"n": 60, "load"']) + "\n", encoding="utf-8")
     mapping = tmp_path / "map.yaml"
     mapping.write_text(
@@ -283,7 +284,7 @@ def test_the_senders_own_numbers_show_loss_repetition_and_a_new_start(tmp_path: 
         "  stamp: time, stamp_unit: ms, unit: {fx: kN}, limits: {fx: [-1, 1e6]}}\n"
     )
     values = _run(path, mapping, limit_force=1e9, limit_force_rate=1e12)["input"][2]
-    # 10 between 99 and 110, 2 between 49 and 52
+    # 10 numbers are missing between 99 and 110, and 2 between 49 and 52
     assert (values["samples_lost"], values["dropped_duplicate"], values["dropped_malformed"]) == ("12", "1", "8")
     assert int(values["samples_used"]) == len(numbers) - 3
 
@@ -328,9 +329,9 @@ def test_a_mapping_takes_units_offsets_clocks_and_names_its_faults(tmp_path: Pat
     for wrong in (True, [1], {}, None, 10**400):
         assert read(pose + "stamp: at}", a=wrong, b={"c": 4}, turn=1, at=1) is None
     assert time_ns(1_767_323_045_123_456_789, "ns") == 1_767_323_045_123_456_789
-    assert time_ns(0.5) == 1_500_000_000  # times from an arbitrary start; a stamp of 0 would count as missing
+    assert time_ns(0.5) == 1_500_000_000  # times with an arbitrary start; a stamp of 0 would be missing
     assert time_ns("yesterday") is None and time_ns(float("inf")) is None and time_ns(1e300) is None
-    # the empty date of many databases, and a date that no stamp can hold
+    # the empty date of many databases, and dates that no stamp can represent
     assert time_ns("9999-12-31") is None and time_ns("2300-01-01T00:00:00") is None and time_ns("0001-01-01") is None
     assert time_ns(10**400) is None and time_ns("20260102") == (20_260_102 + 1) * 10**9
     for text, said in (
@@ -355,7 +356,7 @@ def test_a_mapping_takes_units_offsets_clocks_and_names_its_faults(tmp_path: Pat
         with pytest.raises(RecordingError, match="head_pose") as caught:
             read_map(path, None)
         assert said in str(caught.value)
-    # an absent time that was requested by name is not replaced by the time of receipt
+    # a time that was requested by name but is absent is not replaced by the time of receipt
     assert read("head_pose: {topic: p, stamp: at}", x=1, y=2, theta=3) is None
     for key, name in (("stamp", "at"), ("sequence", "n")):
         path.write_text(f"head_pose: {{topic: p, {key}: {name}}}")
@@ -371,7 +372,7 @@ def test_a_mapping_takes_units_offsets_clocks_and_names_its_faults(tmp_path: Pat
 
 
 def test_files_wait_for_a_recorder_that_is_slow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Input without a clock comes in batches, each of which fills a quarter of this queue."""
+    """Input without a clock comes in batches, and each batch fills a quarter of this queue."""
     monkeypatch.setattr("plow_twin.live.recording._QUEUE_SIZE", 2400)
     monkeypatch.setattr("plow_twin.record.recorder._POLL_S", 0.3)
     path = _csv(tmp_path / "load.csv", 2000)
@@ -409,7 +410,7 @@ def test_a_reader_of_the_lines_that_hangs_stops_nothing_and_what_it_does_not_get
         outlet.put(str(number))
     assert lost_at == [1] and 99 <= outlet.lost <= 100
     hangs.set()
-    # the newest lines are there, in order, behind the line that was being written
+    # the newest lines follow in order after the line that was being written
     assert outlet.close() and len(taken) + outlet.lost == MOST_WAITING + 100
     assert taken[-MOST_WAITING:] == list(map(str, range(100, MOST_WAITING + 100)))
 
@@ -420,10 +421,10 @@ def test_a_live_twin_whose_standard_output_nobody_reads_goes_on_and_ends_when_it
     with _live(str(path), "--follow", "--scene", "paper", *more) as live:
         pipe = live.process.stdout
         assert pipe is not None
-        fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, 4096)  # less than the lines of a second
+        fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, 4096)  # smaller than the lines of a second
         live.until_count("samples_used", 100)
         give_up = time.monotonic() + START_S
-        for count in range(1000, 4000, 1000):  # nobody reads from here on
+        for count in range(1000, 4000, 1000):  # from here on nobody reads
             with path.open("a") as file:
                 file.writelines(",".join(map(repr, _row(index))) + "\n" for index in range(count - 900, count + 100))
             while _metric(port, "plow_twin_input_samples_used") < count + 100:
@@ -437,7 +438,7 @@ def test_a_live_twin_whose_standard_output_nobody_reads_goes_on_and_ends_when_it
 
 
 def _metric(port: int, name: str) -> float:
-    """Return a number of the page for Prometheus."""
+    """Return a number from the page for Prometheus."""
     with urlopen(f"http://127.0.0.1:{port}/metrics", timeout=10) as page:
         lines = [line.split() for line in page.read().decode().splitlines() if line.startswith(f"{name} ")]
     return float(lines[0][1]) if lines else 0.0
@@ -456,7 +457,7 @@ class Live:
         self.alarms: list[dict[str, Any]] = []
 
     def until(self, reached: Callable[[dict[str, dict[str, Any]]], bool], what: str) -> dict[str, str]:
-        """Read its output until a condition holds; return the values of its input part."""
+        """Read the output until a condition is true; return the values of its part `input`."""
         give_up = time.monotonic() + START_S
         assert self.process.stdout is not None
         while not ("input" in self.heard and reached(self.heard)):
@@ -491,12 +492,12 @@ def test_a_file_is_followed_while_it_grows_and_when_it_is_replaced(tmp_path: Pat
     path, run = tmp_path / "load.csv", tmp_path / "run"
     _csv(path, 100)
     arguments = (str(path), "--follow", "--record", str(run), "--set", "excitation_timeout=3600")
-    # not that of a `nohup` around the tests
+    # not the handler of a `nohup` around the tests
     with _live(*arguments, preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL)) as live:
         live.until_count("samples_used", 100)
         text = "".join(",".join(map(repr, _row(index))) + "\n" for index in range(100, 200))
         with path.open("a") as stream:
-            stream.write(text[:1234])  # in the middle of a number
+            stream.write(text[:1234])  # ends in the middle of a number
             stream.flush()
             live.until_count("samples_used", 105)
             stream.write(text[1234:])
@@ -513,17 +514,17 @@ def test_a_file_is_followed_while_it_grows_and_when_it_is_replaced(tmp_path: Pat
 def test_an_alarm_is_reported_once_with_value_pad_threshold_and_time_and_acknowledged_without_ros(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    # the address of a socket is short, unlike a folder of tests
+    # a socket needs a short path, and the folders of tests have long paths
     path, control = _csv(tmp_path / "load.csv", 5000), Path(tempfile.mkdtemp(dir="/tmp")) / "twin.socket"
     control.touch()
-    assert run_cli(["live", str(path), "--control", str(control)]) == 1  # the existing file is not a socket of a twin
+    assert run_cli(["live", str(path), "--control", str(control)]) == 1  # the existing file is not a twin's socket
     assert "cannot be a socket" in capsys.readouterr().err
     control.unlink()
     thresholds = ("--set", "alarm_force=[20e3,1e9]", "--set", "alarm_duration=0.002")
     arguments = (str(path), "--follow", "--control", str(control), "--set", "excitation_timeout=3600", *thresholds)
     with _live(*arguments, "--record", str(tmp_path / "run")) as live:
         live.until_count("samples_used", 5000)
-        (said,) = live.alarms  # in five seconds the force passes the threshold again and again
+        (said,) = live.alarms  # within five seconds the force passes the threshold repeatedly
         values = said["values"]
         assert values["force_raised"] > values["force_threshold"] == 20e3 and values["force_place"] in PAIR_NAMES
         assert said["stamp_ns"] >= values["force_stamp_ns"] > 1_000_000_000
@@ -541,7 +542,7 @@ def test_an_alarm_is_reported_once_with_value_pad_threshold_and_time_and_acknowl
             ("a\x1b[2Jb", "got 'a\\x1b[2Jb'"),
         ):
             assert run_cli(["call", str(control), "mark", text]) == 2 and got in capsys.readouterr().err
-            assert call(control, "mark", text) == (False, mark_problem(text))  # by any other program too
+            assert call(control, "mark", text) == (False, mark_problem(text))  # any other program can call it too
         for place, kind in ((path, "a file"), (tmp_path, "a folder"), (tmp_path / "none", "nothing there")):
             assert run_cli(["call", str(place), "mark", "x"]) == 1
             assert f"got {kind}, expected the socket that plow-twin live --control" in capsys.readouterr().err
@@ -565,18 +566,18 @@ def test_files_with_dates_are_waited_for_and_followed_from_one_to_the_next(
     mapping.write_text("excitation: {topic: load_*, unit: {fx: N}}\n")
     arguments = (str(tmp_path / "load_*.csv"), "--follow", "--map", str(mapping), "--set", "excitation_timeout=3600")
     with _live(*arguments) as live:
-        days[1].write_text("t,fx")  # half a header
+        days[1].write_text("t,fx")  # a header cut in the middle
         time.sleep(0.5)
         days[1].write_text("t,fx,fy,m\n" + text(0, 100))
         live.until_count("samples_used", 100)
         with days[1].open("a") as before:
             days[2].write_text("t,fx,fy,m\n" + text(150, 200))
             live.until_count("samples_used", 150)
-            before.write(text(100, 150))  # its writer released it late: these rows are late and worked in
+            before.write(text(100, 150))  # the writer released the file late, so these rows are late and are worked in
         values = live.until_count("samples_used", 200)
         assert (values["samples_in"], values["rolled_back"]) == ("200", "50")
         assert live.stop() == 0
-    # all files that end are read, in the order of the numbers in their names; a name with a date needs no other mapping
+    # all files that end are read in the order of the numbers in their names; names with a date need no other mapping
     days[0].write_text("t,fx,fy,m\n" + text(-30, 0))
     for source, count in ((arguments[0], 230), (str(days[0]), 30)):
         assert run_cli(["live", source, "--map", str(mapping), "--json"]) == 0
@@ -607,22 +608,22 @@ def test_nothing_of_a_followed_file_is_lost_unseen_when_it_is_cut_or_another_tak
         return [None if content is None else float(content.get("fx", math.nan)) for content in contents]
 
     assert read() == [10.0, 20.0]
-    path.write_text("4,40,0,0\n")  # cut, and its writer continues without a header; half a line was there
+    path.write_text("4,40,0,0\n")  # the file is cut within a line, and its writer continues without a header
     assert read() == [None, 40.0]
     path.rename(tmp_path / "load.csv.1")
     with (tmp_path / "load.csv.1").open("a") as stream:
-        stream.write("5,50,0,0\n")  # the writer has not heard of it yet
+        stream.write("5,50,0,0\n")  # the writer does not know that the file was cut
     assert read() == [50.0]
     path.write_text("m;fx;t;fy\n0;60;6;0\n")
     assert read() == [60.0]
-    path.write_text("0,7\n0,70,7,0\n")  # cut within a line: the second half does not count
+    path.write_text("0,7\n0,70,7,0\n")  # cut within a line, whose second half is not used
     assert read() == [None, 70.0]
-    path.write_text("t,fx,fy,m\n" + "8,80,0,0\n" * 3)  # written anew, and longer than it was
+    path.write_text("t,fx,fy,m\n" + "8,80,0,0\n" * 3)  # written anew, longer than before
     assert read() == [80.0] * 3
     path.unlink()
     assert read() == []
     path.write_text("a,b\n1,2\n")
-    assert repr(read()) == "[nan]"  # under another header there is no load: counted where it is read
+    assert repr(read()) == "[nan]"  # under another header there is no load; the reader counts these rows
     files.close()
 
 
@@ -646,13 +647,13 @@ def test_lines_on_standard_input_are_taken_and_silence_is_held(tmp_path: Path) -
 
 
 def test_a_closed_standard_input_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "stdin", None)  # as Python sees a closed stream
+    monkeypatch.setattr(sys, "stdin", None)  # Python's value for a closed stream
     with pytest.raises(BridgeError, match="closed standard input"):
         StandardInput()
 
 
 class Endless:
-    """Endless samples at 1 kHz, with poses and speeds in between; `look` is called before each batch."""
+    """Endless samples at 1 kHz with poses and speeds in between; `look` is called before each batch."""
 
     def __init__(self, look: Callable[[int], bool]) -> None:
         self.ends = self.finished = False
@@ -712,9 +713,9 @@ def test_nothing_lives_longer_than_the_time_remembered_but_the_index_of_the_reco
     finally:
         tracemalloc.stop()
     (_, _, _), (objects, size, before), (more, larger, after) = found
-    # of 8,000 samples and 25,000 messages; the memory of the last seconds varies by some hundred
+    # for 8,000 samples and 25,000 messages; the number of objects for the last seconds varies by some hundred
     assert more - objects < 800 and larger - size < 100_000, found
-    # some 140 B a chunk: 2 MB an hour, until the part ends
+    # about 140 B for each chunk, 2 MB an hour, until the part ends
     assert 0 < after - before < 20_000
     figures = front.parts()["input"][2]
     assert int(figures["samples_used"]) == int(figures["samples_in"]) and int(figures["rolled_back"]) > 0
@@ -787,11 +788,11 @@ def test_prometheus_reads_the_numbers_of_the_diagnostics(tmp_path: Path) -> None
         with urlopen(f"http://127.0.0.1:{port}/metrics", timeout=30.0) as page:
             found = dict(line.split() for line in page.read().decode().splitlines() if not line.startswith("#"))
         assert (found["plow_twin_input_samples_used"], found["plow_twin_state_level"]) == ("100.0", "0.0")
-        assert "plow_twin_state_scene" not in found  # a text
+        assert "plow_twin_state_scene" not in found  # texts are not exported
         board = (ROOT / "config" / "grafana.json").read_text()
         shown = set(re.findall(r"plow_twin_\w+", " ".join(_expressions(json.loads(board)))))
         assert len(shown) > 15 and shown <= found.keys(), shown - found.keys()
-        assert run_cli(["live", str(path), "--metrics", str(port), "--quiet"]) == 1  # the port is taken
+        assert run_cli(["live", str(path), "--metrics", str(port), "--quiet"]) == 1  # the port is in use
         assert live.stop() == 0
 
 
@@ -812,7 +813,7 @@ def test_readers_of_metrics_that_ask_nothing_are_bounded() -> None:
                 with urlopen(f"http://127.0.0.1:{port}/metrics", timeout=30.0) as page:
                     assert b"plow_twin_state_model_time_s 1.5" in page.read()
                 break
-            except OSError:  # the server has not seen yet that they have gone
+            except OSError:  # the server has not noticed yet that they are gone
                 assert time.monotonic() < give_up
 
 
@@ -833,12 +834,12 @@ def test_poses_gaps_and_speeds_that_cannot_be_are_not_used() -> None:
     used.clear()
     nan = math.nan
     poses = [(0.01, 0.0, 0.0), (0.04, nan, 0.0), (0.02, 0.06, 0.0), (-0.04, 0.0, 0.0), (nan, 0.001, 0.0)]
-    for at, pose in enumerate(poses):  # y of the third is too large, the fourth changes too fast
+    for at, pose in enumerate(poses):  # y of the third pose is too large, and the fourth changes too fast
         used += [pose] if inputs.uses_pose(second + at * 50_000_000, pose) else []
     assert [pose[0] for pose in used[:2]] == [0.01, 0.04] and used[2][1] == 0.001 and len(used) == 3
     assert inputs.head_pose.counts[Verdict.IMPLAUSIBLE] == 2
     used.clear()
-    # the second lacks pair 3, whose change counts from the first
+    # the second message lacks pair 3, whose change is taken from the first
     for at, gaps in enumerate([{1: 0.01, 3: 0.01}, {1: 0.02}, {3: 0.09, 1: 0.02}, {1: 0.11}, {3: 0.05, 1: 0.03}]):
         used += [gaps] if inputs.uses_gaps(second + at * 20_000_000, gaps) else []
     assert used == [{1: 0.01, 3: 0.01}, {1: 0.02}, {3: 0.05, 1: 0.03}]
@@ -917,7 +918,7 @@ def test_a_file_that_ends_is_read_at_the_pace_of_the_twins_that_follow_and_this_
 ) -> None:
     path = _csv(tmp_path / "load.csv", 50)
     options = ["--set", "estimate=true", "--set", given, "--set", "follow_members=20"]
-    assert run_cli(["live", str(path), "--scene", "paper", *options]) == 3  # too little for an estimate
+    assert run_cli(["live", str(path), "--scene", "paper", *options]) == 3  # the data are not enough for an estimate
     assert ("20 twins follow the machine" in capsys.readouterr().err) == said
     if not said:
         assert run_cli(["live", str(path), "--scene", "paper", *options, "--follow", "--seconds", "0.5"]) == 0
@@ -925,7 +926,7 @@ def test_a_file_that_ends_is_read_at_the_pace_of_the_twins_that_follow_and_this_
 
 
 def _mistaken(name: str) -> str:
-    """Return a file as a plant engineer may have it, with a mistake."""
+    """Return a file as a plant engineer may write it, with a mistake."""
     rows = [_row(index)[1:] for index in range(3000)]
     lines = {
         "decimal commas": lambda t, f: f"{t:.3f},{f[0]:.1f},{f[1]:.1f},{f[2]:.1f}".replace(".", ","),
@@ -984,7 +985,7 @@ def test_utf16_a_folder_that_is_taken_and_a_threshold_in_kilonewtons_are_named(
 
 
 def _troubled_rows(seed: int, count: int) -> Iterator[str]:
-    """Yield rows of a file: mostly a continuing load, and now and then something unusual."""
+    """Yield rows of a file: mostly a continuing load, sometimes unusual rows."""
     rng = np.random.default_rng(seed)
     kinds = ["gap", "late", "twice", "stray", "text", "empty", "wild", "pose", "header", "integer", "triple"]
     stamp = 500.0
@@ -1016,9 +1017,9 @@ def _troubled_rows(seed: int, count: int) -> Iterator[str]:
 
 
 def _recorded(run: Path) -> tuple[list[Any], list[Any]]:
-    """Return journal and outputs of a recording, each output with the number of entries before it.
+    """Return journal and outputs of a recording, with the number of entries before each output.
 
-    Without the parts that depend on wall-clock time: the status, and the time of notes on unused messages.
+    The status and the times of notes on unused messages are left out, because they depend on the wall clock.
     """
     entries: list[EntryRecord] = []
     outputs = []

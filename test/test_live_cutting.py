@@ -1,4 +1,4 @@
-"""The stochastic cutting load: its distribution, its correlation along the face, its passes."""
+"""The stochastic cutting load: its distribution, its correlation along the face, and its passes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def test_the_plough_runs_to_the_end_turns_and_comes_back_without_a_jump() -> Non
     assert position.max() > 199.99 and position[number == 1].min() < 0.01
     np.testing.assert_allclose(np.diff(position), 0.5 * (speed[1:] + speed[:-1]) * 1e-3, rtol=0.0, atol=1e-8)
     assert (speed[(number % 2 == 1)] <= 0.0).all() and np.abs(speed).max() == 2.0
-    assert np.abs(np.diff(speed)).max() <= 1.0001e-3  # 2 m/s within half a turn of 4 s
+    assert np.abs(np.diff(speed)).max() <= 1.0001e-3  # the speed changes by 2 m/s within half of a turn of 4 s
 
 
 def test_the_load_has_mean_variation_correlation_and_skewness_asked_for() -> None:
@@ -32,7 +32,7 @@ def test_the_load_has_mean_variation_correlation_and_skewness_asked_for() -> Non
     assert fx.std() / fx.mean() == pytest.approx(0.5, rel=0.04)
     assert fx.min() > 0.0
     skewness = ((fx - fx.mean()) ** 3).mean() / fx.std() ** 3
-    assert skewness == pytest.approx(2.0 * 0.5, rel=0.15)  # of a Gamma distribution: twice its variation
+    assert skewness == pytest.approx(2.0 * 0.5, rel=0.15)  # the skewness of a Gamma distribution is twice its variation
     assert abs(fy.mean()) < 400.0 and fy.std() == pytest.approx(5e3, rel=0.04)
     np.testing.assert_allclose(moment, 0.1 * fy - 0.7 * fx)
     one = fy[: len(t)]
@@ -48,7 +48,7 @@ def test_the_coal_stays_where_it_is_and_each_pass_cuts_another_web() -> None:
     assert not np.allclose(replace(LOAD, seed=4).at(times), coarse)
     there, back = LOAD.at(np.array([52.0])), LOAD.at(np.array([52.0 + 102.0]))
     assert not np.allclose(there, back)
-    assert (LOAD.at(np.array([0.0])) == 0.0).all()  # standing at the end of the face
+    assert (LOAD.at(np.array([0.0])) == 0.0).all()  # the head stands at the end of the face
 
 
 @pytest.mark.parametrize(

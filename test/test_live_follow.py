@@ -1,4 +1,4 @@
-"""A live twin that follows its machine: estimates taken over, undone, corrected, and the same from the journal."""
+"""A live twin that follows its machine: estimates are adopted, undone, corrected, and reproduced from the journal."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ MEMBERS, T0, SPAN_S = 24, 1_795_000_000_000_000_000, 1.0
 
 @pytest.fixture(scope="module")
 def truth() -> Truth:
-    """A soft contact; the horizontal clearance is 8 mm larger than believed, the gains are up to 10 % off."""
+    """Return a machine with a soft contact, 8 mm more horizontal clearance than believed, and gains up to 10 % off."""
     return draw(replace(GROUPS["plain"], stiffness=(3e6, 3e8), periods=2.2), 71003)
 
 
@@ -98,7 +98,7 @@ def _in_turn(truth: Truth, begin: float, end: float) -> list[Entry]:
 
 
 def _known(truth: Truth, state: State = State.ESTIMATED) -> Estimated:
-    """An estimate with the accuracy of ten load periods."""
+    """Return an estimate with the accuracy of ten load periods."""
     clearance, contact = truth.scene.clearance, truth.scene.contact
     assert contact.damping is not None
     fx, fy, m = (Interval.normal(gain, 0.003) for gain in truth.gain)
@@ -111,12 +111,12 @@ def _known(truth: Truth, state: State = State.ESTIMATED) -> Estimated:
     return Estimated(0, 1, 2, 3, (), (0.0,) * 6, json.dumps(found.as_dict()))
 
 
-#: A millimetre less.
+#: A change of the model: a millimetre less clearance.
 OTHER = SetModel(T0, json.dumps({"clearance.horizontal_m": 0.024}))
 
 
 class Live:
-    """A session of a twin that follows, its journal and what it publishes."""
+    """A session of a following twin, with its journal and its publications."""
 
     def __init__(self, scene: Scene, how: str = "full", *, defers: bool = False) -> None:
         self.journal: list[Entry] = []
@@ -143,7 +143,7 @@ class Live:
         return np.concatenate([one.rows[name] for one in self.published])
 
     def clearance(self) -> Array:
-        """Horizontal and vertical, each with its points, as published last, (2, 3)."""
+        """Return the clearances that were published last, each with its interval points, shape (2, 3)."""
         slow = next(one.slow for one in reversed(self.published) if len(one.slow))
         told = dict(zip(CLEARANCE_NAMES, slow["clearance"][-1].tolist(), strict=True))
         return np.array([[told[f"{axis}{end}"] for end in ("", "/p05", "/p95")] for axis in ("horizontal", "vertical")])
@@ -166,10 +166,10 @@ def test_an_estimate_that_stands_is_taken_over_and_undone_when_it_is_withdrawn(t
     assert known[:, 0] == pytest.approx(truth.clearance, abs=1e-6) and (np.ptp(known, axis=1) < 2e-4).all()
     fine = simulate(truth.scene, 6.0, 1e-3, 1e-6).force
     assert _error(nominal, fine[:3000:10][: len(nominal)]) > (0.3 if how == "parameters" else 0.1)
-    # a single twin forgets its place within some load periods; steered twins were at the machine's place
+    # a single twin forgets its pose within some load periods; steered twins were at the machine's pose
     first, most, above = (150, 0.2, 1.3) if how == "parameters" else (50, 0.03, 1.1)
     assert _error(live.column("force")[first:], fine[3000::10][first : len(live.column("force"))]) < most
-    # no change on the way looks like an impact
+    # no change in between looks like an impact
     assert (live.column("peak").max(axis=0) < above * fine[2900:].max(axis=0) + 2e3).all()
     assert (live.column("followed") == WITH_INTERVALS).all() == (how == "full")
     live.take([_known(truth, State.WITHDRAWN), *_in_turn(truth, 6.0, 6.3)])
@@ -198,7 +198,7 @@ def test_another_machine_is_followed_from_its_prior(truth: Truth, change: Entry)
 
 @pytest.mark.parametrize("before", ["nothing", "withdrawn", "other numbers"])
 def test_without_an_estimate_poses_leave_the_median_twin_alone(truth: Truth, before: str) -> None:
-    """The machine's clearances are 1.5 mm larger: steered to where it is, the nominal twin would press its walls."""
+    """The machine's clearances are 1.5 mm larger; steered to its poses, the nominal twin would press its walls."""
     clearance, begin, end = truth.nominal.clearance, 0.0 if before == "nothing" else 1.0, 3.0
     wider = Clearance(clearance.horizontal_m + 1.5e-3, clearance.vertical_m + 1.5e-3)
     run = simulate(replace(truth.nominal, clearance=wider), end, 0.01, 1e-6)
@@ -284,7 +284,7 @@ def test_late_samples_and_poses_end_in_the_bits_of_those_in_order_and_replay_giv
     entries = [*_in_turn(truth, 0.0, 1.0), _known(truth), *_in_turn(truth, 1.0, 2.0)]
     ordered, late = Live(truth.nominal), Live(truth.nominal)
     ordered.take(entries)
-    # samples and the poses behind them are late by up to 0.3 s, some across the estimate
+    # samples, and the poses behind them, are late by up to 0.3 s, some of them past the estimate
     rng = np.random.default_rng(1)
 
     def due(place: int) -> float:
@@ -303,13 +303,13 @@ def test_late_samples_and_poses_end_in_the_bits_of_those_in_order_and_replay_giv
 
 
 def test_publications_do_not_change_the_motion_where_poses_samples_and_a_hold_are_late(truth: Truth) -> None:
-    """Publications decide how far a late sample goes back."""
+    """Publications determine how far back a late sample can go."""
     live, part = Live(truth.nominal), _in_turn(truth, 0.5, 1.5)
     live.take([*_in_turn(truth, 0.0, 0.5), _known(truth), *part[30:60], *part[:30], *part[90:120], *part[60:90]])
     live.take([Hold(_stamp(1.2)), *part[150:], _known(truth, State.WITHDRAWN), *_in_turn(truth, 1.5, 1.6)])
     live.session.close()
     assert isinstance(live.journal[-1], Digest)
-    # nothing is published here
+    # this run publishes nothing
     assert _again(live.journal, truth.nominal).twin.digest() == live.twin.digest()
 
 
@@ -326,15 +326,15 @@ def test_a_snapshot_holds_all_that_a_later_run_needs(truth: Truth) -> None:
     for name in ROW.names or ():
         assert np.array_equal(live.column(name), other.column(name)), name
     assert live.twin.digest() == other.twin.digest()
-    # the earlier motion with the present wear
+    # the earlier motion is restored with the present wear
     live.take([Restore(_stamp(1.1), snapshot.data), *_in_turn(truth, 0.8, 0.9)])
-    # the next sample belongs to its time
+    # the next sample continues from the restored time
     assert live.twin.time == pytest.approx(0.88) and np.isfinite(live.column("force")).all()
     assert _again(live.journal, truth.nominal).twin.digest() == live.twin.digest()
 
 
 def test_live_and_offline_give_the_same_rows(truth: Truth) -> None:
-    """The estimates of the offline run go to the live one at the same rows."""
+    """The live run gets the estimates of the offline run at the same rows."""
     end = truth.load.t < 5.0
     load = replace(truth.load, t=truth.load.t[end], wrench=truth.load.wrench[end])
     there = truth.poses.t < 5.0
@@ -356,7 +356,7 @@ def test_live_and_offline_give_the_same_rows(truth: Truth) -> None:
 
 
 def test_twins_that_catch_up_later_give_the_same_bits(truth: Truth) -> None:
-    """Any event between the forces and the other twins: poses, late samples, an estimate, a hold, other numbers."""
+    """Any event may come before the other twins: poses, late samples, an estimate, a hold, other parameters."""
     entries = [
         *_in_turn(truth, 0.0, 0.6), *_poses(truth, 0.3, 0.35), _known(truth), *_in_turn(truth, 0.6, 0.81),
         *_late(truth, 0.7), *_in_turn(truth, 0.81, 0.9), PartOfPose(_stamp(0.7), (0, 2), (0.001, 0.0)),
@@ -377,7 +377,7 @@ def test_twins_that_catch_up_later_give_the_same_bits(truth: Truth) -> None:
 
 
 def _late(truth: Truth, t: float) -> list[Sample]:
-    """A sample between two of the load."""
+    """Return a sample between two samples of the load."""
     first, second = _samples(truth, t - 1e-6, t + 0.0101)[:2]
     return [replace(first, stamp_ns=(first.stamp_ns + second.stamp_ns) // 2)]
 
@@ -478,7 +478,7 @@ def test_waiting_poses_are_bounded_dropped_ones_counted_and_no_estimate_is_dropp
     live.take([Pose(_stamp(t), (0.0, 0.0, 0.0)) for t in (3601.0, 7200.0)])
     assert live.session.poses_dropped == 2
     before, more = live.twin.added, 10_050
-    # the load is silent, and a late sample would need all of these poses again
+    # the load is silent; a late sample would need all of these poses again
     live.take([Pose(_stamp(0.51) + 100_000 * index, (0.0, 0.0, 0.0)) for index in range(more)])
     assert live.session.poses_dropped == 2 + before + more - 10_000
     assert live.twin.poses_dropped == more - 10_000
@@ -512,7 +512,7 @@ def test_twins_that_do_not_keep_up_leave_one_that_the_parameters_follow(truth: T
 
 
 def _play(probe: Probe, send: Any, poses: Any, truth: Truth, begin: float, end: float) -> None:
-    """Send load and poses of a part of a truth, faster than their stamps say."""
+    """Send load and poses of a part of a simulated machine's data, faster than their stamps."""
     for index, entry in enumerate(_in_turn(truth, begin, end)):
         if isinstance(entry, Sample):
             send(entry.stamp_ns, entry.wrench)
@@ -575,7 +575,7 @@ def _seconds(message: JointState) -> float:
 
 
 class Front:
-    """Receives and keeps a runtime's messages."""
+    """A front that receives and keeps a runtime's messages."""
 
     name, follows_samples, sends_motion = "/plow_twin", False, True
     topics = {topic.name: f"/{topic.name}" for topic in TOPICS}  # noqa: RUF012

@@ -1,4 +1,4 @@
-"""Contact laws: the closed forms, the exact restitution, the series against the value."""
+"""Contact laws: closed forms, the exact restitution, and the series against the value."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_exact_damping_factor_satisfies_its_identity(e: float) -> None:
 
 
 def test_nearly_elastic_damping_is_its_series() -> None:
-    """D = 3/2 x (1 + x + ..), x = 1 - e: there the identity's own residual is lost in rounding."""
+    """D = 3/2 x (1 + x + ..) with x = 1 - e, where the identity's residual is lost in rounding."""
     for x in 10.0 ** np.linspace(-15.0, -4.0, 45):
         e = 1.0 - x
         assert exact_damping_number(e) == pytest.approx(1.5 * (1.0 - e) * (2.0 - e), rel=1e-6)

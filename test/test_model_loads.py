@@ -1,4 +1,4 @@
-"""Loads: arms, phases, tables, and the directions that the kernels see."""
+"""Loads: arms, phases, tables, and the directions that the kernels use."""
 
 from __future__ import annotations
 

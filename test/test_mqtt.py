@@ -1,4 +1,4 @@
-"""MQTT in and out: a real broker in another process, with paho 2 as with 1.6."""
+"""MQTT inputs and outputs with a real broker in another process, with paho 2 and paho 1.6."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ from plow_twin.stream.journal import Digest
 from plow_twin.telemetry.mqtt import Broker, Message
 from plow_twin.telemetry.sparkplug import Payload
 
-#: A broker before 0.12 closes the connection where it refuses one.
+#: Version of the broker; before 0.12 it closes a connection that it refuses.
 AMQTT = tuple(map(int, version("amqtt").split(".")[:2]))
 STALE = ("--set", "excitation_timeout=3600")
 
 
 def _hash(password: str) -> str:
-    """Return a password as the broker's library keeps it."""
+    """Return a password in the form in which the broker's library keeps it."""
     try:
         from pwdlib import PasswordHash
     except ModuleNotFoundError:  # before amqtt 0.12
@@ -55,7 +55,7 @@ def _hash(password: str) -> str:
 
 @pytest.fixture
 def broker(tmp_path: Path) -> Iterator[Access]:
-    """A broker with TLS and one user, for whom it keeps messages during absence."""
+    """Yield a broker with TLS and one user, for whom it keeps messages during absence."""
     certificate, key = tmp_path / "broker.pem", tmp_path / "broker.key"
     subprocess.run(
         ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-days", "2",
@@ -90,7 +90,7 @@ def broker(tmp_path: Path) -> Iterator[Access]:
 
 
 class Subscriber:
-    """A client that hears all topics, in order of arrival."""
+    """A client that receives all topics in order of arrival."""
 
     def __init__(self, port: int, access: Access | None = None, topics: str = "#") -> None:
         self.messages: list[tuple[str, bytes, bool]] = []
@@ -122,7 +122,7 @@ class Subscriber:
 
 
 class Sender:
-    """A telemetry box: numbered samples to the broker."""
+    """A telemetry box that sends numbered samples to the broker."""
 
     def __init__(self, access: Access) -> None:
         self.client = make_client("", clean=True)
@@ -161,7 +161,7 @@ def test_a_broker_keeps_messages_for_an_absent_twin_and_garbage_is_counted(broke
     )
     sender = Sender(broker)
     old = {"t": 3.0, "force": {"x": 1.0, "y": 1.0}, "moment": 1.0, "n": 9000}
-    sender.raw(json.dumps(old).encode(), retain=True)  # from before the twin: neither a sample nor the first number
+    sender.raw(json.dumps(old).encode(), retain=True)  # older than the twin: neither a sample nor the first number
     with _live(*arguments) as live:
         live.until_count("dropped_inactive", 1)
         sender.send(50)
@@ -180,7 +180,7 @@ def test_a_broker_keeps_messages_for_an_absent_twin_and_garbage_is_counted(broke
     sender.close()
 
 
-# paho leaves the socket of a failed handshake to the collector
+# paho leaves the socket of a failed handshake to the garbage collector
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_misspelt_topic_of_a_broker_is_no_success(
     broker: Access, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -192,10 +192,10 @@ def test_a_misspelt_topic_of_a_broker_is_no_success(
     arguments = ["live", broker.url, "--map", str(mapping), "--scene", "paper", "--seconds", "1", "--quiet"]
     assert run_cli([*arguments, *access]) == 3
     assert "no sample came on plough/mistaken" in capsys.readouterr().err
-    gc.collect()  # here, because the warning about the socket is ignored here
+    gc.collect()  # collect here, where the warning about the socket is ignored
 
 
-# paho drops the socket of a handshake that failed, and leaves closing it to the collector
+# paho drops the socket of a failed handshake, and leaves closing it to the garbage collector
 @pytest.mark.filterwarnings("ignore:unclosed <ssl.SSLSocket:ResourceWarning")
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_wrong_password_a_strange_certificate_and_a_broker_without_tls_are_refused(broker: Access) -> None:
@@ -217,7 +217,7 @@ def test_a_wrong_password_a_strange_certificate_and_a_broker_without_tls_are_ref
 
 @contextmanager
 def _hostile(*answers: bytes) -> Iterator[Access]:
-    """A broker that gives these answers to the packets of each connection, then closes it at the next one."""
+    """Yield a broker that gives these answers to the packets of each connection, and closes it at the next packet."""
     listening = socket.create_server(("127.0.0.1", 0))
 
     def serve() -> None:
@@ -289,7 +289,7 @@ def _until(reached: Callable[[], bool], seen: object = None) -> None:
 
 @contextmanager
 def _open_broker(folder: Path, port: int) -> Iterator[None]:
-    """A broker without TLS that admits everybody."""
+    """Yield a broker without TLS that admits everybody."""
     config = {
         "listeners": {"default": {"type": "tcp", "bind": f"127.0.0.1:{port}"}},
         "plugins": {"amqtt.plugins.authentication.AnonymousAuthPlugin": {"allow_anonymous": True}},
@@ -316,7 +316,7 @@ def test_a_broker_gets_all_groups_with_tls_and_says_when_the_twin_has_died(broke
         live.until_count("samples_used", 1500)
         live.until(lambda heard: heard.get("mqtt_out", {}).get("values", {}).get("sent", 0) > 8, "sent")
         assert broker.password not in Path(f"/proc/{live.process.pid}/cmdline").read_text()
-        # a late subscriber gets the newest of everything but the peaks, which are over
+        # a late subscriber gets the newest message of each topic except the peaks, which are over
         late = Subscriber(port, broker)
         late.until(lambda: late.newest("face/plough/alarms") is not None and len(late.messages) >= 7)
         groups = {"clearance", "wear", "life", "flags", "status", "alarms", "online"}
@@ -401,7 +401,7 @@ def test_messages_that_wait_for_a_broker_are_bounded_counted_and_come_in_order(t
 
 
 class EdgeNode:
-    """Messages of the node `mine/plough` at a host of Sparkplug B."""
+    """The messages of the node `mine/plough` at a Sparkplug B host."""
 
     def __init__(self, port: int) -> None:
         self.subscriber = Subscriber(port, topics="spBv1.0/#")
@@ -415,7 +415,7 @@ class EdgeNode:
         return self.messages(kind)[count - 1]
 
     def ask_for_rebirth(self) -> None:
-        # field 2 of the payload: a metric with its name (1), data type boolean (4) and value (14)
+        # field 2 of the payload is a metric with a name (1), a data type, boolean (4), and a value (14)
         name = b"Node Control/Rebirth"
         metric = bytes([0x0A, len(name)]) + name + bytes([0x20, 11, 0x70, 1])
         for payload in (b"\xff\xff", bytes([0x12, len(metric)]) + metric):

@@ -1,4 +1,4 @@
-"""colcon build, with and without links: the layout where `ros2 run` and `ros2 launch` look, and programs that start."""
+"""colcon build, with and without links: `ros2 run` and `ros2 launch` find their files, and the programs start."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ def test_colcon_build_gives_the_layout_of_ros2_run(options: list[str], tmp_path:
         assert installed == {path.name for path in (ROOT / folder).glob(pattern)}
         assert installed
 
-    if not options:  # an installation by copy may not refer to the sources
+    if not options:  # an installation by copy must not refer to the sources
         shutil.rmtree(source)
         shutil.rmtree(tmp_path / "build")
 
     def start(program: str, code: int = 0) -> str:
-        """Do the same as `. install/setup.bash && ros2 run plow_twin <program>`."""
+        """Start a program as `. install/setup.bash && ros2 run plow_twin <program>` does."""
         line = f". {tmp_path}/install/setup.bash && exec {programs}/{program}"
         return run("bash", "-c", line, cwd=tmp_path, env=environment, code=code)
 
@@ -55,7 +55,7 @@ def test_colcon_build_gives_the_layout_of_ros2_run(options: list[str], tmp_path:
     assert "expected_rate" in start("twin --ros-args -p expected_rate:=-1.0", code=2)
 
 
-#: Files in which ROS is used, and the linters of ament with our width and form of docstrings.
+#: Files that use ROS, and ament's linters with our line width and docstring style.
 OF_ROS = ("launch", "plow_twin/ros", "plow_twin/demo", "setup.py")
 LINTERS = (
     ("ament_xmllint", "package.xml", "config"),

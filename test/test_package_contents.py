@@ -1,4 +1,4 @@
-"""Contents of wheel and sdist: all that the package needs, without the tests."""
+"""Contents of wheel and sdist: everything that the package needs, without the tests."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_a_wheel_holds_package_data_executables_and_metadata(tmp_path: Path, ver
         "plow-twin", "plow-twin-node", "plow-twin-publisher"
     ]  # fmt: skip
     assert metadata["Description-Content-Type"] == "text/markdown" and "# plow_twin" in metadata.get_payload()
-    assert metadata["Requires-Python"] == ">=3.11,<3.13"  # by which pip refuses another, and says so
+    assert metadata["Requires-Python"] == ">=3.11,<3.13"  # pip refuses other versions and says so
     assert any("Python :: 3.12" in classifier for classifier in metadata.get_all("Classifier"))
     assert any(name.endswith("LICENSE") for name in names)
 

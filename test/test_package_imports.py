@@ -46,7 +46,7 @@ SUBPACKAGES = {
     "__init__": CORE | {"scene_file", "record"},
     "__main__": {"cli"},
 }
-#: Parts of scipy that are imported where they are used; numba looks at the package itself.
+#: Parts of scipy that are imported where they are used; numba imports the package itself.
 SCIPY = ("scipy.linalg", "scipy.optimize", "scipy.special")
 MESSAGES = {
     f"{name}_msgs"
@@ -59,7 +59,7 @@ LIBRARIES = {
     "model": {"scipy"},
     "solve": {"scipy"},
     "estimate": {"scipy"},
-    "run": {"matplotlib"},  # as the type of `Result.plot`; a test sees that it is not imported
+    "run": {"matplotlib"},  # the type of `Result.plot`; a test checks that it is not imported
     "scene_file": {"yaml", "jsonschema", "pyarrow"},
     "record": {
         "mcap",
@@ -95,7 +95,7 @@ LIBRARIES = {
 }
 
 
-#: The study of the paper imports the library; of the library only the verb's placeholder refers to it.
+#: The study of the paper imports the library; only the verb's placeholder in the library refers to the study.
 PAPER_STUDY = PACKAGE.parent / "studies" / "paper" / "plow_twin_paper"
 PAPER_MAY_IMPORT = CORE | {"build", "scene_file", "stream", "record", "view", "study", "cli"}
 
@@ -106,7 +106,7 @@ def _modules() -> list[Path]:
 
 @cache
 def _statements(path: Path) -> list[ast.Import | ast.ImportFrom]:
-    """Return every import of a file, lazy imports included."""
+    """Return every import of a file, including lazy imports."""
     nodes = ast.walk(ast.parse(path.read_text(encoding="utf-8")))
     return [node for node in nodes if isinstance(node, (ast.Import, ast.ImportFrom))]
 
@@ -148,7 +148,7 @@ def _module_name(path: Path) -> str:
 
 
 def _module_imports(path: Path, modules: set[str]) -> set[str]:
-    """Return the modules of the package that a module imports, also lazily or for the type checker."""
+    """Return the package's modules that a module imports, also lazily or for the type checker."""
     found = set()
     for node in _statements(path):
         if isinstance(node, ast.Import):
@@ -166,17 +166,19 @@ def test_no_module_imports_itself_by_a_detour() -> None:
     modules = {_module_name(path) for path in _modules()}
     graph = {_module_name(path): _module_imports(path, modules) for path in _modules()}
     assert graph["plow_twin.cli.simulate"] > {"plow_twin.run.simulate", "plow_twin.cli.console"}
-    TopologicalSorter(graph).prepare()  # raises CycleError, which names the circle
+    TopologicalSorter(graph).prepare()  # raises CycleError, which names the cycle
 
 
 def test_the_cache_stamp_and_the_build_fingerprint_cover_every_kernel() -> None:
-    """After a change, a kernel outside would be loaded from the cache, and a replay would count as the same build."""
+    """After a change, the cache would load the old code of a kernel that they do not cover, and builds would look
+    equal.
+    """
     compiled = [path for path in _modules() if "plow_twin.kernel.compiler.kernel" in _imported_names(path)]
     assert len(compiled) > 10
     subpackages = {path.relative_to(PACKAGE).parts[0] for path in compiled}
     assert subpackages <= {*KERNEL_FOLDERS} and {*KERNEL_FOLDERS} <= {*NUMERIC_SUBPACKAGES}
     assert all((PACKAGE / subpackage).is_dir() for subpackage in (*KERNEL_FOLDERS, *NUMERIC_SUBPACKAGES))
-    # only one file compiles without the stamp: it calls no kernel of another file, so numba sees its changes
+    # only one file compiles without the stamp; it calls no kernel of another file, so numba notices its changes
     direct = {path.relative_to(PACKAGE).as_posix() for path in _modules() if "numba" in {*_imports(path)}}
     assert {name for name in direct if not name.startswith("kernel/")} == {"build.py"}
     unstamped = [path for path in _modules() if "plow_twin.kernel.compiler.kept" in _imported_names(path)]
@@ -222,7 +224,7 @@ def _imported_names(path: Path) -> set[str]:
                 "plow_twin.dashboard",
             },
         ),
-        # the server of the screen, a process beside the twin, needs no numeric library
+        # the screen's server, a process beside the twin, needs no numeric library
         ("import numpy, plow_twin.dashboard.server", {"numba", "scipy", "plow_twin.model.scene", "plow_twin.live"}),
         ("import plow_twin.ros.node", {*SCIPY, "mcap", "rosbags", "rerun"}),
         (
@@ -246,7 +248,7 @@ def test_every_public_name_is_found_and_imported_on_first_use() -> None:
     assert {name for name in dir(plow_twin) if not name.startswith("_")} >= names
     for name in names:
         assert getattr(plow_twin, name) is not None
-    assert set(plow_twin.__all__) == names - {"Recording", "read_recording"}  # these need libraries of an extra
+    assert set(plow_twin.__all__) == names - {"Recording", "read_recording"}  # these names need libraries of an extra
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
         plow_twin.nonsense  # noqa: B018
     code = (
