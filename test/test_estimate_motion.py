@@ -213,7 +213,7 @@ def test_without_measurements_the_prior_is_returned() -> None:
 
 
 def test_poses_too_sparse_for_a_fit_are_refused() -> None:
-    """A swing's start is undetermined at 5 Hz, or at 200 Hz with 1.5 % of the poses; a fit would be wrong and narrow."""
+    """At 5 Hz, or 1.5 % of 200 Hz, the start of a swing is undetermined, and a fit would be wrong and narrow."""
     nominal = preset("paper")
     load, _ = Load.of([0.0, 20.0], np.ones((2, 3)))
     rng = np.random.default_rng(1)

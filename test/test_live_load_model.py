@@ -1,4 +1,4 @@
-"""The load from the drive's signals: figures by hand, the interval from random draws, and the entries in the journal."""
+"""The load from the drive's signals: figures by hand, the interval from random draws, and the journal's entries."""
 
 from __future__ import annotations
 

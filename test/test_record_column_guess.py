@@ -1,4 +1,4 @@
-"""Users' files: separator, time, columns and units are guessed, or the option that states them is named."""
+"""Users' files: separator, time, columns and units are guessed, or the message names the option that states them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ CTRL_C = b"\x03"
 
 
 def _file(path: Path, header: str, *, step: float, size: float = 1e3, comma: bool = False) -> Path:
-    """Write a file of a time, the paper's load in units of `size` N, and a pose in mm."""
+    """Write a file with a time, the paper's load in units of `size` N, and a pose in mm."""
     lines = [header]
     for index in range(600):
         phase = math.sin(2e-3 * index)
@@ -118,7 +118,7 @@ def test_loads_far_too_large_for_the_scene_are_refused_before_a_file_is_written(
 
 
 def _in_terminal(folder: Path, *said: bytes) -> tuple[int, str]:
-    """Run `setup own.csv` in a terminal of its own and type something at each prompt; return exit code and screen."""
+    """Run `setup own.csv` in a terminal of its own and type an answer at each prompt; return exit code and screen."""
     command = [sys.executable, "-m", "plow_twin", "setup", "own.csv", "--out", "out"]
     near, far = pty.openpty()
 
@@ -130,7 +130,7 @@ def _in_terminal(folder: Path, *said: bytes) -> tuple[int, str]:
     )
     os.close(far)
     screen, answers, seen = b"", list(said), 0
-    with suppress(OSError):  # the other side is gone
+    with suppress(OSError):  # the other side has gone
         while True:
             # readline misses a signal just before it waits, so the key is pressed again
             while said[-1] == CTRL_C and not answers and not select.select([near], [], [], 5.0)[0]:

@@ -1,4 +1,4 @@
-"""A recording read from Python and exported: the numbers of the messages, in SI, in every format."""
+"""A recording that is read from Python and exported has the messages' numbers, in SI, in every format."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def test_an_export_of_a_cut_recording_says_so_and_of_a_place_that_takes_nothing_
     monkeypatch.setattr(Table, "arrow_batch", full)
     assert cli(["export", str(run.folder), "--to", "parquet", "--out", str(tmp_path / "none"), "--quiet"]) == 1
     assert "cannot be written: No space left" in capsys.readouterr().err
-    assert not list((tmp_path / "none").iterdir())  # nothing that looks like a whole table
+    assert not list((tmp_path / "none").iterdir())  # no file looks like a whole table
     monkeypatch.undo()
     (tmp_path / "file").write_text("")
     assert cli(["export", str(run.folder), "--to", "csv", "--out", str(tmp_path / "file" / "x"), "--quiet"]) == 1

@@ -1,4 +1,4 @@
-"""A recording read while it is written: its parts, its end, a writer that is killed."""
+"""A recording that is read while it is written: its parts, its end, and a writer that is killed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files of one recording in one order: by the stamps that their roles read, each in its own order."""
+"""The files of a recording in one order: by the stamps that their roles read, with each file's own order kept."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ def order(*streams: Iterator[Arrived]) -> list[tuple[str, float | None]]:
     ("one", "other", "expected"),
     [
         ((1, 3, 5), (2, 4), "ababa"),
-        ((1, None, 5), (2, 4), "aabba"),  # without a stamp: in its place
-        ((1, 3, 2.9, 5), (2, 4), "abaaba"),  # late
-        ((10, 12, 1, 13, 15), (11, 14), "abaaaba"),  # one wrong stamp back
-        ((10, 12, 99, 13, 15), (11, 14), "abaaaba"),  # and forward
-        ((10, 12, 2, 4), (11, 3), "abaaba"),  # a step of the clock in both
+        ((1, None, 5), (2, 4), "aabba"),  # a message without a stamp stays in its place
+        ((1, 3, 2.9, 5), (2, 4), "abaaba"),  # a late message
+        ((10, 12, 1, 13, 15), (11, 14), "abaaaba"),  # a wrong stamp in the past
+        ((10, 12, 99, 13, 15), (11, 14), "abaaaba"),  # a wrong stamp in the future
+        ((10, 12, 2, 4), (11, 3), "abaaba"),  # both files have a step of the clock
         ((-4, -3, 5), (-3.5, 0), "ababa"),
     ],
 )

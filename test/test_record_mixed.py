@@ -1,4 +1,4 @@
-"""With any input in any order, a replay of the recording gives each message and each alarm of the live run."""
+"""For any input in any order, a replay of the recording gives every message and every alarm of the live run."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ SCENE = replace(load_scene(scene_path("paper")), wear=WEAR)
 T0 = 1_795_000_000_000_000_000
 MS = NS_PER_S // 1000
 NOTHING = (0.0, 0.0, 0.0)
-#: at such a load no advance succeeds
+#: with such a load no advance succeeds
 ABSURD = (1e200, -1e200, 1e200)
 NAMES = {topic.name: f"/{topic.name}" for topic in TOPICS}
 
 
 class Front:
-    """Receives and keeps the messages."""
+    """A front that receives and keeps the messages."""
 
     name, topics, follows_samples, sends_motion = "/plow_twin", NAMES, True, True
 
@@ -76,7 +76,7 @@ class Front:
 
 
 class Mixed:
-    """A live twin that is recorded, driven by calls at times `ms` of a steady clock."""
+    """A recorded live twin, driven by calls at times `ms` of a steady clock."""
 
     def __init__(self, folder: Path, **values: Any) -> None:
         self.settings = parameters.settings({"record_path": str(folder / "run")} | values)
@@ -87,7 +87,7 @@ class Mixed:
         bound = self.settings.max_evaluations or None
         twin = Twin(SCENE, tol=self.settings.tolerance, excitation="sampled", max_evaluations=bound)
         session = Session(twin, on_entry=self.recording.journal, rollback_span_s=self.settings.rollback_span)
-        intake = Intake(jump_back_s=60.0)  # no limits: an advance may fail
+        intake = Intake(jump_back_s=60.0)  # without limits, an advance may fail
         every_sample = self.settings.publish_mode == "on_sample"
         self.driver = Driver(session, intake, policy(self.settings), every_sample=every_sample)
         session.start()
@@ -171,7 +171,7 @@ def test_after_a_hold_and_a_reset_samples_are_not_taken_for_held(tmp_path: Path)
 @pytest.mark.parametrize("hold", ["hold", "zero"])
 def test_a_blow_before_a_hold_raises_an_alarm_and_a_blow_in_the_hold_does_not(hold: str, tmp_path: Path) -> None:
     live = Mixed(tmp_path, publish_mode="fixed_rate", alarm_force=[6e4, 1e9], excitation_timeout=0.05, hold_policy=hold)
-    # a short push, on which the head goes on without a sample until it meets the frame
+    # after a short push the head continues without a sample until it meets the frame
     live.send(*(_at(index, (0.0, 40e3, 0.0)) for index in range(20)))
     live.publish_due()
     for _ in range(10):
@@ -219,7 +219,7 @@ def test_late_samples_at_the_edge_of_the_memory_give_the_same_however_they_came(
 
 
 def test_a_late_speed_at_the_edge_of_the_memory_acts_where_it_did(tmp_path: Path) -> None:
-    """A replay keeps no states between, so the verdict "too old" may not depend on the states that it has."""
+    """A replay keeps no intermediate states, so whether a speed is too old must not depend on the stored states."""
     live = Mixed(tmp_path, rollback_span=0.1)
     live.send(*map(_swinging, range(300)))
     for ms in (50, 190, 198, 199, 201):
@@ -239,7 +239,7 @@ def test_a_speed_before_the_first_sample_acts_from_there_on_however_often_it_is_
 
 
 def _drive(live: Mixed, random: Random, calls: int) -> None:
-    """Call a live twin with any mix of inputs."""
+    """Call a live twin with a random mix of inputs."""
     index, skipped, fails = 0, [], random.random() < 0.4
     span_ms = round(1000 * live.settings.rollback_span)
     kinds = {
@@ -254,7 +254,7 @@ def _drive(live: Mixed, random: Random, calls: int) -> None:
             case "samples":
                 count = random.choice([1, 1, 2, 5, 40])
                 arriving = [_swinging(index + offset) for offset in range(count)]
-                if random.random() < 0.2 and skipped:  # late ones with them, in any order
+                if random.random() < 0.2 and skipped:  # late samples are sent with them, in any order
                     arriving += [_swinging(ms) for ms in skipped[-3:]]
                     del skipped[-3:]
                     random.shuffle(arriving)
@@ -267,7 +267,7 @@ def _drive(live: Mixed, random: Random, calls: int) -> None:
                 skipped += range(index, index + gap)
                 index += gap
             case "late" if skipped:
-                near = [ms for ms in skipped if abs(index - ms - span_ms) < 20]  # at the edge of the memory
+                near = [ms for ms in skipped if abs(index - ms - span_ms) < 20]  # samples at the edge of the memory
                 chosen = near or random.sample(skipped, min(len(skipped), random.choice([1, 1, 4])))
                 skipped = [ms for ms in skipped if ms not in chosen]
                 load = ABSURD if fails and random.random() < 0.2 else None
@@ -280,7 +280,7 @@ def _drive(live: Mixed, random: Random, calls: int) -> None:
             case "wear":
                 live.driver.set_wear(stamp_ns, [1e-5 * random.random()] * 8, "other pads")
                 skipped.clear()
-            case "travel":  # late, on time, early and far too late
+            case "travel":  # speeds that are late, on time, early and far too late
                 live.driver.travel(stamp_ns + random.randrange(-span_ms - 50, 50) * MS, 3.0 * random.random())
             case "snapshot":
                 live.driver.snapshot()
@@ -322,7 +322,7 @@ def _mixed(folder: Path, seed: int, **more: Any) -> None:
     assert not any(frame.rows["force"].max() > 1e12 for frame in live.front.frames)
 
 
-@pytest.mark.parametrize("seed", [*range(20), 2002])  # 2002: a step ends just after a sample
+@pytest.mark.parametrize("seed", [*range(20), 2002])  # with seed 2002, a step ends just after a sample
 def test_a_replay_gives_the_messages_of_any_mix(seed: int, tmp_path: Path) -> None:
     _mixed(tmp_path, seed)
 

@@ -1,4 +1,4 @@
-"""Parquet instead of CSV: the same numbers, instants of any zone, and files that are too large unpacked."""
+"""Parquet instead of CSV: the same numbers, times of any zone, and files that are too large when unpacked."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ head_pose: {topic: plant, fields: {x: x}, stamp: Zeit}
 
 
 def _table(count: int, kind: pa.DataType = UTC_NS) -> pa.Table:
-    """Return the paper's load at 1 kHz, the forces in kN, and a pose of which each tenth value is missing."""
+    """Return the paper's load at 1 kHz with forces in kN, and a pose without every tenth value."""
     phase = np.sin(2e-3 * np.arange(count))
     fx, fy, m = (phase * amplitude for amplitude in PAPER_AMPLITUDE)
     stamps = pa.array(BEGIN_NS + 1_000_000 * np.arange(count), pa.timestamp("ns"))
@@ -87,7 +87,7 @@ def test_a_file_of_a_historian_gives_the_same_run_as_its_csv(
     capsys.readouterr()
     assert runs[0] == runs[1] and runs[0]["samples_used"] == "3000"
     ours, theirs = (_samples(tmp_path / f"run_{number}") for number in (0, 1))
-    assert ours == theirs and ours[0][0] == BEGIN_NS  # to the nanosecond
+    assert ours == theirs and ours[0][0] == BEGIN_NS  # equal to the nanosecond
 
 
 def test_instants_are_the_same_in_each_zone_and_naive_times_are_utc(tmp_path: Path) -> None:
@@ -103,7 +103,7 @@ def test_instants_are_the_same_in_each_zone_and_naive_times_are_utc(tmp_path: Pa
             assert [stamp for name, stamp, _ in read if name == "excitation"] == (stamps * precision_ns).tolist()
             found.append([(name, values["fx"]) for name, _, values in read if name == "excitation"])
     assert all(rows == found[0] for rows in found)
-    # the same as text
+    # the same times as text
     assert time_ns("2026-01-02T03:03:19.123456789Z") == time_ns("2026-01-02 04:03:19.123456789+01:00") == BEGIN_NS
     assert time_ns("2026-01-02 03:03:19.1234567") == BEGIN_NS - 89
     assert time_ns("2026-01-02T03:03:19.123Z") == BEGIN_NS - 456_789
@@ -147,7 +147,7 @@ def test_the_estimates_folder_calibration_and_setup_take_parquet(
     np.testing.assert_array_equal(found[0].poses, found[1].poses)
     assert len(found[0].load) == 200 and np.isnan(found[0].poses[:, 2]).all() and not found[0].unreadable
     (tmp_path / "c" / "load.csv").rename(tmp_path / "c" / "excitation.csv")
-    with monkeypatch.context() as patched:  # rows beyond those that fit: the newest stay, and the others are counted
+    with monkeypatch.context() as patched:  # of too many rows the newest stay, and the others are counted
         patched.setattr(measured, "MOST_ROWS", 50)
         newest = read_measured(tmp_path / "p", Path("paper")), read_recording(tmp_path / "c", Path("paper"))
     for one in newest:
@@ -238,7 +238,7 @@ def test_a_damaged_page_ends_the_rows_there_and_is_counted(tmp_path: Path, capsy
     data[place + 40 : place + 4000] = bytes(3960)
     path.write_bytes(data)
     read = _read(path, mapping)
-    assert sum(name == "excitation" for name, _, _ in read) == 8192  # whole blocks before the damage
+    assert sum(name == "excitation" for name, _, _ in read) == 8192  # complete blocks before the damage are read
     source = open_source(path)
     assert len(list(source.messages(lambda _: True))) == 8192 and source.losses.counts["truncated_files"] == 1
     assert cli(["live", str(path), "--map", str(mapping), "--scene", "paper"]) == 1

@@ -1,4 +1,4 @@
-"""Recordings opened by readers that are not ours: MCAP's own in JavaScript, rerun's loader."""
+"""Recordings opened by other readers: MCAP's own reader in JavaScript, and rerun's loader."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_mcap_s_own_reader_in_javascript_finds_every_message(run: Run, tmp_path:
     reader = RunReader(run.folder)
     assert [*reader.batches()]
     assert found["counts"] == dict(reader.counts) and found["counts"]["/contact_forces"] == COUNT
-    # read from front to back too, every checksum compared
+    # the file is also read from front to back, and every checksum is compared
     assert found["inOrder"] and found["done"] and found["streamed"] == reader.counts.total()
     assert found["profile"] == "ros2" and found["metadata"] == ["plow_twin", "plow_twin_loss"]
     assert "sensor_msgs/msg/JointState ros2msg" in found["schemas"]

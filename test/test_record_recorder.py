@@ -1,4 +1,4 @@
-"""The recorder under stress: killed, overrun, out of disk, forgotten; losses are counted."""
+"""The recorder under stress: killed, overrun, with a full disk, and not closed. Losses are counted."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ from plow_twin.stream.session import Session
 HEADER = RunHeader("version: 1")
 TOPIC = "/contact_forces"
 
-#: A process that journals at 1 kHz and reports each receipt once the recorder has it. Arguments: folder, limit of a
-#: file's size, number of samples, options of the recorder as JSON.
+#: A program that writes a journal at 1 kHz and reports each sample when the recorder has it. Its arguments are the
+#: folder, the limit of a file's size, the number of samples, and the recorder's options as JSON.
 WRITER = """
     import json, os, sys, time
     import numpy as np
@@ -80,7 +80,7 @@ WRITER = """
 def writer_command(
     folder: Path, *, limit: int = 0, count: int = 10**9, begin: str = "", end: str = "", **options: Any
 ) -> list[str]:
-    """Return the command of a writer, with code before and after its own."""
+    """Return the command of a writer, with additional code before and after the program."""
     code = "".join(map(textwrap.dedent, (begin, WRITER, end)))
     return [sys.executable, "-c", code, str(folder), str(limit), str(count), json.dumps(options)]
 
@@ -95,7 +95,7 @@ def joint_state(index: int) -> JointState:
     return JointState(BASE_NS + index * STEP_NS, "slide_frame", PAIR_NAMES, values, values, values)
 
 
-#: Forks a writer for each line `folder flush_period` that it reads; prints its number, and its end.
+#: A program that forks a writer for each line `folder flush_period` that it reads, and prints its number and its end.
 FORKS = """
     import json, os, sys
     import plow_twin.record.writer, mcap.writer, rosbags.typesys, lz4.frame, zstandard
@@ -117,7 +117,7 @@ FORKS = """
 
 
 def kill_writers(folders: Iterable[Path], rng: random.Random, flush_s: float, longest_s: float) -> None:
-    """Kill writers at random moments: only items since the last flush are lost."""
+    """Kill writers at random moments, and check that only items since the last flush are lost."""
     command = [sys.executable, "-c", textwrap.dedent(FORKS) + textwrap.dedent(WRITER)]
     with started(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         assert process.stdin is not None and process.stdout is not None
@@ -125,10 +125,10 @@ def kill_writers(folders: Iterable[Path], rng: random.Random, flush_s: float, lo
             process.stdin.write(f"{folder} {flush_s}\n")
             process.stdin.flush()
             child = int(process.stdout.readline().split()[1])
-            lines = [process.stdout.readline()]  # it writes
+            lines = [process.stdout.readline()]  # the writer has begun to write
             killer = threading.Timer(rng.uniform(0.0, longest_s), os.kill, [child, signal.SIGKILL])
             killer.start()
-            for line in process.stdout:  # all along, so that the pipe never fills up
+            for line in process.stdout:  # lines are read all the time, so that the pipe never fills up
                 if line.endswith("end\n"):
                     break
                 lines.append(line)
@@ -149,8 +149,8 @@ def check_killed(folder: Path, lines: list[str], flush_s: float) -> None:
     messages = [r.message() for r in records if isinstance(r, OutputRecord)]
     assert [m.stamp_ns for m in messages] == [BASE_NS + index * STEP_NS for index in range(len(messages))]
     assert len(messages) <= len(stamps) <= last_index + 2
-    # Entries up to one flush period before the kill are there, and messages up to two: the journal's chunk is written
-    # first. The allowance is for the machine, not for the recorder.
+    # The file has the entries up to one flush period before the kill, and the messages up to two periods before,
+    # because the journal's chunk is written first. The allowance is for the machine, not for the recorder.
     first_ns = int(lines[0].split()[1])
     for kind, periods in ((EntryRecord, 1), (OutputRecord, 2)):
         newest_ns = max((r.log_time_ns for r in records if isinstance(r, kind)), default=first_ns)
@@ -186,7 +186,7 @@ def test_a_full_queue_is_counted_and_noted_in_the_file(tmp_path: Path) -> None:
     assert loss.closed and loss.error is None
     assert loss.lost[JOURNAL] > 0 and loss.lost[TOPIC] > 0 and taken["snapshot"] > 0
     assert len(kept_messages) + loss.lost[TOPIC] == 4000
-    assert len(kept_samples) + loss.lost[JOURNAL] >= 4000  # refused snapshots may be among the lost
+    assert len(kept_samples) + loss.lost[JOURNAL] >= 4000  # the lost entries may include refused snapshots
 
     reader = RunReader(tmp_path / "run")
     records = list(reader)
@@ -195,7 +195,7 @@ def test_a_full_queue_is_counted_and_noted_in_the_file(tmp_path: Path) -> None:
     assert [r.publish_time_ns for r in records if isinstance(r, OutputRecord)] == kept_messages
     assert sum(entry.count for entry in entries if isinstance(entry, Loss)) == loss.lost[JOURNAL]
     assert sum(entry.count for entry in entries if isinstance(entry, Dropped)) == loss.lost[TOPIC]
-    # lost messages may be noted in between: a loss is noted before the snapshot
+    # notes of lost messages may be in between, because a loss is noted before the snapshot
     told = [entry for entry in entries if not isinstance(entry, Dropped)]
     for entry, following in itertools.pairwise(told):
         assert not isinstance(entry, Loss) or isinstance(following, Snapshot)
@@ -220,13 +220,13 @@ def test_a_full_disk_stops_the_recording_and_nothing_else(tmp_path: Path) -> Non
     output, _ = process.communicate(timeout=60)
     assert process.returncode == 0
     report = json.loads(output.splitlines()[-1])
-    assert len(output.splitlines()) == 3001  # the caller went on to its end
+    assert len(output.splitlines()) == 3001  # the caller has continued to its end
     assert report["errors"] == [report["error"]] and "File too large" in report["error"]
     assert not report["closed"] and report["refused"] > 0 and report["counted"] == report["lost"]
     reader = RunReader(tmp_path / "run")
     entries = [record for record in reader if isinstance(record, EntryRecord)]
     assert reader.status is FileStatus.TRUNCATED and len(entries) > 100
-    # every item is there or counted; an item under way when the disk filled up may be both
+    # every item is in the file or counted; an item being written when the disk became full may be both
     assert len(entries) + report["lost"][JOURNAL] >= 3000
 
 
@@ -250,7 +250,7 @@ def test_little_free_space_ends_a_recording_that_can_be_read(tmp_path: Path) -> 
 
 
 def record_around_a_pause(folder: Path, stop: Callable[[], object], go_on: Callable[[], object]) -> Recorder:
-    """Record a twin; let the disk fail half way and get well again."""
+    """Record a twin; the disk fails half way and recovers."""
     scene = load_scene(scene_path("paper"))
     recorder = Recorder(folder, RunHeader(dump_scene(scene)), flush_period_s=0.02, min_free_bytes=1)
     session = Session(Twin(scene, excitation="sampled"), on_entry=recorder.journal)
@@ -350,7 +350,7 @@ def test_a_ring_keeps_the_last_seconds_and_writes_them_at_a_mark(
     dump = RingWriter.dump
 
     def dump_after_another(ring: RingWriter, folder: Path, loss: Mapping[str, int]) -> None:
-        if folder.name == "ring_2":  # another process takes it first
+        if folder.name == "ring_2":  # another process makes this folder first
             Recorder(folder, HEADER).close()
         dump(ring, folder, loss)
 
@@ -385,8 +385,8 @@ def test_a_ring_keeps_the_last_seconds_and_writes_them_at_a_mark(
     for path in written:
         report = replay(path)
         assert (report.exit_code, report.divergences) == (0, 0) and report.messages_compared
-        assert 0.02 < report.span_s < 0.7 * index * 1e-3  # a busy machine gives few samples in the 0.4 s
-    # items between the two are in one of the recordings or in neither
+        assert 0.02 < report.span_s < 0.7 * index * 1e-3  # on a busy machine 0.4 s have few samples
+    # items between the two recordings are in one of them or in neither
     stamps = [
         {int(stamp) for batch in RunReader(path).batches() for stamp in batch.entries.stamp_ns[batch.entries.sample]}
         for path in written
@@ -442,7 +442,7 @@ def test_closing_waits_while_items_are_written_and_then_says_what_is_missing(
     write, stuck = RunWriter.write_samples, threading.Event()
 
     def slowly(writer: RunWriter, *given: Any) -> None:
-        if len(given[0]) == 1:  # the last sample, after the others
+        if len(given[0]) == 1:  # this sample comes last
             stuck.wait(60.0)
         time.sleep(0.3)
         write(writer, *given)
@@ -453,7 +453,7 @@ def test_closing_waits_while_items_are_written_and_then_says_what_is_missing(
         recorder = Recorder(tmp_path / f"run{count}", HEADER)
         for index in range(count):
             assert recorder.journal(paper_sample(index))
-        report = recorder.close(timeout_s=0.6)  # shorter than all, longer than one burst
+        report = recorder.close(timeout_s=0.6)  # this timeout is shorter than all bursts and longer than one
         assert report.complete == (count == 50)
     sentence = report.sentence(tmp_path / "run51")
     stuck.set()
@@ -478,7 +478,7 @@ def test_of_recorders_that_want_one_folder_each_gets_its_own(tmp_path: Path, mon
     def make(folder: Path) -> Recorder:
         if not quicker:
             quicker.append(Recorder(folder, HEADER))
-        elif len(quicker) == 1:  # its folder was there already, empty
+        elif len(quicker) == 1:  # the empty folder existed before
             monkeypatch.setattr("plow_twin.record.writer._is_free", lambda folder: True)
             quicker.append(Recorder(folder, HEADER))
         else:
@@ -505,7 +505,7 @@ def test_a_message_of_another_type_stops_the_recording_with_its_topic(tmp_path: 
     assert loss.error is not None and TOPIC in loss.error and not loss.closed
 
 
-#: Logs the waits for the disk: path and size.
+#: Code that logs each wait for the disk with path and size.
 SYNCS = """
     import os, time
     def note(wait):
@@ -533,10 +533,10 @@ def test_with_sync_flushed_data_survive_a_loss_of_power(tmp_path: Path) -> None:
             else:
                 synced.append((rest[1], int(rest[0])))
                 flushes += index >= 0
-                before = index if flushes == 3 else before  # the next flush at the latest waits for it
+                before = index if flushes == 3 else before  # at the latest, the next flush waits for the disk
             if flushes == 5:
                 process.kill()
-    # a loss of power may leave only that
+    # a loss of power may leave only the synced files
     assert {str(folder), str(tmp_path)} <= {path for path, _ in synced}
     os.truncate(file, max(size for path, size in synced if path == str(file)))
     reader = RunReader(folder)

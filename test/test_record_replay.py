@@ -1,4 +1,4 @@
-"""Replay computes: the same run gives the same bits, and any change of a recording is found at its place."""
+"""A replay computes: the same run gives the same bits, and any change of a recording is found where it is."""
 
 from __future__ import annotations
 
@@ -47,12 +47,12 @@ SAMPLES = "/plow_twin/journal/samples"
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """2.5 s of the paper's load without a break: samples only, a frame after each."""
+    """Return a run of 2.5 s under the paper's load without a break, with samples only and a frame after each."""
     return record_run(tmp_path_factory.mktemp("runs") / "paper", map(paper_sample, range(COUNT)))
 
 
 def flip_sample(index: int, bit: int) -> Any:
-    """Flip one bit of Fx in the sample with that index."""
+    """Flip one bit of Fx in the sample with a given index."""
 
     def change(topic: str, message: Any) -> bytes | None:
         if topic != SAMPLES or message.publish_time != BASE_NS + index * STEP_NS:
@@ -84,7 +84,7 @@ def test_the_same_build_gives_the_same_bits(frame_every: int, tmp_path: Path) ->
     assert report.entries == len(run.entries)
     assert (report.samples, report.steps) == (COUNT, COUNT + 1)
     assert shares == sorted(shares) and shares[-1] == 1.0
-    # the run is worth comparing: there was contact
+    # the run is worth comparing, because there was contact
     assert max(m.effort.max() for _, m in run.outputs if isinstance(m, JointState) and m.effort.size) > 1e4
 
 
@@ -170,7 +170,7 @@ def test_outputs_in_another_order_are_compared_all_the_same(run: Run, tmp_path: 
 
 
 def test_a_missing_sample_diverges(run: Run, tmp_path: Path) -> None:
-    """One sample repeats the stamp before it: the model cannot be where the recorded messages are."""
+    """A sample repeats the stamp of the previous one, so the model cannot reach the recorded messages."""
 
     def change(topic: str, message: Any) -> bytes | None:
         if topic != SAMPLES or message.publish_time != BASE_NS + 900 * STEP_NS:
@@ -195,10 +195,10 @@ def test_a_cut_file_is_replayed_as_far_as_it_goes(run: Run, tmp_path: Path) -> N
 def test_after_a_damaged_chunk_nothing_is_claimed(run: Run, tmp_path: Path) -> None:
     spans = chunk_spans(run.file)
     lost_entries = lost_messages = False
-    for start, length in spans:  # of the journal, and of the sent messages
+    for start, length in spans:  # the chunks of the journal, and of the sent messages
         data = bytearray(run.file.read_bytes())
         middle = start + length // 2
-        # a single flipped bit may lie in a reference to other, equal bytes
+        # a single flipped bit may be in a reference, and lead to other bytes that are equal
         data[middle : middle + 8] = bytes(byte ^ 0xFF for byte in data[middle : middle + 8])
         damaged = tmp_path / "damaged.mcap"
         damaged.write_bytes(data)
@@ -213,7 +213,7 @@ def test_replay_goes_on_from_the_snapshot_after_a_loss(tmp_path: Path) -> None:
     def rush_then_walk() -> Iterator[Sample]:
         for index in range(COUNT):
             if index > COUNT // 2 and index % 10 == 0:
-                time.sleep(0.03)  # the queue empties: from here on the recording is whole
+                time.sleep(0.03)  # the queue empties, so the recording is complete from here on
             yield paper_sample(index)
 
     run = record_run(tmp_path / "run", rush_then_walk(), queue_size=150, pause_every=0)
@@ -272,7 +272,7 @@ def test_a_journal_alone_gives_the_full_recording_again(tmp_path: Path) -> None:
 def test_digests_alone_are_compared_without_opening_the_outputs(run: Run, tmp_path: Path) -> None:
     data = bytearray(run.file.read_bytes())
     for start, length in chunk_spans(run.file, journal=False):
-        data[start + length // 2] ^= 0xFF  # the chunks of outputs, which are not read
+        data[start + length // 2] ^= 0xFF  # the damaged chunks are of outputs, which are not read
     file = tmp_path / "damaged.mcap"
     file.write_bytes(data)
     report = replay(file, digests_only=True)
@@ -292,7 +292,7 @@ def test_digests_do_not_break_a_run_of_samples(run: Run, monkeypatch: pytest.Mon
 
     monkeypatch.setattr(Session, "advance", counted)
     assert replay(run.folder).exit_code == 0
-    # one call warms up; the others take thousands of samples, not the hundred between two digests
+    # one call warms up; the others process thousands of samples, not just the hundred between two digests
     assert sum(calls) == COUNT + 2 and len(calls) <= 4
 
 

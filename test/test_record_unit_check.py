@@ -1,4 +1,4 @@
-"""A wrong unit is caught by magnitude and rate, and named; a stated unit and an unusual machine pass."""
+"""A wrong unit is detected by magnitude and rate, and named; a stated unit and an unusual machine are accepted."""
 
 from __future__ import annotations
 
@@ -70,11 +70,11 @@ def test_an_estimate_refuses_millimetres_for_metres(tmp_path: Path, capsys: pyte
 
 
 def test_a_swing_that_the_clearance_does_not_allow_is_in_degrees() -> None:
-    angle = largest_angle(SCENE)  # the frame of 0.33 m by 0.27 m touches both walls at it
+    angle = largest_angle(SCENE)  # at this angle the frame of 0.33 m by 0.27 m touches both walls
     reach = 0.33 * np.sin(angle) + 0.27 * np.cos(angle), 0.33 * np.cos(angle) + 0.27 * np.sin(angle)
     assert min(0.30 - reach[0], 0.355 - reach[1]) == pytest.approx(0.0, abs=1e-4)
     for swing, likely in ((0.25, []), (0.6, ["deg"]), (6.0, ["deg"])):
-        for offset in (0.0, 0.1):  # of the sensor
+        for offset in (0.0, 0.1):  # offsets of the sensor
             theta = {("head_pose", "theta"): offset + swing * np.sin(2.0 * TIMES)}
             assert [doubt.likely for doubt in unit_doubts(theta, TIMES, SCENE)] == likely
 

@@ -1,4 +1,4 @@
-"""The wear of the pads on disk: complete or not at all, of one head and one scene."""
+"""The wear of the pads on disk: written completely or not at all, for one head and one scene."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def _loaded(folder: Path, head: str, scene: Scene) -> tuple[float, ...] | None:
 
 
 def _saved(keeper: WearKeeper, depth: np.ndarray) -> str:
-    """Have depths saved and wait for it; return the error."""
+    """Save depths and wait until they are saved; return the error."""
     keeper.save(depth)
     assert keeper._writing is not None
     keeper._writing.result()
@@ -55,7 +55,7 @@ def test_saved_wear_is_loaded_to_the_bit_and_no_other_file_stays_behind(tmp_path
     _save(folder)
     assert _loaded(folder, "head 7", SCENE) == DEPTH
     assert os.listdir(folder) == [FILE_NAME]
-    # loads and contact numbers are not the pads
+    # loads and the numbers of the contact do not concern the pads
     assert _loaded(folder, "head 7", replace(SCENE, loads=())) == DEPTH
 
 
@@ -108,7 +108,7 @@ def test_a_disk_that_takes_nothing_leaves_the_old_file(tmp_path: Path, monkeypat
 
 
 def test_a_file_that_came_while_the_twin_ran_is_left_as_it_is(tmp_path: Path) -> None:
-    # as by a volume that is mounted late: suddenly another folder is there, with earlier wear
+    # a volume that is mounted late replaces the folder by another one, with earlier wear
     folder, volume = tmp_path / "wear", tmp_path / "volume"
     volume.mkdir()
     path = _save(volume)
@@ -121,7 +121,7 @@ def test_a_file_that_came_while_the_twin_ran_is_left_as_it_is(tmp_path: Path) ->
     assert _loaded(folder, "head 7", SCENE) == DEPTH
     with pytest.raises(WearStateError, match="another twin keeps its wear there"):
         WearKeeper(folder, "head 7", SCENE)
-    # the former folder is back; then another program writes to it, then it is removed
+    # the former folder returns; then another program writes to it, and then it is removed
     folder.rename(volume)
     (tmp_path / "beneath").rename(folder)
     assert _saved(keeper, WORN) == "" and _loaded(folder, "head 7", SCENE) == tuple(WORN)
@@ -163,7 +163,7 @@ def test_wear_that_could_not_be_saved_goes_on_unless_the_file_is_another_one(
 
         def fail(descriptor: int) -> None:
             calls.append(descriptor)
-            if len(calls) == 1 + waited:  # error of the file, or of the folder when the new file is already there
+            if len(calls) == 1 + waited:  # an error of the file, or of the folder when the new file already exists
                 raise OSError(28, "No space left on device")
 
         full.setattr(os, "fsync", fail)

@@ -1,4 +1,4 @@
-"""The main job, live, as a user starts it: publisher and node as processes, summed up from the recording."""
+"""The main task as a user starts it, live: publisher and node as processes, with a summary of the recording."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_the_processes_of_the_demo_end_with_it_however_it_ends(tmp_path: Path) -
     )
     done = subprocess.run([sys.executable, "-c", text], cwd=ROOT, capture_output=True, text=True, timeout=110)
     child, give_up = Path("/proc", done.stdout.strip(), "cmdline"), time.monotonic() + 60.0
-    while child.exists() and child.read_bytes():  # a zombie's is empty
+    while child.exists() and child.read_bytes():  # it is empty for a zombie
         assert time.monotonic() < give_up
         time.sleep(0.05)
 
@@ -66,7 +66,7 @@ def test_the_demo_runs_to_its_end_without_loss(tmp_path: Path, speed: str) -> No
     ):
         assert line in done.stdout, done.stdout
     if speed == "fast":
-        # the printed command runs from here, without the environment on PATH
+        # the printed command works in this folder, without the environment on PATH
         (again,) = (line.partition(":  ")[2] for line in done.stdout.splitlines() if "again, bit for bit" in line)
         bare = dict(os.environ) | {"PATH": "/usr/bin:/bin"}
         assert subprocess.run(again, shell=True, cwd=ROOT, env=bare, capture_output=True, timeout=100).returncode == 0
@@ -79,7 +79,7 @@ def test_the_demo_runs_to_its_end_without_loss(tmp_path: Path, speed: str) -> No
     assert json.loads((folder / "publisher.log").read_text().splitlines()[-1])["stalls"] == 0
     assert "Traceback" not in (folder / "node.log").read_text()
 
-    # the summary against the twin itself
+    # the summary is compared with the twin itself
     scene = load_scene(folder / "scene.yaml")
     times = np.arange(3000) * 1e-3
     series = Twin(scene, excitation="sampled").advance_samples(times, compile_loads(scene.loads).at(times))
@@ -99,7 +99,7 @@ def test_the_demo_runs_to_its_end_without_loss(tmp_path: Path, speed: str) -> No
 def test_the_demo_takes_no_sample_before_the_estimator_is_compiled(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The processes are played: each look at the reports brings the next one."""
+    """The processes are simulated: each look at the reports brings the next report."""
     watch, seen = Watch(), list[str]()
     reports = iter([
         {"state": {"lifecycle": "active"}, "estimate": {"ready": "0"}}, {"estimate": {"ready": "0"}},
@@ -132,7 +132,7 @@ def test_forces_are_compared_with_the_machine_s_and_the_time_of_each_estimate_is
     beside = compare_forces(record_run(tmp_path / "run", entries).folder, 1.5e-3)
     assert beside is not None
     assert beside.estimates_s == pytest.approx([1.499])
-    # this run does not follow: its forces are nominal
+    # this run does not follow the machine, so its forces are nominal
     assert beside.error["followed"] == pytest.approx(beside.error["nominal"], rel=1e-3)
     assert beside.error["nominal"] > 0.02
 

@@ -1,4 +1,4 @@
-"""Faults with real processes: every sample sent is accounted for, and the twin goes on."""
+"""Faults with real processes: every sent sample is accounted for, and the twin continues."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def _accounted(figures: dict[str, str]) -> int:
 
 
 def _until_accounted(running: Bench, sent: int) -> dict[str, str]:
-    """Wait until all samples sent are accounted for; a loss at the very end shows by a later sample."""
+    """Wait until all sent samples are accounted for; a later sample reveals a loss at the very end."""
     figures: dict[str, str] = {}
 
     def reached() -> bool:
@@ -89,7 +89,7 @@ def test_late_samples_of_a_publisher_that_was_stopped_are_used(tmp_path: Path) -
         running.probe.pause(2.0)
         publisher.send_signal(signal.SIGCONT)
         figures = _until_accounted(running, _sent(publisher))
-        # all at once, some may overrun the publisher's own queue
+        # samples sent at once may overrun the publisher's own queue
         assert int(figures["samples_used"]) + int(figures["samples_lost"]) == 4000
         assert int(figures["rolled_back"]) > 0
 
@@ -121,13 +121,13 @@ def test_a_paused_node_counts_the_overrun_of_its_queue_and_continues(tmp_path: P
 
 
 def test_outputs_come_in_time_while_samples_come_ten_times_as_fast(tmp_path: Path) -> None:
-    # reliable: a best-effort reader's loss at the very end would never show
+    # the reader is reliable, because a best-effort reader's loss at the very end would never show
     settings = {"publish_mode": "fixed_rate", "publish_rate": 100.0, "input_depth": 20000}
     with bench(tmp_path, **settings, **RELIABLE_INPUT) as running:
         publisher = running.publisher("--rate", "10000", "--seconds", "5")
         _until_accounted(running, _sent(publisher))
-        # an executor that checked its timers only when nothing waited sent 23 of 500 due messages; at this rate such a
-        # loop sometimes finds an empty queue, so test_ros_runtime keeps the queue full
+        # an executor that checks its timers only when nothing waits would send 23 of 500 due messages; at this rate
+        # such a loop sometimes finds an empty queue, so test_ros_runtime keeps the queue full
         figures = running.probe.figures("output")
         assert int(figures["published"]) - int(figures["held"]) > 60
 
@@ -158,10 +158,10 @@ def test_after_a_kill_the_recording_replays_and_the_wear_goes_on(tmp_path: Path)
 
 def test_a_disk_that_takes_no_more_stops_the_recording_and_not_the_twin(tmp_path: Path) -> None:
     with bench(tmp_path, record_path=tmp_path / "run", **RELIABLE_INPUT) as running:
-        # as good as a full disk: a write beyond that size fails
+        # a write beyond this size fails, as on a full disk
         resource.prlimit(running.twin._process.pid, resource.RLIMIT_FSIZE, (200_000, 200_000))
         publisher = running.publisher("--rate", "1000", "--seconds", "120")
-        # losses of a busy machine are also trouble, and may be reported earlier
+        # losses on a busy machine are errors too, and may be reported earlier
         running.probe.until(lambda: running.probe.figures("recorder")["error"], "the full disk")
         running.probe.until(lambda: value(running.probe.status[-1], "recorder") == "trouble", "the full disk in status")
         assert running.probe.status[-1].level == b"\x02"
@@ -230,7 +230,7 @@ def test_damaged_bytes_on_every_input_are_counted_to_the_last_one(tmp_path: Path
         assert running.twin.stop() == 0
     report = replay(tmp_path / "run")
     assert report.exit_code == 0 and report.samples > 2900
-    # the file agrees to the message
+    # the file agrees, message by message
     assert sum(report.inputs["tool_forces"].values()) == 3000
 
 
@@ -265,11 +265,11 @@ def test_a_clock_that_is_paused_looped_and_fast_moves_the_twin_with_its_samples(
         play(0, 500, 10)
         _until_accounted(running, 500)
         busy = psutil.Process(running.twin._process.pid).cpu_times()
-        probe.pause(3.0)  # /clock stands still, and so does everything else
+        probe.pause(3.0)  # while /clock stands still, everything stands still
         idle = psutil.Process(running.twin._process.pid).cpu_times()
         assert (idle.user + idle.system) - (busy.user + busy.system) < 1.0
-        play(500, 3000, 500)  # in large steps
-        play(0, 500, 10)  # and from the beginning again
+        play(500, 3000, 500)  # the clock advances in large steps
+        play(0, 500, 10)  # the clock starts from the beginning again
         figures = _until_accounted(running, 3500)
         assert (figures["samples_used"], figures["holds"]) == ("3500", "0")
         assert probe.figures("state")["resets"] == "1"
@@ -293,13 +293,13 @@ def test_the_scene_s_loads_follow_a_clock_that_is_paused_looped_and_fast(tmp_pat
         reach(T0)
         reach(T0 + 20 * MS)
         count = len(forces)
-        for _ in range(3):  # paused: three reports without motion
+        for _ in range(3):  # while paused, three reports show no motion
             probe.figures("output")
         assert len(forces) == count and probe.figures("state")["resets"] == "0"
-        for second in range(1, 8):  # as fast as the answers come, seven seconds of the head in as many messages
+        for second in range(1, 8):  # one message a second of the head, each after the previous answer
             reach(T0 + second * 1000 * MS)
         assert probe.figures("state")["resets"] == "0"
-        reach(T0)  # from the beginning again
+        reach(T0)  # the clock starts from the beginning again
         reach(T0 + 20 * MS)
         figures = probe.figures("state")
         assert (figures["resets"], figures["solver_failures"]) == ("1", "0")
@@ -339,7 +339,7 @@ def test_any_sequence_on_clock_is_survived_counted_and_repeated_by_the_journal(s
                 service = rng.choice(("reset", "set_wear", "snapshot", "restore", "mark"))
                 probe.call(Trigger, f"{running.namespace}/plow_twin/{service}", Trigger.Request())
             probe.pace(index)
-        # once it runs steadily again it is followed again
+        # when the clock runs steadily again, the twin follows it again
         probe.pause(10.0)
         time_ns, count = T0, len(forces)
 
@@ -362,9 +362,9 @@ def test_any_sequence_on_clock_is_survived_counted_and_repeated_by_the_journal(s
 
 @pytest.fixture
 def stepped_clock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
-    """Give processes started from now on a clock of their own; return a function that shifts it by seconds.
+    """Give later processes a clock of their own; return a function that shifts this clock by seconds.
 
-    The system's clock only: the steady one goes on as it is, as with a step of NTP.
+    Only the system's clock is shifted; the steady clock continues, as with a step of NTP.
     """
     compiler, library, offset = shutil.which("cc"), tmp_path / "stepped_clock.so", tmp_path / "offset"
     if compiler is None:
@@ -387,7 +387,7 @@ def test_steps_of_the_node_s_own_clock_stop_reset_and_lose_nothing(
 ) -> None:
     settings = {"record_path": tmp_path / "run", "excitation_timeout": 60.0, **RELIABLE_INPUT}
     with bench(tmp_path, **settings) as running:
-        monkeypatch.delenv("LD_PRELOAD")  # of the node alone
+        monkeypatch.delenv("LD_PRELOAD")  # only the node has the shifted clock
         probe = running.probe
         send = probe.excitation()
         sent = 0
@@ -399,7 +399,7 @@ def test_steps_of_the_node_s_own_clock_stop_reset_and_lose_nothing(
                 probe.pace(sent)
             figures = _until_accounted(running, sent)
             age_s = float(figures["newest_sample_age_s"]) - (time.time_ns() - T0 - sent * MS) * 1e-9
-            # the report has the node's own time, which shows the step there; a busy machine may read it late
+            # the report has the node's time, which shows the step; on a busy machine it may be read late
             assert abs(age_s - off_s) < 5.0
             assert (figures["samples_used"], figures["holds"]) == (str(sent), "0")
         found = probe.figures("state")
@@ -439,8 +439,8 @@ rclpy.spin(node)
 
 
 def test_a_subscriber_that_stands_still_does_not_hold_up_the_twin(tmp_path: Path) -> None:
-    # room for all: a machine that does other work may let the twin stand for more than a second, which is not a loss
-    # here
+    # the queue has room for all samples, because on a busy machine the twin may stop for more than a second, which is
+    # not a loss here
     with bench(tmp_path, jump_forward=60.0, input_depth=10_000, **RELIABLE_INPUT) as running:
         slow = subprocess.Popen(
             [sys.executable, "-c", SUBSCRIBER.format(namespace=running.namespace)], stdout=subprocess.PIPE
@@ -523,7 +523,7 @@ def test_two_twins_in_one_process_do_not_disturb_each_other() -> None:
 
 def test_two_minutes_with_the_recorder_account_for_every_message_and_grow_by_nothing() -> None:
     command = [sys.executable, str(ROOT / "benchmark" / "live_load.py"), "--minutes", "2", "--rate", "500"]
-    environment = os.environ | {"ROS_DOMAIN_ID": "97"}  # other nodes report too
+    environment = os.environ | {"ROS_DOMAIN_ID": "97"}  # other nodes publish reports too
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=400.0)
     rows = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]

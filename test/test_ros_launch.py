@@ -1,4 +1,4 @@
-"""The launch file as `colcon test` runs it: launch_testing starts the twin, hears it and looks at its end."""
+"""The launch file as `colcon test` runs it: launch_testing starts the twin, listens to it and checks its end."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-# of a sourced ROS 2: neither is on PyPI
+# both belong to a sourced ROS 2, and neither is on PyPI
 pytest.importorskip("launch_testing")
 pytest.importorskip("launch_ros")
 

@@ -1,4 +1,4 @@
-"""Files and topics beside the node: markers, layouts, groups of diagnostics, access rights."""
+"""Files and topics beside the node: markers, layouts, groups of diagnostics, and access rights."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_markers_show_the_head_where_it_is_and_the_forces_on_it(tmp_path: Path) 
     assert np.ptp(frame, axis=0) == pytest.approx((scene.frame.width_m, scene.frame.height_m))
     arrows = [marker for (kind, _), marker in markers.items() if kind == "forces" and marker.action == Marker.ADD]
     assert 0 < len(arrows) < len(PAIR_NAMES)
-    # the walls that are pushed against hold the head back
+    # the walls that the head pushes against hold it back
     pushed = sum(
         np.array([arrow.points[1].x - arrow.points[0].x, arrow.points[1].y - arrow.points[0].y]) for arrow in arrows
     )

@@ -1,4 +1,4 @@
-"""`plow-twin record` beside a node: other topics as the bytes that came, into the folder of the run."""
+"""`plow-twin record` beside a node writes other topics, byte for byte, into the folder of the run."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ def test_other_topics_come_into_the_run_s_folder_with_their_types(tmp_path: Path
         notes.publish(note)
         camera = probe.node.create_publisher(PoseStamped, "camera/pose", 1000)
         strong = probe.node.create_publisher(PoseStamped, "gauge", 1000)
-        others = f"^(?!{namespace}/)"  # other tests may run beside this one
+        others = f"^(?!{namespace}/)"  # other tests may run at the same time
         command = [sys.executable, "-m", "plow_twin", "record", str(run), "--all", "--exclude", others, "--json"]
         with log.open("wb") as stream:
             recorder = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=stream, text=True)
         try:
             probe.until(lambda: camera.get_subscription_count() == 1, "the recorder")
-            # a publisher that offers less comes later: both are heard, and no message twice
+            # a publisher with a weaker offer comes later; both are received, and no message twice
             best_effort = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
             weak = probe.node.create_publisher(PoseStamped, "gauge", best_effort)
             probe.until(lambda: weak.get_subscription_count() == 1, "a subscription that the weaker publisher matches")
@@ -66,7 +66,7 @@ def test_other_topics_come_into_the_run_s_folder_with_their_types(tmp_path: Path
     assert recorder.returncode == (3 if facts["lost"] else 0), log.read_text()
     assert facts["messages"][f"{namespace}/camera/pose"] == COUNT and facts["messages"][f"{namespace}/notes"] == 1
     gauge = f"{namespace}/gauge"
-    assert facts["messages"][gauge] + facts["lost"].pop(gauge, 0) == 2 * COUNT  # best effort
+    assert facts["messages"][gauge] + facts["lost"].pop(gauge, 0) == 2 * COUNT  # these messages are best-effort
     assert facts["lost"] == {} == facts["skipped_topics"] and facts["without_publisher"] == []
     # topics of the run itself are left out
     assert not facts["messages"].keys() & {*RunReader(run).header.topics.values()}

@@ -1,4 +1,4 @@
-"""Many twins in one call: each equals its single run, in numbers, snapshots and errors."""
+"""Many twins in one call: each twin equals its single run in numbers, snapshots and errors."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FIELDS = ("q", "v", "penetration", "rate", "force", "peak", "impulse", "makes", 
 
 
 def members() -> list[Scene]:
-    """Scenes that differ in clearance, stiffness, damping, mass and place."""
+    """Return scenes that differ in clearance, stiffness, damping, mass and initial pose."""
     scene, rng = preset("bench_kv"), np.random.default_rng(5)
     found = []
     for _ in range(9):
@@ -35,7 +35,7 @@ def samples(count: int) -> np.ndarray:
 
 
 def in_lanes() -> dict[str, list[Scene]]:
-    """Return scenes that go eight to a vector, by the form of their law."""
+    """Return scenes that run in the eight lanes of a vector, by the form of their law."""
     laws = {
         "C d'": {},
         "lambda d'": {"law": "hunt_crossley", "damping": 0.7},
@@ -64,7 +64,7 @@ def test_a_member_beside_the_lanes_is_its_single_run_bit_for_bit(workers: int) -
 @pytest.mark.parametrize("law", in_lanes())
 def test_a_member_in_lanes_has_its_own_bits_and_the_motion_of_a_twin(law: str) -> None:
     scenes = in_lanes()[law]
-    # a pause, a jump and samples that come often: series of few orders and of all
+    # samples with a pause, with a jump and at short intervals need series of few orders and of all orders
     times = np.concatenate([TIMES[:250], TIMES[250:] + 0.2, [0.7, 0.7]])
     wrench = np.concatenate([samples(len(scenes)), samples(len(scenes))[:, :2]], axis=1)
     together = TwinBatch(scenes, tol=1e-9).advance_samples(times, wrench)

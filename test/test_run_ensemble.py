@@ -1,4 +1,4 @@
-"""Many scenes at once: the same bits as one by one, on any number of threads; a failure stays with its member."""
+"""Many scenes at once have the same bits as one by one, on any number of threads. A failure affects only its member."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from plow_twin.solve import compiled_scene
 
 
 def members() -> list[Scene]:
-    """Scenes that the lanes do not take (`test_solve_lanes`)."""
+    """Return scenes that the lanes do not take (`test_solve_lanes`)."""
     scene = preset("bench_hc")
     pairs = [(gx, gy) for gx in (0.020, 0.025, 0.030) for gy in (0.021, 0.028)]
     scenes = [dataclasses.replace(scene, clearance=Clearance(gx, gy)) for gx, gy in pairs]
@@ -42,7 +42,7 @@ def test_each_member_is_its_single_run_bit_for_bit(workers: int) -> None:
 
 
 def test_members_with_other_terms_leave_nothing_behind() -> None:
-    """The thread's scratch space goes from one to the next: a sampled load, a flight, a rest."""
+    """A thread's scratch memory is used by one member after the other: a sampled load, a flight, a rest."""
     scene = preset("bench_hc")
     table = Table("ramp", np.array([0.0, 1.0]), np.array([[0.0, 0.0, 0.0], [4e4, -1e4, 2e3]]))
     swing = Harmonic("swing", (200.0, 50.0), 20.0)
@@ -79,7 +79,7 @@ def test_scenes_one_after_the_other_share_what_their_equal_parts_need(monkeypatc
     for gap in (0.020, 0.025, 0.030):
         simulate(dataclasses.replace(scene, clearance=Clearance(gap, gap)), 1e-3)
     assert len(summed) == 1
-    for _ in range(2):  # a table is not kept
+    for _ in range(2):  # a table is not cached
         simulate(dataclasses.replace(scene, loads=(table,)), 1e-3)
     assert len(summed) == 3
 
@@ -93,7 +93,7 @@ def test_parts_that_the_clearance_does_not_decide_are_computed_once(monkeypatch:
 
     monkeypatch.setattr(geometry, "arm_rows", counted)
     centred = preset("bench_kv")
-    beside = dataclasses.replace(centred, initial=Initial(q=(1e-3, 2e-3, 0.01)))  # may touch its walls at the start
+    beside = dataclasses.replace(centred, initial=Initial(q=(1e-3, 2e-3, 0.01)))  # may touch walls at the start
     gaps = [Clearance(gap, 0.03) for gap in (0.015, 0.020, 0.025)]
     scenes = [dataclasses.replace(scene, clearance=gap) for scene in (centred, beside) for gap in gaps]
     params, _ = compiled_scene.compile_scenes(scenes, 1e-6)

@@ -1,4 +1,4 @@
-"""Bounded work: limits of a run, Ctrl-C and progress, each with the results so far."""
+"""Limited work: limits of a run, Ctrl-C and progress. Each gives the results so far."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def test_a_twin_stops_at_its_limits_where_its_last_advance_ended() -> None:
     samples = np.stack([4e4 * np.sin(2.0 * times), 1e4 * np.cos(2.0 * times), 3e4 * np.sin(2.0 * times)], axis=1)
     free = Twin(BENCH, excitation="sampled")
     whole = free.advance_samples(times, samples)
-    # a limit of steps belongs to the motion: that advance is undone, with a status
+    # a limit of steps belongs to the motion, so an advance beyond it is undone and gets a status
     tied = Twin(BENCH, excitation="sampled", max_steps=1)
     assert {tied.advance(t, load).status.name for t, load in zip(times[:50], samples, strict=False)} == {"OK", "BUDGET"}
     for name in ("sampled", "scene"):
@@ -126,7 +126,7 @@ def test_a_twin_stops_at_its_limits_where_its_last_advance_ended() -> None:
         if name == "scene":
             assert late.time == len(part) == 0 and late.digest() == Twin(BENCH).digest()
             continue
-        # it continues as if no more had been requested
+        # it can continue as if no more had been requested
         assert 0 < len(part) < len(times) and late.time == times[len(part) - 1] == stop.value.time_s
         assert np.array_equal(part.q, whole.q[: len(part)])
         late._pace.max_wall_s = np.inf
@@ -179,7 +179,7 @@ def test_no_scene_works_without_bound(scene: Scene, tol: float) -> None:
         assert "at t = " in str(error)
 
 
-#: A process that prints its steps when the signal arrives, from another thread, and when the call has returned.
+#: A program that prints its steps when the signal arrives, from another thread, and when the call has returned.
 INTERRUPTED = """
 import json, os, signal, threading, time
 from plow_twin import RunInterrupted, load_scene
@@ -216,7 +216,7 @@ print(json.dumps(told))
 
 
 def test_slices_of_lanes_stay_bounded_through_many_short_ones() -> None:
-    """A scene at rest leaves its lane repeatedly: more than thirty slices in a row take no time."""
+    """A scene at rest leaves its lane repeatedly, so that more than thirty slices in a row take almost no time."""
     scene = replace(preset("bench_kv"), loads=())
     found = simulate_many([scene], 1e6, 1e6, 1e-6, workers=1)
     assert found.status[0] == Status.OK and found.steps[0] > 10_000
@@ -229,12 +229,12 @@ def test_a_process_that_gets_sigint_returns_within_a_slice_of_work() -> None:
         told = json.loads(process.communicate(timeout=60)[0])
     slices = told["slices"]
     largest = max(after - before for before, after in itertools.pairwise(slices))
-    # the slice under way when the signal came is the last one; it may have grown fourfold
+    # the slice during which the signal came is the last one; it may be four times as large as the slice before
     assert 0 <= told["returned"] - told["signalled"] <= 4 * largest
     assert told["rows"] >= 1
 
 
-#: The command line, which prints when the motion itself has begun.
+#: A program that runs the command line and prints when the motion itself has begun.
 COMMAND = """
 import sys
 from plow_twin.run import simulate as module

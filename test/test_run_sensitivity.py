@@ -1,4 +1,4 @@
-"""The worth of a tolerance: growth of errors against finite differences, a map's exponent, a scene that amplifies."""
+"""The meaning of a tolerance: growth of errors against finite differences, a map's exponent, and amplified errors."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from plow_twin.study.parameters import with_parameters
 
 
 def bouncing(gamma: float, r: float, stiffness: float) -> Scene:
-    """A ball on a table that vibrates with A w^2 = gamma g, in the table's frame, on its period-one orbit."""
+    """Return a ball on a table that vibrates with A w^2 = gamma g, in the table's frame, on its period-one orbit."""
     phase = math.acos(math.pi * (1.0 - r) / (1.0 + r) / gamma)
     speed = 0.5 * GRAVITY * PERIOD - gamma * GRAVITY / OMEGA * math.cos(phase)
     return Scene(
@@ -50,7 +50,7 @@ def bouncing(gamma: float, r: float, stiffness: float) -> Scene:
 
 
 def test_the_exponent_of_a_ball_on_a_vibrating_table_is_that_of_its_map() -> None:
-    """The map of the impacts shrinks areas by r^2 each period, its eigenvalues are a pair of size r: ln(r) a period."""
+    """The map of the impacts shrinks areas by r^2 a period; its pair of eigenvalues of size r gives ln(r) a period."""
     r = 0.5
     result = simulate(bouncing(1.3, r, 1e10), 4.0, sensitivity=True)
     assert result.sensitivity is not None and result.sensitivity.trusted
@@ -77,7 +77,7 @@ def test_the_derivatives_are_finite_differences_of_the_motion() -> None:
 
 @pytest.mark.parametrize("name", ["bench_kv", "paper"])
 def test_the_derivatives_by_parameters_are_finite_differences_of_the_motion(name: str) -> None:
-    """Stiffness, damping, clearances and gains of the loads, over several touches."""
+    """The parameters are stiffness, damping, clearances and load gains; the motion has several touches."""
     scene = replace(preset(name), initial=Initial((0.001, 0.002, 0.003), (0.1, 0.0, 0.2)))
     paths = sensitivity_parameters(scene)
     assert {"contact.stiffness", "contact.damping", "clearance.vertical_m"} < set(paths) and len(paths) >= 5
@@ -96,11 +96,11 @@ def test_the_derivatives_by_parameters_are_finite_differences_of_the_motion(name
 
 
 def _law(name: str) -> Scene:
-    """The paper's scene, thrown, with a law whose force is not linear or depends on the speed of a touch."""
+    """Return the paper's scene, thrown, with a law whose force is nonlinear or depends on the speed of a touch."""
     scene = replace(preset("paper"), initial=Initial((0.001, 0.002, 0.003), (0.4, 0.1, 0.8)))
     stiffness = scene.contact.stiffness
     contact = {
-        # with this floor no implicit step is possible, as in the presets, whose kernels are used again
+        # with this floor, as in the presets, no implicit step is possible, so the presets' kernels are used again
         "restitution": Contact("exact_restitution", stiffness, restitution=0.7, impact_speed_floor_m_s=0.05),
         "Hertz with restitution": Contact(
             "exact_restitution", 30.0 * stiffness, 1.5, restitution=0.7, impact_speed_floor_m_s=0.05
@@ -121,7 +121,10 @@ def _law(name: str) -> Scene:
     ],
 )
 def test_the_linearised_equations_agree_with_displaced_motions(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Laws that the differences of runs above do not cover; the equations are used, not shadows."""
+    """The laws are those that the differences of runs above do not cover.
+
+    The linearised equations are used, not shadow runs.
+    """
     scene, used = _law(name), list[int]()
     paths = tuple(sensitivity_parameters(scene))
     beside = sensitivity.columns_beside
@@ -140,7 +143,7 @@ def test_the_linearised_equations_agree_with_displaced_motions(name: str, monkey
 
 
 def test_derivatives_where_errors_grow_follow_a_motion_that_is_known_better(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Stiff walls multiply errors: at the first tolerance the motion would soon be a different one."""
+    """Stiff walls multiply errors, so with the first tolerance the motion would soon be a different one."""
     scene = replace(preset("bench_kv"), contact=Contact("kelvin_voigt", 1e9, damping=1e4))
     tolerances, follow = [], sensitivity._by_equations
 
@@ -156,7 +159,7 @@ def test_derivatives_where_errors_grow_follow_a_motion_that_is_known_better(monk
 
 
 def test_products_of_stretches_grow_as_their_matrices_do() -> None:
-    """Growth against numpy's norms, in one call and in portions, with stretches that continue past some ends."""
+    """The growth is that of numpy's norms, in one call and in portions, with stretches that continue past some ends."""
     random = np.random.default_rng(3)
     matrices = 0.5 * random.normal(size=(300, 4, 4))
     changes, ends = random.normal(size=(300, 2, 4)), random.random(300) < 0.7
@@ -213,7 +216,7 @@ def test_a_live_twin_has_the_derivatives_too() -> None:
 
 @pytest.mark.parametrize("e", [1.0, 0.7])
 def test_a_live_twin_has_the_derivative_by_restitution_also_where_nothing_damps(e: float) -> None:
-    """At e = 1 the scene beside it is damped, and a contact under way keeps the damping of its touch."""
+    """At e = 1 the displaced scene is damped, and an existing contact keeps the damping of its touch."""
     scene = replace(preset("paper"), initial=Initial((0.001, 0.002, 0.003), (0.4, 0.1, 0.8)))
     scene = replace(scene, contact=Contact("exact_restitution", scene.contact.stiffness, restitution=e))
     twin = Twin(scene, excitation="sampled")
@@ -232,7 +235,7 @@ def test_a_live_twin_has_the_derivative_by_restitution_also_where_nothing_damps(
         assert rows.makes.sum() > 2
         return np.concatenate([rows.q[-1], rows.v[-1]])
 
-    # one-sided, and once more with half the step
+    # a one-sided difference, and another one with half the step
     ends = [end(with_parameters(scene, {"contact.restitution": e - d})) for d in (0.0, 1e-5, 2e-5)]
     expected = (1.5 * ends[0] - 2.0 * ends[1] + 0.5 * ends[2]) / 1e-5
     found = followed.by_parameter["contact.restitution"]

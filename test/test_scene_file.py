@@ -1,4 +1,4 @@
-"""Scene files: reading, refusals with their messages, and writing and reading back without loss."""
+"""Scene files: reading, errors with their messages, and writing and reading back without loss."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ contact: {law: hunt_crossley, stiffness: 9.6975e6, damping: 0.72154}
 
 def test_numbers_are_read_as_people_write_them() -> None:
     scene = loads_scene(MINIMAL)
-    assert scene.contact.stiffness == 9.6975e6  # YAML 1.1 reads a text here
+    assert scene.contact.stiffness == 9.6975e6  # YAML 1.1 reads this number as a text
     assert type(scene.head.mass_kg) is float
     assert scene.pairs == PAIR_NAMES
     assert scene.wear is None
@@ -161,7 +161,7 @@ gravty: 3
     missing = {key: value for key, value in expected.items() if got.get(key, ("", ""))[0] != value}
     assert not missing, f"not reported: {missing}\n{caught.value}"
     assert got.keys() - {"frame.labels.1"} == expected.keys()
-    assert "mass_kg" in got["head.mas"][1]  # the nearest known key
+    assert "mass_kg" in got["head.mas"][1]  # the error names the nearest known key
     assert got["gravty"][1] == "a known key; did you mean gravity?"
     assert got["head.mass_kg"][1] == "a finite number > 0 [kg]"
     assert str(caught.value).startswith("bad.yaml: ")
@@ -226,7 +226,7 @@ def test_table_from_a_file_stands_in_the_dump(tmp_path: Path) -> None:
 
 
 def test_a_table_is_read_as_any_other_csv_file(tmp_path: Path) -> None:
-    """A byte order mark was taken for a part of `t`, and semicolons did not separate columns."""
+    """A byte order mark is not taken for a part of `t`, and semicolons separate columns."""
     scene = MINIMAL + "loads: [{name: cut, table: {file: load.csv}}]"
     for text in (
         "time;fx;fy;m\r\n0;1,5;2;3\r\n\r\n0,5;1;-2,25;3\r\n",
@@ -313,7 +313,7 @@ def scenes(draw: st.DrawFn) -> Scene:
         sliding=draw(st.sampled_from(["travel", "total"])), running_in_ratio=ratio, running_in_depth_m=draw(POSITIVE),
     )  # fmt: skip
     rate = ratio * wear.coefficient_m2_n * wear.travel_speed_m_s / wear.pad_area_m2
-    # a pad that would wear faster than its damper lets the head move is refused
+    # a pad that wears faster than its damper lets the head move is refused
     bearable = not LAWS[contact.law].additive or not (contact.damping or 0.0) * rate > 1.0
     letters = draw(st.lists(NAME, max_size=len(CORNER_NAMES), unique=True))
     labels = dict(zip(letters, draw(st.permutations(CORNER_NAMES)), strict=False))
@@ -352,7 +352,7 @@ def _bits(value: Any) -> Any:
 def test_a_dumped_scene_reads_back_the_same_bit_for_bit(scene: Scene) -> None:
     text = dump_scene(scene)
     assert _bits(loads_scene(text)) == _bits(scene)
-    # other YAML readers see the same texts and sections
+    # other YAML readers get the same texts and sections
     assert yaml.safe_load(text)["head"]["rotation"] == "paper"
 
 

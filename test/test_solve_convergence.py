@@ -1,4 +1,4 @@
-"""Measured convergence orders: the method's with event location, the missed touch's with a fixed step."""
+"""Measured orders of convergence: of the method with event location, and of a fixed step that misses the touch."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ def local_orders(errors: list[float]) -> np.ndarray:
 def fixed_step_errors(
     contact: Contact, method: Literal["rk4", "euler"], halvings: int, phases: int = 32
 ) -> list[float]:
-    """Mean error of the pose after one impact, for steps of 80 us halved again and again.
+    """Return the mean error of the pose after one impact, for steps of 80 us that are halved repeatedly.
 
-    The touch falls on all phases of the step equally, and, by a slightly varied stiffness, so does the separation: the
-    mean is smooth in dt where a single run is not.
+    The touch occurs equally often at every phase of a step, and so does the separation, because the stiffness varies
+    slightly. The mean is therefore smooth in dt, although a single run is not.
     """
     t_end, errors = 0.016, []
     for count in 200 * 2 ** np.arange(halvings + 1):
@@ -58,13 +58,13 @@ def fixed_step_errors(
         ("kelvin_voigt", 1.0),
         ("n = 1", 2.0),
         ("n = 1.5", 2.5),
-        # kernels of their own
+        # these laws compile their own kernels
         pytest.param("n = 1.5, Hertz", 2.5, marks=pytest.mark.stress),
         pytest.param("n = 2", 3.0, marks=pytest.mark.stress),
     ],
 )
 def test_rk4_without_event_location_has_order_n_plus_one(name: str, order: float) -> None:
-    """The force sets in as d^n, Kelvin-Voigt's jumps (Shampine and Thompson, Comput. Math. Appl. 39 (2000) 43)."""
+    """The force begins as d^n; that of Kelvin-Voigt jumps (Shampine and Thompson, Comput. Math. Appl. 39 (2000) 43)."""
     errors = fixed_step_errors(CONTACTS[name], "rk4", 4)
     assert np.polyfit(np.log2([1, 2, 4, 8, 16]), np.log2(errors), 1)[0] == pytest.approx(-order, abs=0.15)
     assert local_orders(errors) == pytest.approx(order, abs=0.35)
@@ -81,9 +81,9 @@ def test_semi_implicit_euler_has_order_one(name: str) -> None:
 def test_event_location_keeps_the_order_of_the_series(
     name: str, first: int, order: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Error against number of steps over 4 s of impacts, the order of the series held at 6 and 8.
+    """The error is compared with the number of steps over 4 s of impacts, with series of order 6 and 8.
 
-    Six decades of the tolerance, above rounding (1e-13 of the clearance).
+    The tolerance varies over six decades, above rounding (1e-13 of the clearance).
     """
     scene, exact = preset(name), reference(REFERENCES[name])["q"][:401]
     monkeypatch.setattr(compiled_scene, "order_for", lambda tol: order)
@@ -94,13 +94,13 @@ def test_event_location_keeps_the_order_of_the_series(
 
 @pytest.mark.parametrize("name", REFERENCES)
 def test_the_error_falls_with_the_tolerance(name: str) -> None:
-    """From 1e-3 to 1e-8, above rounding: error = constant times tol^s with s near 1."""
+    """From 1e-3 to 1e-8, above rounding, the error is a constant times tol^s with s near 1."""
     scene, exact = preset(name), reference(REFERENCES[name])["q"][:501]
     exponents = np.arange(3, 9)
     errors = [run(scene, 10.0**-k, exact)[1] for k in exponents.tolist()]
     slope, offset = np.polyfit(-exponents, np.log10(errors), 1)
     assert slope == pytest.approx(1.0, abs=0.12)
-    # no decade falls out of line by more than half a decade
+    # no error is off the line by more than 0.6 decades
     assert np.log10(errors) == pytest.approx(offset - slope * exponents, abs=0.6)
 
 

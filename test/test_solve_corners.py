@@ -1,4 +1,4 @@
-"""A head that carries corners: a block in a fixed cavity, alone on one wall, tumbling, and beside a head with walls."""
+"""A head that carries corners is a block in a fixed cavity: on one wall, tumbling, and beside a head with walls."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ WALL = 1.0
 
 
 def block(**changes: object) -> Scene:
-    """Return a square block above a table 1 m below the cavity's centre; the other walls are never met."""
+    """Return a square block above a table 1 m below the cavity's centre; it never meets the other walls."""
     scene = Scene(
         Head(MASS, INERTIA, carries="corners"),
         Frame(SIDE, SIDE),
@@ -67,7 +67,7 @@ def on_table(t: float, z: np.ndarray) -> list[float]:
 
 @pytest.fixture(scope="module")
 def falls() -> object:
-    """Return a block that falls on its table, rolls over two of its corners and comes to lie."""
+    """Return a block that falls on its table, rolls over two of its corners and comes to rest."""
     return simulate(block(), t_end=0.8, output_dt=0.004, tol=1e-9, energy_balance=True)
 
 
@@ -89,20 +89,20 @@ def test_corners_balance_energy_and_momentum(falls) -> None:
 
 
 def test_corners_pass_their_contact_on_at_45_degrees() -> None:
-    # pressed on the table by ten times its weight, rolled over its lower right corner
+    # the block is pressed on the table by ten times its weight and rolls over its lower right corner
     push = Constant("push", force_n=(0.0, -90.0), moment_n_m=-3.3)
     lying = Initial(q=(0.0, -WALL + 0.5 * SIDE, 0.0), v=(0.0, 0.0, -0.3))
     scene = block(initial=lying, loads=(push,), friction=Friction(1.0, 0.02))
-    result = simulate(scene, t_end=0.25, output_dt=1e-3, energy_balance=True)  # the kernels of `falls`
+    result = simulate(scene, t_end=0.25, output_dt=1e-3, energy_balance=True)  # uses the kernels of `falls`
     turned = np.flatnonzero(result.q[:, 2] < -0.25 * math.pi)
     assert turned.size > 0
     at = result.t[turned[0]]
     passed = [event for event in result.events if abs(event["time"] - at) < 1.1e-3]
-    # one event, two names, the same time and no touch
+    # one event changes two pairs at the same time, without a touch
     assert {(int(e["pair"]), int(e["mode_from"]), int(e["mode_to"])) for e in passed} == {(4, 1, 0), (6, 0, 1)}
     assert passed[0]["time"] == passed[1]["time"]
     force = result.force[:, [4, 6]].sum(axis=1)
-    # the force goes on as it was: the steps before, across and after the event grow alike
+    # the force continues smoothly: its steps before, across and after the event grow alike
     steps = np.abs(np.diff(force[turned[0] - 3 : turned[0] + 2]))
     assert force[turned[0]] > 0.0
     assert np.abs(np.diff(steps)).max() < steps.max()
@@ -119,7 +119,7 @@ def test_corners_fly_and_turn_without_end(spin: float) -> None:
 
 
 def mirrored(scene: Scene) -> Scene:
-    """Return the head with walls whose motion is the block's with the sign turned, while it does not turn."""
+    """Return the head with walls whose motion is the block's with the opposite sign, while it does not turn."""
     q, v = scene.initial.q, scene.initial.v
     turned = tuple(replace(load, force_n=(-load.force_n[0], -load.force_n[1])) for load in scene.loads)
     return replace(
@@ -132,7 +132,7 @@ def mirrored(scene: Scene) -> Scene:
 
 
 STICK = Friction(0.2, stick_stiffness_n_m=1e6, stick_damping_n_s_m=20.0)
-#: With so much inertia that it does not turn; a locked angle would need its own kernels.
+#: A block with so much inertia that it does not turn; a locked angle would need its own kernels.
 GUIDED = block(
     head=Head(MASS, 1e12, carries="corners"),
     frame=Frame(0.3, 0.2),
@@ -168,7 +168,7 @@ def test_corners_that_turn_little_are_nearly_a_mirrored_head_with_walls() -> Non
         scene = replace(
             GUIDED,
             head=block().head,
-            # next to no friction and load, instead of none: the kernels of the test above
+            # friction and load are negligible instead of absent, so that the kernels of the test above are used
             friction=replace(STICK, coefficient=1e-12),
             loads=(Harmonic("push", force_n=(1e-9, 0.0), omega_rad_s=9.0),),
             initial=Initial(q=(0.0, 0.0, angle), v=(0.4, -0.3, 0.0)),
@@ -176,7 +176,7 @@ def test_corners_that_turn_little_are_nearly_a_mirrored_head_with_walls() -> Non
         ends = [simulate(one, t_end=0.03, output_dt=1e-3, tol=1e-10).q for one in (scene, mirrored(scene))]
         return float(np.abs(ends[0] + ends[1]).max())
 
-    # the arms differ by the clearance over the size, and a turn as large
+    # the arms differ by the ratio of clearance to size, and by a turn of this size
     assert difference(1e-3) < 0.1 * 0.03
 
 
@@ -190,8 +190,8 @@ def test_corners_move_the_same_by_fixed_steps_and_by_a_live_twin(falls) -> None:
 
 
 def test_senses_of_corners_are_those_of_the_block() -> None:
-    # a moment turns the block counter-clockwise against its guide: these sets stop a counter-clockwise swing; a larger
-    # moment would compile implicit steps
+    # a moment turns the block counter-clockwise against its guide, so these sets stop a counter-clockwise swing; a
+    # larger moment would compile implicit steps
     scene = block(
         frame=Frame(0.3, 0.2), clearance=Clearance(0.01, 0.01), friction=Friction(1e-12, 0.05), gravity=Gravity(0.0),
         loads=(Constant("turn", moment_n_m=5.0),), initial=Initial(),
@@ -229,7 +229,7 @@ def test_estimate_refuses_a_block() -> None:
     "radius", [pytest.param(None, id="sharp"), pytest.param(0.01, id="rounded", marks=pytest.mark.stress)]
 )
 def test_twins_with_walls_and_with_corners_share_no_compiled_code(radius: float | None) -> None:
-    """Both have the same terms: only the records of their constants differ."""
+    """Both twins have the same terms; only the records of their constants differ."""
     walls = replace(mirrored(block()), frame=Frame(SIDE, SIDE))
     corners = block(frame=Frame(SIDE, SIDE, corner_radius_m=radius))
     expected = simulate(corners, t_end=0.3, output_dt=0.1, energy_balance=True).q[-1]
@@ -241,12 +241,12 @@ def test_twins_with_walls_and_with_corners_share_no_compiled_code(radius: float 
 
 
 def test_strongly_damped_block_sinks_in_as_deep_as_its_weight_presses() -> None:
-    """Two corners of an overdamped contact creep to the static depth in implicit steps."""
+    """Two corners with overdamped contact creep to the static depth in implicit steps."""
     stiffness, start = 1e4, -WALL + 0.5 * SIDE
     damped = Contact("kelvin_voigt", stiffness=stiffness, damping=4e4)
     scene = block(contact=damped, initial=Initial((0.0, start, 0.0), (0.0, 0.0, 0.0)), friction=None)
     found = simulate(scene, t_end=60.0, output_dt=1.0)
-    # C x' = m g / 2 - K x for each corner, but for the first m / 2 C = 13 us
+    # for each corner C x' = m g / 2 - K x, except in the first m / 2 C = 13 us
     depth = 0.5 * MASS * 9.81 / stiffness * (1.0 - np.exp(-found.t * stiffness / 4e4))
     np.testing.assert_allclose(start - found.q[:, 1], depth, atol=2e-7)
     assert found.solver["steps"] < 2000

@@ -1,4 +1,4 @@
-"""The balance of energy and momentum holds where the motion is right, and only there."""
+"""The balance of energy and momentum closes for a correct motion, and only for a correct motion."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SCENES = {
     "locked": replace(PAPER, locked=("y",)),
 }
 SCENES["offset, wear"] = replace(SCENES["offset"], wear=SCENES["wear"].wear)
-# each compiles kernels of its own; a ramp is in test_solve_ramp
+# each of these compiles its own kernels; test_solve_ramp covers a ramp
 FULL_COUNT = ("bench_hc", "offset", "ramp", "wear", "locked")
 
 
@@ -56,7 +56,7 @@ def test_the_balance_changes_no_bit_of_the_motion_and_costs_nothing_when_off() -
 
 
 def test_a_wrong_motion_does_not_balance() -> None:
-    """The balance computes its own forces: a solver with another stiffness is detected."""
+    """The balance computes its own forces, so a solver with another stiffness is detected."""
     compiled = compile_scene(PAPER, 1e-9)
     motion = Motion.start(compiled, np.zeros((1, 3)), np.zeros((1, 3)), outputs=True)
     motion.sums = new_balance()

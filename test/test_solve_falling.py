@@ -1,4 +1,4 @@
-"""A restitution that falls with the impact: single impacts, no gain of energy, and no code without it."""
+"""A restitution that decreases with the impact: single impacts, no gain of energy, and no code without it."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ LAW = Contact(
     "exact_restitution", 1e8, restitution=E, restitution_fall=FALL, restitution_speed_m_s=SPEED,
     impact_speed_floor_m_s=0.01,
 )  # fmt: skip
-#: A block that no impact turns. Heavy instead of locked, with negligible friction and with the balance of energy, these
-#: scenes have the same kernels.
+#: A block that no impact turns. It is heavy instead of locked; with negligible friction and the energy balance, all of
+#: these scenes use the same kernels.
 HEAVY = Head(MASS, 1e12, carries="corners")
 SMOOTH = Friction(1e-12, 0.05)
 
 
 def impact(contact: Contact, v: tuple[float, float, float], angle: float = 0.0, **changes: object) -> Scene:
-    """Return a block of which the lower left corner is a micrometre above the table, without weight."""
+    """Return a weightless block whose lower left corner is a micrometre above the table."""
     lowest = 0.5 * SIDE * (math.sin(angle) + math.cos(angle))
     scene = Scene(
         Head(MASS, INERTIA, carries="corners"),
@@ -63,7 +63,7 @@ def impact(contact: Contact, v: tuple[float, float, float], angle: float = 0.0, 
 
 
 def returned(scene: Scene) -> float:
-    """Return the normal speed of the lower left corner after its impact over that before."""
+    """Return the ratio of the lower left corner's normal speeds after and before its impact."""
     (_, _, angle), (_, fall, omega) = scene.initial.q, scene.initial.v
     arm = -0.5 * SIDE * (math.cos(angle) - math.sin(angle))
     result = simulate(scene, t_end=2e-6 / -fall + 0.01, output_dt=1e-3, energy_balance=True)
@@ -91,7 +91,7 @@ def test_every_law_is_asked_for_what_is_left(law: str) -> None:
 @pytest.mark.parametrize("power", [0.5, 1.3])
 def test_impact_counts_by_the_mass_at_the_corner(angle: float, omega: float, power: float) -> None:
     speed, arm = 2.0, 0.5 * SIDE * (math.cos(angle) - math.sin(angle))
-    # so hard that the block hardly turns during the impact
+    # the contact is so hard that the block hardly turns during the impact
     contact = replace(LAW, stiffness=1e12, restitution_mass_power=power)
     found = returned(impact(contact, (0.0, -speed, omega), angle, pairs=("bottom_left_bottom",)))
     approach = speed + omega * arm
@@ -136,7 +136,7 @@ def test_no_impact_gains_energy(fall, along, omega, angle, e, power, least, mass
     contact = Contact(
         "exact_restitution", 1e8, restitution=e, restitution_fall=power, restitution_speed_m_s=least,
         restitution_mass_power=mass, restitution_fall_along_s_m=sideways,
-        impact_speed_floor_m_s=0.2,  # a lower one would compile implicit steps
+        impact_speed_floor_m_s=0.2,  # a lower floor would compile implicit steps
     )  # fmt: skip
     scene = impact(contact, (along, -fall, omega), angle, friction=Friction(0.3, 0.05))
     result = simulate(scene, t_end=0.02, output_dt=1e-3, energy_balance=True)
@@ -175,14 +175,14 @@ def test_block_with_a_falling_restitution_agrees_with_an_independent_integration
     found = simulate(only, t_end=0.006, output_dt=1e-3, tol=1e-9, energy_balance=True)
     z0 = [*scene.initial.q, *scene.initial.v]
     reference = solve_ivp(rate, (0.0, 0.006), z0, "DOP853", rtol=1e-10, atol=1e-12, max_step=1e-6)
-    # the approach in flight lasts a microsecond, in which weight and turn change the speed of the touch a little
+    # the approach in flight lasts a microsecond, in which weight and turning change the speed of the touch a little
     assert (np.abs(found.v[-1] - reference.y[3:, -1]) < [1e-3, 1e-3, 0.05]).all()
 
 
 def test_live_twin_and_batch_have_the_motion_of_the_run() -> None:
     scene = impact(LAW, (0.2, -1.0, 3.0), 0.1, friction=Friction(0.2, 0.05), gravity=Gravity())
     run = simulate(scene, t_end=0.05, output_dt=0.01, energy_balance=True)
-    twin = Twin(scene, excitation="sampled")  # under samples of zero: the kernel of the batch
+    twin = Twin(scene, excitation="sampled")  # zero samples are used, for which the batch's kernel exists
     np.testing.assert_allclose([twin.advance(float(t)).q for t in run.t[1:]], run.q[1:], atol=1e-9)
     rows = TwinBatch([scene, scene]).advance(0.05)
     np.testing.assert_allclose(rows.q[:, 0], [run.q[-1]] * 2, atol=1e-9)
@@ -219,7 +219,7 @@ def test_what_a_falling_restitution_cannot_be_is_named(make: Callable[[], Contac
 
 
 def test_resting_block_comes_to_rest() -> None:
-    """Slow touches keep the restitution of the slowest impact that falls: bounces die out as with a constant one."""
+    """Slow touches keep the restitution of the law's lowest speed, so bounces die out as with a constant one."""
     scene = impact(LAW, (0.0, -0.3, 0.0), gravity=Gravity(), loads=(Constant("press", (0.0, -5.0)),))
     result = simulate(scene, t_end=0.5, output_dt=0.01, energy_balance=True)
     assert abs(result.v[-1]).max() < 1e-4

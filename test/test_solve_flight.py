@@ -1,4 +1,4 @@
-"""Free flight in closed form: compared with the formula and the series, without passing a wall."""
+"""Free flight in closed form, compared with the formula and the series; it never passes a wall."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from plow_twin.solve.state import new_work
 
 
 def swaying(drift: tuple[float, float, float] = (0.0, 0.0, 0.0), amplitude: float = 1e-3, omega: float = 20.0) -> Scene:
-    """A weightless head that a load swings by `amplitude` metres, and that drifts."""
+    """Return a weightless head that drifts while a load swings it by `amplitude` metres."""
     scene = preset("bench_kv")
     m, inertia = scene.head.mass_kg, scene.head.inertia_kg_m2
     force, moment = np.array([m, 0.5 * m]) * amplitude * omega**2, inertia * amplitude * omega**2
@@ -44,7 +44,7 @@ def test_an_hour_of_swinging_costs_36_steps_and_is_exact() -> None:
     scene, amplitude, omega = swaying(), 1e-3, 20.0
     result = simulate(scene, 3600.0, 3.7, energy_balance=True)
     assert result.solver["steps"] == 36 and len(result.events) == 0
-    # phases of 72,000 rad are rounded to 1e-11
+    # rounding of phases of 72,000 rad is 1e-11
     shape = np.array([1.0, 0.5, 1.0]) * amplitude
     assert np.abs(result.q + shape * np.sin(omega * result.t)[:, None]).max() < 1e-13
     assert np.abs(result.v + shape * omega * np.cos(omega * result.t)[:, None]).max() < 2e-12

@@ -1,4 +1,4 @@
-"""Tangential friction: closed forms of a sliding block, both solvers, and no code without friction."""
+"""Tangential friction: closed forms of a sliding block, with both solvers, and no code without friction."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MASS, G, STIFFNESS, MU, SPEED = 800.0, 9.81, 1e8, 0.3, 0.02
 
 
 def block(push: float, speed: float) -> Scene:
-    """Return a head that hangs by its roof on the two upper corners, at rest vertically, free to slide."""
+    """Return a head that hangs by its roof on the two upper corners, at rest vertically and free to slide."""
     depth = MASS * G / (2.0 * STIFFNESS)
     return Scene(
         Head(MASS, 100.0),
@@ -42,7 +42,7 @@ def test_a_sliding_block_slows_down_as_the_law_says() -> None:
 
 @pytest.mark.parametrize("share", [0.5, -0.9])
 def test_a_push_below_the_limit_makes_it_creep(share: float) -> None:
-    """A steady state: mu N tanh(v / v_s) = F."""
+    """In the steady state, mu N tanh(v / v_s) = F."""
     result = simulate(block(share * MU * MASS * G, 0.0), 1.0, output_dt=0.5)
     assert result.v[-1, 0] == pytest.approx(SPEED * math.atanh(share), rel=1e-9)
 

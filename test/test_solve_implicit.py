@@ -1,4 +1,4 @@
-"""Overdamped contact: implicit steps agree with explicit ones, are taken only there, and cost no more when stiffer."""
+"""Overdamped contact: implicit steps agree with explicit ones, are used only there, and cost no more when stiffer."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_implicit_and_explicit_steps_agree(
     damping: float, friction: Friction | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene = replace(damped(damping), friction=friction)
-    # with friction the kernels of the test below
+    # with friction, the kernels of the test below are used
     implicit = simulate(scene, 0.5, output_dt=0.01, energy_balance=friction is None)
     monkeypatch.setattr(compiled_scene, "_implicit", lambda *arguments: None)
     explicit = simulate(scene, 0.5, output_dt=0.01)
@@ -61,12 +61,12 @@ def test_the_work_hardly_grows_with_the_damping() -> None:
         twin.advance(0.3)
         steps[damping] = twin.steps
         assert twin._state.implicit_steps > 0
-    # explicit steps would be a hundred times as many
+    # a hundred times as many explicit steps would be needed
     assert steps[1e11] < 10 * steps[1e9]
 
 
 def test_a_damped_slide_has_its_closed_form() -> None:
-    """C d' + K d = F far above the mass's own time: d = F / K (1 - exp(-K t / C)), at both of two corners."""
+    """After the time constant of the mass, C d' + K d = F, so d = F / K (1 - exp(-K t / C)) at both corners."""
     stiffness, damping, mass, g = 1e7, 1e9, 2.0, 9.81
     contact, corners = Contact("kelvin_voigt", stiffness, damping=damping), ("top_left_top", "top_right_top")
     scene = wall_and_point(contact, speed=0.0, mass=mass, gravity=g, gap=0.0, pairs=corners)
@@ -83,7 +83,7 @@ CLAMPED = replace(BENCH, clearance=Clearance(-1e-3, -1e-3))
 
 
 def overdamped(law: str, damping: float) -> Contact:
-    """Return a contact of a damping, or of a restitution up to 1 where the law takes one."""
+    """Return a contact with a damping or, if the law takes it, with a restitution up to 1."""
     given = law in ("kelvin_voigt", "ramped_damping") or damping > 1.0
     return Contact(
         law, 1e9, 1.5 if law == "ramped_damping" else 1.0, damping=damping if given else None,
@@ -92,7 +92,7 @@ def overdamped(law: str, damping: float) -> Contact:
 
 
 def assert_within_the_gate(scene: Scene, tolerances: tuple[float, ...]) -> None:
-    """Check that errors stay within ten tolerances of a tight run, and the steps within their limit."""
+    """Check that errors stay within ten tolerances of a more accurate run, and steps within their limit."""
     exact = simulate(scene, 2.0, output_dt=0.01, tol=1e-12)
     growth = 0.0
     for moved in ((1e-12, 0.0, 0.0), (0.0, 0.0, 1e-12)):
@@ -103,7 +103,7 @@ def assert_within_the_gate(scene: Scene, tolerances: tuple[float, ...]) -> None:
     for tol in tolerances:
         result = simulate(scene, 2.0, output_dt=0.01, tol=tol)
         assert result.solver["steps"] <= (15_000 if tol >= 1e-8 else 30_000), tol
-        # where displacements grow, the tolerance has no meaning
+        # if displacements grow, the tolerance has no meaning
         if growth < 1e3:
             assert pose_error(shown, result.q, exact.q) <= 10.0 * tol, (tol, growth)
 
@@ -118,7 +118,7 @@ def test_the_tolerance_holds_however_loose_it_is(damping: float) -> None:
 
 
 def test_growth_while_dampers_hold_the_head_is_reported() -> None:
-    """Resting on two corners 1e-8 m deep amplifies rounding errors, but not for the whole rest."""
+    """Rest on two corners at a depth of 1e-8 m amplifies rounding errors, but not during the whole rest."""
     scene = replace(BENCH, contact=overdamped("kelvin_voigt", 1e11), friction=Friction(0.2, 0.02))
     with pytest.warns(ToleranceWarning, match=r"an error grows \S+ times"):
         found = simulate(scene, 1.77, output_dt=0.01, sensitivity=True)
@@ -147,7 +147,7 @@ def test_every_law_keeps_to_the_tolerance_and_to_bounded_work(start: Scene, law:
 
 @pytest.mark.parametrize("damping", [10.0**k for k in range(10, 14)])
 def test_damping_beyond_double_precision_or_the_model_is_refused(damping: float) -> None:
-    """The gate's other scenes: a factor of the force, and damping beside a wear that is faster than the head."""
+    """The other scenes: damping as a factor of the force, and damping beside wear that is faster than the head."""
     with pytest.raises(SceneError, match=r"contact.damping: got \S+, expected at most 1e\+09 s/m for hunt_crossley"):
         replace(BENCH, contact=overdamped("hunt_crossley", damping))
     wear = Wear(1e-12, 0.015, 2.0)
@@ -161,7 +161,7 @@ def test_damping_beyond_double_precision_or_the_model_is_refused(damping: float)
 
 
 def test_a_start_inside_a_wall_leaves_as_from_the_middle_of_an_impact() -> None:
-    """Released at depth d it leaves with e v0 of the impact that turns back at d; undamped with d sqrt(2 K / m)."""
+    """Released at the depth d, it leaves with e v0 of an impact that turns back at d; undamped with d sqrt(2 K / m)."""
     depth, stiffness, mass = 1e-3, 1e9, 2430.0
     for e in (1.0, 0.4):
         contact = Contact("exact_restitution", stiffness, restitution=e)

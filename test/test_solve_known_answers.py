@@ -1,6 +1,6 @@
-"""Answers known from outside: Hertz, depth and time of an impact, statics, momentum. Sources at each test.
+"""Answers known from elsewhere: Hertz, depth and time of an impact, statics, momentum. Each test names its source.
 
-More of them in the files test_known_*; docs/known_answers.md lists all.
+The files test_known_* have more of them; docs/known_answers.md lists all.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from plow_twin.model.contact_laws import exact_damping_number
 
 
 def test_hertz_impact_of_a_sphere_on_a_rigid_plane() -> None:
-    """Chung and Ooi, Granular Matter 13 (2011) 643, test 2: 49.7172 um, 11.36986 kN, 731.66 us."""
+    """Chung and Ooi, Granular Matter 13 (2011) 643, test 2, give 49.7172 um, 11.36986 kN and 731.66 us."""
     radius, modulus, poisson, density = 0.1, 7e10, 0.30, 2699.0
     stiffness = 4.0 / 3.0 * modulus / (1.0 - poisson**2) * math.sqrt(radius)
     mass = 4.0 / 3.0 * math.pi * radius**3 * density
@@ -52,8 +52,8 @@ def test_a_constant_load_settles_on_statics(n: float, law: str) -> None:
     )  # fmt: skip
     end = simulate(scene, 30.0, output_dt=30.0, tol=1e-10)
     force, depth = end.force[-1], end.penetration[-1]
-    # the head leans with its roof on the two upper corners and, pushed right, with its left wall on one or two left
-    # ones
+    # the head lies with its roof on the two upper corners and, pushed to the right, with its left wall on one or both
+    # left corners
     c, s = math.cos(end.q[-1, 2]), math.sin(end.q[-1, 2])
     normal = np.array([[0, 1], [-1, 0], [0, 1], [1, 0], [0, -1], [1, 0], [0, -1], [-1, 0]]) @ np.array(
         [[c, s], [-s, c]]
@@ -68,7 +68,7 @@ def test_a_constant_load_settles_on_statics(n: float, law: str) -> None:
 
 @pytest.mark.parametrize("name", ["paper", "bench_kv", "bench_hc"])
 def test_impulses_add_up_to_the_change_of_momentum(name: str) -> None:
-    """Vertical: contact forces, turned to world axes, plus excitation and weight, integrated over time."""
+    """The vertical impulse is the time integral of contact forces in world axes, excitation and weight."""
     scene = preset(name)
     result = simulate(scene, 3.0, output_dt=1e-5, tol=1e-10)
     theta = result.q[:, 2]

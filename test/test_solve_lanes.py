@@ -1,4 +1,4 @@
-"""Scenes in the lanes of one SIMD vector: bits that depend on the scene alone, and the motion of the single loop."""
+"""Scenes in the lanes of a SIMD vector: bits depend on the scene alone, and the motion is that of the single loop."""
 
 from __future__ import annotations
 
@@ -80,7 +80,8 @@ def draw(rng: np.random.Generator) -> Scene:
     )
 
 
-#: Directions of the harmonics and terms of the law, each pair of which compiles kernels of its own: every one once.
+#: Directions of the harmonics and terms of the law. Each combination compiles its own kernels; these have every value
+#: once.
 SOME = {(0, None, None), (0, 1, None), (1, 1, None), (2, None, 1)}
 
 
@@ -102,7 +103,7 @@ def same(one: Ensemble, i: int, other: Ensemble, k: int) -> bool:
 def test_a_scene_has_the_same_bits_alone_and_in_any_company() -> None:
     scenes = drawn(1, 19)
     together = simulate_many(scenes, 1.0, 0.05, 1e-7, workers=1)
-    assert together.events.min() < together.events.max() // 10  # lanes end far apart, and are filled again
+    assert together.events.min() < together.events.max() // 10  # lanes end at very different times and are filled again
     backwards = simulate_many(scenes[::-1], 1.0, 0.05, 1e-7, workers=3)
     for index, scene in enumerate(scenes):
         assert same(together, index, simulate_many([scene], 1.0, 0.05, 1e-7), 0)
@@ -130,7 +131,7 @@ def _check_beside_the_loop(seed: int, count: int, some: bool) -> None:
         alone = simulate(scene, 0.7, 0.02, tol=1e-12)
         error = pose_error(scene, many.q[index], alone.q)
         if error > 1e-9:
-            # the scene amplifies rounding errors, in two single runs as well
+            # the scene amplifies rounding errors, also between two single runs
             assert error < 300.0 * pose_error(scene, simulate(scene, 0.7, 0.02, tol=1e-11).q, alone.q), index
             continue
         close += 1
@@ -163,7 +164,7 @@ def test_the_bench_scene_meets_its_reference_with_every_event(tol: float) -> Non
     stride = round(0.1 / (exact["t"][1] - exact["t"][0]))
     assert pose_error(preset("bench_kv"), found.q[0], exact["q"][::stride]) < 10.0 * tol
     assert found.events[0] == 366 and found.makes.sum() == 120
-    # a clipped pair that parts changes no force: its event ends no step
+    # a clipped pair that separates changes no force, so its event ends no step
     assert found.steps[0] < 0.95 * simulate(preset("bench_kv"), 20.0, 0.1, tol=tol).solver["steps"]
 
 

@@ -1,4 +1,4 @@
-"""The contract of a method (`solve.method.protocol`), checked for each on states that it takes and refuses."""
+"""The contract of a method (`solve.method.protocol`), checked for each method on states that it accepts and refuses."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from plow_twin.solve.modes import weigh_pairs
 from plow_twin.solve.state import new_work
 from plow_twin.solve.step import METHODS
 
-#: Fields of the state that every method may write, and fields of one method alone.
+#: Fields of the state that every method may write; below them, the fields of single methods.
 OUTPUT = {"alpha", "beta", "sigma_end", "order", "ends_at_stop", "evaluations"}
 DECAY = {"implicit_size", "decay_times", "refused"}
 OWN = {
@@ -67,9 +67,9 @@ ASK: dict[Any, Callable[..., bool]] = {
 
 
 def pressed(damping: float, share: float) -> Scene:
-    """Return a head pressed by gravity on two corners, at a share of the equilibrium depth, with its slow rate there.
+    """Return a head that gravity presses on two corners, at a share of the equilibrium depth, with the slow rate.
 
-    Far above the mass's own time C d' + K d = m g / 2 at each corner.
+    After the time constant of the mass, C d' + K d = m g / 2 at each corner.
     """
     stiffness, mass, g = 1e7, 2.0, 9.81
     contact = Contact("kelvin_voigt", stiffness, damping=damping)
@@ -100,7 +100,7 @@ def test_a_method_lays_out_a_step_or_leaves_the_state_to_the_next_one(name: str)
     takes = set()
     for method in METHODS:
         state, w = compiled.initial_state(), new_work()
-        # overdamped contact has lasted long enough for its fast part to be gone
+        # the overdamped contact has lasted so long that its fast part has decayed
         state.decay_times = 1e3
         w.wrench[0] = compiled.params.constant
         before = state.copy()

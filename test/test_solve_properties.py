@@ -1,7 +1,7 @@
-"""A search for scenes that break the solver: it gives a finite answer that obeys the energy balance, or a named status.
+"""A search for scenes that break the solver: a finite answer obeys the energy balance, or there is a named status.
 
-The structure of a scene (which parts it has, hence what is compiled) comes from a fixed list, its numbers are drawn
-over decades. H = kinetic + potential + stored elastic energy can only fall, except by the work of loads that change in
+The structure of a scene, its parts and thus its compiled code, comes from a fixed list; its numbers are drawn over
+decades. The energy H, kinetic, potential and elastic, can only decrease, except for the work of loads that change in
 time: the damping of every law, the clipping of the force and the wear take energy.
 """
 
@@ -24,9 +24,9 @@ from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.run.advance import Advance
 from plow_twin.solve.compiled_scene import compile_scene
 
-#: Steps that a request may take; a longer one ends with its status.
+#: Largest number of steps of a request; a longer request ends with a status.
 BUDGET = 20_000
-#: Steps after which a run is long enough.
+#: Number of steps after which a run is long enough.
 ENOUGH = 100_000
 
 
@@ -34,7 +34,7 @@ ENOUGH = 100_000
 class Case:
     scene: Scene
     tol: float
-    times: np.ndarray  # requests in s, never falling
+    times: np.ndarray  # times of the requests in s, never decreasing
     wrench: np.ndarray | None  # samples (n, 3), or None for the scene's own loads
 
 
@@ -49,7 +49,7 @@ Draw = Callable[[st.SearchStrategy], float]
 
 
 def a_contact(draw: Draw, law: str, exponent: float, weight: float, size: float, mass: float) -> Contact:
-    """Stiffness by the depth at which the wall carries the weight: 1e-8 .. 1e-2 of the size, some 1e3 .. 1e13 N/m."""
+    """Draw a contact; at 1e-8 to 1e-2 of the size its wall bears the weight, which gives about 1e3 to 1e13 N/m."""
     depth = size * draw(decades(1e-8, 1e-2))
     stiffness = min(weight / depth**exponent, 1e13)
     if law == "kelvin_voigt":
@@ -112,7 +112,7 @@ def cases(draw: Draw, structure: str) -> Case:
         PAIR_NAMES if draw(st.booleans()) else tuple(draw(SOME_PAIRS)),
         Wear(draw(decades(1e-15, 1e-9)), 0.015, 2.0) if "wear" in structure else None,
     )  # fmt: skip
-    # requests: a grid, with zero and tiny steps among them
+    # the requests are a grid, with zero and tiny steps in it
     end = (
         draw(decades(1e-4, 2.0))
         if "harmonic" not in structure
@@ -131,7 +131,7 @@ def cases(draw: Draw, structure: str) -> Case:
 def mechanical_energy(
     scene: Scene, q: np.ndarray, v: np.ndarray, penetration: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Kinetic energy, potential of gravity and constant loads, elastic energy of the springs, in J for each row."""
+    """Return kinetic energy plus potential of gravity and constant loads plus elastic energy, in J for each row."""
     mass, inertia, (rx, ry) = scene.head.mass_kg, scene.head.inertia_kg_m2, scene.head.com_offset_m
     c, s = np.cos(q[:, 2]), np.sin(q[:, 2])
     arm_x, arm_y = c * rx - s * ry, s * rx + c * ry
@@ -148,10 +148,10 @@ def mechanical_energy(
 
 
 def work_of_loads(case: Case, t: np.ndarray, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Work in J done up to each row by loads that change, and a bound of its error.
+    """Return the work in J done up to each row by loads that change, and a bound of its error.
 
-    By parts, F q - integral of F' q: the pose is smoother than its rate. The linear pieces of samples have a constant
-    F'; the trapezoid rule is off by F' q'' dt^3 / 12 a row.
+    The work is integrated by parts, F q - integral of F' q, because the pose is smoother than its rate. The linear
+    pieces of samples have a constant F'; the error of the trapezoid rule is F' q'' dt^3 / 12 for each row.
     """
     if case.wrench is not None:
         load = case.wrench[: len(t)]
@@ -219,11 +219,11 @@ def check_energy(
     gain = kinetic + potential + elastic - work
     gain -= gain[0]
     scale = kinetic.max() + elastic.max() + np.ptp(potential) + np.ptp(work)
-    # hundreds of steps and impacts spend the tolerance, and amplify
+    # hundreds of steps and impacts add up their errors and amplify them
     slack = (1e3 * case.tol + 1e-9) * scale + work_error
-    # and it is absolute for speeds below a thousandth of the clearance in a second
+    # for speeds below a thousandth of the clearance per second the tolerance is absolute
     slack += case.tol * length_scale(case.scene) * np.sqrt(2.0 * case.scene.head.mass_kg * kinetic.max())
-    # the tolerance is of the pose; under force an error of the pose is energy
+    # the tolerance is for the pose, and under force an error of the pose is an error of the energy
     slack += 100.0 * case.tol * length_scale(case.scene) * peak.sum(axis=1).max()
     rise = gain - np.minimum.accumulate(gain)
     assert (rise <= slack).all(), (rise.max() / scale, case.tol, int(rise.argmax()))
@@ -232,9 +232,10 @@ def check_energy(
 
 
 def has_kernels_of_others(case: Case) -> bool:
-    """Return whether a case needs no kernels of its own in the quick count.
+    """Return whether a case needs no kernels of its own in the quick run.
 
-    These are those of harmonics so small that the head may rest, and of implicit steps with exponents like 1.5.
+    Own kernels are needed for harmonics so small that the head may rest, and for implicit steps with exponents like
+    1.5.
     """
     parts = compile_scene(case.scene, case.tol).parts
     swings = parts.terms.harmonics is None or parts.terms.rest is None
@@ -242,14 +243,14 @@ def has_kernels_of_others(case: Case) -> bool:
 
 
 def search(structure: str, examples: int) -> None:
-    """Check many scenes of one structure; most of them must really have been solved."""
+    """Check many scenes of one structure; the solver must reach the end for most of them."""
     ended: Counter[Status] = Counter()
 
-    # a scene that fails is shrunk where there is time for it
+    # failing scenes are shrunk if there is time for it
     shrinking = settings.get_current_profile_name() == "stress"
     phases = [Phase.generate, Phase.shrink] if shrinking else [Phase.generate]
 
-    # the others are left to the full count
+    # the full run covers the other cases
     drawn = cases(structure) if shrinking else cases(structure).filter(has_kernels_of_others)
 
     @settings(max_examples=examples, phases=phases, suppress_health_check=list(HealthCheck))
@@ -259,12 +260,12 @@ def search(structure: str, examples: int) -> None:
 
     every_scene_is_solved_or_named()
     assert ended[Status.OK] >= 0.5 * ended.total(), ended
-    # overdamped and very stiff contact with an explicit series: named, not endless
+    # overdamped and very stiff contacts with an explicit series end with a status, not without end
     assert ended[Status.BUDGET] < 0.2 * ended.total(), ended
     assert ended[Status.NON_FINITE] == 0, ended
 
 
-# each structure compiles all kernels: the others are left to the full count
+# each structure compiles all kernels, so the full run covers the other structures
 @pytest.mark.parametrize("structure", ["viscous, harmonic", "factor, n = 1.5, harmonic", "factor, sampled"])
 def test_random_scenes_keep_the_energy_balance(structure: str) -> None:
     search(structure, 12)

@@ -1,4 +1,4 @@
-"""Damping that is ramped in: its limits, both solvers, and laws that a user adds."""
+"""Ramped damping: its limits, both solvers, and laws that a user adds."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_a_short_ramp_is_kelvin_voigt_and_a_long_one_elastic() -> None:
 def test_both_solvers_agree(stiffness: float, exponent: float) -> None:
     contact = Contact("ramped_damping", stiffness, exponent, damping=6e4, ramp_m=1e-3)
     scene = replace(preset("paper"), contact=contact)
-    # other exponents without the balance: the kernels of the pinned motions
+    # other exponents are run without the balance, with the kernels of the pinned motions
     events = simulate(scene, 2.0, output_dt=0.1, energy_balance=exponent == 1.0)
     steps = simulate(scene, 2.0, output_dt=0.1, method="rk4", dt=1e-5)
     assert pose_error(scene, steps.q, events.q) < 1e-6
@@ -76,7 +76,7 @@ def laws_restored() -> Iterator[None]:
 
 @pytest.mark.usefixtures("laws_restored")
 def test_a_law_of_one_s_own_works_like_the_others() -> None:
-    """One definition: scenes, checks and every solver take it."""
+    """Scenes, checks and every solver use a single definition of the law."""
     add_law("half_exact", ContactLaw("half exact", "of this test", lambda e: 0.5 * exact_damping_number(e)))
     stiffness, e = 1e8, 0.6
     scene = replace(preset("paper"), contact=Contact("half_exact", stiffness, restitution=e))
@@ -92,7 +92,10 @@ def test_a_law_of_one_s_own_works_like_the_others() -> None:
 
 
 def test_a_clipped_pair_pushes_again_before_it_parts_at_every_tolerance() -> None:
-    """Damping falls with the ramp faster than the spring relaxes: out of the clip and off within a microsecond."""
+    """Damping decreases with the ramp faster than the spring relaxes.
+
+    The pair therefore pushes again and separates within a microsecond.
+    """
     scene = replace(preset("bench_kv"), contact=Contact("ramped_damping", 1e9, 1.5, damping=1e4, ramp_m=1e-4))
     tight, loose = (simulate(scene, 1.0, output_dt=0.01, tol=tol) for tol in (1e-12, 1e-9))
     assert pose_error(scene, loose.q, tight.q) < 1e-11
@@ -102,9 +105,9 @@ def test_a_clipped_pair_pushes_again_before_it_parts_at_every_tolerance() -> Non
 
 
 def test_a_clipped_pair_does_not_push_before_its_time() -> None:
-    """Its force is a cubic of a penetration that leaves the ramp far behind, whose series ends late.
+    """Its force is a cubic in the penetration over a short ramp, so that many terms of its series matter.
 
-    With steps as long as the motion allows, the force acted too early: 28 tolerances off.
+    With steps as long as the motion allows, the force would act too early, with an error of 28 tolerances.
     """
     scene = Scene(
         Head(9678.65468622175, 6223.158278044431), Frame(0.5358668741978295, 0.8164604022979493),
@@ -114,7 +117,7 @@ def test_a_clipped_pair_does_not_push_before_its_time() -> None:
         (Harmonic("swing", (136407.79207032567, 78091.2651934814), 2.13280634928262, 6.183084803690521, -11577.53909),),
         Initial((0.0, 0.0, 0.0), (0.08018584619312634, 0.08016477931228669, -0.04463423756155122)),
     )  # fmt: skip
-    # with the balance the kernels of `test_both_solvers_agree`
+    # with the balance, the kernels of `test_both_solvers_agree` are used
     exact = simulate(scene, 1.0, output_dt=0.005, tol=1e-12, energy_balance=True)
     for tol in (1e-4, 1e-6, 1e-8, 1e-10):
         found = simulate(scene, 1.0, output_dt=0.005, tol=tol, energy_balance=True)

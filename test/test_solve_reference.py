@@ -1,4 +1,4 @@
-"""Trajectories against references made in extended precision by another method, and against fixed-step RK4."""
+"""Trajectories compared with references in extended precision by another method, and with RK4 with a fixed step."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_a_tighter_tolerance_gives_a_smaller_error_within_the_tolerance(name: st
 
 
 def test_reconstruction_r1_gives_the_published_table() -> None:
-    """The figures of R1 over 60 s; the paper's own are 153 / 74 kN at a and 177 / 82 kN at b."""
+    """These are the figures of R1 over 60 s; the paper has 153 / 74 kN at a and 177 / 82 kN at b."""
     result = simulate(preset("paper"), 60.0)
     ccw = {"a": "bottom_right_bottom", "b": "top_right_right", "c": "top_left_top", "d": "bottom_left_left"}
     cw = {"a": "bottom_right_right", "b": "top_right_top", "c": "top_left_left", "d": "bottom_left_bottom"}
@@ -80,7 +80,7 @@ VARIANTS = {
 
 
 def test_an_exponent_that_is_no_integer_keeps_to_the_tolerance_when_separations_are_slow() -> None:
-    """The slower a separation, the larger the force left out before it: here of a thrown head slowed by its damping."""
+    """The slower a separation, the larger the neglected force before it; here damping slows a thrown head."""
     scene = preset("bench_hc")
     contact = Contact("hunt_crossley", 3e9 * 1e-3**-1.2, 2.2, damping=3.0)
     scene = dataclasses.replace(scene, contact=contact, initial=Initial((0.0, 0.0, 0.0), (-1.1, 0.3, -6.0)))
@@ -89,11 +89,11 @@ def test_an_exponent_that_is_no_integer_keeps_to_the_tolerance_when_separations_
         assert pose_error(scene, simulate(scene, 3.0, output_dt=0.02, tol=tol).q, exact.q) < 3.0 * tol
 
 
-# each compiles kernels of its own: the other pairings are left to the full count
+# each pairing compiles its own kernels, so the full run covers the other pairings
 @pytest.mark.parametrize(
     ("offset", "loads", "contact"),
     [
-        # a table acts like samples, so other tests have compiled its kernels
+        # a table acts like samples, so other tests compile its kernels
         pytest.param((0.0, 0.0), VARIANTS["table"], (6e6, 1.0), id="centred, table"),
         pytest.param((0.05, -0.08), VARIANTS["two directions"], (2e9, 2.0), id="offset, two directions"),
         pytest.param(
@@ -138,7 +138,7 @@ def test_locked_coordinates_stay_while_the_others_agree_with_rk4(locked: tuple[s
 def test_random_scenes_converge_to_one_motion(
     gx: float, gy: float, log_k: float, e: float, fx: float, fy: float, moment: float, omega: float
 ) -> None:
-    """Runs at three tolerances agree, pulse by pulse, until amplification by impacts separates them."""
+    """Runs with three tolerances agree, pulse by pulse, until impacts amplify their differences."""
     scene = Scene(
         Head(2430.0, 1265.0), Frame(0.33, 0.27), Clearance(gx, gy),
         Contact("exact_restitution", 10.0**log_k, 1.0, restitution=e), Gravity(9.81), (Harmonic("f", (fx, fy), omega,

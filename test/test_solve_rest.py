@@ -1,4 +1,4 @@
-"""Rest: recognised where the contacts hold the head for good, and nowhere else; a load that changes wakes it."""
+"""Rest is recognised only if the contacts hold the head for good. A load that changes wakes the head."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LAWS = ("kelvin_voigt", "exact_restitution")
 
 
 def fallen(law: str = "kelvin_voigt") -> Scene:
-    """The head falls on the frame and comes to rest on three pairs."""
+    """Return a head that falls on the frame and comes to rest on three pairs."""
     scene = dataclasses.replace(preset("bench_kv"), loads=())
     if law != "kelvin_voigt":
         contact = dataclasses.replace(preset("bench_hc").contact, law=law, damping=None, restitution=0.2)
@@ -28,12 +28,12 @@ def fallen(law: str = "kelvin_voigt") -> Scene:
 
 
 def fallen_under_a_harmonic(force: float, omega: float) -> Scene:
-    """The same under a harmonic and its weight; at 23.2 rad/s the head on its three pairs resonates."""
+    """Return the same head under a harmonic and its weight; at 23.2 rad/s the head on its three pairs resonates."""
     return dataclasses.replace(fallen(), loads=(Harmonic("small", (force, 0.3 * force), omega, 0.3, 0.1 * force),))
 
 
 def static_pose(scene: Scene, guess: np.ndarray) -> np.ndarray:
-    """Solve the balance of weight and springs in another way: scipy, forces in head axes."""
+    """Solve the balance of weight and springs in another way, with scipy and forces in head axes."""
     mass, g, arm = scene.head.mass_kg, scene.gravity.acceleration_m_s2, scene.gravity.arm_m
     rows, arms, contact = penetration_rows(scene), arm_rows(scene), scene.contact
 
@@ -64,14 +64,17 @@ def test_an_hour_at_rest_costs_next_to_nothing_and_is_in_balance(law: str) -> No
         and result.energy_balance.imbalance_j < 1e-12 * result.energy_balance.turnover_j
     )
     assert np.abs(result.energy_balance.momentum_imbalance).max() < 1e-12 * weight * 3600.0
-    # the pads carry the weight meanwhile, so the totals continue
+    # during rest the pads bear the weight, so the totals grow
     carried = sum(row["impulse"] for row in result.statistics.values())
     before = sum(row["impulse"] for row in settled.statistics.values())
     assert carried == pytest.approx(before + result.force[-1].sum() * (3600.0 - 120.0), rel=1e-9)
 
 
 def test_a_load_that_changes_wakes_the_head() -> None:
-    """Under samples: at rest for 50 s, then a push; the same motion as at a tolerance at which rest comes later."""
+    """The head rests for 50 s under samples and is then pushed.
+
+    The motion is the same with a tolerance at which rest comes later.
+    """
     t = np.concatenate([np.arange(1, 51) * 1.0, 50.0 + np.arange(1, 501) * 1e-3])
     wrench = np.where(t[:, None] > 50.0, [4e4, 1e4, 2e3], [0.0, 0.0, 0.0])
     twins = [Twin(fallen(), tol=tol, excitation="sampled") for tol in (1e-6, 1e-12)]
@@ -92,7 +95,7 @@ def test_a_sliding_head_is_not_at_rest() -> None:
 
 @pytest.mark.parametrize("corners", [("left", "right"), ("left",)])
 def test_an_unstable_balance_is_not_rest(corners: tuple[str, ...]) -> None:
-    """On two upper corners the head rests; on one, its weight right below, the least tilt grows."""
+    """On two upper corners the head rests; on one corner, with its weight right below, the smallest tilt grows."""
     scene, stable = fallen(), len(corners) == 2
     sunk = scene.head.mass_kg * 9.81 / len(corners) / scene.contact.stiffness + 0.5 * scene.clearance.vertical_m
     arm = 0.0 if stable else -0.5 * scene.frame.width_m
@@ -143,24 +146,24 @@ def test_a_spring_that_nothing_damps_goes_on_ringing() -> None:
 def test_a_harmonic_that_cannot_be_seen_lets_the_head_rest(
     force: float, omega: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its motion of the head is below a thousandth of the tolerance: proved beforehand, and seen without rest."""
+    """It moves the head by less than a thousandth of the tolerance, as proved beforehand and seen without rest."""
     tol, scene = 1e-6, fallen_under_a_harmonic(force, omega)
     rested = simulate(scene, 400.0, 0.317, tol=tol)
     assert rested.solver["steps"] == simulate(scene, 200.0, tol=tol).solver["steps"] + 2
     larger = simulate(fallen_under_a_harmonic(1e3 * force, omega), 60.0, 0.317, tol=tol)
     monkeypatch.setattr(compiled_scene, "_harmonics_are_small", lambda *arguments: False)
-    monkeypatch.setattr(compiled_scene, "_LATELY", compiled_scene._Shared())  # nothing is known of the scene
+    monkeypatch.setattr(compiled_scene, "_LATELY", compiled_scene._Shared())  # nothing about the scene is cached
     followed = simulate(scene, 400.0, 0.317, tol=tol)
     assert followed.solver["steps"] > 4 * rested.solver["steps"]
     way = tol * geometry.length_scale(scene)
     assert 0.0 < np.abs(rested.q - followed.q).max() < 1e-3 * way
-    # a thousand times as large it can be seen, and is followed
+    # a harmonic a thousand times as large can be seen, and the head follows it
     swing = np.ptp(larger.q[larger.t > 50.0], axis=0).max()
     assert swing > 1e-2 * way
 
 
 def test_loose_tolerances_find_the_same_rest() -> None:
-    """Steps near the bound of stability leave some ringing of the stiffest pairs, which hardly moves the head."""
+    """Steps near the limit of stability leave the stiffest pairs ringing a little, which hardly moves the head."""
     steps = [simulate(fallen(), t_end, tol=1e-3).solver["steps"] for t_end in (100.0, 1000.0)]
     assert steps[1] == steps[0] + 9
 

@@ -1,4 +1,4 @@
-"""Rounded corners: a block that rolls on them, a frame with them, and no effect on sharp corners."""
+"""Rounded corners: a block that rolls on them, a frame that has them, and no effect on sharp corners."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def in_guide(carries: str, **changes: object) -> Scene:
 
 
 def on_table(t: float, z: np.ndarray) -> list[float]:
-    """Return the rate of z = (x, y, theta, vx, vy, omega) of the block: four discs that touch where they are lowest."""
+    """Return the rate of z = (x, y, theta, vx, vy, omega) of the block; four discs touch at their lowest points."""
     _, y, theta, vx, vy, omega = z
     c, s, half = math.cos(theta), math.sin(theta), 0.5 * SIDE - RADIUS
     fx = fy = moment = 0.0
@@ -84,21 +84,21 @@ def test_rounded_block_agrees_with_an_independent_integration_of_four_discs() ->
         on_table, (0.0, 0.4), [0.0, -0.85, 0.3, 0.4, 0.0, 6.0], "DOP853", found.t, rtol=1e-9, atol=1e-11, max_step=2e-5
     )
     np.testing.assert_allclose(found.q, reference.y[:3].T, atol=1e-6)
-    # it has turned over a corner, and sharp corners move otherwise
+    # the block has turned over a corner, and with sharp corners it moves differently
     assert abs(found.q[-1, 2]) > 1.0
     sharp = simulate(block(frame=Frame(SIDE, SIDE)), t_end=0.4, output_dt=0.004, energy_balance=True)
     assert np.abs(sharp.q - found.q).max() > 1e-3
 
 
 def test_disc_of_rounded_corners_rolls_without_sliding() -> None:
-    """Pushed along a table that it sticks to, a disc rolls: x = -r theta, x'' = F / (m + I / r^2)."""
+    """A disc that is pushed along a table to which it sticks rolls, with x = -r theta and x'' = F / (m + I / r^2)."""
     radius = 0.5 * SIDE * (1.0 - 1e-9)
     inertia, push = 0.5 * MASS * radius**2, 0.5
     disc = block(
         head=Head(MASS, inertia, carries="corners"),
         frame=Frame(SIDE, SIDE, corner_radius_m=radius),
         friction=Friction(0.5, stick_stiffness_n_m=1e7, stick_damping_n_s_m=200.0),
-        # the second load and the balance are there for the kernels of `in_guide`
+        # with the second load and the balance, the kernels of `in_guide` are used
         loads=(Constant("push", (push, 0.0)), Harmonic("nothing to speak of", (1e-12, 0.0), 9.0)),
         initial=Initial(q=(0.0, -1.0 + 0.5 * SIDE, 0.0)),
     )
@@ -106,12 +106,12 @@ def test_disc_of_rounded_corners_rolls_without_sliding() -> None:
     expected = 0.5 * push / (MASS + inertia / radius**2) * found.t**2
     np.testing.assert_allclose(found.q[:, 0], expected, atol=1e-5)
     np.testing.assert_allclose(found.q[:, 2], -expected / radius, atol=1e-3)
-    # more than a quarter turn
+    # the disc has rolled by more than a quarter turn
     assert found.q[-1, 2] < -1.6
 
 
 def pairings(*quick: str) -> pytest.MarkDecorator:
-    """Return the pairings; each compiles kernels of its own, so all but the named ones are left to the full count."""
+    """Return the pairings. Each compiles its own kernels, so only the full run covers pairings that are not named."""
     drag = {"stick": STICK, "regularised": Friction(MU, SLIP_SPEED)}
     names = [(carries, name, f"{carries}, {name}") for carries in ("corners", "walls") for name in drag]
     parts = [
@@ -136,7 +136,7 @@ def test_rounded_corners_move_the_same_by_fixed_steps_a_live_twin_and_a_batch(ca
     scene = in_guide(carries, friction=friction)
     run = simulate(scene, t_end=0.1, output_dt=0.01, energy_balance=True)
     fixed = simulate(scene, t_end=0.1, output_dt=0.01, method="rk4", dt=1e-5)
-    # fixed steps know of a touch and a slip at their ends only
+    # fixed steps notice a touch and a slip only at their ends
     np.testing.assert_allclose(fixed.q, run.q, atol=1e-3)
     twin = Twin(scene)
     np.testing.assert_allclose([twin.advance(float(t)).q for t in run.t[1:]], run.q[1:], atol=1e-9)
@@ -145,9 +145,9 @@ def test_rounded_corners_move_the_same_by_fixed_steps_a_live_twin_and_a_batch(ca
     assert np.abs(alone.q - run.q[-1]).max() > 1e-4
 
 
-@pytest.mark.stress  # four kernels of its own
+@pytest.mark.stress  # this test compiles four kernels of its own
 def test_rounded_corners_hold_with_implicit_steps_and_wear() -> None:
-    """A damper that outweighs its spring, and pads that wear by sliding: the balance of energy still closes."""
+    """The balance of energy also closes with a damper stronger than its spring, and with pads that wear by sliding."""
     damped = in_guide(
         "corners",
         contact=Contact("kelvin_voigt", 1e6, damping=2e5),

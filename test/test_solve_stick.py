@@ -1,4 +1,4 @@
-"""Friction with stick: closed forms of slip-stick, a hold without creep, Painleve's case, and no code without it."""
+"""Friction with stick: closed forms of slip-stick, a hold without creep, Painleve's case, and no unused code."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ from plow_twin.solve import compiled_scene
 from plow_twin.solve.state import STATE
 
 GRIP = 1e9
-#: Both corners that the block hangs on.
+#: Tangential damping [N s/m] and friction of each of the two corners from which the block hangs.
 HELD_DAMPING = 2e5
 HELD = Friction(MU, stick_stiffness_n_m=GRIP, stick_damping_n_s_m=HELD_DAMPING)
 
 
 @dataclass
 class Slider:
-    """m x'' + spring x = F(t) - T in closed form, one phase after the other; T holds by `grip` from an anchor."""
+    """Closed form of m x'' + spring x = F(t) - T, phase by phase; a T that holds is a spring `grip` from an anchor."""
 
     mass: float
     spring: float
@@ -53,7 +53,7 @@ class Slider:
     def phase(
         self, t0: float, x0: float, v0: float, stiffness: float, constant: float
     ) -> Callable[[float], np.ndarray]:
-        """Return x, v of m x'' + stiffness x = F(t) + constant from a state on."""
+        """Return x, v of m x'' + stiffness x = F(t) + constant, starting from a state."""
         rate, amplitude, omega = self.load
         m, w = self.mass, math.sqrt(stiffness / self.mass)
 
@@ -81,7 +81,7 @@ class Slider:
         return motion
 
     def left(self, motion: Callable[[float], np.ndarray], slip: int, anchor: float, t: float) -> float:
-        """Return the distance to the block's next slip or stick."""
+        """Return a margin that is zero at the block's next slip or stick."""
         x, v = motion(t)
         return slip * v if slip else self.static - abs(self.grip * (x - anchor))
 
@@ -113,7 +113,7 @@ class Slider:
 
 
 def test_a_block_pulled_back_and_forth_sticks_and_slips_as_in_closed_form() -> None:
-    """A load that swings beyond mu N: slips while it is above, holds elastically in between."""
+    """The load swings beyond mu N; the block slips while the load is above mu N, and holds elastically in between."""
     normal, amplitude, omega = MASS * G, 1.6 * MU * MASS * G, 12.0
     friction = Friction(MU, stick_stiffness_n_m=GRIP)
     scene = replace(block(0.0, 0.0), friction=friction, loads=(Harmonic("pull", (amplitude, 0.0), omega_rad_s=omega),))
@@ -125,13 +125,14 @@ def test_a_block_pulled_back_and_forth_sticks_and_slips_as_in_closed_form() -> N
 
 
 def belt(speed: float) -> tuple[Scene, Slider]:
-    """A block on a moving belt, seen from the belt: clamped between four corners, held by springs that run away.
+    """Return a block on a moving belt, seen from the belt: four corners clamp it, and springs that move away hold it.
 
-    They run like a slow sine at first; the damping has no effect, but lets other tests' kernels be used again.
+    At first the springs move like a slow sine. The damping has no effect, but lets other tests' kernels be used again.
     """
     stiffness, deep, wide, static, kinetic, omega = 1e6, 1e-3, 0.02, 0.5, 0.3, 0.05
     friction = Friction(kinetic, stick_stiffness_n_m=1e7, static_coefficient=static)
-    # the four side pairs are the spring: both walls stay penetrated, 4 K x in all; their friction acts along locked y
+    # the four side pairs are the spring: both walls stay penetrated, with 4 K x in total; their friction acts along y,
+    # which is locked
     pull = 4.0 * stiffness * speed
     scene = Scene(
         Head(MASS, 100.0), Frame(0.3, 0.3), Clearance(-2.0 * wide, -2.0 * deep),
@@ -152,13 +153,13 @@ def test_a_block_on_a_moving_belt_sticks_and_slips_for_ever() -> None:
 
 
 def test_a_load_below_the_limit_is_held_without_creep() -> None:
-    """Pressed by up to 0.9 mu N back and forth: the displacement is F / k, without creep in 20 periods."""
+    """The block is pressed back and forth by up to 0.9 mu N. Its displacement is F / k, without creep in 20 periods."""
     amplitude, omega = 0.9 * MU * MASS * G, 2.0 * math.pi
     load = Harmonic("pull", (amplitude, 0.0), omega_rad_s=omega)
     scene = replace(block(0.0, 0.0), friction=HELD, loads=(load,))
     result = simulate(scene, 20.0, output_dt=0.05, tol=1e-10)
     settled = result.t > 1.0
-    # a forced swing far below the grip's own frequency
+    # a forced oscillation far below the grip's natural frequency
     stiffness, lag = 2.0 * GRIP - MASS * omega**2, 2.0 * HELD_DAMPING * omega
     swing = amplitude / math.hypot(stiffness, lag)
     expected = swing * np.sin(omega * result.t - math.atan2(lag, stiffness))
@@ -167,7 +168,7 @@ def test_a_load_below_the_limit_is_held_without_creep() -> None:
     assert creeping.q[-1, 0] > 1000.0 * swing
 
 
-@pytest.mark.stress  # kernels of its own; the quick count has `test_a_corner_grips_at_its_touch_as_with_fixed_steps`
+@pytest.mark.stress  # own kernels; the quick run has `test_a_corner_grips_at_its_touch_as_with_fixed_steps`
 @pytest.mark.parametrize("name", ["paper", "bench_hc"])
 def test_fixed_steps_come_to_the_same_motion_and_the_energy_balances(name: str) -> None:
     friction = Friction(0.3, stick_stiffness_n_m=5e7, stick_damping_n_s_m=1e5, static_coefficient=0.3)
@@ -182,7 +183,7 @@ def test_fixed_steps_come_to_the_same_motion_and_the_energy_balances(name: str) 
 
 @pytest.mark.parametrize("damping", [1e10, pytest.param(1e7, marks=pytest.mark.stress)])
 def test_strong_dampers_keep_to_the_tolerance(damping: float) -> None:
-    """A grip whose damper is far stronger than its spring takes implicit steps."""
+    """A grip with a damper far stronger than its spring needs implicit steps."""
     friction = Friction(MU, stick_stiffness_n_m=GRIP, stick_damping_n_s_m=damping)
     push, omega = 1.3 * MU * MASS * G, 9.0
     scene = replace(block(0.0, 0.0), friction=friction, loads=(Harmonic("pull", (push, 0.0), omega_rad_s=omega),))
@@ -192,14 +193,14 @@ def test_strong_dampers_keep_to_the_tolerance(damping: float) -> None:
 
 
 def test_whether_a_corner_holds_from_its_touch_on_is_not_decided_by_rounding() -> None:
-    """Kelvin-Voigt's force is there at once, so a slack grip holds."""
+    """The force of Kelvin-Voigt is present at once, so a slack grip holds."""
     scene = replace(preset("bench_kv"), friction=Friction(0.3, stick_stiffness_n_m=5e7))
     loose, tight = (simulate(scene, 1.0, output_dt=0.1, tol=tol, energy_balance=True) for tol in (1e-6, 1e-10))
     assert pose_error(scene, loose.q, tight.q) < 1e-8
 
 
 def test_whether_a_clipped_corner_that_pushes_again_holds_is_not_decided_by_rounding() -> None:
-    """Its force begins at zero; with mu_s > mu both stick and slip are possible there."""
+    """The corner's force begins at zero, where with mu_s > mu both stick and slip are possible."""
     friction = Friction(0.2, stick_stiffness_n_m=1e8, static_coefficient=0.28)
     scene = replace(
         preset("bench_kv"), contact=Contact("kelvin_voigt", 2.6e9, damping=1e7), friction=friction,
@@ -212,7 +213,7 @@ def test_whether_a_clipped_corner_that_pushes_again_holds_is_not_decided_by_roun
 
 @pytest.mark.parametrize("damping", [1e5, 1e6])
 def test_a_corner_grips_at_its_touch_as_with_fixed_steps(damping: float) -> None:
-    """Kelvin-Voigt's force is there at once: the corner sticks from the touch on, or slips by too large a damper."""
+    """The force of Kelvin-Voigt is present at once. The corner sticks from the touch on, or a strong damper slips."""
     friction = Friction(0.3, stick_stiffness_n_m=5e7, stick_damping_n_s_m=damping)
     scene = replace(preset("bench_kv"), friction=friction)
     events = simulate(scene, 0.3, output_dt=0.1, energy_balance=True)
@@ -222,7 +223,7 @@ def test_a_corner_grips_at_its_touch_as_with_fixed_steps(damping: float) -> None
 
 
 def test_painleves_case_is_an_impact_without_collision() -> None:
-    """A corner that its own friction presses into the wall: the force grows as cosh and stops the slip."""
+    """Its own friction presses a corner into the wall; the force grows as cosh and stops the slip."""
     mass, inertia, stiffness, mu = 1.0, 0.002, 1e8, 0.5
     scene = Scene(
         Head(mass, inertia), Frame(0.1, 0.6), Clearance(0.1, 0.1), Contact("kelvin_voigt", stiffness, damping=1e-3),
@@ -242,7 +243,7 @@ def test_painleves_case_is_an_impact_without_collision() -> None:
         rate, t = math.sqrt(abs(p) * stiffness), result.t[1:40]
         expected = stiffness * 1e-3 / rate * (np.sinh(rate * t) if jams else np.sin(rate * t))
         assert result.force[1:40, pair] == pytest.approx(expected, rel=0.02)
-        # thrown far faster than it came, or just turned back
+        # the corner is thrown back far faster than it came, or just turns back
         assert (result.v[-1, 1] > 0.1) == jams and (result.statistics["top_right_top"]["max"] > 1e3) == jams
         assert result.force[-1, pair] == 0.0
 
@@ -282,7 +283,7 @@ def test_contradictory_friction_is_refused() -> None:
 
 
 def held_scene(law: str, seed: int) -> Scene:
-    """A random head that a load of moderate size drags along its walls: light or heavy, soft or stiff grips."""
+    """Return a random head, light or heavy, with soft or stiff grips, which a moderate load drags along its walls."""
     random = np.random.default_rng(seed)
 
     def decades(low: float, high: float) -> float:
@@ -322,7 +323,7 @@ def held_scene(law: str, seed: int) -> Scene:
 
 
 def furthest_off(scene: Scene, tolerances: tuple[float, ...]) -> float:
-    """Return the largest error in tolerances of runs that are compared with a tight one; their work is bounded."""
+    """Return the largest error, in tolerances, of runs compared with a more accurate run; their work is limited."""
     tight = simulate(scene, 1.0, output_dt=0.01, tol=1e-12, max_steps=100_000)
     runs = [(tol, simulate(scene, 1.0, output_dt=0.01, tol=tol, max_steps=100_000)) for tol in tolerances]
     return max(pose_error(scene, run.q, tight.q) / tol for tol, run in runs)
@@ -338,7 +339,7 @@ def furthest_off(scene: Scene, tolerances: tuple[float, ...]) -> float:
     ],
 )
 def test_a_force_too_small_to_move_the_head_still_decides_whether_its_corner_holds(law: str, seed: int) -> None:
-    """Steps that were accurate for the motion released sticking corners, and moved their anchors."""
+    """Steps that are accurate for the motion alone would release sticking corners and move their anchors."""
     assert furthest_off(held_scene(law, seed), (1e-3, 1e-4, 1e-6, 1e-7, 1e-8)) < 10.0
 
 
@@ -356,7 +357,7 @@ def test_a_soft_grip_at_a_tight_tolerance_stays_finite(seed: int) -> None:
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("law", ["kelvin_voigt", "exact_restitution", "hertz"])
 def test_calm_random_scenes_keep_to_the_tolerance(law: str) -> None:
-    """Where a displacement grows less than 1e4 times."""
+    """The scenes are those in which a displacement grows by less than a factor of 1e4."""
     checked = 0
     for seed in range(200):
         scene = held_scene(law, seed)

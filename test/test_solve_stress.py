@@ -1,4 +1,4 @@
-"""Numerical stress: any scene gives a finite answer or a named error, in bounded work."""
+"""Numerical stress: any scene gives a finite answer or a named error, with limited work."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_extreme_scenes_are_solved(scene: Scene) -> None:
     for array in (result.q, result.v, result.force, result.penetration):
         assert np.isfinite(array).all()
     assert (result.force >= 0.0).all()
-    # 2 s at the head's own weight and load: no more steps than its stiffest contact needs
+    # 2 s under the head's own weight and load need no more steps than the stiffest contact
     assert result.solver["steps"] < 100_000
 
 
@@ -78,7 +78,8 @@ def test_violent_samples_give_finite_rows_or_a_status(kind: str) -> None:
         assert np.isfinite(array).all()
     good = series.status == Status.OK
     if kind == "spikes of 1e9 N":
-        # the first spike throws the head out of the model: named from there on, and the last good pose stays
+        # the first spike throws the head out of the model's range; from then on this is reported, and the last good
+        # pose stays
         left = int(np.argmin(good))
         assert 0 < left < 100 and (series.status[left:] == Status.OUT_OF_RANGE).all()
         assert (series.q[left:] == series.q[left - 1]).all()
@@ -97,7 +98,7 @@ def test_hours_at_rest_do_not_drift_and_cost_little(hours: float) -> None:
     late = simulate(scene, hours * 3600.0, output_dt=3600.0)
     assert np.abs(late.q[1:] - settled.q[-1]).max() < 1e-12
     assert late.force[-1, [0, 2]] == pytest.approx([2430.0 * 9.81 / 2] * 2, rel=1e-9)
-    # resting costs by time, not by contact: a few steps a second at most
+    # the cost of rest depends on time, not on contact: at most a few steps a second
     assert late.solver["steps"] < 20 * hours * 3600.0
 
 

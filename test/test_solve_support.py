@@ -1,4 +1,4 @@
-"""A frame on springs: two coupled masses in closed form, against references of their own, and off without it."""
+"""A frame on springs: two coupled masses in closed form, independent references, and no code without springs."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from plow_twin.solve import compiled_scene
 from plow_twin.solve.state import STATE
 
 SUPPORT = Support(800.0, 60.0, 3e7, 5e7, 4e6, 2e4, 3e4, 5e3)
-#: Head, law and load of the tests that share their compiled code.
+#: Head and law of the tests that share their compiled code.
 HEAD, LAW = Head(2430.0, 1265.0), Contact("kelvin_voigt", 2e7, damping=6e4)
 
 
@@ -49,11 +49,12 @@ def pressed(load: Harmonic) -> Scene:
 
 
 def test_two_masses_pressed_together_move_as_their_eigenmodes() -> None:
-    """Weight and a swinging load; the contact stays closed, so it is one linear system."""
+    """Under weight and a swinging load the contact stays closed, so that the system is linear."""
     omega, amplitude = 40.0, 4e3
     scene = pressed(Harmonic("up and down", (0.0, amplitude), omega_rad_s=omega))
     result = simulate(scene, 1.0, output_dt=0.01, tol=1e-10)
-    # y of the head and v of the frame (from where contact begins), their rates, weight, sine and cosine of the load
+    # the state: y of the head and v of the frame (from the place where contact begins), their rates, weight, sine and
+    # cosine of the load
     k, c, mass = 2.0 * LAW.stiffness, 2.0 * (LAW.damping or 0.0), HEAD.mass_kg
     matrix = np.zeros((7, 7))
     matrix[0, 2] = matrix[1, 3] = 1.0
@@ -73,7 +74,7 @@ def test_two_masses_pressed_together_move_as_their_eigenmodes() -> None:
 
 
 def reference(scene: Scene, times: np.ndarray) -> np.ndarray:
-    """Return head and frame, (n, 6), by SciPy on equations of its own, put together from points in world axes."""
+    """Return head and frame, (n, 6), by SciPy with independent equations, set up from points in world axes."""
     (load,) = scene.loads
     support, contact = scene.support, scene.contact
     assert isinstance(load, Harmonic) and support is not None and contact.damping is not None
@@ -123,7 +124,10 @@ def reference(scene: Scene, times: np.ndarray) -> np.ndarray:
 
 
 def test_a_tilted_throw_agrees_with_equations_of_its_own() -> None:
-    """All six places move, corners hit and part; q is the head's pose relative to the frame and its turned axes."""
+    """All six coordinates move, and corners touch and separate.
+
+    q is the head's pose relative to the frame, in the frame's turned axes.
+    """
     load = Harmonic("cut", (4e4, 1.1e4), omega_rad_s=9.0, at_m=(0.1, -0.6))
     scene = replace(pressed(load), initial=Initial((1e-3, 2e-3, 0.01), (0.3, -0.2, 0.5)))
     result = simulate(scene, 0.5, output_dt=0.025, tol=1e-10)
@@ -155,7 +159,7 @@ def test_a_restored_twin_and_a_batch_go_on_alike() -> None:
     assert twin.frame is not None and np.abs(twin.frame[:3]).max() > 1e-4
     assert np.array_equal(twin.frame, other.frame)
     assert not np.array_equal(members.q[0], members.q[1])
-    # a failure leaves both bodies in place
+    # a failed advance leaves both bodies in place
     held = Twin(scene, excitation="sampled", max_steps=1)
     held.restore(twin.snapshot())
     assert held.advance(0.9, [9e4, 0.0, 0.0]).status.name == "BUDGET" and np.array_equal(held.frame, twin.frame)
@@ -198,12 +202,12 @@ def test_free_bodies_part_with_the_restitution_asked_for_and_keep_their_momentum
 @pytest.mark.parametrize("friction", [None, Friction(0.2), Friction(0.3, stick_stiffness_n_m=5e7)], ids=str)
 @pytest.mark.parametrize("name", ["paper", "bench_kv", "bench_hc"])
 def test_fixed_steps_come_to_the_same_motion_and_energy_is_kept(name: str, friction: Friction | None) -> None:
-    # fixed steps take wear by first order
+    # fixed steps integrate wear with first order
     wear = Wear(1e-11, 0.015, 2.0)
     scene = replace(preset(name), support=SUPPORT, friction=friction, wear=wear)
     events = simulate(scene, 1.0, output_dt=0.1, energy_balance=True)
     assert events.energy_balance is not None and events.energy_balance.relative_imbalance < 1e-10
-    # the force of Kelvin-Voigt jumps at a touch: first order there
+    # the force of Kelvin-Voigt jumps at a touch, where the order is one
     steps = simulate(scene, 1.0, output_dt=0.1, method="rk4", dt=2e-6)
     assert pose_error(scene, steps.q, events.q) < (1e-4 if name == "bench_kv" else 1e-6)
     bounded = Twin(scene, max_evaluations=20_000)

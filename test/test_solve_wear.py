@@ -1,4 +1,4 @@
-"""Archard wear: both closed forms, and no code of it when it is off."""
+"""Archard wear: both closed forms, and no code without wear."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def pressed(wear: Wear | None, *, clearance: float, gravity: float, stiffness: f
 
 
 def test_constant_force_and_speed() -> None:
-    """h = k_s F v t / A, with F the weight on two pads."""
+    """h = k_s F v t / A, where F is the weight on two pads."""
     k_s, area, speed, g, t = 1e-12, 0.015, 2.0, 9.81, 50.0
     start = simulate(pressed(Wear(k_s, area, speed), clearance=0.02, gravity=g), 5.0)
     end = simulate(pressed(Wear(k_s, area, speed), clearance=0.02, gravity=g), 5.0 + t)
@@ -37,7 +37,7 @@ def test_constant_force_and_speed() -> None:
 
 
 def test_linear_feedback_of_wear_on_force() -> None:
-    """h = (exp(b r t) - 1) / b for F = F0 (1 + b h): a head clamped by interference relaxes as it wears, b = -1/d0."""
+    """For F = F0 (1 + b h), h = (exp(b r t) - 1) / b; a head clamped by interference relaxes with b = -1/d0."""
     depth, stiffness, k_s, area, speed, t = 1e-4, 1e7, 2e-9, 0.015, 2.0, 20.0
     scene = pressed(Wear(k_s, area, speed), clearance=-2.0 * depth, gravity=0.0, stiffness=stiffness)
     result = simulate(scene, t, tol=1e-10)
@@ -49,7 +49,7 @@ def test_linear_feedback_of_wear_on_force() -> None:
 
 
 def test_depth_is_the_wear_law_of_the_impulse_and_widens_the_clearance() -> None:
-    scene = dataclasses.replace(preset("bench_kv"), wear=Wear(1e-10, 0.015, 2.5))  # a pinned motion has its kernels
+    scene = dataclasses.replace(preset("bench_kv"), wear=Wear(1e-10, 0.015, 2.5))  # a pinned motion uses its kernels
     result = simulate(scene, 20.0)
     impulse = np.array([row["impulse"] for row in result.statistics.values()])
     assert result.wear_depth == pytest.approx(1e-10 * 2.5 / 0.015 * impulse, rel=1e-8)
@@ -59,24 +59,24 @@ def test_depth_is_the_wear_law_of_the_impulse_and_widens_the_clearance() -> None
     assert worn.q == pytest.approx(same.q, abs=1e-9)
 
 
-#: Both further effects on wear, sliding and running-in: one kernel for the tests of either.
+#: Wear with sliding and with running-in, so that the tests of both effects use one kernel.
 RUBBED = Wear(1e-11, 0.015, 2.0, sliding="total", running_in_ratio=4.0, running_in_depth_m=2e-5)
 
 
 def worn_by(exposure: float) -> float:
-    """Return h with dh/dE = 1 + (r - 1) exp(-h / h0): h0 ln(r exp(E / h0) - r + 1)."""
+    """Return h = h0 ln(r exp(E / h0) - r + 1), which solves dh/dE = 1 + (r - 1) exp(-h / h0)."""
     h0, ratio = RUBBED.running_in_depth_m, RUBBED.running_in_ratio
     assert h0 is not None
     return h0 * math.log(ratio * math.exp(exposure / h0) - ratio + 1.0)
 
 
-# explicit steps are those of the other tests
+# explicit steps use the kernels of the other tests
 @pytest.mark.parametrize(
     "damping", [pytest.param(1e3, id="explicit", marks=pytest.mark.stress), pytest.param(1e8, id="implicit")]
 )
 @pytest.mark.parametrize(("along", "t"), [(0.0, 20.0), (0.4, 1.0)])
 def test_sliding_in_the_plane_and_running_in_under_a_constant_load(damping: float, along: float, t: float) -> None:
-    """A head that slides steadily along the bottom wears its pads by both motions, less as they run in."""
+    """A head that slides steadily along the bottom wears its pads by both motions, and more slowly as they run in."""
     weight, stiffness = 2000.0 * 9.81, 1e7
     scene = dataclasses.replace(
         pressed(RUBBED, clearance=0.02, gravity=9.81, stiffness=stiffness),
@@ -90,12 +90,12 @@ def test_sliding_in_the_plane_and_running_in_under_a_constant_load(damping: floa
     exposure = RUBBED.coefficient_m2_n / RUBBED.pad_area_m2 * 0.5 * weight * math.hypot(2.0, along) * t
     assert worn[[0, 2]] == pytest.approx([worn_by(exposure)] * 2, rel=1e-5)
     assert (twin._state.implicit_steps > 0) == (damping > 1e7)
-    # the running-in is seen: at its end it has made h0 ln r of the depth
+    # running-in has a visible effect: at its end, h0 ln r of the depth is due to it
     assert worn[0] > exposure + 1.5e-5
 
 
 def test_sliding_in_the_plane_wears_by_the_way_of_the_corner() -> None:
-    """Each pad's depth is the integral of its force times its speed, made of the rows; so is that of fixed steps."""
+    """Each pad's depth is the integral of its force times its speed over the rows, also with fixed steps."""
     wear = dataclasses.replace(RUBBED, travel_speed_m_s=0.05)
     scene = dataclasses.replace(preset("paper"), wear=wear)
     result, fixed = simulate(scene, 4.0, 1e-4), simulate(scene, 4.0, method="rk4", dt=2e-5)
@@ -104,14 +104,14 @@ def test_sliding_in_the_plane_wears_by_the_way_of_the_corner() -> None:
     for pair, name in enumerate(PAIR_NAMES):
         x = half_w if "right" in name.rsplit("_", 1)[0] else -half_w
         y = half_h if "top" in name.rsplit("_", 1)[0] else -half_h
-        # speed of the head's wall below the corner, along the wall
+        # speed along the wall of the head's point at the corner
         vx = result.v[:, 0] - result.v[:, 2] * (y - result.q[:, 1])
         vy = result.v[:, 1] + result.v[:, 2] * (x - result.q[:, 0])
         along = c * vx + s * vy if name.endswith(("top", "bottom")) else c * vy - s * vx
         corners.append(np.trapezoid(result.force[:, pair] * np.hypot(0.05, along), result.t))
     expected = [worn_by(wear.coefficient_m2_n / wear.pad_area_m2 * float(way)) for way in corners]
     impulse = np.array([row["impulse"] for row in result.statistics.values()])
-    # far more than the travel alone
+    # far more than by the travel alone
     assert result.wear_depth.max() > 1.5 * worn_by(wear.coefficient_m2_n / wear.pad_area_m2 * 0.05 * impulse.max())
     assert result.wear_depth == pytest.approx(expected, rel=1e-3, abs=1e-12)
     assert fixed.wear_depth == pytest.approx(result.wear_depth, rel=0.02, abs=1e-11)
@@ -125,7 +125,7 @@ def test_a_twin_goes_on_wearing_from_a_snapshot_and_stands_still_without_wear() 
     other = Twin(scene)
     other.restore(parts.snapshot())
     assert np.array_equal(other.advance(2.0).wear_depth, expected)
-    # worn pads have run in: at the same motion they wear slower than new ones
+    # worn pads have run in, so with the same motion they wear more slowly than new pads
     other.reset(0.0, wear_depth=np.full(8, 1e-3))
     assert (other.advance(2.0).wear_depth - 1e-3).max() < 0.4 * expected.max()
     other.set_travel_speed(0.0)

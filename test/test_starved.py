@@ -1,4 +1,4 @@
-"""A machine with a shortage: the twin works, or names the shortage in one line."""
+"""On a machine with a shortage the twin works, or names the shortage in one line."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def _run(
 
 @pytest.fixture(scope="module")
 def compiled(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """Compile into the cache first: the compiler needs more than a run."""
+    """Compile into the cache first, because the compiler needs more than a run."""
     folder = tmp_path_factory.mktemp("compiled")
     _csv(folder / "load.csv", 100)
     assert _run(folder, *LIVE) == (0, [])
@@ -77,7 +77,8 @@ def test_a_run_works_and_is_repeated_where_little_is_there(lacking: dict[str, ob
     assert (report.exit_code, report.samples) == (0, 1500)
 
 
-#: As a user has it where another has installed: package, cache and home cannot be written, and there is no /dev/shm.
+#: Shell script that makes package, cache, home and /dev/shm read-only, as for a user of another user's installation,
+#: and runs a command.
 NOTHING_WRITABLE = """
 for place in "$PACKAGE" "$CACHE" "$HOME"; do
     mount --bind "$place" "$place"
@@ -132,7 +133,7 @@ def test_lacking_resources_are_named(lacking: dict[str, object], code: int, said
     assert len(lines) <= (2 if code == 3 else 1), lines  # with loss: the reason, then what was lost
 
 
-#: A command for each library of an extra that it needs.
+#: For each library of an extra, a command that needs it.
 NEEDING: dict[str, tuple[str, ...]] = {
     "mcap": LIVE,
     "paho": ("live", "mqtt://127.0.0.1:9", "--map", "map.yaml", "--scene", "paper"),

@@ -1,4 +1,4 @@
-"""Alarms: two levels, hysteresis, a minimum duration, latched until acknowledged."""
+"""Alarms have two levels, hysteresis and a minimum duration, and are latched until acknowledged."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_an_alarm_comes_after_its_duration_goes_below_its_hysteresis_and_stays_l
     assert _levels(alarms) == (Level.WARN, Level.WARN)
     _changes(alarms, _publication(5, 94.0))
     assert _levels(alarms) == (Level.NONE, Level.WARN)
-    # a short level raises no alarm, and a level without samples is no evidence
+    # a level that is too short raises no alarm, and a level without samples is no evidence
     _changes(alarms, _publication(6, 300.0))
     _changes(alarms, _publication(7, 0.0))
     for stamp in range(8, 20):
@@ -59,7 +59,10 @@ def test_an_alarm_comes_after_its_duration_goes_below_its_hysteresis_and_stays_l
     _changes(alarms, _publication(30, 150.0))
     assert alarms.acknowledge() == ["force"] and _levels(alarms) == (Level.WARN, Level.WARN)
     raised = alarms.alarms["force"].raised
-    assert raised is not None and (raised.value, raised.threshold) == (300.0, 100.0)  # of the level that is left
+    assert raised is not None and (raised.value, raised.threshold) == (
+        300.0,
+        100.0,
+    )  # those of the level that was left
 
 
 def test_a_threshold_of_zero_is_no_alarm() -> None:
@@ -79,10 +82,10 @@ def test_a_residual_is_that_at_the_stamp_of_the_pose_early_and_late_alike() -> N
 
     for stamp_ms in range(0, 100, 10):
         _changes(alarms, moved(stamp_ms))
-    # between two publications: the model's place at that time, not its present place
+    # a pose between two publications is compared with the model's pose at its time, not with the present pose
     assert not alarms.feed_pose(35 * MS, (0.036, 0.0, 0.0))
     assert abs(alarms.alarms["residual"].value - 0.001) < 1e-12
-    # ahead of the model, for which the pose waits
+    # a pose ahead of the model waits for it
     assert not alarms.feed_pose(105 * MS, (0.110, 0.0, 0.0))
     assert not _changes(alarms, moved(100))
     assert _changes(alarms, moved(110))

@@ -1,4 +1,4 @@
-"""Silence, jumps, failures and the scene's own loads: their effect on journal and motion."""
+"""Effects of silence, jumps, failures and the scene's own loads on journal and motion."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_silence_is_bridged_that_far_behind_the_clock(hold: str) -> None:
     assert held == [first, Hold(T0 + 31 * MS)]
     assert driver.state is StreamState.STALE
 
-    # a sample that the model has passed is late, the next one is used at once
+    # a sample that the model has passed is late; the next sample is used at once
     assert bench.sample(T0 + 31 * MS, LOAD, now_ns=132 * MS) is None
     assert bench.sample(T0 + 32 * MS, LOAD, now_ns=132 * MS) is not None
     assert driver.state is StreamState.RUNNING
@@ -148,7 +148,7 @@ def test_a_late_burst_after_a_long_silence_is_dropped_and_the_model_goes_on() ->
     assert "Reset" not in bench.kinds()
     assert driver.session.twin.digest() == digest
     assert bench.sample(T0 + 3000 * MS, LOAD, now_ns=3000 * MS) is not None
-    # a repeated jump is not a step of the clock, and a duplicate just after a jump is not late
+    # a repeated jump is not a step of the clock, and a duplicate right after a jump is not late
     assert bench.sample(T0 - 60 * NS_PER_S, LOAD, now_ns=3001 * MS) is None
     assert bench.sample(T0 - 60 * NS_PER_S, LOAD, now_ns=3001 * MS) is None
     assert bench.sample(T0 - 60 * NS_PER_S + MS, LOAD, now_ns=3001 * MS) is not None
@@ -205,7 +205,7 @@ def test_the_scenes_own_loads_follow_the_clock_that_is_passed_in() -> None:
     bench = Bench(excitation="scene")
     stamps = [T0, T0 + 250 * MS, T0 + 250 * MS, T0 + 1700 * MS]
     advances = [bench.tick(stamp, now_ns=0) for stamp in stamps]
-    assert advances[2] is None  # a paused clock moves nothing
+    assert advances[2] is None  # while the clock is paused, nothing moves
     direct = Twin(SCENE)
     for stamp, advance in zip(stamps, advances, strict=True):
         if advance is not None:
@@ -228,7 +228,7 @@ def test_model_time_goes_on_where_it_was_after_an_inactive_hour() -> None:
     direct.advance(0.5)
     assert advance.rows["q"][0].tobytes() == direct.advance(700 * MS * 1e-9).q.tobytes()
     assert "Reset" not in bench.kinds()
-    # a step of the clock, and a reset, start on the clock itself
+    # after a step of the clock, and after a reset, the motion starts at the clock's time
     driver.clock_tick(T0 + 2 * hour, hour)
     assert bench.journal[-2:] == [Reset(T0 + 2 * hour, "clock jump_forward"), Hold(T0 + 2 * hour)]
     driver.resume(3 * hour)
@@ -282,7 +282,7 @@ def test_wrong_stamps_one_after_another_reset_no_more_than_five_times_and_keep_n
         bench.sample(T0 + index * MS + ahead_ns, LOAD, now_ns=index * MS)
     bench.driver.pause()
     counted = counters(bench.driver)
-    # five in ten seconds may be steps of the clock, each with its return
+    # within ten seconds there may be five steps of the clock, each with its return
     assert counted["resets"] <= 10
     assert counted["samples_used"] >= 1900
     assert counted["samples_used"] + counted["dropped_unsteady"] + counted["dropped_stray"] == 2000
@@ -324,7 +324,7 @@ def test_failures_within_a_batch_end_in_a_reset_and_count_for_nothing() -> None:
 
 
 def _troubled(seed: int, count: int) -> list[tuple[str, list[tuple[int, tuple[float, float, float]]], int]]:
-    """Return calls of a driver: mostly one sample each, and now and then something unusual."""
+    """Return calls of a driver: mostly one sample each, sometimes unusual calls."""
     rng = np.random.default_rng(seed)
     calls, stamp, now = [], T0, 0
     kinds = ["late", "twice", "stray", "jump", "nan", "wild", "batch", "travel", "silence", "reset"]
@@ -344,7 +344,7 @@ def _troubled(seed: int, count: int) -> list[tuple[str, list[tuple[int, tuple[fl
             case "stray":
                 arrived[0] = (stamp + 100 * NS_PER_S, arrived[0][1])
             case "jump":
-                stamp, now = stamp - 50 * NS_PER_S, now + 4 * NS_PER_S  # more of them in a row are refused
+                stamp, now = stamp - 50 * NS_PER_S, now + 4 * NS_PER_S  # more such steps in a row are refused
             case "nan":
                 arrived[0] = (stamp, (math.nan, 0.0, 0.0))
             case "wild":
@@ -357,7 +357,7 @@ def _troubled(seed: int, count: int) -> list[tuple[str, list[tuple[int, tuple[fl
 
 @pytest.mark.parametrize("max_steps", [DEFAULT_BUDGET, 3])
 def test_single_calls_of_the_session_give_the_driver_s_bits_for_any_input(max_steps: int) -> None:
-    """Messages, journal and all that a later sample depends on; with 3 steps an advance fails now and then."""
+    """Messages, journal and the state for later samples are the same; with 3 steps an advance fails now and then."""
 
     def new_session(journal: list[Entry]) -> Session:
         twin = Twin(SCENE, excitation="sampled", max_steps=max_steps)

@@ -1,4 +1,4 @@
-"""Figures of the running system against numpy on the same numbers."""
+"""Figures of the running system, compared with numpy's results for the same numbers."""
 
 from __future__ import annotations
 
@@ -52,5 +52,5 @@ def test_periods_left_out_are_counted_and_the_others_described_since_the_last_lo
     assert (mean, deviation, largest) == pytest.approx((passed.mean(), passed.std(), 0.031))
     assert periods.missed == 2 and np.isnan(periods.recent()).all()
     periods.begin()
-    periods.turn(7.0)  # time spent inactive is not a period
+    periods.turn(7.0)  # inactive time is not a period
     assert periods.missed == 2 and np.isnan(periods.recent()).all()

@@ -1,4 +1,4 @@
-"""Which samples are used; each unused sample is counted under its reason."""
+"""The intake decides which samples are used; each unused sample is counted under its reason."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Late, reordered and batched samples are worked in; only its own service sets the wear."""
+"""Late, reordered and batched samples are worked in. Only the wear's own service sets the wear."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def _marks(frame: Published) -> tuple[bool, ...]:
 
 
 class Live:
-    """A driver on a real twin that remembers `SPAN_S`, its journal and what it publishes."""
+    """A driver on a real twin that remembers the last `SPAN_S` seconds, with its journal and its publications."""
 
     def __init__(self, *, every_sample: bool = True, policy: Policy | None = None) -> None:
         self.journal: list[Entry] = []
@@ -101,7 +101,7 @@ def test_any_order_and_any_batches_end_in_the_bits_of_the_samples_in_order(
     while begin < 160:
         size = sizes[number % len(sizes)]
         live.send(*(_arrival(index) for index in arriving[begin : begin + size]), now_ns=begin * MS)
-        live.silence(begin * MS + 900 * MS * (number % 3 == 0))  # each third time the model runs ahead
+        live.silence(begin * MS + 900 * MS * (number % 3 == 0))  # every third time the model runs ahead
         if number == 0:
             for index, speed in travels.items():
                 live.driver.travel(T0 + index * MS, speed)
@@ -126,11 +126,11 @@ def test_a_lasting_rise_of_the_delay_does_not_stop_the_twin() -> None:
     ordered.send(*(_arrival(index) for index in range(1500)))
     for index in range(500):
         live.send(_arrival(index), now_ns=index * MS)
-    for now in range(500, 1300, 10):  # no sample for 0.8 s
+    for now in range(500, 1300, 10):  # there is no sample for 0.8 s
         live.silence(now * MS)
     assert _newest(live.frames[-1], "held") and _newest(live.frames[-1], "stamp_ns") > T0 + 1100 * MS
     held = len(live.frames)
-    for index in range(500, 1500):  # and from then on everything is 0.8 s late
+    for index in range(500, 1500):  # from then on everything is 0.8 s late
         live.send(_arrival(index), now_ns=(index + 800) * MS)
         live.silence((index + 800) * MS)
     assert live.motion == ordered.motion
@@ -195,7 +195,7 @@ def test_speeds_of_another_clock_act_from_the_time_reached_on_and_are_counted_an
         right = live.wear if right is None else right
         assert (live.wear == right).all()
     live = Live()
-    # without a sample the speeds wait, but only those within a step of the clock
+    # without a sample, speeds wait if they are within a step of the clock
     live.send(*(_arrival(index) for index in range(10)))
     for index in range(0, 30_000, 10):
         live.driver.travel(T0 + index * MS, 2.0 + 1e-6 * index)
@@ -227,7 +227,7 @@ def test_clocks_out_of_step_end_in_an_error_and_not_in_resets_for_ever() -> None
     dropped = sum(count for key, count in counted.items() if key.startswith("dropped_"))
     assert counted["samples_used"] + dropped + (live.driver._steps._jumped is not None) == 400
     assert counted["dropped_unsteady"] > 50
-    # once the stamps are steady again, a step counts as a step
+    # when the stamps are steady again, a step is a step of the clock again
     live.send(_arrival(60_000), _arrival(60_001), now_ns=20_000 * MS)
     assert live.driver.resets == 6 and not live.driver.unsteady(20_000 * MS)
 
@@ -281,7 +281,7 @@ def test_the_journal_repeats_any_input_at_every_entry(seed: int) -> None:
                 live.driver.reset(T0 + index * MS, "asked for")
             else:
                 live.driver.set_wear(T0 + index * MS, [1e-5 * random.random()] * 8, "other pads")
-        elif chance < 0.96:  # late, on time, early and far too late
+        elif chance < 0.96:  # speeds that are late, on time, early and far too late
             live.driver.travel(T0 + (index + random.randrange(-200, 50)) * MS, 3.0 * random.random())
         else:
             live.driver.due()

@@ -1,4 +1,4 @@
-"""The model changed while it runs, and motions taken back: journaled, continuous, and exact in a second run."""
+"""Changes of the running model, and motions that are taken back: journaled, continuous, and exact in a second run."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ WRENCH = compile_loads(PAPER.loads).at(np.arange(2000) * 1e-3).tolist()
 
 
 class Bench:
-    """A driver on a real twin, its journal and publications."""
+    """A driver on a real twin, with its journal and publications."""
 
     def __init__(self, scene: Scene) -> None:
         self.journal: list[Entry] = []
@@ -52,7 +52,7 @@ def _same(first: list[Published], second: list[Published]) -> bool:
 
 
 def _again(scene: Scene, entries: list[Entry]) -> list[Entry]:
-    """Run a journal again, as read back from a file, and return the emitted entries."""
+    """Run a journal as read from a file, and return the emitted entries."""
     emitted: list[Entry] = []
     session = Session(Twin(scene, excitation="sampled"), on_entry=emitted.append, rollback_span_s=0.5)
     for entry in entries:
@@ -71,13 +71,13 @@ def test_a_restored_motion_continues_as_after_its_snapshot_for_any_stamps() -> N
     first = bench.send(700, 900)
     bench.send(900, 1300)
     makes = bench.out[-1].rows["makes"].copy()
-    for shift_ns in (0, 3600 * 10**9, -3600 * 10**9):  # the earlier stamps, a later and an earlier time
+    for shift_ns in (0, 3600 * 10**9, -3600 * 10**9):  # stamps as before, later and earlier
         bench.driver.restore(T0, kept)
         again = bench.send(699, 900, shift_ns)
         assert again[0].rows["stamp_ns"][0] == T0 + 699 * MS + shift_ns
         assert (again[0].rows["q"] == bench.out[699].rows["q"]).all()
         assert _same(first, again[1:])
-        assert (again[-1].rows["makes"] >= makes).all()  # counts are not set back
+        assert (again[-1].rows["makes"] >= makes).all()  # counts are never set back
     assert bench.driver.resets == 0
     bench.driver.mark(bench.session.stamp_ns or 0, "after the third")
     bench.session.close()
@@ -122,7 +122,7 @@ def test_a_changed_model_goes_on_from_pose_rates_and_wear_and_a_snapshot_of_it_h
     bench.session.close()
     assert sum(isinstance(entry, SetModel) for entry in bench.journal) == 2
     assert _again(WORN, bench.journal) == bench.journal
-    # a part of the recording that begins with the snapshot
+    # this part of the recording begins with the snapshot
     index = max(number for number, entry in enumerate(bench.journal) if isinstance(entry, Snapshot))
     assert _again(WORN, bench.journal[index:]) == bench.journal[index:]
 

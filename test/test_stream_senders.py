@@ -1,4 +1,4 @@
-"""Loss by the sender's own numbering, and which sender is followed."""
+"""Losses by the sender's own numbering, and the choice of the sender."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_one_sender_is_followed_until_it_has_gone_or_a_switch_is_asked_for() -> 
     senders = Senders()
     assert not senders.switch()
     assert [senders.hear(ONE, 1), senders.hear(OTHER, 1), senders.hear(ONE, 2)] == [True, False, True]
-    # not yet in the list of present publishers, which is no evidence
+    # the sender is not yet in the list of present publishers, which is no evidence against it
     senders.alive([])
     assert senders.followed == ONE
     senders.alive([ONE, OTHER])

@@ -1,4 +1,4 @@
-"""The session behind live node and replay: same entries, same bits; no loss between two publications."""
+"""The session of live node and replay: equal entries give equal bits, and nothing is lost between publications."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def _entries() -> list[Entry]:
 
 
 class Run:
-    """One session, all that it emitted and published."""
+    """A session, with everything that it emitted and published."""
 
     def __init__(self) -> None:
         self.emitted: list[Entry] = []
@@ -67,12 +67,12 @@ class Run:
         return self
 
 
-#: Published numbers of a row, beside its stamp.
+#: Published numbers of a row, except its stamp.
 NUMBERS = ("penetration", "rate", "force", "makes", "impulse", "peak", "q", "v")
 
 
 def _number(published: Published, name: str) -> np.ndarray:
-    """Return a field of the one row."""
+    """Return a field of the only row."""
     found: np.ndarray = published.rows[name][0]
     return found
 
@@ -122,7 +122,7 @@ def test_one_flipped_bit_of_a_sample_shows_in_the_next_digest(reference: Run) ->
         [entry for entry in run.emitted if isinstance(entry, Digest)],
         strict=False,
     )
-    # later digests may agree again: damped contact forgets the last bits
+    # later digests may agree again, because damped contact forgets the last bits
     same = [(ours.stamp_ns < sample.stamp_ns, ours == theirs) for ours, theirs in pairs]
     before = sum(earlier for earlier, _ in same)
     assert 0 < before < len(same)
@@ -233,17 +233,17 @@ def test_running_in_and_sliding_in_the_plane_wear_live_as_offline_and_go_on_afte
         return simulate(worn, 2e-3 * (STEPS - 1), 0.1, tol=Twin(scene).tol).wear_depth
 
     new = lived(WearKeeper(tmp_path, "head 7", scene))
-    # within the solver's tolerance of the motion
+    # equal within the solver's tolerance of the motion
     assert new == pytest.approx(offline(np.zeros(8)), rel=1e-3, abs=1e-12)
     assert new.max() > 1.5 * wear.running_in_depth_m
     worn = lived(WearKeeper(tmp_path, "head 7", scene))
     assert worn == pytest.approx(offline(new), rel=1e-3, abs=1e-12)
-    # pads that have run in wear slower by the given ratio
+    # pads that have run in wear more slowly, by the given ratio
     assert (worn - new).max() < 0.6 * new.max()
 
 
 def test_a_speed_at_which_the_damping_lets_no_contact_last_is_refused_by_name() -> None:
-    """Force would wear a pad faster than it moves the head: refused before it acts, and before it is journaled."""
+    """A force would wear a pad faster than it moves the head. The speed is refused before it acts and is journaled."""
     damping, area = 2e5, 0.015
     contact = Contact("kelvin_voigt", 1e9, damping=damping)
     scene = replace(SCENE, contact=contact, wear=Wear(area / (4.0 * damping), area, 2.0, prior_m2_n=(1e-15, 1e-6)))
@@ -258,7 +258,7 @@ def test_a_speed_at_which_the_damping_lets_no_contact_last_is_refused_by_name() 
     ):
         with pytest.raises(ArgumentError, match=r"got -?4.1, expected at most 4 m/s, .* contact.damping 200000.0 N"):
             refuse()
-    # nor can the damping be raised while a speed waits
+    # the damping cannot be raised either while a speed waits
     with pytest.raises(ArgumentError, match=r"speed_m_s: got -3.9, expected at most 3.2 m/s"):
         session.check_model({"contact.damping": 1.25 * damping})
     session.check_model({"contact.damping": damping})

@@ -1,4 +1,4 @@
-"""Calibration: known parameters recovered from random starts, equal bits from equal seeds, targets by kind."""
+"""Calibration: known parameters from random starts, equal bits from equal seeds, and targets of each kind."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from plow_twin.study.calibration.unknowns import Space, parse_unknown
 from plow_twin.study.parameters import StudyError, with_parameters
 from plow_twin.study.statistics import statistic
 
-#: Of a scene that is not the preset: stiffness, damping, a phase, a clearance and a sign.
+#: Parameters of a scene that differs from the preset: stiffness, damping, a phase, a clearance and a sign.
 TRUTH = {
     "contact.stiffness": 2.3e7,
     "contact.damping": 0.43,
@@ -71,7 +71,7 @@ def errors(found: Calibration) -> list[float]:
 def test_known_parameters_are_recovered_from_every_random_start() -> None:
     found, objective = from_recording(3)
     assert len(found.starts) == 3 and max(errors(found)) < RECOVERED
-    assert len({start.before_polish for start in found.starts}) == 3  # each start went its own way
+    assert len({start.before_polish for start in found.starts}) == 3  # each start has taken its own path
     known = identifiability(space(), objective, found.best.point)
     assert len(known.singular_values) == 4 and known.singular_values[-1] > 1e-2
     assert sum(value**2 for value in known.weakest.values()) == pytest.approx(1.0)
@@ -93,7 +93,7 @@ def test_the_same_seed_gives_the_same_bits_on_any_number_of_threads() -> None:
 
 def test_an_unseen_parameter_is_reported_as_such() -> None:
     scene = with_parameters(preset("paper"), {"contact.impact_speed_floor_m_s": 2e-3})
-    # a constant damping does not use the floor, so the recording does not determine it
+    # a constant damping does not use the floor of the speed, so the recording does not determine this floor
     unknowns = Space(
         tuple(parse_unknown(text, scene) for text in (RANGES[0], "contact.impact_speed_floor_m_s=1e-4:1e-2"))
     )
@@ -104,7 +104,7 @@ def test_an_unseen_parameter_is_reported_as_such() -> None:
 
 
 def figures(seconds: float) -> TargetSet:
-    """Return figures of the true motion as a paper might publish them: forces, means, shares, impulses."""
+    """Return figures of the true motion as a paper might publish them: forces, means, shares and impulses."""
     true = with_parameters(preset("paper"), TRUTH)
     members = simulate_many([true], seconds, seconds)
     paths = [
@@ -155,7 +155,7 @@ def test_the_command_fits_a_recording_and_marks_the_fitted_numbers(
     check_figure(figures[0])
     pose, residual = figures[0].axes[:2]
     np.testing.assert_allclose(pose.lines[0].get_ydata(), 1e3 * rec.q[:, 0])
-    assert np.abs(residual.lines[0].get_ydata()).max() < 1e-6  # mm: the recording is exact
+    assert np.abs(residual.lines[0].get_ydata()).max() < 1e-6  # in mm, because the recording is exact
     assert figures[0].axes[-1].get_yticklabels()[0].get_text() == "contact stiffness [MN/mⁿ]"
     assert "singular values" in capsys.readouterr().out
     fit = load_scene(tmp_path / "fit" / "fit.yaml")

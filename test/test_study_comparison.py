@@ -1,4 +1,4 @@
-"""Runs compared: windows hold the recorded numbers; chance, load and machine are distinguished."""
+"""Comparison of runs: windows contain the recorded numbers, and chance, load and machine are distinguished."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_a_window_without_a_message_of_the_clearance_has_that_of_its_neighbours(
 
 
 def test_windows_with_a_stretch_without_samples_are_left_out_and_named(runs: tuple[Run, Run], tmp_path: Path) -> None:
-    # with 97 % of its messages in the first case, the window counts as full
+    # in the first case a window has 97 % of its messages, which is enough
     for first, end, timeout in ((4100, 4130, 0.02), (4100, 5200, 0.5)):
         samples = (paper_sample(index) for index in range(SECONDS * 1000) if not first <= index < end)
         run = record_run(tmp_path / str(end), samples, parameters={"excitation_timeout": timeout})
@@ -96,13 +96,13 @@ def test_windows_with_a_stretch_without_samples_are_left_out_and_named(runs: tup
 
 def test_the_window_is_the_period_of_the_load(runs: tuple[Run, Run]) -> None:
     starts = windows_of(read_recording(runs[0].folder)).start_ns
-    assert np.diff(starts)[0] * 1e-9 == pytest.approx(np.pi, rel=0.3)  # 2 rad/s, seen for two and a half periods
+    assert np.diff(starts)[0] * 1e-9 == pytest.approx(np.pi, rel=0.3)  # 2 rad/s, in data of two and a half periods
 
 
 def change(
     before: tuple[np.ndarray, np.ndarray], after: tuple[np.ndarray, np.ndarray], random: Any, draws: int = 300
 ) -> Change | None:
-    """The change of one quantity."""
+    """Return the change of one quantity."""
     return changes(*(Drawn(values[:, None], load, random, draws) for values, load in (before, after)))[0]
 
 
@@ -113,7 +113,7 @@ def test_of_fifty_cells_judged_together_chance_takes_none_for_a_change_in_ninete
         groups = [(random.gamma(4.0, 25e3, (60, 50)), random.normal(1.0, 0.05, 60)) for _ in range(2)]
         drawn = [Drawn(*group, random, draws=200) for group in groups]
         tables.append([cell.verdict for cell in changes(*drawn) if cell is not None])
-        groups[1][0][:, 7] *= 1.8  # a single true change among them is still seen
+        groups[1][0][:, 7] *= 1.8  # a single true change among them is still detected
         cell = changes(drawn[0], Drawn(*groups[1], random, draws=200))[7]
         found_again += cell is not None and cell.verdict == "machine"
     assert sum(any(verdict != "chance" for verdict in table) for table in tables) <= 7
@@ -144,7 +144,7 @@ def test_a_lasting_change_of_a_load_that_windows_cut_through_is_the_load_s() -> 
         for scale in (1.0, 1.15):
             true = scale * random.normal(
                 1.0, 0.15, 62
-            )  # of each period; a window has halves of two periods, but its peak is that of one period
+            )  # a window has halves of two periods, but the peak of one period
             start_ns = 10**9 * np.arange(61)
             seen = with_neighbours(0.5 * (true[1:] + true[:-1]), start_ns)
             groups.append((1e5 * true[1:] * random.normal(1.0, 0.02, 61), seen))
@@ -155,11 +155,11 @@ def test_a_lasting_change_of_a_load_that_windows_cut_through_is_the_load_s() -> 
     np.testing.assert_array_equal(
         with_neighbours(np.array([1.0, 2.0, 3.0]), np.array([0, 10, 90])), [[1, 1, 2], [2, 1, 2], [3, 3, 3]]
     )
-    # a slope does not hold far beyond its loads
+    # a slope is not valid far from its loads
     load = random.normal(1.0, 0.02, 40)
     apart = change((1e5 * load**2, load), (1.4e5 * load**2, 1.4 * load), random, draws=100)
     assert apart is not None and apart.verdict == "load or machine"
-    equal = np.full(93, 0.025)  # its mean is rounded
+    equal = np.full(93, 0.025)  # the mean of equal numbers is rounded
     constant = change((equal[:62], np.ones(62)), (equal, np.ones(93)), random, draws=100)
     assert constant is not None and constant.verdict == "chance"
 
@@ -189,7 +189,7 @@ def test_two_runs_are_compared_on_the_terminal_as_json_and_as_a_page(
     assert ratio == pytest.approx(1.3)
     changes = facts["changes"]["tuesday"]
     assert set(changes) == set(PAIR_NAMES) and changes["top_right_top"]["peak"]["verdict"] != "machine"
-    assert facts["clearance_changes"]["tuesday"]["horizontal"]["verdict"] == "chance"  # the pads do not wear
+    assert facts["clearance_changes"]["tuesday"]["horizontal"]["verdict"] == "chance"  # here the pads do not wear
     page = (tmp_path / "compare.html").read_text(encoding="utf-8")
     assert "tuesday compared with monday" in page and "data:image/png;base64," in page and "http" not in page
     table = pyarrow.parquet.read_table(tmp_path / "windows.parquet")

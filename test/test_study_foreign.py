@@ -1,4 +1,4 @@
-"""Files that others hand over: cut off, half written, exported by a spreadsheet, in encodings that are not ROS 2's."""
+"""Files from others: cut off, half written, exported by a spreadsheet, and in encodings other than ROS 2's."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ TYPE = "geometry_msgs/msg/WrenchStamped"
 
 
 def sqlite_bag(folder: Path) -> Path:
-    """A bag with the load, whose last third is in the log that a killed recorder leaves behind."""
+    """Return a bag with the load; its last third is in the log that a killed recorder leaves behind."""
     with BagWriter(folder, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
         connection = writer.add_connection("/load", TYPE, typestore=STORE)
         for index in range(2 * COUNT // 3):
@@ -48,7 +48,7 @@ def sqlite_bag(folder: Path) -> Path:
         live.execute("INSERT INTO messages (topic_id, timestamp, data) VALUES (1, ?, ?)", (time_ns, data))
     live.commit()
     killed.mkdir()
-    for item in folder.glob("*.db3*"):  # as it is on the disk, without a clean end
+    for item in folder.glob("*.db3*"):  # the files are copied as they are on the disk, without a clean end
         if not item.name.endswith("-shm"):
             shutil.copy(item, killed)
     live.close()
@@ -174,7 +174,7 @@ def test_columns_that_are_missing_or_there_twice_are_named(tmp_path: Path) -> No
 
 
 def test_a_mapping_without_a_field_or_stamp_is_named(tmp_path: Path) -> None:
-    """A typo of `header` was taken for `header`; a typo of a field gave only `malformed 300`."""
+    """A typo of `header` must not be taken for `header`, and a typo of a field must be named, not only counted."""
     schema = STORE.generate_msgdef(TYPE, ros_version=2)[0].encode()
     times = [BASE_NS + i * STEP_NS for i in range(COUNT)]
     messages = [(time_ns, wrench_message(time_ns, paper_sample(i).wrench)) for i, time_ns in enumerate(times)]
@@ -196,7 +196,7 @@ def test_a_mapping_without_a_field_or_stamp_is_named(tmp_path: Path) -> None:
 
 
 def test_the_estimate_reads_csv_as_the_analysis_does(tmp_path: Path) -> None:
-    """A byte order mark became an invisible part of `t`, semicolons separated no columns, dates were not times."""
+    """A byte order mark must not become a part of `t`, semicolons separate columns, and dates are times."""
     scene, names = Path(PAPER), ("t", "x", "y", "theta")
     sheet(tmp_path / "load.csv", ",", comma=False, mark=False)
     sheet(tmp_path / "pose.csv", ",", comma=False, mark=False, header=names)
@@ -264,7 +264,7 @@ def test_a_part_that_a_killed_recorder_has_only_named_costs_nothing_before_it(tm
 
 
 def bag_of_parts(folder: Path, kind: StoragePlugin) -> list[Path]:
-    """A bag of three parts, 10 ms of load each without a gap, as rosbag2 splits one; return the parts."""
+    """Write a bag in three parts, each with 10 ms of load and without a gap, as rosbag2 does; return the parts."""
     ending, listed = kind.name.lower().replace("sqlite3", "db3"), []
     folder.mkdir()
     for part in range(3):
@@ -284,7 +284,7 @@ def bag_of_parts(folder: Path, kind: StoragePlugin) -> list[Path]:
 
 @pytest.mark.parametrize("kind", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
 def test_of_a_bag_with_a_damaged_or_missing_part_the_others_are_used(kind: StoragePlugin, tmp_path: Path) -> None:
-    """No load is interpolated over a gap of any length; a damaged file used to make the whole bag unreadable."""
+    """No load is interpolated over a gap of any length, and a damaged file does not make the whole bag unreadable."""
     parts = bag_of_parts(tmp_path / "bag", kind)
     plain = analyse(tmp_path / "bag", scene=PAPER)
     assert (plain.input["samples_used"], plain.lost, len(plain.predictions[0].spans)) == (COUNT, {}, 1)

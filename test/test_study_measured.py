@@ -1,4 +1,4 @@
-"""The contact model compared with impacts and drops that others measured (`benchmark/data/measured`)."""
+"""The contact model, compared with impacts and drops that others have measured (`benchmark/data/measured`)."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_measured_impacts_are_met_better_than_by_a_rigid_impact(impacts) -> None
     missed = misses(impact(before), after)
     assert np.sqrt((missed**2).mean()) < 0.245
     assert np.median(missed) < 0.15
-    # without the fall of restitution and without the spring's damper it is no better than the rigid one
+    # without the decrease of restitution and without the spring's damper, the model is no better than a rigid one
     plain = replace(ELLIPSE, fall=0.0, fall_along=0.0, restitution=0.54, tilt=0.0, stick_damping=0.0)
     assert np.sqrt((misses(impact(before, plain), after) ** 2).mean()) > 0.27
 
@@ -111,10 +111,10 @@ def test_tossed_block_moves_as_the_preset_computed_by_the_solver(drops) -> None:
         apart.append(np.abs(found[:20] - solved[:20] - [0.0, 1.0, 0.0]).max(axis=0))
         off = MARKER.measured(solved + np.array([0.0, 1.0, 0.0]))[: len(measured), :2] - measured[:, :2]
         far.append(np.hypot(*off.T).mean())
-    # fixed steps against exact events: impacts enlarge the difference
+    # impacts enlarge the difference between fixed steps and exact events
     assert (np.max(apart, axis=0) < [2e-3, 2e-3, 0.1]).all()
     assert (np.median(apart, axis=0) < [4e-4, 3e-4, 0.03]).all()
-    # rigid impacts are off by 10 mm
+    # rigid impacts have an error of 10 mm
     assert np.median(far) < 9e-3, far
 
 
@@ -124,7 +124,7 @@ def test_flight_is_fitted_to_its_measured_rows(drops) -> None:
             continue
         flight = fit_flight(pose[:given])
         assert abs(flight.state[0] - pose[given - 1, 0]) < 3e-4
-        # the last row given may lie after the impact: the flight then ends a row before
+        # the last given row may be after the impact; the flight then ends one row earlier
         assert len(flight.times) in (given, given - 1, given - 2)
     assert fit_flight(np.delete(pose[:given], 4, axis=0)).times[0] == pytest.approx(fit_flight(pose[:given]).times[0])
 
@@ -149,7 +149,7 @@ def test_bands_are_ordered_start_narrow_and_repeat(drops) -> None:
 def test_bad_rows_of_a_flight_are_named(drops) -> None:
     flight = drops.pose[0, : drops.flight_rows[0]]
     wrong: list[Any] = [np.zeros((3, 3)), np.zeros((8, 2)), np.full((8, 3), np.nan), [], [["a", "b", "c"]] * 5]
-    # a whole drop that ends at rest, a place below the table, millimetres
+    # a whole drop that ends at rest, a pose below the table, and millimetres
     wrong += [drops.pose[0], flight - [0.0, 1.0, 0.0], flight * [1e3, 1e3, 1.0]]
     for rows in wrong:
         with pytest.raises(ArgumentError, match="first_flight"):
@@ -186,7 +186,7 @@ def test_marker_is_turned_as_the_angles_at_rest_show(drops) -> None:
 def test_marker_s_state_is_the_block_s_and_back() -> None:
     state = np.random.default_rng(0).standard_normal((20, 6))
     np.testing.assert_allclose(MARKER.state_of_block(MARKER.measured(state)), state, atol=1e-12)
-    # it moves with a point of the block
+    # the marker moves with a point of the block
     h = 1e-6
     moved = state.copy()
     moved[:, :3] += h * state[:, 3:]

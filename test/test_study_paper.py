@@ -1,4 +1,4 @@
-"""The study of the paper: its files, its numbers equal to the run's, and its list of disagreements."""
+"""The study of the paper: its files, numbers equal to those of the run, and its list of disagreements."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_the_command_leaves_a_report_its_table_and_the_run(tmp_path: Path, capsy
     files = [(out / "figures" / f"{name}.png").read_bytes() for name in FIGURES]
     assert [base64.b64decode(image) for image in images] == files
     assert all(re.search(rb"Title\0[^\0]+; scene paper, 20\d\d-\d\d-\d\d", file) for file in files)
-    assert not re.search(r'(src|href)="(?!data:)', html)  # no resource outside of the file
+    assert not re.search(r'(src|href)="(?!data:)', html)  # the file needs no other resource
 
     document = json.loads((out / "table.json").read_text())
     with (out / "table.csv").open() as file:
@@ -88,7 +88,7 @@ def test_the_command_leaves_a_report_its_table_and_the_run(tmp_path: Path, capsy
     assert document["recording_error_m"] < 1e-6
     assert replay(out / "run").divergences == 0
 
-    assert run(["study", "paper", "--out", str(out)]) == 2  # no file is overwritten
+    assert run(["study", "paper", "--out", str(out)]) == 2  # no existing file is overwritten
     assert "expected a new folder" in " ".join(capsys.readouterr().err.split())
 
 
@@ -125,7 +125,7 @@ def test_disagreements_are_listed(study: PaperStudy) -> None:
     assert row(study, "a is loaded more than c and d, largest force").verdict is Verdict.DISAGREES
     assert row(study, "b is loaded more than c and d, largest force").verdict is Verdict.AGREES
     assert "at c" in row(study, "counter-clockwise: largest force is at a").computed
-    assert row(study, "clockwise: {a} occurs").verdict is Verdict.DISAGREES  # for 0.8 ms alone
+    assert row(study, "clockwise: {a} occurs").verdict is Verdict.DISAGREES  # it occurs for 0.8 ms only
     quoted = [entry for entry in study.rows if "contact at 5" in entry.what]
     assert [entry.verdict for entry in quoted] == [Verdict.DISAGREES] * 6
     statements = " ".join(entry.statement for entry in contradictions(study.runs))
@@ -134,7 +134,7 @@ def test_disagreements_are_listed(study: PaperStudy) -> None:
 
 
 def test_a_second_reconstruction_gets_its_own_verdicts(study: PaperStudy) -> None:
-    # other signs of loads and arms, other contact: fits the forces at a and b and one trend less
+    # with other signs of loads and arms, and another contact, the scene fits the forces at a and b, but one trend less
     scene = preset("paper")
     fx1, fx2, fx3, fy = scene.loads
     loads = (
@@ -204,7 +204,7 @@ def test_a_set_counts_from_five_milliseconds_on() -> None:
     [
         ([1.0, 2.0, 3.0], True, False),
         ([1.0, 3.0, 2.0], False, True),
-        ([100.0, 110.0, 109.8, 120.0], True, False),  # a step back that a printed curve does not show
+        ([100.0, 110.0, 109.8, 120.0], True, False),  # this step back would not show in a printed curve
         ([100.0, 110.0, 105.0, 120.0], False, False),
         ([100.0, 100.2, 100.0], False, False),
         ([3.0, 2.0, 1.0], False, False),
@@ -260,8 +260,8 @@ def test_the_exact_rigid_body_falls_without_turning(study: PaperStudy) -> None:
     np.testing.assert_array_equal(rotation.results[0].q, study.runs.case.q)
     head, t = study.runs.scene.head, study.runs.case.t[20]
     turned = [float(result.q[20, 2]) for result in rotation.results]
-    # gravity alone: its moment turns the first body at once, the second falls about its centre of mass; the loads add
-    # t^3
+    # gravity alone turns the first body at once by its moment, and the second falls about its centre of mass; the loads
+    # add t^3
     assert turned[0] == pytest.approx(-0.5 * head.mass_kg * 9.81 * 0.255 / head.inertia_kg_m2 * t**2, rel=0.15)
     assert abs(turned[1]) < 0.15 * abs(turned[0])
     values = {entry.what: entry for entry in study.rotation}

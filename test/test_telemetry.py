@@ -1,4 +1,4 @@
-"""Outputs to a plant besides MQTT: real servers and clients in other processes get the numbers of the recording."""
+"""Outputs to a plant other than MQTT: real servers and clients in other processes get the recording's numbers."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from plow_twin.telemetry.opcua.model import NAMESPACE
 
 
 class Heard:
-    """Events of conditions as a client gets them."""
+    """A client that collects the events of conditions."""
 
     def __init__(self) -> None:
         self.events: list[Any] = []
@@ -34,7 +34,7 @@ class Heard:
         self.events.append(event)
 
     def states(self) -> list[tuple[bool, bool]]:
-        """Return whether each was active, and acknowledged."""
+        """Return for each event whether the condition was active, and acknowledged."""
         return [(getattr(event, "ActiveState/Id"), getattr(event, "AckedState/Id")) for event in self.events]
 
 
@@ -54,7 +54,7 @@ async def _acknowledge(client: Client, heard: Heard, condition: Any, event_id: b
 
 
 async def _conditions(client: Client) -> Heard:
-    """Subscribe to conditions, and ask for those that are there."""
+    """Subscribe to conditions, and request the existing ones."""
     heard = Heard()
     subscription = await client.create_subscription(50, heard)
     alarm_type = client.get_node(ua.NodeId(ua.ObjectIds.ExclusiveLevelAlarmType))
@@ -88,7 +88,7 @@ def test_opcua_clients_read_a_typed_model_and_acknowledge_alarms_where_that_is_a
             await _soon(lambda: _is_good(horizontal))
             value, low = await horizontal.read_data_value(), await node("clearance.horizontal.p05").read_value()
             assert (value.Value.Value, low, unit.DisplayName.Text) == (pytest.approx(0.025), pytest.approx(0.025), "m")
-            assert value.SourceTimestamp.timestamp() == pytest.approx(1.0 + 1499e-3, abs=0.01)  # of the last sample
+            assert value.SourceTimestamp.timestamp() == pytest.approx(1.0 + 1499e-3, abs=0.01)  # the last sample's time
             assert not (await node("life.seconds.p50").read_data_value(raise_on_bad_status=False)).StatusCode.is_good()
             for written in (horizontal, node("flags.stream"), node("alarms.force")):
                 with pytest.raises(ua.UaStatusCodeError):
@@ -112,7 +112,7 @@ def test_opcua_clients_read_a_typed_model_and_acknowledge_alarms_where_that_is_a
 
 
 def _meanwhile(live: Live, work: Coroutine[Any, Any, Any]) -> Any:
-    """Do something while the twin's output is read: the twin waits for its readers."""
+    """Call a function while the twin's output is read, because the twin waits for its readers."""
     with ThreadPoolExecutor(1) as pool:
         done = pool.submit(asyncio.run, work)
         live.until(lambda _: done.done(), "done")
@@ -178,7 +178,7 @@ def _certificate(folder: Path, name: str) -> None:
 
 
 class Database(BaseHTTPRequestHandler):
-    """The write interface of InfluxDB 2."""
+    """A handler with the write interface of InfluxDB 2."""
 
     def do_POST(self) -> None:
         server: Any = self.server
@@ -190,7 +190,7 @@ class Database(BaseHTTPRequestHandler):
             server.lines += text.splitlines()
 
     def log_message(self, *_: Any) -> None:
-        """Say nothing."""
+        """Log nothing."""
 
 
 def test_influxdb_gets_lines_also_from_the_time_while_it_was_down(tmp_path: Path) -> None:
@@ -213,5 +213,5 @@ def test_influxdb_gets_lines_also_from_the_time_while_it_was_down(tmp_path: Path
     clearance = [line for line in lines if line.startswith("plow_twin_clearance,head=plough_head ")][-1]
     fields, _, stamp = clearance.partition(" ")[2].rpartition(" ")
     assert "horizontal=0.025," in fields and "horizontal/p05=" in fields
-    assert int(stamp) == 1_000_000_000 + 499 * 1_000_000  # of the last sample
+    assert int(stamp) == 1_000_000_000 + 499 * 1_000_000  # the last sample's time
     assert any('stream="running"' in line for line in lines if line.startswith("plow_twin_flags"))

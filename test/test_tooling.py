@@ -1,4 +1,4 @@
-"""Promises of the checks: new examples at each stress run, and really the lowest versions."""
+"""Promises of the checks: new examples in each stress run, and exactly the lowest versions."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_stress_draws_new_examples_prints_its_seed_and_shrinks() -> None:
 
 @pytest.fixture
 def metadata(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """The arguments of setup() in setup.py."""
+    """Return the arguments of setup() in setup.py."""
     stated: dict[str, Any] = {}
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr("setuptools.setup", lambda **keywords: stated.update(keywords))
@@ -61,7 +61,7 @@ def test_the_lowest_versions_are_those_that_setup_names(metadata: dict[str, Any]
         match = VERSION.fullmatch(line)
         assert match is not None, line
         stated[match[1]] = match[2]
-    stated["lz4"] = "4.3"  # the first that is a wheel for Python 3.11; 4.0.2, Ubuntu's, needs a compiler
+    stated["lz4"] = "4.3"  # the first with a wheel for Python 3.11; Ubuntu's 4.0.2 needs a compiler
     lines = (ROOT / "requirements" / "lowest.txt").read_text().splitlines()
     lowest = dict(line.split("==") for line in lines if not line.startswith("#"))
     assert lowest.keys() == stated.keys()
@@ -71,7 +71,7 @@ def test_the_lowest_versions_are_those_that_setup_names(metadata: dict[str, Any]
     assert "1.26" in lowest["numpy"]
 
 
-#: Holds the interpreter's lock: no signal's handler runs, and no thread.
+#: Code that holds the interpreter's lock, so that no signal handler and no thread runs.
 HANGING = """
 import ctypes
 
@@ -92,10 +92,10 @@ def test_a_test_that_hangs_is_named_and_ends_the_run(tmp_path: Path) -> None:
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert done.returncode != 0 and "1 failed, 1 passed" in done.stdout
     assert re.search("crashed while running '.*test_that_hangs'", done.stdout)
-    assert "in test_that_hangs" in done.stderr  # where it stands
+    assert "in test_that_hangs" in done.stderr  # the place where the test hangs
 
 
-#: A kernel, and a test of it that waits until another process has come as far.
+#: A kernel, and a test of it that waits until another process has reached the same place.
 DOUBLE = "from plow_twin.kernel.compiler import kernel\n@kernel(entry=True)\ndef double(x):\n    return 2.0 * x\n"
 MEETING = """
 import time
@@ -135,7 +135,7 @@ def test_ci_is_bounded_and_runs_every_check() -> None:
     steps = re.findall(r'^step "([^"]+)" (\d+) (?:env \S+ )?make (.+)', program, re.MULTILINE)
     assert sum(int(limit) for _, limit, _ in steps) <= 4200
     targets = {word for _, _, given in steps for word in given.split()}
-    # coverage has no required minimum: it is a figure, not a check
+    # coverage has no required minimum, because it is a figure and not a check
     assert targets >= {"test", "lint", "docs", "demo", "lowest"}
     assert "test_stream_session.py" in dry_run("coverage") and "--cov" not in dry_run("test")
     lowest = dry_run("lowest")

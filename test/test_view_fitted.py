@@ -1,4 +1,4 @@
-"""The picture of a fit: measured against fitted motion, residuals, values beside their priors."""
+"""The picture of a fit: measured and fitted motion, residuals, and values beside their priors."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_the_fitted_motion_leaves_the_sensor_s_noise_alone(picture: FittedPictur
     residual = picture.motion.residual
     assert np.isfinite(residual).mean() > 0.5
     np.testing.assert_allclose(np.nanstd(residual, axis=0), picture.noise, rtol=0.1)
-    assert (np.nanstd(picture.motion.measured, axis=0) > 3.0 * np.array(picture.noise)).all()  # not only the noise
+    assert (np.nanstd(picture.motion.measured, axis=0) > 3.0 * np.array(picture.noise)).all()  # more than noise
 
 
 def test_each_value_stands_with_its_interval_in_that_of_the_prior(picture: FittedPicture) -> None:

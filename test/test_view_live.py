@@ -1,4 +1,4 @@
-"""A live view while the node records: separate processes that can stop, fall behind and be ended."""
+"""A live view while the node records, by separate processes that can stop, fall behind and be ended."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_a_stopped_viewer_does_not_disturb_the_node_and_catches_up_later(tmp_pat
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     run, log, file_log = tmp_path / "run", tmp_path / "view.log", tmp_path / "file.log"
-    # one into a viewer, one into a file
+    # one process sends to a viewer, the other writes a file
     shown = follower(run, log, "--web", "--web-port", str(port))
     written = follower(run, file_log, "--out", str(tmp_path / "run.rrd"))
     try:
@@ -60,7 +60,7 @@ def test_a_stopped_viewer_does_not_disturb_the_node_and_catches_up_later(tmp_pat
             node.probe.until(lambda: len(forces) >= 4000, "every publication")
             recorder, output = node.probe.figures("recorder"), node.probe.figures("output")
             assert recorder["lost"] in ("", "0", "{}") and recorder["error"] == "" and output["withheld"] == "0"
-            os.kill(shown.pid, signal.SIGCONT)  # it continues alone, and its messages are not read
+            os.kill(shown.pid, signal.SIGCONT)  # the process continues alone, and nobody reads its messages
             assert node.twin.stop() == 0
         assert written.wait(WAIT_S) == 0
         reader = RunReader(run)
@@ -71,7 +71,7 @@ def test_a_stopped_viewer_does_not_disturb_the_node_and_catches_up_later(tmp_pat
         until(lambda: b" read" in log.read_bytes(), "all to be shown")
         shown_rows = re.search(r" of (\d+) read", log.read_text())
         assert shown_rows is not None and int(shown_rows[1]) == published
-        # ended while the viewer does not answer
+        # the process is ended while the viewer does not answer
         os.kill(viewer, signal.SIGSTOP)
         shown.terminate()
         assert shown.wait(10.0) in (0, 1)

@@ -1,4 +1,4 @@
-"""The picture of a recording: long runs as envelopes, clearances in millimetres, annotations inside their axes."""
+"""The picture of a recording: envelopes of long runs, clearances in millimetres, and annotations inside their axes."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ from plow_twin.view.run_curves import RunCurves
 
 @pytest.fixture
 def figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
-    """Receive the figures that are drawn."""
+    """Return a list that receives the figures that are drawn."""
     return kept_figures(monkeypatch)
 
 
 def test_an_hour_of_load_fills_the_same_band_everywhere() -> None:
     envelope = Envelope(1)
     times = np.arange(72_000) / 20.0
-    for part in np.array_split(times, 300):  # as in the batches of a recording
+    for part in np.array_split(times, 300):  # rows come in parts, as in the batches of a recording
         envelope.add(part, np.sin(2.0 * part)[:, None])
     at, least, largest = envelope.bands(0)
     assert 300 <= len(at) <= 700
     widths = np.diff(at)
     np.testing.assert_allclose(widths, widths[0])
-    assert (largest[:-1] > 0.99).all() and (least[:-1] < -0.99).all()  # all but the last hold a whole period
+    assert (largest[:-1] > 0.99).all() and (least[:-1] < -0.99).all()  # all bins but the last contain a whole period
 
 
 @given(st.lists(st.integers(1, 40), min_size=1, max_size=12), st.integers(0, 2**31))
@@ -77,7 +77,7 @@ def test_an_estimate_and_a_changed_parameter_are_marked_and_are_no_wear(tmp_path
     horizontal = np.asarray(clearance.lines[0].get_ydata(), float)
     np.testing.assert_allclose(np.unique(horizontal.round(6)), [25.0, 26.0, 31.0])  # a changed model ends the estimate
     marks = {text.get_text(): text.xy[0] for text in clearance.texts if isinstance(text, Annotation)}
-    # the estimate of a window that ended earlier holds from its arrival on
+    # the estimate of a window that ended earlier is valid from its arrival on
     assert marks == {"first estimate": pytest.approx(0.399), "parameters set": pytest.approx(0.5)}
 
 
@@ -99,7 +99,7 @@ def test_a_stretch_without_samples_is_shaded_and_crossed_by_no_line(tmp_path: Pa
     def held(first: int, last: int) -> list[Entry]:
         return [Hold(BASE_NS + index * STEP_NS) for index in range(first, last)]
 
-    # the second stretch is filled by late samples and leaves no shade, the third lasts to the end
+    # the second silence is filled by late samples and is not shaded; the third lasts until the end
     entries: list[Entry] = [*map(paper_sample, range(200)), *held(200, 500), *map(paper_sample, range(500, 700))]
     entries += [*held(750, 751), *map(paper_sample, range(700, 900)), *held(900, 1000)]
     run = record_run(tmp_path / "run", entries, rollback_span_s=0.2)
@@ -117,7 +117,7 @@ def test_a_stretch_without_samples_is_shaded_and_crossed_by_no_line(tmp_path: Pa
 def test_every_force_of_the_instant_shown_has_its_arrow_and_its_value_inside_the_axes(
     tmp_path: Path, figures: list[Figure]
 ) -> None:
-    load = map(paper_sample, range(0, 3000, 50))  # the peaks lie between the stamps
+    load = map(paper_sample, range(0, 3000, 50))  # the peaks are between the stamps
     run = record_run(tmp_path / "run", load)
     to_png(run.folder, tmp_path / "run.png")
     check_figure(figures[0])
@@ -133,7 +133,7 @@ def test_every_force_of_the_instant_shown_has_its_arrow_and_its_value_inside_the
     of_run, at_stamp = (float(number) for number in re.findall(r"([\d.]+) kN", section.get_title()))
     assert max(float(text.get_text().split()[0]) for text in values) == pytest.approx(at_stamp, abs=0.51)
     peaks = max(max(m.effort) for topic, m in run.outputs if topic == "/contact_peaks" and isinstance(m, JointState))
-    assert of_run == pytest.approx(peaks / 1e3, abs=0.051) and of_run > at_stamp  # as in the other views
+    assert of_run == pytest.approx(peaks / 1e3, abs=0.051) and of_run > at_stamp  # equal to the other views
     assert 1 <= len(values) <= PAIR_COUNT
     x, y = sorted(section.get_xlim()), sorted(section.get_ylim())
     for text in values:

@@ -1,4 +1,4 @@
-"""The .rrd of a recording, read back with rerun's own reader."""
+"""The .rrd file of a recording, read back with rerun's own reader."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def view(run: Run) -> tuple[ViewSummary, dict[str, pa.Table]]:
 
 
 def read(path: Path) -> dict[str, pa.Table]:
-    """Return the rows in time of each entity of a .rrd; colours that change in time stand under `<entity> colors`."""
+    """Return each entity's rows in time from a .rrd file; colours that change in time are under `<entity> colors`."""
     batches: dict[str, list[pa.RecordBatch]] = {}
     for chunk in RrdReader(str(path)).stream():
         if not chunk.is_static:
@@ -60,7 +60,7 @@ def read(path: Path) -> dict[str, pa.Table]:
 
 
 def curve_names(path: Path) -> dict[str, str]:
-    """Return the legend's name of each curve of a .rrd."""
+    """Return the name of each curve in the legend of a .rrd file."""
     names: dict[str, str] = {}
     for chunk in RrdReader(str(path)).stream():
         batch = chunk.to_record_batch()
@@ -138,7 +138,7 @@ def test_the_growth_of_the_clearance_is_drawn_in_micrometres(tmp_path: Path) -> 
         index = sent[0].name.index(name)
         np.testing.assert_allclose(best, [1e6 * (m.position[index] - new_m) for m in sent], rtol=0, atol=1e-9)
         assert 0.0 < low[-1] < 0.2 * best[-1] < best[-1] < 0.2 * high[-1]
-        # the legend shows the colour of the first stroke, which is not faint for a band
+        # the legend shows the colour of the first stroke, so the first stroke of a band is not faint
         colors = tables[f"/growth/band/{name} colors"]["SeriesLines:colors"].to_pylist()
         assert [color[0] & 0xFF for color in colors] == [255, layout._BAND_ALPHA]
 
@@ -151,7 +151,7 @@ def test_the_cross_section_moves_with_the_head(run: Run, view: tuple[ViewSummary
     cavity = np.array([355.0, 300.0])
     for strips, pose in zip(head["LineStrips2D:strips"].to_pylist(), poses, strict=True):
         inner = np.array(strips[0])[:4]
-        # drawn in mm with y down: the centre is the pose, the first side is the top one, turned by theta
+        # the drawing is in mm with y down; the centre is the pose, and the first side is the top side, turned by theta
         centre = inner.mean(axis=0)
         np.testing.assert_allclose(centre, [1e3 * pose.position[0], -1e3 * pose.position[1]], atol=1e-3)
         top = inner[1] - inner[0]
@@ -167,7 +167,7 @@ def test_a_file_without_room_on_the_disk_is_reported_and_no_half_of_it_stays(
 ) -> None:
     out, before = tmp_path / "run.rrd", resource.getrlimit(resource.RLIMIT_FSIZE)
     command = ["view", str(run.file), "--out", str(out), "--quiet", *follow]
-    assert cli(command) == 0  # its kernels are kept from now on
+    assert cli(command) == 0  # the kernels are in the cache from now on
     for room in (0, 1000, 10_000, out.stat().st_size // 2):
         resource.setrlimit(resource.RLIMIT_FSIZE, (room, before[1]))
         try:
@@ -195,7 +195,7 @@ def test_forces_along_the_face_measured_poses_and_other_scenes_are_drawn(tmp_pat
     wide = replace(scene, clearance=replace(scene.clearance, horizontal_m=0.05))
     to_rrd(run.file, tmp_path / "run.rrd", others={"the same": scene, "wide": wide})
     tables = read(tmp_path / "run.rrd")
-    # there and back: the second pass ends half way
+    # the face is passed there and back; the second pass ends half way
     first, second = tables["/face/force"]["LineStrips2D:strips"].to_pylist()[-1][1:]
     assert first[0][0] < 10.0 and first[-1][0] > 290.0 and 140.0 < second[0][0] < 160.0
     assert "2 m" in tables["/face/ticks"]["Points2D:labels"].to_pylist()[-1]
@@ -206,7 +206,7 @@ def test_forces_along_the_face_measured_poses_and_other_scenes_are_drawn(tmp_pat
     largest, same, other = (scalars(tables[f"/what_if/{number}"]) for number in range(3))
     np.testing.assert_allclose(same, largest, rtol=0.01, atol=1.0)
     assert len(same) == COUNT and np.abs(other - largest).max() > 10.0
-    # the bars at the corners of the frame, and their depths in words
+    # the bars at the corners of the frame, and the texts with their depths
     depths = tables["/exaggerated/pads/wear"]["Points2D:labels"].to_pylist()[-1]
     assert len(depths) == 8 and all(depth.endswith(" µm") for depth in depths)
     for group in ("clearance", "growth"):
@@ -258,7 +258,7 @@ def test_a_touch_that_is_over_is_not_drawn_on_in_a_thinned_run(tmp_path: Path) -
 
 
 def test_finished_pieces_are_not_redrawn(tmp_path: Path) -> None:
-    """A load that has fallen to zero, a held load, and the wear of replaced pads."""
+    """The pieces are a load that has fallen to zero, a held load, and the wear of replaced pads."""
     wear = Wear(1e-14, pad_area_m2=0.015, travel_speed_m_s=2.0)
     end = BASE_NS + 1000 * STEP_NS
     silent: list[Entry] = [Hold(end), *(Unload(end + index * 10 * STEP_NS) for index in range(1, 30))]
@@ -279,7 +279,7 @@ def test_finished_pieces_are_not_redrawn(tmp_path: Path) -> None:
 def test_an_arrow_pushes_the_wall_off_its_corner() -> None:
     section = Section.of(load_scene(scene_path("paper")))
     force = np.zeros(8)
-    force[2] = 1e5  # top right corner, top wall: the head is pushed up, which is towards -y on the screen
+    force[2] = 1e5  # at the top right corner the top wall pushes the head up, which is towards -y on the screen
     origins, vectors, pairs = section.arrows((0.0, 0.0, 0.0), force)
     np.testing.assert_allclose(origins, [[165.0, -135.0]])
     np.testing.assert_allclose(vectors, [[0.0, -ARROW_MM_PER_N * 1e5]], atol=1e-9)
@@ -290,7 +290,7 @@ def test_a_block_moves_in_its_guide_and_a_wall_pushes_its_corner_inwards() -> No
     scene = load_scene("paper")
     section = Section.of(replace(scene, head=replace(scene.head, carries="corners")))
     np.testing.assert_allclose(np.abs(section.frame_strip()).max(axis=0), 0.5 * section.cavity)
-    # turned by more than 45 degrees: the corner that was bottom right is the top right one
+    # turned by more than 45 degrees, the former bottom right corner is the top right corner
     pose = (0.01, 0.02, 0.5 * np.pi + 0.1)
     (outline,) = section.head_strips(pose)
     corners = section.corners(pose)
@@ -299,7 +299,7 @@ def test_a_block_moves_in_its_guide_and_a_wall_pushes_its_corner_inwards() -> No
     force[PAIR_NAMES.index("bottom_left_bottom")] = 1e5
     origins, vectors, _ = section.arrows(pose, force)
     np.testing.assert_allclose(origins, corners[[CORNER_NAMES.index("bottom_left")]])
-    np.testing.assert_allclose(vectors, [[0.0, -ARROW_MM_PER_N * 1e5]], atol=1e-9)  # up, which is -y on the screen
+    np.testing.assert_allclose(vectors, [[0.0, -ARROW_MM_PER_N * 1e5]], atol=1e-9)  # up is -y on the screen
 
 
 def test_events_show_touches_and_the_end_of_the_file(
@@ -333,7 +333,7 @@ def test_a_long_run_is_thinned_without_losing_a_peak(run: Run, tmp_path: Path) -
     tables = read(thin.path)
     for pair, name in enumerate(PAIR_NAMES):
         values = scalars(tables[f"/force/{name}"])
-        # at most three of each span; the end of a batch also ends a span
+        # at most three values for each span; the end of a batch also ends a span
         assert len(values) <= 750 < COUNT and values.max() == efforts[:, pair].max() / 1e3
     assert thin.section_rows < COUNT // 10
 
@@ -351,12 +351,12 @@ def test_gaps_are_drawn_as_wide_as_asked_with_their_wear() -> None:
     np.testing.assert_allclose(top[:, 1], -(135.0 + 20.0))  # 10 mm, twice as wide, y down
     np.testing.assert_allclose(right[:, 0], 165.0 + 60.0)
     np.testing.assert_allclose(bottom[:, 1], 135.0 + 10.0)
-    # the left wall is slanted: it passes through its points beside the corners
+    # the left wall is slanted and passes through its points beside the corners
     slope = (left[0, 0] - left[1, 0]) / (left[0, 1] - left[1, 1])
     np.testing.assert_allclose(
         left[0, 0] + slope * (np.array([-135.0, 135.0]) - left[0, 1]), [-165.0 - 40.0, -165.0 + 2.0]
     )
-    np.testing.assert_allclose(walls[:, 1], np.roll(walls[:, 0], -1, axis=0))  # a closed outline
+    np.testing.assert_allclose(walls[:, 1], np.roll(walls[:, 0], -1, axis=0))  # the outline is closed
     assert touching.tolist() == [False, False, False, True]
 
 
@@ -414,7 +414,7 @@ def test_the_lane_of_contact_sets_has_room_in_a_low_window() -> None:
     curves = blueprint.root_container.contents[1]
     names = [getattr(part, "name", None) for part in curves.contents]
     share = curves.row_shares[names.index("Corners that carry force")] / sum(curves.row_shares)
-    # of 620 pixels curves have 555; title, time axis, name and lane take 87, as drawn in a window of 1000 x 620
+    # curves have 555 of 620 pixels; title, time axis, name and lane take 87, as drawn in a window of 1000 x 620
     assert share * 555.0 > 87.0
 
 
@@ -429,7 +429,7 @@ def test_the_legends_of_the_clearance_are_not_cut_in_a_low_window(
             for entity, name in curve_names(view[0].path).items()
             if entity.startswith(f"/{group}/") and not entity.endswith(("/p05", "/p95"))
         }
-        # a line takes 23 pixels, of equal names one is shown; at 94 of 112 the last was cut
+        # a line takes 23 pixels, and of equal names only one is shown; with 94 of 112 pixels the last line was cut
         assert names >= {"horizontal", "vertical"} and 23 * len(names) + 2 < 0.77 * height
 
 
