@@ -138,7 +138,7 @@ def test_the_clearances_of_an_estimate_after_the_last_publication_are_shown_with
             clearance = (far.receive() or {})["motion"]["clearance"]
             return clearance["horizontal/p05"], clearance["vertical/p05"]
 
-        publish(1.0, 0.0057)  # this came before the estimate and is summed up with later ones
+        publish(1.0, 0.0057)  # came before the estimate; summed up with later publications
         feed.part("estimate", (0, "", numbers))
         feed.part("status", (0, "", {"horizontal": "estimated", "vertical": "not_observable"}))
         feed.part("estimate", (0, "estimating", {"estimates": "1"}))

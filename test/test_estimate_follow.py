@@ -245,7 +245,7 @@ def test_a_machine_without_gravity_is_steered_too(truth: Truth, monkeypatch: pyt
     monkeypatch.setattr(TwinBatch, "move", counted)
     nominal = replace(truth.nominal, gravity=replace(truth.nominal.gravity, acceleration_m_s2=0.0))
     _run(Follower(nominal, MEMBERS), truth, 1.0)
-    assert np.mean(moved) > MEMBERS / 3  # with a limit of zero no member would be moved
+    assert np.mean(moved) > MEMBERS / 3  # with a limit of zero hardly any member would be moved
 
 
 def test_a_member_is_never_pushed_into_a_hard_wall() -> None:

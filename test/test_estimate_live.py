@@ -251,7 +251,7 @@ def test_an_estimate_stays_until_it_is_withdrawn_or_the_pads_are_changed() -> No
 
 
 class _Finished:
-    """A replacement of the process, whose results the test gives."""
+    """A worker without a process, to which the test gives the results."""
 
     def __init__(self, *_: Any) -> None:
         self.found: list[Found] = []

@@ -104,7 +104,7 @@ def test_the_vertical_clearance_of_a_head_that_never_moves_sideways_is_estimated
 
 @pytest.mark.parametrize("seed", [pytest.param(43202, marks=pytest.mark.stress), 43210])
 def test_intervals_hold_between_soft_and_hard_contacts(seed: int) -> None:
-    # one of these contacts could be taken for hard, and the fit of the other need not converge
+    # one of these contacts was once taken for a hard one, and the fit of the other did not converge
     truth = draw(GROUPS["middle"], seed)
     result = estimate(truth.nominal, truth.load, truth.poses)
     for value, state, true in zip(

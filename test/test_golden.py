@@ -17,7 +17,7 @@ from golden import CASES, build_name
 
 FOLDER = Path(__file__).resolve().parent / "data" / "golden"
 PROGRAM = Path(__file__).resolve().parent / "golden.py"
-#: Largest change of a count by rounding on another build.
+#: Largest relative change of a count that rounding may cause on another build.
 OTHER_BUILD = 0.02
 
 # compiling all kernels takes long

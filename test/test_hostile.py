@@ -179,7 +179,7 @@ COMMANDS = {
     ],
 }
 FOREIGN = {"array", "texts", "nothing", "itself", "tree", "chain", "empty_lines", "topics"}
-#: Files above a limit, and files of which the usable rest is used.
+#: Files above a limit, and files whose usable part is used.
 ABOVE = {"channels", "many_chunks", "topics", "columns", "line", "row", "unpacked"}
 WITH_LOSS = {"large_chunks", "lying_zstd", "lying_lz4", "lying_length"}
 #: Largest memory of a command [MB], of which compiled code and libraries take 200.

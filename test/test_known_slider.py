@@ -30,7 +30,7 @@ def penetrations(y: float, theta: float) -> np.ndarray:
 
 
 def test_gap_functions_are_our_penetrations() -> None:
-    """g1 and g2 belong to the upper left and right corners at the upper wall, g3 and g4 to the lower ones below."""
+    """g1 and g2 are gaps of the upper left and right corners at the upper wall, g3 and g4 of the lower corners."""
     random = np.random.default_rng(2010)
     for y, theta in zip(random.uniform(-2e-3, 2e-3, 200), random.uniform(-0.05, 0.05, 200), strict=True):
         depth = penetrations(y, theta)

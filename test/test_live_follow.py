@@ -252,7 +252,7 @@ def test_intervals_of_peaks_and_impulses_are_those_of_the_span_that_is_published
 
 
 def _again(journal: Sequence[Entry], scene: Scene, at_once: int = 1) -> Session:
-    """Run a journal again, so many samples at once, and compare its digests."""
+    """Run a journal again in batches of samples, and compare its digests."""
     session, run = Session(follower(scene, "full", MEMBERS, 1e-9), rollback_span_s=SPAN_S), list[Sample]()
 
     def advance() -> None:

@@ -1,4 +1,4 @@
-"""The files of a recording in one order: by the stamps that their roles read, with each file's own order kept."""
+"""The messages of a recording's files in one order: by the stamps of their roles, keeping each file's order."""
 
 from __future__ import annotations
 

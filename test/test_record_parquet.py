@@ -35,7 +35,7 @@ head_pose: {topic: plant, fields: {x: x}, stamp: Zeit}
 
 
 def _table(count: int, kind: pa.DataType = UTC_NS) -> pa.Table:
-    """Return the paper's load at 1 kHz with forces in kN, and a pose without every tenth value."""
+    """Return the paper's load at 1 kHz, with forces in kN, and a pose in which every tenth value is missing."""
     phase = np.sin(2e-3 * np.arange(count))
     fx, fy, m = (phase * amplitude for amplitude in PAPER_AMPLITUDE)
     stamps = pa.array(BEGIN_NS + 1_000_000 * np.arange(count), pa.timestamp("ns"))

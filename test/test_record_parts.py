@@ -341,7 +341,7 @@ def test_a_part_that_is_not_there_is_counted_and_no_load_drawn_over_its_hole(whi
         (run.folder / "metadata.yaml").unlink(missing_ok=True)
     assert found.input["samples_used"] == report.samples < COUNT
     times = np.diff(found.predictions[0].series()[0])
-    assert times.max() == 1_000_000  # the times of one stretch
+    assert times.max() == 1_000_000  # the rows are of one stretch
     assert found.predictions[0].loads.duration_s < whole.predictions[0].loads.duration_s
 
 

@@ -159,7 +159,7 @@ def test_derivatives_where_errors_grow_follow_a_motion_that_is_known_better(monk
 
 
 def test_products_of_stretches_grow_as_their_matrices_do() -> None:
-    """The growth is that of numpy's norms, in one call and in portions, with stretches that continue past some ends."""
+    """The growth agrees with numpy's norms, in one call and in portions, with stretches that pass some of the ends."""
     random = np.random.default_rng(3)
     matrices = 0.5 * random.normal(size=(300, 4, 4))
     changes, ends = random.normal(size=(300, 2, 4)), random.random(300) < 0.7
@@ -235,7 +235,7 @@ def test_a_live_twin_has_the_derivative_by_restitution_also_where_nothing_damps(
         assert rows.makes.sum() > 2
         return np.concatenate([rows.q[-1], rows.v[-1]])
 
-    # a one-sided difference, and another one with half the step
+    # two one-sided differences, the second with half the step
     ends = [end(with_parameters(scene, {"contact.restitution": e - d})) for d in (0.0, 1e-5, 2e-5)]
     expected = (1.5 * ends[0] - 2.0 * ends[1] + 0.5 * ends[2]) / 1e-5
     found = followed.by_parameter["contact.restitution"]

@@ -64,7 +64,7 @@ def fixed_step_errors(
     ],
 )
 def test_rk4_without_event_location_has_order_n_plus_one(name: str, order: float) -> None:
-    """The force begins as d^n; that of Kelvin-Voigt jumps (Shampine and Thompson, Comput. Math. Appl. 39 (2000) 43)."""
+    """The force begins as d^n, or with a jump (Shampine and Thompson, Comput. Math. Appl. 39 (2000) 43)."""
     errors = fixed_step_errors(CONTACTS[name], "rk4", 4)
     assert np.polyfit(np.log2([1, 2, 4, 8, 16]), np.log2(errors), 1)[0] == pytest.approx(-order, abs=0.15)
     assert local_orders(errors) == pytest.approx(order, abs=0.35)

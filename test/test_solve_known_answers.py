@@ -52,8 +52,8 @@ def test_a_constant_load_settles_on_statics(n: float, law: str) -> None:
     )  # fmt: skip
     end = simulate(scene, 30.0, output_dt=30.0, tol=1e-10)
     force, depth = end.force[-1], end.penetration[-1]
-    # the head lies with its roof on the two upper corners and, pushed to the right, with its left wall on one or both
-    # left corners
+    # the head rests with its roof on the two upper corners and, because it is pushed to the right, with its left wall
+    # on one or both left corners
     c, s = math.cos(end.q[-1, 2]), math.sin(end.q[-1, 2])
     normal = np.array([[0, 1], [-1, 0], [0, 1], [1, 0], [0, -1], [1, 0], [0, -1], [-1, 0]]) @ np.array(
         [[c, s], [-s, c]]

@@ -105,7 +105,7 @@ def test_a_clipped_pair_pushes_again_before_it_parts_at_every_tolerance() -> Non
 
 
 def test_a_clipped_pair_does_not_push_before_its_time() -> None:
-    """Its force is a cubic in the penetration over a short ramp, so that many terms of its series matter.
+    """The force is a cubic in penetration over ramp, which becomes large, so its series needs many terms.
 
     With steps as long as the motion allows, the force would act too early, with an error of 28 tolerances.
     """

@@ -207,7 +207,7 @@ def test_fixed_steps_come_to_the_same_motion_and_energy_is_kept(name: str, frict
     scene = replace(preset(name), support=SUPPORT, friction=friction, wear=wear)
     events = simulate(scene, 1.0, output_dt=0.1, energy_balance=True)
     assert events.energy_balance is not None and events.energy_balance.relative_imbalance < 1e-10
-    # the force of Kelvin-Voigt jumps at a touch, where the order is one
+    # the force of Kelvin-Voigt jumps at a touch, so fixed steps have first order there
     steps = simulate(scene, 1.0, output_dt=0.1, method="rk4", dt=2e-6)
     assert pose_error(scene, steps.q, events.q) < (1e-4 if name == "bench_kv" else 1e-6)
     bounded = Twin(scene, max_evaluations=20_000)

@@ -59,10 +59,8 @@ def test_an_alarm_comes_after_its_duration_goes_below_its_hysteresis_and_stays_l
     _changes(alarms, _publication(30, 150.0))
     assert alarms.acknowledge() == ["force"] and _levels(alarms) == (Level.WARN, Level.WARN)
     raised = alarms.alarms["force"].raised
-    assert raised is not None and (raised.value, raised.threshold) == (
-        300.0,
-        100.0,
-    )  # those of the level that was left
+    # value and threshold of the level that was left
+    assert raised is not None and (raised.value, raised.threshold) == (300.0, 100.0)
 
 
 def test_a_threshold_of_zero_is_no_alarm() -> None:

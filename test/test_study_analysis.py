@@ -96,10 +96,8 @@ def test_values_of_another_clock_and_impossible_ones_are_counted(tmp_path: Path)
     pose.write_text("t,x,y,theta\n" + "".join(f"{t},{x},{y},{theta}\n" for t, x, y, theta in late))
     found = analyse(tmp_path, scene=PAPER, out=tmp_path / "out")
     assert found.facts()["outside"] == {"x": 10, "y": 11} and found.facts()["signals"]["x"]["n"] == 18
-    assert found.lost == {
-        "measured_implausible": 1,
-        "measured_outside_the_load": 11,
-    }  # y has no value inside
+    # y has no value within the load's time
+    assert found.lost == {"measured_implausible": 1, "measured_outside_the_load": 11}
     write_report(found, tmp_path / "out")
     assert "outside the time of the load" in (tmp_path / "out" / "report.html").read_text()
     pose.write_text("t,x,y,theta\n" + "".join(f"{t + 1e6},{0},{y},{theta}\n" for t, (_, y, theta) in poses))

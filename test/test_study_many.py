@@ -210,7 +210,7 @@ def test_no_recording_of_a_folder_is_left_out_unsaid(tmp_path: Path, capsys: pyt
     table = parquet.read_table(out / "runs.parquet")
     assert table.column("lost").to_pylist() == [None, 0, None]
     assert table.column("error").to_pylist()[1:] == [None, "left out: no recording"]
-    assert cli(["analyse", str(tmp_path), "--json", "--quiet"]) == 1  # of the recording without its parts
+    assert cli(["analyse", str(tmp_path), "--json", "--quiet"]) == 1  # one recording lacks its parts
     assert json.loads(capsys.readouterr().out)["left_out"] == [str(tmp_path / "empty")]
     shutil.copytree(tmp_path / "good", inner := tmp_path / "good" / "inner")
     assert left_out(tmp_path) == [tmp_path / "empty", inner]

@@ -92,7 +92,7 @@ def test_tossed_block_moves_as_the_preset_computed_by_the_solver(drops) -> None:
         half=0.5 * scene.frame.width_m - radius, radius=radius, gyration=scene.head.inertia_kg_m2**0.5, table=0.0,
         stiffness=contact.stiffness, tangential=friction.stick_stiffness_n_m / contact.stiffness,
         tangential_damping=0.5 * friction.stick_damping_n_s_m / friction.stick_stiffness_n_m**0.5,
-        # of an impact of 1 m/s, whose mass counts beside that of a square's edge
+        # restitution of an impact at 1 m/s, with a mass relative to that of an impact on the square's edge
         restitution=contact.restitution * (1.5**power * (contact.restitution_speed_m_s or 1.0)) ** fall,
         restitution_fall=fall, mass_power=power, friction=friction.coefficient, friction_fall=0.0,
         gravity=scene.gravity.acceleration_m_s2, drag=0.0, spin_drag=0.0,
@@ -104,7 +104,7 @@ def test_tossed_block_moves_as_the_preset_computed_by_the_solver(drops) -> None:
         measured = drops.pose[index, first:until]
         x, z, theta, *rates = MARKER.state_of_block(fit_flight(drops.pose[index, : first + 1]).state)
         if z < radius + float(block["half"]) * (abs(np.cos(theta)) + abs(np.sin(theta))):
-            continue  # extrapolated into the table, where a scene starts in the midst of an impact
+            continue  # this state is in the table, where a scene would start within an impact
         start = Initial((x, z - 1.0, theta), (rates[0], rates[1], rates[2]))
         solved = simulate(replace(scene, initial=start), t_end=len(measured) / 250.0, output_dt=0.004).q
         found = toss(np.array([[x, z, theta, *rates]]), len(solved), np.array([block], block.dtype))[0, :, :3]

@@ -49,8 +49,8 @@ Array = NDArray[np.float64]
 #: Shared unknowns, noise and differences from the previous window, 21 numbers; empty for no guess.
 Guess = tuple[float, ...]
 
-#: Bound: longest window in load periods and in s, of which the longer limit applies. Of longer data the newest part is
-#: used.
+#: Bound: a window has at most this many load periods or this many seconds, whichever is longer. Of longer data the
+#: newest part is used.
 MOST_PERIODS, MOST_SPAN_S = 20.0, 60.0
 #: Bound: longest data in s in which the load's period is searched, as long as the longest window of a node.
 _LONGEST_S = 600.0
@@ -531,8 +531,8 @@ def _graded(problem: Problem, fit: Fit, verdict: Verdict) -> Graded | None:
     """Return the result of the fit for a machine that may differ from the model, or None.
 
     The result is None if the data contradict themselves, or if swings are linked and no check fails. A fit that has not
-    reached an optimum may be near a false one, so it also gives None if its swings are linked or its residuals far
-    exceed the noise.
+    reached an optimum may be near a false one. It therefore also gives None if its swings are linked or if its
+    residuals far exceed the noise.
     """
     if verdict.broken:
         return None

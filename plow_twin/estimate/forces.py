@@ -103,7 +103,7 @@ class ForceEnsemble:
         self, scene: Scene, found: Estimate, members: int = MEMBERS, *, seed: int = 0, start: float = 0.0
     ) -> None:
         if State.WITHDRAWN in (found.horizontal_state, found.vertical_state):
-            raise ForcesError(f"estimate: got a withdrawn one ({'; '.join(found.reasons)}), expected a valid one")
+            raise ForcesError(f"estimate: got a withdrawn estimate ({'; '.join(found.reasons)}), expected a valid one")
         if members < FEWEST:
             raise ForcesError(f"members: got {members}, expected at least {FEWEST}")
         scenes, self._gain = draw_scenes(scene, found, members, np.random.default_rng(seed))

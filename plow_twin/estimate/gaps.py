@@ -124,7 +124,7 @@ def _theta_at(t: Array, poses: Poses) -> Array:
 def _fit_one_set(
     rows: Array, t: Array, gap: Array, pairs: NDArray[np.int64], theta: Array, error: float, scene: Scene
 ) -> GapsFit | None:
-    """Solve the messages of one set of sensors; `gap` (n, k) of `pairs` (k,)."""
+    """Fit the messages of one set of sensors; `gap`, shape (n, k), holds the gaps of the pairs `pairs`, shape (k,)."""
     # gap = half the clearances minus the reach of a corner
     half = 0.5 * np.abs(np.stack([NORMAL_X, NORMAL_Y], axis=1))[pairs]
     fixed = np.concatenate([-rows[2:4, pairs].T, half], axis=1)

@@ -1,4 +1,4 @@
-"""The numbers of the estimator that were chosen instead of derived, each with the data on which it was set.
+"""The numbers of the estimator that are chosen, not derived, each with the data on which it was set.
 
 They are read as `tuning.NAME` where they are used, so that `benchmark/tuning_sensitivity.py` can vary them;
 `benchmark/results/tuning.md` shows them with the sensitivity that it measured. Seeds: `benchmark/estimate.py`. All
@@ -331,7 +331,7 @@ REACH_WINDOWS: Annotated[
 ] = ((0.6, 0.8), (0.75, 0.95), (0.9, 0.99))
 TURN_WINDOWS: Annotated[
     tuple[tuple[float, float], ...],
-    Tuned("quantiles", "two windows of the reach, whose distance is smallest with the correct bias of theta"),
+    Tuned("quantiles", "two windows of the reach; their distance is smallest with the correct bias of theta"),
 ] = ((0.4, 0.7), (0.9, 0.99))
 AVERAGED: Annotated[float, Tuned("s", "time over which the pose is averaged for a second set of reaches")] = 0.05
 PATH_PHASES: Annotated[

@@ -158,7 +158,7 @@ class Measured:
     implausible: int = 0
 
     def add(self, role: str, stamp_ns: int, numbers: Mapping[str, float], stretch: int = 0) -> None:
-        """Add the numbers of one message in a stretch; numbers that are not finite were not measured."""
+        """Add the numbers of one message in a stretch; a number that is not finite means that nothing was measured."""
         before, newest = self._latest.get(role, (0, stamp_ns))
         back = newest - stamp_ns > _STEP_NS
         # the measurement's clock may step back before the load's clock does

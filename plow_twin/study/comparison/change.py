@@ -143,7 +143,7 @@ def changes(before: Drawn, after: Drawn) -> list[Change | None]:
     """Return the changes of quantities between two groups of windows, None if there are too few windows.
 
     Means are compared by a bootstrap over windows. For the comparison at equal load, the part that depends on the load
-    is subtracted; its slopes are those of the load's variation within the groups (analysis of covariance).
+    is subtracted. Its slopes come from the load's variation within the groups (analysis of covariance).
 
     References
     ----------

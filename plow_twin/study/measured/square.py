@@ -39,8 +39,8 @@ SQUARE: Final = np.array(
 class Marker:
     """The tracked frame on the block, whose pose the sensor measures.
 
-    In 242 of 250 drops the tracked angle of the block at rest is 33 mrad less than that of a block that lies flat. The
-    tracked height at rest depends on the side on which the block lies.
+    In 242 of 250 drops the block lies flat at rest, but its tracked angle is 33 mrad less. The tracked height at rest
+    depends on the side on which the block lies.
 
     Attributes
     ----------
