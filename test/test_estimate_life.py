@@ -53,7 +53,7 @@ def test_the_jump_agrees_with_the_direct_run_with_sliding_in_the_plane_and_runni
     assert path.depth[-1] == pytest.approx(direct, rel=0.03, abs=1e-5)
     travel_only = wear_path(replace(preset("paper"), wear=replace(slow, sliding="travel")), (1.0, 1.0), exposure)
     assert direct.max() > 1.5 * travel_only.depth[-1].max() > 1e-4
-    # the same path holds for a quarter of the coefficient, at which running-in is not complete
+    # the same path is valid for a quarter of the coefficient, with which running-in is not yet complete
     quarter = simulate(replace(scene, wear=replace(scene.wear, coefficient_m2_n=7.5e-10)), span, span, 1e-6).wear_depth
     early = [np.interp(0.25 * exposure, path.exposure, pad) for pad in path.depth.T]
     assert early == pytest.approx(quarter, rel=0.05, abs=1e-5)

@@ -47,7 +47,7 @@ SAMPLES = "/plow_twin/journal/samples"
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """Return a run of 2.5 s under the paper's load without a break, with samples only and a frame after each."""
+    """Return a run of 2.5 s under the paper's load without a break, with only samples, each followed by a frame."""
     return record_run(tmp_path_factory.mktemp("runs") / "paper", map(paper_sample, range(COUNT)))
 
 

@@ -1,4 +1,4 @@
-"""A search for scenes that break the solver: a finite answer obeys the energy balance, or there is a named status.
+"""A search for scenes that break the solver: every answer obeys the energy balance or has a status that says why not.
 
 The structure of a scene, its parts and thus its compiled code, comes from a fixed list; its numbers are drawn over
 decades. The energy H, kinetic, potential and elastic, can only decrease, except for the work of loads that change in

@@ -213,7 +213,10 @@ def test_whether_a_clipped_corner_that_pushes_again_holds_is_not_decided_by_roun
 
 @pytest.mark.parametrize("damping", [1e5, 1e6])
 def test_a_corner_grips_at_its_touch_as_with_fixed_steps(damping: float) -> None:
-    """Kelvin-Voigt's force is present at once. The corner sticks from the touch on, or slips with too strong a damper."""
+    """Kelvin-Voigt's force is present at once.
+
+    The corner sticks from the touch on, or slips if its damper is too strong.
+    """
     friction = Friction(0.3, stick_stiffness_n_m=5e7, stick_damping_n_s_m=damping)
     scene = replace(preset("bench_kv"), friction=friction)
     events = simulate(scene, 0.3, output_dt=0.1, energy_balance=True)

@@ -77,8 +77,8 @@ def test_a_run_works_and_is_repeated_where_little_is_there(lacking: dict[str, ob
     assert (report.exit_code, report.samples) == (0, 1500)
 
 
-#: Shell script that makes package, cache, home and /dev/shm read-only, as for a user of another user's installation,
-#: and runs a command.
+#: Shell script that runs a command with read-only package, cache, home and /dev/shm, as for a user of another user's
+#: installation.
 NOTHING_WRITABLE = """
 for place in "$PACKAGE" "$CACHE" "$HOME"; do
     mount --bind "$place" "$place"
@@ -130,7 +130,7 @@ def test_a_recording_is_replayed_while_it_is_written_as_far_as_it_goes(folder: P
 def test_lacking_resources_are_named(lacking: dict[str, object], code: int, said: str, folder: Path) -> None:
     found, lines = _run(folder, *LIVE, **lacking)  # type: ignore[arg-type]
     assert found == code and said in lines[0], lines
-    assert len(lines) <= (2 if code == 3 else 1), lines  # a loss adds a line
+    assert len(lines) <= (2 if code == 3 else 1), lines  # exit code 3, a loss, may add a line
 
 
 #: For each library of an extra, a command that needs it.

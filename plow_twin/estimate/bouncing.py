@@ -563,7 +563,7 @@ class MotionFeatures:
         self.q = filled(poses)
         self.noise = noise_level(self.q)
         self._period, self._parts = period, tuning.PATH_PHASES // 2
-        #: poses from a period on, when the motion has forgotten its start, which a delay changes
+        #: which poses are at least one period after the first; earlier ones still depend on the start
         self._settled = poses.t - poses.t[0] >= period
         self._whole = self._there.all(axis=1)
         if self._whole.sum() <= _FEWEST_WHOLE:

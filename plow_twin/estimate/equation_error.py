@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 
 #: Definition: index of each pair's wall in the order right, left, top, bottom.
 _WALL: Final = np.argmax(np.stack(WALLS), axis=0)
-#: Bound: number of Gauss-Newton steps; size in m of a last step, and of the longest step.
+#: Bound: number of Gauss-Newton steps, size in m below which a step is the last, and longest step in m.
 _STEPS, _SMALL, _LONGEST = 8, 2e-5, 3e-3
 #: Guard: shortest distance of rows in s, and fewest rows in half of a test function.
 _SHORTEST, _FEWEST = 5e-3, 3

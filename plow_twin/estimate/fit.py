@@ -147,7 +147,7 @@ class Fit:
     variance : (n, 3) variance with which each measurement is weighted
     jitter : (n, 3) variance of the unpredictable part of the motion
     linear : Jacobians at the point
-    left : (SIZE + 6 s,) the remaining step, linearised; zero at an optimum
+    left : (SIZE + 6 s,) remaining step of the linearised problem, zero at an optimum
     gain_left : reduction of the cost by that step
     """
 

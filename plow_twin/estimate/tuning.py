@@ -122,8 +122,8 @@ MORE_ASKEW: Annotated[
     float,
     Tuned(
         "1",
-        "smallest ratio of chi^2 of turned walls, lever arm and low pass to chi^2 of the scales; each partly "
-        "explains the other",
+        "smallest ratio of chi^2 of turned walls, lever arm and low pass to chi^2 of the scales, which partly "
+        "explain each other",
         "walls worn askew: 5 and more (0.3 to 1 times the wear late in a life); low pass of 20 Hz: 2.2 and 7.3 "
         "(`filter_20`, seeds 99001, 98002); scales of 1.05: 0.4 to 1.6; frame, mass, scale of theta: 0.2 to 0.7",
     ),
@@ -183,7 +183,7 @@ REPEATING: Annotated[
 ] = (0.25, 3.0)
 LONGEST_GAP: Annotated[
     tuple[float, ...],
-    Tuned("s, 1", "longest silence of the load; the same in median intervals of samples, for a load of few knots"),
+    Tuned("s, 1", "longest silence of the load in s or, for a load of few knots, in median intervals of its samples"),
 ] = (0.5, 20.0)
 
 # Fit
@@ -277,8 +277,8 @@ LEFT_OPEN: Annotated[
     float,
     Tuned(
         "1",
-        "factor on the unknown effect of a broad-band load between its samples; contacts turn errors of the pose "
-        "into errors of the rate, and back",
+        "factor on the unknown effect of a broad-band load between its samples, because contacts turn errors of "
+        "the pose into errors of the rate, and back",
     ),
 ] = 4.0
 
@@ -365,8 +365,8 @@ FIRM_SPREAD: Annotated[
     tuple[float, ...],
     Tuned(
         "1",
-        "deviation of the logarithms drawn for a firm contact: in the first round; relative to the previous "
-        "result; smallest",
+        "deviation of the logarithms drawn for a firm contact: its value in the first round, its ratio to the "
+        "previous result's deviation, and its smallest value",
         "seeds 43200 to 43215",
     ),
 ] = (0.5, 1.5, 0.1)
@@ -384,8 +384,8 @@ UNEXPLAINED_HARD: Annotated[
     float,
     Tuned(
         "m",
-        "additional deviation of a clearance with a hard contact, if its rounds have not converged or if the "
-        "motion differs from the model; in the latter case times the motion's distance over the limit",
+        "additional deviation of a clearance with a hard contact whose rounds have not converged; for a motion "
+        "that differs from the model it is multiplied by the ratio of the distance to its limit",
         "`hard_kelvin_voigt`, `hard_shape`: median error of 0.1 mm",
     ),
 ] = 3e-4
@@ -522,7 +522,7 @@ CORRECTED: Annotated[
     tuple[float, ...],
     Tuned(
         "1, m",
-        "share of the regression's correction that is added to the deviation, and a constant addition",
+        "share of the regression's correction that is added to the deviation, and constant that is added",
         "seeds 80000 to 80003",
     ),
 ] = (0.3, 4e-4)
@@ -584,7 +584,8 @@ IMPACT_SHARE: Annotated[
     float,
     Tuned(
         "1",
-        "largest share of impacts that gain energy; smallest share of contacts that are impacts between two flights",
+        "largest share of impacts that gain energy, and smallest share of contacts that are impacts between two "
+        "flights",
         "measured drops: 0.01 and 0.5; at 50 Hz 0.5; behind a soft contact 0.05",
     ),
 ] = 0.25
@@ -607,7 +608,10 @@ LEAST_PROBABLE: Annotated[
 ] = (1e-6, 0.02)
 MEAN_PERIODS: Annotated[
     tuple[int, ...],
-    Tuned("periods", "numbers of load periods that are left out, and over which the mean force is taken"),
+    Tuned(
+        "periods",
+        "number of load periods that are left out first, and number of periods over which the mean force is taken",
+    ),
 ] = (2, 4)
 JUMP: Annotated[
     tuple[float, ...], Tuned("clearance", "largest change of a pad's depth in a jump, and largest error of this change")
@@ -619,8 +623,8 @@ WINDOW_SHARES: Annotated[
     tuple[float, ...],
     Tuned(
         "window, window, 1",
-        "smallest part of a window that is estimated; smallest part of an early window; growth from one early window "
-        "to the next",
+        "shares of the full length: of the shortest window that is estimated, and of the shortest early window; "
+        "growth from one early window to the next",
     ),
 ] = (0.5, 0.1, 1.5)
 ALIKE: Annotated[

@@ -177,7 +177,7 @@ class Unknowns:
         return deviations
 
     def is_hard(self, vector: Array) -> bool:
-        """Return whether the bounces of the contact cannot be predicted for long."""
+        """Return whether the contact is so hard that its bounces can only be predicted for a short time."""
         return bool(vector[SOFTNESS] < math.log(tuning.CERTAINLY_HARD + tuning.RESOLVED))
 
     def softness_of(self, stiffness: float) -> float:

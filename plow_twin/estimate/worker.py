@@ -136,7 +136,7 @@ class Worker:
     def finish(self) -> None:
         """Request the estimate of the last window, at the end of the input.
 
-        When the estimate is done, `ended` is no longer None.
+        `ended` is None until this estimate is done.
         """
         self._waiting.append(("end",))
 

@@ -88,7 +88,7 @@ def with_neighbours(load: Array, start_ns: NDArray[np.int64]) -> Array:
 
 
 class Drawn:
-    """Moments of a group: the first row for all its windows, each other row for a draw from the windows.
+    """Moments of a group. The first row is for all its windows, each other row for a draw from the windows.
 
     Parameters
     ----------
