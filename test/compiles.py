@@ -38,7 +38,7 @@ class Compiles(event.Listener):
         self._test = item.user_properties
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        if report.when == "teardown":  # this report has the properties of all phases
+        if report.when == "teardown":  # earlier reports of a test hold only part of its kernels
             for name, value in report.user_properties:
                 if name == PROPERTY:
                     self._found.append((*value, report.nodeid))  # type: ignore[misc]

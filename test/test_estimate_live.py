@@ -174,7 +174,7 @@ def test_the_live_estimate_is_published_and_given_again_by_the_journal(tmp_path:
         probe.until_figure("estimate", "estimates", *map(str, range(1, 9)))
         probe.until(lambda: value(probe.status[-1], "horizontal") == "estimated", "the flag")
         found = dict(zip(heard[-1].name, heard[-1].position, strict=True))
-        # with the next slow publication, under the hold policy
+        # the hold policy applies the estimate at the next slow publication
         probe.until(lambda: abs(clearances[-1].position[0] - found["horizontal"]) < 1e-9, "the clearance")
         last = dict(zip(clearances[-1].name, clearances[-1].position, strict=True))
         status: DiagnosticStatus = probe.status[-1]

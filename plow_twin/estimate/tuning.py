@@ -457,7 +457,7 @@ LEARNING: Annotated[
     Tuned(
         "1",
         "weight of a pose when these parameters are learned",
-        "as for `LEARNED_TO`: with 1, the learned parameters are two to three of their deviations off",
+        "as for `LEARNED_TO`: with 1, the errors of the learned parameters are two to three of their deviations",
     ),
 ] = 0.25
 LEARNED_FOR: Annotated[
