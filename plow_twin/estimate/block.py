@@ -264,7 +264,7 @@ def impacts(scene: Scene, load: Load, poses: Poses, level: Array) -> tuple[list[
     """
     t, q = poses.t, _of_mass(scene, poses.q)
     inertia = np.asarray(inertias(scene))
-    free = _free_acceleration(scene, load, t) / inertia
+    free = _load_and_weight(scene, load, t) / inertia
     unknown = tuning.DRAG * Gravity().acceleration_m_s2 * np.array([1.0, 1.0, 1.0 / geometry.half_diagonal(scene)])
     ends = _kinks(t, q, free, level, unknown)
     found = []
@@ -300,7 +300,7 @@ def _of_mass(scene: Scene, q: Array) -> Array:
     return np.stack([q[:, 0] + c * x - s * y, q[:, 1] + s * x + c * y, theta], axis=1)
 
 
-def _free_acceleration(scene: Scene, load: Load, t: Array) -> Array:
+def _load_and_weight(scene: Scene, load: Load, t: Array) -> Array:
     """Return load plus weight at the times `t`, shape (n, 3), in N, N, N m."""
     wrench = np.stack([np.interp(t, load.t, column) for column in load.wrench.T], axis=1)
     weight = scene.head.mass_kg * scene.gravity.acceleration_m_s2
