@@ -44,10 +44,14 @@ async def _device(client: Client) -> tuple[Any, Callable[[str], Any]]:
 
 
 async def _acknowledge(client: Client, heard: Heard, condition: Any, event_id: bytes | None = None) -> str:
-    method = ua.NodeId(ua.ObjectIds.AcknowledgeableConditionType_Acknowledge)
     given = ua.Variant(event_id or heard.events[-1].EventId, ua.VariantType.ByteString)
+    return await _call_acknowledge(condition, given, ua.Variant(ua.LocalizedText("seen")))
+
+
+async def _call_acknowledge(condition: Any, *arguments: ua.Variant) -> str:
+    method = ua.NodeId(ua.ObjectIds.AcknowledgeableConditionType_Acknowledge)
     try:
-        await condition.call_method(method, given, ua.Variant(ua.LocalizedText("seen")))
+        await condition.call_method(method, *arguments)
     except ua.UaStatusCodeError as error:
         return type(error).__name__
     return "Good"
@@ -98,6 +102,8 @@ def test_opcua_clients_read_a_typed_model_and_acknowledge_alarms_where_that_is_a
             if not allowed:
                 assert await _acknowledge(client, heard, condition) == "BadUserAccessDenied"
                 return
+            assert await _call_acknowledge(condition) == "BadArgumentsMissing"
+            assert await _call_acknowledge(condition, *[ua.Variant(b"event")] * 3) == "BadTooManyArguments"
             assert await _acknowledge(client, heard, condition, b"another") == "BadEventIdUnknown"
             assert await _acknowledge(client, heard, condition) == "Good"
             await _soon(lambda: heard.states()[-1][1])

@@ -99,15 +99,15 @@ def forecast(
     from plow_twin.estimate.coefficient import coefficient
     from plow_twin.estimate.forecast import Plan, Scenario, with_clearances
     from plow_twin.estimate.forecast import forecast as run
-    from plow_twin.estimate.life import LifeError
+    from plow_twin.estimate.life import LifeError, wear_in_travel
 
     if stop is not None and stop > horizon:
         raise click.UsageError(f"--stop: got {stop:g} h, expected at most the horizon, --horizon {horizon:g}")
     model, facts_now, lost = _scene(scene)
-    if model.wear is None or model.wear.travel_speed_m_s <= 0.0:
-        raise click.UsageError(
-            f"{scene}: wear: got none, or no travel speed, expected a section `wear` with travel_speed_m_s above 0"
-        )
+    try:
+        wear_in_travel(model)
+    except LifeError as error:
+        raise click.UsageError(f"{scene}: {error}") from error
     if estimated is not None:
         facts_now = _estimate(estimated)
     limits = 1e-3 * limit_horizontal, 1e-3 * limit_vertical

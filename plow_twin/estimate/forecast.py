@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from plow_twin.estimate import tuning
 from plow_twin.estimate.coefficient import Coefficient
-from plow_twin.estimate.life import LifeError, Path, wear_path
+from plow_twin.estimate.life import LifeError, Path, wear_in_travel, wear_path
 from plow_twin.estimate.result import NORMAL_P95, State
 from plow_twin.estimate.unknowns import contact_with
 from plow_twin.model.pairs import NORMAL_X, NORMAL_Y, PAIR_COUNT
@@ -209,9 +209,7 @@ def _forecast(
     scene: Scene, plan: Plan, deviation_m: tuple[float, float], known: Coefficient | None, multiple: float = 1.0
 ) -> Forecast:
     """Forecast for a multiple of the known wear coefficient."""
-    wear = scene.wear
-    if wear is None or wear.travel_speed_m_s <= 0.0:
-        raise LifeError("wear: got none, or no travel speed, expected a section `wear` with travel_speed_m_s above 0")
+    wear = wear_in_travel(scene)
     if not all(0.0 <= value < math.inf for value in deviation_m):
         raise LifeError(f"deviations: got {deviation_m} m, expected two finite numbers >= 0")
     if known is None:

@@ -124,11 +124,18 @@ def mean_forces(scene: Scene, depth: Array, tol: float = 1e-6) -> tuple[Array, A
     return forces.mean(axis=0), forces.std(axis=0, ddof=1) / math.sqrt(len(forces))
 
 
+def wear_in_travel(scene: Scene) -> Wear:
+    """Return the wear section of a scene; raise LifeError without the section or with a travel speed of 0."""
+    if scene.wear is None:
+        raise LifeError("wear: missing, expected a section `wear` with travel_speed_m_s above 0")
+    if scene.wear.travel_speed_m_s <= 0.0:
+        raise LifeError(f"wear.travel_speed_m_s: got {scene.wear.travel_speed_m_s:g}, expected a speed above 0")
+    return scene.wear
+
+
 def _trace(scene: Scene, period: float) -> float:
     """Return a wear coefficient in m^2/N so small that the head's weight wears a pad by about `_TRACE_M`."""
-    wear = scene.wear
-    if wear is None or wear.travel_speed_m_s <= 0.0:
-        raise LifeError("wear: got none, or no travel speed, expected a section `wear` with travel_speed_m_s above 0")
+    wear = wear_in_travel(scene)
     impulse = scene.head.mass_kg * 10.0 * sum(tuning.MEAN_PERIODS) * period
     return _TRACE_M * wear.pad_area_m2 / (wear.travel_speed_m_s * impulse)
 

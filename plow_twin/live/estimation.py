@@ -255,7 +255,7 @@ def problems(settings: Settings, scene: Scene) -> list[Problem]:
     if settings.excitation_source == "scene":
         found.append(Problem("estimate", True, "false with excitation_source scene: no load arrives"))
     if scene.support is not None:
-        found.append(Problem("estimate", True, "false where the scene has a support: the fit does not know its place"))
+        found.append(Problem("estimate", True, "false where the scene has a support: the fit assumes a fixed frame"))
     if settings.follows != "off" and settings.max_evaluations:
         expected = "0 unless follow is off: the work of the following twins has no bound"
         found.append(Problem("max_evaluations", settings.max_evaluations, expected))

@@ -108,14 +108,17 @@ class Conditions:
         place = f" at {values[f'{name}_place']}" if values[f"{name}_place"] else ""
         await condition.events.trigger(datetime.now(UTC), message=f"{name} {values[name]}{place}, {condition.level}")
 
-    async def _called(self, parent: ua.NodeId, event_id: ua.Variant, comment: ua.Variant) -> ua.StatusCode:
-        """Acknowledge: the method of a condition."""
+    async def _called(self, parent: ua.NodeId, *arguments: ua.Variant) -> ua.StatusCode:
+        """Acknowledge: the method of a condition; its arguments are the identifier of an event and a comment."""
+        if len(arguments) != 2:
+            missing = len(arguments) < 2
+            return ua.StatusCode(StatusCodes.BadArgumentsMissing if missing else StatusCodes.BadTooManyArguments)
         if self.acknowledge is None:
             return ua.StatusCode(StatusCodes.BadUserAccessDenied)
         condition = next((found for found in self._conditions.values() if found.node_id == parent), None)
         if condition is None:
             return ua.StatusCode(StatusCodes.BadNodeIdUnknown)
-        if event_id.Value != condition.event_id:
+        if arguments[0].Value != condition.event_id:
             return ua.StatusCode(StatusCodes.BadEventIdUnknown)
         if condition.acknowledged:
             return ua.StatusCode(StatusCodes.BadConditionBranchAlreadyAcked)
