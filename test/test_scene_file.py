@@ -118,6 +118,7 @@ loads:
   - {harmonic: {}, constant: {}}
   - {name: c, table: {file: no.csv}}
   - {name: d, table: {t: [0, 1], wrench: [[1, 2, 3], [1, 2]]}}
+  - 3
 pairs: [top, top_left_top]
 locked: z
 wear: {coefficient_m2_n: 1e-14}
@@ -151,6 +152,7 @@ gravty: 3
         "loads[2]": "['constant', 'harmonic']",
         "loads[3].table.file": repr(str(tmp_path / "no.csv")),
         "loads[4].table.wrench[1]": "[1, 2]",
+        "loads[5]": "3",
         "pairs[0]": "'top'",
         "locked": "'z'",
         "wear.pad_area_m2": "nothing",

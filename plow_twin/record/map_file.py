@@ -10,8 +10,8 @@ from typing import Any, Final
 from plow_twin.errors import InputError, Problem, RecordingError
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record.times import STAMP_UNITS
-
-Schema = dict[str, Any]
+from plow_twin.scene_file.validation import NUMBER, Schema, choice, mapping, validate
+from plow_twin.scene_file.yaml_text import read_yaml
 
 #: Roles that a topic can have, and the numbers of each.
 ROLES: Final[dict[str, tuple[str, ...]]] = {
@@ -59,11 +59,10 @@ _PLACE: Final[Schema] = {
     "type": ["string", "integer"],
     "description": "the name of a column, a path, or {node: identifier}",
 }
-_NUMBER: Final[Schema] = {"type": "number", "description": "a finite number"}
 _LIMITS: Final[Schema] = {
     "anyOf": [
         {"type": "number", "exclusiveMinimum": 0.0, "description": "a finite number > 0"},
-        {"type": "array", "items": _NUMBER, "minItems": 2, "maxItems": 2, "description": "two numbers"},
+        {"type": "array", "items": NUMBER, "minItems": 2, "maxItems": 2, "description": "two numbers"},
     ],
     "description": "a number, or the smallest and the largest",
 }
@@ -85,9 +84,6 @@ def read_map_file(path: Path) -> dict[str, Any]:
     MapError
         The file cannot be used.
     """
-    from plow_twin.scene_file.validation import validate
-    from plow_twin.scene_file.yaml_text import read_yaml
-
     given, problems = read_yaml(path, "mapping", ", ".join(ROLES))
     if isinstance(given, dict):
         given = {role: _nodes_as_fields(role, _for_each(role, entry)) for role, entry in given.items()}
@@ -153,18 +149,8 @@ def map_schema() -> Schema:
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "plow_twin mapping",
-        **_mapping({**{role: _role(role) for role in ROLES}, LOAD_MODEL: _load_model()}, ()),
+        **mapping({**{role: _role(role) for role in ROLES}, LOAD_MODEL: _load_model()}),
         "minProperties": 1,
-    }
-
-
-def _mapping(properties: dict[str, Schema], required: tuple[str, ...]) -> Schema:
-    return {
-        "type": "object",
-        "properties": properties,
-        "required": list(required),
-        "additionalProperties": False,
-        "description": f"a mapping with {', '.join(properties)}",
     }
 
 
@@ -174,13 +160,13 @@ def _role(role: str) -> Schema:
     keys = {
         "topic": {"type": "string", "description": "the name of a topic"},
         "type": {"type": "string", "description": "the type of the topic"},
-        "fields": _mapping(dict.fromkeys(names, _PLACE), ()),
-        "scale": _mapping(dict.fromkeys(names, _NUMBER), ()),
-        "offset": _mapping(dict.fromkeys(names, _NUMBER), ()),
-        "unit": _mapping({name: _choice(units[name]) for name in names}, ()),
-        "limits": _mapping(dict.fromkeys(names, _LIMITS), ()),
+        "fields": mapping(dict.fromkeys(names, _PLACE)),
+        "scale": mapping(dict.fromkeys(names, NUMBER)),
+        "offset": mapping(dict.fromkeys(names, NUMBER)),
+        "unit": mapping({name: choice(units[name]) for name in names}),
+        "limits": mapping(dict.fromkeys(names, _LIMITS)),
         "stamp": {**_PLACE, "description": f"header, log, {_PLACE['description']}"},
-        "stamp_unit": _choice(tuple(STAMP_UNITS)),
+        "stamp_unit": choice(tuple(STAMP_UNITS)),
         "clock_offset": {
             "type": "number",
             "exclusiveMinimum": -_MOST_OFFSET_S,
@@ -189,20 +175,16 @@ def _role(role: str) -> Schema:
         },
         "sequence": _PLACE,
     }
-    return _mapping(keys, ("topic",))
-
-
-def _choice(choices: tuple[str, ...]) -> Schema:
-    return {"enum": list(choices), "description": f"one of {', '.join(choices)}"}
+    return mapping(keys, ("topic",))
 
 
 def _load_model() -> Schema:
-    point = _pair([_NUMBER, _NUMBER], "two finite numbers: x and y [m]")
+    point = _pair([NUMBER, NUMBER], "two finite numbers: x and y [m]")
     spread = {"type": "number", "minimum": 0.0, "description": "a standard deviation >= 0"}
-    coefficient = _pair([_NUMBER, spread], "a mean and a standard deviation >= 0")
+    coefficient = _pair([NUMBER, spread], "a mean and a standard deviation >= 0")
     factor = {"type": "number", "minimum": 0.0, "description": "a factor >= 0"}
     resistance = {
-        "position_m": {"type": "array", "items": _NUMBER, "minItems": 1, "description": "a list of places [m]"},
+        "position_m": {"type": "array", "items": NUMBER, "minItems": 1, "description": "a list of places [m]"},
         "factor": {"type": "array", "items": factor, "minItems": 1, "description": "a list of factors >= 0"},
     }
     sources = ("efficiency", "specific_force_n_m", "idle_force_n")
@@ -210,10 +192,10 @@ def _load_model() -> Schema:
     keys = {
         **dict.fromkeys(names, coefficient),
         "at_m": point,
-        "resistance": _mapping(resistance, ("position_m", "factor")),
+        "resistance": mapping(resistance, ("position_m", "factor")),
     }
     return {
-        **_mapping(keys, ("push_ratio", "at_m")),
+        **mapping(keys, ("push_ratio", "at_m")),
         "anyOf": [{"required": [key]} for key in sources],
         "description": f"a mapping with push_ratio, at_m and {' or '.join(sources)} (for chain_force)",
     }

@@ -26,7 +26,7 @@ from plow_twin.model.scene import (
     describe,
     must_be_given,
 )
-from plow_twin.scene_file.validation import Schema
+from plow_twin.scene_file.validation import Schema, choice, mapping
 
 #: Sections of the file, each described by one dataclass.
 SECTIONS: Final[dict[str, type]] = {
@@ -75,13 +75,7 @@ def scene_schema() -> Schema:
 
 def _object(part: type, without: tuple[str, ...] = ()) -> Schema:
     specs = [spec for spec in fields(part) if spec.name not in without]
-    return {
-        "type": "object",
-        "description": f"a mapping with {', '.join(spec.name for spec in specs)}",
-        "properties": {spec.name: _property(spec) for spec in specs},
-        "required": [spec.name for spec in specs if must_be_given(spec)],
-        "additionalProperties": False,
-    }
+    return mapping({spec.name: _property(spec) for spec in specs}, [s.name for s in specs if must_be_given(s)])
 
 
 def _property(spec: Field[Any]) -> Schema:
@@ -90,8 +84,7 @@ def _property(spec: Field[Any]) -> Schema:
     if spec.default_factory is not MISSING:
         return _labels(spec)
     if "choices" in spec.metadata:
-        choices = spec.metadata["choices"]
-        return {"enum": list(choices), "description": f"one of {', '.join(choices)}"}
+        return choice(spec.metadata["choices"])
     return {"type": "string", "minLength": 1, "description": "a name"}
 
 
@@ -112,10 +105,7 @@ def _markable(plain: Schema) -> Schema:
         "description": f"a mapping with value, mark, source and deviation, value: {plain['description']}",
         "properties": {
             "value": plain,
-            "mark": {
-                "enum": [mark.value for mark in Mark],
-                "description": f"one of {', '.join(m.value for m in Mark)}",
-            },
+            "mark": choice([mark.value for mark in Mark]),
             "source": {"type": "string", "description": "a text"},
             "deviation": {
                 "type": "number",
@@ -134,20 +124,17 @@ def _either(first: Schema, second: Schema, expected: str) -> Schema:
 
 
 def _labels(spec: Field[Any]) -> Schema:
-    choices = spec.metadata["choices"]
-    corner = {"enum": list(choices), "description": f"one of {', '.join(choices)}"}
     return {
         "type": "object",
         "description": "a mapping from letters to corners",
-        "additionalProperties": corner,
+        "additionalProperties": choice(spec.metadata["choices"]),
         "propertyNames": {"type": "string", "description": "a text as label"},
     }
 
 
 def _name_list(spec: Field[Any]) -> Schema:
-    choices = ", ".join(spec.metadata["choices"])
-    item = {"enum": list(spec.metadata["choices"]), "description": f"one of {choices}"}
-    return {"type": "array", "items": item, "description": f"a list of {choices}"}
+    choices = spec.metadata["choices"]
+    return {"type": "array", "items": choice(choices), "description": f"a list of {', '.join(choices)}"}
 
 
 def _load() -> Schema:

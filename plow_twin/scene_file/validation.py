@@ -1,13 +1,13 @@
 """Check of plain data against a JSON schema, with readable messages: key, value got, value expected.
 
-Scenes, parameters, mappings of recordings and load models are checked here. A message gives the `description` of a
-schema as the value expected.
+Scenes, parameters, mappings of recordings, load models and targets are checked here. A message gives the `description`
+of a schema as the value expected.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from functools import cache
 from itertools import islice
@@ -21,6 +21,24 @@ from jsonschema.validators import extend
 from plow_twin.errors import Problem
 
 Schema = dict[str, Any]
+
+NUMBER: Final[Schema] = {"type": "number", "description": "a finite number"}
+
+
+def mapping(properties: Mapping[str, Schema], required: Sequence[str] = ()) -> Schema:
+    """Return the schema of a mapping without other keys."""
+    return {
+        "type": "object",
+        "properties": dict(properties),
+        "required": list(required),
+        "additionalProperties": False,
+        "description": f"a mapping with {', '.join(properties)}",
+    }
+
+
+def choice(choices: Sequence[str]) -> Schema:
+    """Return the schema of a word."""
+    return {"enum": list(choices), "description": f"one of {', '.join(choices)}"}
 
 
 class _Shown:
@@ -93,7 +111,8 @@ def _explain(error: ValidationError, whole: str) -> Iterator[Problem]:
     elif error.validator == "anyOf":
         yield from _closest_branch(key or whole, error, whole)
     elif error.validator == "oneOf":
-        yield Problem(key or whole, sorted(map(str, instance)), schema["description"])
+        if isinstance(instance, dict):  # otherwise the type is a problem of its own
+            yield Problem(key or whole, sorted(map(str, instance)), schema["description"])
     else:
         yield Problem(key or whole, instance, schema.get("description", error.message))
 

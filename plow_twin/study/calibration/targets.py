@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.model.scene import Mark, Scene
+from plow_twin.scene_file.validation import NUMBER, Schema, choice, mapping, validate
 from plow_twin.scene_file.yaml_text import read_yaml
 from plow_twin.study.parameters import StudyError, Value, check_path
 from plow_twin.study.statistics import statistic
@@ -33,10 +34,6 @@ Array = NDArray[np.float64]
 TRENDS: Final = ("rises", "falls", "rises_then_falls")
 #: Residual of a target with a failed or omitted run.
 FAILED_RESIDUAL: Final = 10.0
-_KINDS: Final = ("value", "at_least", "at_most", "above", "trend")
-_KEYS: Final = {
-    "name", "statistic", *_KINDS, "along", "over", "set", "tolerance", "scale", "margin", "weight", "mark", "source",
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -140,6 +137,47 @@ class TargetSet:
         return TargetSet(left, self.t_end_s, self.tol, self.source, self.unknowns)
 
 
+_ABOVE_0: Final[Schema] = {"type": "number", "exclusiveMinimum": 0.0, "description": "a number > 0"}
+_TEXT: Final[Schema] = {"type": "string", "description": "a text"}
+_TEXTS: Final[Schema] = {
+    "anyOf": [_TEXT, {"type": "array", "items": _TEXT, "minItems": 1, "description": "one or more texts"}],
+    "description": "a text, or a list of texts",
+}
+#: The kinds of targets, of which each target has one.
+_KINDS: Final[dict[str, Schema]] = {
+    "value": {**NUMBER, "not": {"const": 0}, "description": "a number but 0, because the tolerance is relative"},
+    "at_least": NUMBER,
+    "at_most": NUMBER,
+    "above": _TEXTS,
+    "trend": choice(TRENDS),
+}
+_TARGET: Final[Schema] = {
+    **mapping(
+        {
+            "name": _TEXT, "statistic": _TEXTS, **_KINDS, "along": _TEXT,
+            "over": {"type": "array", "items": NUMBER, "minItems": 2, "description": "at least 2 numbers"},
+            "set": {"type": "object", "description": "parameters and their values"},
+            "tolerance": _ABOVE_0, "scale": _ABOVE_0, "margin": NUMBER, "weight": NUMBER,
+            "mark": choice([mark.value for mark in Mark]), "source": _TEXT,
+        },
+        ["statistic"],
+    ),
+    "oneOf": [{"required": [kind]} for kind in _KINDS],
+    "dependentRequired": {"trend": ["along", "over"]},
+    "if": {"properties": {"trend": {"const": "rises_then_falls"}}, "required": ["trend"]},
+    "then": {"properties": {"over": {"minItems": 3, "description": "at least 3 numbers"}}},
+    "description": f"a mapping with statistic and one of {', '.join(_KINDS)}; with trend also along and over",
+}  # fmt: skip
+_TARGETS: Final[Schema] = {"type": "array", "items": _TARGET, "minItems": 1, "description": "a list of targets"}
+_FILE: Final = mapping(
+    {
+        "version": {"const": 1, "description": "1"},
+        **{"t_end": _ABOVE_0, "tol": _ABOVE_0, "unknowns": _TEXTS, "targets": _TARGETS},
+    },
+    ("version", "t_end", "targets"),
+)
+
+
 def load_targets(path: Path, scene: Scene) -> TargetSet:
     """Read a target file.
 
@@ -149,91 +187,44 @@ def load_targets(path: Path, scene: Scene) -> TargetSet:
         The file cannot be read or used; the error lists every problem.
     """
     raw, found = read_yaml(path, "target", "version, t_end, targets")
-    problems = [str(problem) for problem in found]
-    if not problems and not (isinstance(raw, dict) and isinstance(raw.get("targets"), list) and raw["targets"]):
-        problems.append("got no list `targets`, expected version, t_end, targets")
+    problems = [str(problem) for problem in found or validate(raw, _FILE, "targets")]
+    items = raw.get("targets") if isinstance(raw, dict) and not found else None
     targets: list[Target] = []
-    if not problems:
-        extra = set(raw) - {"version", "t_end", "tol", "targets", "unknowns"}
-        problems += [f"{key}: expected version, t_end, tol, unknowns, targets" for key in sorted(map(str, extra))]
-        if raw.get("version") != 1:
-            problems.append(f"version: got {raw.get('version')!r}, expected 1")
-        for key in ("t_end", "tol"):
-            if not _positive(raw.get(key, 1e-6 if key == "tol" else None)):
-                problems.append(f"{key}: got {raw.get(key)!r}, expected a number > 0")
-        for index, item in enumerate(raw["targets"]):
+    for index, item in enumerate(items if isinstance(items, list) else ()):
+        place = f"targets[{index}]"
+        if not any(problem.startswith(place) for problem in problems):
             try:
                 targets.append(_target(item, scene))
             except StudyError as error:
-                problems.append(f"targets[{index}]: {error}")
+                problems.append(f"{place}: {error}")
     if problems:
         lines = "\n".join(f"  {problem}" for problem in problems)
         raise StudyError(f"{path}: {len(problems)} problem(s)\n{lines}")
-    return TargetSet(
-        tuple(targets), float(raw["t_end"]), float(raw.get("tol", 1e-6)), str(path), _texts(raw.get("unknowns"))
-    )
+    unknowns = _texts(raw.get("unknowns", []))
+    return TargetSet(tuple(targets), float(raw["t_end"]), float(raw.get("tol", 1e-6)), str(path), unknowns)
 
 
-def _target(item: Any, scene: Scene) -> Target:
-    if not isinstance(item, dict) or not set(item) <= _KEYS:
-        got = sorted(set(item) - _KEYS) if isinstance(item, dict) else item
-        raise StudyError(f"got {got!r}, expected keys of {', '.join(sorted(_KEYS))}")
-    kinds = [kind for kind in _KINDS if kind in item]
-    if len(kinds) != 1:
-        raise StudyError(f"got {kinds}, expected exactly one of {', '.join(_KINDS)}")
-    kind = kinds[0]
-    names = _texts(item.get("statistic"))
+def _target(item: Mapping[str, Any], scene: Scene) -> Target:
+    """Return a target that fits the schema; its paths are checked against the scene."""
+    kind = next(kind for kind in _KINDS if kind in item)
+    names = _texts(item["statistic"])
     others = _texts(item["above"]) if kind == "above" else ()
     for name in (*names, *others):
         statistic(scene, name)
-    if not names or (kind == "above" and not others):
-        raise StudyError(f"got statistic {item.get('statistic')!r}, expected one or more paths of statistics")
-    if item.get("mark") not in (None, *(mark.value for mark in Mark)):
-        raise StudyError(f"mark: got {item['mark']!r}, expected one of {', '.join(m.value for m in Mark)}")
-    numbers = {key: _float(item, key) for key in ("tolerance", "scale", "margin", "weight") if key in item}
+    base = item.get("set", {})
+    for path in base:
+        check_path(scene, str(path))
+    settings: tuple[Mapping[str, Value], ...] = (dict(base),)
+    if kind == "trend":
+        along = check_path(scene, item["along"])
+        settings = tuple({**base, along: float(x)} for x in item["over"])
     return Target(
-        name=str(item.get("name", f"{kind} {' '.join(names)}")), kind=kind, statistics=names, others=others,
-        number=_float(item, kind) if kind in ("value", "at_least", "at_most") else 0.0,
-        shape=_shape(item) if kind == "trend" else "", settings=_settings(item, kind, scene),
-        mark=str(item.get("mark", "")), source=str(item.get("source", "")), **numbers,
+        name=item.get("name", f"{kind} {' '.join(names)}"), kind=kind, statistics=names, others=others,
+        number=float(item[kind]) if kind in ("value", "at_least", "at_most") else 0.0,
+        shape=item.get("trend", ""), settings=settings, mark=item.get("mark", ""), source=item.get("source", ""),
+        **{key: float(item[key]) for key in ("tolerance", "scale", "margin", "weight") if key in item},
     )  # fmt: skip
 
 
-def _settings(item: Mapping[str, Any], kind: str, scene: Scene) -> tuple[Mapping[str, Value], ...]:
-    base = item.get("set", {})
-    if not isinstance(base, dict):
-        raise StudyError(f"set: got {base!r}, expected parameters and their values")
-    for path in base:
-        check_path(scene, str(path))
-    if kind != "trend":
-        return (dict(base),)
-    over, along = item.get("over"), check_path(scene, str(item.get("along")))
-    least = 3 if item["trend"] == "rises_then_falls" else 2
-    if not isinstance(over, list) or len(over) < least or not all(isinstance(x, int | float) for x in over):
-        raise StudyError(f"over: got {over!r}, expected at least {least} numbers")
-    return tuple({**base, along: float(x)} for x in over)
-
-
-def _shape(item: Mapping[str, Any]) -> str:
-    if item["trend"] not in TRENDS:
-        raise StudyError(f"trend: got {item['trend']!r}, expected one of {', '.join(TRENDS)}")
-    return str(item["trend"])
-
-
-def _texts(raw: Any) -> tuple[str, ...]:
-    items: Sequence[Any] = raw if isinstance(raw, list) else [raw] if raw is not None else []
-    return tuple(map(str, items))
-
-
-def _float(item: Mapping[str, Any], key: str) -> float:
-    value = item[key]
-    positive = key in ("tolerance", "scale")
-    if isinstance(value, bool) or not isinstance(value, int | float) or (positive and value <= 0.0):
-        raise StudyError(f"{key}: got {value!r}, expected a number{' > 0' if positive else ''}")
-    if key == "value" and value == 0.0:
-        raise StudyError("value: got 0, expected another number (use at_most, because the tolerance is relative)")
-    return float(value)
-
-
-def _positive(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and value > 0.0
+def _texts(given: str | list[str]) -> tuple[str, ...]:
+    return (given,) if isinstance(given, str) else tuple(given)
