@@ -12,37 +12,20 @@ from typing import Any
 import click
 from rich.console import Console
 
-from plow_twin.cli.console import (
-    DONE,
-    DONE_WITH_LOSS,
-    FAILED,
-    POSITIVE,
-    json_option,
-    output_console,
-    progress,
-    quiet_option,
-    say_error,
-    say_lost,
-    table,
-    unit_option,
-)
+from plow_twin.cli.console import DONE, DONE_WITH_LOSS, FAILED, output_console, progress, say_error, say_lost, table
+from plow_twin.cli.options import FOLDER, PLACE, POSITIVE, json_option, map_option, quiet_option, unit_option
 
 
 @click.command(
     short_help="Compare recordings with the model's predictions.",
     epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 done with counted loss.",
 )
-@click.argument("recordings", metavar="RUN...", type=click.Path(path_type=Path), nargs=-1, required=True)
+@click.argument("recordings", metavar="RUN...", type=PLACE, nargs=-1, required=True)
 @click.option("--scene", help="Scene file or preset; needed for a recording of another program.")
-@click.option(
-    "--map",
-    "mapping",
-    type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    help="YAML mapping: which topic is the excitation, the head_pose, the travel, the forces, the gaps.",
-)
+@map_option
 @unit_option
 @click.option("--with", "others", multiple=True, help="A further scene for predictions; may be repeated.")
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Folder for report.html and Parquet.")
+@click.option("--out", type=FOLDER, help="Folder for report.html and Parquet.")
 @click.option("--workers", type=click.IntRange(1), help="Processes for many recordings; by default one per core.")
 @click.option(
     "--dask", metavar="ADDRESS", help="Scheduler of a Dask cluster for many recordings, e.g. tcp://host:8786."

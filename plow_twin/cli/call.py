@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from plow_twin.cli.console import DONE, FAILED, say_error
+from plow_twin.cli.options import PLACE
 from plow_twin.live.service_names import SERVICES, mark_problem
 
 
@@ -14,7 +15,7 @@ from plow_twin.live.service_names import SERVICES, mark_problem
     short_help="Ask a running `plow-twin live` to acknowledge its alarms, set a mark or reset.",
     epilog="Exit codes: 0 done, 1 refused or no answer, 2 wrong usage.",
 )
-@click.argument("socket", type=click.Path(path_type=Path))
+@click.argument("socket", type=PLACE)
 @click.argument("service", type=click.Choice(SERVICES))
 @click.argument("text", required=False)
 def call(socket: Path, service: str, text: str | None) -> int:

@@ -10,18 +10,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from plow_twin.cli.console import (
-    DONE,
-    DONE_WITH_LOSS,
-    POSITIVE,
-    json_option,
-    output_console,
-    progress,
-    quiet_option,
-    say_error,
-    say_lost,
-    table,
-)
+from plow_twin.cli.console import DONE, DONE_WITH_LOSS, output_console, progress, say_error, say_lost, table
+from plow_twin.cli.options import FOLDER, PLACE, POSITIVE, json_option, quiet_option
 
 if TYPE_CHECKING:
     from plow_twin.study.comparison.change import Change
@@ -32,12 +22,12 @@ if TYPE_CHECKING:
     short_help="Compare runs: do the contacts change, and is it the load or the machine?",
     epilog="Exit codes: 0 done; 1 failed; 2 wrong usage; 3 done, but a run was left out.",
 )
-@click.argument("recordings", metavar="RUN...", type=click.Path(path_type=Path), nargs=-1, required=True)
+@click.argument("recordings", metavar="RUN...", type=PLACE, nargs=-1, required=True)
 @click.option("--by", type=click.Choice(["run", "day", "shift"]), default="run", show_default=True, help="Groups.")
 @click.option("--shifts", default="06:00,14:00,22:00", show_default=True, help="Times at which shifts begin.")
 @click.option("--zone", default="UTC", show_default=True, help="Time zone of days and shifts, e.g. Europe/Berlin.")
 @click.option("--window", type=POSITIVE, metavar="S", help="Length of a window; by default the load's period.")
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Folder for compare.html and Parquet.")
+@click.option("--out", type=FOLDER, help="Folder for compare.html and Parquet.")
 @click.option("--workers", type=click.IntRange(1), help="Processes; by default one per core.")
 @click.option("--dask", metavar="ADDRESS", help="Scheduler of a Dask cluster, e.g. tcp://host:8786.")
 @json_option

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -36,33 +35,11 @@ DONE_WITH_LOSS: Final = 3
 #: Function that is called with the share of the work done, 0..1.
 OnProgress = Callable[[float], None]
 
-quiet_option = click.option("--quiet", "-q", is_flag=True, help="No progress and no tables; files and errors only.")
-json_option = click.option("--json", "as_json", is_flag=True, help="The result as JSON on standard output.")
-
 
 def say_error(text: str) -> None:
     """Print a line on standard error; a full disk or a closed terminal raises no error."""
     with suppress(OSError):
         click.echo(printable(text), err=True)
-
-
-class PositiveNumber(click.ParamType):  # type: ignore[type-arg]  # generic from click 8.3 on
-    """A finite number above zero."""
-
-    name = "number"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """Return the number, or fail with the value got and the value expected."""
-        try:
-            number = float(value)
-        except ValueError:
-            number = math.nan
-        if not (math.isfinite(number) and number > 0.0):
-            self.fail(f"got {value!r}, expected a finite number > 0", param, ctx)
-        return number
-
-
-POSITIVE: Final = PositiveNumber()
 
 
 class PlainConsole(Console):
@@ -213,19 +190,3 @@ def say_lost(recording: object, lost: Mapping[str, int]) -> None:
 def kilonewton(force_n: float) -> str:
     """Return a force in N as text in kN."""
     return f"{force_n / 1e3:.2f}"
-
-
-def unit_option(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add `--unit NAME=UNIT`, which arrives as the parameter `units`: units by name."""
-
-    def parsed(context: click.Context, parameter: click.Parameter, given: tuple[str, ...]) -> dict[str, str]:
-        units = dict(text.partition("=")[::2] for text in given)
-        for text in given:
-            if "=" not in text:
-                raise click.BadParameter(f"got {text!r}, expected NAME=UNIT, such as fx=kN or t=ms")
-        return units
-
-    return click.option(
-        "--unit", "units", multiple=True, metavar="NAME=UNIT", callback=parsed,
-        help="Unit of a measured number, e.g. fx=kN, x=mm, theta=deg, t=ms; may be repeated.",
-    )(command)  # fmt: skip

@@ -13,6 +13,7 @@ import click
 from click.core import ParameterSource
 
 from plow_twin.cli.console import DONE, say_error
+from plow_twin.cli.options import FILE, PLACE, node_options, wait_option
 
 if TYPE_CHECKING:
     from plow_twin.dashboard.access import PageAccess
@@ -24,7 +25,7 @@ def access_options(command: Callable[..., Any]) -> Callable[..., Any]:
     for option in (
         click.option(
             "--token-file",
-            type=click.Path(path_type=Path, exists=True, dir_okay=False),
+            type=FILE,
             help="File whose first line is the token of the screen; by default PLOW_TWIN_DASHBOARD_TOKEN.",
         ),
         click.option(
@@ -79,18 +80,10 @@ def stay(screen: Screen, stopped: Callable[[], bool]) -> None:
     short_help="Show a node or a recording on a page in the browser.",
     epilog="Exit codes: 0 done, 1 failed, 2 wrong usage.",
 )
-@click.argument("run", type=click.Path(path_type=Path), required=False)
+@click.argument("run", type=PLACE, required=False)
 @click.option("--ros", is_flag=True, help="Show a node through its topics.")
-@click.option("--namespace", default="", help="Its namespace.")
-@click.option("--name", default="plow_twin", show_default=True, help="Its name.")
-@click.option("--scene", help="Scene of the node, if the node's path to it cannot be read here.")
-@click.option(
-    "--wait",
-    type=click.FloatRange(0.0),
-    default=10.0,
-    show_default=True,
-    help="Time to wait for the node or recording [s].",
-)
+@node_options
+@wait_option("Time to wait for the node or recording [s].")
 @access_options
 def dashboard(
     run: Path | None, ros: bool, namespace: str, name: str, scene: str | None, wait: float, **options: Any

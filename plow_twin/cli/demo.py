@@ -7,8 +7,8 @@ from typing import Any
 
 import click
 
-from plow_twin.cli.console import POSITIVE, quiet_option
 from plow_twin.cli.dashboard import access_if_shown, access_options, dashboard_option
+from plow_twin.cli.options import FOLDER, POSITIVE, quiet_option
 
 
 @click.command(
@@ -25,7 +25,7 @@ from plow_twin.cli.dashboard import access_if_shown, access_options, dashboard_o
 @click.option("--seconds", type=POSITIVE, default=20.0, show_default=True, help="Duration in the machine's time [s].")
 @click.option(
     "--out",
-    type=click.Path(path_type=Path, file_okay=False),
+    type=FOLDER,
     default=Path("out/demo"),
     show_default=True,
     help="Folder for the recording and the view.",

@@ -8,14 +8,15 @@ from typing import Any
 
 import click
 
-from plow_twin.cli.console import DONE, DONE_WITH_LOSS, json_option, output_console, show_facts
+from plow_twin.cli.console import DONE, DONE_WITH_LOSS, output_console, show_facts
+from plow_twin.cli.options import EXISTING, json_option
 
 
 @click.command(
     short_help="Report content and losses of a recording; repair it.",
     epilog="Exit codes: 0 complete, 1 failed or no recording, 2 wrong usage, 3 incomplete.",
 )
-@click.argument("recording", type=click.Path(path_type=Path, exists=True))
+@click.argument("recording", type=EXISTING)
 @click.option("--repair", is_flag=True, help="Rewrite parts that were cut off or damaged; the old files are kept.")
 @json_option
 def doctor(recording: Path, repair: bool, as_json: bool) -> int:

@@ -11,18 +11,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from plow_twin.cli.console import (
-    DONE,
-    DONE_WITH_LOSS,
-    FAILED,
-    busy,
-    counts,
-    json_option,
-    output_console,
-    quiet_option,
-    say_error,
-    table,
-)
+from plow_twin.cli.console import DONE, DONE_WITH_LOSS, FAILED, busy, counts, output_console, say_error, table
+from plow_twin.cli.options import EXISTING, FOLDER, NEW_FILE, PLACE, json_option, map_option, quiet_option
 from plow_twin.cli.scene_facts import damping_unit
 from plow_twin.errors import UnitError
 
@@ -40,22 +30,11 @@ if TYPE_CHECKING:
     epilog="Exit codes: 0 done, even if an estimate is withdrawn; 1 failed; 2 wrong usage or scene; 3 done with "
     "counted loss.",
 )
-@click.argument("source", metavar="INPUT", type=click.Path(path_type=Path, exists=True))
-@click.option(
-    "--scene", type=click.Path(path_type=Path), help="Nominal scene, a file or a preset; by default the scene of INPUT."
-)
-@click.option(
-    "--map",
-    "mapping",
-    type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    help="YAML mapping: which topic of a recording is the excitation, the head_pose, the gaps, the forces.",
-)
+@click.argument("source", metavar="INPUT", type=EXISTING)
+@click.option("--scene", type=PLACE, help="Nominal scene, a file or a preset; by default the scene of INPUT.")
+@map_option
 @json_option
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path, file_okay=False),
-    help="Folder for estimate.json, forces.csv, followed.csv.",
-)
+@click.option("--out", type=FOLDER, help="Folder for estimate.json, forces.csv, followed.csv.")
 @click.option(
     "--forces",
     "members",
@@ -85,7 +64,7 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--plot",
-    type=click.Path(path_type=Path, dir_okay=False),
+    type=NEW_FILE,
     help="Picture of the fit: measured and fitted motion, residuals, intervals. PNG, or .rrd for rerun.",
 )
 @quiet_option

@@ -6,16 +6,17 @@ from pathlib import Path
 
 import click
 
-from plow_twin.cli.console import DONE, DONE_WITH_LOSS, busy, output_console, quiet_option, say_lost, table
+from plow_twin.cli.console import DONE, DONE_WITH_LOSS, busy, output_console, say_lost, table
+from plow_twin.cli.options import EXISTING, PLACE, quiet_option
 
 
 @click.command(
     short_help="Write a recording as CSV, Parquet or NPZ.",
     epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, 3 done, but the recording is incomplete.",
 )
-@click.argument("recording", metavar="RUN", type=click.Path(path_type=Path, exists=True))
+@click.argument("recording", metavar="RUN", type=EXISTING)
 @click.option("--to", "kind", type=click.Choice(["csv", "parquet", "npz"]), required=True, help="Format.")
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder (csv, parquet) or file (npz).")
+@click.option("--out", type=PLACE, required=True, help="Folder (csv, parquet) or file (npz).")
 @quiet_option
 def export(recording: Path, kind: str, out: Path, quiet: bool) -> int:
     """Write load, measured poses, forces, peaks, motion, clearances and wear rates of RUN as tables in SI."""

@@ -10,18 +10,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from plow_twin.cli.console import (
-    DONE,
-    DONE_WITH_LOSS,
-    POSITIVE,
-    busy,
-    counts,
-    json_option,
-    output_console,
-    quiet_option,
-    say_error,
-    table,
-)
+from plow_twin.cli.console import DONE, DONE_WITH_LOSS, busy, counts, output_console, say_error, table
+from plow_twin.cli.options import FILE, NEW_FILE, POSITIVE, json_option, quiet_option
 from plow_twin.scene_file.presets import scene_path
 
 if TYPE_CHECKING:
@@ -56,12 +46,12 @@ _METRES: Final = 1e-2
 @click.option(
     "--estimate",
     "estimated",
-    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    type=FILE,
     help="estimate.json of `plow-twin estimate --out`: the present clearances with their intervals, and the contact.",
 )
 @click.option(
     "--history",
-    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    type=FILE,
     help="CSV of clearances over time (km, horizontal_mm, horizontal_sd_mm, vertical_mm, vertical_sd_mm): gives "
     "the wear coefficient and the present clearances; --estimate then gives only the contact.",
 )
@@ -73,7 +63,7 @@ _METRES: Final = 1e-2
     help="A forecast for multiples of load and wear coefficient; may be repeated.",
 )
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="The same seed gives the same bits.")
-@click.option("--plot", type=click.Path(path_type=Path, dir_okay=False), help="PNG of clearances and probability.")
+@click.option("--plot", type=NEW_FILE, help="PNG of clearances and probability.")
 @json_option
 @quiet_option
 def forecast(

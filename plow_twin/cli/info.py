@@ -15,16 +15,8 @@ from rich.console import Console
 from rich.padding import Padding
 from rich.text import Text
 
-from plow_twin.cli.console import (
-    DONE,
-    DONE_WITH_LOSS,
-    json_option,
-    output_console,
-    say_end,
-    show_facts,
-    table,
-    unit_option,
-)
+from plow_twin.cli.console import DONE, DONE_WITH_LOSS, output_console, say_end, show_facts, table
+from plow_twin.cli.options import json_option, map_option, unit_option
 from plow_twin.errors import RecordingError
 from plow_twin.scene_file.presets import PRESETS
 
@@ -35,12 +27,7 @@ from plow_twin.scene_file.presets import PRESETS
 )
 @click.argument("target", required=False)
 @click.option("--unused", is_flag=True, help="Print each unused message of a recording, one per line.")
-@click.option(
-    "--map",
-    "mapping",
-    type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    help="YAML mapping of load, travel and pose in a recording of another program.",
-)
+@map_option
 @unit_option
 @json_option
 def info(target: str | None, unused: bool, mapping: Path | None, units: dict[str, str], as_json: bool) -> int:

@@ -14,20 +14,17 @@ import click
 from plow_twin.cli.console import (
     DONE,
     DONE_WITH_LOSS,
-    POSITIVE,
     OnProgress,
     busy,
     error_console,
-    json_option,
     output_console,
     progress_bar,
-    quiet_option,
     say_error,
     show_facts,
-    unit_option,
 )
 from plow_twin.cli.dashboard import access_if_shown, access_options, dashboard_option, say_where, stay
 from plow_twin.cli.live_report import Report
+from plow_twin.cli.options import FILE, FOLDER, PLACE, POSITIVE, json_option, map_option, quiet_option, unit_option
 from plow_twin.cli.telemetry import telemetry_options, ways_of
 
 if TYPE_CHECKING:
@@ -46,7 +43,6 @@ if TYPE_CHECKING:
 _PROGRESS_S = 0.2
 #: Names of the counters of unused input.
 _LOST = re.compile(r"dropped_.*|.*_dropped|.*_lost")
-_FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 
 
 @click.command(
@@ -55,11 +51,11 @@ _FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 )
 @click.argument("source")
 @click.option("--scene", help="Scene file or preset; by default the parameter scene.")
-@click.option("--map", "mapping", type=_FILE, help="YAML mapping of load, travel and pose, with units.")
+@map_option
 @unit_option
-@click.option("--params", type=_FILE, help="YAML file of parameters, as for the node.")
+@click.option("--params", type=FILE, help="YAML file of parameters, as for the node.")
 @click.option("--set", "given", multiple=True, metavar="NAME=VALUE", help="One parameter; may be repeated.")
-@click.option("--record", type=click.Path(path_type=Path, file_okay=False), help="Folder for the recording.")
+@click.option("--record", type=FOLDER, help="Folder for the recording.")
 @click.option("--follow", is_flag=True, help="Continue while the files grow.")
 @click.option(
     "--seconds",
@@ -72,20 +68,18 @@ _FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
     default="",
     help="User at the broker or server; password in PLOW_TWIN_MQTT_PASSWORD, PLOW_TWIN_OPCUA_PASSWORD or a file.",
 )
-@click.option("--password-file", type=_FILE, help="File whose first line is the password.")
-@click.option("--user-cert", type=_FILE, help="Certificate of the user at an OPC UA server, instead of --user.")
-@click.option("--user-key", type=_FILE, help="Key of that certificate.")
-@click.option("--tls-ca", type=_FILE, help="Certificate authority for the broker's or server's certificate.")
-@click.option("--tls-cert", type=_FILE, help="Certificate of this client.")
-@click.option("--tls-key", type=_FILE, help="Key of that certificate.")
+@click.option("--password-file", type=FILE, help="File whose first line is the password.")
+@click.option("--user-cert", type=FILE, help="Certificate of the user at an OPC UA server, instead of --user.")
+@click.option("--user-key", type=FILE, help="Key of that certificate.")
+@click.option("--tls-ca", type=FILE, help="Certificate authority for the broker's or server's certificate.")
+@click.option("--tls-cert", type=FILE, help="Certificate of this client.")
+@click.option("--tls-key", type=FILE, help="Key of that certificate.")
 @click.option(
     "--client-id", default="plow_twin", show_default=True, help="Client name under which the broker keeps messages."
 )
 @click.option("--plain", is_flag=True, help="Allow brokers and servers on other machines without encryption.")
 @click.option("--lines", is_flag=True, help="Status, alarms and diagnostics as JSON lines on standard output.")
-@click.option(
-    "--control", type=click.Path(path_type=Path), help="Socket to open, for plow-twin call SOCKET acknowledge_alarms."
-)
+@click.option("--control", type=PLACE, help="Socket to open, for plow-twin call SOCKET acknowledge_alarms.")
 @click.option("--metrics", type=click.IntRange(1, 65535), help="Port of a page for Prometheus, on this machine.")
 @telemetry_options
 @dashboard_option

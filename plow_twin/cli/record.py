@@ -10,26 +10,19 @@ from pathlib import Path
 
 import click
 
-from plow_twin.cli.console import (
-    DONE,
-    DONE_WITH_LOSS,
-    json_option,
-    output_console,
-    quiet_option,
-    say_error,
-    show_facts,
-)
+from plow_twin.cli.console import DONE, DONE_WITH_LOSS, output_console, say_error, show_facts
+from plow_twin.cli.options import FOLDER, json_option, quiet_option, wait_option
 
 
 @click.command(
     short_help="Record other topics beside a run.",
     epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, 3 done with loss or without a named topic.",
 )
-@click.argument("run", type=click.Path(path_type=Path, file_okay=False))
+@click.argument("run", type=FOLDER)
 @click.argument("topics", metavar="[TOPIC]...", nargs=-1)
 @click.option("--all", "every", is_flag=True, help="All topics except hidden ones and the run's own.")
 @click.option("--exclude", metavar="REGEX", help="With --all: leave out these topics.")
-@click.option("--wait", type=click.FloatRange(0.0), default=10.0, show_default=True, help="Time to wait for a run [s].")
+@wait_option("Time to wait for a run [s].")
 @json_option
 @quiet_option
 def record(

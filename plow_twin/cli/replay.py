@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from plow_twin.cli.console import json_option, output_console, progress, quiet_option, say_end, say_error, show_facts
+from plow_twin.cli.console import output_console, progress, say_end, say_error, show_facts
+from plow_twin.cli.options import EXISTING, FOLDER, json_option, quiet_option
 
 if TYPE_CHECKING:
     from plow_twin.record.replay_report import ReplayReport
@@ -18,11 +19,11 @@ if TYPE_CHECKING:
     short_help="Compute a recording again and compare it bit for bit.",
     epilog="Exit codes: 0 the same, bit for bit; 1 diverged or failed; 2 wrong usage; 3 the same, with counted loss.",
 )
-@click.argument("recording", type=click.Path(path_type=Path, exists=True))
+@click.argument("recording", type=EXISTING)
 @click.option("--digests-only", is_flag=True, help="Compare the digests of the state alone.")
 @click.option(
     "--write",
-    type=click.Path(path_type=Path, file_okay=False),
+    type=FOLDER,
     help="New folder for a full recording made from the journal, with all outputs after each advance.",
 )
 @json_option

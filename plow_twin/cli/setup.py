@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from plow_twin.cli.console import DONE, output_console, quiet_option, say_error, table, unit_option
+from plow_twin.cli.console import DONE, output_console, say_error, table
+from plow_twin.cli.options import FILE, FOLDER, quiet_option, unit_option
 from plow_twin.errors import UnitError
 
 if TYPE_CHECKING:
@@ -20,11 +21,11 @@ if TYPE_CHECKING:
     short_help="Guess the columns of a CSV or Parquet file; write a mapping and a stub of a scene.",
     epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, or a column that cannot be assigned.",
 )
-@click.argument("file", type=click.Path(path_type=Path, exists=True, dir_okay=False))
+@click.argument("file", type=FILE)
 @click.option("--scene", help="Scene file or preset of the machine; without it a stub is written.")
 @click.option("--column", "given", multiple=True, metavar="NAME=COLUMN", help="A column: fx=Load_1, t=Zeit.")
 @unit_option
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path(), help="Folder for the files.")
+@click.option("--out", type=FOLDER, default=Path(), help="Folder for the files.")
 @quiet_option
 def setup(file: Path, scene: str | None, given: tuple[str, ...], units: dict[str, str], out: Path, quiet: bool) -> int:
     """Guess separator, time, columns and units of FILE, ask in a terminal about the rest, and write map and scene."""

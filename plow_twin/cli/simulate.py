@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Final
 
 import click
 
-from plow_twin.cli.console import DONE, POSITIVE, json_option, kilonewton, output_console, progress, quiet_option, table
+from plow_twin.cli.console import DONE, kilonewton, output_console, progress, table
+from plow_twin.cli.options import NEW_FILE, POSITIVE, json_option, quiet_option
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -30,9 +31,7 @@ MOST_ROWS: Final = 10_000_000
     "--output-dt", type=POSITIVE, help="Distance of the output rows [s]; a thousandth of the motion by default."
 )
 @click.option("--tol", type=POSITIVE, default=1e-9, show_default=True, help="Tolerance, relative to the clearance.")
-@click.option(
-    "--out", type=click.Path(path_type=Path, dir_okay=False), help="Write the output rows to this .csv or .npz file."
-)
+@click.option("--out", type=NEW_FILE, help="Write the output rows to this .csv or .npz file.")
 @json_option
 @click.option(
     "--method",
@@ -42,11 +41,7 @@ MOST_ROWS: Final = 10_000_000
     help="events: every touch is located; rk4, euler: fixed steps, for comparison.",
 )
 @click.option("--dt", type=POSITIVE, help="Step of rk4 and euler [s].")
-@click.option(
-    "--energy-balance",
-    is_flag=True,
-    help="Balance of energy and momentum; takes some four times as long.",
-)
+@click.option("--energy-balance", is_flag=True, help="Balance of energy and momentum; takes some four times as long.")
 @click.option(
     "--trust",
     is_flag=True,

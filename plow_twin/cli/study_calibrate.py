@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from plow_twin.cli.console import DONE, POSITIVE, output_console, progress, quiet_option, table
+from plow_twin.cli.console import DONE, output_console, progress, table
+from plow_twin.cli.options import FILE, FOLDER, NEW_FILE, POSITIVE, quiet_option
 from plow_twin.cli.study_options import set_option, study_scene, usage_errors
 from plow_twin.scene_file.presets import config_folder
 
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--recording",
-    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    type=FILE,
     help="Motion to fit: .csv, .parquet or .npz with t, x, y, theta, or a recording of the node (.mcap).",
 )
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="The same seed gives the same bits.")
@@ -56,10 +57,10 @@ if TYPE_CHECKING:
     type=POSITIVE,
     help="Objective above the best up to which a point is near optimal; by default 10 % of the best.",
 )
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False), required=True, help="Folder of the results.")
+@click.option("--out", type=FOLDER, required=True, help="Folder of the results.")
 @click.option(
     "--plot",
-    type=click.Path(path_type=Path, dir_okay=False),
+    type=NEW_FILE,
     help="Picture of the fit: measured, fitted, residuals, ranges. PNG, or with --recording .rrd for rerun.",
 )
 @set_option

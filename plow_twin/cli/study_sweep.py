@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from plow_twin.cli.console import DONE, DONE_WITH_LOSS, POSITIVE, output_console, progress, quiet_option, say_error
+from plow_twin.cli.console import DONE, DONE_WITH_LOSS, output_console, progress, say_error
 from plow_twin.cli.console import table as rich_table
+from plow_twin.cli.options import FOLDER, POSITIVE, quiet_option
 from plow_twin.cli.study_options import set_option, study_scene, usage_errors
 
 if TYPE_CHECKING:
@@ -35,12 +36,7 @@ _COLUMN, _FIRST_COLUMN = 12, 8
 )
 @click.option("--t-end", metavar="T", type=POSITIVE, required=True, help="Time to simulate [s].")
 @click.option("--tol", type=POSITIVE, default=1e-9, show_default=True, help="Tolerance, relative to the clearance.")
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path, file_okay=False),
-    required=True,
-    help="Folder for chunks, table and picture.",
-)
+@click.option("--out", type=FOLDER, required=True, help="Folder for chunks, table and picture.")
 @set_option
 @click.option("--workers", type=click.IntRange(1), help="Threads; all cores by default.")
 @click.option("--dask", metavar="ADDRESS", help="Scheduler of a Dask cluster to run on, e.g. tcp://host:8786.")

@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from plow_twin.cli.console import DONE, DONE_WITH_LOSS, POSITIVE, say_error
+from plow_twin.cli.console import DONE, DONE_WITH_LOSS, say_error
+from plow_twin.cli.options import FILE, POSITIVE, node_options, wait_option
 
 if TYPE_CHECKING:
     from plow_twin.telemetry.access import WayOut
@@ -21,7 +21,7 @@ def telemetry_options(command: Callable[..., Any]) -> Callable[..., Any]:
     for option in (
         click.option(
             "--out-access",
-            type=click.Path(path_type=Path, exists=True, dir_okay=False),
+            type=FILE,
             help="YAML file with users, certificates and files of secrets of the outputs.",
         ),
         click.option(
@@ -76,12 +76,8 @@ def ways_of(options: dict[str, Any]) -> list[WayOut]:
     short_help="Send the results of a node to MQTT, Sparkplug, InfluxDB or OPC UA.",
     epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, 3 done, but messages were lost.",
 )
-@click.option("--namespace", default="", help="Its namespace.")
-@click.option("--name", default="plow_twin", show_default=True, help="Its name.")
-@click.option("--scene", help="Scene of the node, if the node's path to it cannot be read here.")
-@click.option(
-    "--wait", type=click.FloatRange(0.0), default=10.0, show_default=True, help="Time to wait for the node [s]."
-)
+@node_options
+@wait_option("Time to wait for the node [s].")
 @click.option("--plain", is_flag=True, help="Allow receivers on other machines without encryption.")
 @telemetry_options
 def telemetry(namespace: str, name: str, scene: str | None, wait: float, **options: Any) -> int:

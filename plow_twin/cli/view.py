@@ -13,18 +13,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from plow_twin.cli.console import (
-    DONE,
-    DONE_WITH_LOSS,
-    POSITIVE,
-    busy,
-    progress,
-    quiet_option,
-    say_end,
-    say_error,
-    say_lost,
-    unit_option,
-)
+from plow_twin.cli.console import DONE, DONE_WITH_LOSS, busy, progress, say_end, say_error, say_lost
+from plow_twin.cli.options import NEW_FILE, PLACE, POSITIVE, map_option, quiet_option, unit_option, wait_option
 
 if TYPE_CHECKING:
     from plow_twin.model.scene import Scene
@@ -40,15 +30,9 @@ _MOST_EXAGGERATED = 1e4
     short_help="Draw a recording for rerun, or as a picture.",
     epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, 3 done, but parts of the recording are missing.",
 )
-@click.argument("recording", type=click.Path(path_type=Path))
-@click.option(
-    "--out", type=click.Path(path_type=Path, dir_okay=False), help="The .rrd file; by default beside the .mcap."
-)
-@click.option(
-    "--exaggerate",
-    type=POSITIVE,
-    help="Factor by which a second cross-section widens the clearance.",
-)
+@click.argument("recording", type=PLACE)
+@click.option("--out", type=NEW_FILE, help="The .rrd file; by default beside the .mcap.")
+@click.option("--exaggerate", type=POSITIVE, help="Factor by which a second cross-section widens the clearance.")
 @click.option(
     "--with",
     "others",
@@ -57,19 +41,12 @@ _MOST_EXAGGERATED = 1e4
     help="A further scene whose forces under the run's load are also drawn; may be repeated.",
 )
 @click.option("--scene", help="Scene file or preset for a recording of another program.")
-@click.option(
-    "--map",
-    "mapping",
-    type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    help="YAML mapping of load, travel and pose in a recording of another program.",
-)
+@map_option
 @unit_option
-@click.option(
-    "--png", type=click.Path(path_type=Path, dir_okay=False), help="Write a picture instead; needs no viewer."
-)
+@click.option("--png", type=NEW_FILE, help="Write a picture instead; needs no viewer.")
 @click.option(
     "--html",
-    type=click.Path(path_type=Path, dir_okay=False),
+    type=NEW_FILE,
     help="Write one page instead, with picture, curves and tables; needs neither viewer nor network.",
 )
 @click.option("--web", is_flag=True, help="Serve rerun's own web viewer on this machine until interrupted.")
@@ -81,13 +58,7 @@ _MOST_EXAGGERATED = 1e4
     help="Port of the web viewer; 0: any free port.",
 )
 @click.option("--follow", is_flag=True, help="Show a run while it is recorded: in a window, with --web, or into --out.")
-@click.option(
-    "--wait",
-    type=click.FloatRange(0.0),
-    default=10.0,
-    show_default=True,
-    help="Time that --follow waits for a run [s].",
-)
+@wait_option("Time that --follow waits for a run [s].")
 @quiet_option
 def view(
     recording: Path,

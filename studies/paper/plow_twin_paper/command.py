@@ -11,7 +11,8 @@ from rich.console import Console
 from rich.padding import Padding
 from rich.text import Text
 
-from plow_twin.cli.console import DONE, DONE_WITH_LOSS, POSITIVE, output_console, progress, quiet_option, say_error
+from plow_twin.cli.console import DONE, DONE_WITH_LOSS, output_console, progress, say_error
+from plow_twin.cli.options import POSITIVE, quiet_option
 
 if TYPE_CHECKING:
     from plow_twin_paper.rows import Row

@@ -1,0 +1,74 @@
+"""Options and types of arguments that several verbs have."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+import click
+
+EXISTING: Final = click.Path(path_type=Path, exists=True)
+FILE: Final = click.Path(path_type=Path, exists=True, dir_okay=False)
+FOLDER: Final = click.Path(path_type=Path, file_okay=False)
+NEW_FILE: Final = click.Path(path_type=Path, dir_okay=False)
+PLACE: Final = click.Path(path_type=Path)
+
+quiet_option = click.option("--quiet", "-q", is_flag=True, help="No progress and no tables; files and errors only.")
+json_option = click.option("--json", "as_json", is_flag=True, help="The result as JSON on standard output.")
+map_option = click.option(
+    "--map", "mapping", type=FILE,
+    help="YAML mapping of a recording of another program: which topics are load, travel, pose, gaps, forces.",
+)  # fmt: skip
+
+
+def wait_option(text: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Return the option `--wait` with its help text; it arrives as the parameter `wait` [s]."""
+    return click.option("--wait", type=click.FloatRange(0.0), default=10.0, show_default=True, help=text)
+
+
+def node_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options that name a running node: `--namespace`, `--name` and `--scene`."""
+    for option in (
+        click.option("--scene", help="Scene of the node, if the node's path to it cannot be read here."),
+        click.option("--name", default="plow_twin", show_default=True, help="Its name."),
+        click.option("--namespace", default="", help="Its namespace."),
+    ):
+        command = option(command)
+    return command
+
+
+def unit_option(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add `--unit NAME=UNIT`, which arrives as the parameter `units`: units by name."""
+
+    def parsed(context: click.Context, parameter: click.Parameter, given: tuple[str, ...]) -> dict[str, str]:
+        units = dict(text.partition("=")[::2] for text in given)
+        for text in given:
+            if "=" not in text:
+                raise click.BadParameter(f"got {text!r}, expected NAME=UNIT, such as fx=kN or t=ms")
+        return units
+
+    return click.option(
+        "--unit", "units", multiple=True, metavar="NAME=UNIT", callback=parsed,
+        help="Unit of a measured number, e.g. fx=kN, x=mm, theta=deg, t=ms; may be repeated.",
+    )(command)  # fmt: skip
+
+
+class PositiveNumber(click.ParamType):  # type: ignore[type-arg]  # generic from click 8.3 on
+    """A finite number above zero."""
+
+    name = "number"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """Return the number, or fail with the value got and the value expected."""
+        try:
+            number = float(value)
+        except ValueError:
+            number = math.nan
+        if not (math.isfinite(number) and number > 0.0):
+            self.fail(f"got {value!r}, expected a finite number > 0", param, ctx)
+        return number
+
+
+POSITIVE: Final = PositiveNumber()
