@@ -214,11 +214,11 @@ def summary(lifecycle: str, reason: str, runtime: Runtime | None, preparing: boo
     level = _LEVELS[state]
     values["solver_failures"] = str(runtime.driver.failed.count)
     said = [state.value, *failures(runtime)]
-    others = runtime.inputs.other_senders()
+    others, keeper = runtime.inputs.other_senders(), runtime.wear_keeper
     troubles = [
         (ERROR, runtime.unsteady, "the stamps jump again and again: samples are dropped"),
         (ERROR, values["recorder"] == "trouble", "the recording has lost data or has stopped"),
-        (ERROR, bool(runtime.wear_error), runtime.wear_error),
+        (ERROR, bool(keeper and keeper.error), keeper.error if keeper else ""),
         (WARN, estimation is not None and bool(estimation.error), estimation.error if estimation else ""),
         (
             WARN,
@@ -283,7 +283,7 @@ class Health:
             values |= {
                 "stream": driver.state.value,
                 "reason": driver.failed.reason,
-                "scene": runtime.scene_name,
+                "scene": runtime.settings.scene,
                 "compile_s": f"{runtime.compile_s:.3f}",
                 "model_time_s": f"{driver.real_time.model_s:.3f}",
                 "real_time_factor": f"{driver.real_time.recent(now_ns):.4f}",
@@ -306,7 +306,7 @@ class Health:
         inputs, residual, age_s = runtime.inputs, runtime.residual(), runtime.newest_sample_age_s()
         peak, wait_s = inputs.pop_queue_peak()
         values = {key: str(counted[key]) for key in KEYS["input"] if key in counted} | {
-            "source": runtime.source,
+            "source": runtime.settings.excitation_source,
             "silent_s": f"{runtime.driver.silences.total_ns * 1e-9:.3f}" if counted["silences"] else "0",
             "newest_sample_age_s": "" if age_s is None else f"{age_s:.3f}",
             "samples_lost": str(inputs.senders.lost),
@@ -374,7 +374,7 @@ class Health:
         self._before["periods_missed"] = missed
         values |= zip(keys, (str(missed), *map(_ms, runtime.periods.recent())), strict=True)
         new = missed - before
-        return f"{new} periods left out since the last report" if 0 < runtime.missed_periods <= new else ""
+        return f"{new} periods left out since the last report" if 0 < runtime.settings.missed_periods <= new else ""
 
     def estimate(self, runtime: Runtime) -> Part:
         """Return the state of the estimate."""

@@ -94,7 +94,8 @@ class Runtime:
         self.reduced = False
         self._waiting_seconds = 0
         self._clock_before_ns = 0
-        self._start_due = True
+        #: whether the journal still waits for a clock, so that services are refused
+        self.waits_for_clock = True
         self._early: list[Arrival] = []
         self._seen: tuple[Any, ...] = ()
         self.wear_keeper: WearKeeper | None = None
@@ -133,7 +134,7 @@ class Runtime:
         self.publishing = Publishing(front, settings, self.alarms, self.recording, self.mark, catch_up)
         self.inputs = Inputs(
             front,
-            self.source,
+            settings.excitation_source,
             settings.input_depth,
             settings.rollback_span,
             journaled=self.recording is not None,
@@ -148,10 +149,10 @@ class Runtime:
 
     def start(self) -> None:
         """Open the journal, once the front can no longer fail. Without a clock the first sample opens it."""
-        self._start_due = self.without_clock
-        self.inputs.started = not self._start_due
-        self.clock = "waiting" if self._start_due else "running"
-        if not self._start_due:
+        self.waits_for_clock = self.without_clock
+        self.inputs.started = not self.waits_for_clock
+        self.clock = "waiting" if self.waits_for_clock else "running"
+        if not self.waits_for_clock:
             self.driver.session.start()
             self.driver.set_model(self.stamp_ns, model_changes(self.settings))
 
@@ -172,16 +173,6 @@ class Runtime:
     def without_clock(self) -> bool:
         """Whether the node uses `/clock` and no message on it has arrived."""
         return self._front.now_ns() == 0
-
-    @property
-    def waits_for_clock(self) -> bool:
-        """Whether the journal still waits for a clock, so that services are refused."""
-        return self._start_due
-
-    @property
-    def wear_error(self) -> str:
-        """Why the wear could not be saved; empty if it was saved, or is not kept."""
-        return self.wear_keeper.error if self.wear_keeper else ""
 
     def kept_wear(self) -> KeptWear:
         """Return the wear for the next runtime of this process; after the close."""
@@ -207,21 +198,6 @@ class Runtime:
         found = self.recording.counters
         return "trouble" if found.error or found.lost else "recording"
 
-    @property
-    def scene_name(self) -> str:
-        """Scene file or preset in use."""
-        return self.settings.scene
-
-    @property
-    def source(self) -> str:
-        """Excitation source in use."""
-        return self.settings.excitation_source
-
-    @property
-    def poses_have_covariance(self) -> bool:
-        """Whether measured poses bring their covariance."""
-        return self.settings.head_pose_type == "pose_with_covariance"
-
     def residual(self) -> tuple[float, float, float] | None:
         """Return model minus newest measured pose: x, y [m], theta [rad], or None without a measurement."""
         q = self.publishing.q
@@ -244,11 +220,6 @@ class Runtime:
             stands = now_ns == self._clock_before_ns
             self.clock = "waiting" if now_ns == 0 else "paused" if stands else "running"
         self._clock_before_ns = now_ns
-
-    @property
-    def missed_periods(self) -> int:
-        """Number of missed periods between two reports that is a warning; 0: no warning."""
-        return self.settings.missed_periods
 
     def time_text(self, stamp_ns: int) -> str:
         """Return a stamp in words."""
@@ -273,7 +244,7 @@ class Runtime:
 
     def record_status(self, status: DiagnosticStatus) -> None:
         """Write a published status to the recording."""
-        if self.recording and not self._start_due:
+        if self.recording and not self.waits_for_clock:
             self.recording.message("status", self.stamp_ns, status)
 
     def activate(self) -> None:
@@ -339,7 +310,7 @@ class Runtime:
         self._set_limits(settings)
         for intake in (self.driver.intake, self.driver.clock):
             intake.jump_back_s, intake.jump_forward_s = settings.jump_back, settings.jump_forward
-        if self._start_due:
+        if self.waits_for_clock:
             return  # the journal is still empty
         if name in MODEL:
             self.driver.set_model(self.stamp_ns, model_changes(settings))
@@ -360,9 +331,9 @@ class Runtime:
 
     def step(self, arrived: list[Arrival]) -> Iterator[Outgoing]:
         """Use samples in order of arrival; yield the messages, each before more is computed."""
-        if self._start_due:
+        if self.waits_for_clock:
             self.start()
-        if self._start_due:
+        if self.waits_for_clock:
             # kept until the clock comes: a player of a recording may start the clock a little later
             room = self.settings.input_depth - len(self._early)
             self._early += arrived[:room]
@@ -378,7 +349,7 @@ class Runtime:
 
     def step_series(self, stamps: NDArray[np.int64], wrench: NDArray[np.float64]) -> Iterator[Outgoing]:
         """Use many samples of a source with its own time, like `step`; stamps [ns], shape (n,), wrenches (n, 3)."""
-        if self._start_due or self.publishing.watch is not None or self.settings.record_ring:
+        if self.waits_for_clock or self.publishing.watch is not None or self.settings.record_ring:
             # an observer sees each sample; a ring is written with the state after the sample of its alarm
             yield from self.step(list(zip(stamps.tolist(), map(tuple, wrench.tolist()), strict=True)))
             return
@@ -415,9 +386,9 @@ class Runtime:
         """Continue under the scene's own loads."""
         if self.periods and self.settings.publish_mode != "fixed_rate":
             self.periods.turn(time.monotonic())
-        if self._start_due:
+        if self.waits_for_clock:
             self.start()
-            if self._start_due:
+            if self.waits_for_clock:
                 return
         self.publishing.received_ns = now_ns = time.monotonic_ns()
         self._send(self.publishing.messages(self.driver.clock_tick(self._front.now_ns(), now_ns)))
@@ -498,18 +469,18 @@ class Runtime:
         """Let only the parameters follow if the twins do not keep up."""
         waited_s, self.inputs.wait_s = self.inputs.wait_s, 0.0
         self._waiting_seconds = self._waiting_seconds + 1 if waited_s > _LONGEST_WAIT_S else 0
-        if self._waiting_seconds == _WAITING_SECONDS and not self.reduced and not self._start_due:
+        if self._waiting_seconds == _WAITING_SECONDS and not self.reduced and not self.waits_for_clock:
             self.reduced = True
             self.driver.parameter("follow", "parameters")
             self._front.changed()
 
     def _look_for_clock(self) -> None:
-        if self._start_due and not self.without_clock:
+        if self.waits_for_clock and not self.without_clock:
             self._send(self.step([]))
 
     def _journal_unused(self) -> None:
         """Journal the unused messages, once there is a journal."""
-        if not self._start_due:
+        if not self.waits_for_clock:
             for entry in self.inputs.unused.pop_all(self._front.sender_name):
                 self.driver.session.emit(entry)
 

@@ -92,5 +92,5 @@ class Services:
         done = self._runtime.inputs.senders.switch()
         self._changed()
         if done:
-            return True, f"the other publisher of {self._runtime.source} is followed from now on"
-        return False, f"no other publisher of {self._runtime.source} has been heard"
+            return True, f"the other publisher of {self._runtime.settings.excitation_source} is followed from now on"
+        return False, f"no other publisher of {self._runtime.settings.excitation_source} has been heard"

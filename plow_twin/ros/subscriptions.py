@@ -68,7 +68,7 @@ class Subscriptions:
         #: publishers of each input at the last look
         self._found: dict[str, list[bytes]] = {}
         self._tool_forces = ToolForces(runtime.scene)
-        self._source, depth = runtime.source, self._inputs.depth
+        self._source, depth = runtime.settings.excitation_source, self._inputs.depth
         self._names: dict[tuple[str, bytes], str] = {}
         #: number of the next message, by topic and publisher
         self._following: dict[tuple[str, bytes], int] = {}
@@ -76,7 +76,8 @@ class Subscriptions:
         #: publishers of the excitation that were unknown then: first message, and losses counted before this message
         self._appeared: dict[bytes, tuple[Taken, int]] = {}
         self._before: frozenset[bytes] = frozenset()
-        self._pose = PoseWithCovarianceStamped if runtime.poses_have_covariance else PoseStamped
+        with_covariance = runtime.settings.head_pose_type == "pose_with_covariance"
+        self._pose = PoseWithCovarianceStamped if with_covariance else PoseStamped
         self._subscribe(WrenchStamped, "excitation", depth)
         self._subscribe(JointState, "tool_forces", depth)
         self._subscribe(TwistStamped, "travel", _SLOW_DEPTH)
