@@ -22,6 +22,7 @@ from plow_twin.errors import Problem
 
 Schema = dict[str, Any]
 
+TEXT: Final[Schema] = {"type": "string", "description": "a text"}
 NUMBER: Final[Schema] = {"type": "number", "description": "a finite number"}
 
 

@@ -12,15 +12,18 @@ from urllib.parse import urlsplit
 
 from plow_twin.access import is_loopback, read_secret
 from plow_twin.errors import InputError, Problem
+from plow_twin.scene_file.validation import TEXT, mapping, validate
 from plow_twin.scene_file.yaml_text import read_yaml
 
 _PORTS: Final = {"mqtt": 1883, "mqtts": 8883, "opc.tcp": 4840, "http": 8086, "https": 443}
-#: Keys of each section of the file of credentials.
-_KEYS: Final = {
-    "mqtt": ("user", "password_file", "ca", "certificate", "key", "client_id"),
-    "influx": ("token_file", "ca"),
-    "opcua": ("user", "password_file", "certificate", "key", "trusted"),
-}
+#: Schema of the file of credentials.
+_CREDENTIALS: Final = mapping(
+    {
+        "mqtt": mapping(dict.fromkeys(("user", "password_file", "ca", "certificate", "key", "client_id"), TEXT)),
+        "influx": mapping(dict.fromkeys(("token_file", "ca"), TEXT)),
+        "opcua": mapping(dict.fromkeys(("user", "password_file", "certificate", "key", "trusted"), TEXT)),
+    }
+)
 
 
 class AccessError(InputError):
@@ -72,27 +75,16 @@ class Credentials:
 
         Raises
         ------
-        AccessError
-            A section or key is not known, or a value is not a text.
-        SceneError
-            The file is not YAML within the bounds.
+        InputError
+            The file is not YAML within the bounds, a section or key is not known, or a value is not a text.
         OSError
             The file cannot be read.
         """
         if path is None:
             return cls()
-        data, problems = read_yaml(path, str(path), ", ".join(_KEYS))
-        if problems:
+        data, found = read_yaml(path, "credentials", _CREDENTIALS["description"])
+        if problems := found or validate(data, _CREDENTIALS, "credentials"):
             raise InputError(problems, str(path))
-        if not isinstance(data, dict):
-            raise AccessError(str(path), type(data).__name__, f"the sections {', '.join(_KEYS)}")
-        for section, values in data.items():
-            keys = _KEYS.get(section)
-            if keys is None or not isinstance(values, dict):
-                raise AccessError(f"{path}: {section}", values, f"one of the sections {', '.join(_KEYS)}")
-            for key, value in values.items():
-                if key not in keys or not isinstance(value, str):
-                    raise AccessError(f"{path}: {section}.{key}", value, f"a text under one of {', '.join(keys)}")
         return cls(data, path.parent)
 
     def text(self, section: str, key: str, otherwise: str = "") -> str:

@@ -10,12 +10,16 @@ from typing import Any, Final
 from urllib.parse import urlsplit
 
 from plow_twin.access import read_secret
-from plow_twin.errors import InputError, Problem
+from plow_twin.errors import InputError
 from plow_twin.live.bridge.source import BridgeError
+from plow_twin.scene_file.validation import TEXT, mapping, validate
 from plow_twin.scene_file.yaml_text import read_yaml
 
 #: Keys of a file of credentials that name files.
 _FILES: Final = ("ca", "certificate", "key", "user_certificate", "user_key", "password_file")
+_CREDENTIALS: Final = mapping(
+    {"user": TEXT, "plain": {"type": "boolean", "description": "true or false"}, **dict.fromkeys(_FILES, TEXT)}
+)
 
 
 @dataclass(frozen=True)
@@ -86,17 +90,9 @@ def read_access(url: str, path: Path | None) -> Access:
     """
     if path is None:
         return Access(url, password=password(None, "OPCUA"))
-    keys = ("user", "plain", *_FILES)
-    expected = f"some of {', '.join(keys)}"
-    given, found = read_yaml(path, "credentials", expected)
-    if not found and not isinstance(given, dict):
-        found = [Problem("credentials", type(given).__name__, expected)]
-    for key, value in {} if found else given.items():
-        if key not in keys or not isinstance(value, bool if key == "plain" else str):
-            wanted = "true or false" if key == "plain" else f"a text under {expected}"
-            found = [*found, Problem(str(key), value, wanted)]
-    if found:
-        raise InputError(found, str(path))
+    given, found = read_yaml(path, "credentials", _CREDENTIALS["description"])
+    if problems := found or validate(given, _CREDENTIALS, "credentials"):
+        raise InputError(problems, str(path))
     files: dict[str, Any] = {key: path.parent / given[key] for key in _FILES if key in given}
     secret = password(files.pop("password_file", None), "OPCUA")
     return Access(url, given.get("user", ""), secret, plain=given.get("plain", False), **files)

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.model.scene import Mark, Scene
-from plow_twin.scene_file.validation import NUMBER, Schema, choice, mapping, validate
+from plow_twin.scene_file.validation import NUMBER, TEXT, Schema, choice, mapping, validate
 from plow_twin.scene_file.yaml_text import read_yaml
 from plow_twin.study.parameters import StudyError, Value, check_path
 from plow_twin.study.statistics import statistic
@@ -138,9 +138,8 @@ class TargetSet:
 
 
 _ABOVE_0: Final[Schema] = {"type": "number", "exclusiveMinimum": 0.0, "description": "a number > 0"}
-_TEXT: Final[Schema] = {"type": "string", "description": "a text"}
 _TEXTS: Final[Schema] = {
-    "anyOf": [_TEXT, {"type": "array", "items": _TEXT, "minItems": 1, "description": "one or more texts"}],
+    "anyOf": [TEXT, {"type": "array", "items": TEXT, "minItems": 1, "description": "one or more texts"}],
     "description": "a text, or a list of texts",
 }
 #: The kinds of targets, of which each target has one.
@@ -154,11 +153,11 @@ _KINDS: Final[dict[str, Schema]] = {
 _TARGET: Final[Schema] = {
     **mapping(
         {
-            "name": _TEXT, "statistic": _TEXTS, **_KINDS, "along": _TEXT,
+            "name": TEXT, "statistic": _TEXTS, **_KINDS, "along": TEXT,
             "over": {"type": "array", "items": NUMBER, "minItems": 2, "description": "at least 2 numbers"},
             "set": {"type": "object", "description": "parameters and their values"},
             "tolerance": _ABOVE_0, "scale": _ABOVE_0, "margin": NUMBER, "weight": NUMBER,
-            "mark": choice([mark.value for mark in Mark]), "source": _TEXT,
+            "mark": choice([mark.value for mark in Mark]), "source": TEXT,
         },
         ["statistic"],
     ),
