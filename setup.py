@@ -18,7 +18,7 @@ EXTRAS = {
         f"ros-jazzy-common-interfaces==5.3.6{ROS_WHEELS}",
     ],
     # Writer.flush of mcap came after 1.4; 1.6 is what the tests run with
-    "record": ["mcap>=1.6", "rosbags>=0.11", "ruamel.yaml>=0.17.21", "lz4>=4.0.2", "zstandard>=0.22", "isal>=1.6"],
+    "record": ["mcap>=1.6", "rosbags>=0.11", "lz4>=4.0.2", "zstandard>=0.22", "isal>=1.6"],
     "mqtt": ["paho-mqtt>=1.6"],
     "opcua": ["asyncua>=2.1"],
     "sparkplug": ["paho-mqtt>=1.6", "protobuf>=4.21.12"],

@@ -64,7 +64,6 @@ LIBRARIES = {
     "record": {
         "mcap",
         "rosbags",
-        "ruamel",
         "numba",
         "llvmlite",
         "lz4",

@@ -316,10 +316,7 @@ def test_the_extra_brings_every_library_that_is_imported(monkeypatch: pytest.Mon
     monkeypatch.setattr(setuptools, "setup", declared.update)
     runpy.run_path("setup.py")
     wanted = [*declared["install_requires"], *declared["extras_require"]["record"]]
-    names = {
-        re.split("[^A-Za-z0-9_-]", requirement.replace("ruamel.yaml", "ruamel").replace("PyYAML", "yaml"))[0]
-        for requirement in wanted
-    }
+    names = {re.split("[^A-Za-z0-9_-]", requirement.replace("PyYAML", "yaml"))[0] for requirement in wanted}
     names.add("llvmlite")  # numba requires llvmlite at a fixed version
     names |= {"pandas", "pyarrow"}  # for tables of a recording, only if installed
     assert imported - names - sys.stdlib_module_names - {"plow_twin"} == set()

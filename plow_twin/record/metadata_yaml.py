@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any, Final
 from plow_twin.errors import Problem, RecordingError
 from plow_twin.record.cdr import type_hash
 from plow_twin.record.durable import sync_path
-from plow_twin.scene_file.yaml_text import load_yaml, read_yaml
+from plow_twin.scene_file.yaml_text import dump_yaml, load_yaml, read_yaml
 from plow_twin.stream.topics import TOPICS
 
 METADATA_VERSION: Final = 9
@@ -56,18 +55,7 @@ def offered(reliable: bool, latched: bool, depth: int) -> dict[str, Any]:
 
 def qos_text(base_name: str) -> str:
     """Return the QoS of a topic as the text that a channel of the file carries."""
-    return dump_yaml([qos_profile(base_name)]).strip()
-
-
-def dump_yaml(value: Mapping[str, Any] | Sequence[Any]) -> str:
-    """Return YAML in block style."""
-    from ruamel.yaml import YAML
-
-    yaml = YAML()
-    yaml.default_flow_style = False
-    stream = io.StringIO()
-    yaml.dump(value, stream)
-    return stream.getvalue()
+    return dump_yaml([qos_profile(base_name)], flow=False).strip()
 
 
 @dataclass(frozen=True)
@@ -183,7 +171,7 @@ def missing_files(folder: Path, without: Collection[str] = ()) -> list[str]:
 def write_metadata(folder: Path, metadata: Mapping[str, Any], *, sync: bool = False) -> None:
     """Write `metadata.yaml` in one step; with `sync` wait for the disk."""
     partial = folder / "metadata.yaml.partial"
-    partial.write_text(dump_yaml(metadata), encoding="utf-8")
+    partial.write_text(dump_yaml(metadata, flow=False), encoding="utf-8")
     if sync:
         sync_path(partial)
     partial.replace(folder / "metadata.yaml")

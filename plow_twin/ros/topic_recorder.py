@@ -19,12 +19,13 @@ from rclpy.signals import SignalHandlerOptions
 
 from plow_twin.record.bag import BagWriter, Topic
 from plow_twin.record.cdr import schema_text
-from plow_twin.record.metadata_yaml import dump_yaml, offered
+from plow_twin.record.metadata_yaml import offered
 from plow_twin.record.writer import in_free_folder
 from plow_twin.ros.connections import WithoutEvents
 from plow_twin.ros.input_loop import InputLoop, Turns
 from plow_twin.ros.input_queue import InputQueue, Taken
 from plow_twin.ros.main import make_executor
+from plow_twin.scene_file.yaml_text import dump_yaml
 
 #: Messages that may wait for a slow disk, by topic.
 _DEPTH: Final = 5000
@@ -111,7 +112,9 @@ class TopicRecorder:
                 types[0],
                 schema_of(types[0]),
                 str(publishers[0].topic_type_hash),
-                dump_yaml([offered(*_quality(profile), max(1, profile.depth)) for profile in profiles]).strip(),
+                dump_yaml(
+                    [offered(*_quality(profile), max(1, profile.depth)) for profile in profiles], flow=False
+                ).strip(),
             )
             message_class(types[0])
             with self._turns:

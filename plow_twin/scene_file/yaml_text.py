@@ -175,9 +175,13 @@ def _place(mark: Any) -> str:
     return f"line {mark.line + 1}, column {mark.column + 1}"
 
 
-def dump_yaml(data: Any) -> str:
-    """Return plain data as YAML text, with floats by repr so that reading them gives the same bits."""
-    return yaml.dump(data, Dumper=SceneDumper, sort_keys=False, default_flow_style=None, allow_unicode=True, width=120)
+def dump_yaml(data: Any, *, flow: bool = True) -> str:
+    """Return plain data as YAML text, with floats by repr so that reading them gives the same bits.
+
+    With `flow`, collections of scalars alone stand in brackets.
+    """
+    style = None if flow else False
+    return yaml.dump(data, Dumper=SceneDumper, sort_keys=False, default_flow_style=style, allow_unicode=True, width=120)
 
 
 def _repeated_keys(node: yaml.Node, path: str) -> Iterator[Problem]:
