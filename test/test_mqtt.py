@@ -192,7 +192,7 @@ def test_a_misspelt_topic_of_a_broker_is_no_success(
     arguments = ["live", broker.url, "--map", str(mapping), "--scene", "paper", "--seconds", "1", "--quiet"]
     assert run_cli([*arguments, *access]) == 3
     assert "no sample came on plough/mistaken" in capsys.readouterr().err
-    gc.collect()  # collect here, where the warning about the socket is ignored
+    gc.collect()  # the socket is collected here, where its warning is ignored, and not during another test
 
 
 # paho drops the socket of a failed handshake, and leaves closing it to the garbage collector

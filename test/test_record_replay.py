@@ -292,7 +292,7 @@ def test_digests_do_not_break_a_run_of_samples(run: Run, monkeypatch: pytest.Mon
 
     monkeypatch.setattr(Session, "advance", counted)
     assert replay(run.folder).exit_code == 0
-    # one call warms up; the others process thousands of samples, not just the hundred between two digests
+    # a digest follows every hundred samples, yet a call, after the one that warms up, processes thousands
     assert sum(calls) == COUNT + 2 and len(calls) <= 4
 
 

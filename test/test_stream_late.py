@@ -1,4 +1,4 @@
-"""Late, reordered and batched samples are worked in. Only the wear's own service sets the wear."""
+"""Late, reordered and batched samples act at their stamps. Only the wear's own service sets the wear."""
 
 from __future__ import annotations
 

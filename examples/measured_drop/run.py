@@ -1,4 +1,4 @@
-"""One measured drop of a square, the block of the preset over it, and the band that its first flight leaves open.
+"""Draw a measured drop of a square, the preset's block simulated from the same first flight, and the 90 % band.
 
 Writes a picture and a recording for rerun in which both bodies move over each other.
 """

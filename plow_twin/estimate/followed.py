@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 WINDOW_S, INTERVAL_S = 32.0, 10.0
 #: Definition: nanoseconds of a second.
 _NS: Final = 1e9
-#: Bound: seconds of load that are advanced at once, so that the rows of all members stay in the processor's cache.
+#: Bound: the load is used in parts of so many seconds, so that the rows of all members fit into the processor's cache.
 _PART_S: Final = 0.02
 
 

@@ -136,8 +136,8 @@ class Units:
             return length if name.startswith(("frame.", "corner_", "turn_", "lever_")) else 1.0
 
         scale = (
-            f"the reasons are in units of {length:g} m, {self.mass:g} kg, {time:g} s, because the machine has not the "
-            "paper's size",
+            f"the reasons are in units of {length:g} m, {self.mass:g} kg, {time:g} s, because the machine does not "
+            "have the paper's size",
         )
         return replace(
             found,

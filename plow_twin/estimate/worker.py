@@ -166,7 +166,7 @@ class Worker:
                 return found if found.restarts == self._restarts else None
         except (EOFError, OSError):
             code = self._process.poll()
-            if code is not None:  # otherwise the process is about to end, and the next call gets the code
+            if code is not None:  # None: the process is still ending; the next call gets the code
                 self._fail(f"the estimator ended with code {code}")
         return None
 

@@ -124,9 +124,9 @@ def penetrations_at_centre(scene: Scene) -> NDArray[np.float64]:
 
 
 def _of_places(scene: Scene, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the rows of a place of a head that carries walls, or adapt them to a head that carries corners.
+    """Adapt rows made for a head that carries walls to the scene's head, and return them.
 
-    There R takes the place of R^T, and the head's position has the opposite sign.
+    For a head that carries corners R takes the place of R^T, and the head's position has the opposite sign.
     """
     if scene.head.carries == "corners":
         rows[1:4] *= -1.0

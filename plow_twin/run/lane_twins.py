@@ -85,7 +85,7 @@ class LaneTwins:
             waiting = self._advance_others(len(times), alone) if self._progress[1] else ()
 
     def _advance_others(self, count: int, alone: Callable[[int, int], None]) -> list[int]:
-        """Advance each of the other twins once; return the twins that have not done all `count` advances."""
+        """Advance the twins that have no lane once each; return those that have not reached all `count` times."""
         others: list[int] = self._other[: self._progress[1]].tolist()
         for member in others:
             alone(member, int(self._place[member]))

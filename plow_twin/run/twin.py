@@ -214,7 +214,7 @@ class Twin:
         Raises
         ------
         ArgumentError
-            As for `advance`; nothing has changed.
+            As for `advance`; the twin is left unchanged.
         """
         if self.excitation != "sampled":
             raise ArgumentError("advance_samples: got excitation='scene', expected excitation='sampled'")
@@ -251,7 +251,7 @@ class Twin:
         Raises
         ------
         ArgumentError
-            As for `advance`; nothing has changed.
+            As for `advance`; the twin is left unchanged.
         """
         sampled, count, with_rows = self.excitation == "sampled", len(t), rows is not None
         t, wrench = np.ascontiguousarray(t, np.float64), np.ascontiguousarray(wrench, np.float64)

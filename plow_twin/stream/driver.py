@@ -116,7 +116,7 @@ class Driver:
         #: model time up to which the real-time factor has counted [ns]
         self._counted_ns: int | None = None
         self._zeroed = False
-        #: time spent inactive [ns], by which the stamps of the scene's own loads are behind the clock
+        #: time spent inactive [ns]: the stamps of the scene's own loads lag behind the clock by it
         self._behind_ns = 0
         self._resumed = False
 

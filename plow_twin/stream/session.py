@@ -590,7 +590,7 @@ class Session:
     def _rewind(self, stamp_ns: int, *more: Travel) -> list[Sample]:
         """Go back to the newest snapshot before `stamp_ns`; return the samples after the snapshot.
 
-        The speeds after the snapshot, and the speeds `more`, wait again.
+        The speeds after the snapshot, and the speeds `more`, become pending again.
         """
         data, samples, travels = self.history.rewind(stamp_ns)
         advances, pending, slow = self._advances, self._travels, self.outputs.slow_before

@@ -303,7 +303,7 @@ class OpcUa(SourceState):
         return False
 
     async def _read_history(self, ends_ns: Mapping[int, int]) -> None:
-        """Read the history in pieces, until each node has a value at its end."""
+        """Read the history in pieces, until each node has a value as new as its time in `ends_ns`."""
         end_ns = max(ends_ns.values(), default=time.time_ns())
         reached_ns, found = 0, 0
         give_up = time.monotonic() + _HISTORY_LAG_S

@@ -56,7 +56,7 @@ class Samples:
         self._waiting[stamp_ns][1].setdefault(node, value)
 
     def add_stray(self, node: str, stamp_ns: int, value: Value, now_s: float) -> None:
-        """Add a value with an impossible stamp: its sample is passed on and changes nothing else."""
+        """Add a value with an impossible stamp; its sample is passed on alone, for the intake to count."""
         self._strays.setdefault(stamp_ns, (now_s, {}))[1].setdefault(node, value)
 
     def begin(self, node: str, stamp_ns: int, value: Value) -> None:
