@@ -104,17 +104,19 @@ def test_the_vertical_clearance_of_a_head_that_never_moves_sideways_is_estimated
 
 @pytest.mark.parametrize("seed", [pytest.param(43202, marks=pytest.mark.stress), 43210])
 def test_intervals_hold_between_soft_and_hard_contacts(seed: int) -> None:
-    # one of these contacts was once taken for a hard one, and the fit of the other did not converge
+    """The first contact is estimated like a hard one, whose interval also allows for the frame: this frame is exact."""
     truth = draw(GROUPS["middle"], seed)
     result = estimate(truth.nominal, truth.load, truth.poses)
-    for value, state, true in zip(
-        (result.horizontal, result.vertical),
+    values = result.horizontal, result.vertical
+    for value, exact, state, true in zip(
+        values,
+        result.apparent or values,
         (result.horizontal_state, result.vertical_state),
         truth.clearance,
         strict=True,
     ):
-        assert state is State.ESTIMATED
-        assert abs(value.mean - true) < 2.0 * value.deviation and value.deviation < 2e-4
+        assert state is State.ESTIMATED and value.p05 < true < value.p95
+        assert abs(exact.mean - true) < 2.0 * exact.deviation and exact.deviation < 2e-4
 
 
 def test_another_law_of_a_soft_contact_is_found_where_residuals_hardly_repeat() -> None:
@@ -213,13 +215,13 @@ def test_without_measurements_the_prior_is_returned() -> None:
 
 
 def test_poses_too_sparse_for_a_fit_are_refused() -> None:
-    """At 5 Hz, or 1.5 % of 200 Hz, the start of a swing is undetermined, and a fit would be wrong and narrow."""
+    """At 5 Hz, 1.5 % of 200 Hz or 10 % of 100 Hz, swings begin anywhere, and a fit would be wrong and narrow."""
     nominal = preset("paper")
     load, _ = Load.of([0.0, 20.0], np.ones((2, 3)))
     rng = np.random.default_rng(1)
-    rare, some = np.arange(0.0, 20.0, 0.2), np.arange(0.0, 20.0, 0.005)
-    q = np.where(rng.random((len(some), 3)) < 0.015, 0.0, np.nan)
-    for t, rows in ((rare, np.zeros((len(rare), 3))), (some, q)):
+    rare, some, more = np.arange(0.0, 20.0, 0.2), np.arange(0.0, 20.0, 0.005), np.arange(0.0, 20.0, 0.01)
+    sparse = [(t, np.where(rng.random((len(t), 3)) < share, 0.0, np.nan)) for t, share in ((some, 0.015), (more, 0.1))]
+    for t, rows in ((rare, np.zeros((len(rare), 3))), *sparse):
         poses, _ = Poses.of(t, rows)
         result = estimate(nominal, load, poses)
         assert result.horizontal_state is result.vertical_state is State.NOT_OBSERVABLE
@@ -227,13 +229,11 @@ def test_poses_too_sparse_for_a_fit_are_refused() -> None:
 
 
 @pytest.mark.stress
-@pytest.mark.parametrize("what", ["nine of ten components missing", "noise of 5 mm"])
-def test_sparse_or_noisy_poses_give_no_narrow_interval_beside_the_truth(what: str) -> None:
-    noisy = replace(GROUPS["plain"], periods=6.0, noise_m=5e-3 if what == "noise of 5 mm" else 5e-4)
-    truth = draw(noisy, 2)
+@pytest.mark.parametrize(("missing", "noise_m"), [(0.9, 5e-4), (0.85, 5e-4), (0.0, 5e-3)])
+def test_sparse_or_noisy_poses_give_no_narrow_interval_beside_the_truth(missing: float, noise_m: float) -> None:
+    truth = draw(replace(GROUPS["plain"], periods=6.0, noise_m=noise_m), 2)
     q = truth.poses.q.copy()
-    if what != "noise of 5 mm":
-        q[np.random.default_rng(2).random(q.shape) < 0.9] = np.nan
+    q[np.random.default_rng(2).random(q.shape) < missing] = np.nan
     poses, _ = Poses.of(truth.poses.t, q)
     result = estimate(truth.nominal, truth.load, poses)
     for value, state, true in zip(

@@ -846,8 +846,12 @@ def _lacking(poses: Poses) -> tuple[str, ...]:
         for name, count in zip(COMPONENTS, counts, strict=True)
         if count < FEWEST_POSES
     )
-    if not lacking and poses.interval() > tuning.SPARSEST:
-        lacking = (f"poses: got {1.0 / poses.interval():.1f} a second, expected at least {1.0 / tuning.SPARSEST:.1f}",)
+    if lacking:
+        return lacking
+    # a flight in a long gap is not seen, however dense the values around it are
+    apart = max(poses.interval(), poses.gap())
+    if apart > tuning.SPARSEST:
+        lacking = (f"poses: got {1.0 / apart:.1f} a second, expected at least {1.0 / tuning.SPARSEST:.1f}",)
     return lacking
 
 

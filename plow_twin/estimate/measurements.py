@@ -79,6 +79,11 @@ class Poses:
         measured = int(np.isfinite(self.q).sum())
         return float(np.median(np.diff(self.t))) * self.q.size / max(measured, 1)
 
+    def gap(self) -> float:
+        """Return the gap in s between measured values that half of all moments lie in or below, over all components."""
+        gaps = np.sort(np.concatenate([np.diff(self.t[np.isfinite(column)]) for column in self.q.T]))
+        return float(gaps[np.searchsorted(gaps.cumsum(), 0.5 * gaps.sum())])
+
     def between(self, start: float, end: float) -> Poses:
         """Return the poses stamped in [start, end)."""
         inside = (self.t >= start) & (self.t < end)
