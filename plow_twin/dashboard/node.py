@@ -82,6 +82,7 @@ class NodeWatch:
             for service in ("acknowledge_alarms", "mark")
         }
         self.feed: Feed | None = None
+        self._source: str | None = None
         waited = 0.0
         while not self._ask.service_is_ready():
             if waited >= wait_s or stopped():
@@ -93,15 +94,26 @@ class NodeWatch:
         """Process messages that have arrived, waiting a little."""
         self._executor.spin_once(timeout_sec=0.1)
 
-    def parameters(self) -> dict[str, Any]:
-        """Return the node's parameters that are shown."""
+    def facts(self, scene: str | None) -> dict[str, Any]:
+        """Return the facts of the node; `scene` replaces the node's scene where its name cannot be read here.
+
+        Raises
+        ------
+        DashboardError
+            The node does not answer.
+        SceneError
+            The scene cannot be read.
+        """
         answer = self._called(self._ask, GetParameters.Request(names=list(_SHOWN)))
         if answer is None:
             raise DashboardError("--ros", self.name, f"an answer within {_PATIENCE_S:g} s")
         values = map(parameter_value_to_python, answer.values)
-        return {name: value for name, value in zip(_SHOWN, values, strict=False) if value is not None}
+        parameters = {name: value for name, value in zip(_SHOWN, values, strict=False) if value is not None}
+        self._source = parameters.get("excitation_source")
+        found = load_scene(scene_path(scene or str(parameters.get("scene", ""))))
+        return facts_of(found, parameters, f"node {self.name}")
 
-    def listen(self, feed: Feed, source: str) -> None:
+    def listen(self, feed: Feed) -> None:
         """Pass messages from now on to a feed."""
         self.feed = feed
         best_effort = partial(QoSProfile, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -115,7 +127,7 @@ class NodeWatch:
             self._subscribe(JointState, topic, OUTPUTS[topic], partial(self._said, topic))
         for topic in names_of(Cadence.CHANGE):
             self._subscribe(DiagnosticStatus, topic, OUTPUTS[topic], partial(self._said, topic))
-        if source == "excitation":
+        if self._source == "excitation":
             self.node.create_subscription(WrenchStamped, "excitation", self._load, sensor_input(_ALL), raw=True)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._diagnostics, DIAGNOSTICS)
 
@@ -223,10 +235,8 @@ def show_node(
     with ExitStack() as opened:
         opened.enter_context(ros())
         watch = opened.enter_context(closing(NodeWatch(namespace, name, wait_s, stopped)))
-        parameters = watch.parameters()
-        found = load_scene(scene_path(scene or str(parameters.get("scene", ""))))
-        with Screen(access, facts_of(found, parameters, f"node {watch.name}"), watch.answer) as screen:
-            watch.listen(screen.feed, str(parameters.get("excitation_source", "")))
+        with Screen(access, watch.facts(scene), watch.answer) as screen:
+            watch.listen(screen.feed)
             on_open(screen)
             timer = Timer(1.0 / RATE_HZ, screen.feed.turn)
             while not (stopped() or screen.has_ended):

@@ -5,11 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 
-from plow_twin.dashboard.facts import facts_of
 from plow_twin.dashboard.node import NodeWatch, ros
 from plow_twin.live.timer import Timer
-from plow_twin.scene_file import load_scene
-from plow_twin.scene_file.presets import scene_path
 from plow_twin.telemetry.access import WayOut
 from plow_twin.telemetry.outlet import Outlet
 
@@ -58,12 +55,9 @@ def send_node(
         timers = []
         for way in ways:
             watch = opened.enter_context(closing(NodeWatch(namespace, name, wait_s, stopped)))
-            parameters = watch.parameters()
-            found = load_scene(scene_path(scene or str(parameters.get("scene", ""))))
-            facts = facts_of(found, parameters, f"node {watch.name}")
             answer = watch.answer if way.may_acknowledge else None
-            outlet = opened.enter_context(Outlet(way, facts, answer, on_error))
-            watch.listen(outlet.feed, str(parameters.get("excitation_source", "")))
+            outlet = opened.enter_context(Outlet(way, watch.facts(scene), answer, on_error))
+            watch.listen(outlet.feed)
             listeners.append((watch, outlet))
             timers.append(Timer(1.0 / rate_hz, outlet.turn))
         while not stopped() and any(not outlet.link.broken for _, outlet in listeners):

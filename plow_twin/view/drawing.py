@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 import rerun as rr
+import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import Scene
 from plow_twin.record.alarms import ALARMS
 from plow_twin.record.entries import Batch, Entries, Holes
-from plow_twin.record.header import RunHeader
 from plow_twin.record.messages import DiagnosticStatus
 from plow_twin.record.outputs import publication_templates
 from plow_twin.record.reader import FileStatus, RunReader
@@ -27,7 +27,7 @@ from plow_twin.view.columns import Array, Batches, Curves, Indexes, TimeAxis, bu
 from plow_twin.view.contact_sets import ContactSets, masks_of, set_color
 from plow_twin.view.events import Events
 from plow_twin.view.face import FaceChart
-from plow_twin.view.figures import signed
+from plow_twin.view.figures import scene_and_date, signed
 from plow_twin.view.residuals import Residuals
 from plow_twin.view.section import ARROW_MM_PER_N, LABEL_MM, LOAD_COLOR, PAIR_COLORS, Section
 from plow_twin.view.what_if import WhatIf
@@ -50,19 +50,23 @@ _BAND_ROWS: Final = 10
 _FACE_NS: Final = 1_000_000_000
 
 
+#: Receives the stream and its blueprint.
+Sink = Callable[[rr.RecordingStream, rrb.Blueprint], object]
+
+
 class Drawing:
     """Draws batches of a recording into a stream of the viewer.
 
     Parameters
     ----------
-    stream
-        Stream of the viewer.
-    header, scene, source
-        Header, scene and path of the recording.
+    reader
+        Reader of the recording.
+    sink
+        Receives the stream and its blueprint, before anything is drawn.
     section_hz
         Rate of the cross-section [Hz].
     exaggerate
-        Factor of the width of the clearance in the second cross-section.
+        Factor of the width of the clearance in the second cross-section; None: chosen by its size.
     span_ns
         Span of stamps in which a curve keeps its least and largest value [ns]; 0: it keeps every row.
     others
@@ -71,18 +75,21 @@ class Drawing:
 
     def __init__(
         self,
-        stream: rr.RecordingStream,
-        header: RunHeader,
-        scene: Scene,
-        source: Path,
+        reader: RunReader,
+        sink: Sink,
         *,
         section_hz: float,
-        exaggerate: float,
+        exaggerate: float | None,
         span_ns: int,
         others: Mapping[str, Scene] | None = None,
     ) -> None:
-        self.stream, self.header, self.section = stream, header, Section.of(scene)
-        self._exaggerate, self.section_hz = exaggerate, section_hz
+        self.header = header = reader.header
+        scene = header.scene(reader.path)
+        self.stream = stream = rr.RecordingStream("plow_twin")
+        self.section = Section.of(scene)
+        self._exaggerate, self.section_hz = exaggerate or self.section.exaggeration(), section_hz
+        follows, title = header.follow == "full", scene_and_date(reader)
+        sink(stream, layout.blueprint(self.section, self._exaggerate, bool(others), follows, title=title))
         self._axis = axis = TimeAxis()
         self.force = Curves(stream, axis, layout.FORCE, span_ns)
         self.force_at_stamp = Curves(stream, axis, layout.FORCE_AT_STAMP, span_ns)
@@ -126,7 +133,7 @@ class Drawing:
         self._scene = scene
         self._templates = publication_templates(header.frame_id, header.child_frame_id)
         self._topics = {header.topic(name): name for name in self._templates}
-        self._draw_still(scene, source)
+        self._draw_still(scene, reader.path)
 
     @property
     def first_ns(self) -> int:

@@ -10,26 +10,17 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Final
 
-import rerun as rr
-import rerun.blueprint as rrb
-
 from plow_twin.model.scene import Scene
 from plow_twin.record.follow import Tail
 from plow_twin.record.reader import RunReader
-from plow_twin.view import layout
-from plow_twin.view.drawing import Drawing
-from plow_twin.view.figures import scene_and_date
+from plow_twin.view.drawing import Drawing, Sink
 from plow_twin.view.rrd import ViewSummary
-from plow_twin.view.section import Section
 
 #: Rate of the spans in which a curve keeps two values [Hz]: an hour of all curves takes some 200 MB in the viewer.
 CURVE_HZ: Final = 25.0
 #: Rates of the cross-section [Hz]: live, and for the part that was recorded before the view started.
 SECTION_HZ: Final = 20.0
 _SECTION_HZ_BEFORE: Final = 1.0
-
-#: Receives the stream and its blueprint.
-Sink = Callable[[rr.RecordingStream, rrb.Blueprint], object]
 
 
 def follow(
@@ -48,24 +39,8 @@ def follow(
         The file is not a recording.
     """
     reader = RunReader(path, Tail(stop))
-    scene = reader.header.scene(reader.path)
-    wide = exaggerate or Section.of(scene).exaggeration()
-    stream = rr.RecordingStream("plow_twin")
-    sink(
-        stream,
-        layout.blueprint(
-            Section.of(scene), wide, bool(others), reader.header.follow == "full", title=scene_and_date(reader)
-        ),
-    )
     drawing = Drawing(
-        stream,
-        reader.header,
-        scene,
-        reader.path,
-        section_hz=_SECTION_HZ_BEFORE,
-        exaggerate=wide,
-        span_ns=round(1e9 / CURVE_HZ),
-        others=others,
+        reader, sink, section_hz=_SECTION_HZ_BEFORE, exaggerate=exaggerate, span_ns=round(1e9 / CURVE_HZ), others=others
     )
     for batch in reader.batches():
         if len(batch.entries) or batch.outputs:
@@ -73,8 +48,8 @@ def follow(
         else:  # all that is recorded so far
             drawing.section_hz = SECTION_HZ
             drawing.flush()
-            stream.flush()
+            drawing.stream.flush()
     drawing.finish(reader)
-    stream.flush()
-    stream.disconnect()
+    drawing.stream.flush()
+    drawing.stream.disconnect()
     return ViewSummary.of(reader.path, drawing, reader)

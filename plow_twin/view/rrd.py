@@ -7,15 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-import rerun as rr
-
 from plow_twin.model.scene import Scene
 from plow_twin.record.reader import FileStatus, RunReader
-from plow_twin.view import layout
 from plow_twin.view.drawing import Drawing
-from plow_twin.view.figures import scene_and_date
 from plow_twin.view.rrd_file import RrdFile
-from plow_twin.view.section import Section
 
 #: Largest number of rows of a curve that is not thinned.
 MOST_ROWS: Final = 200_000
@@ -97,24 +92,13 @@ def to_rrd(
         The file is not a recording, or `out` cannot be written.
     """
     reader = RunReader(Path(path))
-    scene = reader.header.scene(reader.path)
-    wide = exaggerate or Section.of(scene).exaggeration()
-    stream = rr.RecordingStream("plow_twin")
     duration_s = reader.duration_s()
     with RrdFile(out) as file:
-        file.attach(
-            stream,
-            layout.blueprint(
-                Section.of(scene), wide, bool(others), reader.header.follow == "full", title=scene_and_date(reader)
-            ),
-        )
         drawing = Drawing(
-            stream,
-            reader.header,
-            scene,
-            reader.path,
+            reader,
+            file.attach,
             section_hz=min(section_hz, max(1.0, 0.05 * most_rows / max(duration_s, 1e-9))),
-            exaggerate=wide,
+            exaggerate=exaggerate,
             span_ns=_span_ns(reader, duration_s, most_rows),
             others=others,
         )

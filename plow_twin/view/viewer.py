@@ -7,7 +7,6 @@ import shutil
 import socket
 import subprocess
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -59,7 +58,7 @@ class Viewer:
         self.process.wait()
 
 
-def start_viewer(*, web_port: int | None = None, options: Sequence[str] = ()) -> Viewer:
+def start_viewer(*, web_port: int | None = None) -> Viewer:
     """Start a viewer on the loopback address: a page on `web_port`, or a window.
 
     Raises
@@ -68,7 +67,7 @@ def start_viewer(*, web_port: int | None = None, options: Sequence[str] = ()) ->
         The viewer is not installed or does not answer.
     """
     port, web_port = free_port(), None if web_port is None else page_port(web_port)
-    command = [viewer_program(), "--bind", LOOPBACK, "--port", str(port), "--memory-limit", _MEMORY, *options]
+    command = [viewer_program(), "--bind", LOOPBACK, "--port", str(port), "--memory-limit", _MEMORY]
     if web_port is not None:
         command += ["--serve-web", "--web-viewer-port", str(web_port), "--server-memory-limit", _MEMORY]
     bound = shutil.which("setpriv")
