@@ -6,7 +6,6 @@ import os
 import shutil
 from pathlib import Path
 from threading import Thread
-from types import TracebackType
 from typing import Final, Self
 
 import rerun as rr
@@ -50,16 +49,14 @@ class RrdFile:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, *_: object) -> None:
         if self._stream is not None:
             self._stream.disconnect()
         os.close(self._inlet)
         self._writer.join()
-        if (error is not None or self.failed) and self.path.is_file():  # not a device
+        if (kind is not None or self.failed) and self.path.is_file():  # not a device
             self.path.unlink()
-        if error is None:
+        if kind is None:
             self.check()
 
     def attach(self, stream: rr.RecordingStream, blueprint: rrb.Blueprint) -> None:
