@@ -279,12 +279,12 @@ def test_other_pads_and_other_model_numbers_discard_earlier_estimates(
         found = _found(State.ESTIMATED, State.ESTIMATED)
         suspect = replace(found.estimate, model="suspect", reasons=("why",))
         found = replace(found, estimate=suspect, also={"forecast": {"p50": {"hours": 3.0}}})
-        estimation._worker.found.append(found)
+        estimation.worker.found.append(found)
         return estimation.poll(session)
 
     assert told()["forecast"].name == ("seconds/p50",)
     # an estimate of the previous machine is being computed
-    estimation._worker.found.append(_found(State.ESTIMATED, State.ESTIMATED))
+    estimation.worker.found.append(_found(State.ESTIMATED, State.ESTIMATED))
     session.apply(SetModel(START_NS, json.dumps({"clearance.horizontal_m": 0.026})))
     # the clearance is the model's again, because no estimate is kept beside a clearance that is not observable
     assert estimation.entry is None and set(estimation.states.values()) == {State.PRIOR}

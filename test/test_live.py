@@ -696,10 +696,10 @@ def test_nothing_lives_longer_than_the_time_remembered_but_the_index_of_the_reco
         if index and index % 8000 == 0:
             recording = front.runtime.recording
             assert recording is not None
-            while recording.counters.queued:
+            while recording.recorder.counters.queued:
                 time.sleep(0.01)
             gc.collect()
-            writer = recording._recorder._writer
+            writer = recording.recorder._writer
             assert isinstance(writer, RunWriter)
             index_bytes = len(writer._part.file._chunk_index)
             found.append((len(gc.get_objects()), tracemalloc.get_traced_memory()[0] - index_bytes, index_bytes))

@@ -86,7 +86,7 @@ class Mixed:
         self.publishing = Publishing(self.front, self.settings, self.alarms, self.recording, lambda text: None)
         bound = self.settings.max_evaluations or None
         twin = Twin(SCENE, tol=self.settings.tolerance, excitation="sampled", max_evaluations=bound)
-        session = Session(twin, on_entry=self.recording.journal, rollback_span_s=self.settings.rollback_span)
+        session = Session(twin, on_entry=self.recording.recorder.journal, rollback_span_s=self.settings.rollback_span)
         intake = Intake(jump_back_s=60.0)  # without limits, an advance may fail
         every_sample = self.settings.publish_mode == "on_sample"
         self.driver = Driver(session, intake, policy(self.settings), every_sample=every_sample)
@@ -115,8 +115,8 @@ class Mixed:
 
     def replayed(self) -> ReplayReport:
         self.driver.close()
-        self.recording.close()
-        return replay(self.recording.path)
+        self.recording.recorder.close()
+        return replay(self.recording.recorder.path)
 
 
 def _at(ms: float, load: tuple[float, float, float]) -> Arrival:

@@ -201,11 +201,12 @@ def test_a_ring_that_the_disk_does_not_take_is_trouble_and_counted(
         assert node.start() and node._front is not None
         runtime = node._front.runtime
         assert runtime.recording is not None
+        recorder = runtime.recording.recorder
 
         def mark(written: int, lost: int) -> None:
             assert node._front is not None and node._front.answer("mark")[0]
             give_up = time.monotonic() + 60.0
-            while (counted := runtime.recording.counters) and (counted.marks, counted.marks_lost) != (written, lost):  # type: ignore[union-attr]
+            while (counted := recorder.counters) and (counted.marks, counted.marks_lost) != (written, lost):
                 assert time.monotonic() < give_up
                 time.sleep(0.01)
 
@@ -217,7 +218,7 @@ def test_a_ring_that_the_disk_does_not_take_is_trouble_and_counted(
         mark(1, 1)
         reader = RunReader(folder)
         assert list(reader) and reader.status is FileStatus.COMPLETE
-        assert not runtime.recording.close().complete
+        assert not recorder.close().complete
 
 
 def test_a_pose_and_its_negative_quaternion_give_the_same_residual() -> None:

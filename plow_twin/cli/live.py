@@ -163,8 +163,8 @@ def _say_what_differs(front: BridgeFront, settings: Settings) -> None:
     from plow_twin.record.unit_check import small_thresholds
 
     recording = front.runtime.recording
-    if recording is not None and recording.path.parent != Path(settings.record_path):
-        say_error(f"plow-twin: {settings.record_path} is not empty: the recording goes to {recording.path.parent}")
+    if recording is not None and (folder := recording.recorder.path.parent) != Path(settings.record_path):
+        say_error(f"plow-twin: {settings.record_path} is not empty: the recording goes to {folder}")
     doubt = small_thresholds(settings.alarm_force, front.runtime.scene)
     if doubt:
         say_error(f"plow-twin: {doubt}")

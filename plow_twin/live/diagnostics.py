@@ -219,7 +219,7 @@ def summary(lifecycle: str, reason: str, runtime: Runtime | None, preparing: boo
         (ERROR, runtime.unsteady, "the stamps jump again and again: samples are dropped"),
         (ERROR, values["recorder"] == "trouble", "the recording has lost data or has stopped"),
         (ERROR, bool(keeper and keeper.error), keeper.error if keeper else ""),
-        (WARN, estimation is not None and bool(estimation.error), estimation.error if estimation else ""),
+        (WARN, estimation is not None and bool(estimation.worker.error), estimation.worker.error if estimation else ""),
         (
             WARN,
             estimation is not None and bool(estimation.reasons),
@@ -384,17 +384,17 @@ class Health:
             return OK, "not estimating", values
         age_s = runtime.estimate_age_s()
         values |= {
-            "ready": str(int(found.ready)),
+            "ready": str(int(found.worker.ready)),
             "estimates": str(found.count),
             "skipped": str(found.skipped),
             "window_age_s": "" if age_s is None else f"{age_s:.3f}",
             "wall_s": f"{found.wall_s:.3f}" if found.count else "",
             "reasons": "; ".join(found.reasons),
-            "error": found.error,
+            "error": found.worker.error,
         }
-        trouble = found.error or values["reasons"]
-        doing = "estimating" if found.ready else "compiling the estimator"
-        return (ERROR if found.error else WARN if trouble else OK), trouble or doing, values
+        trouble = found.worker.error or values["reasons"]
+        doing = "estimating" if found.worker.ready else "compiling the estimator"
+        return (ERROR if found.worker.error else WARN if trouble else OK), trouble or doing, values
 
     def follow(self, runtime: Runtime) -> Part:
         """Return how the twin follows the machine, as a part of the diagnostics."""
@@ -424,9 +424,9 @@ class Health:
         values = dict.fromkeys(KEYS["recorder"], "")
         if runtime.recording is None:
             return OK, "not recording", values
-        found = runtime.recording.counters
+        found = runtime.recording.recorder.counters
         values |= {
-            "recording": str(runtime.recording.path),
+            "recording": str(runtime.recording.recorder.path),
             "written": str(found.written),
             "queued": str(found.queued),
             "lost": ", ".join(f"{topic}: {count}" for topic, count in sorted(found.lost.items())),

@@ -48,7 +48,7 @@ class Estimation:
         span = (settings.estimate_window, settings.estimate_interval, settings.rollback_span)
         windows = Windows(*span, settings.head_pose_deviation, settings.excitation_deviation, settings.gaps_deviation)
         asked = asked_of(settings)
-        self._worker = Worker(scene, windows, asked)
+        self.worker = Worker(scene, windows, asked)
         sent = {ESTIMATE: True, WINDOW_FORCES: bool(asked.members), FORECAST: asked.plan is not None}
         self._topics = [topic for topic, wanted in sent.items() if wanted]
         #: time at which other pads were set, until an empty message has been sent [ns]
@@ -68,73 +68,54 @@ class Estimation:
         self.entry: Estimated | None = None
 
     @property
-    def error(self) -> str:
-        """Reason why the estimation has ended; empty: it continues."""
-        return self._worker.error
-
-    @property
-    def ready(self) -> bool:
-        """Whether the estimator is compiled; until then data wait."""
-        return self._worker.ready
-
-    def finish(self) -> None:
-        """Let the last window be estimated: the source has ended."""
-        self._worker.finish()
-
-    @property
     def done(self) -> bool:
         """Whether the estimation is over: the last window is done, or the process has failed."""
-        return self._worker.ended is not None or bool(self.error)
+        return self.worker.ended is not None or bool(self.worker.error)
 
     @property
     def shortage(self) -> str:
         """Why no estimate was made; empty: an estimate was made, or the source has not ended."""
-        return "" if self.count else self._worker.ended or ""
-
-    @property
-    def behind(self) -> bool:
-        """Whether much data waits for the estimate."""
-        return self._worker.behind
+        return "" if self.count else self.worker.ended or ""
 
     def add(self, entry: Entry) -> None:
         """Pass an entry that the session has accepted to the estimate."""
         match entry:
             case Sample(stamp_ns, wrench):
-                self._worker.add_load(stamp_ns, wrench)
+                self.worker.add_load(stamp_ns, wrench)
             case Pose(stamp_ns, pose, deviation):
-                self._worker.add_pose(stamp_ns, pose, deviation)
+                self.worker.add_pose(stamp_ns, pose, deviation)
             case PartOfPose(stamp_ns) as part:
-                self._worker.add_pose(stamp_ns, whole_pose(part))
+                self.worker.add_pose(stamp_ns, whole_pose(part))
             case Gaps(stamp_ns, pairs, gaps):
-                self._worker.add_gaps(stamp_ns, pairs, gaps)
+                self.worker.add_gaps(stamp_ns, pairs, gaps)
             case Spread(_, deviation):
-                self._worker.set_load_deviation(deviation)
+                self.worker.set_load_deviation(deviation)
             case SetWear(stamp_ns):
-                self._worker.restart()
+                self.worker.restart()
                 self._forget()
                 self._set_ns, self.end_ns = stamp_ns, None
                 self.trust, self.reasons = dict.fromkeys(self.trust, ""), ()
                 self.forecast, self.forecast_error = None, "nothing has been estimated since the pads were set"
             case SetModel():
                 # the clearances have been replaced, so an older estimate no longer applies
-                self._worker.restart()
+                self.worker.restart()
                 self._forget()
             case Reset():
-                self._worker.restart()
+                self.worker.restart()
                 if self._follows:
                     self._forget()
 
     def add_series(self, series: Series) -> None:
         """Pass samples that were applied together to the estimate."""
         for stamp_ns, wrench in zip(series.stamps.tolist(), series.wrench.tolist(), strict=True):
-            self._worker.add_load(stamp_ns, tuple(wrench))
+            self.worker.add_load(stamp_ns, tuple(wrench))
 
     def poll(self, session: Session) -> dict[str, plain.JointState]:
         """Pass a finished estimate to the session and return its messages by topic, empty without an estimate.
 
         After other pads have been set, empty messages replace the latched ones.
         """
-        found = self._worker.poll()
+        found = self.worker.poll()
         stamp_ns, self._set_ns = self._set_ns, None
         if found is None:
             topics = self._topics if stamp_ns is not None else ()
@@ -160,10 +141,6 @@ class Estimation:
         """Return to the model's clearances."""
         self.entry = None
         self.states = dict.fromkeys(self.states, State.PRIOR)
-
-    def close(self) -> None:
-        """End the process."""
-        self._worker.close()
 
 
 def entry_of(found: Found, session: Session, before: Estimated | None) -> Estimated:

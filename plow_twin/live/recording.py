@@ -17,10 +17,9 @@ from plow_twin.record.decimation import Decimation
 from plow_twin.record.header import RunHeader
 from plow_twin.record.messages import Message
 from plow_twin.record.outputs import marks
-from plow_twin.record.recorder import LossReport, Recorder, RecorderCounters
+from plow_twin.record.recorder import Recorder
 from plow_twin.record.writer import in_free_folder
 from plow_twin.scene_file import dump_scene
-from plow_twin.stream.journal import Entry
 from plow_twin.stream.outputs import Published
 from plow_twin.stream.session import Series, Session
 
@@ -81,25 +80,13 @@ class Recording:
         )
         #: for each sample of the newest series, the number of the journal entry before its publication
         self._series = np.zeros(0, np.int64)
-        self._recorder = in_free_folder(Path(settings.record_path), make)
-        #: takes a journal entry; a loss is counted by the recorder
-        self.journal: Callable[[Entry], bool] = self._recorder.journal
-
-    @property
-    def path(self) -> Path:
-        """The file being written."""
-        return self._recorder.path
-
-    @property
-    def counters(self) -> RecorderCounters:
-        """Counters as of now."""
-        return self._recorder.counters
+        self.recorder = in_free_folder(Path(settings.record_path), make)
 
     def publication(self, published: Published, sent: Mapping[str, bytes]) -> None:
         """Take the messages of a sent publication; `sent`: their bytes, if any."""
         wanted = self._decimation.select(published)
         if wanted is not None:
-            self._recorder.publication(wanted, sent if wanted is published else {})
+            self.recorder.publication(wanted, sent if wanted is published else {})
         if published.rows["marked"][0] and not (sent and wanted is published):
             stamp_ns = int(published.rows["stamp_ns"][0])
             for topic, message in marks(published, self._frame_id).items():
@@ -107,43 +94,30 @@ class Recording:
 
     def series(self, series: Series) -> None:
         """Take the journal of samples that were applied together."""
-        self._series = self._recorder.series(series)
+        self._series = self.recorder.series(series)
 
     def publications(self, published: Published) -> None:
         """Take the publications after each sample of the newest series."""
         if self._decimation.keeps_all:
-            self._recorder.publications(published, self._series)
+            self.recorder.publications(published, self._series)
             return
         for number, sequence in enumerate(self._series.tolist()):
             wanted = self._decimation.select(published.at(number))
             if wanted is not None:
-                self._recorder.publications(wanted, np.array([sequence]))
+                self.recorder.publications(wanted, np.array([sequence]))
 
     def message(self, topic: str, stamp_ns: int, message: Message) -> None:
         """Take another message that was sent on the topic with a base name."""
-        self._recorder.output(self._topics[topic], stamp_ns, message)
+        self.recorder.output(self._topics[topic], stamp_ns, message)
 
     @property
     def behind(self) -> bool:
         """Whether so much is queued that losses are near."""
-        return self._recorder.counters.queued > _QUEUE_SIZE // 2
-
-    @property
-    def wants_snapshot(self) -> bool:
-        """Whether `renew` has something to do."""
-        return self._recorder.snapshot_wanted
+        return self.recorder.counters.queued > _QUEUE_SIZE // 2
 
     def renew(self, session: Session) -> bool:
         """Journal a snapshot when entries were lost and there is room again; return whether it was journalled."""
-        wanted = self._recorder.snapshot_wanted
+        wanted = self.recorder.snapshot_wanted
         if wanted:
-            self._recorder.journal(session.renew())
+            self.recorder.journal(session.renew())
         return wanted
-
-    def mark(self) -> Path | None:
-        """Write the ring and return its folder; None if everything is recorded."""
-        return self._recorder.mark()
-
-    def close(self) -> LossReport:
-        """Write the queue and close the file."""
-        return self._recorder.close()

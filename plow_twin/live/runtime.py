@@ -118,7 +118,7 @@ class Runtime:
                     front.say_error(f"{settings.wear_state_path}: the file is older than the wear of this process")
             self.recording = self._record()
             if self.recording:
-                made.callback(self.recording.close)
+                made.callback(self.recording.recorder.close)
             self.estimation = self._estimate()
             made.pop_all()
         session = Session(
@@ -195,7 +195,7 @@ class Runtime:
         """`off`, `recording`, or `trouble`: something was lost or it has stopped."""
         if self.recording is None:
             return "off"
-        found = self.recording.counters
+        found = self.recording.recorder.counters
         return "trouble" if found.error or found.lost else "recording"
 
     def residual(self) -> tuple[float, float, float] | None:
@@ -236,7 +236,7 @@ class Runtime:
         self.driver.mark(self.stamp_ns, text)
         if self.recording is None:
             return False, "nothing is recorded"
-        folder = self.recording.mark()
+        folder = self.recording.recorder.mark()
         if folder is None:
             return True, "noted in the recording"
         self._renew_recording()
@@ -265,14 +265,14 @@ class Runtime:
         self.deactivate()
         lost = []
         if self.estimation:
-            lost += [self.estimation.error] if self.estimation.error else []
-            self.estimation.close()
+            lost += [self.estimation.worker.error] if self.estimation.worker.error else []
+            self.estimation.worker.close()
         if self.wear_keeper:
             self.wear_keeper.close(self.driver.session.wear_depth)
             lost += [self.wear_keeper.error] if self.wear_keeper.error else []
         self.driver.close()
-        if self.recording is not None and not (report := self.recording.close()).complete:
-            lost.append(report.sentence(self.recording.path.parent))
+        if self.recording is not None and not (report := self.recording.recorder.close()).complete:
+            lost.append(report.sentence(self.recording.recorder.path.parent))
         return lost
 
     def periodic(self) -> list[tuple[float, Callable[[], float | None]]]:
@@ -423,12 +423,12 @@ class Runtime:
         """Return the receiver of each entry: the recording, the estimate, both or neither."""
         recording, estimation = self.recording, self.estimation
         if estimation is None:
-            return recording.journal if recording else _ignore
+            return recording.recorder.journal if recording else _ignore
         if recording is None:
             return estimation.add
 
         def both(entry: Entry) -> None:
-            recording.journal(entry)
+            recording.recorder.journal(entry)
             estimation.add(entry)
 
         return both
@@ -496,7 +496,7 @@ class Runtime:
         return self._front.now_ns() if stamp_ns is None else stamp_ns
 
     def _advanced(self, count: int = 1) -> None:
-        if self.recording and self.recording.wants_snapshot:
+        if self.recording and self.recording.recorder.snapshot_wanted:
             self._renew_recording()
         if self._front.follows_samples:
             # without a deadline: a pause, bounded by the number of samples, lets recorder and estimate catch up
@@ -511,14 +511,14 @@ class Runtime:
 
     @property
     def _behind(self) -> bool:
-        return bool((self.recording and self.recording.behind) or (self.estimation and self.estimation.behind))
+        return bool((self.recording and self.recording.behind) or (self.estimation and self.estimation.worker.behind))
 
     def _renew_recording(self) -> None:
         assert self.recording is not None
         renewed = self.recording.renew(self.driver.session)
         if renewed and self.estimation and self.estimation.entry and self.driver.session.following is None:
             # the snapshot of a twin lacks the estimate; the snapshot of a follower has it
-            self.recording.journal(self.estimation.entry)
+            self.recording.recorder.journal(self.estimation.entry)
 
 
 def _periods(settings: Settings) -> Periods | None:
