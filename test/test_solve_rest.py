@@ -112,11 +112,12 @@ def test_an_unstable_balance_is_not_rest(corners: tuple[str, ...]) -> None:
 
 
 def test_a_twin_at_rest_is_asked_saved_and_restored_without_a_trace() -> None:
-    twin, other = Twin(fallen()), Twin(fallen())
+    scene = dataclasses.replace(fallen(), locked=("x", "theta"))  # with the kernels of other tests
+    twin, other = Twin(scene), Twin(scene)
     rows = [twin.advance(t) for t in np.linspace(0.5, 77.7, 300)]
     assert twin._state.at_rest == 1 and not rows[-1].v.any()
     assert other.advance(77.7).q.tolist() == rows[-1].q.tolist()
-    restored = Twin(fallen())
+    restored = Twin(scene)
     restored.restore(twin.snapshot())
     for t in (78.0, 300.0):
         a, b = restored.advance(t), twin.advance(t)
