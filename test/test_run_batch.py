@@ -49,8 +49,8 @@ def in_lanes() -> dict[str, list[Scene]]:
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_member_beside_the_lanes_is_its_single_run_bit_for_bit(workers: int) -> None:
-    hard = dataclasses.replace(preset("bench_hc").contact, stiffness=3e8)
-    scenes = [dataclasses.replace(one, contact=hard) for one in members()]
+    paper, wear = preset("paper").contact, Wear(1e-9, 0.015, 2.0)
+    scenes = [dataclasses.replace(one, contact=paper, wear=wear) for one in members()]
     wrench = samples(len(scenes))
     together = TwinBatch(scenes, tol=1e-7, workers=workers).advance_samples(TIMES, wrench)
     assert len(together) == len(scenes)
