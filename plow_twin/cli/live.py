@@ -151,7 +151,8 @@ def _live(
     if as_json and taken:
         click.echo(json.dumps(facts, indent=2))
     elif not quiet and not lines:
-        show_facts(output_console(), {"input": {key: facts["input"][key] for key in _shown(facts["input"])}})
+        shown = {key: value for key, value in facts["input"].items() if value not in ("", "0") or key == "samples_used"}
+        show_facts(output_console(), {"input": shown})
         _show_estimate(front)
     unused = any(int(facts["input"][key]) for key in facts["input"] if _LOST.fullmatch(key))
     code = DONE_WITH_LOSS if lost or unused or facts["recorder"]["lost"] else DONE
@@ -247,10 +248,6 @@ def _show_estimate(front: BridgeFront) -> None:
     from plow_twin.estimate.result import Estimate
 
     show_estimate(Estimate.from_dict(json.loads(estimation.entry.result)), front.runtime.scene)
-
-
-def _shown(values: dict[str, str]) -> list[str]:
-    return [key for key, value in values.items() if value not in ("", "0") or key == "samples_used"]
 
 
 def _settings(options: dict[str, Any]) -> Settings:

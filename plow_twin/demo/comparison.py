@@ -10,10 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.model.pairs import PAIR_COUNT
-from plow_twin.model.scene import Scene
 from plow_twin.record.reader import RunReader
 from plow_twin.record.recording import read_recording
-from plow_twin.run.advance import AdvanceSeries
 from plow_twin.run.twin import Twin
 from plow_twin.stream.journal import Estimated
 
@@ -68,7 +66,7 @@ def compare_forces(run: Path, wider_m: float) -> Comparison | None:
     )
     times = (stamps - stamps[0]) * 1e-9
     motions = {
-        name: _motion(one, times, wrench)
+        name: Twin(one, tol=1e-6, excitation="sampled").advance_samples(times, wrench)
         for name, one in (("nominal", scene), ("true", replace(scene, clearance=clearance)))
     }
     late = times >= times[-1] - COMPARED_S
@@ -84,10 +82,6 @@ def compare_forces(run: Path, wider_m: float) -> Comparison | None:
     }
     came = [1e-9 * (stamp_ns - int(stamps[0])) for stamp_ns in _estimate_stamps(RunReader(run))]
     return Comparison({**peaks, "followed": followed.max(axis=0)}, error, came, float(times[-1]) - COMPARED_S)
-
-
-def _motion(scene: Scene, times: Array, wrench: Array) -> AdvanceSeries:
-    return Twin(scene, tol=1e-6, excitation="sampled").advance_samples(times, wrench)
 
 
 def _estimate_stamps(reader: RunReader) -> list[int]:

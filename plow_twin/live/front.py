@@ -185,7 +185,7 @@ class BridgeFront:
         """Return in words which input never came or was not read."""
         if self._settings.excitation_source != "excitation":
             return []
-        intake, topic = self.runtime.driver.intake, self.roles[_load_role(self.roles)].topic
+        intake, topic = self.runtime.driver.intake, self.roles["drive" if "drive" in self.roles else "excitation"].topic
         if not sum(intake.counts.values()):
             return [f"no sample came on {topic}"]
         if stopped and self._bridge.ends and (self._first or not self._bridge.finished):
@@ -280,10 +280,6 @@ class BridgeFront:
         self.send(ALARMS, alarms_message(self.runtime.alarms, self.name, self._settings.hardware_id))
         for name, part in self.parts().items():
             self._tell(name, part)
-
-
-def _load_role(roles: Mapping[str, Role]) -> str:
-    return "drive" if "drive" in roles else "excitation"
 
 
 def _first_messages(bridge: Bridge) -> Iterator[Messages]:

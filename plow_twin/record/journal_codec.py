@@ -8,6 +8,7 @@ import math
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -171,10 +172,6 @@ def _integer(value: Any) -> int:
     return found
 
 
-def _bytes(value: Any) -> bytes:
-    return base64.b64decode(value, validate=True)
-
-
 def _floats(value: Any) -> tuple[float, ...]:
     read = _exactly(float)
     return tuple(read(item) for item in value)
@@ -195,7 +192,7 @@ _READERS: Final[dict[str, Callable[[Any], Any]]] = {
     "int": _integer,
     "float": _exactly(float, int),
     "str": _exactly(str),
-    "bytes": _bytes,
+    "bytes": partial(base64.b64decode, validate=True),
     "tuple[float, ...]": _floats,
     "tuple[int, ...]": _ints,
     "tuple[tuple[float, ...], ...]": _rows,

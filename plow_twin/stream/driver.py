@@ -230,7 +230,7 @@ class Driver:
             self._newest_ns = stamp_ns
         self.silences.add_one(stamp_ns)
         self._received_ns, self._zeroed = now_ns, False
-        insort(run, Sample(stamp_ns, wrench), key=_stamp)
+        insort(run, Sample(stamp_ns, wrench), key=lambda sample: sample.stamp_ns)
 
     def due(self) -> Published:
         """Return the publication of all advances since the last publication."""
@@ -478,10 +478,6 @@ class Driver:
             self._restart_model(self.session.stamp_ns or 0, self.failed.restarted(), None)
             self.intake.restart()
             self.clock.restart()
-
-
-def _stamp(sample: Sample) -> int:
-    return sample.stamp_ns
 
 
 def counters(driver: Driver) -> dict[str, int]:

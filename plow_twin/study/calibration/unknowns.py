@@ -129,7 +129,8 @@ class Space:
         places = []
         for unknown in self.unknowns:
             value = parameter_of(scene, unknown.path)
-            inside = value in unknown.choices if unknown.choices else _inside(unknown, value)
+            within = isinstance(value, float) and unknown.low <= value <= unknown.high
+            inside = value in unknown.choices if unknown.choices else within
             if value is None or not inside:
                 return None
             places.append(unknown.place(value))
@@ -148,7 +149,3 @@ def check_usable(space: Space, scene: Scene, trials: int = 100) -> None:
     points = np.random.default_rng(0).random((trials, space.size))
     if not any(is_usable(scene, values) for values in space.values_of(points)):
         with_parameters(scene, space.values(points[0]))
-
-
-def _inside(unknown: Unknown, value: Value | None) -> bool:
-    return isinstance(value, float) and unknown.low <= value <= unknown.high
