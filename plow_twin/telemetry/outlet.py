@@ -14,7 +14,7 @@ from plow_twin.live.part import Part
 from plow_twin.telemetry.access import WayOut
 from plow_twin.telemetry.way import TelemetryError
 
-#: How long a process may take to open its output [s], in which it only imports its library.
+#: How long a process may take to open its output [s]; most of the time goes into the import of its library.
 _START_S: Final = 60.0
 
 

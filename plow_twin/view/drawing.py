@@ -198,7 +198,7 @@ class Drawing:
             self.events.add(self.stamp_ns, max(self.step, 0), text, "ERROR")
 
     def _whole(self, batch: Batch) -> None:
-        """Draw entries and messages without a gap."""
+        """Draw a batch, or a part of one, in which no entry is missing."""
         entries = batch.entries
         advance = entries.sample.copy()
         advance[[index for index, entry in entries.others.items() if isinstance(entry, Hold | Unload)]] = True
