@@ -38,7 +38,7 @@ def found() -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def pinned() -> dict[str, Any]:
-    """Return the figures of this build or, without digests, those of another build."""
+    """Return the figures of this build; if it has none, those of another build, without their digests."""
     own = FOLDER / f"{build_name()}.json"
     path = own if own.exists() else sorted(FOLDER.glob("*.json"))[0]
     figures: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))

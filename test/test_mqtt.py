@@ -161,7 +161,7 @@ def test_a_broker_keeps_messages_for_an_absent_twin_and_garbage_is_counted(broke
     )
     sender = Sender(broker)
     old = {"t": 3.0, "force": {"x": 1.0, "y": 1.0}, "moment": 1.0, "n": 9000}
-    sender.raw(json.dumps(old).encode(), retain=True)  # retained, so sent before the twin began: dropped, and its number is not counted from
+    sender.raw(json.dumps(old).encode(), retain=True)  # sent before the twin began, so its number starts no count
     with _live(*arguments) as live:
         live.until_count("dropped_inactive", 1)
         sender.send(50)

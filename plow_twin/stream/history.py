@@ -1,7 +1,7 @@
 """The last seconds of a session, kept for late samples: snapshots, and all entries since the oldest snapshot.
 
-The age at which a sample is too old depends on the journal alone. Calls with one sample each
-make many snapshots. A call with many samples makes one and notes the stamps of the others, so the limit is the same.
+The age at which a sample is too old depends on the journal alone. Calls with one sample each make many snapshots; a
+call with many samples makes one and notes the stamps of the others, so that the limit is the same.
 """
 
 from __future__ import annotations

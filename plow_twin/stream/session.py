@@ -421,7 +421,7 @@ class Session:
         taken: NDArray[np.int64],
         digest_after: NDArray[np.int64],
     ) -> Applied:
-        """Advance when speeds along the face wait, or when the load was held until now."""
+        """Advance in parts: up to each pending speed along the face, and to the first sample after a held load."""
         if not np.isfinite(wrench).all():
             raise ValueError(f"wrench: got {wrench!r}, expected finite numbers")
         resumed, begin, count = self._resume_wear(), 0, len(stamps)

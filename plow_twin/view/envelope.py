@@ -84,7 +84,7 @@ class Envelope:
             self._bin_s = max(2.0 * float(np.ptp(self._kept.place)) / self._most_bins, 1e-9)
             self._kept = self._kept.binned(self._bin_s)
         self._kept = self._kept.merged()
-        # segments always stay apart, however many there are
+        # rows of different segments are never merged, so the number of rows may stay above the limit
         while len(self._kept.place) > self._most_bins and np.ptp(self._kept.place) > 1.0:
             self._bin_s *= 2.0
             self._kept = self._kept.binned(2.0).merged()
