@@ -24,8 +24,6 @@ class Senders:
         self.lost = 0
         #: number of samples of other senders, which are not used
         self.ignored = 0
-        #: number of changes from one sender to another
-        self.switches = 0
         self._next: dict[bytes, int] = {}
         self._before: frozenset[bytes] = frozenset()
         self._listed: set[bytes] = set()
@@ -50,7 +48,7 @@ class Senders:
             if len(self._next) >= _MOST_SENDERS:
                 self._next.pop(next(name for name in self._next if name != self.followed))
         if self.followed is None:
-            self._follow(sender)
+            self.followed = sender
         followed = sender == self.followed
         if followed:
             # a message that arrives after all is no longer lost
@@ -77,13 +75,8 @@ class Senders:
         """Follow the other sender that was heard last; return False if there is none."""
         if self._other is None:
             return False
-        other, self._other = self._other, self.followed
-        self._follow(other)
+        self._other, self.followed = self.followed, self._other
         return True
-
-    def _follow(self, sender: bytes) -> None:
-        self.switches += bool(self._next)
-        self.followed = sender
 
 
 class OneSender:
