@@ -22,11 +22,9 @@ LINKED = (
     "compiled_scene.compile_scene(load_scene('paper'), 1e-6).initial_state(); "
     "(overload,) = modes.mode_inside.overloads.values(); print(len(list(overload.library.get_defined_functions())))"
 )
-#: Program that prints whether a kernel called by Python contains its own copies of the kernels that it calls.
+#: Continuation that prints whether a kernel called by Python contains its own copies of the kernels that it calls.
 ENTRY = (
-    "from plow_twin import load_scene; from plow_twin.solve import compiled_scene, modes; "
-    "compiled_scene.compile_scene(load_scene('paper'), 1e-6).initial_state(); "
-    "(overload,) = modes.settle_modes.overloads.values(); "
+    "; (overload,) = modes.settle_modes.overloads.values(); "
     "held = [function.linkage.name for function in overload.library.get_defined_functions()]; "
     "print(bool(held), 'linkonce_odr' in held or 'weak_odr' in held)"
 )
@@ -84,14 +82,12 @@ def test_code_of_other_sources_is_removed(tmp_path: Path) -> None:
     assert old.load("signature") is None
 
 
-def test_a_kernel_that_only_kernels_call_has_no_machine_code(tmp_path: Path) -> None:
-    """Compiling it in addition to each caller would take a third of the time."""
-    assert run(tmp_path, LINKED) == "0"
+def test_a_kernel_that_only_kernels_call_stands_as_a_copy_in_each_entry_and_has_no_machine_code(tmp_path: Path) -> None:
+    """Compiling it in addition to each caller would take a third of the time.
 
-
-def test_an_entry_holds_its_own_copy_of_every_kernel_it_calls(tmp_path: Path) -> None:
-    """Otherwise bits would depend on which entry a process loads first, and on whether it compiles or loads entries."""
-    assert run(tmp_path, ENTRY) == "True False"
+    Without copies, bits would depend on which entry a process loads first, and on whether it compiles or loads entries.
+    """
+    assert run(tmp_path, LINKED + ENTRY).splitlines() == ["0", "True False"]
 
 
 def test_a_call_from_python_of_a_kernel_without_machine_code_is_an_error() -> None:
