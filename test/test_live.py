@@ -573,7 +573,9 @@ def test_files_with_dates_are_waited_for_and_followed_from_one_to_the_next(
         with days[1].open("a") as before:
             days[2].write_text("t,fx,fy,m\n" + text(150, 200))
             live.until_count("samples_used", 150)
-            before.write(text(100, 150))  # the writer released the file late, so these rows are late and are worked in
+            before.write(
+                text(100, 150)
+            )  # the writer released the file late, so these rows are late: the motion is corrected
         values = live.until_count("samples_used", 200)
         assert (values["samples_in"], values["rolled_back"]) == ("200", "50")
         assert live.stop() == 0

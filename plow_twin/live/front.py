@@ -276,7 +276,7 @@ class BridgeFront:
 
     def _report(self) -> None:
         self.changed()
-        # otherwise sent only when a level changes; here for their values
+        # the twin sends alarms only when a level changes; reports have their present values
         self.send(ALARMS, alarms_message(self.runtime.alarms, self.name, self._settings.hardware_id))
         for name, part in self.parts().items():
             self._tell(name, part)

@@ -110,7 +110,7 @@ class Publishing:
         self.age = DurationHistogram()
         #: publications, and publications withheld because a number was not finite
         self.published = self.withheld = 0
-        #: publications computed without a sample, and publications after late samples have been worked in
+        #: publications computed without a sample, and publications that correct earlier ones because of late samples
         self.held_frames = self.corrected_frames = 0
         #: steady time at which the samples of the next publication were received [ns]; 0: it has no samples
         self.received_ns = 0

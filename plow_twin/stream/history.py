@@ -34,7 +34,7 @@ class History:
         self._snapshots: list[tuple[int, bytes]] = []
         #: stamps of the first sample in each span, where calls with single samples have a snapshot
         self._kept_ns: list[int] = []
-        #: largest of these stamps so far; computing again up to it discards no state
+        #: largest of these stamps so far; going back and computing up to it again drops no kept stamp
         self._newest_kept_ns: int | None = None
         self._samples: list[Sample] = []
         self._stamps_ns: list[int] = []
@@ -146,7 +146,7 @@ class History:
         self._travels.insert(place, travel)
 
     def add_snapshot(self, stamp_ns: int, data: bytes, *, kept: bool = True) -> None:
-        """Add the state at `stamp_ns`; with `kept`, its stamp is noted wherever it is in a span."""
+        """Add the state at `stamp_ns`; with `kept`, its stamp is noted too, although it need not be the first of a span."""
         if not self._span_ns:
             return
         if not self._snapshots or self._snapshots[-1][0] < stamp_ns:

@@ -235,7 +235,7 @@ class Outputs:
     def correct(self, stamp_ns: int, oldest_ns: int) -> int:
         """Note that the motion from `stamp_ns` on is computed again; return the earliest such stamp of the window.
 
-        A correction at or before `oldest_ns` is finished: the result is later.
+        A correction that began at or before `oldest_ns` is over; this one starts anew.
         """
         window = self._window[0]
         if not window["corrected"] or self._corrected_ns <= oldest_ns:
@@ -247,7 +247,7 @@ class Outputs:
         return self._corrected_ns
 
     def begin_correction(self) -> None:
-        """Begin impulses and peaks at the present time, which `correct` returned.
+        """Begin impulses and peaks at the time that `correct` returned and the session has gone back to.
 
         Advances that were published before are not published again, even if every later advance fails.
         """
@@ -264,7 +264,7 @@ class Outputs:
 
     @property
     def is_clear(self) -> bool:
-        """Whether the next publication will cover only later advances and have no mark."""
+        """Whether nothing waits to be published: neither an advance nor a mark."""
         window = self._window
         return not (self._waits or window["corrected"][0] or window["marked"][0])
 
@@ -353,7 +353,9 @@ class Outputs:
         self._clear()
         self._window["makes"] = parts[0].view(np.int64)
         self._window["impulse"], self._window["peak"] = parts[1:3]
-        self._window["measured_peak"] = parts[2]  # the part with samples is unknown
+        self._window["measured_peak"] = parts[
+            2
+        ]  # a state has no peak of the samples alone: the peak of all stands for it
         self._slow_wear_depth = parts[3].copy()
         slow_ns = int(np.frombuffer(data, np.int64, 1, offset=8 * _STATE_SIZE)[0])
         self._slow_ns = None if slow_ns < 0 else slow_ns
