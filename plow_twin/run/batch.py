@@ -172,7 +172,7 @@ class TwinBatch:
         Raises
         ------
         ArgumentError
-            A time is before the present time, or a number is not finite; nothing has changed.
+            A time is before the present time, or a number is not finite; the batch is unchanged.
         """
         times, samples = np.ascontiguousarray(t, dtype=np.float64), np.asarray(wrench, dtype=np.float64)
         check_times(self.time, times)

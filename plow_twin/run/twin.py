@@ -185,7 +185,7 @@ class Twin:
         Raises
         ------
         ArgumentError
-            The time is before the present model time, or a number is not finite; nothing has changed.
+            The time is before the present model time, or a number is not finite; the twin is unchanged.
         """
         if self.excitation == "scene" and wrench is not None:
             raise ArgumentError(f"wrench: got {wrench!r}, expected None with excitation='scene'")
@@ -214,7 +214,7 @@ class Twin:
         Raises
         ------
         ArgumentError
-            As for `advance`; the twin is left unchanged.
+            As for `advance`; the twin is unchanged.
         """
         if self.excitation != "sampled":
             raise ArgumentError("advance_samples: got excitation='scene', expected excitation='sampled'")
@@ -251,7 +251,7 @@ class Twin:
         Raises
         ------
         ArgumentError
-            As for `advance`; the twin is left unchanged.
+            As for `advance`; the twin is unchanged.
         """
         sampled, count, with_rows = self.excitation == "sampled", len(t), rows is not None
         t, wrench = np.ascontiguousarray(t, np.float64), np.ascontiguousarray(wrench, np.float64)

@@ -146,7 +146,7 @@ class History:
         self._travels.insert(place, travel)
 
     def add_snapshot(self, stamp_ns: int, data: bytes, *, kept: bool = True) -> None:
-        """Add the state at `stamp_ns`; with `kept`, its stamp is noted too, although it need not be the first of a span."""
+        """Add the state at `stamp_ns`; with `kept`, its stamp is noted, although it may not be the first of a span."""
         if not self._span_ns:
             return
         if not self._snapshots or self._snapshots[-1][0] < stamp_ns:
