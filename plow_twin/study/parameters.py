@@ -136,7 +136,9 @@ def with_parameters(scene: Scene, values: Mapping[str, Value]) -> Scene:
         if path == "frame.labels":
             parts["frame"] = _labelled(parts["frame"], str(value))
         elif path == "clearance.scale":
-            parts["clearance"] = _scaled_clearance(parts["clearance"], float(value))
+            gaps, factor = parts["clearance"], float(value)
+            scaled = {name: factor * getattr(gaps, name) for name in ("horizontal_m", "vertical_m")}
+            parts["clearance"] = replace(gaps, **scaled)
         elif owner.startswith("loads."):
             name = owner.removeprefix("loads.")
             loads[name] = _load_with(loads[name], field_name, value)
@@ -226,10 +228,6 @@ def _vector(load: Any, field_name: str) -> tuple[float, ...]:
         # the sign of a sampled load is the sign of its largest force component
         return (float(load.wrench[:, :2].flat[abs(load.wrench[:, :2]).argmax()]),)
     return tuple(load.force_n)
-
-
-def _scaled_clearance(clearance: Any, factor: float) -> Any:
-    return replace(clearance, horizontal_m=factor * clearance.horizontal_m, vertical_m=factor * clearance.vertical_m)
 
 
 def _times(vector: tuple[float, ...], factor: float) -> tuple[float, ...]:

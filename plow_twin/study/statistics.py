@@ -46,43 +46,19 @@ def _sum(array: Array, columns: list[int]) -> Array:
     return total
 
 
-def _max(members: Ensemble, pairs: list[int]) -> Array:
-    return np.asarray(members.peak[:, pairs].max(axis=1))
-
-
 def _mean_in_contact(members: Ensemble, pairs: list[int]) -> Array:
     impulse, time = _sum(members.impulse, pairs), _sum(members.time_in_contact, pairs)
     return np.asarray(np.divide(impulse, time, out=np.zeros_like(impulse), where=time > 0.0))
 
 
-def _mean_over_time(members: Ensemble, pairs: list[int]) -> Array:
-    return np.asarray(_impulse(members, pairs) / members.t[-1])
-
-
-def _impulse(members: Ensemble, pairs: list[int]) -> Array:
-    return _sum(members.impulse, pairs)
-
-
-def _time_in_contact(members: Ensemble, pairs: list[int]) -> Array:
-    return _sum(members.time_in_contact, pairs)
-
-
-def _makes(members: Ensemble, pairs: list[int]) -> Array:
-    return _sum(members.makes.astype(np.float64), pairs)
-
-
-def _wear_depth(members: Ensemble, pairs: list[int]) -> Array:
-    return np.asarray(members.wear_depth[:, pairs].max(axis=1))
-
-
 _OF_PAIRS: Final[Mapping[str, Callable[..., Array]]] = {
-    "max": _max,
+    "max": lambda members, pairs: np.asarray(members.peak[:, pairs].max(axis=1)),
     "mean_in_contact": _mean_in_contact,
-    "mean_over_time": _mean_over_time,
-    "impulse": _impulse,
-    "time_in_contact": _time_in_contact,
-    "makes": _makes,
-    "wear_depth": _wear_depth,
+    "mean_over_time": lambda members, pairs: np.asarray(_sum(members.impulse, pairs) / members.t[-1]),
+    "impulse": lambda members, pairs: _sum(members.impulse, pairs),
+    "time_in_contact": lambda members, pairs: _sum(members.time_in_contact, pairs),
+    "makes": lambda members, pairs: _sum(members.makes.astype(np.float64), pairs),
+    "wear_depth": lambda members, pairs: np.asarray(members.wear_depth[:, pairs].max(axis=1)),
 }
 UNITS: Final[Mapping[str, str]] = {
     "max": "N", "mean_in_contact": "N", "mean_over_time": "N", "impulse": "N s", "time_in_contact": "s", "makes": "1",
