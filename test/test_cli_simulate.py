@@ -109,7 +109,7 @@ def test_npz_keeps_the_contract(tmp_path: Path) -> None:
 def test_fixed_step_methods_run_the_same_scene(tmp_path: Path) -> None:
     answers = {}
     for method, extra in (("events", []), ("rk4", ["--dt", "1e-4"]), ("euler", ["--dt", "1e-5"])):
-        done = plow_twin_here("simulate", "bench_kv", "--t-end", "1", "--method", method, *extra, "--json")
+        done = plow_twin_here("simulate", "paper", "--t-end", "1", "--method", method, *extra, "--json")
         assert done.returncode == 0, done.stderr
         answers[method] = json.loads(done.stdout)
         assert answers[method]["solver"]["method"] == method
