@@ -166,12 +166,7 @@ def test_more_events_than_the_first_log_holds_are_all_there() -> None:
 
 @pytest.mark.parametrize(
     ("name", "dt", "bound"),
-    [
-        ("paper", 1e-4, 1e-5),
-        # laws with kernels of fixed steps that no other test has
-        pytest.param("bench_kv", 1e-5, 1e-3, marks=pytest.mark.stress),
-        pytest.param("bench_hc", 1e-4, 1e-4, marks=pytest.mark.stress),
-    ],
+    [("paper", 1e-4, 1e-5), ("bench_kv", 1e-5, 1e-3), pytest.param("bench_hc", 1e-4, 1e-4, marks=pytest.mark.stress)],
 )
 def test_fixed_step_rk4_follows_the_reference_as_far_as_it_can(name: str, dt: float, bound: float) -> None:
     scene, expected = preset(name), reference("paper_r1" if name == "paper" else name)
