@@ -12,7 +12,7 @@ from plow_twin.errors import RecordingError, TakenError
 from plow_twin.record.durable import sync_path
 from plow_twin.record.header import RunHeader
 from plow_twin.record.mcap_file import ByteFile
-from plow_twin.record.metadata_yaml import PartFacts, bag_metadata, write_metadata
+from plow_twin.record.metadata_yaml import LOST, PartFacts, bag_metadata, write_metadata
 from plow_twin.record.writer import RunWriter, make_folder
 
 #: Number of parts of a full ring; the oldest is dropped as a whole.
@@ -80,8 +80,8 @@ class RingWriter(RunWriter):
         ------
         TakenError
             The folder has another recording.
-            OSError, RecordingError
-                The folder cannot be written; the ring stays as it is.
+        OSError, RecordingError
+            The folder cannot be written; the ring stays as it is.
         """
         make_folder(folder)
         with ExitStack() as undone:  # removes an incomplete ring
@@ -109,7 +109,7 @@ class RingWriter(RunWriter):
             if self._sync_dumps:
                 sync_path(folder / name)
             facts.append(PartFacts(name, part.start_ns, part.end_ns, part.topics))
-        lost = {f"plow_twin_lost {topic}": str(n) for topic, n in loss.items()}
+        lost = {f"{LOST}{topic}": str(n) for topic, n in loss.items()}
         for name in ("metadata.yaml", "metadata.yaml.partial"):
             undone.callback((folder / name).unlink, missing_ok=True)
         write_metadata(folder, bag_metadata(facts, lost), sync=self._sync_dumps)

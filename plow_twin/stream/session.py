@@ -561,7 +561,7 @@ class Session:
         self._set_speed(travel)
 
     def _is_late(self, stamp_ns: int) -> bool:
-        """Return whether the model has passed a stamp; its own time is passed too if it has no sample there."""
+        """Return whether a stamp is behind the time reached, or equal to it without a sample there."""
         if self.stamp_ns is None or stamp_ns > self.stamp_ns:
             return False
         return stamp_ns < self.stamp_ns or (self.held and self.history.oldest_ns is not None)
