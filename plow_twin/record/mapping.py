@@ -35,24 +35,14 @@ Number = TypeVar("Number", float, NDArray[np.float64])
 #: Prefix of the reasons in the counts of messages that do not fit their role.
 UNFIT: Final = "unfit, "
 _WRENCH: Final = {"fx": "wrench.force.x", "fy": "wrench.force.y", "m": "wrench.torque.z"}
+_POSE: Final = {"x": "pose.position.x", "y": "pose.position.y", "theta": "pose.orientation"}
+_POSE_IN_POSE: Final = {key: f"pose.{path}" for key, path in _POSE.items()}
 _FIELDS: Final[dict[tuple[str, str], dict[str, str]]] = {
     ("excitation", "geometry_msgs/msg/WrenchStamped"): _WRENCH,
     ("excitation", "geometry_msgs/msg/Wrench"): {key: path.removeprefix("wrench.") for key, path in _WRENCH.items()},
-    ("head_pose", "geometry_msgs/msg/PoseStamped"): {
-        "x": "pose.position.x",
-        "y": "pose.position.y",
-        "theta": "pose.orientation",
-    },
-    ("head_pose", "nav_msgs/msg/Odometry"): {
-        "x": "pose.pose.position.x",
-        "y": "pose.pose.position.y",
-        "theta": "pose.pose.orientation",
-    },
-    ("head_pose", "geometry_msgs/msg/PoseWithCovarianceStamped"): {
-        "x": "pose.pose.position.x",
-        "y": "pose.pose.position.y",
-        "theta": "pose.pose.orientation",
-    },
+    ("head_pose", "geometry_msgs/msg/PoseStamped"): _POSE,
+    ("head_pose", "nav_msgs/msg/Odometry"): _POSE_IN_POSE,
+    ("head_pose", "geometry_msgs/msg/PoseWithCovarianceStamped"): _POSE_IN_POSE,
     ("travel", "geometry_msgs/msg/TwistStamped"): {"speed": "twist.linear.z"},
     ("forces", "sensor_msgs/msg/JointState"): {name: f"effort[{name}]" for name in PAIR_NAMES},
     ("gaps", "sensor_msgs/msg/JointState"): {name: f"position[{name}]" for name in PAIR_NAMES},
