@@ -308,7 +308,7 @@ class Recorder:
         return fits
 
     def _admitted(self, now: int, items: int, topics: Iterable[str]) -> bool:
-        """Note the losses on the topics of messages for which there is room; otherwise count these as lost."""
+        """Note earlier losses on the topics if there is room for these messages; otherwise count them as lost too."""
         if not self._room(items, self._queue_size * 3 // 4):
             self._snapshot_due = True
             self._output_gaps.update(topics)
@@ -473,7 +473,7 @@ class Recorder:
                 self._dump(self._ring, self._mark, lost)
             except (OSError, RecordingError) as failed:  # the ring stays in memory
                 error = f"{self._mark}: the last {self._ring_s:g} s not written: {failed}"
-            with self._lock:  # who sees the count may mark again
+            with self._lock:  # a reader of the new count finds no mark under way, and may mark again
                 self._mark = None
                 if error is None:
                     self._marks += 1

@@ -287,7 +287,7 @@ def _spacing(stamps_s: Array, load: Array) -> list[UnitDoubt]:
     if stamps_s.max() > _DATES_S:
         return []
     spacing = float(np.median(np.abs(steps)))
-    # the stamp of a number from some start is a second later
+    # `time_ns` has shifted times that count from some start by a second
     low, high = (days + _START_S for days in _SHEET_DAYS)
     if low <= stamps_s[0] <= high and np.ptp(stamps_s) < 1.0 and spacing < _SHORTEST_SPACING_S:
         found = f"{stamps_s[0] - _START_S:.6g} and stamps {spacing:.2g} s apart"
