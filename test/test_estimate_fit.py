@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from unittest.mock import Mock
+
 import numpy as np
 import pytest
+from estimate_support import GROUPS, draw
 from scipy.stats import truncnorm
 
+from plow_twin.estimate import search
 from plow_twin.estimate.arrow import Arrow
-from plow_twin.estimate.fit import link_weights
+from plow_twin.estimate.fit import fit, link_weights
+from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.result import Interval
+from plow_twin.estimate.unknowns import MOVING, Unknowns
 from plow_twin.kernel.low_pass import lagged
 
 
@@ -62,3 +69,23 @@ def test_an_interval_is_cut_off_where_the_head_has_been() -> None:
     for least in (-3.0, 0.0, 2.0, 20.0, 40.0):
         one, other = Interval.normal(0.0, 1.0).above(least), truncnorm(least, np.inf)
         assert (one.mean, one.p05, one.p95) == pytest.approx((other.mean(), *other.ppf([0.05, 0.95])), abs=2e-4)
+
+
+@pytest.mark.parametrize(("group", "least", "most"), [("plain", 3, 4), ("noisy", 8, 11)])
+def test_starts_that_meet_end_the_search(
+    group: str, least: int, most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:  # fmt: skip
+    """Two starts that lead to the same optimum need no third; noise keeps the starts apart, so all six are fitted."""
+    truth = draw(replace(GROUPS[group], periods=3.0), 2)
+    fitted = Mock(side_effect=fit)
+    monkeypatch.setattr(search, "fit", fitted)
+    forward, unknowns = Forward(truth.nominal, truth.load), Unknowns(truth.nominal)
+    problem, found = search.candidate(forward, unknowns, truth.poses, truth.load.period()) or (None, None)
+    assert problem is not None and found is not None
+    assert least <= fitted.call_count <= most
+    # the derivatives by the six components of all starting states take one call, each other unknown takes one
+    run = Mock(side_effect=forward.run)
+    monkeypatch.setattr(forward, "run", run)
+    problem.linearise(found.point)
+    swings = problem.window.swings
+    assert sorted(len(call.args[3]) for call in run.call_args_list) == [swings] * len(MOVING) + [6 * swings]

@@ -50,12 +50,31 @@ def candidate(forward: Forward, unknowns: Unknowns, poses: Poses, period: float)
     points = [(vector, states_at(window, vector), tuning.FIRST_NOISE) for vector in vectors]
     fits: list[Fit] = []
     for stage, horizon in zip(STAGES, horizons, strict=True):
-        problem = Problem(forward, unknowns, window, horizon=horizon)
-        points = [(shared, better_states(problem, shared, states), noise) for shared, states, noise in points]
-        fits = [one for one in (fit(problem, *point, stage.iterations) for point in points) if one is not None]
-        fits = sorted(fits, key=lambda one: one.loss)[: stage.keep]
+        problem, fits = Problem(forward, unknowns, window, horizon=horizon), []
+        for shared, states, noise in points:
+            found = fit(problem, shared, better_states(problem, shared, states), noise, stage.iterations)
+            if found is None:
+                continue
+            fits = sorted([*fits, found], key=lambda one: one.loss)
+            if _have_met(fits, found):
+                del fits[1:]
+                break
+        fits = fits[: stage.keep]
         points = [(one.shared, one.point.states, one.noise) for one in fits]
     return (problem, fits[0]) if fits else None
+
+
+def _have_met(fits: list[Fit], newest: Fit) -> bool:
+    """Return whether the newest fit and another have the same clearances and loss, and no fit is better than both.
+
+    `fits` are ordered, best first. Starts of different stiffness lead to such a point only if it is the optimum. With
+    another loss, one of them is in a false optimum of a swing's starting state.
+    """
+    if len(fits) < 2 or newest not in fits[:2]:
+        return False
+    best, other = fits[:2]
+    near = np.abs(other.shared - best.shared)[[GX, GY]] < tuning.MET
+    return bool(near.all()) and other.loss - best.loss < tuning.OUTLYING**2
 
 
 def behind_low_pass(problem: Problem, found: Fit) -> Fit | None:
