@@ -188,6 +188,26 @@ class Fit:
         return deviation
 
 
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """The rows of the swings for stamps that are `shift` s late.
+
+    swing, inside, times : (n,) swing of each pose, -1 outside of all swings; (k,) rows in swings, and their times in s
+    inner : (s + 1,) the first of these rows in each swing
+    asked, edges : times of a run, with the ends of linked swings, and the first of them in each swing
+    ends : places of these ends in `asked`
+    """
+
+    shift: float
+    swing: NDArray[np.int64]
+    inside: NDArray[np.int64]
+    times: Array
+    inner: NDArray[np.int64]
+    asked: Array
+    ends: NDArray[np.int64]
+    edges: NDArray[np.int64]
+
+
 def depth_of(turns: Array) -> Array | None:
     """Return the outward displacement of each pad, shape (8,), in m; None if no wall is turned."""
     if not turns.any():
@@ -218,6 +238,7 @@ class Problem:
         self._memory: Memory | None = None
         self._columns: tuple[Point | None, Array] = None, np.zeros(0)
         self._scene: tuple[bytes, Scene] = b"", unknowns.scene
+        self._at: _Rows | None = None
 
     def evaluate(
         self, shared: Array, states: Array, differences: Array | None = None, push: Array | None = None,
@@ -236,30 +257,62 @@ class Problem:
         change : callable, optional
             Function that returns a changed scene, perhaps with other compiled terms.
         """
+        found = self._evaluate(shared, states[None], differences, push, share, change)
+        return None if found is None else found[0]
+
+    def _evaluate(
+        self, shared: Array, several: Array, differences: Array | None = None, push: Array | None = None,
+        share: Array | None = None, change: Callable[[Scene], Scene] | None = None,
+    ) -> list[Point] | None:  # fmt: skip
+        """Run the model in one call from `several` sets of starting states, shape (k, s, 6); None as in `evaluate`."""
         window, differences = self.window, self.differences if differences is None else differences
         lag = float(np.sqrt(differences[LAG]))
         shift = shared[DELAY] - lag
-        times = window.poses.t - shift
-        swing = np.searchsorted(window.starts, times, side="right") - 1
-        swing[swing >= window.swings] = -1
-        swing[times - window.starts[np.maximum(swing, 0)] > self.horizon] = -1
-        rows = np.flatnonzero(swing >= 0)
-        # times rise, so the rows of a swing are consecutive
-        inner = np.searchsorted(swing[rows], np.arange(window.swings + 1)).astype(np.int64)
-        asked, ends, edges = times[rows], np.zeros(0, np.int64), inner
-        if len(self.link):  # each swing but the last runs to the start of the next
-            ends = edges[1:-1] + np.arange(len(self.link))
-            asked = np.insert(asked, edges[1:-1], window.starts[1:-1])
-            edges = edges + np.minimum(np.arange(window.swings + 1), len(self.link))
+        rows = self._rows_at(float(shift))
         scene, forward = self._scene_of(shared), self.forward
         if change is not None:
             scene, forward = change(scene), forward.of(change(self.unknowns.scene))
+        count, size = len(several), len(rows.asked)
+        edges = (size * np.arange(count)[:, None] + rows.edges[:-1]).ravel()
         motions = forward.run(
-            scene, shared[GAIN], window.starts[:-1], states, edges, asked, depth_of(differences[TURNS]), push, share
-        )
+            scene, shared[GAIN], np.tile(window.starts[:-1], count), several.reshape(-1, 6),
+            np.append(edges, size * count), np.tile(rows.asked, count), depth_of(differences[TURNS]), push, share,
+        )  # fmt: skip
         if motions is None:
             return None
-        q, v = np.delete(motions.q, ends, axis=0), np.delete(motions.v, ends, axis=0)
+        q, v = motions.q.reshape(count, size, 3), motions.v.reshape(count, size, 3)
+        contact = motions.contact.reshape(count, window.swings, -1)
+        return [
+            self._point(shared, several[k], rows, q[k], v[k], contact[k], differences, lag, shift) for k in range(count)
+        ]
+
+    def _rows_at(self, shift: float) -> _Rows:
+        """Return the rows of the swings if the stamps are `shift` s late, cached as successive vectors share it."""
+        if self._at is None or self._at.shift != shift:
+            window = self.window
+            times = window.poses.t - shift
+            swing = np.searchsorted(window.starts, times, side="right") - 1
+            swing[swing >= window.swings] = -1
+            swing[times - window.starts[np.maximum(swing, 0)] > self.horizon] = -1
+            inside = np.flatnonzero(swing >= 0)
+            # times rise, so the rows of a swing are consecutive
+            inner = np.searchsorted(swing[inside], np.arange(window.swings + 1)).astype(np.int64)
+            asked, ends, edges = times[inside], np.zeros(0, np.int64), inner
+            if len(self.link):  # each swing but the last runs to the start of the next
+                ends = edges[1:-1] + np.arange(len(self.link))
+                asked = np.insert(asked, edges[1:-1], window.starts[1:-1])
+                edges = edges + np.minimum(np.arange(window.swings + 1), len(self.link))
+            self._at = _Rows(shift, swing, inside, times[inside], inner, asked, ends, edges)
+        return self._at
+
+    def _point(
+        self, shared: Array, states: Array, rows: _Rows, q: Array, v: Array, contact: Array, differences: Array,
+        lag: float, shift: float,
+    ) -> Point:  # fmt: skip
+        """Return a point from the poses and rates of its motion at the asked times, as the sensor measures them."""
+        window, at_ends = self.window, np.hstack((q[rows.ends], v[rows.ends]))
+        if len(rows.ends):
+            q, v = np.delete(q, rows.ends, axis=0), np.delete(v, rows.ends, axis=0)
         begin = states[:, :3], states[:, 3:]
         if differences[LEVER].any():
             q, v = moved_by_lever(q, v, differences[LEVER])
@@ -267,12 +320,14 @@ class Problem:
         if lag:
             self._memory = self._memory or Memory(window.poses)
             memory = self._memory.at(window.starts[:-1] + shift) - shared[BIAS]
-            q, v = lagged(lag, inner, window.starts[:-1], *map(np.ascontiguousarray, begin), memory, times[rows], q, v)
-        predicted, rate = np.full((len(times), 3), np.nan), np.zeros((len(times), 3))
-        predicted[rows], rate[rows] = q, v
+            begin = np.ascontiguousarray(begin[0]), np.ascontiguousarray(begin[1])
+            q, v = lagged(lag, rows.inner, window.starts[:-1], *begin, memory, rows.times, q, v)
+        count = len(rows.swing)
+        predicted, rate = np.full((count, 3), np.nan), np.zeros((count, 3))
+        predicted[rows.inside], rate[rows.inside] = q, v
         residual = window.poses.q - predicted - shared[BIAS]
-        defect = states[1 : len(ends) + 1] - np.hstack((motions.q[ends], motions.v[ends]))
-        return Point(shared, states, swing, predicted, residual, rate, motions.contact, defect)
+        defect = states[1 : len(rows.ends) + 1] - at_ends
+        return Point(shared, states, rows.swing, predicted, residual, rate, contact, defect)
 
     def cost(self, point: Point, variance: Array) -> float:
         """Return twice the negative logarithm of the posterior: Huber's function of the residuals and the prior.
@@ -290,12 +345,19 @@ class Problem:
     def linearise(self, point: Point) -> Linear:
         """Return the Jacobians of the prediction and of the ends of the swings."""
         rows, ends = np.zeros((len(point.residual), 3, SIZE + OWN)), np.zeros((len(point.defect), 6, SIZE + OWN))
-        for j in (j for j in MOVING if j != DAMPING or self.unknowns.damped):
-            rows[:, :, j], ends[:, :, j] = self._quotient(point, j)
+        # states and gains first, because they have the point's scene
+        together = self._evaluate(point.shared, point.states + np.diag(_DISPLACED)[:, None])
+        for j in range(6):
+            if together is not None:
+                found = _by_state(point, together[j], j, _DISPLACED[j])
+            else:
+                found = self._quotient_by_state(point, j)
+            rows[:, :, SIZE + j], ends[:, :, SIZE + j] = found
+        for j in reversed(MOVING):
+            if j != DAMPING or self.unknowns.damped:
+                rows[:, :, j], ends[:, :, j] = self._quotient(point, j)
         rows[:, :, BIAS] = np.eye(3)
         rows[:, :, DELAY] = -point.rate
-        for j in range(6):
-            rows[:, :, SIZE + j], ends[:, :, SIZE + j] = self._quotient_by_state(point, j)
         return Linear(rows, ends)
 
     def _scene_of(self, shared: Array) -> Scene:
@@ -341,10 +403,15 @@ class Problem:
             moved[:, index] += signed
             other = self.evaluate(point.shared, moved)
             if other is not None:
-                ends = point.defect - other.defect
-                ends[:, index] += signed  # the start of the next swing has moved too
-                return np.nan_to_num((point.residual - other.residual) / signed), ends / signed
+                return _by_state(point, other, index, signed)
         return np.zeros_like(point.residual), np.zeros_like(point.defect)
+
+
+def _by_state(point: Point, other: Point, index: int, moved: float) -> tuple[Array, Array]:
+    """Return the derivatives of predictions and ends by a component of the starting states, `moved` in `other`."""
+    ends = point.defect - other.defect
+    ends[:, index] += moved  # the start of the next swing has moved too
+    return np.nan_to_num((point.residual - other.residual) / moved), ends / moved
 
 
 def link_weights(spans: Array, drift: Array) -> Array:
