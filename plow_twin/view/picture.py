@@ -165,7 +165,7 @@ def _draw_section(axis: Any, section: Section, instant: Instant, curves: RunCurv
         fontsize=9,
     )
     axis.margins(0.1)
-    axis.set_xlabel("to scale; where a wall lies inside a corner, the contact gives way", fontsize=8)
+    axis.set_xlabel("to scale: a wall drawn inside a corner is pressed in by that depth", fontsize=8)
     axis.legend(loc="upper left", bbox_to_anchor=(0.0, -0.1), ncols=2, fontsize=7)
     _y_upwards(axis)
 
