@@ -257,9 +257,9 @@ def test_attachments_and_other_topics_of_any_size_are_passed_over(run: Run, tmp_
 @pytest.mark.stress
 def test_ten_gigabytes_take_the_memory_of_some_chunks(run: Run, tmp_path: Path) -> None:
     small = check_large(run, tmp_path, images=0, image_size=0, attachments=0)
-    large = check_large(run, tmp_path, images=50, image_size=80_000_000, attachments=20)
+    large = check_large(run, tmp_path, images=70, image_size=60_000_000, attachments=20)
     assert (tmp_path / "large.mcap").stat().st_size > 10_000_000_000
-    assert large - small < 5 * 80_000_000
+    assert large - small < 5 * 60_000_000
 
 
 def test_a_file_that_another_program_rewrote_is_a_run(run: Run, tmp_path: Path) -> None:
