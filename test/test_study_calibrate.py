@@ -220,9 +220,10 @@ def test_targets_are_judged_as_they_say(tmp_path: Path) -> None:
     )
     assert fit.marks["contact.stiffness"].mark is Mark.RECONSTRUCTED and fit.marks["head.mass_kg"].mark is Mark.GIVEN
     (tmp_path / "bad.yaml").write_text(
-        "version: 1\nt_end: -3\ntargets:\n- {statistic: max.z, value: 1}\n- {value: 2}\n"
+        "version: 1\nt_end: -3\ntargets:\n- {statistic: max.z, value: 1}\n- {value: 2}\n- 3\n"
     )
-    with pytest.raises(StudyError, match=r"(?s)3 problem.*t_end: got -3.*max\.z.*targets\[1\]"):
+    expected = r"(?s)4 problem.*t_end: got -3.*targets\[1\]\.statistic: got nothing.*targets\[2\]: got 3.*max\.z"
+    with pytest.raises(StudyError, match=expected):
         load_targets(tmp_path / "bad.yaml", preset("paper"))
 
 
