@@ -189,18 +189,33 @@ def total(typingctx: Any, value: Any) -> Any:
 
 
 @_operation
-def spread_total(typingctx: Any, value: Any) -> Any:
-    """Return a vector with the sum of the eight lanes in each lane, faster than `splat(total(...))`."""
+def three_totals(typingctx: Any, first: Any, second: Any, third: Any) -> Any:
+    """Return a vector with the sums of the lanes of three vectors in its lanes 2, 3 and 4, and 0 in the others.
+
+    The sums share their additions, which is faster than three times `total`.
+    """
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        value = arguments[0]
-        for distance in (4, 2, 1):
-            order = ir.Constant(ir.VectorType(ir.IntType(32), _WIDTH), [lane ^ distance for lane in range(_WIDTH)])
-            other = builder.shuffle_vector(value, ir.Constant(_VECTOR, ir.Undefined), order)
-            value = builder.fadd(value, other, flags=_FLAGS)
-        return value
+        def shuffled(left: Any, right: Any, *places: int) -> Any:
+            order = ir.Constant(ir.VectorType(ir.IntType(32), len(places)), places)
+            return builder.shuffle_vector(left, right, order)
 
-    return lanes(value), codegen
+        def added(left: Any, right: Any) -> Any:
+            return builder.fadd(left, right, flags=_FLAGS)
+
+        one, two, three = (
+            added(shuffled(value, value, 0, 1, 2, 3), shuffled(value, value, 4, 5, 6, 7)) for value in arguments
+        )
+        both = added(shuffled(one, two, 0, 1, 4, 5), shuffled(one, two, 2, 3, 6, 7))
+        both = added(shuffled(both, both, 0, 2), shuffled(both, both, 1, 3))
+        last = added(shuffled(three, three, 0, 1), shuffled(three, three, 2, 3))
+        last = added(last, shuffled(last, last, 1, 0))
+        zeros = ir.Constant(both.type, [0.0, 0.0])
+        low = shuffled(zeros, both, 0, 1, 2, 3)
+        high = shuffled(last, zeros, 0, 2, 2, 2)
+        return shuffled(low, high, *range(_WIDTH))
+
+    return lanes(first, second, third), codegen
 
 
 @_operation

@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 
 from plow_twin.kernel.compiler import kernel
-from plow_twin.kernel.simd import lane, magnitude, pack, permutation, row, set_row, splat, spread_total, total
+from plow_twin.kernel.simd import lane, magnitude, pack, permutation, row, set_row, splat, three_totals, total
 from plow_twin.model.contact import power_term, power_terms, ramp_terms, root_terms
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.contact_force import law_terms
@@ -258,9 +258,7 @@ def _loads_along_world(p, w, k, alpha, beta, harmonics, second, segments):
 def _applied(p, along_x, along_y, torque):
     """Return the accelerations by the pairs' forces (in head axes) and moments, in the lanes of the state's rates."""
     mass, inertia = p.inverse_mass, p.inverse_inertia
-    pushed = spread_total(along_x) * pack(0.0, 0.0, mass, 0.0, 0.0, 0.0, 0.0, 0.0)
-    pushed = pushed + spread_total(along_y) * pack(0.0, 0.0, 0.0, mass, 0.0, 0.0, 0.0, 0.0)
-    return pushed + spread_total(torque) * pack(0.0, 0.0, 0.0, 0.0, inertia, 0.0, 0.0, 0.0)
+    return three_totals(along_x, along_y, torque) * pack(0.0, 0.0, mass, mass, inertia, 0.0, 0.0, 0.0)
 
 
 @kernel(fast=True)
@@ -458,6 +456,21 @@ def _turn_of_axes(p):
     return pack(1.0, -1.0, 1.0, -1.0, 0.0, -1.0, 1.0, 0.0)
 
 
+@kernel(fast=True, inline="code")
+def _size(p, w, k, penetrating, sigma_limit, wear, support, sliding, running_in):
+    """Return the size of order k > 0 as a velocity."""
+    here = w.series[k]
+    size = abs(here[VX]) + abs(here[VY]) + p.radius * abs(here[OMEGA]) + p.weight * (abs(here[COS]) + abs(here[SIN]))
+    if support is not None:
+        there = w.frame[k]
+        size += abs(there[FRAME_VX]) + abs(there[FRAME_VY]) + p.radius * abs(there[SPIN])
+        size += p.weight * (abs(there[SEEN_COS]) + abs(there[SEEN_SIN]))
+    if wear is not None and penetrating:
+        size += p.weight / p.radius * total(magnitude(row(w.wear, k)))
+        size += _slide_size(p, w, k, sliding, running_in) / sigma_limit
+    return size
+
+
 @kernel(fast=True)
 def expand(
     p,
@@ -489,11 +502,10 @@ def expand(
         start_frame(state, w)
         here, there = row(w.moved, 0), row(w.frame, 0)
     c1 = s1 = c2 = s2 = 0.0
-    small, quiet, reach, order = _VANISHED * p.threshold[p.order], 0, 1.0, limit
-    for k in range(order + 1):
+    small, quiet, reach = _VANISHED * p.threshold[p.order], 0, 1.0
+    for k in range(limit + 1):
         set_row(w.series, k, here)
-        x, yy, vx, vy = lane(here, X), lane(here, Y), lane(here, VX), lane(here, VY)
-        om, c, s = lane(here, OMEGA), lane(here, COS), lane(here, SIN)
+        x, yy, om, c, s = lane(here, X), lane(here, Y), lane(here, OMEGA), lane(here, COS), lane(here, SIN)
         # the pairs depend on the state relative to the frame
         seen_c, seen_s, seen_x, seen_y = c, s, x, yy
         if support is not None:
@@ -510,21 +522,10 @@ def expand(
         else:
             if not penetrating:
                 penetration = row_values(p.penetration_rows, seen_c, seen_s, seen_x, seen_y)
-            size = abs(vx) + abs(vy) + p.radius * abs(om) + p.weight * (abs(c) + abs(s))
-            if support is not None:
-                size += abs(lane(there, FRAME_VX)) + abs(lane(there, FRAME_VY)) + p.radius * abs(lane(there, SPIN))
-                size += p.weight * (abs(seen_c) + abs(seen_s))
             if wear is not None and penetrating:
                 penetration = penetration - row(w.wear, k)
-                size += p.weight / p.radius * total(magnitude(row(w.wear, k)))
-                size += _slide_size(p, w, k, *rub_terms) / sigma_limit
-            w.term_size[k] = size
-            reach *= sigma_limit
-            quiet = quiet + 1 if size * reach < small else 0
-            if quiet == p.lacuna and k >= 4:
-                order = k
         set_row(w.penetration, k, penetration)
-        if k == order:
+        if k == limit:
             break
         s1_k = 0.0 if load_terms[0] is None else load[0, k]
         turned, turning_by = _turned(here), pack(om, om, om, om, s1_k, om, om, s1_k)
@@ -580,4 +581,13 @@ def expand(
         rates = turning + applied
         here = rates * steady + before * bent
         before = rates
-    return order
+        if k > 0:
+            # the size comes last, because the next order does not wait for it
+            size = _size(p, w, k, penetrating, sigma_limit, wear, support, *rub_terms)
+            w.term_size[k] = size
+            reach *= sigma_limit
+            quiet = quiet + 1 if size * reach < small else 0
+            if quiet == p.lacuna and k >= 4:
+                return k
+    w.term_size[limit] = _size(p, w, limit, penetrating, sigma_limit, wear, support, *rub_terms)
+    return limit
