@@ -19,6 +19,7 @@ from plow_twin.errors import ArgumentError
 from plow_twin.estimate.follow import LATEST_S, Follower
 from plow_twin.estimate.followed import Stretch, follow, table
 from plow_twin.estimate.forces import TOLERANCE
+from plow_twin.estimate.learned import biases_of
 from plow_twin.estimate.measurements import Load, Poses
 from plow_twin.estimate.result import Estimate, Interval, State
 from plow_twin.estimate.window import Windows
@@ -283,6 +284,19 @@ def test_stiffness_and_gains_of_a_hard_contact_are_learned_from_the_poses() -> N
     alone = Follower(truth.nominal, 1)
     alone.restore(follower.snapshot())
     assert alone.digest() == follower.digest()
+
+
+def test_a_wrong_bias_of_the_sensor_is_learned_with_a_hard_contact() -> None:
+    truth = draw(replace(GROUPS["hard"], periods=1.3), 71102)
+    wrong = np.array([4e-4, -4e-4, 2e-3])  # the truth has none
+    x, y, theta = (Interval.normal(value, abs(value) / 2.0) for value in wrong)
+    follower = Follower(truth.nominal, MEMBERS)
+    _take(follower, replace(_known(truth), bias_x=x, bias_y=y, bias_theta=theta))
+    _run(follower, truth, 4.0)
+    biases = biases_of(follower._ensemble.learned()[0])
+    # of the median twin, and of the others
+    assert (np.abs(biases[0]) < 0.6 * np.abs(wrong)).all()
+    assert (np.abs(biases.mean(axis=0)) < 0.6 * np.abs(wrong)).all()
 
 
 def test_twins_go_on_with_other_numbers_but_not_with_other_terms() -> None:

@@ -510,10 +510,10 @@ class Follower:
         self._used.append(t)
         while self._used and self._used[0] < self.time - 2.0 * LATEST_S:
             self._used.popleft()
-        noise, bias, delay = self._sensor()
+        noise, delay = self._sensor()
         if noise is not None:
             before = self._ensemble.outlying
-            used = self._ensemble.correct(t - delay, q - bias, noise, self._load_error())
+            used = self._ensemble.correct(t - delay, q, noise, self._load_error())
             self.poses_used += used
             if not used and self._ensemble.outlying > before:
                 self.poses_outlying += 1
@@ -526,8 +526,8 @@ class Follower:
         found: Array = tuning.LOAD_ERROR_SHARE * self._load_share * 0.5 * (self._range[1] - self._range[0])
         return found
 
-    def _sensor(self) -> tuple[Array | None, Array, float]:
-        """Return noise, bias and delay of the sensor; the noise is None after too few poses."""
+    def _sensor(self) -> tuple[Array | None, float]:
+        """Return noise and delay of the sensor; the noise is None after too few poses."""
         found = self.estimate
         noise: Array | None = None
         if found is not None and found.noise is not None:
@@ -535,11 +535,8 @@ class Follower:
         elif len(self._noise_rows) >= _NOISE_ROWS[0]:
             noise = noise_level(np.array(self._noise_rows))
         if noise is None or not noise.all():
-            return None, np.zeros(3), 0.0
-        if found is None:
-            return noise, np.zeros(3), 0.0
-        bias = [0.0 if value is None else value.mean for value in (found.bias_x, found.bias_y, found.bias_theta)]
-        return noise, np.array(bias), 0.0 if found.delay is None else max(found.delay.mean, 0.0)
+            return None, 0.0
+        return noise, 0.0 if found is None or found.delay is None else max(found.delay.mean, 0.0)
 
     # -- clearances and forces ---------------------------------------------------------------------------------------
 

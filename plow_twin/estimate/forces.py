@@ -194,6 +194,16 @@ def draw_scenes(scene: Scene, found: Estimate, members: int, rng: np.random.Gene
     return scenes, np.stack(gains, axis=1)
 
 
+def draw_biases(found: Estimate, members: int, rng: np.random.Generator) -> Array:
+    """Return biases of the sensor drawn from an estimate, shape (m, 3), those of the first member without error."""
+    drawn = np.zeros((members, 3))
+    for index, value in enumerate((found.bias_x, found.bias_y, found.bias_theta)):
+        if value is not None:
+            drawn[:, index] = value.mean
+            drawn[1:, index] = _normal(value, rng.standard_normal(members - 1))
+    return drawn
+
+
 def _normal(value: Interval, white: Array) -> Array:
     """Return two-piece normal numbers with the 5 % and 95 % points of the interval."""
     below, above = (value.mean - value.p05) / NORMAL_P95, (value.p95 - value.mean) / NORMAL_P95

@@ -28,10 +28,11 @@ _MEMBERS: Final = 4
 _MOST_RESTITUTION = 0.999
 
 
-def numbers_of(scenes: Sequence[Scene], gain: Array) -> Array:
-    """Return the parameters of members in units of `tuning.LEARNED_TO`, shape (m, 7), from scenes and gains (m, 3).
+def numbers_of(scenes: Sequence[Scene], gain: Array, bias: Array) -> Array:
+    """Return the parameters of members in units of `tuning.LEARNED_TO`, shape (m, 10).
 
-    They are the logarithms of K^-1/2 and of the damping (or restitution), the clearances and the load gains.
+    They are the logarithms of K^-1/2 and of the damping (or restitution), the clearances, the load gains, (m, 3), and
+    the sensor's biases, (m, 3).
     """
     damping = [one.contact.damping if one.contact.restitution is None else one.contact.restitution for one in scenes]
     raw = np.column_stack([
@@ -40,14 +41,21 @@ def numbers_of(scenes: Sequence[Scene], gain: Array) -> Array:
         [one.clearance.horizontal_m for one in scenes],
         [one.clearance.vertical_m for one in scenes],
         gain,
+        bias,
     ])  # fmt: skip
     found: Array = raw / np.array(tuning.LEARNED_TO)
     return found
 
 
+def biases_of(numbers: Array) -> Array:
+    """Return the biases of the sensor, (..., 3), among the parameters of members, (..., 10)."""
+    found: Array = (numbers * np.array(tuning.LEARNED_TO))[..., -3:]
+    return found
+
+
 def with_numbers(scene: Scene, numbers: Array) -> tuple[Scene, Array]:
-    """Return a member's scene and load gains, (3,), with other parameters, (7,)."""
-    softness, damping, horizontal, vertical, *gain = (numbers * np.array(tuning.LEARNED_TO)).tolist()
+    """Return a member's scene and load gains, (3,), with other parameters, (10,)."""
+    softness, damping, horizontal, vertical, *gain = (numbers * np.array(tuning.LEARNED_TO)).tolist()[:-3]
     number = None
     if scene.contact.restitution is not None:
         number = min(float(np.exp(damping)), _MOST_RESTITUTION)
@@ -62,7 +70,7 @@ class Learner:
 
     Parameters
     ----------
-    drawn : ndarray, shape (m, 7)
+    drawn : ndarray, shape (m, 10)
         Parameters of the members as drawn from an estimate, those of the median twin first.
     learned : ndarray of int, shape (k,)
         Indices of the learned parameters.
@@ -111,7 +119,7 @@ class Learner:
 
         Parameters
         ----------
-        numbers : ndarray, shape (m, 7)
+        numbers : ndarray, shape (m, 10)
             Parameters of the members.
         seen : ndarray, shape (m, c)
             Predictions of the members, minus their mean.
@@ -153,7 +161,7 @@ class Learner:
         self._begin()
 
     def numbers(self, which: NDArray[np.int64]) -> Array:
-        """Return the parameters of some members, shape (k, 7)."""
+        """Return the parameters of some members, shape (k, 10)."""
         found = self._all[which].copy()
         own = self.mean + self._white[which] @ np.linalg.cholesky(self.covariance).T
         found[:, self.open] = np.clip(own, self._least, self._most)

@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.estimate import tuning
-from plow_twin.estimate.forces import FEWEST, draw_scenes, quantiles
-from plow_twin.estimate.learned import Learner, numbers_of, with_numbers
+from plow_twin.estimate.forces import FEWEST, draw_biases, draw_scenes, quantiles
+from plow_twin.estimate.learned import Learner, biases_of, numbers_of, with_numbers
 from plow_twin.estimate.result import Estimate, Interval, State
 from plow_twin.estimate.unknowns import QUANTITIES
 from plow_twin.model.geometry import penetration_rows, states_of
@@ -86,7 +86,7 @@ class Ensemble:
         self.first = Twin(scenes[0], tol=tol, excitation="sampled", start=start)
         self.others = TwinBatch(scenes[1:], tol=tol, start=start) if members > 1 else None
         self._scene, self._gain, self._rng, self._speed = scene, gain, rng, 0.0
-        self._numbers = numbers_of(scenes, gain)
+        self._numbers = numbers_of(scenes, gain, draw_biases(known, members, rng))
         #: learner of the parameters that an estimate hardly determines; the next member to adopt learned parameters;
         #: the number of members that are due to adopt them
         learns = learns and self._steers_first and members > 1
@@ -313,7 +313,8 @@ class Ensemble:
         after = min(bisect_left(times, t), len(times) - 1)
         path = np.stack([self._path[index][1] for index in range(after - 1, len(times))])
         share = min((t - times[after - 1]) / (times[after] - times[after - 1]), 1.0)
-        then = ((1.0 - share) * path[0] + share * path[1])[:, there]
+        # as the sensor of each member would have measured it
+        then = ((1.0 - share) * path[0] + share * path[1] + biases_of(self._numbers))[:, there]
         since = self.first.time - self._drifted
         self._drift(load_error)
         state = np.concatenate([self._v, *path, self._load_off], axis=1)
