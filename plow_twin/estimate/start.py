@@ -19,6 +19,8 @@ Array = NDArray[np.float64]
 
 #: Definition: pairs of the walls to the right, left, top and bottom.
 WALLS: Final = (NORMAL_X > 0.0, NORMAL_X < 0.0, NORMAL_Y > 0.0, NORMAL_Y < 0.0)
+#: Derived: the two pairs of each of these walls.
+_PADS: Final = [np.flatnonzero(wall).tolist() for wall in WALLS]
 #: Bound: number of moments that are tried for the start of a swing.
 _CANDIDATES = 12
 
@@ -42,7 +44,7 @@ def reaches(scene: Scene, q: Array) -> Array:
     body = np.stack([c, s, c * q[:, 0] + s * q[:, 1], -s * q[:, 0] + c * q[:, 1]], axis=1)
     toward = body @ rows
     half = np.array([scene.frame.width_m, scene.frame.width_m, scene.frame.height_m, scene.frame.height_m]) / 2.0
-    return np.stack([toward[:, wall].max(axis=1) for wall in WALLS], axis=1) - half
+    return np.stack([np.maximum(toward[:, one], toward[:, other]) for one, other in _PADS], axis=1) - half
 
 
 def smooth_width(poses: Poses, span: float = 0.06) -> int:
