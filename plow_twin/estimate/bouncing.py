@@ -231,7 +231,7 @@ def compare(
     deviation = np.where(np.abs(moved) > tuning.ASTRAY, np.hypot(deviation, tuning.UNEXPLAINED_HARD), deviation)
     law, odds = 0.0, -math.inf
     if found.value[5] < math.log(tuning.FITTED):
-        law, odds = _of_other_law(drawn, centre, delay, int(longer * tuning.MOST_WORK[2]))
+        law, odds = _of_other_law(drawn, centre, delay, int(longer * tuning.MOST_WORK[2]), near is None)
     return Bounced(
         centre,
         deviation,
@@ -394,8 +394,12 @@ def path_delay(eye: MotionFeatures, features: Array, drawn: list[Array], measure
     return max(float(_LAGS_S[int(np.argmin(off))]), 0.0)
 
 
-def _of_other_law(drawn: _Drawn, centre: Array, delay: float, most_work: int) -> tuple[float, float]:
+def _of_other_law(
+    drawn: _Drawn, centre: Array, delay: float, most_work: int, by_odds: bool
+) -> tuple[float, float]:  # fmt: skip
     """Return the likeness of the measured motion to motions under another law, and the log odds of that law.
+
+    With `by_odds`, half of the draws are enough if their odds are clear, because then the likeness does not matter.
 
     Goodness of fit does not separate laws with similar motions. A classifier of draws of both laws (Pudlo et al.,
     Bioinformatics 32 (2016) 859) and the likelihood under each law do separate them. Each of the two methods finds
@@ -404,14 +408,19 @@ def _of_other_law(drawn: _Drawn, centre: Array, delay: float, most_work: int) ->
     other, nothing = drawn.of_other_law(), (0.0, -math.inf)
     if other is None:
         return nothing
-    other.add(tuning.DRAWS[4], centre, tuning.DRAWN_CLEARANCE[2], delay, most_work)
-    drawn.forward.work += other.forward.work
-    if len(other.features) < _FEWEST:
-        return nothing
-    eye = drawn.eye
+    eye, half = drawn.eye, tuning.DRAWS[4] // 2
     measured = np.concatenate([eye.features(eye.q)[5:], eye.changes(eye.q)])
-    more = class_deviate(drawn.like(), other.like(), measured)
-    return more, log_odds(drawn.draws(), other.draws(), np.concatenate([measured, eye.changes_by_phase(eye.q)]))
+    by_phase = np.concatenate([measured, eye.changes_by_phase(eye.q)])
+    found = nothing
+    for count in (half, tuning.DRAWS[4] - half):
+        other.add(count, centre, tuning.DRAWN_CLEARANCE[2], delay, most_work)
+        if len(other.features) >= _FEWEST:
+            odds = log_odds(drawn.draws(), other.draws(), by_phase)
+            found = class_deviate(drawn.like(), other.like(), measured), odds
+            if by_odds and not tuning.CLEAR_ODDS[0] < odds < tuning.CLEAR_ODDS[1]:
+                break
+    drawn.forward.work += other.forward.work
+    return found
 
 
 def class_deviate(believed: Array, other: Array, measured: Array) -> float:
@@ -554,6 +563,19 @@ def _scatter_at(basis: Array, weight: Array, error: Array, leverage: Array) -> A
     return variance
 
 
+@dataclass(frozen=True, eq=False)
+class _Phases:
+    """Rows with a component in (k,), the part of the period of each, and how many rows are in each part, at least 1.
+
+    `known` tells which parts have enough rows.
+    """
+
+    rows: NDArray[np.int64]
+    inside: NDArray[np.int64]
+    size: NDArray[np.int64]
+    known: NDArray[np.bool_]
+
+
 class MotionFeatures:
     """Features of motions as the sensor sees them, at the poses' times and with their gaps and noise."""
 
@@ -570,7 +592,13 @@ class MotionFeatures:
             self._whole = np.ones(len(poses.t), np.bool_)
         self._smooth = max(min(smooth_width(poses, tuning.AVERAGED), int(self._whole.sum()) // 8), 1)
         self._reach_phase = ((poses.t[self._whole] - poses.t[0]) / period % 1.0 * tuning.PATH_PHASES).astype(int)
-        self._phase = np.minimum(((poses.t - poses.t[0]) / period % 1.0 * self._parts).astype(int), self._parts - 1)
+        phase = np.minimum(((poses.t - poses.t[0]) / period % 1.0 * self._parts).astype(int), self._parts - 1)
+        #: rows with each component, in each part of a period with enough of them
+        self._parts_of = [
+            [rows for k in range(self._parts) if len(rows := np.flatnonzero((phase == k) & there)) > 8]
+            for there in self._there.T
+        ]
+        self._phases: dict[float, list[_Phases]] = {}
 
     def look(
         self, forward: Forward, unknowns: Unknowns, clearance: Array, numbers: Array, delay: float,
@@ -599,22 +627,31 @@ class MotionFeatures:
 
         Phases with too few poses are NaN. The scatter shows how fast bounces die out.
         """
-        parts = tuning.PATH_PHASES
-        phase = ((self._t - self._t[0] - lag_s) / self._period % 1.0 * parts).astype(int) % parts
-        out = np.full((2, parts, 3), np.nan)
-        for i in range(3):
-            there = self._there[:, i] & self._settled
-            inside = phase[there]
-            count = np.bincount(inside, minlength=parts)
-            known = count >= _FEWEST_OF_PHASE
-            if not known.any():
+        out = np.full((2, tuning.PATH_PHASES, 3), np.nan)
+        for i, phases in enumerate(self._phases_at(lag_s)):
+            if not phases.known.any():
                 continue
-            value = q[there, i] - q[there, i].mean()
-            mean = np.bincount(inside, value, parts) / np.maximum(count, 1)
-            square = np.bincount(inside, (value - mean[inside]) ** 2, parts) / np.maximum(count, 1)
+            inside, known, size = phases.inside, phases.known, phases.size
+            value = q[phases.rows, i] - q[phases.rows, i].mean()
+            mean = np.bincount(inside, value, len(size)) / size
+            square = np.bincount(inside, (value - mean[inside]) ** 2, len(size)) / size
             out[0, known, i] = mean[known] - mean[known].mean()
             out[1, known, i] = 0.5 * np.log(square[known] + _NO_SCATTER)
         return out.ravel()
+
+    def _phases_at(self, lag_s: float) -> list[_Phases]:
+        """Return the phases of each component for a lag, cached because all drawn motions are seen with few lags."""
+        if lag_s not in self._phases:
+            if len(self._phases) > 2 * len(_OF_DRAWN_S):
+                self._phases.clear()
+            parts, found = tuning.PATH_PHASES, []
+            phase = ((self._t - self._t[0] - lag_s) / self._period % 1.0 * parts).astype(int) % parts
+            for there in self._there.T:
+                rows = np.flatnonzero(there & self._settled)
+                count = np.bincount(phase[rows], minlength=parts)
+                found.append(_Phases(rows, phase[rows], np.maximum(count, 1), count >= _FEWEST_OF_PHASE))
+            self._phases[lag_s] = found
+        return self._phases[lag_s]
 
     def _seen(self, q: Array, white: Array) -> Array:
         """Return a motion with the noise that makes its quick changes as large as the measured ones.
@@ -644,11 +681,7 @@ class MotionFeatures:
         averaged = averaged[:, [0, 2]] + averaged[:, [1, 3]] - sums
         scatter = []
         for i in range(3):
-            parts = np.array([
-                q[inside, i].std()
-                for k in range(self._parts)
-                if (inside := (self._phase == k) & self._there[:, i]).sum() > 8
-            ])  # fmt: skip
+            parts = np.array([q[rows, i].std() for rows in self._parts_of[i]])
             calm = np.sort(parts)[: max(len(parts) // 3, 1)]
             scatter += [math.log(calm.mean() + 1e-9), math.log(parts.mean() + 1e-9)] if len(parts) else [0.0, 0.0]
         like = [reach[2] - reach[0], reach[2] - reach[1], scatter, averaged.ravel()]
