@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.kernel.compiler import kernel
+from plow_twin.kernel.simd import exact_row, set_row
 
 Array = NDArray[np.float64]
 
@@ -30,6 +31,21 @@ def to_bernstein(g: Array, n: int, h: float, inverse_binomial: Array, b: Array) 
     for r in range(1, n + 1):
         for j in range(n, r - 1, -1):
             b[j] += b[j - 1]
+
+
+@kernel()
+def sum_to_bernstein(b: Array, n: int) -> None:
+    """Turn  g_k h^k / C(n, k)  in each of b's eight columns into the Bernstein coefficients of g on [0, h]."""
+    # two sweeps at once halve the number of stores
+    for r in range(1, n + 1, 2):
+        before = exact_row(b, r)
+        once = before + exact_row(b, r - 1)
+        set_row(b, r, once)
+        for j in range(r + 1, n + 1):
+            here = exact_row(b, j)
+            swept = here + before
+            set_row(b, j, swept + once)
+            before, once = here, swept
 
 
 @kernel(inline="code")

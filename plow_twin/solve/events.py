@@ -7,7 +7,7 @@ guard turns negative, found by `polynomial.first_root`.
 from __future__ import annotations
 
 from plow_twin.kernel.compiler import kernel
-from plow_twin.kernel.polynomial import first_root, first_root_within
+from plow_twin.kernel.polynomial import first_root, first_root_within, sum_to_bernstein
 from plow_twin.kernel.simd import below, magnitude, row, set_row, splat
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.grip import grip_guard
@@ -39,11 +39,12 @@ def _guards(p, state, w, order, penetrating, viscous, ramp) -> None:
         if viscous is not None and ramp is None and mode == ON:
             weights[RATIO, pair] = p.viscous / p.stiffness
     sign, ratio = row(weights, SIGN), row(weights, RATIO)
-    for k in range(order + 1):
-        set_row(guard, k, row(w.penetration, k) * sign)
-    if viscous is not None and ramp is None and penetrating:
-        for k in range(order):
-            set_row(guard, k, row(guard, k) + row(w.rate, k) * ratio)
+    for k in range(order):
+        term = row(w.penetration, k)
+        if viscous is not None and ramp is None and penetrating:
+            term = term + row(w.rate, k) * ratio
+        set_row(guard, k, term * sign)
+    set_row(guard, order, row(w.penetration, order) * sign)
     for pair in range(PAIR_COUNT):
         first = max(guard[0, pair], 0.0)
         if state.mode[pair] == ON:
@@ -118,26 +119,22 @@ def _ramp_guard(p, state, w, order, pair) -> None:
 def _unsafe_pairs(w, order, h):
     """Return a bit for each guard that may turn negative on [0, h].
 
-    A guard stays positive if g_0 > sum max(-g_k, 0) h^k. If this fails for any guard, the guards are tested by the sign
-    of their Bernstein coefficients.
+    A guard stays positive if g_0 and g_0 + g_1 h - sum over k > 1 of max(-g_k, 0) h^k are positive, because this lower
+    bound is concave in h. If this fails for any guard, the guards are tested by the sign of their Bernstein
+    coefficients.
     """
     guard, b = w.guard, w.bernstein
     reach = splat(0.0)
-    for k in range(order, 0, -1):
+    for k in range(order, 1, -1):
         term = row(guard, k)
         reach = (reach + (magnitude(term) - term) * 0.5) * h
-    if below(row(guard, 0), reach) == 0:
+    if below(row(guard, 0) + row(guard, 1) * h, reach * h) == 0:
         return 0
     power = 1.0
     for k in range(order + 1):
         set_row(b, k, row(guard, k) * (power * w.binomial[order, k]))
         power *= h
-    for r in range(1, order + 1):
-        before = row(b, r - 1)
-        for j in range(r, order + 1):
-            here = row(b, j)
-            set_row(b, j, here + before)
-            before = here
+    sum_to_bernstein(b, order)
     zero, bits = splat(0.0), 0
     for k in range(order + 1):
         bits |= below(row(b, k), zero)
@@ -185,11 +182,11 @@ def _next_mode(p, mode, viscous, fraction, ramp):
 
 @kernel()
 def _stays(column, order, h) -> bool:
-    """Return whether g_0 > sum max(-g_k, 0) h^k proves that a guard does not turn negative on [0, h]."""
+    """Return whether the lower bound of `_unsafe_pairs` proves that a guard does not turn negative on [0, h]."""
     reach = 0.0
-    for k in range(order, 0, -1):
+    for k in range(order, 1, -1):
         reach = (reach + max(-column[k], 0.0)) * h
-    return column[0] >= reach
+    return column[0] + column[1] * h >= reach * h
 
 
 @kernel()

@@ -140,13 +140,13 @@ def summary(rows, n) -> tuple[int, int, int, int, float, float, float, bool]:
 def _sums(w, order, h) -> None:
     """Write an upper bound of each force over [0, h], and the sums of f_k h^k / (k+1) and f_k h^k / (k+2).
 
-    The bound is the larger value at the two ends plus h^2 / 8 times a bound of the curvature.
+    The bound is the larger value at the two ends plus h^2 / 8 times a bound of the downward curvature.
     """
     end = bend = first = second = splat(0.0)
     for k in range(order, -1, -1):
         force = row(w.force, k)
         end = end * h + force
-        bend = bend * h + magnitude(force) * (0.125 * k * (k - 1))
+        bend = bend * h + (magnitude(force) - force) * (0.0625 * k * (k - 1))
         first = first * h + force * w.inverse[k + 1]
         second = second * h + force * w.inverse[k + 2]
     start = row(w.force, 0)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.kernel.compiler import kernel
+from plow_twin.kernel.polynomial import sum_to_bernstein
 from plow_twin.kernel.simd import choose, exact_row, exact_splat, fused, set_row
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.compiled_scene import CompiledScene, options
@@ -297,13 +298,4 @@ def to_bernstein(lanes, column, w, order, h) -> None:
     for k in range(order + 1):
         set_row(b, k, exact_row(column, k) * (power * w.binomial[order, k]))
         power = power * h
-    # two sweeps at once halve the number of stores
-    for r in range(1, order + 1, 2):
-        before = exact_row(b, r)
-        once = before + exact_row(b, r - 1)
-        set_row(b, r, once)
-        for j in range(r + 1, order + 1):
-            here = exact_row(b, j)
-            swept = here + before
-            set_row(b, j, swept + once)
-            before, once = here, swept
+    sum_to_bernstein(b, order)
