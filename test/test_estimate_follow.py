@@ -176,6 +176,20 @@ def test_a_withdrawn_estimate_is_undone(truth: Truth) -> None:
     assert (np.ptp(follower.clearance(), axis=1) > 0.3 * before).all()
 
 
+def test_a_rough_estimate_of_the_same_motion_does_not_replace_one_that_is_not_rough(truth: Truth) -> None:
+    follower = Follower(truth.nominal, MEMBERS)
+    _run(follower, truth, 0.5)
+    rough = _known(truth, State.ROUGH)
+    assert _take(follower, rough) and _take(follower, _known(truth))
+    same = Follower(truth.nominal, MEMBERS)
+    same.restore(follower.snapshot())
+    for one in (follower, same):
+        _run(one, truth, 0.6, 0.5)
+        assert not _take(one, rough)  # a tenth of its window, of 1 s, is new
+        _run(one, truth, 0.8, 0.6)
+        assert _take(one, rough)
+
+
 def test_another_machine_is_followed_from_its_own_prior(truth: Truth) -> None:
     session = Session(Follower(truth.nominal, MEMBERS), 0)
     load, following = truth.load, session.following

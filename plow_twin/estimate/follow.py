@@ -156,8 +156,8 @@ class Follower:
         #: numbers of poses that moved the members, that were outliers, and that were dropped because too many were
         #: waiting
         self.poses_used = self.poses_outlying = self.poses_dropped = 0
-        #: how often members were drawn anew
-        self.drawn = 0
+        #: how often members were drawn anew; time in s since which the estimate is followed
+        self.drawn, self._since = 0, start
         self._draw("", start, self._unworn())
         self._forget()
 
@@ -406,8 +406,9 @@ class Follower:
         facts = {
             "members": self._members, "added": self.added, "drawn": self.drawn, "estimate": self._text,
             "due": self._due, "used": list(self._used), "speed": self._speed, "cell": self._cell,
-            "span": self._span_start, "worn": self._ensemble.worn_before.tolist(), "random": random,
-            "outlying": self._ensemble.outlying, "range": self._range.tolist(), "sizes": [len(blob) for blob in blobs],
+            "span": self._span_start, "since": self._since, "worn": self._ensemble.worn_before.tolist(),
+            "random": random, "outlying": self._ensemble.outlying, "range": self._range.tolist(),
+            "sizes": [len(blob) for blob in blobs],
         }  # fmt: skip
         head = json.dumps(facts).encode()
         return b"".join([_LENGTH.pack(len(head)), head, *blobs])
@@ -431,6 +432,7 @@ class Follower:
             self.drawn, self._members = int(facts["drawn"]), int(facts["members"])
             self._draw(facts["estimate"], 0.0, worn)
         self.added, self._cell, self._span_start = int(facts["added"]), int(facts["cell"]), float(facts["span"])
+        self._since = float(facts["since"])
         self._due = [(float(when), int(number), measured) for when, number, measured in facts["due"]]
         self._used = deque(facts["used"])
         *own, noise, clearance, wrench = blobs
@@ -452,7 +454,8 @@ class Follower:
     def add_estimate(self, text: str, t: float) -> None:
         """Add an estimate that is known from time `t` in s on, as JSON of `Estimate.as_dict`.
 
-        An estimate with both clearances is followed. One clearance is enough while no estimate is followed. After a
+        An estimate with both clearances is followed. One clearance is enough while no estimate is followed. Of two
+        estimates of nearly the same motion, the first is followed if the second has more rough clearances. After a
         withdrawn estimate the twin follows the prior again.
         """
         self._add(t, text)
@@ -476,8 +479,18 @@ class Follower:
         if State.WITHDRAWN in states:
             if self.estimate is not None:
                 self._begin_anew("")
+        elif self._is_better(found):
+            return
         elif all(state.known for state in states) or (self.estimate is None and any(state.known for state in states)):
             self._begin_anew(measured)
+
+    def _is_better(self, found: Estimate) -> bool:
+        """Return whether the followed estimate has fewer rough clearances, from nearly the same motion as another."""
+        before, window_s = self.estimate, found.t_end - found.t_start
+        if before is None or self.time - self._since >= tuning.NEW_MOTION * window_s:
+            return False
+        own, new = ((one.horizontal_state, one.vertical_state) for one in (before, found))
+        return all(state.known for state in own) and own.count(State.ROUGH) < new.count(State.ROUGH)
 
     @property
     def known(self) -> str:
@@ -494,6 +507,7 @@ class Follower:
         """Draw members from an estimate (JSON) or the prior; they start at the poses of the previous members."""
         before = self._ensemble
         self.drawn += 1
+        self._since = self.time
         self._draw(text, self.time, self.wear_depth)
         self._ensemble.stand_like(before, self._wrench)
 

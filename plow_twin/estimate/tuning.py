@@ -492,6 +492,14 @@ LEARNED_FOR: Annotated[
 LEARNED_EACH: Annotated[
     float, Tuned("s", "time between two updates of the learned parameters", "as for `LEARNED_TO`")
 ] = 1.0
+NEW_MOTION: Annotated[
+    float,
+    Tuned(
+        "window",
+        "smallest share of new motion with which an estimate replaces one that has fewer rough clearances",
+        "windows that grow by half have a third, neighbouring windows of a node 0.31, those of 10.0 and 10.8 s 0.07",
+    ),
+] = 0.2
 
 # Loads that do not explain the motion
 MODULATED: Annotated[
