@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from estimate_support import known
 from scenes import preset
 
 from plow_twin import Clearance, Table, Wear, simulate
+from plow_twin.estimate import pads
 from plow_twin.estimate.estimate import estimate
 from plow_twin.estimate.measurements import Load, Poses
 from plow_twin.estimate.result import Estimate, State
@@ -45,9 +47,12 @@ def worn_askew(depth: np.ndarray, seed: int) -> tuple[Estimate, dict[str, float]
     }  # fmt: skip
 
 
-def test_walls_worn_askew_are_estimated_and_the_model_is_not_suspect() -> None:
+def test_walls_worn_askew_are_estimated_and_the_model_is_not_suspect(monkeypatch: pytest.MonkeyPatch) -> None:
     """The pads are as uneven as near the end of a life, where a fit with even pads fails."""
+    fitted = Mock(side_effect=pads.fit)
+    monkeypatch.setattr(pads, "fit", fitted)
     result, true = worn_askew(UNEVEN, 1)
+    assert fitted.call_count == 2, "the walls are not fitted again once their turns change by less than their noise"
     assert (result.model, result.horizontal_state) == ("ok", State.ESTIMATED), result.reasons
     assert result.horizontal.mean == pytest.approx(0.5 * (true["horizontal_top"] + true["horizontal_bottom"]), abs=3e-4)
     assert result.vertical.mean == pytest.approx(0.5 * (true["vertical_left"] + true["vertical_right"]), abs=3e-4)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.estimate import tuning
-from plow_twin.estimate.fit import DIFFERENCE_STEPS, DIFFERENCES, LAG, TURNS, WALLS, Fit, Problem, fit, joint_step
+from plow_twin.estimate.fit import DIFFERENCES, LAG, TURNS, WALLS, Fit, Problem, fit, joint_step
 from plow_twin.estimate.gaps import GROUPS
 from plow_twin.estimate.priors import UNSTATED
 from plow_twin.estimate.result import Interval
@@ -68,11 +68,15 @@ def shown(problem: Problem, found: Fit) -> float:
 def with_differences(problem: Problem, found: Fit) -> tuple[Problem, Fit] | None:
     """Repeat a fit with differences of machine and sensor; None if the model cannot be run."""
     forward, most = problem.forward.renewed(), 0.5 * deviations()
-    for _ in range(_ROUNDS):
-        step, _ = _joint_step(problem, found)
+    for index in range(_ROUNDS):
+        step, covariance = _joint_step(problem, found)
         differences = problem.differences + np.clip(step[SIZE:], -most, most)
         differences[LAG] = max(differences[LAG], 0.0)
-        change = np.abs(differences - problem.differences)
+        change = differences - problem.differences
+        size = float(change @ np.linalg.solve(covariance[SIZE:, SIZE:], change))
+        # a change within the noise follows linearly in the grades of a fit
+        if index and size < tuning.SETTLED:
+            break
         problem = Problem(
             forward, problem.unknowns, problem.window, horizon=problem.horizon, differences=differences,
             drift=problem.drift,
@@ -81,8 +85,6 @@ def with_differences(problem: Problem, found: Fit) -> tuple[Problem, Fit] | None
         if again is None:
             return None
         found = again
-        if (change < 0.5 * DIFFERENCE_STEPS).all():
-            break
     return problem, found
 
 

@@ -334,6 +334,14 @@ UNEXPLAINED: Annotated[
     ),
 ] = 1e-4
 TURN: Annotated[float, Tuned("m", "prior deviation of the turn of a wall in a fit")] = 4e-3
+SETTLED: Annotated[
+    float,
+    Tuned(
+        "chi^2",
+        "change of turned walls, lever arm and low pass between two fits below which they are not fitted again",
+        "`lever` 80000 and `filter_5` 96001: clearances move by at most 0.13 deviations; with 4 by 0.6",
+    ),
+] = 1.0
 
 # Hard contacts
 FITTED: Annotated[
