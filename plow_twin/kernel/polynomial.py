@@ -136,20 +136,43 @@ def first_root_within(g: Array, n: int, h: float, w) -> float:
 
 
 @kernel()
-def maximum(g: Array, n: int, h: float, floor: float, w) -> float:
-    """Return the larger of `floor` and the maximum of g on [0, h], to a relative error of 1e-12."""
-    end, steepest, power = g[n], 0.0, 1.0
+def _value(g: Array, n: int, x: float) -> float:
+    value = g[n]
     for k in range(n - 1, -1, -1):
-        end = end * h + g[k]
-    for k in range(2, n + 1):
-        power *= h
-        steepest += k * abs(g[k]) * power
-    if abs(g[1]) >= steepest:
-        # g is monotonic on [0, h]
-        return max(floor, g[0], end)
+        value = value * x + g[k]
+    return value
+
+
+@kernel()
+def maximum(g: Array, n: int, h: float, floor: float, w) -> float:
+    """Return the larger of `floor` >= 0 and the maximum of g on [0, h], to a relative error of 1e-12.
+
+    If the Bernstein coefficients of g' change their sign at most once, a maximum between the ends is at the only root
+    of g'. Otherwise the hull of g's own coefficients is narrowed.
+    """
+    best, slope, b = max(floor, g[0], _value(g, n, h)), w.column[1], w.halves
+    if n < 2:
+        return best
+    for k in range(n):
+        slope[k] = (k + 1) * g[k + 1]
+    to_bernstein(slope, n - 1, h, w.binomial[n - 1], b[0])
+    changes, crossing, rises = 0, 0.0, b[0, 0] >= 0.0
+    positive = rises
+    for k in range(1, n):
+        if (b[0, k] >= 0.0) != positive:
+            changes += 1
+            crossing = h * (k - 1 + b[0, k - 1] / (b[0, k - 1] - b[0, k])) / (n - 1)
+            positive = not positive
+    if changes == 1 and rises:
+        return max(best, _value(g, n, _crossing(slope, n - 1, 0.0, h, crossing)))
+    return best if changes <= 1 else _narrowed(g, n, h, best, w)
+
+
+@kernel()
+def _narrowed(g: Array, n: int, h: float, best: float, w) -> float:
+    """Return the larger of `best` and the maximum of g on [0, h]; intervals whose hull exceeds `best` are halved."""
     b = w.halves
     to_bernstein(g, n, h, w.binomial[n], b[0])
-    best = floor
     top = 0
     while top >= 0:
         best = max(best, b[top, 0], b[top, n])

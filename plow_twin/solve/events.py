@@ -145,8 +145,8 @@ def _unsafe_pairs(w, order, h):
 def _nothing_ends(p, state, w, order, h, penetrating, hysteretic) -> bool:
     """Return whether every pair is proved to keep its mode on [0, h], for an integer exponent without a ramp.
 
-    It makes the first test of `_unsafe_pairs` and the test of `_stays` for all pairs side by side. An allowance for
-    rounding makes sure that guards that pass here would also pass there.
+    It makes the first test of `_unsafe_pairs` and the test of `_stays` for all pairs side by side, without credit for a
+    rising linear term. An allowance for rounding makes sure that guards that pass here would also pass there.
     """
     weights = w.per_pair
     for pair in range(PAIR_COUNT):
