@@ -61,6 +61,18 @@ def test_gaps_at_one_wall_alone_give_no_clearance(gapped: tuple[Truth, np.ndarra
         Gaps.of(np.arange(4.0), np.zeros((4, 3)))
 
 
+def test_gaps_with_theta_alone_give_the_clearances_and_the_reason_names_the_missing_components(
+    gapped: tuple[Truth, np.ndarray],
+) -> None:
+    """Four sensors leave theta to the poses, so they give no pose in place of the measured one."""
+    truth, gap = gapped
+    four, q = np.full_like(gap, np.nan), truth.poses.q.copy()
+    four[:, [0, 1, 3, 6]], q[:, :2] = gap[:, [0, 1, 3, 6]], np.nan
+    result = estimate(truth.nominal, truth.load, Poses(truth.poses.t, q), gaps=Gaps.of(truth.poses.t, four)[0])
+    assert result.horizontal_state is result.vertical_state is State.ESTIMATED
+    assert result.reasons == tuple(f"{name}: measured 0 times, expected at least 20" for name in "xy")
+
+
 def test_gaps_without_a_pose_give_an_estimate_and_a_shifted_one_is_found(gapped: tuple[Truth, np.ndarray]) -> None:
     truth, gap = gapped
     gaps, lost = Gaps.of(truth.poses.t, gap)

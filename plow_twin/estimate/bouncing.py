@@ -75,13 +75,14 @@ class Bounced:
     noise : (3,) standard deviation of the measurements
     distance : distance of the measured motion from nearby drawn motions, relative to the distances among drawn motions
     path : distance of the measured path (mean and scatter of the pose over the load's period) from its prediction by
-        the drawn motions, as a normal deviate among the same distances of the drawn motions
+        the drawn motions, as a normal deviate among the same distances of the drawn motions; 0 with too few poses
     law : likeness of the motion to motions under another contact law, as a normal deviate among motions under the
-        believed law; 0 if no other law is known
-    odds : log odds of the other law; minus infinity if no other law is known
+        believed law; 0 if no other law is known, or too few of its motions can be run, or the contact is not hard
+    odds : log odds of the other law; minus infinity in the same cases, and about a given vector
     unseen : (2,) deviation of the clearances in m due to errors of the frame's sides and of theta's scale, which the
         motion does not show
-    rounded : (2,) excess of the clearances in m if the frame's corners are rounded by `priors.ROUNDING`
+    rounded : (2,) excess of the clearances in m if the frame's corners are rounded by `priors.ROUNDING`; zero if the
+        scene states the corners or the sides' deviations
     """
 
     clearance: Array

@@ -147,7 +147,7 @@ def _estimate(
     poses, spikes = poses.without_spikes(noise_level(filled(poses)))
     lost += spikes
     by_gaps = None if gaps is None else fit_gaps(scene, gaps.between(span[0], span[1] + 1e-9), poses)
-    if by_gaps is not None and (len(poses.t) < FEWEST_POSES or _lacking(poses)):
+    if by_gaps is not None and len(by_gaps.poses.t) and (len(poses.t) < FEWEST_POSES or _lacking(poses)):
         poses = by_gaps.poses
     if forces is not None:
         forces = forces.between(span[0], span[1] + 1e-9)

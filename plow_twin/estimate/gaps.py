@@ -80,7 +80,7 @@ class GapsFit:
     poses : poses from the gaps; empty if theta was taken from the measured poses
     clearance, deviation : (2,) horizontal and vertical clearance, and their standard deviations, in m
     groups : clearances between facing pads that both have sensors
-    used : number of messages
+    used : number of messages, all with the same sensors
     contradiction : largest mean residual of a sensor in units of the constant error; 0 if no sensor is redundant
     """
 
@@ -95,7 +95,8 @@ class GapsFit:
 def fit_gaps(scene: Scene, gaps: Gaps, poses: Poses) -> GapsFit | None:
     """Fit clearances and poses to gaps, with theta from `poses` if the gaps do not determine it.
 
-    Returns None if fewer than 20 messages have enough gaps.
+    Of messages with different sensors, the most frequent set of enough sensors is used. Returns None if no such set has
+    20 messages.
     """
     error = gaps.deviation or tuning.CONSTANT_ERROR
     rows = penetration_rows(replace(scene, clearance=Clearance(0.0, 0.0)))
