@@ -151,7 +151,12 @@ def maximum(g: Array, n: int, h: float, floor: float, w) -> float:
     of g'. Otherwise the hull of g's own coefficients is narrowed.
     """
     best, slope, b = max(floor, g[0], _value(g, n, h)), w.column[1], w.halves
-    if n < 2:
+    steepest, power = 0.0, 1.0
+    for k in range(2, n + 1):
+        power *= h
+        steepest += k * abs(g[k]) * power
+    if abs(g[1]) >= steepest:
+        # g is monotonic on [0, h]
         return best
     for k in range(n):
         slope[k] = (k + 1) * g[k + 1]

@@ -525,6 +525,14 @@ def expand(
             if wear is not None and penetrating:
                 penetration = penetration - row(w.wear, k)
         set_row(w.penetration, k, penetration)
+        if k > 0 and load_terms[2] is not None:
+            # under samples most series end early, and an order in vain would cost more than the wait for its size
+            reach *= sigma_limit
+            size = _size(p, w, k, penetrating, sigma_limit, wear, support, *rub_terms)
+            w.term_size[k] = size
+            quiet = quiet + 1 if size * reach < small else 0
+            if quiet == p.lacuna and k >= 4:
+                return k
         if k == limit:
             break
         s1_k = 0.0 if load_terms[0] is None else load[0, k]
@@ -581,7 +589,7 @@ def expand(
         rates = turning + applied
         here = rates * steady + before * bent
         before = rates
-        if k > 0:
+        if k > 0 and load_terms[2] is None:
             # the size comes last, because the next order does not wait for it
             size = _size(p, w, k, penetrating, sigma_limit, wear, support, *rub_terms)
             w.term_size[k] = size
