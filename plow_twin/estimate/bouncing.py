@@ -313,7 +313,7 @@ class _Drawn:
         self.q: list[Array] = []
 
     def add(self, count: int, centre: Array, about: float, delay: float, most_work: int) -> None:
-        """Draw motions that are seen `delay` s late, until there are `count` or the work reaches `most_work`.
+        """Draw `count` more motions that are seen `delay` s late, or fewer if the work reaches `most_work`.
 
         The clearances have the mean `centre` and the deviation `about`, both in m.
         """

@@ -80,7 +80,7 @@ class Poses:
         return float(np.median(np.diff(self.t))) * self.q.size / max(measured, 1)
 
     def gap(self) -> float:
-        """Return the gap in s between measured values that half of all moments lie in or below, over all components."""
+        """Return the median gap in s between measured values of a component, weighted by the gaps' lengths."""
         gaps = np.sort(np.concatenate([np.diff(self.t[np.isfinite(column)]) for column in self.q.T]))
         return float(gaps[np.searchsorted(gaps.cumsum(), 0.5 * gaps.sum())])
 
