@@ -174,8 +174,10 @@ def test_of_a_run_the_pads_as_it_left_them_count_and_no_estimate_of_others(tmp_p
 
 def test_a_scene_without_wear_or_period_is_refused() -> None:
     scene = preset("paper")
-    with pytest.raises(LifeError, match="wear: got none"):
+    with pytest.raises(LifeError, match="wear: missing"):
         forecast(scene, Plan(0.03, 0.03, 100.0))
+    with pytest.raises(LifeError, match=r"wear\.travel_speed_m_s: got 0, expected a speed above 0"):
+        forecast(replace(scene, wear=Wear(1e-14, 0.015, 0.0)), Plan(0.03, 0.03, 100.0))
     for unlikely in (0.0, 5e-13):
         with pytest.raises(LifeError, match=r"expected one within wear\.prior_m2_n, 1e-15 to 1e-13"):
             forecast(replace(scene, wear=Wear(unlikely, 0.015, 2.0)), Plan(0.03, 0.03, 100.0))
@@ -311,7 +313,7 @@ def test_unusable_input_of_a_forecast_is_refused_and_not_left_out(
 
     assert "--stop: got 20 h, expected at most the horizon, --horizon 5" in said("--horizon", "5", "--stop", "20")
     assert "scenario: got 'hard:mass=1.3'" in said("--scenario", "hard:mass=1.3")
-    assert "wear: got none" in said(scene_file="paper")
+    assert "wear: missing, expected a section `wear`" in said(scene_file="paper")
     assert "got 0.028 mm, expected more than the present clearance, 25.000 mm; is it in m?" in " ".join(
         said("--limit-horizontal", "0.028").split()
     )
