@@ -19,7 +19,7 @@ quiet_option = click.option("--quiet", "-q", is_flag=True, help="No progress and
 json_option = click.option("--json", "as_json", is_flag=True, help="The result as JSON on standard output.")
 map_option = click.option(
     "--map", "mapping", type=FILE,
-    help="YAML mapping of a recording of another program: which topics are load, travel, pose, gaps, forces.",
+    help="YAML mapping: which topics, columns or nodes are load, travel, pose, gaps, forces, and their units.",
 )  # fmt: skip
 
 
