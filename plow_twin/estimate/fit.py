@@ -266,9 +266,7 @@ class Problem:
     ) -> list[Point] | None:  # fmt: skip
         """Run the model in one call from `several` sets of starting states, shape (k, s, 6); None as in `evaluate`."""
         window, differences = self.window, self.differences if differences is None else differences
-        lag = float(np.sqrt(differences[LAG]))
-        shift = shared[DELAY] - lag
-        rows = self._rows_at(float(shift))
+        rows = self._rows_at(float(shared[DELAY]) - float(np.sqrt(differences[LAG])))
         scene, forward = self._scene_of(shared), self.forward
         if change is not None:
             scene, forward = change(scene), forward.of(change(self.unknowns.scene))
@@ -282,9 +280,7 @@ class Problem:
             return None
         q, v = motions.q.reshape(count, size, 3), motions.v.reshape(count, size, 3)
         contact = motions.contact.reshape(count, window.swings, -1)
-        return [
-            self._point(shared, several[k], rows, q[k], v[k], contact[k], differences, lag, shift) for k in range(count)
-        ]
+        return [self._point(shared, several[k], rows, q[k], v[k], contact[k], differences) for k in range(count)]
 
     def _rows_at(self, shift: float) -> _Rows:
         """Return the rows of the swings if the stamps are `shift` s late, cached as successive vectors share it."""
@@ -306,11 +302,11 @@ class Problem:
         return self._at
 
     def _point(
-        self, shared: Array, states: Array, rows: _Rows, q: Array, v: Array, contact: Array, differences: Array,
-        lag: float, shift: float,
-    ) -> Point:  # fmt: skip
+        self, shared: Array, states: Array, rows: _Rows, q: Array, v: Array, contact: Array, differences: Array
+    ) -> Point:
         """Return a point from the poses and rates of its motion at the asked times, as the sensor measures them."""
-        window, at_ends = self.window, np.hstack((q[rows.ends], v[rows.ends]))
+        window, lag = self.window, float(np.sqrt(differences[LAG]))
+        at_ends = np.hstack((q[rows.ends], v[rows.ends]))
         if len(rows.ends):
             q, v = np.delete(q, rows.ends, axis=0), np.delete(v, rows.ends, axis=0)
         begin = states[:, :3], states[:, 3:]
@@ -319,7 +315,7 @@ class Problem:
             begin = moved_by_lever(*begin, differences[LEVER])
         if lag:
             self._memory = self._memory or Memory(window.poses)
-            memory = self._memory.at(window.starts[:-1] + shift) - shared[BIAS]
+            memory = self._memory.at(window.starts[:-1] + rows.shift) - shared[BIAS]
             begin = np.ascontiguousarray(begin[0]), np.ascontiguousarray(begin[1])
             q, v = lagged(lag, rows.inner, window.starts[:-1], *begin, memory, rows.times, q, v)
         count = len(rows.swing)
