@@ -80,7 +80,7 @@ def prepare_simulate(
     def call(end: float) -> Result:
         return simulate(scene, end, output_dt, tol, method, dt, energy_balance, sensitivity=sensitivity)
 
-    if sensitivity:
+    if sensitivity or whole_call:
         call(output_dt or t_end)  # compiles
 
     def run() -> Sample:
