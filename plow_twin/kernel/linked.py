@@ -1,7 +1,7 @@
 """Two compilers for numba: one for kernels that only kernels call, one for kernels that Python calls too.
 
 LLVM optimises a kernel together with every kernel that it calls. Numba would also optimise each called kernel alone and
-generate its machine code, which takes a quarter of the compile time; the first compiler stops before, at code that
+generate its machine code, which takes a quarter of the compile time; the first compiler stops before that, at code that
 callers can link. Both compilers use numba's extension point (its manual, "Customizing the Compiler"), each with its own
 class of code library.
 """
@@ -149,7 +149,7 @@ class EntryCompiler(_Compiler):
     lowering = _LowerForPython
 
     def compile_extra(self, func: Any) -> Any:
-        """Compile with garbage collection paused, which would take a seventh of the time and free little memory."""
+        """Compile with garbage collection paused; it would take a seventh of the time and free little memory."""
         with garbage_kept():
             return super().compile_extra(func)
 

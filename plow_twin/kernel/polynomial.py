@@ -50,7 +50,7 @@ def sum_to_bernstein(b: Array, n: int) -> None:
 
 @kernel(inline="code")
 def _halve(left: Array, right: Array, n: int) -> None:
-    """Split the Bernstein coefficients in `left` at the middle: the left half stays there, `right` gets the other."""
+    """Split the Bernstein coefficients at the middle: `left` keeps its left half, `right` gets the right half."""
     for r in range(n + 1):
         right[n - r] = left[n]
         for j in range(n, r, -1):

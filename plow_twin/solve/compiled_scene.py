@@ -48,13 +48,14 @@ from plow_twin.solve.state import (
 
 #: Tightest and loosest tolerance.
 TOLERANCE_RANGE = (1e-13, 1e-1)
-#: Error of a step as a share of the tolerance, so that hundreds of steps and amplifying impacts stay within it.
+#: Admissible error of one step as a share of the tolerance; small, because the errors of hundreds of steps add up and
+#: impacts amplify them.
 STEP_SHARE = 3e-4
-#: Largest error of a step over the length scale, which limits `STEP_SHARE` of a loose tolerance.
+#: Largest admissible error of a step relative to the length scale; it limits the error of a step at a loose tolerance.
 LARGEST_STEP_ERROR = 1e-6
 #: `STEP_SHARE` for exponents that are not integers; it is smaller because near a branch point series converge slowly.
 STEP_SHARE_FRACTION = 1e-6
-#: Number of mode changes at one instant after which the solver steps beyond it.
+#: Number of mode changes at one instant after which the solver steps beyond this instant.
 MAX_EVENTS_AT_ONCE = 64
 #: Rest is checked (`method.small_harmonics`) if the harmonics are at most this share of the load that presses the head
 #: to its walls.
@@ -156,7 +157,7 @@ def _check_tolerance(tol: float) -> None:
 class _Shared:
     """Results that scenes share, computed once for each set of objects on which they depend.
 
-    If `most` is given, only this number of the newest results is kept.
+    If `most` is given, only the newest `most` results are kept.
     """
 
     def __init__(self, most: float = math.inf) -> None:
@@ -382,12 +383,12 @@ def _thresholds(admissible: float, order: int) -> Array:
 
 
 def order_for(admissible: float) -> int:
-    """Return the series' order for an admissible error of a step, by a fit to the fastest order of the bench scenes."""
+    """Return the series' order for an admissible error of a step, fitted to the fastest orders of the bench scenes."""
     return int(min(MAX_ORDER, max(8, round(6.0 - math.log10(admissible)))))
 
 
 def _lacuna(exponent: float) -> int:
-    """Return how many consecutive orders can vanish: without other terms d^n gives a term every n + 1 orders."""
+    """Return how many consecutive orders can vanish: d^n alone gives a term only every n + 1 orders."""
     if not float(exponent).is_integer():
         return 6
     return 2 if exponent == 1.0 else int(exponent) + 1
@@ -413,7 +414,7 @@ def _segments(scene: Scene, pieces: Pieces) -> Segments:
 
 
 def law_terms(contact: Contact) -> tuple[Terms, float]:
-    """Return the terms of the law with all other terms absent, and D of lambda = D / v0 (-1 if lambda is constant)."""
+    """Return the law's terms, with all other terms absent, and D in lambda = D / v0 (-1 if lambda is constant)."""
     law, exponent = LAWS[contact.law], float(contact.exponent)
     viscous = law.additive and bool(contact.damping)
     number = -1.0 if contact.restitution is None else law.damping_number(contact.restitution)
@@ -504,7 +505,7 @@ def _release(scene: Scene, tol: float, length: float, speed: float) -> float:
         # the spring of a sticking corner ends at its release, so the jump of its force must be negligible too
         stretch = max(1e-3 * tol * length, 1e-15 * geometry.half_diagonal(scene))
         held = stretch * friction.stick_stiffness_n_m / friction.coefficient
-        # the series of a corner that crosses the depth in less than 1e-11 s would have non-finite terms
+        # if a corner crossed this depth in less than 1e-11 s, its series would have non-finite terms
         depth = max(float((held / scene.contact.stiffness) ** (1.0 / exponent)), 1e-11 * speed)
         release = min(release, depth)
     return release

@@ -58,7 +58,7 @@ def wear_depth_at(state, w, sigma, out) -> None:
     """Write each pad's wear depth at sigma of the step to `out`, shape (8,)."""
     wear_depth = row(state.wear_depth, 0)
     if any_penetrates(state):
-        # row 0 is left out: the sum is only the growth over the step; pairs without force do not wear
+        # row 0 is left out, so that the sum is the growth over the step; pairs without force do not wear
         order = state.order
         growth = row(w.wear, order)
         for k in range(order - 1, 0, -1):

@@ -27,7 +27,7 @@ from plow_twin.solve.state import ON, Harmonics, Segments
 
 
 class Acting(NamedTuple):
-    """Arguments of the equations of motion beside the law.
+    """Arguments of the equations of motion other than the law.
 
     They have few different types, so that scenes share compiled code.
     """

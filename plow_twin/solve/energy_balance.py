@@ -23,10 +23,11 @@ from plow_twin.solve.loads import load_at
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, X, Y, new_record
 from plow_twin.solve.support import to_ground
 
-#: Nodes of the quadrature, which is exact to degree 15. More nodes would not reduce the imbalance, because the higher
-#: terms of a step's series are as small as the series' error.
+#: Number of nodes of the quadrature, which is exact to degree 15. More nodes would not reduce the imbalance, because
+#: the higher terms of a step's series are as small as the series' error.
 _NODES = 8
-#: Phase of the fastest harmonic [rad] over a panel of a flight or rest: products of two harmonics are exact to 1e-13.
+#: Largest phase [rad] of the fastest harmonic over a panel of a flight or rest; products of two harmonics are then
+#: integrated to 1e-13.
 _PANEL_PHASE = 2.0
 # indices into the powers [W] and forces [N, N m] at one instant
 LOADS, NORMAL, FRICTION, SUPPORT, LOAD_X, LOAD_Y, LOAD_M, CONTACT_X, CONTACT_Y, CONTACT_M, SIZE = range(11)

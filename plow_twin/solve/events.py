@@ -13,14 +13,15 @@ from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.grip import grip_guard
 from plow_twin.solve.state import CLIPPED, CROSSING, OFF, ON, RATIO, RELEASED, SIGN
 
-#: Events are simultaneous if they are closer than this share of the step before them.
+#: Two events are simultaneous if the time between them is less than this share of the step before them.
 _AT_ONCE = 1e-12
-#: Penetration at which a pair that is on is released, as a share of `Params.release`, where it acts again.
+#: Penetration at which a pair that is on is released, as a share of `Params.release`. The pair acts again at
+#: `Params.release` itself.
 _LET_GO = 0.25
-#: Allowances for rounding in the proofs for all guards at once: a factor on the sums, and an error of 1 + lambda d'.
+#: Allowances for rounding where all guards are proved at once: a factor on the sums, and an error of 1 + lambda d'.
 _ROUNDED, _ROUNDING = 1.0 + 1e-9, 1e-9
 _ALL_PAIRS = 2**PAIR_COUNT - 1
-#: Penetration below which a released pair rests on the wall, as a share of the release penetration.
+#: Penetration below which a released pair counts as resting on its wall, as a share of `Params.release`.
 _ON_THE_WALL = 1e-6
 
 
@@ -28,8 +29,8 @@ _ON_THE_WALL = 1e-6
 def _guards(p, state, w, order, penetrating, viscous, ramp) -> None:
     """Write each pair's first guard to `w.guard`.
 
-    The guard of a pair that is off is -d. The guard of a pair that is on is F / K = d + (C / K) d' for Kelvin-Voigt,
-    otherwise d, or d less a small penetration for exponents that are not integers. All other guards are d.
+    The guard of a pair that is off is -d. The guard of a pair that is on is F / K = d + (C / K) d' for Kelvin-Voigt;
+    for other laws it is d, less a small penetration if the exponent is not an integer. All other guards are d.
     """
     guard, weights = w.guard, w.per_pair
     for pair in range(PAIR_COUNT):
@@ -51,7 +52,7 @@ def _guards(p, state, w, order, penetrating, viscous, ramp) -> None:
             # a pair is released at a quarter of the depth at which it acts again, so that it cannot alternate
             first -= min(_LET_GO * p.release, 0.5 * first)
         elif state.mode[pair] == RELEASED and first <= _ON_THE_WALL * p.release:
-            # the guard of a pair that rests on the wall ends a little outside the wall
+            # the guard of a pair that rests on its wall turns negative a little outside the wall
             first = max(guard[0, pair] + _LET_GO * p.release, 0.0)
         guard[0, pair] = first if p.enabled[pair] == 1 else 1.0
 
@@ -201,7 +202,7 @@ def _sooner(state, w, order, best) -> float:
 
 @kernel()
 def _ends_with(column, order, at, within) -> bool:
-    """Return whether a guard that is positive before `at` turns negative at most `within` after it."""
+    """Return whether a guard that is positive before `at` turns negative no later than `within` after it."""
     value, slope = column[order], 0.0
     for k in range(order - 1, -1, -1):
         slope = slope * at + value
@@ -211,7 +212,7 @@ def _ends_with(column, order, at, within) -> bool:
 
 @kernel(fast=True)
 def _guards_end_with(w, order, at, within):
-    """Return a bit for each pair whose first guard ends with the event at `at`, in the sense of `_ends_with`."""
+    """Return a bit for each pair whose first guard turns negative with the event at `at` (see `_ends_with`)."""
     value, slope, zero = row(w.guard, order), splat(0.0), splat(0.0)
     for k in range(order - 1, -1, -1):
         slope = slope * at + value
@@ -265,7 +266,7 @@ def first_event(p, state, w, order, sigma, penetrating, viscous, hysteretic, int
             for k in range(order + 1):
                 column[k], w.halves[0, k] = w.guard[k, pair], w.bernstein[k, pair]
             if _stays(column, order, best):
-                # the event that has already been found comes first
+                # this guard cannot turn negative before the event that has already been found
                 continue
             state.guard_roots += 1
             root = first_root_within(column, order, sigma, w)

@@ -35,9 +35,11 @@ from plow_twin.solve.state import (
     Y,
 )
 
-#: A guard's first value is rounding error if below this share of its terms at the step's start, or over the step.
+#: A guard's first value counts as rounding error if it is at most the first number times its terms at the step's start
+#: plus the second number times its largest term over the step.
 _ROUNDING, _ROUNDING_OVER_STEP = 1e-10, 1e-13
-#: Rounding error of a corner's place along its wall (relative to the frame's size) and of its relative rate.
+#: Rounding error of a corner's place along its wall, relative to `Params.leverage`, and of its slip rate, relative to
+#: `Params.threshold[0]`.
 _FINEST = 4e-15
 
 
@@ -56,7 +58,7 @@ def held_force(p, state, pair, place, rate):
 
 @kernel(inline="code")
 def tangential_force(p, state, frozen, pair, normal, place, rate):
-    """Return T in N for the normal force N; unless `frozen`, a corner slips if its spring carries too much."""
+    """Return T in N for a normal force in N; unless `frozen`, T is limited by the force at which the corner slips."""
     grip = state.grip[pair]
     if state.mode[pair] != ON:
         return 0.0
@@ -85,8 +87,8 @@ def _normal_force(p, state, pair, depth):
 def grasp(p, state, pair, old) -> None:
     """Let the corner of a pair that begins to push stick with a slack spring, or slip if T would exceed mu_s N.
 
-    N is taken from the previous mode `old`, since with the rounded depth rounding would decide between stick and slip.
-    At a touch N is the force at depth 0 (of Kelvin-Voigt's damper); for a clipped pair that pushes again it is 0.
+    N follows from the previous mode `old`; if N followed from the depth, rounding would decide between stick and slip.
+    At a touch N is the force at depth 0, that of Kelvin-Voigt's damper; for a clipped pair that pushes again N is 0.
     """
     place, rate = _along(p, pair, state.y)
     depth = 0.0 if old == OFF else penetration_of(p, state, pair, state.y)
@@ -152,10 +154,10 @@ def grip_terms(p, state, w, k, place, rate):
 
 @kernel()
 def grip_guard(p, state, w, order, pair, side) -> int:
-    """Write a guard of a corner's grip to `w.column[0]`; return the grip after it turns negative, 0 without a guard.
+    """Write a guard of a corner's grip to `w.column[0]`; return the outcome if it turns negative, or 0 without a guard.
 
-    The guard of a sticking corner is mu_s N -+ T, one for each side. The guard of a slipping corner is the condition of
-    the module's docstring times the time per sigma, for the first side only.
+    The guard of a sticking corner is mu_s N -+ T, one for each side. A slipping corner has a guard for the first side
+    only: the condition for slip in the module's docstring, times the time per sigma.
     """
     g, rate, force, drag = w.column[0], w.slip[0], w.force, w.slip[4]
     grip = state.grip[pair]
@@ -167,7 +169,7 @@ def grip_guard(p, state, w, order, pair, side) -> int:
         sign = 1.0 if side == 0 else -1.0
         for k in range(order):
             g[k] = p.static_friction * force[k, pair] - sign * drag[k, pair]
-        # clipped at 0: a pair that is on can be outside its wall by the error of the place of its touch
+        # the force is clipped at 0: a pair that is on can be outside its wall by the error of the place of its touch
         g[0] = p.static_friction * max(force[0, pair], 0.0) - sign * drag[0, pair]
         size, noise = p.static_friction * abs(force[0, pair]) + abs(drag[0, pair]), 0.0
         # raise the guard by the rounding error of T, otherwise a corner could slip as soon as it sticks
@@ -185,7 +187,7 @@ def grip_guard(p, state, w, order, pair, side) -> int:
         for k in range(1, order):
             power *= state.sigma_end
             noise = max(noise, _ROUNDING_OVER_STEP * abs(g[k]) * power)
-    # a first value that is rounding error must not be negative: the other terms decide
+    # a first value within rounding error is clipped at 0, so that the higher orders decide
     if abs(g[0]) <= _ROUNDING * size + noise:
         g[0] = max(g[0], 0.0)
     g[0] += late

@@ -29,8 +29,8 @@ def _multiply(a, b, out) -> None:
 def _larger_norm(a, height, most, gram, power, square) -> float:
     """Return the larger of `most` and the largest singular value of the first `height` rows of a matrix.
 
-    With G = A^T A the square of the singular value lies between trace(G^(m+1)) / trace(G^m) and trace(G^m)^(1/m). G is
-    squared until the upper bound is below `most`, or until the power has rank one.
+    With G = A^T A the square of the largest singular value lies between trace(G^(m+1)) / trace(G^m) and
+    trace(G^m)^(1/m). G is squared until the upper bound is below `most`, or until the power has rank one.
     """
     size, trace = a.shape[1], 0.0
     for i in range(size):
@@ -68,7 +68,7 @@ def _larger_norm(a, height, most, gram, power, square) -> float:
 
 @kernel(fast=True)
 def _multiply_all(matrix, since, count, grown) -> None:
-    """Multiply the matrices since[:, i, :] from the left by `matrix`; row k of all of them is one row of `since`."""
+    """Multiply the matrices since[:, i, :] from the left by `matrix`; `since[k]` holds row k of all these matrices."""
     size = len(matrix)
     length = count * size
     for i in range(size):
@@ -107,12 +107,13 @@ def _largest(grown, count, height, scratch) -> float:
 
 @kernel()
 def _stretch_basis(matrix, basis, moved, logs) -> None:
-    """Multiply a basis by a matrix and orthonormalise it; write the logarithms of the factors of its extension."""
+    """Multiply a basis by a matrix and orthonormalise it; write the logarithms of its vectors' stretching."""
     size = len(matrix)
     _multiply(matrix, basis, moved)
     for j in range(size):
         for i in range(2 * j):
-            # made orthogonal to the vectors before it twice, because once leaves rounding errors
+            # each vector is made orthogonal to the vectors before it twice, because doing so once leaves rounding
+            # errors
             before, share = i % j, 0.0
             for k in range(size):
                 share += basis[k, before] * moved[k, j]

@@ -105,7 +105,7 @@ def slip_arm(p, pair, c, s, x, y):
 
 @kernel(fast=True, inline="code")
 def rolled(p, values, angle):
-    """Add the part of rounded corners, proportional to the angle or its rate, to all pairs' places or slip rates."""
+    """Add the part due to rounded corners, proportional to the angle or its rate, to all places or slip rates."""
     if _is_rounded(p) is not None:
         values = values + splat(_roll(p) * angle)
     return values

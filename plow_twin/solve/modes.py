@@ -33,13 +33,15 @@ from plow_twin.solve.state import (
     Y,
 )
 
-#: Share of the release penetration, and of the speed needed to reach it, below which a value is taken as zero.
+#: A penetration below this share of the release penetration, or a speed below this share of the speed needed to reach
+#: it, counts as zero.
 _SHALLOW = 1e-3
-#: Iterations for the damping and speed of an impact under way, which depend on each other.
+#: Number of iterations for the damping and speed of an impact under way, which depend on each other.
 _ROUNDS = 8
-#: Halvings of a bracket, enough for the last bit of a double.
+#: Number of halvings of a bracket, enough for the last bit of a double.
 _BISECTIONS = 60
-#: Largest |theta| in rad at which each corner meets the walls of its pairs, 45 degrees plus some rounding errors.
+#: Largest |theta| in rad at which each corner meets the walls of its pairs: 45 degrees and a margin for rounding
+#: errors.
 LARGEST_ANGLE = 0.25 * math.pi + 1e-12
 _ALL_PAIRS = 2**PAIR_COUNT - 1
 
@@ -52,7 +54,7 @@ def penetration_and_rate(p, state, pair):
 
 @kernel()
 def _fallen_number(p, y, pair, speed):
-    """Return D for a restitution that falls with the impact (`model.scene.Contact`); `speed` is that of approach."""
+    """Return D for a restitution that falls with the impact (`model.scene.Contact`); `speed` is the approach speed."""
     arm = row_value(p.arm_rows, pair, y[COS], y[SIN], y[X], y[Y])
     mobility = 1.0 + p.free[2] * arm * arm * p.inverse_inertia / p.inverse_mass
     impact = speed * mobility**-p.fall_mass
@@ -85,13 +87,13 @@ def touch(p, state, pair) -> None:
 def _impact_speed(number, rate, energy) -> float:
     """Return the speed v0 of the impact that led to a state inside a wall.
 
-    `number` is D, `rate` the penetration rate d' in m/s, `energy` the elastic energy per mass E / m in m^2/s^2. First
-    integral of the free impact with u = D d' / v0:  u - ln(1 + u) + D^2 E / (m v0^2) = D - ln(1 + D).
+    `number` is D, `rate` the penetration rate d' in m/s, `energy` the elastic energy per mass E / m in m^2/s^2. The
+    first integral of the free impact, with u = D d' / v0, is  u - ln(1 + u) + D^2 E / (m v0^2) = D - ln(1 + D).
     """
     if number <= 0.0 or (energy <= 0.0 and rate == 0.0):
         return 0.0
     full = number - math.log1p(number)
-    # an impact of this speed would reach the energy at its turning point (rate 0); with a rate it was faster
+    # at its turning point (rate 0) an impact of this speed would have this energy; with a rate the impact was faster
     low = math.sqrt(number * number * energy / full)
     high = max(low, abs(rate)) * (1.0 + number)
     low = max(low, rate, -number * rate)
@@ -110,7 +112,7 @@ def _impact_speed(number, rate, energy) -> float:
 def _start_inside(p, state, pair, energy) -> None:
     """Give a pair that starts inside its wall the damping of the impact that would have brought it there.
 
-    `energy` is the elastic energy of all pairs, since all of it may have been the impact's.
+    `energy` is the elastic energy of all pairs, since all of it may come from this impact.
     """
     if p.damping_number >= 0.0:
         y = state.y
@@ -216,7 +218,7 @@ def weigh_pairs(p, state, w, viscous, fraction, ramp, stick) -> bool:
             if penetration > _SHALLOW * p.release:
                 per_pair[BASE, pair] = 0.5 / math.sqrt(penetration) if p.exponent == 1.5 else 1.0 / penetration
             else:
-                # the step after the touch was interrupted at a depth too shallow for a series of its power
+                # the step after the touch was interrupted at a depth that is too shallow for a series of d^n
                 mode[pair] = RELEASED
         acts = mode[pair] == ON
         per_pair[ACTS, pair] = p.stiffness if acts else 0.0
@@ -230,7 +232,7 @@ def weigh_pairs(p, state, w, viscous, fraction, ramp, stick) -> bool:
 
 @kernel(inline="source")
 def slow_touch(p) -> float:
-    """Return the speed of a touch in m/s which is too slow to carry a pair to the release penetration by itself."""
+    """Return the speed in m/s below which a touch alone does not carry a pair to the release penetration."""
     acceleration = p.threshold[0] * p.weight / p.radius
     return _SHALLOW * math.sqrt(2.0 * acceleration * p.release)
 

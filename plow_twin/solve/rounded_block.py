@@ -1,9 +1,8 @@
 """Short motions of many square blocks with rounded corners that are tossed on a table, each with its own parameters.
 
 Contacts have the normal force of `model.contact` and the spring friction of `solve.grip`. Here restitution and friction
-also fall with the impact, and their values are scattered from touch to touch. Flight has linear drag. In contact, a
-step is a fixed fraction of the contact time. In flight, a step is as long as possible without a corner reaching the
-table.
+also fall with the impact speed, and both are scattered from touch to touch. Flight has linear drag. In contact, a step
+is a fixed fraction of the contact time. In flight, a step is as long as possible without a corner reaching the table.
 """
 
 from __future__ import annotations
@@ -17,8 +16,9 @@ from plow_twin.model.contact import normal_force
 
 #: Parameters of a block, per mass: half the distance between the centres of its corners' arcs [m], their radius [m],
 #: radius of gyration [m], height of the table [m], stiffness K [1/s^2], tangential stiffness over K [1], tangential
-#: damping over critical damping [1], restitution and friction at 1 m/s, the power of their fall with the impact, the
-#: power of the moving mass in the impact, gravity [m/s^2], drag of place and of angle [1/s].
+#: damping over critical damping [1], restitution at an impact speed of 1 m/s and the power with which it falls,
+#: friction at 1 m/s and the power with which it falls, the power of the moving mass in the impact, gravity [m/s^2],
+#: drag of place and of angle [1/s].
 BLOCK = np.dtype(
     [
         (name, "f8")
@@ -31,7 +31,7 @@ BLOCK = np.dtype(
 CORNERS = 4
 #: Number of steps in half a period of the stiffest contact.
 _STEPS = 70.0
-#: Slowest touch in m/s that changes a restitution, least restitution, largest restitution.
+#: Least speed of a touch in m/s for its damping, least restitution, largest restitution.
 _SLOWEST, _LEAST, _LARGEST = 0.01, 0.05, 0.9
 #: Impact speed in m/s below which restitution and friction are constant.
 _SMALLEST_IMPACT = 0.05

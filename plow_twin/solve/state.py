@@ -31,9 +31,10 @@ ON: Final = 1
 CLIPPED: Final = 2
 #: A pair penetrates less than `Params.release`, so that its force is negligible (exponents that are not integers).
 RELEASED: Final = 3
-#: Outcome of an event that is no mode: a pair crosses the end of its damping's ramp.
+#: Outcome of an event that does not change the mode: a pair crosses the end of its damping's ramp.
 CROSSING: Final = 4
-#: Further outcomes that are no modes: the corner begins to slip along the wall, forward or backward, or to stick.
+#: Further outcomes that do not change the mode: the corner begins to slip along the wall, forward or backward, or to
+#: stick.
 SLIPS_FORWARD: Final = 5
 SLIPS_BACKWARD: Final = 6
 STICKS: Final = 7
@@ -85,8 +86,8 @@ _STATUS_TEXT: Final = {
 }
 
 
-# Records rather than tuples of arrays, because a kernel then gets one pointer, shapes are constants, and nothing is
-# reference counted.
+# These are records rather than tuples of arrays, because a kernel then gets one pointer, shapes are constants, and
+# nothing is reference counted.
 
 _ROWS: Final = MAX_ORDER + 1
 _WIDE: Final = (_ROWS, PAIR_COUNT)
@@ -109,17 +110,18 @@ def _in_lines(fields: list[tuple[Any, ...]]) -> np.dtype[np.void]:
     )
 
 
-#: Intervals of the grid of restitutions with tabulated damping numbers; the least restitution is one interval.
+#: Number of intervals of the grid of restitutions with tabulated damping numbers; the least restitution is one
+#: interval.
 RESTITUTIONS: Final = 1000
 
-#: Constants of one scene at one tolerance, divided by mass and inertia if that saves work.
+#: Constants of one scene at one tolerance, divided by mass and inertia where that saves work.
 _PARAM_FIELDS: Final[list[tuple[Any, ...]]] = [
-    ("penetration_rows", "f8", (5, PAIR_COUNT)),  # penetration rows for c, s, X, Y, 1
-    ("arm_rows", "f8", (4, PAIR_COUNT)),  # arm rows for c, s, X, Y
-    ("slip_rows", "f8", (4, PAIR_COUNT)),  # place along the wall, rows for c, s, X, Y
-    ("slip_arm_rows", "f8", (4, PAIR_COUNT)),  # arm about G of a force along the wall
+    ("penetration_rows", "f8", (5, PAIR_COUNT)),  # coefficients of the penetrations for c, s, X, Y, 1
+    ("arm_rows", "f8", (4, PAIR_COUNT)),  # coefficients of the arms for c, s, X, Y
+    ("slip_rows", "f8", (4, PAIR_COUNT)),  # coefficients of the place along the wall for c, s, X, Y
+    ("slip_arm_rows", "f8", (4, PAIR_COUNT)),  # coefficients of the arm about G of a force along the wall
     ("wear_per_impulse", "f8", (PAIR_COUNT,)),  # depth of each pad per impulse, k_s v / A
-    ("speed_per_wear", "f8"),  # A / k_s, v over depth per impulse; 0 if sliding in the plane does not wear
+    ("speed_per_wear", "f8"),  # A / k_s, speed over depth per impulse; 0 if sliding in the plane does not wear
     ("running_in", "f8"),  # share by which a new pad wears faster
     ("running_in_rate", "f8"),  # 1 / h0 in 1/m, the rate at which this share falls with the depth
     ("enabled", "i8", (PAIR_COUNT,)),  # 1 if the pair can touch
@@ -149,8 +151,8 @@ _PARAM_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("threshold", "f8", (_ROWS,)),  # admissible size of term k of a velocity over a step
     ("velocity_tolerance", "f8"),  # admissible error of a velocity
     ("position_tolerance", "f8"),  # admissible error of a position
-    ("weight", "f8"),  # velocity per cosine or sine, for the size of terms
-    ("radius", "f8"),  # length per angle
+    ("weight", "f8"),  # factor from a cosine or sine to a velocity, for the size of terms
+    ("radius", "f8"),  # factor from an angle to a length
     ("release", "f8"),  # penetration below which the force is negligible
     ("fastest", "f8"),  # largest angular frequency of the harmonics
     ("leverage", "f8"),  # distance of a corner of the frame from its centre
@@ -165,11 +167,11 @@ _OPTION_FIELDS: Final[dict[str, list[tuple[Any, ...]]]] = {
     "rounded": [("roll", "f8")],  # distance of a rounded corner along its wall per angle [m/rad]
     "falling": [  # a restitution that falls with the impact
         ("damping_numbers", "f8", (RESTITUTIONS + 1,)),  # e D(e) on a grid from 0 to 1
-        ("restitution", "f8"),  # for impacts up to `fall_speed`
-        ("fall", "f8"),  # power of its fall with the impact
+        ("restitution", "f8"),  # restitution of impacts up to `fall_speed`
+        ("fall", "f8"),  # power with which it falls with the impact
         ("fall_speed", "f8"),  # in m/s
         ("fall_mass", "f8"),  # power of the effective mass
-        ("fall_along", "f8"),  # its fall per speed along the wall, in s/m
+        ("fall_along", "f8"),  # loss of restitution per speed along the wall, in s/m
     ],
 }
 
@@ -209,7 +211,7 @@ _STATE_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("time", "f8"),  # the present time, bit for bit as the caller gave it
     ("implicit_size", "f8"),  # size of the next implicit step
     ("decay_times", "f8"),  # number of decay times in overdamped contact since a contact changed
-    ("implicit_size_before", "f8"),  # both before the current step was laid out
+    ("implicit_size_before", "f8"),  # this and the next: values before the current step was laid out
     ("decay_times_before", "f8"),
     ("order", "i8"),  # order of the series of the current step
     ("event_pair", "i8"),  # the pair whose event ends the step, or -1
@@ -283,9 +285,9 @@ WORK: Final = np.dtype(
         ("switch", "i8", (PAIR_COUNT,)),  # modes that pairs take at the step's end, -1 for no change
         ("inverse", "f8", (_ROWS + 2,)),  # 1/k
         ("damping", "f8", (3, 3)),  # rest under harmonics: minus the derivatives of the accelerations by rate
-        ("rub", "f8", (6, *_WIDE)),  # wear: s' / v, sliding distance per travel, force times it; running-in
+        ("rub", "f8", (6, *_WIDE)),  # wear: s' / v, sliding distance per travel, force times this distance; running-in
         ("binomial", "f8", (_ROWS, _ROWS)),  # 1 / C(order, k)
-        ("beyond", "f8", (3,)),  # of the newest advance out of range: angle [rad], largest penetration [m], its pair
+        ("beyond", "f8", (3,)),  # newest advance out of range: angle [rad], largest penetration [m], pair of the latter
     ]
 )
 
@@ -318,21 +320,21 @@ ROW: Final = np.dtype(
         ("steps", "i8"),
         ("status", "i8"),
         ("error_estimate", "f8"),
-        # in a published row (`solve.totals.publish`) `makes` counts touches since the beginning, impulse and peak are
-        # since the publication before
+        # in a published row (`solve.totals.publish`) `makes` counts touches since the beginning; impulse and peak cover
+        # the time since the publication before
         ("stamp_ns", "i8"),
-        ("samples", "i8"),  # number of advances since the publication before that ended at a sample
+        ("samples", "i8"),  # number of advances that ended at a sample since the publication before
         ("measured_peak", "f8", (PAIR_COUNT,)),  # largest force in these advances
         ("held", "i8"),  # 1 if the motion at the stamp was computed with held loads, without a sample
         ("corrected", "i8"),  # 1 if late samples have changed the motion since the publication before
         ("marked", "i8"),  # 1 if `held` or `corrected` is 1, here or in the publication before
         ("orientation", "f8", (2,)),  # z and w of the head's quaternion
         ("twist", "f8", (3,)),  # rates along the head's own axes [m/s], about z [rad/s]
-        # written if the motion follows measurements: 5 % and 95 % points over the drawn twins (peak and impulse since
-        # the publication before), and the clearances [m] with their points
+        # written if the motion follows measurements: 5 % and 95 % quantiles over the drawn twins (of peak and impulse
+        # since the publication before), and the clearances [m] with their quantiles
         ("followed", "i8"),  # `FOLLOWED`: clearances are filled; `WITH_INTERVALS`: all fields are filled
         *((f"{name}_{end}", "f8", (PAIR_COUNT,)) for name in ("force", "peak", "impulse") for end in ("low", "high")),
-        ("known_clearance", "f8", (6,)),  # horizontal clearance and its points, vertical clearance and its points
+        ("known_clearance", "f8", (6,)),  # horizontal clearance and its quantiles, vertical clearance and its quantiles
     ]
 )
 
@@ -408,7 +410,7 @@ PACE: Final = np.dtype(
     [
         ("slice", "i8"),  # steps of a slice
         ("left", "i8"),  # steps left of the slice
-        ("row", "i8"),  # index of the next advance, with the members one after another
+        ("row", "i8"),  # index of the next advance, counted through one member after another
         ("underway", "i8"),  # 1 if this advance has begun
         ("mark", "i8"),  # index of the next mark
         ("failed", "i8"),  # number of failed advances

@@ -90,7 +90,7 @@ def start_frame(state, w) -> None:
 
 @kernel(fast=True)
 def see_from_frame(w, order, sigma, y) -> None:
-    """Convert the head's body coordinates at sigma of a step from relative to the ground to relative to the frame.
+    """Make the head's body coordinates at sigma of a step, given relative to the ground, relative to the frame.
 
     The frame's state at sigma is written to `w.frame_now`.
     """

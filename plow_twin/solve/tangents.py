@@ -48,7 +48,7 @@ _OF_PAIRS: Final = (PAIR_COUNT, _ROWS, WIDTH)
 COLUMNS: Final = np.dtype(
     [
         ("series", "f8", (6, _ROWS, WIDTH)),
-        ("depth", "f8", _OF_PAIRS),  # of pairs that act: change of penetration, of its rate, of force
+        ("depth", "f8", _OF_PAIRS),  # pairs that act: changes of penetration, of its rate, of force
         ("rate", "f8", _OF_PAIRS),
         ("force", "f8", _OF_PAIRS),
         ("load", "f8", (3, _ROWS, WIDTH)),  # change of the load per mass and inertia, world axes
@@ -77,7 +77,7 @@ ALONG: Final = np.dtype(
         ("lift", "f8", (_ROWS, PAIR_COUNT)),  # 1 + lambda d'
         ("damped", "f8", (_ROWS, PAIR_COUNT)),  # d^n d'
         ("push", "f8", (4, _ROWS)),  # fx, fy, derivative of the moment by the angle, -fy
-        ("mode", "i8", (PAIR_COUNT,)),  # before the step's event
+        ("mode", "i8", (PAIR_COUNT,)),  # modes before the step's event
         ("waiting", "i8"),  # number of ends in a row at which no stretch began
     ]
 )
@@ -307,7 +307,7 @@ def _move_columns(columns, order, sigma) -> None:
 
 @kernel()
 def _second_rate(state, w, pair):
-    """Return the second derivative by time of a penetration at the step's end [m/s^2]."""
+    """Return the second time derivative of a penetration at the step's end [m/s^2]."""
     sigma, slope, bend = state.sigma_end, 0.0, 0.0
     for k in range(state.order, 0, -1):
         bend = bend * sigma + slope
@@ -318,7 +318,7 @@ def _second_rate(state, w, pair):
 
 @kernel()
 def _touch(p, state, w, columns, pair, viscous) -> None:
-    """Add the effects of a touch to eight columns: the impulse of an earlier touch, the change of the impact speed."""
+    """Add the effects of a touch to eight columns: the impulse of an earlier touch, and the changed impact speed."""
     y, now = state.y, columns.now
     c, s, om = y[COS], y[SIN], y[OMEGA]
     arm = row_value(p.arm_rows, pair, c, s, y[X], y[Y])

@@ -18,7 +18,8 @@ from plow_twin.solve.modes import penetration_and_rate
 from plow_twin.solve.state import COS, OFF, OMEGA, ON, RELEASED, SIN, THETA
 from plow_twin.solve.totals import log_event
 
-#: Two pairs of each wall: of the corner that leads in a counter-clockwise turn, and of the corner behind it.
+#: The two pairs of each wall: that of the corner that leads in a counter-clockwise turn, and that of the corner behind
+#: it.
 _HANDED_OVER = tuple(
     (PAIR_NAMES.index(leading), PAIR_NAMES.index(following))
     for leading, following in (
@@ -28,7 +29,7 @@ _HANDED_OVER = tuple(
         ("top_right_right", "bottom_right_right"),
     )
 )
-#: Tolerance in rad for reaching 45 degrees: some rounding errors of a root.
+#: The block has reached 45 degrees if less than this angle [rad] is missing; it covers the rounding errors of a root.
 _THERE = 1e-12
 
 

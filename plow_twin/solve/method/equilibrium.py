@@ -13,7 +13,7 @@ from plow_twin.solve.state import OFF, ON
 
 @kernel()
 def held(p, state, y, least) -> bool:
-    """Return whether each pair is on or off, and its penetration or gap is larger than `least`."""
+    """Return whether every pair is on or off and its penetration or gap is larger than `least`."""
     for pair in range(PAIR_COUNT):
         if p.enabled[pair] == 1:
             penetration = penetration_of(p, state, pair, y)
@@ -47,7 +47,7 @@ def stiffness_at(p, acts, state, w, gyration) -> None:
 
 @kernel()
 def stiffer_than(h, least) -> bool:
-    """Return whether the symmetric matrix h exceeds `least` times the unit matrix: all leading minors are positive."""
+    """Return whether the symmetric matrix h exceeds `least` times the unit matrix, by its leading minors' signs."""
     a, b, c = h[0, 0] - least, h[1, 1] - least, h[2, 2] - least
     if not a > 0.0:
         return False

@@ -1,8 +1,8 @@
 """Free flight in closed form: a step can have any size as long as the head cannot reach a wall.
 
-If no pair touches, the centre of mass and the angle are the load's double integral, which is elementary for constants,
-linear pieces and harmonics. An upper bound of the distance that the head can move within a time limits the step
-(conservative advancement). Near a wall steps are Taylor series, which locate the touch.
+If no pair touches, the place of the centre of mass and the angle are double integrals of the load, which are elementary
+functions for constants, linear pieces and harmonics. An upper bound of the distance that the head can move within a
+time limits the step (conservative advancement). Near a wall steps are Taylor series, which locate the touch.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from plow_twin.kernel.compiler import kernel
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.kinematics import penetration_of, to_body, to_world
 
-#: Least phase of the fastest harmonic [rad] over a flight; a step of a series covers about 2 rad.
+#: Least phase of the fastest harmonic [rad] over a flight; a step of a series covers a phase of about 2 rad.
 _LEAST_PHASE = 8.0
-#: Largest distance of a flight as a share of the smallest gap.
+#: Largest distance that the head may move in a flight, as a share of the smallest gap.
 _SAFE = 0.9
 
 

@@ -53,7 +53,8 @@ STAGES = 9
 #: A contact is overdamped if its dampers act this many times faster than its springs. The same ratio decides, when the
 #: scene is compiled, whether the scene can need implicit steps.
 OVERDAMPED_RATIO = 20.0
-#: Cost of an implicit step in explicit steps; a shorter implicit step is not worth its cost.
+#: Cost of an implicit step, as a number of explicit steps; an implicit step must be longer than this number of stable
+#: explicit steps.
 _WORTH = 30.0
 #: Factor on the admissible error of an implicit step compared with an explicit step, since it replaces many of them.
 _GAIN = 100.0
@@ -61,7 +62,7 @@ _GAIN = 100.0
 _NOISE = 1e-12
 #: Rounding error of a guard of the corners' grip, as a share of its largest term.
 _GUARD_NOISE = 1e-6
-#: Number of failed attempts up to which each attempt doubles the wait.
+#: Number of failed attempts up to which each attempt doubles the wait for the next attempt.
 _MOST_REFUSED = 12
 
 
@@ -136,7 +137,7 @@ def new_implicit(support: bool) -> Implicit:
 
 @kernel()
 def decay_rate(p, state, slip, stick, support) -> float:
-    """Return the sum of the rates in 1/s at which the pairs' dampers stop the head, or 0 if it is not overdamped.
+    """Return the sum of the rates in 1/s at which the pairs' dampers stop the head, or 0 if no contact is overdamped.
 
     Regularised friction acts as a damper too, with its slope at the present slip; so does the damper of a sticking
     corner.
@@ -429,7 +430,7 @@ def _series_seen(support, h, w, implicit):
 
 @kernel()
 def _frame_terms(p, support, w, implicit, scale):
-    """Return the frame's parts of `off` and `size` in `_write_series`: velocity left out at the start, last term."""
+    """Return the frame's `off` and `size` for `_write_series`: velocity left out at the start, last term's size."""
     off = size = 0.0
     if support is not None:
         s = implicit.nodes.size
@@ -531,7 +532,7 @@ def _last_of_guards(p, state, w, h) -> float:
 
 @kernel()
 def _write_ramp(p, h, w, implicit) -> float:
-    """Write the law's force as K times an elastic part plus C times a rest, and return the last term's size.
+    """Write the law's force as K times an elastic part plus C times a remainder, and return the last term's size.
 
     The elastic part is d for the exponent 1, otherwise 0. The size is a velocity per h^(STAGES - 1). The series of a
     clipped pair does not act on the head, but gives the time at which the pair pushes again.
@@ -628,7 +629,7 @@ def _collocate(p, parts, support, state, w, span, decay, implicit, ramp, wear, s
             size = _write_series(p, support, state, h, w, implicit, ramp, wear, stick)
             better = 0.9 * (admissible / max(size, 1e-6 * admissible)) ** (1.0 / (STAGES - 1))
             if size <= admissible:
-                # if a sample has cut the step short, the size before is still a good guess
+                # if a sample has cut the step short, the previous size is still a good guess
                 longer = h * min(better, 4.0)
                 state.implicit_size = max(longer, state.implicit_size) if h == span else longer
                 state.implicit_steps += 1

@@ -14,15 +14,17 @@ from plow_twin.solve.method.series import expand, expand_harmonics, one_by_one
 from plow_twin.solve.modes import penetration_and_rate
 from plow_twin.solve.state import CLIPPED, ON
 
-#: A parting is looked for within this many steps of the last size, by a series of this order.
+#: The parting of a pair is searched for within this many steps of the last size, with a series of this order.
 _PARTING_REACH, PARTING_ORDER = 1.3, 6
-#: The reach with friction that sticks, since its guards make steps shorter.
+#: The same reach under friction with stick, whose guards make steps shorter.
 _PARTING_REACH_STICK = 8.0
-#: Most Newton steps to the parting, and the relative change at which they end; the next step corrects the rest.
+#: Largest number of Newton steps to the parting, and the relative change at which they end; the next step corrects the
+#: error.
 _NEWTON_STEPS, _ROOT_FOUND = 6, 1e-9
 #: Largest usable term; products of larger terms would not be finite.
 _FINITE = 1e300
-#: Most shortenings of a step, over which the largest term shrinks too, and the factor above which shortening ends.
+#: Largest number of times that a step is shortened (its largest term shrinks too), and the factor above which
+#: shortening ends.
 _SHORTER, _SHORT_ENOUGH = 20, 0.9
 
 
@@ -66,7 +68,7 @@ def before_sticking(p, state, w, order, sigma) -> float:
             change = (change + abs(w.slip[0, k, pair])) * within
         limit = theta * math.hypot(w.slip[0, 0, pair], 0.5 * math.pi)
         if change > limit:
-            # the change is convex in sigma, so that it falls at least in proportion
+            # the change is convex in sigma, so it falls at least in proportion to sigma
             within *= limit / change
     return within
 

@@ -15,7 +15,8 @@ from plow_twin.solve.method.step_size import (
     time_to_separation,
 )
 
-#: Number of steps of the last size after a touch for which the root of time since the touch is the variable.
+#: After a touch the square root of the time since the touch is the series' variable for this many steps of the last
+#: size.
 _TOUCH_REACH = 2.5
 
 
