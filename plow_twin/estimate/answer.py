@@ -16,9 +16,10 @@ from plow_twin.estimate.result import Estimate, State
 from plow_twin.estimate.window import Window
 from plow_twin.model.scene import Scene, Table
 
-#: Derived: after one load period the members have forgotten their initial states.
+#: Derived: number of load periods after which the members have forgotten their initial states.
 _SETTLE_PERIODS: Final = 1.0
-#: Derived: a load period has at least 400 knots; `tuning.LOAD_KNOT` gives the paper's period about twice as many.
+#: Derived: longest distance of two knots as a share of a load period; `tuning.LOAD_KNOT` is about half of it for the
+#: paper's period.
 _KNOT_SHARE: Final = 1.0 / 400.0
 
 

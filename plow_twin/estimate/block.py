@@ -366,7 +366,7 @@ def _corners(scene: Scene) -> Array:
 
 
 def _deeper(scene: Scene, mass: float, before: float, after: float) -> float:
-    """Return how far beyond the wall, in m, two flights meet that a compliant contact connects.
+    """Return the distance in m beyond the wall at which the flights before and after a compliant contact meet.
 
     The corner approaches with the normal speed v, stays in contact for the time T and leaves with e v. The straight
     lines of the two flights then meet v e T / (1 + e) beyond the wall. With the largest penetration u, T = pi u / v,

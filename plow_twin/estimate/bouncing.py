@@ -1,6 +1,6 @@
 """Clearances with a hard contact, from features of the whole motion instead of the pose at each moment.
 
-Behind a hard contact the head bounces many times before it rests, so its pose at a moment cannot be predicted. The
+With a hard contact the head bounces many times before it rests, so its pose at a moment cannot be predicted. The
 reach of the corners and the scatter of the pose at each phase of the load can be predicted. Motions with randomly drawn
 stiffness, damping and load gains are simulated and observed with the sensor's noise and gaps. A regression among the
 simulated motions near the measured one gives the difference between clearance and reach (approximate Bayesian
@@ -33,13 +33,13 @@ from plow_twin.model import geometry
 Array = NDArray[np.float64]
 
 #: Derived: biases of theta that are tried, in rad, up to eight prior deviations to both sides. A parabola refines the
-#: best bias; its range to both sides is three quarters of their spacing.
+#: best bias; it covers three quarters of the spacing of the tried biases to both sides.
 _TURNS: Final = np.linspace(-0.16, 0.16, 81)
 _FINEST_TURN: Final = 3e-3
 _NEAR_TURNS: Final = np.linspace(-_FINEST_TURN, _FINEST_TURN, 5)
 #: Bound: most rows in the search for a bias, and in its refinement.
 _MOST_ROWS, _MOST_NEAR_ROWS = 2000, 1200
-#: Derived: the mean of nine values has a third of their scatter.
+#: Derived: fewest rows in a part of a load period; the mean of nine values has a third of their scatter.
 _FEWEST_OF_PHASE = 9
 #: Derived: delays in s that are tried for the measured path, up to two prior deviations to both sides, and for the
 #: drawn paths, up to a tenth of that. `_NO_LAG` is the index of zero delay among the delays of drawn paths.
@@ -78,8 +78,9 @@ class Bounced:
         the drawn motions, as a normal deviate among the same distances of the drawn motions; 0 with too few poses
     law : likeness of the motion to motions under another contact law, as a normal deviate among motions under the
         believed law; 0 if no other law is known, or too few of its motions can be run, or the contact is not hard
-    odds : log odds of the other law; minus infinity in the same cases, and about a given vector
-    unseen : (2,) deviation of the clearances in m due to errors of the frame's sides and of theta's scale, which the
+    odds : log odds of the other law; minus infinity in the same cases, and if the motions are drawn about a given
+    vector unseen : (2,) deviation of the clearances in m due to errors of the frame's sides and of theta's scale, which
+    the
         motion does not show
     rounded : (2,) excess of the clearances in m if the frame's corners are rounded by `priors.ROUNDING`; zero if the
         scene states the corners or the sides' deviations
@@ -218,7 +219,7 @@ def compare(
         found = regress_near(like, targets, seen)
         moved = measured[:2] + found.value[:2] - centre
         centre = centre + moved
-        # a clearance that still moves has not converged
+        # the last move is added to the deviation, because a clearance that still moves has not converged
         deviation = np.hypot(found.deviation[:2], moved)
         if near is None and len(features) <= tuning.DRAWS[0] and found.distance > tuning.NOT_HARD:
             return None
@@ -228,7 +229,7 @@ def compare(
             if len(rounds) == 3 and count == tuning.DRAWS[2] and not followed:
                 rounds.append((tuning.DRAWS[3], tuning.DRAWN_CLEARANCE[3]))
     assert found is not None
-    # a large last correction shows that a clearance has not converged
+    # a large last move shows that a clearance has not converged
     deviation = np.where(np.abs(moved) > tuning.ASTRAY, np.hypot(deviation, tuning.UNEXPLAINED_HARD), deviation)
     law, odds = 0.0, -math.inf
     if found.value[5] < math.log(tuning.FITTED):
@@ -244,7 +245,7 @@ def compare(
         found.distance,
         path_deviate(eye.paths(eye.q, _LAGS_S), features[:, 5:], paths, measured[5:]),
         law,
-        odds if near is None else -math.inf,  # the limit of the odds was set with hard contacts
+        odds if near is None else -math.inf,  # the limit of the odds was tuned on hard contacts
         *hidden_by_geometry(unknowns, poses, period, measured[:2]),
     )
 
@@ -566,9 +567,9 @@ def _scatter_at(basis: Array, weight: Array, error: Array, leverage: Array) -> A
 
 @dataclass(frozen=True, eq=False)
 class _Phases:
-    """Rows with a component in (k,), the part of the period of each, and how many rows are in each part, at least 1.
+    """Rows (k,) that have a component, the part of the load period of each row, and the number of rows in each part.
 
-    `known` tells which parts have enough rows.
+    A number of rows is at least 1, so that quotients are finite; `known` marks the parts with enough rows.
     """
 
     rows: NDArray[np.int64]
@@ -594,7 +595,7 @@ class MotionFeatures:
         self._smooth = max(min(smooth_width(poses, tuning.AVERAGED), int(self._whole.sum()) // 8), 1)
         self._reach_phase = ((poses.t[self._whole] - poses.t[0]) / period % 1.0 * tuning.PATH_PHASES).astype(int)
         phase = np.minimum(((poses.t - poses.t[0]) / period % 1.0 * self._parts).astype(int), self._parts - 1)
-        #: rows with each component, in each part of a period with enough of them
+        #: for each component the rows that have it, by part of a period; parts with few rows are left out
         self._parts_of = [
             [rows for k in range(self._parts) if len(rows := np.flatnonzero((phase == k) & there)) > 8]
             for there in self._there.T
@@ -657,8 +658,8 @@ class MotionFeatures:
     def _seen(self, q: Array, white: Array) -> Array:
         """Return a motion with the noise that makes its quick changes as large as the measured ones.
 
-        Bounces also change the pose quickly. Taken for noise alone, quick changes would overestimate the noise and the
-        reach.
+        Bounces also change the pose quickly. If all quick changes were taken for noise, noise and reach would be
+        overestimated.
         """
         noise = self.noise
         for _ in range(_NOISE_ROUNDS):

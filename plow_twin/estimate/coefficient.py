@@ -71,7 +71,7 @@ class Coefficient:
     depth: Array
 
     def interval(self) -> Interval:
-        """Return median and 5 % and 95 % points in m^2/N."""
+        """Return the median and the 5 % and 95 % quantiles in m^2/N."""
         return Interval(self.quantile(0.5), self.quantile(0.05), self.quantile(0.95))
 
     def quantile(self, share: float) -> float:

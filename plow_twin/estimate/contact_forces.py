@@ -130,8 +130,8 @@ class Feeling:
 def forces_at(scene: Scene, q: Array, v: Array, depth: Array | None = None) -> tuple[Array, Array]:
     """Return penetrations in m and forces in N of the pairs, (n, 8) each, from poses and rates, (n, 3) each.
 
-    `depth`, shape (8,), is the outward displacement of each pad in m. The scene must state the law's damping itself: a
-    damping from a restitution depends on the speed of each touch.
+    `depth`, shape (8,), is the outward displacement of each pad in m. The scene must state the damping, not a
+    restitution, whose damping depends on the speed of each touch.
     """
     x, y, vx, vy, omega, c, s, _ = body_states(np.hstack((q, v)), scene.head.com_offset_m).T
     rows = penetration_rows(scene)
@@ -142,7 +142,7 @@ def forces_at(scene: Scene, q: Array, v: Array, depth: Array | None = None) -> t
     factor = 0.0 if viscous else float(scene.contact.damping or 0.0)
     numbers = float(params["stiffness"]), float(params["exponent"]), factor, viscous, float(params["ramp"])
     force, inside = np.zeros(penetration.shape), penetration > 0.0
-    linear = numbers[1] == 1.0 and not numbers[-1]  # only then does the law accept arrays
+    linear = numbers[1] == 1.0 and not numbers[-1]  # the law accepts arrays only in this case
     law = _LAW if linear else np.vectorize(_LAW, otypes=[np.float64])
     force[inside] = np.maximum(law(penetration[inside], rate[inside], *numbers), 0.0)
     return penetration, force
@@ -167,7 +167,7 @@ def cells_of(feeling: Feeling, found: Fit, forces: ContactForces) -> tuple[Cells
     measured = forces.force - offset
     found_out, pairs = [], []
     largest = float(np.nanmax(felt.force))
-    # a cell that shows 0 in flight still has this resolution
+    # a cell that reads exactly 0 in flight still has this resolution
     noise = np.maximum(noise, 1e-4 * largest)
     for i, name in enumerate(PAIR_NAMES):
         there = np.isfinite(measured[:, i]) & (felt.swing >= 0)

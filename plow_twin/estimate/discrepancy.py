@@ -35,7 +35,8 @@ from plow_twin.model.scene import Friction, Scene
 
 Array = NDArray[np.float64]
 
-#: Step: of the difference quotients by quantities of a scene, a fifth to a half of their prior deviation, by path.
+#: Step: for the difference quotients by quantities of a scene, named by their paths; a fifth to a half of their prior
+#: deviations.
 STATED: Final = {
     "head.mass_kg": 0.02,
     "head.inertia_kg_m2": 0.02,
@@ -44,13 +45,14 @@ STATED: Final = {
     "contact.exponent": 0.02,
     "friction.coefficient": 0.01,
 }
-#: Step: of a wall's relative stiffness, and of a constant load in units of half the load's range.
+#: Step: for the difference quotients by a wall's relative stiffness, and by a constant load in units of half the load's
+#: range.
 _WALL_STEP, _PUSH_STEP = 0.02, 5e-3
 #: Guard: smallest error of the load in units of half the load's range.
 _LEAST_PUSH = 1e-5
 #: Bound: numbers of rounds of expectation-maximisation; the noise is tempered after each series of rounds.
 _ROUNDS = (8, 5, 3)
-#: Bound: number of sweeps of the sampler, and of the first sweeps that are discarded.
+#: Bound: number of the sampler's sweeps, and number of the first sweeps that are discarded.
 _SWEEPS, _BURNT = 50, 10
 #: Bound: longest lag in rows at which the correlation of residuals is computed.
 _LONGEST_LAG = 60
@@ -186,7 +188,7 @@ def _of_sensor(problem: Problem, point: Point) -> Iterator[tuple[str, Array]]:
 
 
 def variants(scene: Scene) -> tuple[Scene, ...]:
-    """Return the changed scenes that need other compiled terms: with another exponent, and with friction."""
+    """Return two changed scenes that need other compiled terms: one with another exponent, and one with friction."""
     return tuple(_moved(scene, path, STATED[path], 1.0) for path in ("contact.exponent", "friction.coefficient"))
 
 
@@ -299,7 +301,7 @@ class _Linearised:
         return covariance @ self._score, covariance
 
     def averaged(self, rng: np.random.Generator) -> tuple[Array, Array, Array, bool]:
-        """Return mean and covariance over the draws, how often each quantity differs, and if the scene may be exact.
+        """Return mean and covariance over the draws, how often each quantity differs, whether the scene may be exact.
 
         The scene may be exact if it is exact in any draw. A quantity that the fit includes always differs.
         """
@@ -309,7 +311,7 @@ class _Linearised:
         known: dict[bytes, float] = {}
 
         def evidence(which: NDArray[np.bool_]) -> float:
-            key = which.tobytes()  # the sampler returns to most sets
+            key = which.tobytes()  # kept, as the sampler returns to most sets
             if key not in known:
                 use = np.append(np.arange(SIZE), SIZE + np.flatnonzero(which))
                 lower = np.linalg.cholesky(self._normal[np.ix_(use, use)])
@@ -358,7 +360,7 @@ class _Linearised:
         If it is above 1, the linearisation is inaccurate.
         """
         z = (self._value + mean[SIZE:]) * np.sqrt(self._precision[SIZE:])
-        # the mean over the quantities is weighted by how often each of them differs
+        # the mean over the quantities is weighted by how often each quantity differs
         return max(1.0, float((z**2 / np.maximum(often, 0.1)).sum() / max(often.sum(), 1.0)))
 
     def named(self, mean: Array, often: Array) -> dict[str, tuple[float, float, float]]:

@@ -36,11 +36,11 @@ Array = NDArray[np.float64]
 _WALL: Final = np.argmax(np.stack(WALLS), axis=0)
 #: Bound: number of Gauss-Newton steps, size in m below which a step is the last, and longest step in m.
 _STEPS, _SMALL, _LONGEST = 8, 2e-5, 3e-3
-#: Guard: shortest distance of rows in s, and fewest rows in half of a test function.
+#: Guard: shortest interval of rows in s, and fewest rows in half of a test function.
 _SHORTEST, _FEWEST = 5e-3, 3
 #: Derived: unit of the stiffness in N/m in which its column is as large as the other columns.
 _UNIT = 1e7
-#: Derived: deviate beyond which Huber's function is linear; standard deviation over median absolute deviation.
+#: Derived: deviate beyond which Huber's function is linear; ratio of standard deviation to median absolute deviation.
 _HUBER, _MAD = 2.0, 1.4826
 #: Bound: starts of a search: clearances as shares of the range of motion, and penetrations in m.
 _SHARES, _DEPTHS = (0.25, 0.5, 0.75, 0.95), (3e-3, 6e-3, 12e-3, 20e-3)

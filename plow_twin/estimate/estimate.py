@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from plow_twin.estimate.contact_forces import ContactForces
 
 Array = NDArray[np.float64]
-#: Shared unknowns, noise and differences from the previous window, 21 numbers; empty for no guess.
+#: Shared unknowns, noise and differences from the previous window, 21 numbers; empty without a guess.
 Guess = tuple[float, ...]
 
 #: Bound: a window has at most this many load periods or this many seconds, whichever is longer. Of longer data the
@@ -291,7 +291,7 @@ def under_uncertain_load(
     period: float,
     fitted: tuple[Problem, Fit] | None = None,
 ) -> Estimate:
-    """Return an estimate with withdrawn clearances replaced by values that allow for errors of the load or no angle.
+    """Return an estimate with withdrawn clearances replaced by values that allow for load errors or a missing angle.
 
     `result` is the estimate under the believed load. It is returned unchanged if it has a clearance or if the
     comparison finds none. `fitted` is a fit that failed and may be in a false optimum. Where the comparison agrees with
@@ -468,7 +468,7 @@ def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: 
         states.append(_state(bool(sensor), observed, rough))
     exponent = unknowns.scene.contact.exponent
     log = Interval.normal(*bounced.ln_penetration)
-    # a regression that extrapolates is not bounded
+    # clipped, because a regression that extrapolates is not bounded
     log = Interval(*np.clip([log.mean, log.p05, log.p95], *_LN_PENETRATIONS).tolist())
     mean, soft, hard = (unknowns.force / np.exp(value) ** exponent for value in (log.mean, log.p95, log.p05))
     bias = [Interval.normal(*pair) for pair in zip(bounced.bias, bounced.bias_deviation, strict=True)]
@@ -480,7 +480,7 @@ def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: 
         horizontal_state=states[0],
         vertical_state=states[1],
         apparent=(apparent[0], apparent[1]) if all(state.known for state in states) else None,
-        # only bounces determine the stiffness, so its interval is open to the hard side
+        # bounces alone determine the stiffness here, so its interval is open towards harder contacts
         stiffness=Interval(float(mean), float(soft), max(float(hard), unknowns.hardest_believed)),
         damping=_damping(unknowns, Interval.normal(*bounced.ln_damping)),
         bias_x=bias[0],
@@ -614,7 +614,7 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
     if not finished and not suspect:
         gain = f"the cost would still fall by {fit.gain_left:.0f}, expected at most {tuning.OUTLYING**2:g}"
         reasons = [f"the fit has not reached an optimum: {gain}"]
-    # largest penetration into compliant walls
+    # the depth by which compliant walls can give way
     given = tuning.GIVEN * float(np.exp(shared[SOFTNESS] + NORMAL_P95 * min(deviation[SOFTNESS], 1.0)))
     least = range_of_motion(unknowns.scene, poses)[0] - given
     share = predicted(fit).sum(axis=0) / np.maximum(np.isfinite(fit.point.residual).sum(axis=0), 1)
@@ -751,7 +751,7 @@ def _between_optima(unknowns: Unknowns, shared: Array) -> float:
 
 
 def _scatter(problem: Problem, fit: Fit, variance: Array) -> float:
-    """Return the variance from the swings' scatter over the variance from noise, averaged over `MOVING`."""
+    """Return the ratio of the variance from the swings' scatter to the variance from noise, averaged over `MOVING`."""
     scattered = np.diag(sandwich(problem, fit, 1.0 / problem.deviation**2))
     swings, moving = problem.window.swings, list(MOVING)
     return freed(swings, len(moving)) * float((scattered / variance)[moving].mean())
@@ -799,7 +799,7 @@ def _unobserved(unknowns: Unknowns, deviation: Array, index: int, reach: float, 
 
 
 def _stiffness(unknowns: Unknowns, psi: Interval) -> Interval:
-    """Return the stiffness; if the contact is too hard to be resolved, the interval is open to the hard side."""
+    """Return the stiffness; if the contact is too hard to be resolved, the interval is open towards harder contacts."""
     soft, hard = unknowns.stiffness_of(psi.p95), unknowns.stiffness_of(psi.p05)
     if unknowns.within(np.full(SIZE, psi.p05))[SOFTNESS] > psi.p05:
         hard = max(hard, unknowns.hardest_believed)
