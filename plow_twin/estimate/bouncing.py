@@ -567,7 +567,7 @@ def _scatter_at(basis: Array, weight: Array, error: Array, leverage: Array) -> A
 
 @dataclass(frozen=True, eq=False)
 class _Phases:
-    """Rows (k,) that have a component, the part of the load period of each row, and the number of rows in each part.
+    """Rows (k,) that have a component, the part of the load period of each row, and the number of rows of each part.
 
     A number of rows is at least 1, so that quotients are finite; `known` marks the parts with enough rows.
     """

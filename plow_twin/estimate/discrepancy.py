@@ -344,7 +344,7 @@ class _Linearised:
         return mean, second / counted - np.outer(mean, mean), often / counted, exact
 
     def scatter(self) -> float:
-        """Return the variance from the swings' scatter over the variance from noise, averaged over `MOVING`."""
+        """Return the variance from the swings' scatter relative to that from noise, averaged over `MOVING`."""
         scores = np.stack([score[:SIZE] for _, score in self._blocks])
         scores = scores - scores.mean(axis=0)
         count, moving = len(scores), list(MOVING)

@@ -193,8 +193,8 @@ class _Rows:
     """The rows of the swings for stamps that are `shift` s late.
 
     swing, inside, times : (n,) swing of each pose, -1 outside of all swings; (k,) rows in swings, and their times in s
-    inner : (s + 1,) the first of these rows in each swing
-    asked, edges : times of a run, with the ends of linked swings, and the first of them in each swing
+    inner : (s + 1,) index of the first row of each swing among the rows in swings
+    asked, edges : times of a run, including the ends of linked swings, and index of the first time of each swing
     ends : places of these ends in `asked`
     """
 
@@ -283,7 +283,7 @@ class Problem:
         return [self._point(shared, several[k], rows, q[k], v[k], contact[k], differences) for k in range(count)]
 
     def _rows_at(self, shift: float) -> _Rows:
-        """Return the rows of the swings if the stamps are `shift` s late, cached as successive vectors share it."""
+        """Return the rows of the swings if the stamps are `shift` s late; cached, as successive vectors share it."""
         if self._at is None or self._at.shift != shift:
             window = self.window
             times = window.poses.t - shift

@@ -347,7 +347,7 @@ class Follower:
         return end
 
     def _moved(self, worn: Array) -> Array:
-        """Return the growth of the clearances and of their interval points, (..., 6), by the pads' wear `worn` (...,
+        """Return the growth of the clearances and of their intervals' ends, (..., 6), by the pads' wear `worn` (...,
         8).
         """
         if self.scene.wear is None:
@@ -562,7 +562,7 @@ class Follower:
         return found
 
     def span(self) -> Span:
-        """Return peaks and impulses since the previous call, if no publication has ended a span."""
+        """Return peaks and impulses since the previous call; valid if no publication has ended a span since then."""
         self.catch_up()
         start, self._span_start = self._span_start, self.time
         found = Span(start, self.time, *self._ensemble.span())

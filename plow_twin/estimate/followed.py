@@ -24,11 +24,12 @@ from plow_twin.stream.session import Session
 
 Array = NDArray[np.float64]
 
-#: Definition: length in s of the estimates' windows and interval in s of their ends, the defaults of a node.
+#: Definition: length in s of the estimates' windows, and interval in s of the windows' ends; the defaults of a node.
 WINDOW_S, INTERVAL_S = 32.0, 10.0
 #: Definition: nanoseconds of a second.
 _NS: Final = 1e9
-#: Bound: the load is used in parts of so many seconds, so that the rows of all members fit into the processor's cache.
+#: Bound: the load is used in parts of this many seconds, so that the rows of all members fit into the processor's
+#: cache.
 _PART_S: Final = 0.02
 
 

@@ -24,10 +24,10 @@ Array = NDArray[np.float64]
 
 #: Bound: most rows, about 200 a second for a window of ten load periods.
 _MOST_ROWS = 6000
-#: Bound: number of steps; number of first steps in which predictability is probed, and draws of each probe; reduction
-#: of the cost, no more than noise, that ends the steps.
+#: Bound: largest number of steps; number of first steps in which predictability is probed; number of draws of a probe;
+#: reduction of the cost, within noise, below which the steps end.
 _ROUNDS, _DRAWN_ROUNDS, _PROBES, _ENOUGH = 8, 3, 3, 0.5
-#: Step: of the two-sided difference quotients by the delay in s and by a starting state. With the longer one-sided
+#: Step: for the two-sided difference quotients by the delay in s and by a starting state. With the longer one-sided
 #: steps of the fit of the poses, clearances were wrong by 4 of their deviations.
 _DELAY_STEP = 2e-5
 _STATE_STEPS = np.array([1e-5, 1e-5, 5e-5, 2e-4, 2e-4, 1.4e-3])
@@ -290,7 +290,7 @@ class _Joint:
         return total / _PROBES
 
     def _scatter(self, blocks: list[_Block], covariance: Array) -> float:
-        """Return the variance from the swings' scatter over the variance from noise, averaged over `MOVING`."""
+        """Return the variance from the swings' scatter relative to that from noise, averaged over `MOVING`."""
         scores = np.stack([block.score for block in blocks])
         scores = scores - scores.mean(axis=0)
         count, unknown, moving = len(blocks), self._border - (SIZE - len(MOVING)), list(MOVING)

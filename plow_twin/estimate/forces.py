@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 MEMBERS: Final = 256
 #: Definition: quantiles of an interval.
 POINTS: Final = (0.05, 0.5, 0.95)
-#: Derived: fewer members have no 5 % point.
+#: Derived: fewest members that have a 5 % point.
 FEWEST: Final = 20
 #: Guard: smallest drawn clearance, as a share of the estimated clearance.
 _LEAST_SHARE = 0.02

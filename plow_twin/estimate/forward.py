@@ -20,7 +20,7 @@ from plow_twin.solve.state import EVENT, SEGMENT, TOTALS, Parts, Status, new_rec
 
 Array = NDArray[np.float64]
 
-#: Bound: most steps of a run for each second of motion, and additional steps; rows in the log of a run.
+#: Bound: largest number of steps of a run for each second of motion, and further steps; number of rows in a run's log.
 _STEPS_PER_SECOND, _STEPS = 20_000, 2_000
 _LOG_SIZE = 4096
 #: Bound: number of series steps that cost as much as one implicit step.

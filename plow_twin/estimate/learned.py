@@ -92,7 +92,7 @@ class Learner:
 
     @classmethod
     def of(cls, drawn: Array, time: float) -> Learner | None:
-        """Return a learner of the parameters whose deviation exceeds a unit; None without any, or with few members."""
+        """Return a learner of the parameters whose deviation exceeds a unit; None if there are none, or few members."""
         learned = np.flatnonzero(drawn[1:].std(axis=0) > 1.0)
         enough = len(drawn) >= _MEMBERS * (len(learned) + 1)
         return cls(drawn, learned, time) if len(learned) and enough else None
@@ -136,8 +136,8 @@ class Learner:
         rest = seen - apart @ slope
         alone = rest.T @ rest / (len(own) - len(self.open) - 1)
         inverse = np.linalg.inv(alone + np.diag(noise**2))
-        # scatter of the members alone already gives a random slope; the information that it seems to contain is
-        # subtracted
+        # the scatter of the members alone also gives a slope; the information that this random slope seems to contain
+        # is subtracted
         self._precision += slope @ inverse @ slope.T - spread * np.trace(inverse @ alone)
         self._score += slope @ inverse @ (off - (self.mean - middle) @ slope)
 

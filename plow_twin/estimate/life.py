@@ -29,9 +29,9 @@ Array = NDArray[np.float64]
 
 #: Guard: wear in m by which the travel of sliding pads is measured, too small to change the motion.
 _TRACE_M = 1e-12
-#: Bound: rows inserted for each row of a path with running-in.
+#: Bound: number of rows inserted for each row of a path with running-in.
 _FINER = 16
-#: Bound: steps of a path.
+#: Bound: largest number of steps of a path.
 _MOST_STEPS = 400
 #: Guard: smallest clearance in m of a path, because a path from zero would not end.
 _LEAST_CLEARANCE = 1e-3

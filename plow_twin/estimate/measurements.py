@@ -96,8 +96,8 @@ class Poses:
     def without_spikes(self, level: Array) -> tuple[Poses, int]:
         """Leave out values far from all four neighbours, and return their number.
 
-        `level`, shape (3,), is the noise from row to row. If there are many such values, the sensor is bad, and none is
-        left out.
+        `level`, shape (3,), is the noise from row to row. If there are many such values, the sensor is bad, and all
+        values are kept.
         """
         if len(self.t) < FEWEST_FOR_SCATTER:
             return self, 0
@@ -405,7 +405,7 @@ def _check_deviation(name: str, deviation: Deviation) -> None:
 
 
 def _in_order(times: Array, usable: Any) -> NDArray[np.int64]:
-    """Return the indices of usable rows in order of time, the first of equal stamps."""
+    """Return the indices of usable rows in order of time; of rows with equal stamps only the first is kept."""
     candidates = np.flatnonzero(usable & np.isfinite(times))
     _, first = np.unique(times[candidates], return_index=True)
     index: NDArray[np.int64] = candidates[first]

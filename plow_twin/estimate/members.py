@@ -100,7 +100,7 @@ class Ensemble:
         self._stiffness, self._exponent = np.array([one.contact.stiffness for one in scenes]), scene.contact.exponent
         self._pressed = tuning.PRESSED * scene.head.mass_kg * Gravity().acceleration_m_s2
         self.good = np.ones(members, dtype=bool)
-        #: force, and peak and impulse since the span's beginning
+        #: force; peak and impulse since the beginning of the span
         self._sums = np.zeros((members, 3, PAIR_COUNT))
         self._peak, self._impulse = self._sums[:, 1], self._sums[:, 2]
         #: sum of the squares of each member's normalised innovations
@@ -283,7 +283,7 @@ class Ensemble:
         return np.divide(self._room(), room, out=np.ones_like(room), where=room > 0.0)
 
     def _stand(self, q: Array, v: Array, force: Array, which: NDArray[np.int64] | None = None) -> None:
-        """Move members to poses, but only so far from the middle that no pair bears much more than `force`, (m, 8)."""
+        """Move members to poses, or less far from the middle so that no pair bears much more than `force`, (m, 8)."""
         which = np.arange(len(q)) if which is None else which
         q, v, force = q[which], v[which], force[which]
         low, high = np.zeros(len(q)), np.ones(len(q))
@@ -313,7 +313,7 @@ class Ensemble:
         after = min(bisect_left(times, t), len(times) - 1)
         path = np.stack([self._path[index][1] for index in range(after - 1, len(times))])
         share = min((t - times[after - 1]) / (times[after] - times[after - 1]), 1.0)
-        # as the sensor of each member would have measured it
+        # the pose as the sensor of each member would have measured it
         then = ((1.0 - share) * path[0] + share * path[1] + biases_of(self._numbers))[:, there]
         since = self.first.time - self._drifted
         self._drift(load_error)
@@ -336,7 +336,7 @@ class Ensemble:
         if self._learner is not None:
             self._learner.add(self._numbers[use], seen[use], center, noise[there])
         off = _off(q, then, there)
-        # bounded, so that a bad pose does not outweigh all others
+        # clipped, so that a bad pose does not outweigh all others
         most = tuning.OUTLYING * noise[there]
         self.square += ((off.clip(-most, most) / noise[there]) ** 2).sum(axis=1)
         weight = np.linalg.solve(scatter, seen[use].T @ about[use] / freedom)

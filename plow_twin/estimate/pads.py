@@ -22,7 +22,8 @@ from plow_twin.estimate.unknowns import GX, GY, SIZE
 
 Array = NDArray[np.float64]
 
-#: Definition: for each group its clearance, and the share of the turns of the left, right, top and bottom wall in it.
+#: Definition: for each group of pads the clearance to which it belongs, and the shares with which the turns of the
+#: left, right, top and bottom wall change its own clearance.
 _MADE_OF: Final = {
     "horizontal_top": (GX, np.array([0.5, 0.5, 0.0, 0.0])),
     "horizontal_bottom": (GX, np.array([-0.5, -0.5, 0.0, 0.0])),
@@ -74,7 +75,7 @@ def with_differences(problem: Problem, found: Fit) -> tuple[Problem, Fit] | None
         differences[LAG] = max(differences[LAG], 0.0)
         change = differences - problem.differences
         size = float(change @ np.linalg.solve(covariance[SIZE:, SIZE:], change))
-        # a change within the noise follows linearly in the grades of a fit
+        # grading a fit allows for a change within the noise by a linear step
         if index and size < tuning.SETTLED:
             break
         problem = Problem(

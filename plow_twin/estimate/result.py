@@ -42,7 +42,7 @@ class State(Enum):
 
 @dataclass(frozen=True)
 class Interval:
-    """A value with its 5 % and 95 % points."""
+    """A value with the 5 % and 95 % points of its distribution."""
 
     mean: float
     p05: float
@@ -77,7 +77,7 @@ def _tail(least: float) -> tuple[float, float, float]:
 
     scipy's `truncnorm` is not used, because its import takes half a second.
     """
-    if least > _FAR:  # the tail is exponential there
+    if least > _FAR:  # beyond this the tail is exponential
         return least + 1.0 / least, least - math.log(0.95) / least, least - math.log(0.05) / least
     share = 0.5 * math.erfc(least / math.sqrt(2.0))
     mean = math.exp(-0.5 * least * least) / (math.sqrt(2.0 * math.pi) * share)

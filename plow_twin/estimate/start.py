@@ -53,7 +53,7 @@ def smooth_width(poses: Poses, span: float = 0.06) -> int:
 
 
 def range_of_motion(scene: Scene, poses: Poses) -> tuple[Array, Array]:
-    """Return clearances (2,) and bias of x and y (2,) from the range of motion alone, in m."""
+    """Return the clearances (2,) and the bias of x and y (2,) in m, from the range of motion alone."""
     reach = reaches(scene, smoothed(filled(poses), smooth_width(poses)))
     right, left, top, bottom = np.quantile(reach, 0.99, axis=0)
     # when the head moves to the right, the frame moves to the left relative to the head
@@ -78,7 +78,7 @@ def cut(scene: Scene, poses: Poses, period: float, shortest: float) -> Window:
     while t[-1] > starts[-1] + 2.0 * apart:
         near = np.flatnonzero((t > starts[-1] + apart) & (t < starts[-1] + 2.0 * apart) & (room > clear))
         if not len(near):
-            # if no clear start comes for long, the swing ends after a whole period
+            # if there is no clear start for a long time, the swing ends after a whole period
             far = np.flatnonzero((t > starts[-1] + 2.0 * apart) & (room > clear))
             end = min(float(t[far[0]]) if len(far) else np.inf, starts[-1] + period)
             near = np.flatnonzero((t >= end) & (t < end + apart))

@@ -26,9 +26,9 @@ from plow_twin.model import geometry
 
 Array = NDArray[np.float64]
 
-#: Derived: interval of the knots of a load's error, a third of the error's shortest correlation time.
+#: Derived: interval between the knots of a load's error, as a share of the error's shortest correlation time.
 _KNOTS = 1.0 / 3.0
-#: Derived: interval [s] of the knots of the load between samples, half the period of a soft contact (20 Hz).
+#: Derived: interval [s] between the knots of the load between samples, half the period of a soft contact (20 Hz).
 _KNOT = 0.025
 #: Bound: number of rounds of draws; each later round is drawn about the result of the previous round.
 _ROUNDS = 3
@@ -125,7 +125,7 @@ def compare_under_uncertain_load(
     assert found is not None
     share, least = tuning.CORRECTED
     unexplained = np.hypot(share * value[:2], least) if angle else np.zeros(2)
-    # a clearance that still moves has not converged
+    # the last move is added to the deviation, because a clearance that still moves has not converged
     moved = spread.centre - before
     return Compared(
         spread.centre,

@@ -199,7 +199,7 @@ class Unknowns:
 
     @property
     def hardest_believed(self) -> float:
-        """Upper end of the stiffness if the motion only shows that the contact is hard."""
+        """Upper end of the stiffness' interval if the motion only shows that the contact is hard."""
         return float(self.force / (1e-6) ** self.scene.contact.exponent)
 
     def damping_of(self, value: float) -> float:

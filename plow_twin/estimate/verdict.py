@@ -101,7 +101,7 @@ def _colour(fit: Fit, verdict: Verdict) -> None:
         if quick <= 0.0 or len(rows) < 50:
             continue
         ratio = float(np.mean(np.minimum(np.abs(rows), 5.0 * quick) ** 2) / quick**2)
-        # the last term allows for the scatter of the ratio itself, from a mean square and a median of differences
+        # the last term allows for the scatter of the ratio, which divides a mean square by a median of differences
         limit = 1.0 + (tuning.MOST_RATIO - 1.0) + 4.0 * 2.5 / np.sqrt(len(rows))
         verdict.figures[f"colour_{name}"] = ratio
         if ratio > limit and not verdict.sensor:

@@ -34,7 +34,7 @@ from plow_twin.model.scene import Scene
 
 #: Bound: interval at which queued data are sent [s].
 _SEND_S: Final = 0.05
-#: Bound: most queued items. So many wait only if the far side has stopped reading.
+#: Bound: most queued items; this many items wait only if the far side has stopped reading.
 _MOST_WAITING: Final = 1_000_000
 #: Bound: `nice` of the far side.
 _NICE: Final = 10
@@ -107,7 +107,8 @@ class Worker:
         self._closed = threading.Event()
         #: reason why estimating has ended; empty before
         self.error = ""
-        #: None until everything before `finish` is done; then why the last window could not be estimated, or empty
+        #: None until everything before `finish` is done; then the reason why the last window could not be estimated, or
+        #: empty
         self.ended: str | None = None
         self._thread = threading.Thread(target=self._send_queue, name="estimate", daemon=True)
         self._thread.start()
@@ -166,7 +167,7 @@ class Worker:
                 return found if found.restarts == self._restarts else None
         except (EOFError, OSError):
             code = self._process.poll()
-            if code is not None:  # None: the process is still ending; the next call gets the code
+            if code is not None:  # None means that the process is still ending; the next call gets the code
                 self._fail(f"the estimator ended with code {code}")
         return None
 
