@@ -79,8 +79,8 @@ class Bounced:
     law : likeness of the motion to motions under another contact law, as a normal deviate among motions under the
         believed law; 0 if no other law is known, or too few of its motions can be run, or the contact is not hard
     odds : log odds of the other law; minus infinity in the same cases, and if the motions are drawn about a given
-    vector unseen : (2,) deviation of the clearances in m due to errors of the frame's sides and of theta's scale, which
-    the
+        vector
+    unseen : (2,) deviation of the clearances in m due to errors of the frame's sides and of theta's scale, which the
         motion does not show
     rounded : (2,) excess of the clearances in m if the frame's corners are rounded by `priors.ROUNDING`; zero if the
         scene states the corners or the sides' deviations
