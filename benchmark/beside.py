@@ -1,4 +1,4 @@
-"""Measure this checkout and an earlier commit in one run, by processes that do the same work in turn.
+"""Measure this checkout and an earlier commit in one run, by two processes that do the same work in turn.
 
     python benchmark/beside.py COMMIT [--rounds 5]
 
@@ -20,7 +20,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "benchmark" / "results" / "beside.md"
-#: Program of a process, which uses only features that both commits have: runs as in README.
+#: The program of a process. It repeats the runs of README, and uses only features that both commits have.
 _WORK = """
 import json, sys, time
 import numpy as np

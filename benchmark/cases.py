@@ -47,10 +47,10 @@ class Row:
     steps: int | None = None
     evaluations: int | None = None
     events: int | None = None
-    #: figures of the section: members beyond the listed error, times real time, share of a core, error in
-    #: tolerances, ratio of times, kernels compiled
+    #: the section's figure: members beyond the listed error, multiple of real time, share of a core, error in
+    #: tolerances, ratio of times, or number of compiled kernels
     value: float | None = None
-    #: growth of a small displacement at t = 0 (random scenes, ensemble)
+    #: growth of a small displacement at t = 0 (in the sections of random scenes and of the ensemble)
     amplification: float | None = None
     status: str = "ok"
 
@@ -65,7 +65,7 @@ class Case:
     samples: list[Sample] = field(default_factory=list)
 
 
-#: A case is not repeated any more after its runs have taken this time together.
+#: A case is no longer repeated once its runs have together taken this time.
 TIME_PER_CASE_S = 1.0
 #: A first run shorter than this is a warm-up and is discarded; in a longer run warm-up makes no difference.
 WARM_UP_BELOW_S = 0.05

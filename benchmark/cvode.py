@@ -1,4 +1,4 @@
-"""CVODE called from C by the program `cvode_bench.c`, which measures its own time."""
+"""CVODE, called from C by the program `cvode_bench.c`, which measures its own time."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def version() -> str:
 
 
 def prepare(p: Array, law: str, method: str, roots: bool, rtol: float, output_dt: float) -> Callable[[], Sample]:
-    """Prepare one setting; each call starts a process, which measures the time of its run without its start."""
+    """Prepare one setting; each call starts a process, which measures the time of its run without the start."""
     executable = program()
     numbers = " ".join(repr(float(number)) for number in p)
 

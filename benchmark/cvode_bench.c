@@ -1,9 +1,9 @@
-/* CVODE (SUNDIALS) on a bench scene, called from C; times itself.
+/* CVODE (SUNDIALS) on a bench scene, called from C; the program measures its own time.
  *
  * usage: cvode_bench LAW METHOD ROOTS RTOL T_END OUTPUT_DT REPEATS POSES < parameters
  *   LAW      kv or hc
  *   METHOD   adams (functional iteration), bdf (dense Newton, difference quotients)
- *   ROOTS    1: CVODE's own rootfinding on every change of contact, with CVodeReInit there; 0: without
+ *   ROOTS    1: CVODE's rootfinding locates every change of contact, and CVodeReInit restarts there; 0: no rootfinding
  *   POSES    file for rows of x, y, theta as doubles
  * parameters: width height gx gy mass inertia gravity arm K exponent C-or-lambda, then one harmonic: Fx Fy M omega
  * Prints: one time in s per repeat, then `steps evaluations roots`.
@@ -22,7 +22,7 @@
 
 typedef struct {
     double w, h, gx, gy, m, inertia, g, arm, K, n, C, fx, fy, moment, omega;
-    int hc, roots, mode[8]; /* with roots: 0 off, 1 on, 2 clipped, frozen within a step */
+    int hc, roots, mode[8]; /* with roots, frozen within a step: 0 off, 1 on, 2 clipped */
 } scene;
 
 static const int SX[4] = {-1, 1, 1, -1}, SY[4] = {1, 1, -1, -1};
@@ -34,7 +34,7 @@ static inline double force(const scene *s, double d, double v)
 
 static inline double pushed(const scene *s, int pair, double d, double v)
 {
-    if (s->roots) /* no switch within a step: the mode decides */
+    if (s->roots) /* the mode decides, so that the force does not switch within a step */
         return s->mode[pair] == 1 ? force(s, s->hc && d < 0 ? 0 : d, v) : 0;
     double f = d > 0 ? force(s, d, v) : 0;
     return f > 0 ? f : 0;
@@ -111,7 +111,7 @@ static double seconds(void)
     return t.tv_sec + 1e-9 * t.tv_nsec;
 }
 
-/* adds what CVODE has counted since its last start: steps, evaluations */
+/* adds the steps and evaluations that CVODE has counted since its last start */
 static void count(void *mem, int adams, long *counts)
 {
     long steps = 0, calls = 0, jacobian = 0;

@@ -21,13 +21,14 @@ SECTION = "ensemble"
 BATCH = f"{HEYOKA}, batch"
 COLUMNS, ROWS = 40, 25
 PAIRS = f"kv, {COLUMNS * ROWS} clearance pairs"
-#: Tolerances from loose to tight; the first at which every pair is within `LISTED` is timed repeatedly.
+#: Tolerances from loose to tight. The loosest at which every pair is within `LISTED` is timed repeatedly.
 TOLERANCES = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5, 3e-6, 1e-6)
 _BATCH_TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
 EXACT = 1e-12
-#: Error in clearances beyond which a pair is listed.
+#: Error, as a multiple of the clearance, beyond which a pair is listed.
 LISTED = 1e-4
-#: Displacement at t = 0, in clearances, for the measurement of amplification; large compared with rounding.
+#: Displacement at t = 0, as a multiple of the clearance, by which amplification is measured; it is large compared with
+#: rounding.
 PERTURBATION = 1e-8
 
 
@@ -42,7 +43,7 @@ def clearance_pairs(columns: int, rows: int) -> list[Scene]:
 
 
 def ensemble_rows(columns: int, rows: int, lean_steps: Sequence[float], repeats: int, notify: Notify) -> Iterator[Row]:
-    """Yield rows for tolerances down to the tolerance that all pairs need, then rows of the peers and of listed pairs.
+    """Yield rows for tolerances down to the one that all pairs need, then rows of the peers and of the listed pairs.
 
     The peers run only with `lean_steps`.
     """

@@ -1,4 +1,4 @@
-"""Errors, coverage, widths and flags of the estimate on fresh synthetic truths, by group.
+"""Errors, coverage, widths and flags of the estimate on fresh synthetic truths, for each group of truths.
 
 The errors are compared with those of the range of motion, the simplest estimate of a clearance.
 
@@ -132,7 +132,7 @@ def main(groups: tuple[str, ...], truths: int, seed: int, periods: float | None,
     done = {(row["group"], row["seed"]) for row in rows}
     names = groups or tuple(GROUPS)
     seeds = range(seed, seed + truths)
-    # all groups in turn, so that a run that is stopped early leaves groups of equal size
+    # the groups take turns, so that a run that is stopped early leaves groups of equal size
     for number in seeds:
         for name in names:
             if (name, number) not in done:

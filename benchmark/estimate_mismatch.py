@@ -3,9 +3,9 @@
     python benchmark/estimate_mismatch.py --truths 8 --seed 80000              # all kinds
     python benchmark/estimate_mismatch.py --kind friction_05 --truths 4
 
-Each kind differs mildly in one respect, `several` in most respects. The truth is simulated by `mismatched_machine.py`,
-which has its own equations and integrator. Each truth is written as soon as it is done, and truths in the file are not
-run again.
+Each kind of machine differs mildly in one respect; the kind `several` differs in most respects. The truth is simulated
+by `mismatched_machine.py`, which has its own equations and integrator. Each truth is written as soon as it is done, and
+truths in the file are not run again.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ USEFUL_M = 4e-3
 
 @dataclass(frozen=True)
 class Kind:
-    """The difference of a machine from the model; a share or size with a random sign is a standard deviation."""
+    """The difference of a machine from the model; a share or size that gets a random sign is a standard deviation."""
 
     title: str
     stiffness: tuple[float, float] = (5e6, 3e7)
@@ -60,17 +60,17 @@ class Kind:
     #: shape of the given load: paper, cutting (paper with a broad-band part), pressed, chatter, vertical
     shape: str = "paper"
     gain: float = 0.05
-    #: shares of each load component's range: correlated error, third harmonic, constant
+    #: errors of the load as shares of each component's range: a correlated error, a third harmonic, a constant
     correlated: float = 0.0
     harmonic: float = 0.0
     constant: float = 0.0
-    #: the given load consists of averages over this many s, or of samples every this many s
+    #: the given load consists of averages over `averaged_s` seconds, or of samples every `sampled_s` seconds
     averaged_s: float = 0.0
     sampled_s: float = 0.01
     friction: float = 0.0
     exponent: float = 1.0
     walls: float = 0.0
-    #: true over assumed mass and inertia, and excess of the true over the assumed frame size in m
+    #: excess of the true over the assumed value: of mass and inertia as a share, of the frame size in m
     mass: float = 0.0
     inertia: float = 0.0
     frame_m: float = 0.0
@@ -83,8 +83,9 @@ class Kind:
     theta_missing: bool = False
     theta_scale: float = 0.0
     clock: float = 0.0
-    #: differences that no tuning used: number of bursts without poses, largest pose that the sensor shows as a share of
-    #: the motion's, excess of gravity's arm, delay of the load, drift of the bias of x and y over the window
+    #: differences on which nothing was tuned: number of bursts without poses; largest pose that the sensor shows, as a
+    #: share of the motion's largest; error of gravity's arm; delay of the load; drift of the bias of x and y over the
+    #: window
     bursts: int = 0
     saturated: float = 0.0
     arm_m: float = 0.0

@@ -17,7 +17,7 @@ from scipy.stats import beta
 
 from plow_twin.estimate.result import State
 
-#: Groups in the order of the page; a pair is a first seed and a number of truths.
+#: Groups in the order of the page; each pair is a first seed and a number of truths.
 TRUTHS: dict[str, tuple[tuple[int, int], ...]] = {
     "plain": ((54000, 50),),
     "sensor": ((54000, 50),),
@@ -39,7 +39,7 @@ TRUTHS: dict[str, tuple[tuple[int, int], ...]] = {
     "hard_shape": ((50000, 6),),
     "hard_kelvin_voigt": ((50000, 23), (54000, 10), (60000, 30)),
 }
-#: Target of the RMSE of a group [mm].
+#: Largest RMSE [mm] that each group should have.
 ASKED = {"plain": 0.05, "sensor": 0.06, "stochastic": 0.06, "middle": 0.05, "firm": 0.05, "hard": 0.1}
 _LEVEL = 0.95
 
@@ -106,7 +106,7 @@ def wrong_models() -> str:
 
 
 def wrong_sum() -> str:
-    """Return a sentence on how many truths outside the model are flagged, for soft contacts and for hard contacts."""
+    """Return a sentence on how many truths outside the model are flagged, for soft and for hard contacts."""
     names = [name for name in TRUTHS if (GROUPS[name].model, GROUPS[name].sensor) != ("ok", "ok")]
     hard = "hard_kelvin_voigt"
     soft = [_flagged(row) for name in names if name != hard for row in truths(name, TRUTHS[name])]

@@ -60,12 +60,12 @@ class Group:
     sensor_scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
     #: wear coefficient of the truth; the estimate assumes no wear
     wear_m2_n: float = 0.0
-    #: load cells at all pairs: rate, noise, deviation of each gain, largest delay
+    #: load cells at all pairs: sampling rate, noise, deviation of each gain, largest delay
     forces_hz: float = 0.0
     forces_noise_n: float = 1e3
     forces_gain: float = 0.05
     forces_delay_s: float = 0.05
-    #: expected verdicts on model and sensor
+    #: expected verdicts on the model and on the sensor
     model: str = "ok"
     sensor: str = "ok"
 

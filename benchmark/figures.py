@@ -88,7 +88,7 @@ def work() -> str:
 
 
 def missed() -> str:
-    """Return the table of the solver's missed targets; targets against the same peer share a line."""
+    """Return the table of the solver's missed targets; targets relative to the same peer share a line."""
     groups: dict[tuple[str, str], list[targets.Verdict]] = {}
     for verdict in targets.verdicts(solver_rows()):
         if not verdict.reached:

@@ -51,10 +51,10 @@ RESULTS = Path(__file__).resolve().parent / "results"
 
 TOLERANCE = 1e-4
 MEMBERS = 128
-#: Index of the estimate's first unknown in the state, after pose and rate.
+#: Index in the filters' state of the first unknown of the estimate; pose and rate come before it.
 _FIRST = 6
-#: Process noise in each step: x, y [m], theta [rad] and their rates; for the unknowns a share of the prior's standard
-#: deviation. Both were set by hand, with trials on seeds 200 and 201 only.
+#: Process noise in each step: of x, y [m], theta [rad] and their rates; of the unknowns, as a share of the prior's
+#: standard deviation. Both were set by hand, with trials on seeds 200 and 201 only.
 _STATE_NOISE = np.array([1e-5, 1e-5, 4e-5, 3e-3, 3e-3, 1e-2])
 _UNKNOWN_NOISE = 3e-4
 
@@ -118,7 +118,7 @@ class Members:
         wrench = ends * unknown[:, None, 4:7] / self._masses
         result = np.zeros((len(out), 1), ROW)
         pace = new_record(PACE)
-        pace.slice = 2**62  # all work in one slice
+        pace.slice = 2**62  # so large that all work is done in one slice
         move(
             self._params, self._parts, states, new_records(STATE, 1), self._work, self._totals, np.array([end]), wrench,
             result, pace,
@@ -195,7 +195,7 @@ def run_one(name: str, method: str, seed: int) -> dict[str, Any]:
     try:
         for t, q in zip(truth.poses.t[1:], truth.poses.q[1:], strict=True):
             one.predict(float(t) - one.now)
-            # a component that was not measured gets so large a noise that it has no effect
+            # a component that was not measured gets a noise so large that it has no effect
             there = np.isfinite(q)
             one.update(np.where(there, q, 0.0), np.diag(np.where(there, noise, 1e3) ** 2))
     except np.linalg.LinAlgError as error:

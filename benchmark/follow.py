@@ -3,9 +3,9 @@
     python benchmark/follow.py --group soft --group hard --truths 12 --seed 72000
     python benchmark/follow.py --table                       # table of the truths in the file
 
-The errors are compared with those of the nominal twin. The result at a time uses only measurements up to that time. All
-thresholds were set on seeds below 72000. Each truth is written as soon as it is done, and truths in the file are not
-run again.
+The errors are compared with those of the nominal twin. At each time the result uses only measurements up to that time.
+All thresholds were set on seeds below 72000. Each truth is written as soon as it is done, and truths in the file are
+not run again.
 """
 
 from __future__ import annotations
@@ -38,9 +38,11 @@ GROUPS = {
     "law": Group("law: Kelvin-Voigt", law="kelvin_voigt"),
     "shape": Group("load: third harmonic of 10 %", third_harmonic=0.1),
 }
-#: Forces are compared from the fifth load period on, for pairs with at least a hundredth of the largest impulse.
+#: Forces are compared from the fifth load period on, and only for pairs with at least this share of the largest
+#: impulse.
 FIRST_PERIOD, LEAST_SHARE = 4, 0.01
-#: Interval in s of the rows from which the truth's peaks and impulses are computed, a fifth of the shortest contact.
+#: Interval in s between the rows from which the truth's peaks and impulses are computed. It is a fifth of the duration
+#: of the shortest contact.
 _FINE = 1e-4
 
 

@@ -27,7 +27,7 @@ from plow_twin.stream.journal import Estimated
 from plow_twin.stream.topics import TOPICS
 
 _T0 = 1_795_000_000_000_000_000
-#: Sampling interval, length of the run, length of the warm-up (not measured), and time of the estimate, in s.
+#: In s: sampling interval, length of the run, length of the warm-up (which is not measured), time of the estimate.
 _STEP, _END, _FIRST, _ESTIMATED = 1e-3, 6.0, 1.0, 0.5
 
 
@@ -63,7 +63,7 @@ def measured(truth: Truth, follow: str) -> tuple[list[int], list[int]]:
     with tempfile.TemporaryDirectory() as folder:
         scene = Path(folder, "believed.yaml")
         scene.write_text(dump_scene(truth.nominal), encoding="utf-8")
-        # windows and intervals too long for the runtime to make an estimate of its own
+        # windows and intervals are so long that the runtime makes no estimate of its own
         given = parameters.settings(
             {"scene": str(scene), "estimate": True, "estimate_window": 600.0, "estimate_interval": 600.0}
             | {"follow": follow}

@@ -18,14 +18,15 @@ import numpy as np
 from bench_scenes import T_END
 from cases import Array, Sample, timed
 
-#: Time after an event in which heyoka ignores the same event [s]; with the default it would miss the next touch.
+#: Time [s] after an event during which heyoka ignores the same event; with heyoka's default it would miss the next
+#: touch.
 _COOLDOWN = 1e-7
 #: Indices of the clearances in heyoka's parameters, after the modes of the pairs.
 _GX, _GY = 8, 9
 
 
 def _pairs(p: Array, state: Sequence[Any], hy: Any) -> list[tuple[Any, ...]]:
-    """Return penetration, its rate, and the wrench in body axes per newton, of each pair (see `lean`)."""
+    """Return for each pair (see `lean`) the penetration, its rate, and the wrench in body axes of a force of 1 N."""
     a, b, far_x, far_y = 0.5 * p[0], 0.5 * p[1], 0.5 * (p[0] + hy.par[_GX]), 0.5 * (p[1] + hy.par[_GY])
     x, y, th, vx, vy, om = state
     c, s = hy.cos(th), hy.sin(th)
@@ -56,7 +57,8 @@ def _equations(p: Array, begin: float) -> tuple[list[tuple[Any, Any]], list[tupl
             force = hy.par[i] * law
         else:
             law = 1.0 + p[10] * rate
-            # the base is 1 if the pair does not act, since a negative number has no real power
+            # the base is 1 if the pair does not act, since a negative number has no real power with a fractional
+            # exponent
             force = hy.par[i] * p[8] * (hy.par[i] * d + (1.0 - hy.par[i])) ** p[9] * law
             d = d - begin
         fx, fy, torque = fx + along_x * force, fy + along_y * force, torque + arm * force

@@ -34,7 +34,7 @@ def main() -> None:
     for name, one in (("kv", scene), ("hc, n = 1", dataclasses.replace(scene, contact=linear))):
         runs = (prepare_bare(one, SPARSE, tol), _in_lanes(one, 1, tol), _in_lanes(one, 8, tol))
         least = [float("inf")] * len(runs)
-        for _ in range(chosen.rounds + 1):  # the first compiles
+        for _ in range(chosen.rounds + 1):  # the first round compiles
             for i, run in enumerate(runs):
                 begin = time.process_time()
                 run()

@@ -26,8 +26,8 @@ PEERS: dict[str, Member] = {
     "our RK4": lambda solver: solver == OURS_RK4,
 }
 OWN: dict[str, Member] = {name: name.__eq__ for name in (OURS_BARE, OURS, OURS_CALL)}
-#: A solver is measured only once if it is slower than the fastest solver of its group by more than this factor. The
-#: same applies to a setting and the fastest setting of its solver.
+#: A solver is not measured again if it is slower than the fastest solver of its group by more than this factor. The
+#: same holds for a setting compared with the fastest setting of its solver.
 _NEAR = 1.4
 
 
@@ -50,7 +50,7 @@ def ladders(rows: Sequence[Row], scene: str, output_s: float, member: Member) ->
 
 
 def reach(ladder: Sequence[Row], level: float) -> Reached | None:
-    """Return the least time for an error of at most `level`, of a setting or interpolated between two settings.
+    """Return the least time for an error of at most `level`, of one setting or interpolated between two.
 
     The interpolation is linear in the logarithms of time and error, and only between neighbouring settings of which the
     looser misses the level and the tighter reaches it.

@@ -382,7 +382,7 @@ def soak(minutes: float, rate_hz: float) -> bool:
                 "threads": _status(process_id, "Threads"),
                 "files": len(os.listdir(f"/proc/{process_id}/fd")),
                 "core": round((_cpu_s(process_id) - busy) / PERIOD_S, 3),
-                "age_p50_ms": round(ages[len(ages) // 2], 3) if ages else None,  # None: no clock
+                "age_p50_ms": round(ages[len(ages) // 2], 3) if ages else None,  # None without a clock
                 "age_p99_ms": round(ages[len(ages) * 99 // 100], 3) if ages else None,
                 "queued": int(figures.get("queued") or 0),
                 **_account(figures),

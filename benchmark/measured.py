@@ -2,7 +2,7 @@
 
     python benchmark/measured.py            fits, errors, coverage: benchmark/results/measured.json
     python benchmark/measured.py --only square
-    python benchmark/measured.py --only fit      the square fitted to either half of its drops, errors on the other
+    python benchmark/measured.py --only fit      the square fitted to each half of its drops, errors on the other
     python benchmark/measured.py --only table    height of the table by the estimate of each drop
     python benchmark/measured.py --plot     pictures of it in docs/images
 
@@ -296,9 +296,9 @@ PRESET_FITTED = (
     "gyration", "stiffness", "restitution", "restitution_fall", "mass_power", "friction", "tangential",
     "tangential_damping", "gravity",
 )  # fmt: skip
-#: Largest difference of two first flights that are nearly the same: angle [rad], rates [m/s, m/s, rad/s].
+#: Largest differences at which two first flights count as nearly the same: angle [rad], rates [m/s, m/s, rad/s].
 NEAR_TWINS = (0.05, 0.15, 0.15, 1.5)
-#: Two corners hit at the same time if their touches are within this time in s.
+#: Two corners hit at the same time if at most this time in s lies between their touches.
 TWO_AT_ONCE_S = 1e-3
 
 
@@ -309,7 +309,7 @@ class Square:
         self.drops, self.usable = drops, np.array(drops.usable())
         self.first = drops.flight_rows[self.usable] - 1
         bounces = [drops.bounces[i] for i in self.usable]
-        #: number of rows from the end of the first flight to each bounce, 0 without this bounce, shape (n, 3)
+        #: number of rows from the end of the first flight to each bounce, 0 if there is no such bounce, shape (n, 3)
         self.rows = np.array(
             [
                 [its[k] - first if k < len(its) else 0 for k in (1, 2, 3)]
@@ -413,7 +413,7 @@ class Square:
         in x and of whole quarter turns.
         """
         gravity, height = float(SQUARE["gravity"]), 0.05
-        # time from the last row of the flight to the height of 50 mm
+        # time from the last row of the flight until the centre is at the height of 50 mm
         z, fall = self.flights[:, 1], self.flights[:, 4]
         shift = (fall + np.sqrt(np.maximum(fall**2 + 2.0 * gravity * (z - height), 0.0))) / gravity
         turned = self.flights[:, 2] + shift * self.flights[:, 5]

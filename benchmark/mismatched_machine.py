@@ -1,6 +1,6 @@
 """A machine with properties that a scene lacks: its own equations, integrated with fixed Runge-Kutta steps.
 
-It does not use the solver. The walls may differ in stiffness, the corners may be round, the pads may lie askew, the
+It does not use the solver. The walls may differ in stiffness, the corners may be round, the pads may be displaced, the
 frame may stand on a spring, and the corners may rub. Only heads with `rotation: paper` are modelled.
 """
 

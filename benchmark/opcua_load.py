@@ -139,7 +139,7 @@ def _live(
         cwd=folder, env=os.environ | {"PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     assert server.stdout is not None and twin.stdout is not None
-    time.sleep(0.2 * seconds)  # the start is not measured
+    time.sleep(0.2 * seconds)  # the start of the process is not measured
     begin, busy, machine = time.monotonic(), _cpu_s(twin.pid), _machine_s() - _cpu_s(server.pid)
     time.sleep(0.6 * seconds)
     passed_s, used_s = time.monotonic() - begin, _cpu_s(twin.pid) - busy

@@ -31,7 +31,7 @@ STYLES: dict[str, tuple[str, str]] = {
     "MuJoCo RK4": ("#8c510a", ">"),
     "Exudyn RK44": ("#dfa526", "h"),
 }
-#: Engines that have only rows 1 ms apart; their points are drawn among the sparse rows of the other solvers.
+#: Engines that have only rows 1 ms apart; their points are drawn together with the sparse rows of the other solvers.
 _DENSE_ONLY = ("MuJoCo", "Exudyn")
 
 

@@ -18,7 +18,7 @@ from lives import SHARES
 
 from plow_twin.estimate.result import NORMAL_P95, State
 
-#: Groups that are drawn, with their colours, in the order of the legend, and the first seed that no tuning used.
+#: Groups that are drawn, in the order of the legend, with their colours; then the first seed that no tuning used.
 STYLES = {
     "plain": "#1f4e9c", "sensor": "#5aae61", "stochastic": "#dfa526", "middle": "#8c510a", "firm": "#35978f",
     "hard": "#d62728", "hard_sensor": "#9970ab",

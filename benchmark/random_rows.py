@@ -21,7 +21,7 @@ QUICK_COUNT = 10
 def random_rows(few: bool, notify: Callable[[str], None]) -> Iterator[Row]:
     """Yield a row for each random scene with its error in tolerances (`value`) and its amplification.
 
-    With `few` only scenes are run that need no other kernel than the KV bench scene.
+    With `few` only scenes are run that use the kernel of the KV bench scene.
     """
     saved = random_scenes.load()
     chosen = [index for index, scene in enumerate(saved.scenes) if not few or _is_plain(scene)]

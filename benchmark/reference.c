@@ -1,4 +1,4 @@
-/* Reference trajectories in extended precision, by another method than the package's.
+/* Reference trajectories in extended precision, by a method other than the package's.
  *
  * Gragg-Bulirsch-Stoer extrapolation of order 16 in world axes about the centre of mass, contact modes frozen within a step,
  * events located by re-stepping to the root of the guard (no dense output, no series). Long double by default; with
@@ -8,7 +8,7 @@
  *   TOL           admissible error of one step, relative to the clearance
  *   CAP           longest step in contact as a phase of the contact's oscillation, in rad; CAP ms in flight
  *   PERTURBATION  added to the initial x, in clearances
- * Each scene is one line of numbers (see random_scenes.py: `reference_line`). Output, per scene, doubles:
+ * Each scene is one line of numbers (see random_scenes.py: `reference_line`). The output of each scene is in doubles:
  *   status (0 done, 1 step too small), steps, evaluations, events, rows, then rows x (x, y, theta) of the cavity's centre.
  */
 #include <stdio.h>
@@ -150,7 +150,8 @@ static void measure(const scene *s, const contacts *k, real t, const real *z, ga
     }
 }
 
-/* Guard `which` (0, 1) of a pair: positive past the event. Returns 0 when there is none; value and slope in v. */
+/* Writes value and slope of guard `which` (0, 1) of a pair to v; it is positive past the event. Returns 0 if there is
+ * no such guard. */
 static int guard(const scene *s, const contacts *k, const gaps *g, int pair, int which, real *v)
 {
     real d = g->d[pair], r = g->rate[pair], a = g->second[pair];
@@ -250,7 +251,7 @@ typedef struct {
     int pair, which;
 } probe;
 
-/* Guard (v[0]) and its slope (v[1]) at t + x, by a step of its own. */
+/* Writes a guard (v[0]) and its slope (v[1]) at t + x, computed by a separate step. */
 static void at(const probe *p, real x, real *v)
 {
     real z[6];
@@ -268,7 +269,7 @@ static real summit(const probe *p, real h)
         real x = (low + high) / 2;
         at(p, x, v);
         if (v[0] > 0)
-            return x; /* positive already: that is enough */
+            return x; /* a point with a positive value is enough */
         if (v[1] > 0)
             low = x;
         else
@@ -277,7 +278,8 @@ static real summit(const probe *p, real h)
     return high;
 }
 
-/* Point in [0, h] past the fall of a guard that falls first and rises later: there it is well below rounding noise. */
+/* Point in [0, h] near the lowest value of a guard that falls first and rises later; this value is negative by far more
+ * than rounding noise. */
 static real valley(const probe *p, real h)
 {
     real low = 0, high = h, v[2] = {0, 0};
@@ -292,7 +294,8 @@ static real valley(const probe *p, real h)
     return low;
 }
 
-/* Root in [low, high] of a guard that is `start` <= 0 at low and `value` > 0 at high, from above: Illinois, bisection. */
+/* Point just above the root in [low, high] of a guard that is `start` <= 0 at low and `value` > 0 at high, by the
+ * Illinois method and bisection. */
 static real root(const probe *p, real low, real start, real high, real value)
 {
     real below = start < 0 ? start : -1e-30L, v[2] = {0, 0};
@@ -374,7 +377,7 @@ static void run(const scene *s, real tol, real cap)
     long steps = 0, events = 0, status = 0, rows = (long)(s->end / s->output + 0.5L) + 1, row = 0;
     memcpy(z, s->initial, sizeof z);
     evaluations = 0;
-    /* rows are collected before the header is known */
+    /* rows are kept until the run ends, because the header in front of them has its counts */
     real(*kept)[6] = malloc(rows * sizeof *kept);
     memcpy(kept[row++], z, sizeof z);
     while (row < rows && !status) {

@@ -5,8 +5,8 @@ of real time (of all messages, and of digests alone), and its upper bounds (the 
 also prints the speed of a drawing that is thinned like the drawing of an hour, and of reading the file with `mcap` and
 `rosbags`. Times are processor times of one thread, the least of some runs.
 
-The start of a replay (scene, twin, loading of compiled code) has its own row. It is included in each time but not in
-the last column. It is negligible for an hour, and takes a tenth of the replay of 100 s by digests alone.
+The start of a replay (scene, twin, loading of compiled code) has its own row. Each time includes it, the last column
+does not. The start is negligible for an hour; for 100 s it is a tenth of a replay by digests alone.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ def main(seconds: float) -> None:
             size = record(folder, seconds, outputs)
             print(f"{folder.name:8} {size / seconds / 1e3:8.1f} kB/s {size / seconds * 3.6e-3:8.0f} MB/h")
         record(short, _SHORT_S, True)
-        replay(short)  # compiles
+        replay(short)  # the first replay compiles
         replay(short, digests_only=True)
         start = least(lambda: replay(short))
         print(f"{'start of a replay':26} {start:8.3f} s")
@@ -134,7 +134,7 @@ def main(seconds: float) -> None:
             "read with mcap": lambda: read_mcap(full / "full_0.mcap"),
             "read with rosbags": lambda: read_rosbags(full),
         }
-        to_rrd(full, Path(name) / "full.rrd")  # compiles
+        to_rrd(full, Path(name) / "full.rrd")  # the first drawing compiles
         for title, work in works.items():
             spent = least(work)
             apart = f", {seconds / (spent - start):.0f} x without its start" if title.startswith("replay") else ""

@@ -28,13 +28,13 @@ ASKED = tuple(round(0.01 * k, 2) for k in range(101))
 SHOWN = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0)
 #: Damping ratios C / (2 sqrt(K m)) of the Kelvin-Voigt table.
 RATIOS = (0.0, 0.01, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 2.0)
-#: Ramp lengths of the ramped law, over the depth v sqrt(m/K) of the undamped impact.
+#: Ramp lengths of the ramped law, as multiples of the depth v sqrt(m/K) of the undamped impact.
 RAMPS = (0.001, 0.01, 0.1, 0.3, 1.0, 3.0, 10.0)
 #: A law is valid where the delivered restitution is within this share of the nominal restitution.
 VALID = 0.05
 
 MASS_KG, SPEED_M_S, STIFFNESS, EXPONENT = 2.0, 1.0, 1e9, 1.5
-#: Stiffness [N/m] of the laws that add C d' to a linear spring.
+#: Stiffness [N/m] for the laws that add C d' to a linear spring.
 LINEAR_STIFFNESS = 1e6
 #: Floor of the impact speed for the damping [m/s], so low that all restitutions below 1 share compiled kernels.
 FLOOR = 1e-6
@@ -44,8 +44,8 @@ FLOOR = 1e-6
 class Row:
     """One free impact.
 
-    `asked` is a restitution, or a damping ratio for laws that add C d'; `ramp` is the length of the ramped law's ramp
-    over the depth of the undamped impact.
+    `asked` is a restitution, or a damping ratio for laws that add C d'; `ramp` is the length of the ramped law's ramp,
+    divided by the depth of the undamped impact.
     """
 
     law: str
@@ -66,7 +66,7 @@ def free_impact(contact: Contact, mass: float = MASS_KG, speed: float = SPEED_M_
         locked=("x", "theta"),
         pairs=("top_left_top",),
     )
-    # the mass needs 5 ms to the wall; the slowest rebound (D at its cap) takes some 50 ms
+    # the mass needs 5 ms to reach the wall; the slowest rebound (D at its largest value) takes some 50 ms
     result = simulate(scene, 0.2 / speed, output_dt=0.2 / speed, tol=1e-11)
     if result.penetration[-1, 0] > 0.0 or result.statistics["top_left_top"]["makes"] != 1:
         raise RuntimeError(f"{contact}: not one whole impact")

@@ -8,8 +8,8 @@ benchmark/siconos.py FOLDER` compares the `.ref` files of a copy of that folder 
 
 Both models have four corners in a guide. The slider of Siconos is driven by a crank and a rod; our slider is a free
 body under loads. The mechanism therefore acts on our slider as a load m a(t), where a(t) is the slider's acceleration
-across the guide without contact, in the state of the reference. Our solver then computes touches, restitution and
-rests.
+across the guide without contact, in the state that the reference has at that time. Our solver then computes touches,
+restitution and rests.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ def rigid_motion(t_end: float, impacts: int) -> tuple[Array, Array, list[float]]
             row = across(state[:2])
             weight = np.linalg.solve(mass, row)
             state[2:] -= weight * (1.0 + RESTITUTION) * (row @ state[2:]) / (row @ weight)
-            # the rates jump, so a further time follows just after the impact
+            # the rates jump, so a second row follows just after the impact
             times.append(math.nextafter(time, math.inf))
             states.append(state)
     return np.array(times), np.array(states), found
@@ -141,7 +141,7 @@ class Comparison:
 
 
 def phases(touching: NDArray[np.bool_], t: Array, shortest: float = 1e-3) -> list[tuple[float, float]]:
-    """Return begin and end of each rest, which is contact without a break for `shortest` s or more."""
+    """Return begin and end of each rest, which is contact without a break for at least `shortest` s."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], touching.astype(int), [0]]))).reshape(-1, 2)
     whole = [(float(t[first]), float(t[last - 1])) for first, last in edges.tolist()]
     return [(begin, end) for begin, end in whole if end - begin >= shortest]

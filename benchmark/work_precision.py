@@ -43,8 +43,8 @@ LEAN_STEPS = (*FIXED_STEPS, 5e-6, 2e-6, 1e-6)
 _LADDER = _decades(2, 13)
 #: Tolerances of CVODE in C, down to the tolerance at which it breaks down.
 _C_LADDER = _decades(2, 14)
-#: Tolerances of `solve_ivp`, which is slow because its loop is in Python: it is run with sparse output only, and Radau
-#: and BDF, which take seconds, only at whole decades.
+#: Tolerances of `solve_ivp`, whose loop in Python is slow: it is run with sparse output only, and Radau and BDF, which
+#: take seconds, only at whole decades.
 _SOLVE_IVP = {"LSODA": _decades(3, 12), "DOP853": _decades(3, 12), "Radau": _decades(3, 8, 1), "BDF": _decades(3, 8, 1)}
 _MUJOCO = {"Euler": (1e-3, 5e-4, 2e-4, 1e-4), "implicitfast": (1e-3, 5e-4), "RK4": (1e-3, 5e-4, 2e-4)}
 _EXUDYN = {"VelocityVerlet": (1e-3, 5e-4, 2e-4, 1e-4), "RK44": (1e-3, 5e-4, 2e-4), "RK67": (1e-3, 5e-4)}
@@ -81,7 +81,7 @@ def prepare_simulate(
         return simulate(scene, end, output_dt, tol, method, dt, energy_balance, sensitivity=sensitivity)
 
     if sensitivity or whole_call:
-        call(output_dt or t_end)  # compiles
+        call(output_dt or t_end)  # the first call compiles
 
     def run() -> Sample:
         wall, result = timed(lambda: call(t_end))
@@ -108,7 +108,7 @@ def prepare_bare(scene: Scene, output_dt: float, tol: float, t_end: float = T_EN
         state = motion.state
         return Sample(wall, motion.q, int(state.steps), int(state.evaluations), int(motion.totals.logged))
 
-    # compiles
+    # this call compiles
     nothing = Motion.start(compiled, np.zeros((1, 3)), np.zeros((1, 3)))
     run_events(compiled, nothing, np.zeros(1), 0.0, work, BUDGET)
     return run

@@ -19,7 +19,7 @@ HOUR_S = 3600.0
 def stiffness_cases() -> Iterator[Case]:
     """Yield the KV scene with stiffnesses from soft to stiff and a constant damping ratio.
 
-    The error over 2 s is that against our own run at a tolerance of 1e-12.
+    The errors over 2 s are relative to our own run at a tolerance of 1e-12.
     """
     scene = bench_scene("kv")
     contact = scene.contact
@@ -72,7 +72,7 @@ def swaying_scene() -> Scene:
 
 
 def horizon_cases(longest: float) -> Iterator[Case]:
-    """Yield the KV scene over longer and longer times, and hours almost without events."""
+    """Yield the KV scene over increasing times, and scenes with hours almost without events."""
     scenes = [(bench_scene("kv"), "kv", t_end) for t_end in (1.0, 10.0, 60.0, 600.0, HOUR_S)]
     scenes += [
         (still_scene(), "at rest after the fall", HOUR_S),
