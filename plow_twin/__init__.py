@@ -52,8 +52,8 @@ if _TYPE_CHECKING:
     from plow_twin.scene_file import dump_scene as dump_scene
     from plow_twin.scene_file import load_scene as load_scene
 
-#: Where each name is defined. It is imported at its first use, so that a command can be stopped from its first moment
-#: on, and scenes built in Python do not need the YAML reader.
+#: Public names by the module that defines them. A module is imported when one of its names is first used, so that
+#: Ctrl-C stops a command from its first moment on, and scenes built in Python do not need the YAML reader.
 _NAMES = {
     "plow_twin.errors": (
         "ArgumentError",
@@ -97,7 +97,7 @@ _NAMES = {
     "plow_twin.scene_file": ("dump_scene", "load_scene"),
 }
 _HOMES = {name: module for module, names in _NAMES.items() for name in names}
-#: For a star import, which must work without the libraries of recordings.
+#: Names for a star import, which must work without the libraries that recordings need.
 __all__ = [name for name, module in _HOMES.items() if not module.startswith("plow_twin.record")]
 
 

@@ -8,7 +8,7 @@ from typing import Final
 
 from plow_twin.errors import InputError, Problem
 
-#: Longest secret, a password in an MQTT packet [B].
+#: Longest secret [B], which is the longest password that an MQTT packet can hold.
 _LONGEST_SECRET: Final = 65_535
 
 

@@ -45,7 +45,7 @@ def build_fingerprint() -> Mapping[str, str]:
 
 
 def source_digest(package: Path) -> str:
-    """Return 16 hexadecimal digits that stand for the sources of the numeric subpackages in a package's folder."""
+    """Return a hash of the sources of a package's numeric subpackages, 16 hexadecimal digits."""
     digest = hashlib.sha256()
     for subpackage in NUMERIC_SUBPACKAGES:
         for path in sorted((package / subpackage).rglob("*.py")):

@@ -1,4 +1,4 @@
-"""Exceptions of the package: one base class, each message names the thing, the value got and the value expected."""
+"""Exceptions of the package, with one base class; a message names the thing, the value got and the value expected."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ class PlowTwinError(Exception):
     """Base of every error that the package raises on purpose."""
 
 
-#: Longest value that is shown whole [characters].
+#: Longest value that a message shows in full [characters].
 _LONGEST_SHOWN: Final = 500
-#: Largest number of problems in a message.
+#: Largest number of problems that a message lists.
 _MOST_SHOWN: Final = 50
 
 
-#: Categories of characters that act on a terminal or turn the direction of writing.
+#: Unicode categories of the characters that control a terminal or change the writing direction.
 _ACTING: Final = frozenset({"Cc", "Cf", "Cs", "Zl", "Zp"})
 
 
 def printable(text: str) -> str:
-    """Return a text that is safe for a terminal: control characters are escaped, line ends stay."""
+    """Return a text that is safe for a terminal: control characters are escaped, line ends are kept."""
     if text.isprintable():
         return text
     return "".join(
@@ -39,9 +39,9 @@ class Problem:
     Attributes
     ----------
     key : str
-        Where: the path of a number, a file, a row.
+        Where the problem is: the path of a number, a file or a row.
     got : object
-        What stood there.
+        The value found there.
     expected : str
         The expected value, in words.
     """
@@ -58,7 +58,7 @@ class Problem:
 
 
 class InputError(PlowTwinError, ValueError):
-    """A file or values that a user wrote cannot be used; the message lists the problems, the first 50 of them.
+    """A file or values that a user wrote cannot be used; the message lists the first 50 problems.
 
     Attributes
     ----------
@@ -139,11 +139,11 @@ class ExcessError(RecordingError):
 
 
 class UnitError(RecordingError):
-    """A unit is unknown, or numbers look as if they were in another one; the message says how to state the unit."""
+    """A unit is unknown, or numbers look as if they had another unit; the message says how to state the unit."""
 
 
 class TakenError(RecordingError):
-    """A recording cannot be made where another one is."""
+    """A recording cannot be written, because another recording exists at the same place."""
 
 
 class ForeignRecordingError(RecordingError):

@@ -3,8 +3,8 @@
     additive laws     F = K d^n + C psi(d) d',  psi = 1 (Kelvin-Voigt) or u^2 (3 - 2 u), u = min(d / ramp, 1)
     all other laws    F = K d^n (1 + lambda d')
 
-They reconstruct eq. 6 of the paper, which is lost; `contact_laws` gives lambda. The solver decides when a pair is in
-contact, and sets the force to zero where it would pull.
+These laws reconstruct eq. 6 of the paper, which is lost; `contact_laws` gives lambda. The solver decides when a pair is
+in contact, and sets the force to zero where it would pull.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ def free_force(
 ) -> float:
     """Return the law's F in N for penetration d in m and rate d' in m/s; it is negative where it would pull.
 
-    `damping_factor` is lambda in s/m, `viscous` is C in N s/m; one of the two is zero. `ramp` in m is zero without a
-    ramp.
+    `damping_factor` is lambda in s/m, `viscous` is C in N s/m; one of the two is zero. `ramp` is in m, and zero for a
+    law without a ramp.
     """
     elastic = stiffness * (penetration if exponent == 1.0 else max(penetration, 0.0) ** exponent)
     if ramp > 0.0 and penetration < ramp:

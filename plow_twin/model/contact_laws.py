@@ -16,7 +16,7 @@ from typing import Final
 
 from plow_twin.errors import ArgumentError
 
-#: Limit of 1 - e below which rounding dominates the exact law's residual, so that two terms of D's series are used.
+#: Value of 1 - e below which rounding dominates the exact law's residual, so that two terms of D's series replace it.
 _NEARLY_ELASTIC: Final = 1e-5
 #: Largest D = lambda v0 used; as the restitution goes to 0 the damping would grow without bound.
 DAMPING_NUMBER_CAP: Final = 1e3

@@ -1,4 +1,4 @@
-"""Geometry of the guide: place of each frame corner in the head's axes, its penetration, and the arm of its force.
+"""Geometry of the guide: the place of each frame corner in head axes, its penetration, and the arm of its force.
 
 The head's state is kept in *body coordinates* of its centre of mass G:
 
@@ -39,12 +39,12 @@ if TYPE_CHECKING:
 
 #: Number of components of the body-coordinate state: X, Y, VX, VY, omega, c, s, theta.
 STATE_SIZE = 8
-#: 1 for pairs at a wall with its normal along x (or along y), 0 for the others, shape (8,) each.
+#: 1 for pairs whose wall has its normal along x (first array) or along y (second array), otherwise 0, shape (8,) each.
 _ALONG_X, _ALONG_Y = np.abs(NORMAL_X), np.abs(NORMAL_Y)
 
 
 def corner_positions(scene: Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return Cx and Cy of each pair's corner in m, world axes, shape (8,) each; of rounded corners the arc's centre."""
+    """Return Cx and Cy of each pair's corner (if rounded, of its arc's centre) in m, world axes, shape (8,) each."""
     radius = corner_radius(scene)
     return (0.5 * scene.frame.width_m - radius) * CORNER_X, (0.5 * scene.frame.height_m - radius) * CORNER_Y
 
@@ -134,9 +134,9 @@ def _of_places(scene: Scene, rows: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _of_arms(scene: Scene, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the rows of an arm about G of a head that carries walls, or adapt them to a head that carries corners.
+    """Adapt rows of an arm about G, made for a head that carries walls, to the scene's head, and return them.
 
-    There the arm does not depend on the head's position.
+    The arm of a head that carries corners does not depend on the head's position.
     """
     if scene.head.carries == "corners":
         rows[0] *= -1.0
@@ -234,7 +234,7 @@ def body_states(states: NDArray[np.float64], offset: tuple[float, float]) -> NDA
 
 
 def tumbles(scene: Scene) -> bool:
-    """Return whether the head may turn beyond 45 degrees: only a square block without wear, since its corners match."""
+    """Return whether the head may turn beyond 45 degrees; only a square block without wear may: its corners match."""
     alike = scene.frame.width_m == scene.frame.height_m and scene.wear is None
     return scene.head.carries == "corners" and alike
 

@@ -19,7 +19,7 @@ def load_laws(names: Iterable[str]) -> None:
     Parameters
     ----------
     names : iterable of str
-        Path of a file ending in .py, or name of an installed module, for each.
+        For each module, the path of a file that ends in .py, or the name of an installed module.
 
     Raises
     ------

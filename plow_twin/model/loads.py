@@ -83,7 +83,7 @@ def wrench_of(force: tuple[float, float], moment: float, at: tuple[float, float]
 
 
 def load_direction(load: Harmonic | Constant) -> Array:
-    """Return the load's wrench per newton of its force, shape (3,), or of a pure moment the wrench per N m."""
+    """Return the load's wrench per N of its force, or per N m of its moment if it has no force, shape (3,)."""
     size = float(np.hypot(*load.force_n)) or abs(load.moment_n_m) or 1.0
     return wrench_of(load.force_n, load.moment_n_m, load.at_m) / size
 

@@ -56,7 +56,7 @@ class Provenance:
     source : str
         The source, in words.
     deviation : float, optional
-        Standard deviation of the number, in its unit; None if it is not stated.
+        Standard deviation, in the unit of the number; None if it is not stated.
     """
 
     mark: Mark
@@ -143,7 +143,8 @@ class Contact:
     """
 
     law: str = _choice("contact law", LAWS, "exact_restitution")
-    # must be given; the default (NaN, not admissible) is here only because the field before has a default
+    # must be given: its default is NaN, which is not admissible, and is here only because the preceding field has a
+    # default
     stiffness: float = _quantity("N/m^exponent", "K in F = K d^n (...)", math.nan, gt=0.0)
     exponent: float = _quantity("1", "n in F = K d^n (...)", 1.0, ge=1.0, le=4.0)
     damping: float | None = _quantity(
@@ -185,7 +186,7 @@ class Friction:
     """Tangential friction of all pairs, by one of two laws.
 
     Without `stick_stiffness_n_m` friction is regularised Coulomb, T = mu N tanh(slip rate / regularisation speed),
-    under which bodies creep. With it friction is Coulomb's law with stick: a spring and a damper hold a corner to the
+    under which bodies creep. With it, friction is Coulomb's law with stick: a spring and a damper hold a corner to the
     wall up to static mu N, then the corner slips with T = mu N.
 
     References
@@ -212,7 +213,7 @@ class Support:
     """The frame as a body with mass on springs and dampers to ground. In a scene without a support the frame is fixed.
 
     The frame starts at rest in its equilibrium without contact, where its weight is carried, and its displacement is
-    measured from there. q is the head's displacement from the frame, as without a support.
+    measured from there. As in a scene without a support, q is the head's displacement from the frame.
     """
 
     mass_kg: float = _quantity("kg", "mass of the frame and of the parts that move with it", gt=0.0)
@@ -229,7 +230,7 @@ class Support:
 
 @dataclass(frozen=True)
 class Gravity:
-    """Gravity, and for `rotation: paper` its constant moment about the cavity's centre, minus m g times the arm."""
+    """Gravity, and for `rotation: paper` its constant moment about the cavity's centre, which is -m g times the arm."""
 
     acceleration_m_s2: float = _quantity("m/s^2", "acceleration along -y", 9.81)
     arm_m: float = _quantity("m", "arm of the constant moment, positive to the right", 0.0)
@@ -405,7 +406,7 @@ OPTIONAL_PARTS: Final[Mapping[str, type]] = {"wear": Wear, "friction": Friction,
 
 
 def check(scene: Scene) -> Iterator[Problem]:
-    """Yield every problem of a scene: types, ranges and choices first; if there are none, conditions across fields."""
+    """Yield every problem of a scene: wrong types, ranges and choices; if there are none, conflicts between fields."""
     found = list(_check_fields(scene, ""))
     yield from found
     if not found:
@@ -505,7 +506,7 @@ def describe(spec: Field[Any]) -> str:
     return f"a finite number {' and '.join(bounds)}".rstrip() + f" [{spec.metadata['unit']}]"
 
 
-#: Largest damping factor lambda in s/m that a scene can give, of 1 + lambda d'.
+#: Largest damping factor in s/m that a scene can give: the lambda in 1 + lambda d'.
 MOST_DAMPING_FACTOR: Final = 1e9
 
 
@@ -522,7 +523,7 @@ def _check_wear(wear: Wear, contact: Contact) -> Iterator[Problem]:
 
 
 def fastest_travel(wear: Wear | None, contact: Contact) -> float:
-    """Return the largest speed along the face in m/s for a damping C, A / (k_s C); inf without C or without wear.
+    """Return the largest speed along the face in m/s, A / (k_s C) with the damping C; inf without C or without wear.
 
     Above this speed a force wears the pad faster than it moves the head, so that no contact can last.
     """
@@ -576,7 +577,7 @@ def _check_contact(contact: Contact) -> Iterator[Problem]:
     if law.exponent is not None and contact.exponent != law.exponent:
         yield Problem("contact.exponent", contact.exponent, f"{law.exponent:g} for {contact.law}")
     if not law.additive and contact.damping is not None and contact.damping > MOST_DAMPING_FACTOR:
-        # a larger factor stops a head within sqrt(2 m / (K lambda)), a depth with few digits in double precision
+        # a larger factor stops a head within the depth sqrt(2 m / (K lambda)), which has few digits in double precision
         expected = f"at most {MOST_DAMPING_FACTOR:g} s/m for {contact.law}; a restitution gives at most 1e6"
         yield Problem("contact.damping", contact.damping, expected)
     if law.ramped != (contact.ramp_m is not None):

@@ -32,8 +32,8 @@ class Topic:
 class BagWriter:
     """Write messages to a new folder; `lost` counts by topic the messages for which the disk had no room.
 
-    A killed process loses the messages since the last `flush`. `on_trouble` receives one text when the disk is full and
-    one when it has room again.
+    A killed process loses the messages since the last `flush`. `on_trouble` receives a text when the disk is full and
+    another when the disk has room again.
 
     Raises
     ------

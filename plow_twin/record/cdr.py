@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 _SECOND_NS = 1_000_000_000
-#: Place of the characters in a string message.
+#: Offset of the characters in a string message [B].
 _TEXT_AT = 8
 
 

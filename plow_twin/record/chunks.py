@@ -21,12 +21,13 @@ from plow_twin.record.compression import RECORD_LIMIT, decompress
 from plow_twin.record.template import Bytes, Indexes, compiled
 from plow_twin.record.words import word
 
-try:  # twenty times as fast as the standard library's
+try:  # the crc32 of isal is twenty times as fast as the one of the standard library
     from isal.isal_zlib import crc32 as crc32
 except ImportError:
     from zlib import crc32 as crc32
 
-#: Name of the metadata record that a repair writes in place of an unreadable chunk; the reader counts a damaged chunk.
+#: Name of the metadata record that a repair writes in place of an unreadable chunk; the reader counts it as a damaged
+#: chunk.
 DAMAGE_RECORD: Final = "plow_twin_damage"
 MAGIC: Final = b"\x89MCAP0\r\n"
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _METADATA = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x0C
@@ -37,7 +38,7 @@ _HEAD: Final = struct.Struct("<BQ")
 _HEAD_SIZE: Final = _HEAD.size
 #: Size of a record's head and of the channel number at the start of an index record [B].
 _INDEX_HEAD: Final = _HEAD.size + 2
-#: Largest ratio of the unpacked size of a file's chunks to the size of the file; `RECORD_LIMIT` comes on top.
+#: Largest ratio of the unpacked size of a file's chunks to the size of the file; chunks may have `RECORD_LIMIT` more.
 UNPACKED_RATIO: Final = 200
 #: Largest number of schemas and channels in a file.
 _MOST_DECLARED: Final = 10_000
@@ -131,7 +132,7 @@ class ChunkReader:
     position: int = 0
     #: answers of `wanted` by channel mask
     _answers: dict[int, bool] = field(default_factory=dict, init=False)
-    #: rows of the next table of messages
+    #: number of rows of the next table of messages
     _room: int = field(default=256, init=False)
     #: unpacked size of the chunks so far [B]
     _unpacked: int = field(default=0, init=False)
@@ -206,7 +207,7 @@ class ChunkReader:
         return self._answers[channels]
 
     def _open(self, record: bytes) -> Bytes | None:
-        """Return the content of a chunk, or None for a damaged one."""
+        """Return the content of a chunk, or None for a damaged chunk."""
         try:
             _, _, size, crc, letters = _CHUNK_HEAD.unpack_from(record)
             place = _CHUNK_HEAD.size + letters
@@ -459,8 +460,8 @@ def look_ahead(descriptor, size, place, table):  # type: ignore[no-untyped-def]
 def scan(content: Bytes, table: Indexes, others: Indexes) -> tuple[int, int, bool]:
     """Fill the columns of `table` with the messages of a chunk and `others` with the places of schemas and channels.
 
-    Returns both numbers, and whether the records end with the chunk. If the table is too small, the number of messages
-    is one more than its rows.
+    Returns the numbers of both, and whether the records end with the chunk. If the table is too small, the number of
+    messages is one more than its rows.
     """
     place, count, other = 0, 0, 0
     size, room = content.size, table.shape[1]

@@ -39,7 +39,7 @@ _UNIT: Final = re.compile(
 )
 #: Times above these count from 1970 in the named unit: each limit is a date in 2001.
 _DATES: Final = (("ns", 1e18), ("us", 1e15), ("ms", 1e12), ("s", 1e9))
-#: Largest number of cells that are examined, so fewer rows of a wide file.
+#: Largest number of cells that are examined, so that fewer rows of a wide file are examined.
 _MOST_CELLS: Final = 2_000_000
 #: Numbers that a load needs.
 _NEEDED: Final = tuple(("excitation", name) for name in ROLES["excitation"])
@@ -95,14 +95,14 @@ _ZONE: Final = re.compile(r"([Zz]|:\d\d([.,]\d+)?[+-]\d\d(:?\d\d)?)$")
 
 
 def guess_columns(path: Path, scene: Scene, columns: Mapping[str, str], units: Mapping[str, str]) -> Guess:
-    """Guess the meanings of a CSV or Parquet file's columns, from its first 20,000 rows, or two million cells.
+    """Guess the meanings of a CSV or Parquet file's columns, from at most 20,000 rows and two million cells.
 
     Parameters
     ----------
     path
         The file.
     scene
-        Its loads and sizes say which magnitudes are plausible.
+        Scene whose loads and sizes say which magnitudes are plausible.
     columns, units
         Columns and units that are known, by number (fx, ..., t).
 
@@ -211,7 +211,7 @@ def _find_time(
 
 
 def _find_units(guess: Guess, numbers: Mapping[str, Array], scene: Scene, given: Mapping[str, str]) -> None:
-    """Find the units: stated, in the names, or by the magnitudes."""
+    """Find the units: as stated, from the columns' names, or from the magnitudes."""
     for key, column in guess.columns.items():
         unit = given.get(key[1]) or _unit_of(column)
         known = UNITS[QUANTITIES[key]]

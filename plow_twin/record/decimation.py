@@ -1,4 +1,4 @@
-"""Selection of the publications to record: all, none, or some that include the impulses and peaks of the rest."""
+"""Selection of the publications to record: all, none, or some; these include the impulses and peaks of the rest."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ class Decimation:
     outputs
         `all`, `decimated` or `none`.
     rate_hz
-        Rate of a decimated recording [Hz]: the first publication of each period is kept, and each publication with a
-        slow part.
+        Rate of a decimated recording [Hz]: the first publication of each period and each publication with a slow part
+        are kept.
     """
 
     def __init__(self, outputs: str, rate_hz: float) -> None:

@@ -50,7 +50,7 @@ class PartReport:
     finished: bool
     damaged_chunks: int
     messages: dict[str, int]
-    #: bytes after the end of the file, for which other readers refuse the file
+    #: number of bytes after the last MCAP record, because of which other readers refuse the file
     trailing_bytes: int = 0
     #: number of chunks that an earlier repair left out
     left_out: int = 0
@@ -128,7 +128,7 @@ def examine(path: Path) -> RunReport:
     report.parts = [_part(part) for part in reader.parts]
     expected: int | None = None if reader.header.part else 0
     run_time = RunTime(reader.header.parameters)
-    in_a_row = 0  # number of entries without a gap before the expected entry
+    in_a_row = 0  # length of the gapless run of entries before the expected entry
     inputs = InputCounts(reader.header.excitation_source)
     for batch in reader.batches(outputs=False):
         entries = batch.entries

@@ -24,8 +24,8 @@ def naming(path: Path) -> Iterator[None]:
 def whole_file(path: Path, *, sync: bool = False) -> Iterator[BinaryIO]:
     """Open a stream whose content becomes the file `path` in one step at the end.
 
-    Until then, and after an error or a kill, the file stays as it was. With `sync` it also survives a loss of power. A
-    pipe or a device is written to directly.
+    Until then, and after an error or a kill, the file stays as it was. With `sync` the new file also survives a loss of
+    power. A pipe or a device is written to directly.
 
     Raises
     ------

@@ -179,7 +179,7 @@ class Batch:
     damaged: bool = False
 
     def parted(self, places: Sequence[int]) -> Iterator[Batch]:
-        """Yield the batch in pieces: one up to before each of the entries `places` (rising indexes), then the rest."""
+        """Yield the batch in pieces, the first of which end before the entries `places` (rising indexes)."""
         outputs, begin = self.outputs, 0
         for place in places:
             now, outputs = parted_at(outputs, int(self.entries.sequence[place]))

@@ -14,7 +14,7 @@ from plow_twin.record.sources import open_source
 
 @dataclass
 class _Seen:
-    """Messages of a role: how many were used and did not fit, and the range of their stamps [ns] and numbers in SI."""
+    """Messages of a role: numbers of used and unfit messages, and the range of their stamps [ns] and numbers in SI."""
 
     used: int = 0
     unfit: int = 0

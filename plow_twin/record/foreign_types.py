@@ -23,7 +23,7 @@ def parsed_types(text: str, message_type: str) -> dict[str, Any]:
     """
     from rosbags.typesys import get_types_from_msg
 
-    # the parser's time grows with the square of the number of empty lines in a row
+    # the parser's time grows with the square of the number of consecutive empty lines
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     if sum(map(len, lines)) > _LONGEST:
         raise RecordingError(f"{message_type}: got a longer text, expected at most {_LONGEST} characters")

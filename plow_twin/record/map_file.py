@@ -24,7 +24,7 @@ ROLES: Final[dict[str, tuple[str, ...]]] = {
 }
 #: Type of a topic whose fields are nodes of an OPC UA server.
 OPCUA: Final = "opcua"
-#: Stamp of a node's values to use for the sample: the sensor's, or the server's.
+#: The stamp of a node's value that becomes the sample's stamp: the sensor's or the server's.
 SOURCE_STAMP: Final = "source"
 SERVER_STAMP: Final = "server"
 #: Keys that a node may have besides its identifier.
@@ -40,7 +40,7 @@ UNITS: Final[dict[str, dict[str, float]]] = {
     "power": {"W": 1.0, "kW": 1e3, "MW": 1e6},
     "speed": {"m/s": 1.0, "mm/s": 1e-3, "m/min": 1.0 / 60.0, "km/h": 1.0 / 3.6},
 }
-#: Quantity of each number.
+#: The quantity that each number measures, by role and name.
 QUANTITIES: Final = {
     **{("excitation", name): "force" for name in ("fx", "fy")},
     ("excitation", "m"): "moment",
@@ -129,7 +129,7 @@ def _nodes_as_fields(role: Any, entry: Any) -> Any:
         if own:
             given = rest.get(key)
             rest[key] = {**(given if isinstance(given, dict) else {}), **own}
-        elif isinstance(rest.get(key), dict):  # repeated for all names: drop those without a node
+        elif isinstance(rest.get(key), dict):  # a value for all names was repeated: drop names without a node
             rest[key] = {name: value for name, value in rest[key].items() if name in fields or name not in ROLES[role]}
     return {"stamp": SOURCE_STAMP, "stamp_unit": "ns", **rest, "topic": role, "type": OPCUA, "fields": fields}
 

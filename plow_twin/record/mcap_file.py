@@ -53,7 +53,7 @@ class ChunkBuilder:
         length: Indexes,
         data: bytes,
     ) -> None:
-        """Add messages; arrays have shape (n,), the data of the messages follow each other in `data`."""
+        """Add messages; arrays have shape (n,), and `data` has the data of all messages, one after the other."""
         sizes = MESSAGE_HEAD + length
         ends = np.cumsum(sizes)
         starts = self.reserve(int(ends[-1]) if len(ends) else 0) + ends - sizes
@@ -151,7 +151,7 @@ class ByteFile(Protocol):
         """Return whether the path still leads to this file."""
 
     def close(self) -> None:
-        """Close it."""
+        """Close the destination."""
 
 
 class McapFile:
@@ -184,7 +184,7 @@ class McapFile:
 
     @property
     def counts(self) -> Counter[int]:
-        """Messages by channel."""
+        """Number of messages by channel."""
         return self._counts
 
     @property

@@ -44,7 +44,8 @@ FORCES_FILE = "contact_forces.csv"
 _LOAD_COLUMNS: Final = ("t", "fx", "fy", "m")
 _POSE_COLUMNS: Final = ("t", "x", "y", "theta")
 _NOT_STATED: Final = (math.nan,) * 3
-#: Largest number of rows kept of a table (the newest): 320 MB of a load, nearly three hours at 1 kHz.
+#: Largest number of rows of a table that are kept (the newest rows); for a load they are 320 MB, and nearly three hours
+#: at 1 kHz.
 MOST_ROWS: Final = 10_000_000
 #: Key of the losses for rows older than the kept rows.
 OLDER_ROWS: Final = "older_rows"
@@ -201,9 +202,9 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
 def _journal(reader: RunReader, lost: Counter[str]) -> tuple[Array, list[int], Array, Array, Array, Array]:
     """Return the samples, the rows before which samples are missing, the poses, the gaps, and the stated deviations.
 
-    The first column of each table is the stamp [ns]. The deviations are the load's largest, (3,), and each pose's own,
-    (n, 3), NaN if not stated. Only the data after the last change of the pads or step of the clock are returned,
-    because earlier data belong to another machine or time.
+    The first column of each table is the stamp [ns]. The deviations are the largest of the load, shape (3,), and those
+    of each pose, shape (n, 3), NaN if not stated. Only the data after the last change of the pads or step of the clock
+    are returned, because earlier data belong to another machine or time.
     """
     loads, poses, gaps = _Rows(4), _Rows(7), _Rows(1 + PAIR_COUNT)
     holes, begins, spread = Holes(), list[int](), np.zeros(3)

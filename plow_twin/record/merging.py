@@ -12,7 +12,8 @@ T = TypeVar("T")
 #: A function that returns the stamp of a message [ns], or None.
 StampOf: TypeAlias = Callable[[T], int | None]
 
-#: A stamp older than the newest stamp by more than this [ns] is a step of the clock; by less, a late row.
+#: A stamp older than the newest stamp by more than this [ns] is a step of the clock; a stamp older by less is a late
+#: row.
 _STEP_NS: Final = 1_000_000_000
 #: A stamp newer than the newest stamp so far by more than this [ns] may be wrong.
 _JUMP_NS: Final = 10_000_000_000

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 #: Topics that a replay computes from the journal: with a message in each publication, or in each publication with
 #: intervals or a slow part.
 REPLAYED: Final = topics_of(Cadence.EACH, Cadence.FOLLOWED, Cadence.SLOW)
-#: Their base names.
+#: Base names of these topics.
 PUBLICATION_TOPICS: Final = tuple(topic.name for topic in REPLAYED)
 #: Topics that only a twin with `follow: full` has.
 FOLLOWED_TOPICS: Final = names_of(Cadence.FOLLOWED)

@@ -31,11 +31,11 @@ from plow_twin.record.metadata_yaml import missing_files
 from plow_twin.record.template import Indexes, Template, read_numbers
 from plow_twin.stream.journal import Entry, Loss, Sample
 
-#: Largest number of journal entries that wait for the messages sent after them; bounds the memory.
+#: Largest number of journal entries that wait for the messages sent after them, so that memory is bounded.
 _PENDING: Final = 65_536
-#: Smallest number of entries in a batch; outputs of a sixteenth as many chunks also make a batch.
+#: Smallest number of entries in a batch. A batch may have fewer if the outputs of a sixteenth as many chunks wait.
 _LEAST: Final = 8192
-#: The same number without outputs, which take most of the memory.
+#: The same number if outputs, which take most of the memory, are not read.
 _LEAST_ALONE: Final = 32_768
 #: Growth of a recording of all outputs at 1 kHz [B/s].
 _BYTES_PER_S: Final = 400_000

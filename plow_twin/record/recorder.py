@@ -39,10 +39,10 @@ if TYPE_CHECKING:
 JOURNAL: Final = "journal"
 #: Interval at which the thread empties the queue [s].
 _POLL_S: Final = 0.05
-#: Errors of a full disk, which may have room again.
+#: Errors of a full disk, which may have room again later.
 _FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
-#: Number of items written between two sleeps, some 0.2 ms of Python. The sleep gives callers the interpreter; without
-#: it the thread would get the interpreter back at once.
+#: Number of items written between two sleeps, which takes some 0.2 ms of Python. The sleep gives callers the
+#: interpreter; without it the thread would get the interpreter back at once.
 _BURST: Final = 128
 
 
@@ -113,7 +113,7 @@ class Recorder:
     ring_s
         Time kept in a ring in memory [s], which is written at each `mark`; 0: no ring, everything is written.
     sync
-        Whether each flush, new part and ring waits for the disk (`fdatasync`), against a loss of power.
+        Whether each flush, new part and ring waits for the disk (`fdatasync`), so that it survives a loss of power.
     now_ns
         Function that returns the receive time [ns], called in the caller's thread.
     on_error
@@ -473,7 +473,7 @@ class Recorder:
                 self._dump(self._ring, self._mark, lost)
             except (OSError, RecordingError) as failed:  # the ring stays in memory
                 error = f"{self._mark}: the last {self._ring_s:g} s not written: {failed}"
-            with self._lock:  # a reader of the new count finds no mark under way, and may mark again
+            with self._lock:  # so that a caller that reads the new count may mark again at once
                 self._mark = None
                 if error is None:
                     self._marks += 1
@@ -586,7 +586,7 @@ def _numbers(items: Sequence[_EntryItem | _PublicationItem]) -> tuple[NDArray[np
     return np.array(sequence, np.int64), np.array(log_time_ns, np.int64)
 
 
-# named tuples are made in a quarter of the time of frozen dataclasses, four thousand times a second
+# a named tuple is made in a quarter of the time of a frozen dataclass, and four thousand are made each second
 class _EntryItem(NamedTuple):
     """A journal entry on its way to the file."""
 

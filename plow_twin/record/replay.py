@@ -82,7 +82,7 @@ def replay(
     path
         The recording: its folder or one `.mcap` file.
     on_progress
-        Receives the share of the recording's bytes done, 0..1.
+        Receives the share of the recording's bytes that has been replayed, 0..1.
     digests_only
         Compare the digests alone; chunks that contain only messages are not read.
     write
@@ -159,7 +159,7 @@ class _Replay:
         absent = FOLLOWED_TOPICS if header.follow != "full" else ()
         self.topics = {header.topic(name): name for name in PUBLICATION_TOPICS if name not in absent}
         self.next_sequence = 0
-        self.in_a_row = 0  # number of entries without a gap before the next entry
+        self.in_a_row = 0  # length of the gapless run of entries before the next entry
         self.synced = False  # the session has the state of the live session
         self.outputs_synced = False  # and its windows between messages equal the live ones
         self.outputs_whole = True  # no message of the current batch may be missing without a note
@@ -167,7 +167,7 @@ class _Replay:
         self.messages: Mapping[str, Message] | None = None
         self.first_ns: int | None = None
         self.gaps = 0
-        self.lost_entries = 0  # by the notes in the journal
+        self.lost_entries = 0  # as stated by the notes in the journal
         self.inputs = InputCounts(header.excitation_source)
         self.alarms = AlarmCheck(header, self.all_outputs)
 
@@ -258,7 +258,7 @@ class _Replay:
             rows = self.rows[: len(stamps)]
         try:
             found = self.session.advance(stamps, wrench, rows, taken, done[digests])
-        except ValueError:  # entry by entry, the refused sample is counted
+        except ValueError:  # the entries are then applied one by one, so that the refused sample is counted
             return False
         self.inputs.add(entries)
         self.report.entries += len(entries)

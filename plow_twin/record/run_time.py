@@ -39,7 +39,7 @@ class RunTime:
     def add(self, entries: Entries) -> list[tuple[int, int, int]]:
         """Add entries; return the silences that end in them: index of the ending sample, begin and end [ns].
 
-        A stretch with missing entries is no silence: samples may have been there.
+        A stretch with missing entries is no silence, because some of them may be samples.
         """
         found, done, missing = [], 0, self._holes.find(entries)
         samples = np.flatnonzero(entries.sample)
@@ -64,7 +64,7 @@ class RunTime:
             case Reset() | SetWear() | Restore():
                 self._reached_ns = None
                 self.silences.restart()
-            case Loss():  # samples may have been there
+            case Loss():  # samples may be among the lost entries
                 self.silences.restart()
             case Parameter(name, value) if name == _TIMEOUT:
                 self.silences.timeout_s = float(value)

@@ -14,7 +14,7 @@ from plow_twin.solve.state import ROW
 from plow_twin.stream.outputs import NOTHING, Published
 from plow_twin.stream.topics import Cadence, Topic, topics_of
 
-#: Bytes of a number in a record.
+#: Size of a number in a record [B].
 _WORD: Final = 8
 
 
@@ -35,7 +35,7 @@ class Messages:
             for cadence in (Cadence.EACH, Cadence.SLOW, Cadence.MARKED, Cadence.FOLLOWED)
         ]
         self._followed = followed if intervals else None
-        #: memory of each message by base name of its topic
+        #: the memory that receives each message, by base name of its topic
         self.memory = dict(part for group in groups[: 3 + intervals] for part in group.parts)
 
     def write(self, published: Published) -> tuple[tuple[str, memoryview], ...]:
@@ -64,12 +64,13 @@ class Messages:
 class _Group(NamedTuple):
     """The messages of one record, one after the other; only their stamps and numbers change."""
 
-    #: base name of each topic, and the memory of its message
+    #: base name of each topic, and the part of `buffer` that holds its message
     parts: tuple[tuple[str, memoryview], ...]
     buffer: NDArray[np.uint8]
-    #: where each message begins
+    #: offset in the buffer at which each message begins [B]
     starts: NDArray[np.int64]
-    #: place of each number in the buffer [B], its place in the record [words], and whether it is an integer there
+    #: for each number: its offset in the buffer [B], its offset in the record [words], and whether the record has it as
+    #: an integer
     places: NDArray[np.int64]
     sources: NDArray[np.int64]
     integers: NDArray[np.bool_]
@@ -94,7 +95,7 @@ class _Group(NamedTuple):
 
 
 def _sources(topic: Topic) -> NDArray[np.int64]:
-    """Return the places of a message's numbers in its record [words]."""
+    """Return the offsets of a message's numbers in its record [words]."""
     fields: Any = topic.record_type.fields
     return np.concatenate([fields[name][1] // _WORD + np.arange(count) for name, count in topic.parts])
 

@@ -34,7 +34,8 @@ _ROWS: Final = 1000
 _ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
 #: Largest message that is unpacked [B].
 _LARGEST_MESSAGE: Final = 2**26
-#: Query for topics or messages that are a view or a virtual table, or have computed columns, which may never end.
+#: Query that has a row if `topics` or `messages` is a view or a virtual table or has computed columns, because reading
+#: these may never end.
 _COMPUTED: Final = """
     SELECT 1 FROM sqlite_master
     WHERE name COLLATE NOCASE IN ('topics', 'messages') AND (type != 'table' OR rootpage = 0)
@@ -280,7 +281,7 @@ class SqliteSource:
         self._behind_holes = _behind_holes(parts, missing)
 
     def _open(self, path: Path) -> sqlite3.Connection:
-        log = path.with_name(path.name + "-wal")  # the last messages of a killed recorder
+        log = path.with_name(path.name + "-wal")  # has the last messages of a killed recorder
         kept = log.is_file() and log.stat().st_size > 0
         place = quote(path.resolve().as_posix())
         connection = sqlite3.connect(f"file:{place}?mode=ro" + ("" if kept else "&immutable=1"), uri=True)
@@ -395,7 +396,7 @@ class CsvSource:
         return found
 
     def messages(self, wanted: Callable[[str], bool], stamp_ns: StampOf[Arrived] | None = None) -> Iterator[Arrived]:
-        """Yield the rows of all files in order of their stamps, by default in the column `t`, `time` or the first."""
+        """Yield the rows of all files by their stamps, which are by default in the column `t`, `time` or the first."""
         streams = [self._rows(part) for part in self.parts if wanted(part.stem)]
         if len(streams) == 1:
             return streams[0]
@@ -479,5 +480,5 @@ def _log_time_ns(arrived: Arrived) -> int | None:
 
 
 def _row_time_ns(cell: str) -> int:
-    """Return the time of a row for merging files; a number too large for seconds is in a smaller unit."""
+    """Return the time of a row for merging files; a number too large for seconds is read in a smaller unit."""
     return next((found for unit in STAMP_UNITS if (found := time_ns(cell, unit)) is not None), NO_TIME)

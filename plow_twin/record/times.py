@@ -19,7 +19,8 @@ NO_TIME: Final = -1
 NUMBER: Final = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|inf|nan)", re.IGNORECASE)
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 _NANOSECONDS: Final = re.compile(r"[.,]\d{6}(\d{1,3})")
-#: Times below this [s] count from some start. They are moved away from 0, because a stamp of 0 means a missing stamp.
+#: Times below this [s] count from an unknown start, not from 1970. They are moved away from 0, because a stamp of 0
+#: means a missing stamp.
 EPOCH_S: Final = 1e9
 #: Stamp of a time of 0 [ns].
 START_NS: Final = 1_000_000_000

@@ -44,7 +44,7 @@ _SMOOTH: Final = 0.05
 _FASTEST_M_S: Final = 5.0
 #: Share of falling stamps above which the column is not a time, and share above which the rows are in reverse order.
 _FALLING, _REVERSED = 0.2, 0.9
-#: Length of each other unit that a time may have [s].
+#: Length [s] of each unit other than the second that a time may have.
 _TIMES: Final = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 #: Spreadsheets count days since 1900; the dates of this century are between these numbers.
 _SHEET_DAYS: Final = (36_525.0, 73_050.0)
@@ -98,7 +98,7 @@ def unit_doubts(
     load_stamps_s
         Stamps of the load [s].
     scene
-        Its loads and sizes say which magnitudes are plausible.
+        Scene whose loads and sizes say which magnitudes are plausible.
     """
     magnitudes = {key: _usual_magnitude(np.asarray(found, float)) for key, found in values.items()}
     load = [values["excitation", name] for name in ("fx", "fy", "m") if ("excitation", name) in values]
@@ -233,7 +233,7 @@ def _angle(theta: Array, scene: Scene) -> list[UnitDoubt]:
     largest = _usual_magnitude(theta)
     if scene.head.carries == "corners" or not 0.0 < largest < np.degrees(_LARGEST_ANGLE_RAD):
         return []
-    # the zero of a sensor differs from the head's
+    # the zero of a sensor may differ from the head's zero
     low, high = np.percentile(theta[np.isfinite(theta)], (0.5, 99.5))
     swing = 0.5 * float(high - low)
     allowed = max(_BELIEVED_SWING_RAD, _BEYOND_CLEARANCE * largest_angle(scene))
@@ -287,7 +287,7 @@ def _spacing(stamps_s: Array, load: Array) -> list[UnitDoubt]:
     if stamps_s.max() > _DATES_S:
         return []
     spacing = float(np.median(np.abs(steps)))
-    # `time_ns` has shifted times that count from some start by a second
+    # `time_ns` has added a second to times that count from an unknown start
     low, high = (days + _START_S for days in _SHEET_DAYS)
     if low <= stamps_s[0] <= high and np.ptp(stamps_s) < 1.0 and spacing < _SHORTEST_SPACING_S:
         found = f"{stamps_s[0] - _START_S:.6g} and stamps {spacing:.2g} s apart"

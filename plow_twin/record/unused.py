@@ -1,4 +1,4 @@
-"""Messages at the inputs of a run by its journal: counts of all, and the unused messages with reason and sender."""
+"""Messages at the inputs of a run, from its journal: counts of all, and the unused ones with reason and sender."""
 
 from __future__ import annotations
 

@@ -199,7 +199,7 @@ class JournalWalk:
         self._same = own if same_scene else ()
         self._following = [walker for walker in self._same if walker.session.following is not None]
         self._acting = (*_ACTING, *_FOLLOWED) if self._following else _ACTING
-        #: speeds by their stamps, not yet reached
+        #: speeds whose stamps have not been reached, in order of the stamps
         self._travels: list[Travel] = []
         self._lost = not whole
         self._reached_ns = -1

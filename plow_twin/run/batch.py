@@ -124,7 +124,7 @@ class TwinBatch:
         Parameters
         ----------
         wrench : array_like, shape (m, 3)
-            Fx, Fy [N] and M [N m] about the cavity's centre, of each twin.
+            Fx, Fy [N] and M [N m] about the cavity's centre, for each twin.
         """
         self._wrench = np.array(wrench, dtype=np.float64).reshape(len(self), 3)
 
@@ -136,7 +136,7 @@ class TwinBatch:
         t : float
             Model time in s, not before the present model time.
         wrench : array_like, shape (m, 3) or (3,), optional
-            Fx, Fy [N] and M [N m] about the cavity's centre at `t`, of each twin or of all. Without it the last
+            Fx, Fy [N] and M [N m] about the cavity's centre at `t`, for each twin or for all. Without it the last
             samples are held.
 
         Returns
@@ -162,7 +162,7 @@ class TwinBatch:
         t : array_like, shape (n,)
             Model times in s, not decreasing.
         wrench : array_like, shape (m, n, 3) or (n, 3)
-            Fx, Fy [N] and M [N m] about the cavity's centre at each time, of each twin or of all.
+            Fx, Fy [N] and M [N m] about the cavity's centre at each time, for each twin or for all.
 
         Returns
         -------
@@ -215,8 +215,8 @@ class TwinBatch:
         moved : array_like, shape (m, 6)
             Displacement of x, y [m], theta [rad] and their rates for each twin.
         again : bool
-            Whether the twins were displaced from the same twin before. Each then keeps the damping that was set at the
-            touch of a lasting contact; otherwise it takes this damping from the sampled twin.
+            Whether the twins were displaced from the same twin before. If so, each keeps the damping that was set at
+            the touch of a continuing contact; otherwise it takes this damping from the sampled twin.
 
         Raises
         ------
@@ -246,9 +246,10 @@ class TwinBatch:
         Parameters
         ----------
         which : array_like of int, shape (k,)
-            Numbers of the twins.
+            Indices of the twins.
         q, v : array_like, shape (k, 3)
-            Poses x, y [m], theta [rad] and their rates. A lasting contact keeps the damping of its touch.
+            Poses x, y [m], theta [rad] and their rates. A contact that continues keeps the damping that was set at its
+            touch.
         """
         index = np.asarray(which, dtype=np.int64)
         poses, rates = np.asarray(q, dtype=np.float64), np.asarray(v, dtype=np.float64)
@@ -261,9 +262,9 @@ class TwinBatch:
         Parameters
         ----------
         which : array_like of int, shape (k,)
-            Numbers of the twins; each must be moved by `move` before its next advance.
+            Indices of the twins; each must be moved by `move` before its next advance.
         scenes : sequence of Scene
-            New scenes of these twins. A lasting contact keeps a damping that was set at its touch.
+            New scenes of these twins. A contact that continues keeps a damping that was set at its touch.
 
         Returns
         -------
@@ -291,7 +292,7 @@ class TwinBatch:
         Parameters
         ----------
         speed_m_s : array_like, shape (m,) or ()
-            Speed in m/s, of each twin or of all; wear depends on the magnitude.
+            Speed in m/s, for each twin or for all; wear depends on the magnitude.
 
         Raises
         ------

@@ -24,8 +24,8 @@ class EnergyBalance:
     Attributes
     ----------
     kinetic_j, stored_j : tuple of float
-        Kinetic energy (with that of a frame on springs) and elastic energy K d^(n+1) / (n+1) of the contacts, each at
-        the start and at the end in J.
+        Kinetic energy (including a frame on springs) and elastic energy K d^(n+1) / (n+1) of the contacts in J, each at
+        the start and at the end.
     load_work_j, gravity_work_j : float
         Work of the loads without gravity, and of gravity with its constant moment, in J.
     contact_work_j, friction_work_j : float
@@ -39,7 +39,7 @@ class EnergyBalance:
     imbalance_j : float
         Largest |change of kinetic energy - work| at any step's end in J.
     momentum : ndarray, shape (3,)
-        Change of m vx, m vy [N s] and I omega [N m s], world axes, centre of mass.
+        Change of m vx, m vy [N s] and I omega [N m s], in world axes; vx and vy are those of the centre of mass.
     impulse : ndarray, shape (2, 3)
         Integrals of loads (with gravity) and of contact forces over time; locked axes are not included.
     momentum_imbalance : ndarray, shape (3,)

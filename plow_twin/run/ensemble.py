@@ -109,8 +109,8 @@ def simulate_many(
     ArgumentError
         An argument cannot be used.
         LimitError, RunInterrupted
-            At `max_wall_s`, and after Ctrl-C; `result` has the members up to there, and unfinished members have the
-            status `BUDGET`.
+            The time `max_wall_s` is over, or the user pressed Ctrl-C; `result` has the members up to there, and
+            unfinished members have the status `BUDGET`.
     """
     check_times(t_end, output_dt)
     check_limits(max_steps, max_wall_s)
@@ -136,9 +136,10 @@ def simulate_many(
     return ensemble
 
 
-#: Smallest number of members that a thread takes at a time, because lanes stay empty while its last members end.
+#: Smallest number of members that a thread takes at a time; with fewer, too many lanes would stay empty while the last
+#: members of a share end.
 _LEAST_SHARE = 64
-#: Number of shares for each thread, so that all threads end at about the same time.
+#: Number of shares for each thread; it is above 1 so that all threads end at about the same time.
 _SHARES = 4
 
 

@@ -14,7 +14,7 @@ from plow_twin.solve.lanes.advance import Samples, advance_lanes
 from plow_twin.solve.lanes.record import WIDTH, new_lanes
 from plow_twin.solve.state import STATE, TOTALS, Terms, new_records
 
-#: Number of steps of all lanes in a slice, about a millisecond.
+#: Total number of steps of all lanes in a slice, which takes about a millisecond.
 _SLICE: Final = 256
 
 _Array = NDArray[np.float64]
@@ -30,7 +30,7 @@ class LaneTwins:
     terms : Terms
         Joint terms of all twins.
     members : range
-        Numbers of the twins that advance here.
+        Indices of the twins that advance here.
     work : ndarray of `WORK`, shape (1,)
         Scratch space.
     max_steps : int
@@ -85,7 +85,7 @@ class LaneTwins:
             waiting = self._advance_others(len(times), alone) if self._progress[1] else ()
 
     def _advance_others(self, count: int, alone: Callable[[int, int], None]) -> list[int]:
-        """Advance the twins that have no lane once each; return those that have not reached all `count` times."""
+        """Advance each twin without a lane to its next time; return those that have not reached all `count` times."""
         others: list[int] = self._other[: self._progress[1]].tolist()
         for member in others:
             alone(member, int(self._place[member]))

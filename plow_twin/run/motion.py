@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 _FIRST_LOG: Final = 4096
 #: Default number of steps after which a run ends with an error.
 BUDGET: Final = 10**8
-#: Work between two looks at the clock in s, and number of steps before the first look (explicit and implicit steps).
+#: Computing time between two looks at the clock in s, and number of steps (explicit, implicit) before the first look.
 _SLICE_S: Final = 0.02
 _FIRST_SLICE, _FIRST_SLICE_IMPLICIT = 2048, 64
 
@@ -96,7 +96,7 @@ def run_events(
 
 
 def next_slice(size: int, took_s: float) -> int:
-    """Return the steps of the next slice, at most `BUDGET`, from the steps `size` and the time of the last slice."""
+    """Return the number of steps for the next slice, at most `BUDGET`; `size` steps took the time `took_s`."""
     return min(BUDGET, max(1, int(size * min(4.0, max(0.1, _SLICE_S / max(took_s, 1e-6))))))
 
 

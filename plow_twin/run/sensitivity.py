@@ -1,9 +1,9 @@
 """Growth of errors along a motion, which shows how long the tolerance is met.
 
 The columns of the fundamental matrix are solutions of the linearised equations (`solve.tangents`). For scenes with
-other terms, the columns are differences between the motion and displaced motions (shadows), which start close to it and
-are followed over short stretches. These columns include the jumps at touches and separations (saltation), because each
-shadow has its own events.
+terms that `solve.tangents` does not have, the columns are differences between the motion and displaced motions
+(shadows), which start close to it and are followed over short stretches. These columns include the jumps at touches and
+separations (saltation), because each shadow has its own events.
 """
 
 from __future__ import annotations
@@ -61,17 +61,17 @@ class Sensitivity:
     t : ndarray, shape (n,)
         Times in s.
     growth : ndarray, shape (n,)
-        Largest factor by which an earlier error has grown at `t`. Errors of poses are relative to the clearance, errors
-        of velocities are first multiplied by the time in which the largest load moves the head across it.
+        Largest factor by which an earlier error has grown at `t`. Errors of poses are relative to the clearance; errors
+        of velocities are first multiplied by the time in which the largest load moves the head across the clearance.
     from_start : ndarray, shape (n, k, k)
-        Derivatives of the state at `t` by the initial state; a state has the places, then the rates, of the k / 2 free
-        degrees of freedom.
+        Derivatives of the state at `t` with respect to the initial state; a state has the places, then the rates, of
+        the k / 2 free degrees of freedom.
     exponent : float
-        Largest Lyapunov exponent in 1/s in the second half of the motion; above 0, errors grow for ever.
+        Largest Lyapunov exponent in 1/s in the second half of the motion; if it is above 0, errors grow for ever.
     tol : float
         Tolerance of the motion.
     by_parameter : mapping of str to ndarray, shape (n, k)
-        Derivatives of the state at `t` by the chosen parameters, in the parameters' units.
+        Derivatives of the state at `t` with respect to the chosen parameters, in the parameters' units.
     """
 
     t: Array
@@ -107,9 +107,9 @@ class Sensitivity:
 
 
 def sensitivity_parameters(scene: Scene) -> dict[str, float]:
-    """Return the parameters by which the derivatives of a motion can be computed.
+    """Return the parameters with respect to which a motion can be differentiated.
 
-    They are stiffness, damping or restitution, both clearances, and a factor of each load.
+    These are stiffness, damping or restitution, both clearances, and a factor of each load.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ def sensitivity_parameters(scene: Scene) -> dict[str, float]:
     Returns
     -------
     dict of str to float
-        Values in the scene by path.
+        The parameters' values in the scene, by path.
     """
     contact, clearance = scene.contact, scene.clearance
     found = {"contact.stiffness": contact.stiffness, "contact.damping": contact.damping or 0.0}
@@ -183,9 +183,9 @@ class StretchProduct:
     Attributes
     ----------
     total : ndarray, shape (k, k)
-        Derivatives of the present state by the state at the beginning.
+        Derivatives of the present state with respect to the state at the beginning.
     rows : ndarray, shape (p, k)
-        Derivatives of the present state by the parameters.
+        Derivatives of the present state with respect to the parameters.
     growth : float
         Largest growth of an error since any of the kept times, at least 1.
     """
@@ -215,7 +215,8 @@ class StretchProduct:
         totals, rows, growth : ndarray, shapes (n, k, k), (n, p, k) and (n,)
             The attributes after each matrix.
         logs : ndarray, shape (n, k)
-            Logarithms of the factors by which each stretch that ends has extended the vectors of a basis, otherwise 0.
+            Logarithms of the factors by which a stretch has extended the vectors of a basis, in the row at which the
+            stretch ends; other rows are 0.
         """
         count, size = matrices.shape[:2]
         totals, rows = np.zeros((count, size, size)), np.zeros((count, len(self.rows), size))
@@ -239,7 +240,7 @@ def sensitivity_of(scene: Scene, t_end: float, tol: float, parameters: Sequence[
     tol : float
         Tolerance of the motion itself.
     parameters : sequence of str
-        Paths of the parameters for derivatives, out of `sensitivity_parameters`.
+        Paths of the parameters for derivatives, from `sensitivity_parameters`.
 
     Raises
     ------
@@ -281,10 +282,10 @@ def sensitivity_of(scene: Scene, t_end: float, tol: float, parameters: Sequence[
 
 
 class _Stretches(NamedTuple):
-    """Derivatives at the times `_ends` by the state at the end of the last stretch before, scaled by `scale_of`."""
+    """Derivatives at the times `_ends` with respect to the previous stretch's last state, scaled by `scale_of`."""
 
-    matrices: Array  #: by the state, shape (n, k, k)
-    changes: Array  #: by the parameters, shape (n, p, k)
+    matrices: Array  #: with respect to the state, shape (n, k, k)
+    changes: Array  #: with respect to the parameters, shape (n, p, k)
     ends: NDArray[np.bool_]  #: whether a stretch ends and the next stretch begins, shape (n,)
 
 

@@ -32,7 +32,8 @@ if TYPE_CHECKING:
 Method = Literal["events", "rk4", "euler"]
 Array = NDArray[np.float64]
 
-#: Type of one contact event: time in s, pair, modes (0 off, 1 on, 2 clipped), rate of penetration in m/s.
+#: Type of a contact event: time in s, pair, contact mode before and after (0 off, 1 on, 2 clipped), penetration rate in
+#: m/s.
 EVENT_DTYPE: Final = EVENT
 _ROWS_BY_DEFAULT = 1000
 #: Largest number of rows; a row takes 176 bytes of memory.
@@ -52,13 +53,13 @@ class Result:
     force, penetration : ndarray, shape (n, 8)
         Normal force [N] and signed penetration [m] of each pair.
     events : ndarray of `EVENT_DTYPE`, shape (k,)
-        All changes of contact in order of time.
+        All contact changes in order of time.
     statistics : mapping
         By pair name: max, mean_in_contact, mean_over_time [N], impulse [N s], time_in_contact [s] and makes, of the
         whole motion and not only of the output rows.
     contact_sets : mapping
-        For each sense, `ccw` and `cw`: the share of its contact time in which exactly these corners carry force.
-        Corners have the scene's labels, otherwise their names.
+        By sense (`ccw`, `cw`) and set of corners: the share of the sense's contact time in which exactly the corners of
+        the set carry force. Corners have the scene's labels, otherwise their names.
     solver : mapping
         method, tol or dt, and the numbers of steps, evaluations and events. An evaluation is an order of a series, or
         for fixed steps an evaluation of the right-hand side.
@@ -97,7 +98,7 @@ class Result:
         Parameters
         ----------
         title : str
-            Title of the figure; by default the length of the motion and its changes of contact.
+            Title of the figure; by default it states the length of the motion and the number of contact changes.
 
         Returns
         -------
@@ -184,11 +185,11 @@ def simulate(
     ArgumentError
         An argument cannot be used.
     SolverError
-        The motion could not be continued; the error has time and cause.
+        The motion could not be continued; the message has the time and the cause.
     LimitError
         A limit is reached; `result` has the motion up to there.
     RunInterrupted
-        After Ctrl-C, with `result` likewise; it is also a `KeyboardInterrupt`.
+        The user pressed Ctrl-C; `result` has the motion up to there. The error is also a `KeyboardInterrupt`.
     """
     check_times(t_end, output_dt, method, dt)
     check_limits(max_steps, max_wall_s)
@@ -277,7 +278,7 @@ def _is_finite(value: object) -> bool:
 
 
 def output_times(t_end: float, output_dt: float | None) -> Array:
-    """Return the times 0, output_dt, ..., t_end; without `output_dt`, a thousand intervals."""
+    """Return the times 0, output_dt, ..., t_end; without `output_dt` there are a thousand intervals."""
     if t_end == 0.0:
         return np.zeros(1)
     if output_dt is None:
@@ -392,12 +393,12 @@ def statistics_of(totals: Totals, duration: float) -> dict[str, dict[str, float]
 
 
 def contact_sets_of(scene: Scene, totals: Totals) -> dict[str, dict[str, float]]:
-    """Return the shares of the sets of corners that carry force together, for each sense, largest first."""
+    """Return the time share of each set of corners that carry force together, for each sense, largest share first."""
     letters = {corner: letter for letter, corner in scene.frame.labels.items()}
     labels = [letters.get(corner, corner) for corner in CORNER_NAMES]
     joint = "" if letters else "+"
     senses = {}
-    # the force of a pair turns a block the opposite way to a cavity, so the two senses are exchanged
+    # the force of a pair turns a block the other way than a cavity, so the two senses are exchanged
     order = ("ccw", "cw") if scene.head.carries == "walls" else ("cw", "ccw")
     for sense, times in sorted(zip(order, totals.set_time, strict=True), key=lambda item: item[0]):
         total = times.sum()

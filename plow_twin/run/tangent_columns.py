@@ -47,7 +47,7 @@ def columns_beside(
     omegas : ndarray, shape (h,)
         Angular frequencies of the loads in rad/s.
     amplitudes : ndarray, shape (b, h, 2, 3, 8)
-        Change of the sine and cosine amplitudes by each column, per mass and inertia.
+        Change of the sine and cosine amplitudes that each column makes, divided by mass or inertia.
     """
     blocks = -(-(STATE_COLUMNS + len(changed)) // WIDTH)
     columns, omegas = new_records(COLUMNS, blocks), compiled.loads.omega

@@ -241,7 +241,7 @@ class Twin:
         rows : ndarray of `ROW`, shape (n,), or None
             Receives a row for each time. With None the motion is the same, but no forces are computed for output.
         digest_after : ndarray of int64, shape (m,)
-            Increasing numbers from 1 to n; after this many advances a digest is made.
+            Increasing numbers from 1 to n: the counts of advances after which a digest is made.
 
         Returns
         -------
@@ -300,7 +300,7 @@ class Twin:
         wear_depth : array_like, shape (8,), optional
             Wear depth of each pad in m, at least 0; by default the scene's initial wear depth.
         pose : tuple of array_like, shapes (3,) and (3,), optional
-            x, y [m], theta [rad] and their rates at the start; the scene's by default.
+            x, y [m], theta [rad] and their rates at the start; by default those of the scene.
 
         Raises
         ------
@@ -328,7 +328,8 @@ class Twin:
         Parameters
         ----------
         q, v : array_like, shape (3,)
-            Pose x, y [m], theta [rad] and its rates. A lasting contact keeps the damping of its touch.
+            Pose x, y [m], theta [rad] and its rates. A contact that continues keeps the damping that was set at its
+            touch.
         """
         place = geometry.states_of(self.scene, np.concatenate([q, v])[None])
         settle_moved(self._params, self._states, _THE_ONE, place, self.time, self._parts.terms.stick)
@@ -344,7 +345,7 @@ class Twin:
         Raises
         ------
         ArgumentError
-            The speed is not finite, or above the limit by the damping (`check_travel_speed`).
+            The speed is not finite, or above the limit that the damping sets (`check_travel_speed`).
         """
         check_travel_speed(self.scene, float(speed_m_s))
         if self._parts.terms.wear is not None:
@@ -409,7 +410,7 @@ class Twin:
 
     @property
     def frame(self) -> NDArray[np.float64] | None:
-        """Displacement x, y [m], theta [rad] of a frame on springs and its rate, shape (6,); None without one."""
+        """Displacement x, y [m], theta [rad] of a frame on springs and its rate, shape (6,); None for a fixed frame."""
         state, work = self._state, self._work
         if self._parts.terms.support is None:
             return None
@@ -433,7 +434,7 @@ class Twin:
 
     @property
     def bounded(self) -> int:
-        """Number of advances so far with a coarse end because of `max_evaluations`."""
+        """Number of advances so far that ended with coarse steps because of `max_evaluations`."""
         return int(self._state.bounded)
 
     def _kernel(self, kind: tuple[bool, bool], arguments: tuple[Any, ...]) -> Callable[..., bool]:

@@ -27,14 +27,14 @@ from plow_twin.solve.state import Status
 
 Array = NDArray[np.float64]
 
-#: Length of a stretch in s, and distance of a shadow (in displacements) at which a stretch ends earlier.
+#: Length of a stretch in s, and distance between shadow and twin (in displacements) at which a stretch ends earlier.
 _STRETCH_S, _FAR = 0.1, 100.0
 #: Longest stretch in s while a contact prevents the start of the next stretch.
 _LONGEST_S = 0.5
 
 
 class TwinSensitivity:
-    """The derivatives of a twin's state by its initial state and parameters, updated with each advance.
+    """The derivatives of a twin's state with respect to its initial state and parameters, updated with each advance.
 
     Parameters
     ----------
@@ -42,18 +42,18 @@ class TwinSensitivity:
         A twin with `excitation="sampled"`; from here on only `advance` advances it, with the same bits as without
         sensitivity.
     parameters : sequence of str
-        Paths of the parameters for derivatives, out of `sensitivity_parameters`.
+        Paths of the parameters for derivatives, from `sensitivity_parameters`.
 
     Attributes
     ----------
     t : float
-        Model time in s of the other attributes. It is the end of the last complete stretch, some 0.1 s before the
-        twin's time, or up to 0.5 s before it during a contact.
+        Model time in s to which the other attributes belong: the end of the last complete stretch, some 0.1 s before
+        the twin's time, or up to 0.5 s before it during a contact.
     from_start : ndarray, shape (k, k)
-        Derivatives of the state at `t` by the initial state; a state has the places, then the rates, of the k / 2 free
-        degrees of freedom.
+        Derivatives of the state at `t` with respect to the initial state; a state has the places, then the rates, of
+        the k / 2 free degrees of freedom.
     by_parameter : dict of str to ndarray, shape (k,)
-        Derivatives of the state at `t` by the parameters at constant initial state.
+        Derivatives of the state at `t` with respect to the parameters at constant initial state.
     growth : float
         Largest factor by which an earlier error has grown at `t`, as in `Sensitivity.growth`.
     exponent : float
@@ -88,13 +88,13 @@ class TwinSensitivity:
 
     @property
     def from_start(self) -> Array:
-        """Derivatives by the state at the beginning."""
+        """Derivatives with respect to the state at the beginning."""
         scale = self._scale[self._free]
         return np.asarray(self._product.total * scale[:, None] / scale[None, :])
 
     @property
     def by_parameter(self) -> dict[str, Array]:
-        """Derivatives by the parameters."""
+        """Derivatives with respect to the parameters."""
         return {
             one.path: row * self._scale[self._free] for one, row in zip(self._changed, self._product.rows, strict=True)
         }

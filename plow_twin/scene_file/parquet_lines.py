@@ -16,18 +16,20 @@ if TYPE_CHECKING:
 SUFFIX: Final = ".parquet"
 #: Largest number of rows that are converted at once.
 _ROWS: Final = 4096
-#: Largest number of rows per byte of a file, and number of rows allowed in any file: a few bytes can encode any number.
+#: Largest number of rows per byte of a file, since a few bytes can encode any number of rows; and number of rows that a
+#: file of any size may have.
 _MOST_PER_BYTE: Final = 100
 _ALWAYS: Final = 1_000_000
-#: Largest unpacked column of a row group [B], which is in memory as a whole. Writers make groups of 128 MB.
+#: Largest unpacked column of a row group [B], since a whole column is held in memory. Writers make row groups of 128
+#: MB.
 _LARGEST_COLUMN: Final = 2**29
-#: Largest number of columns, and longest text in the file's description [B].
+#: Largest number of columns, and longest text in the file's metadata [B].
 _MOST_COLUMNS: Final = 10_000
 _LONGEST_TEXT: Final = 2**24
 
 
 def is_parquet(path: Path) -> bool:
-    """Return whether a file has the ending of Parquet."""
+    """Return whether a file's name has the ending of Parquet."""
     return path.suffix.lower() == SUFFIX
 
 

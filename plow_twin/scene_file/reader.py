@@ -193,7 +193,7 @@ def _problems_across(parts: Mapping[str, Any]) -> tuple[Problem, ...]:
 
 
 def _as_written(problem: Problem, raw: Mapping[str, Any]) -> Problem:
-    """Return the problem with the key of the file, where a load's kind precedes its numbers (`loads[0].harmonic`)."""
+    """Return the problem with its key in the file, where a load's kind precedes its numbers (`loads[0].harmonic`)."""
     head, _, rest = problem.key.partition("].")
     index = head.removeprefix("loads[")
     if index == head or not index.isdigit() or rest.startswith(("name", "at_m")):

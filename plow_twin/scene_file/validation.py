@@ -27,7 +27,7 @@ NUMBER: Final[Schema] = {"type": "number", "description": "a finite number"}
 
 
 def mapping(properties: Mapping[str, Schema], required: Sequence[str] = ()) -> Schema:
-    """Return the schema of a mapping without other keys."""
+    """Return the schema of a mapping that may have only these keys."""
     return {
         "type": "object",
         "properties": dict(properties),
@@ -38,7 +38,7 @@ def mapping(properties: Mapping[str, Schema], required: Sequence[str] = ()) -> S
 
 
 def choice(choices: Sequence[str]) -> Schema:
-    """Return the schema of a word."""
+    """Return the schema of a text that is one of the choices."""
     return {"enum": list(choices), "description": f"one of {', '.join(choices)}"}
 
 
@@ -56,7 +56,7 @@ class _Shown:
 NOTHING: Final = _Shown("nothing")
 #: Longest value and longest name that are printed [characters].
 _LONGEST: Final = 200
-#: Largest number of listed problems, because finding the nearest key for each takes time.
+#: Largest number of problems that are listed; it is limited because finding the nearest key for each takes time.
 MOST_PROBLEMS: Final = 50
 
 
@@ -76,7 +76,7 @@ def _validator(schema: Schema) -> Validator:
 
 @cache
 def _validator_class() -> Callable[[Schema], Validator]:
-    """Return a validator in which NaN, infinity and integers beyond float64 are no numbers, and 1.0 is no integer."""
+    """Return a validator for which NaN, infinity and integers beyond float64 are no numbers, and 1.0 is no integer."""
     checker = Draft202012Validator.TYPE_CHECKER.redefine_many(
         {
             "number": lambda _, value: _is_number(value),

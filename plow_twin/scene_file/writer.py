@@ -13,7 +13,7 @@ from plow_twin.model.scene import OPTIONAL_PARTS, SCENE_VERSION, Load, Provenanc
 from plow_twin.scene_file.schema import LOAD_KINDS, SECTIONS
 from plow_twin.scene_file.yaml_text import dump_yaml
 
-#: The sections in the order of a file.
+#: The sections of a scene file, in the order in which they are written.
 _ORDER: Final = (
     "version",
     "head",

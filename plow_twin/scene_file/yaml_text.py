@@ -30,7 +30,8 @@ LARGEST_FILE: Final = 64 * 2**20
 MOST_VALUES: Final = 1_000_000
 #: Deepest nesting of collections; a scene has six levels.
 DEEPEST: Final = 20
-#: Largest number of keys of a document; a scene has some hundred, and the `metadata.yaml` of 1,000 parts 20,000.
+#: Largest number of keys of a document; a scene has some hundred keys, and the `metadata.yaml` of a recording of 1,000
+#: parts has 20,000.
 MOST_KEYS: Final = 50_000
 #: Largest number of values to which all aliases of a document expand.
 MOST_REPEATED: Final = 50_000
@@ -49,7 +50,7 @@ _CORE_SCHEMA: Final = (
 class SceneLoader(_Loader):
     """Safe loader with the scalars of the YAML 1.2 core schema."""
 
-    # PyYAML's own table is for YAML 1.1, in which 1e6 is a text, `on` a bool, 010 eight and 1:30 ninety
+    # PyYAML's own table is for YAML 1.1, in which 1e6 is a text, `on` is a bool, 010 is eight and 1:30 is ninety
     yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012
 
 
@@ -68,7 +69,7 @@ SceneDumper.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+.01
 
 
 def read_yaml(path: Path, name: str, sections: str) -> tuple[Any, list[Problem]]:
-    """Return the document and problems of a YAML file, as `load_yaml`, within `LARGEST_FILE` and `MOST_VALUES`."""
+    """Return the document and problems of a YAML file, as `load_yaml` does, within `LARGEST_FILE` and `MOST_VALUES`."""
     try:
         with path.open("rb") as stream:
             data = stream.read(LARGEST_FILE + 1)
@@ -178,7 +179,7 @@ def _place(mark: Any) -> str:
 def dump_yaml(data: Any, *, flow: bool = True) -> str:
     """Return plain data as YAML text, with floats by repr so that reading them gives the same bits.
 
-    With `flow`, collections of scalars alone stand in brackets.
+    With `flow`, collections that contain only scalars are written in brackets.
     """
     style = None if flow else False
     return yaml.dump(data, Dumper=SceneDumper, sort_keys=False, default_flow_style=style, allow_unicode=True, width=120)
@@ -186,7 +187,7 @@ def dump_yaml(data: Any, *, flow: bool = True) -> str:
 
 def _repeated_keys(node: yaml.Node, path: str) -> Iterator[Problem]:
     if isinstance(node, yaml.SequenceNode):
-        # rows of long tables have no mappings
+        # the rows of long tables are skipped quickly: a scalar has no keys
         for index, item in enumerate(node.value):
             if not isinstance(item, yaml.ScalarNode):
                 yield from _repeated_keys(item, f"{path}[{index}]")

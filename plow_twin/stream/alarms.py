@@ -1,4 +1,4 @@
-"""Alarms on publications: two levels, hysteresis, minimum duration, latched until acknowledged.
+"""Alarms on publications, with two levels, hysteresis and a minimum duration, latched until acknowledged.
 
 Alarms depend only on the publications and the acknowledgements, so a replay gives the same alarms.
 """
@@ -24,8 +24,8 @@ from plow_twin.stream.outputs import CLEARANCE_NAMES, Published, Rows
 
 #: An alarm leaves a level when its value falls below this share of the level's threshold.
 HYSTERESIS: Final = 0.95
-#: Time [ns] over which the growth rate of the clearance is computed; it grows too little from one slow part
-#: to the next (0.1 s).
+#: Time [ns] over which the growth rate of the clearance is computed, because the clearance grows too little from one
+#: slow part to the next (0.1 s).
 RATE_SPAN_NS: Final = 10 * NS_PER_S
 #: Time for which poses of the model are kept for late measured poses [ns].
 _KEPT_NS: Final = 2 * NS_PER_S
@@ -150,7 +150,7 @@ class _Model:
         return [found for pose in due if (found := self.residual(*pose)) is not None]
 
     def residual(self, stamp_ns: int, x: float, y: float) -> tuple[int, float] | None:
-        """Return a measured pose's stamp and its distance [m] from the model, or None if it is not known (yet)."""
+        """Return a measured pose's stamp and its distance [m] from the model, or None if it is unknown (as yet)."""
         if not self._stamps_ns or stamp_ns > self._stamps_ns[-1]:
             if len(self._waiting) < _MOST_WAITING:
                 self._waiting.append((stamp_ns, x, y))
@@ -173,7 +173,7 @@ class Alarms:
         By name: `force` [N], the largest force of a pair since the previous publication, while there were samples;
         `clearance` [m], the larger of the horizontal and the vertical clearance; `clearance_rate` [m/s], its growth
         over `RATE_SPAN_NS`; `wear_rate` [m/s], the largest wear rate of a pad; `residual` [m], the distance of a
-        measured pose from the model at its stamp.
+        measured pose from the model at the pose's stamp.
     duration_s
         Time for which a level must last before the alarm takes this level [s].
     """
@@ -187,7 +187,7 @@ class Alarms:
         self.raised: list[str] = []
 
     def feed(self, published: Published) -> Iterator[int]:
-        """Judge publications; yield the number of each row that changes a level, before the next row is judged.
+        """Judge publications; yield the index of each row that changes a level, before the next row is judged.
 
         Rows without a sample are not judged.
         """

@@ -13,7 +13,8 @@ from plow_twin.run.twin import Advanced
 
 Array = NDArray[np.float64]
 
-#: Largest number of poses kept for going back: ten seconds at 1 kHz. Estimates are always kept.
+#: Largest number of poses that are kept because the motion may be computed again: ten seconds at 1 kHz. Estimates are
+#: always kept.
 MOST_MEASURED: Final = 10_000
 
 
@@ -57,7 +58,7 @@ class Following(Driven, Protocol):
 
     #: number of poses and estimates so far
     added: int
-    #: whether intervals and measurements wait for `catch_up` after a row is published alone
+    #: whether intervals and measurements wait for `catch_up` when a row is published by itself
     defers: bool
 
     def catch_up(self) -> None:
@@ -66,11 +67,11 @@ class Following(Driven, Protocol):
     def add_pose(self, t: float, q: ArrayLike, known: float = ...) -> None:
         """Add a pose measured at model time `t` in s, shape (3,), NaN where not measured.
 
-        It has an effect from model time `known` in s on.
+        The pose has an effect from model time `known` in s on.
         """
 
     def add_estimate(self, text: str, t: float) -> None:
-        """Add an estimate (JSON) that is known from model time `t` in s on."""
+        """Add an estimate (JSON) that has an effect from model time `t` in s on."""
 
     @property
     def known(self) -> str:
@@ -83,7 +84,7 @@ class Following(Driven, Protocol):
         """Continue from the state of the median twin with a single twin, without corrections by poses."""
 
     def end_spans(self, ends: NDArray[np.int64], begins: bool) -> None:
-        """Set which rows of the next `advance_rows` are published, and whether their span begins with the first row."""
+        """State which rows of the next `advance_rows` are published, and whether a span begins with its first row."""
 
     def snapshot_size(self, data: bytes) -> int:
         """Return the length of the snapshot at the beginning of some bytes."""

@@ -43,7 +43,7 @@ Arrival = tuple[int, tuple[float, float, float]]
 
 #: Largest model time that one call may catch up when the excitation is silent [ns], so that a call's work is bounded.
 _LARGEST_HOLD_NS: Final = NS_PER_S
-#: Longest time between two checks for silence [ns], because the policy may change.
+#: Longest time between two checks for silence [ns]; it is limited because the policy may change meanwhile.
 _LONGEST_QUIET_NS: Final = NS_PER_S // 10
 #: Largest number of resets by jumps of the clock within `_RESET_WINDOW_NS`: two clocks that disagree must not reset the
 #: model for ever.
@@ -116,7 +116,7 @@ class Driver:
         #: model time up to which the real-time factor has counted [ns]
         self._counted_ns: int | None = None
         self._zeroed = False
-        #: time spent inactive [ns]: the stamps of the scene's own loads lag behind the clock by it
+        #: time spent inactive [ns], by which the stamps of the scene's own loads lag behind the clock
         self._behind_ns = 0
         self._resumed = False
 
@@ -212,7 +212,7 @@ class Driver:
     ) -> Iterator[Published]:
         """Judge a sample and add it to `run`, the samples to apply together; `run` is applied first where needed."""
         late = bool(run) and self._is_late(run[0])
-        # a stamp that does not rise may be late or a jump back, which `judge` can tell once the run is applied
+        # a stamp that does not rise may be late or a jump back: `judge` can decide once the run is applied
         if run and not late and stamp_ns <= run[-1].stamp_ns:
             yield from self._use(run, now_ns)
             late = False
@@ -237,7 +237,7 @@ class Driver:
         return self.session.outputs.pop()
 
     def silence(self, now_ns: int) -> Published:
-        """Advance under the hold policy if the excitation has been silent for too long; called at intervals."""
+        """Advance under the hold policy if the excitation has been silent for too long; to be called at intervals."""
         if self._newest_ns is None:
             return NOTHING
         timeout_ns = round(self.policy.excitation_timeout_s * NS_PER_S)
@@ -375,7 +375,7 @@ class Driver:
         self.clock.restart()
 
     def resume(self, now_ns: int) -> None:
-        """Restart the measurement of silence and clock, so that the time spent inactive is not caught up."""
+        """Restart the measurement of silence and of the clock; the model does not catch up the time spent inactive."""
         self._received_ns = now_ns
         self._resumed = True
 
@@ -459,7 +459,7 @@ class Driver:
         self._counted_ns = reached_ns
 
     def _judge_rows(self, rows: Rows) -> None:
-        """Count good and failed advances, of which at least one has failed."""
+        """Count the good and the failed advances of rows with at least one failure."""
         stamps = (self.session.origin_ns or 0) + np.rint(rows["t"] * NS_PER_S).astype(np.int64)
         for status, stamp_ns in zip(rows["status"].tolist(), stamps.tolist(), strict=True):
             self._judge_advance(status, stamp_ns, StreamState.RUNNING)

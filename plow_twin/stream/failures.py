@@ -1,4 +1,4 @@
-"""Failed advances, counted and journalled by stretches; after several in a row the model restarts."""
+"""Failed advances, counted and journalled by stretches; after several failures in a row the model restarts."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Failures:
 
     def __init__(self, emit: Callable[[Failed], object]) -> None:
         self._emit = emit
-        #: numbers of failed advances and of stretches of failed advances
+        #: number of failed advances, and number of stretches of failed advances
         self.count = self.stretches = 0
         #: reason of the newest failure; empty without a failure
         self.reason = ""

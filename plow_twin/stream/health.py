@@ -29,7 +29,7 @@ class DurationHistogram:
         return sum(self._counts)
 
     def add(self, duration_s: float, count: int = 1) -> None:
-        """Count a duration [s]; outside the range it is counted in the end bin, and a negative duration is ignored."""
+        """Count a duration [s], in the nearest bin if it is outside the range; a negative duration is ignored."""
         if not duration_s >= 0.0:
             return
         if duration_s > self.largest_s:

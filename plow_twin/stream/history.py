@@ -1,7 +1,8 @@
 """The last seconds of a session, kept for late samples: snapshots, and all entries since the oldest snapshot.
 
 The age at which a sample is too old depends on the journal alone. Calls with one sample each make many snapshots; a
-call with many samples makes one and notes the stamps of the others, so that the limit is the same.
+call with many samples makes one snapshot and notes the stamps that the others would have had, so that the limit is the
+same.
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ class History:
         self._snapshots: list[tuple[int, bytes]] = []
         #: stamps of the first sample in each span, where calls with single samples have a snapshot
         self._kept_ns: list[int] = []
-        #: largest of these stamps so far; going back and computing up to it again drops no kept stamp
+        #: largest of these stamps so far; while the session has gone back and computes up to it again, no kept stamp is
+        #: dropped
         self._newest_kept_ns: int | None = None
         self._samples: list[Sample] = []
         self._stamps_ns: list[int] = []
@@ -51,7 +53,7 @@ class History:
 
     @property
     def oldest_ns(self) -> int | None:
-        """Stamp [ns] after which late samples can be inserted, that of the oldest snapshot; None without a snapshot."""
+        """Stamp [ns] of the oldest snapshot, after which late samples can be inserted; None without a snapshot."""
         return self._kept_ns[0] if self._kept_ns else None
 
     @property
@@ -146,7 +148,7 @@ class History:
         self._travels.insert(place, travel)
 
     def add_snapshot(self, stamp_ns: int, data: bytes, *, kept: bool = True) -> None:
-        """Add the state at `stamp_ns`; with `kept`, its stamp is noted, although it may not be the first of a span."""
+        """Add the state at `stamp_ns`; with `kept`, its stamp is noted, even if it is not the first of a span."""
         if not self._span_ns:
             return
         if not self._snapshots or self._snapshots[-1][0] < stamp_ns:
@@ -171,7 +173,7 @@ class History:
 
 
 class RecentStamps:
-    """Stamps of a stream whose values only need sorting: a value late by less than `span_s` can still be used."""
+    """Stamps of a stream whose values only need sorting: a value less than `span_s` late can still be used."""
 
     def __init__(self, span_s: float) -> None:
         self._span_ns = round(span_s * 1e9)

@@ -78,14 +78,14 @@ class Intake:
     Parameters
     ----------
     jump_back_s
-        A stamp that is older than the newest stamp by more than this [s] is a step of the sender's clock; by less, a
-        late packet.
+        A stamp that is older than the newest stamp by more than this [s] is a step of the sender's clock; a stamp that
+        is older by less is a late packet.
     jump_forward_s
         A stamp that is newer than the model's time by more than this [s] is a step of the sender's clock.
     expected_rate_hz
         Rate of the samples [Hz], from which gaps in the stamps are counted as missing samples; 0: not known.
     limits
-        Largest values; None: any finite value.
+        Largest values; None: any finite value is plausible.
     on_unused
         Receives the reason, stamp [ns] and values of each unused sample.
     """
@@ -155,10 +155,10 @@ class Intake:
         reached_ns
             Time that the model has reached [ns], None before its first sample.
         history
-            The past, for late samples.
+            The stamps of the past, among which late samples are inserted.
         may_reset
             Whether a step of the sender's clock may reset the model now. A return to the stamps before the last step
-            always may, otherwise a single wrong stamp could exclude all correct ones.
+            may always reset it; otherwise a single wrong stamp could exclude all correct stamps.
         """
         verdict = self._judge(stamp_ns, values, reached_ns, history)
         self.returned = verdict.resets and self._goes_on_from_before(stamp_ns)
@@ -190,7 +190,7 @@ class Intake:
         return ahead_ns <= self.jump_forward_s * NS_PER_S and newest_ns - stamp_ns <= self.jump_back_s * NS_PER_S
 
     def goes_on(self, stamp_ns: int, values: Sequence[float], reached_ns: int) -> bool:
-        """Return whether a sample is certain to be accepted, as most are; if not, `jumps` and `judge` decide."""
+        """Return whether a sample, like most samples, is certain to be accepted; if not, `jumps` and `judge` decide."""
         newest_ns = self._newest_ns
         if newest_ns is None or self.limits is None:
             return False

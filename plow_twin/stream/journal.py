@@ -65,7 +65,7 @@ class SetWear:
 
 @dataclass(frozen=True)
 class SetModel:
-    """Numbers of the scene change: `changes` is JSON, numbers by key of the scene file.
+    """Numbers of the scene change: `changes` is a JSON object of numbers by their keys in the scene file.
 
     `changes` has all numbers that differ from the scene of the run. Pose, rates and wear are kept; contacts start
     without history.
@@ -93,10 +93,10 @@ class Mark:
 
 @dataclass(frozen=True)
 class Failed:
-    """`advances` advances up to `stamp_ns` have failed, in a row that began at `since_ns`; no effect on the motion.
+    """`advances` advances up to `stamp_ns` have failed, in a stretch that began at `since_ns`; no effect on the motion.
 
-    There is one entry at the first failure of a row and another entry for the rest at its end, so that the sum of
-    `advances` is the number of failures.
+    A stretch of failures has one entry at its first failure and another entry for the rest at its end, so that the sum
+    of `advances` is the number of failures.
     """
 
     stamp_ns: int

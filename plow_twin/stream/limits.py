@@ -17,7 +17,7 @@ from plow_twin.model.scene import Scene
 
 #: Largest measured load as a multiple of the sum of the scene's largest loads and the head's weight.
 _MARGIN: Final = 10.0
-#: A load may change by its largest value within this time [s], so that an impact of a millisecond passes.
+#: A load may change by its largest value within this time [s], so that an impact of a millisecond is accepted.
 _SHORTEST_S: Final = 1e-3
 
 
@@ -56,10 +56,10 @@ class Limits:
 
 
 def pose_limits(scene: Scene, displacement: float = 0.0, rate: float = 0.0) -> Limits:
-    """Return the limits of x, y [m] and theta [rad] of a measured pose and of their rates; 0: derived from the scene.
+    """Return the limits of a pose x, y [m], theta [rad] and of its rates; a limit given as 0 follows from the scene.
 
-    The derived limits are `largest_displacement`, and a change by as much within a millisecond. An angle may be half a
-    turn (of a block, any angle) and change by half a turn within a millisecond.
+    The derived limits are `largest_displacement`, and a change by as much within a millisecond. An angle may be up to
+    half a turn (or any angle, if the head is a block) and change by half a turn within a millisecond.
     """
     displacement = displacement or largest_displacement(scene)
     rate = rate or displacement / _SHORTEST_S
@@ -74,14 +74,14 @@ def largest_displacement(scene: Scene) -> float:
 
 
 def value_limits(largest: float, rate: float = 0.0) -> Limits:
-    """Return the limits of one number and of its rate; 0: the limit of the number within a millisecond."""
+    """Return the limits of one number and of its rate; a `rate` of 0 means the number's limit within a millisecond."""
     return Limits((largest,), (rate or largest / _SHORTEST_S,))
 
 
 def excitation_limits(
     scene: Scene, force: float = 0.0, moment: float = 0.0, force_rate: float = 0.0, moment_rate: float = 0.0
 ) -> Limits:
-    """Return the limits of Fx, Fy [N] and M [N m] and of their rates; 0: derived from the scene.
+    """Return the limits of Fx, Fy [N] and M [N m] and of their rates; a limit of 0 is derived from the scene.
 
     The derived limit of a force is ten times the sum of all loads of the scene and the head's weight; the limit of the
     moment is this force at an arm of half the frame's diagonal. Each may change by as much within a millisecond.

@@ -22,12 +22,12 @@ from plow_twin.solve.totals import publish, publish_window, summary
 Array = NDArray[np.float64]
 Rows = NDArray[np.void]
 
-#: Span of stamps [ns]; only its first publication has a slow part, `clearance` and `wear_rate`.
+#: Length of a span of stamps [ns]; only the first publication in a span has a slow part, `clearance` and `wear_rate`.
 SLOW_PERIOD_NS: Final = 100_000_000
 
 PAD_NAMES: Final = tuple(f"pad_{name}" for name in PAIR_NAMES)
 _CLEARANCES: Final = ("horizontal", "vertical", *PAD_NAMES)
-#: The names of `clearance`: the best values, then the 5 % and 95 % points of each.
+#: Names of the numbers in `clearance`: the best values, then the 5 % and 95 % points of each.
 CLEARANCE_NAMES: Final = (*_CLEARANCES, *(f"{name}/{point}" for name in _CLEARANCES for point in ("p05", "p95")))
 
 #: The two pads on each side: left, right, top, bottom.
@@ -39,12 +39,12 @@ _STATE_SIZE: Final = 4 * PAIR_COUNT
 SLOW: Final = np.dtype(
     [
         ("stamp_ns", "i8"),
-        ("row", "i8"),  # number of the row with which it is published
+        ("row", "i8"),  # index of the publication's row to which this slow part belongs
         ("clearance", "f8", (len(CLEARANCE_NAMES),)),
         ("wear_rate", "f8", (PAIR_COUNT,)),
     ]
 )
-#: Numbers of the rows to publish: the only row, or none.
+#: Indices of the rows to publish: the only row, or no row.
 THE_ONE: Final = np.zeros(1, np.int64)
 NONE: Final = np.zeros(0, np.int64)
 _NO_ROWS: Final = np.zeros(0, ROW)
@@ -55,9 +55,9 @@ FOLLOWED_FIELDS: Final = (
 )  # fmt: skip
 #: Fields that describe the motion at the row's time.
 _MOTION: Final = ("t", "stamp_ns", "held", "q", "v", "penetration", "rate", "force", "wear_depth", *FOLLOWED_FIELDS)
-#: Fields that `summary` checks for finite numbers by their sum.
+#: Fields whose numbers `summary` checks for being finite by summing them up.
 _SUMMED: Final = ("q", "v", "penetration", "rate", "force", "impulse", "peak")
-#: Places of `known_clearance` in `clearance`.
+#: Indices in `clearance` of the numbers of `known_clearance`.
 _KNOWN: Final = np.array([0, len(_CLEARANCES), len(_CLEARANCES) + 1, 1, len(_CLEARANCES) + 2, len(_CLEARANCES) + 3])
 #: Number of rows made at once, because numpy makes many rows in the time of one.
 _STOCK: Final = 256
@@ -91,7 +91,7 @@ class Published(NamedTuple):
         return Published(self.rows[index : index + 1], _numbered_from(slow, index))
 
     def of(self, index: NDArray[np.int64]) -> Published:
-        """Return the rows with the given rising numbers, and their slow parts."""
+        """Return the rows with the given rising indices, and their slow parts."""
         slow = self.slow[np.isin(self.slow["row"], index)]
         slow["row"] = np.searchsorted(index, slow["row"])
         return Published(self.rows[index], slow)
@@ -111,7 +111,7 @@ NOTHING: Final = Published(_NO_ROWS, _NO_SLOW)
 
 
 def _numbered_from(slow: Rows, first: int) -> Rows:
-    """Return slow parts with row numbers relative to the row `first`."""
+    """Return slow parts with row indices relative to the row `first`."""
     if len(slow):
         slow = slow.copy()
         slow["row"] -= first
@@ -148,8 +148,8 @@ def clearances(scene: Scene, wear_depth: Array) -> Array:
 def prior_points(scene: Scene, wear_depth: Array) -> tuple[Array, Array]:
     """Return the 5 % and 95 % points of the pad depths under the prior of the wear coefficient, shape (8,) each [m].
 
-    The growth, taken without running-in, is proportional to k_s as long as it is small compared with the clearance.
-    Without wear, or with k_s = 0, both points equal the wear depth.
+    The growth of a depth, taken without running-in, is proportional to k_s as long as it is small compared with the
+    clearance. Without wear, or with k_s = 0, both points equal the wear depth.
     """
     if scene.wear is None or scene.wear.coefficient_m2_n == 0.0:
         return wear_depth, wear_depth
@@ -184,8 +184,8 @@ class Outputs:
     def set_shift(self, shift: Sequence[float]) -> None:
         """Shift the horizontal and the vertical clearance of the model, and their points, from now on.
 
-        `shift` has 6 numbers [m]: horizontal, its 5 % and 95 % points, vertical, its points. It is not part of `state`,
-        so that an estimate stays when late samples are inserted.
+        `shift` has 6 numbers [m]: for the horizontal clearance, for its 5 % and 95 % points, and likewise for the
+        vertical clearance. The shift is not part of `state`, so that an estimate stays when late samples are inserted.
         """
         values = np.zeros(len(CLEARANCE_NAMES))
         values[_KNOWN] = shift
@@ -209,7 +209,7 @@ class Outputs:
         stamps : ndarray of int64, shape (n,)
             Stamps of the advances [ns].
         taken : ndarray of int64, shape (m,)
-            Rising numbers of the advances after which to publish; a publication without a good advance has the stamp 0.
+            Rising indices of the advances after which to publish; a publication without a good advance has the stamp 0.
         held : bool
             Whether the advances were computed without samples.
 
@@ -235,7 +235,7 @@ class Outputs:
     def correct(self, stamp_ns: int, oldest_ns: int) -> int:
         """Note that the motion from `stamp_ns` on is computed again; return the earliest such stamp of the window.
 
-        A correction that began at or before `oldest_ns` is over; this one starts anew.
+        A correction that began at or before `oldest_ns` is over; this call then begins a new correction.
         """
         window = self._window[0]
         if not window["corrected"] or self._corrected_ns <= oldest_ns:
@@ -247,7 +247,7 @@ class Outputs:
         return self._corrected_ns
 
     def begin_correction(self) -> None:
-        """Begin impulses and peaks at the time that `correct` returned and the session has gone back to.
+        """Begin impulses and peaks at the time that `correct` returned, to which the session has gone back.
 
         Advances that were published before are not published again, even if every later advance fails.
         """
@@ -336,13 +336,13 @@ class Outputs:
         return found
 
     def modelled(self, wear_depth: Array) -> Array:
-        """Return the model's horizontal clearance and its two points, then the same of the vertical, shape (6,) [m]."""
+        """Return the model's horizontal clearance with its two points, then the vertical likewise, shape (6,) [m]."""
         middle = clearances(self._scene, wear_depth)
         low, high = (clearances(self._scene, points) for points in prior_points(self._scene, wear_depth))
         return np.stack((middle, low, high), axis=1)[:2].ravel()
 
     def state(self) -> bytes:
-        """Return the exact state that, with the next advance, determines the numbers of the next publication."""
+        """Return the exact state that determines, with the next advance, the numbers of the next publication."""
         slow_ns, window = -1 if self._slow_ns is None else self._slow_ns, self._window
         numbers = (window["makes"], window["impulse"], window["peak"], self._slow_wear_depth, np.array([slow_ns]))
         return b"".join(part.tobytes() for part in numbers)
@@ -353,9 +353,8 @@ class Outputs:
         self._clear()
         self._window["makes"] = parts[0].view(np.int64)
         self._window["impulse"], self._window["peak"] = parts[1:3]
-        self._window["measured_peak"] = parts[
-            2
-        ]  # a state has no peak of the samples alone: the peak of all stands for it
+        # a state has no peak of the samples alone; the peak of all advances takes its place
+        self._window["measured_peak"] = parts[2]
         self._slow_wear_depth = parts[3].copy()
         slow_ns = int(np.frombuffer(data, np.int64, 1, offset=8 * _STATE_SIZE)[0])
         self._slow_ns = None if slow_ns < 0 else slow_ns

@@ -34,7 +34,7 @@ class Senders:
         self._before = frozenset(present)
 
     def start_late(self, sender: bytes) -> None:
-        """Note that messages of a sender before its first heard sample need not be lost."""
+        """Note a sender whose messages before its first heard sample are not counted as lost."""
         self._before |= {sender}
 
     def hear(self, sender: bytes, number: int, count: int = 1) -> bool:

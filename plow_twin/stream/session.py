@@ -48,7 +48,7 @@ from plow_twin.stream.outputs import NONE, NOTHING, THE_ONE, Outputs, Published,
 
 #: Number of advances between digests.
 DIGEST_INTERVAL: Final = 100
-#: Head of a snapshot: whether a stamp is known, origin, stamp reached, number of advances, whether the load is held,
+#: Header of a snapshot: whether a stamp is known, origin, stamp reached, number of advances, whether the load is held,
 #: speed along the face, number of waiting speeds.
 _HEADER: Final = struct.Struct("<?qqq?dq")
 _TRAVEL: Final = struct.Struct("<qd")
@@ -266,7 +266,7 @@ class Session:
                 self.following.follow_parameters()
                 self._forget()
             case Parameter() | Gaps() | Mark() | Failed() | Spread() | Unused():
-                # acts through later entries, or has no effect here
+                # the entry acts through later entries, or has no effect here
                 self._on_entry(entry)
             case Snapshot(_, data):
                 self._on_entry(entry)
@@ -307,7 +307,7 @@ class Session:
         samples : sequence of Sample
             At least one sample.
         each : bool
-            Whether to publish after each sample (after the last of late samples); otherwise `outputs` sums up.
+            Whether to publish after each sample (of late samples, only after the last); otherwise `outputs` sums up.
 
         Raises
         ------
@@ -433,7 +433,7 @@ class Session:
                 continue
             if travel is not None:
                 end = int(np.searchsorted(stamps, travel.stamp_ns, side="right"))
-            if resumed:  # going back never reaches the motion without samples before the first sample
+            if resumed:  # the session never goes back to the motion without samples before the first sample
                 end = begin + 1
             here = slice(begin, end)
             chosen = taken[(taken >= begin) & (taken < end)] - begin
@@ -597,8 +597,8 @@ class Session:
         self._restore(data)
         self._advances, self.outputs.slow_before = advances, slow
         if self.following is not None:
-            # each measurement acts from the time when it was known, because the length of going back depends on
-            # publications, which must not change the motion
+            # each measurement acts from the time when it was known, because publications decide how far the session
+            # goes back, and they must not change the motion
             measured, self._measured = self._measured, deque()
             for one in measured:
                 if one.number > self.following.added:
@@ -662,7 +662,7 @@ class Session:
         if not self._wears:
             self._speed = travel.speed_m_s
         elif self.stamp_ns is None:
-            self._use_speed(travel.speed_m_s)  # acts from the first sample on, as nothing goes back before it
+            self._use_speed(travel.speed_m_s)  # acts from the first sample on, before which the session never goes back
         elif travel.stamp_ns > self.stamp_ns:
             insort(self._travels, travel, key=lambda item: item.stamp_ns)
         elif oldest_ns is not None and travel.stamp_ns <= oldest_ns:
@@ -716,7 +716,7 @@ class Session:
         self.origin_ns = self.stamp_ns = None
 
     def _begin(self, stamp_ns: int) -> int:
-        """Return the stamp of model time 0 for which the present model time is at `stamp_ns`."""
+        """Return the stamp that model time 0 must have so that the present model time has the stamp `stamp_ns`."""
         return stamp_ns - round(self.twin.time * 1e9)
 
     def _change_model(self, changes: dict[str, float]) -> None:

@@ -1,4 +1,4 @@
-"""Stretches without samples, found by the stamps."""
+"""Stretches without samples, found from the stamps."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from plow_twin.stream.intake import NS_PER_S
 
 Indexes = NDArray[np.int64]
-#: A silence is longer than this many times the interval before it, so that a log with a sample each minute has none.
+#: A silence is longer than this many times the interval before it, so that a log with a sample each minute has no
+#: silences.
 _LONGER: Final = 5
 
 
