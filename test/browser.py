@@ -81,7 +81,7 @@ class Page:
 
 @contextmanager
 def page(folder: Path, url: str) -> Iterator[Page]:
-    """Open a page in a browser of its own, whose files lie in `folder`."""
+    """Open a page in a separate browser, whose files lie in `folder`."""
     assert CHROMIUM is not None
     command = [CHROMIUM, *_OPTIONS, f"--user-data-dir={folder}", "about:blank"]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -147,7 +147,7 @@ class FirefoxPage:
 
 @contextmanager
 def firefox_page(folder: Path, url: str) -> Iterator[FirefoxPage]:
-    """Open a page in a Firefox of its own, whose files lie in `folder`."""
+    """Open a page in a separate Firefox, whose files lie in `folder`."""
     assert FIREFOX is not None
     folder.mkdir(exist_ok=True)
     options = ["--headless", "--no-remote", "--profile", str(folder), "--remote-debugging-port", "0"]

@@ -29,7 +29,7 @@ class Compiles(event.Listener):
 
     def on_end(self, event: Any) -> None:
         took = time.thread_time() - self._begun.pop()
-        if not self._begun:  # otherwise this kernel is compiled for its caller
+        if not self._begun:  # a kernel that is compiled for another kernel counts with the other
             function = event.data["dispatcher"].py_func
             self._test.append((PROPERTY, (took, f"{function.__module__}.{function.__qualname__}")))
 

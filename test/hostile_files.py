@@ -78,7 +78,7 @@ def run(*entries: str, more: bytes = b"", **changed: str) -> bytes:
 
 
 def foreign(text: str, channels: int = 1) -> bytes:
-    """Return a recording of another program: a topic /load of an own type, defined by a text, and further topics."""
+    """Return a recording of another program: a topic /load of a type that `text` defines, and further topics."""
     declared = schema(1, "a/msg/A", text) + b"".join(
         channel(n % 65536, 1, f"/load{n - 1 if n > 1 else ''}") for n in range(1, channels + 1)
     )

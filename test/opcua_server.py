@@ -32,7 +32,7 @@ class OneUser(UserManager):
         self._known = None if read is None else read.public_bytes(Encoding.DER)
 
     def get_user(self, iserver: Any, username: Any = None, password: Any = None, certificate: Any = None) -> Any:
-        # without a user token, the certificate is the client program's
+        # without a user token, the certificate is that of the client program
         known = (username, password) == ("plough", "s3cret") or (username is None and certificate == self._known)
         return User(UserRole.User) if known else None
 

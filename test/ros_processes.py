@@ -34,7 +34,7 @@ ROOT = Path(__file__).resolve().parent.parent
 START_S = 200.0
 #: Long enough for discovery on a machine that does other work [s].
 WAIT_S = 60.0
-#: Twice the longest time of a stop while three processes share two cores [s].
+#: Twice the longest time that a stop took while three processes shared two cores [s].
 STOP_S = 10.0
 _numbers = itertools.count()
 

@@ -138,7 +138,7 @@ def test_the_clearances_of_an_estimate_after_the_last_publication_are_shown_with
             clearance = (far.receive() or {})["motion"]["clearance"]
             return clearance["horizontal/p05"], clearance["vertical/p05"]
 
-        publish(1.0, 0.0057)  # came before the estimate; summed up with later publications
+        publish(1.0, 0.0057)  # this publication comes before the estimate, and is summed up with later publications
         feed.part("estimate", (0, "", numbers))
         feed.part("status", (0, "", {"horizontal": "estimated", "vertical": "not_observable"}))
         feed.part("estimate", (0, "estimating", {"estimates": "1"}))
@@ -251,7 +251,7 @@ def test_a_frozen_page_costs_no_memory_delays_no_page_and_gets_the_newest_when_i
         with _data(screen.url, sock=raw, ping_interval=None, max_queue=1) as frozen, _data(screen.url) as page:
             assert "version" in json.loads(page.recv())
             before, text = _memory_kb(screen.process.pid), "x" * 2700
-            for index in range(200):  # 6 MB
+            for index in range(200):  # messages of 6 MB in total
                 screen.feed.publication(_published(1.0 + index, float(index)))
                 screen.feed.part("state", (0, str(index), {str(number): text for number in range(10)}))
                 while not screen.feed.send():
@@ -274,7 +274,8 @@ def _row(index: int) -> str:
 
 
 COUNT = 6000
-#: An alarm that the load raises, and a long timeout: the samples have their own stamps, so silence is not held.
+#: Options with an alarm threshold that the forces exceed, and with a timeout so long that no silence is held,
+#: because the samples have their own stamps.
 OPTIONS = ("--scene", "paper", "--set", "excitation_timeout=3600", "--set", "alarm_force=[1.5e5,1e9]", "--json")
 
 
@@ -393,7 +394,7 @@ def test_a_killed_server_is_reported_once_and_the_twin_continues(tmp_path: Path)
         assert process.stdin is not None
         process.stdin.close()
         process.stdin = None
-        out, err = process.communicate(timeout=60)  # the server waits for no page any more
+        out, err = process.communicate(timeout=60)  # the server no longer waits for a page
     assert process.returncode == 0 and json.loads(out)["input"]["samples_used"] == str(COUNT)
     assert "server of the screen" not in err
 

@@ -19,7 +19,7 @@ from plow_twin.study.measured.drops import Drops
 
 DATA = Path(__file__).resolve().parent.parent / "benchmark" / "data" / "measured" / "square_drops.npz"
 SQUARE = load_scene("measured_square")
-#: Prior deviation of the clearance in m; the height of the table, half of it, is known to 5 mm.
+#: Prior deviation of the clearance in m. The height of the table is half of the clearance, so it is known to 5 mm.
 DEVIATION = 0.01
 
 
@@ -73,7 +73,7 @@ def test_walls_that_are_never_met_are_not_observable(drops) -> None:
     assert found.bias_x is None and found.bias_y is None and found.bias_theta is not None
     assert found.horizontal_state is State.NOT_OBSERVABLE
     assert found.horizontal.mean == SQUARE.clearance.horizontal_m
-    # the scene states this deviation
+    # this is the deviation that the scene states
     assert found.horizontal.deviation == pytest.approx(2e-3)
     assert found.stiffness is not None and found.stiffness.deviation == pytest.approx(1e6, rel=0.05)
     assert any("0 impacts on the right wall" in reason for reason in found.reasons)

@@ -89,7 +89,7 @@ def test_a_method_that_disagrees_widens_the_interval() -> None:
 
 @pytest.mark.parametrize("turn", [0.0, -0.1])
 def test_the_bias_of_a_sensor_behind_a_hard_contact_is_found(turn: float) -> None:
-    """If it is not found, half a degree withdraws the estimate, and 9 mm along y make a clearance 1 mm too large."""
+    """A missed half degree would withdraw the estimate; missed 9 mm along y would make a clearance 1 mm too large."""
     truth = draw(replace(GROUPS["hard"], periods=4.0), 3)
     bias = np.array([1e-3, -9e-3, turn])
     found = bias_of_hard(Unknowns(truth.nominal), truth.poses.moved(bias))

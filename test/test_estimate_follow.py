@@ -106,7 +106,7 @@ def test_intervals_hold_from_the_first_row_on_and_narrow(truth: Truth, followed:
     for axis, true in enumerate(truth.clearance):
         value, low, high = clearance[:, axis].T
         assert ((low <= true) & (true <= high)).mean() > 0.85
-        assert 0.02 < high[0] - low[0] < 0.04  # the prior's interval
+        assert 0.02 < high[0] - low[0] < 0.04  # the width of the prior's interval
         assert (low <= value).all() and (value <= high).all()
         assert high[-1] - low[-1] < 1e-3
 
@@ -185,7 +185,7 @@ def test_a_rough_estimate_of_the_same_motion_does_not_replace_one_that_is_not_ro
     same.restore(follower.snapshot())
     for one in (follower, same):
         _run(one, truth, 0.6, 0.5)
-        assert not _take(one, rough)  # a tenth of its window, of 1 s, is new
+        assert not _take(one, rough)  # only 0.1 s of its window of 1 s is new
         _run(one, truth, 0.8, 0.6)
         assert _take(one, rough)
 
@@ -260,7 +260,8 @@ def test_a_machine_without_gravity_is_steered_too(truth: Truth, monkeypatch: pyt
     monkeypatch.setattr(TwinBatch, "move", counted)
     nominal = replace(truth.nominal, gravity=replace(truth.nominal.gravity, acceleration_m_s2=0.0))
     _run(Follower(nominal, MEMBERS), truth, 1.0)
-    assert np.mean(moved) > MEMBERS / 3  # with a limit of zero hardly any member would be moved
+    # if the limit of a wall's force were a share of the weight, which is zero here, hardly any member would be moved
+    assert np.mean(moved) > MEMBERS / 3
 
 
 def test_a_member_is_never_pushed_into_a_hard_wall() -> None:
@@ -302,13 +303,13 @@ def test_stiffness_and_gains_of_a_hard_contact_are_learned_from_the_poses() -> N
 
 def test_a_wrong_bias_of_the_sensor_is_learned_with_a_hard_contact() -> None:
     truth = draw(replace(GROUPS["hard"], periods=1.3), 71102)
-    wrong = np.array([4e-4, -4e-4, 2e-3])  # the truth has none
+    wrong = np.array([4e-4, -4e-4, 2e-3])  # the true sensor has no bias
     x, y, theta = (Interval.normal(value, abs(value) / 2.0) for value in wrong)
     follower = Follower(truth.nominal, MEMBERS)
     _take(follower, replace(_known(truth), bias_x=x, bias_y=y, bias_theta=theta))
     _run(follower, truth, 4.0)
     biases = biases_of(follower._ensemble.learned()[0])
-    # of the median twin, and of the others
+    # the bias of the median twin, then the mean of all twins
     assert (np.abs(biases[0]) < 0.6 * np.abs(wrong)).all()
     assert (np.abs(biases.mean(axis=0)) < 0.6 * np.abs(wrong)).all()
 

@@ -64,7 +64,7 @@ def test_gaps_at_one_wall_alone_give_no_clearance(gapped: tuple[Truth, np.ndarra
 def test_gaps_with_theta_alone_give_the_clearances_and_the_reason_names_the_missing_components(
     gapped: tuple[Truth, np.ndarray],
 ) -> None:
-    """Four sensors leave theta to the poses, so they give no pose in place of the measured one."""
+    """With four sensors theta comes from the poses, so the gaps give no pose in place of the measured one."""
     truth, gap = gapped
     four, q = np.full_like(gap, np.nan), truth.poses.q.copy()
     four[:, [0, 1, 3, 6]], q[:, :2] = gap[:, [0, 1, 3, 6]], np.nan

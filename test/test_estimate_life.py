@@ -275,7 +275,7 @@ def test_a_clearance_hardly_known_is_not_below_zero() -> None:
 
 
 def test_a_history_that_the_prior_does_not_allow_is_refused() -> None:
-    """The whole posterior is at the end of the grid, where the interval has no width and does not contain the truth."""
+    """The whole posterior would be at the end of the grid, with an interval of no width that excludes the truth."""
     scene = replace(preset("paper"), wear=replace(FAST, coefficient_m2_n=1e-9, prior_m2_n=(2.5e-10, 4e-9)))
     travel = np.arange(5) * 10.0
     still = np.tile([0.025, 0.030], (5, 1))

@@ -48,7 +48,8 @@ from estimate_truths import GROUPS, Truth, draw
 #: Stamp of the first sample [ns].
 START_NS = 1_700_000_000_000_000_000
 WINDOW_S, INTERVAL_S, WAIT_S = 10.0, 4.0, 2.0
-#: Settings with which a busy machine loses no sample and no pose, because a window with holes is another window.
+#: Settings with which a busy machine loses no sample and no pose, because a window with missing rows would not be the
+#: same.
 RELIABLE = {
     f"qos_overrides.{{ns}}/{topic}.subscription.reliability": "reliable"
     for topic in ("excitation", "head_pose", "gaps")
@@ -286,7 +287,7 @@ def test_other_pads_and_other_model_numbers_discard_earlier_estimates(
     # an estimate of the previous machine is being computed
     estimation.worker.found.append(_found(State.ESTIMATED, State.ESTIMATED))
     session.apply(SetModel(START_NS, json.dumps({"clearance.horizontal_m": 0.026})))
-    # the clearance is the model's again, because no estimate is kept beside a clearance that is not observable
+    # the clearance is that of the model again: an estimate is not kept if the other clearance is not observable
     assert estimation.entry is None and set(estimation.states.values()) == {State.PRIOR}
     assert estimation.forecast is not None and estimation.poll(session) == {}
     told()

@@ -421,10 +421,10 @@ def test_a_live_twin_whose_standard_output_nobody_reads_goes_on_and_ends_when_it
     with _live(str(path), "--follow", "--scene", "paper", *more) as live:
         pipe = live.process.stdout
         assert pipe is not None
-        fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, 4096)  # smaller than the lines of a second
+        fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, 4096)  # the pipe holds less than the lines of a second
         live.until_count("samples_used", 100)
         give_up = time.monotonic() + START_S
-        for count in range(1000, 4000, 1000):  # from here on nobody reads
+        for count in range(1000, 4000, 1000):  # from here on nobody reads the pipe
             with path.open("a") as file:
                 file.writelines(",".join(map(repr, _row(index))) + "\n" for index in range(count - 900, count + 100))
             while _metric(port, "plow_twin_input_samples_used") < count + 100:
@@ -492,7 +492,7 @@ def test_a_file_is_followed_while_it_grows_and_when_it_is_replaced(tmp_path: Pat
     path, run = tmp_path / "load.csv", tmp_path / "run"
     _csv(path, 100)
     arguments = (str(path), "--follow", "--record", str(run), "--set", "excitation_timeout=3600")
-    # not the handler of a `nohup` around the tests
+    # the default, not the handler of a `nohup` around the tests
     with _live(*arguments, preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL)) as live:
         live.until_count("samples_used", 100)
         text = "".join(",".join(map(repr, _row(index))) + "\n" for index in range(100, 200))
@@ -506,7 +506,7 @@ def test_a_file_is_followed_while_it_grows_and_when_it_is_replaced(tmp_path: Pat
         path.write_text("t,fx,fy,m\n" + "".join(",".join(map(repr, _row(index))) + "\n" for index in range(200, 300)))
         values = live.until_count("samples_used", 300)
         assert values["samples_in"] == "300"
-        assert live.stop(signal.SIGHUP) == 0  # as from a closed terminal
+        assert live.stop(signal.SIGHUP) == 0  # as if the terminal were closed
     report = replay(run)
     assert (report.samples, report.exit_code) == (300, 0)
 
@@ -517,7 +517,7 @@ def test_an_alarm_is_reported_once_with_value_pad_threshold_and_time_and_acknowl
     # a socket needs a short path, and the folders of tests have long paths
     path, control = _csv(tmp_path / "load.csv", 5000), Path(tempfile.mkdtemp(dir="/tmp")) / "twin.socket"
     control.touch()
-    assert run_cli(["live", str(path), "--control", str(control)]) == 1  # the existing file is not a twin's socket
+    assert run_cli(["live", str(path), "--control", str(control)]) == 1  # this file exists and is not a twin's socket
     assert "cannot be a socket" in capsys.readouterr().err
     control.unlink()
     thresholds = ("--set", "alarm_force=[20e3,1e9]", "--set", "alarm_duration=0.002")
@@ -542,7 +542,7 @@ def test_an_alarm_is_reported_once_with_value_pad_threshold_and_time_and_acknowl
             ("a\x1b[2Jb", "got 'a\\x1b[2Jb'"),
         ):
             assert run_cli(["call", str(control), "mark", text]) == 2 and got in capsys.readouterr().err
-            assert call(control, "mark", text) == (False, mark_problem(text))  # any other program can call it too
+            assert call(control, "mark", text) == (False, mark_problem(text))  # other programs can call the socket too
         for place, kind in ((path, "a file"), (tmp_path, "a folder"), (tmp_path / "none", "nothing there")):
             assert run_cli(["call", str(place), "mark", "x"]) == 1
             assert f"got {kind}, expected the socket that plow-twin live --control" in capsys.readouterr().err
@@ -573,9 +573,7 @@ def test_files_with_dates_are_waited_for_and_followed_from_one_to_the_next(
         with days[1].open("a") as before:
             days[2].write_text("t,fx,fy,m\n" + text(150, 200))
             live.until_count("samples_used", 150)
-            before.write(
-                text(100, 150)
-            )  # the writer released the file late, so these rows are late: the motion is corrected
+            before.write(text(100, 150))  # the writer wrote these rows late, so the motion is corrected
         values = live.until_count("samples_used", 200)
         assert (values["samples_in"], values["rolled_back"]) == ("200", "50")
         assert live.stop() == 0
@@ -643,7 +641,7 @@ def test_lines_on_standard_input_are_taken_and_silence_is_held(tmp_path: Path) -
         assert (values["samples_used"], values["dropped_malformed"]) == ("100", "2")
         live.process.stdin = None
         live.process.communicate(timeout=60.0)
-        assert live.process.returncode == 3  # two lines were not used
+        assert live.process.returncode == 3  # exit code for a loss: two lines were not used
     report = replay(tmp_path / "run")
     assert (report.samples, report.exit_code) == (100, 0)
 
@@ -715,9 +713,10 @@ def test_nothing_lives_longer_than_the_time_remembered_but_the_index_of_the_reco
     finally:
         tracemalloc.stop()
     (_, _, _), (objects, size, before), (more, larger, after) = found
-    # for 8,000 samples and 25,000 messages; the number of objects for the last seconds varies by some hundred
+    # between these points 8,000 samples and 25,000 messages pass; the number of objects for the last seconds varies by
+    # some hundreds
     assert more - objects < 800 and larger - size < 100_000, found
-    # about 140 B for each chunk, 2 MB an hour, until the part ends
+    # the index takes about 140 B for each chunk, 2 MB an hour, until the part ends
     assert 0 < after - before < 20_000
     figures = front.parts()["input"][2]
     assert int(figures["samples_used"]) == int(figures["samples_in"]) and int(figures["rolled_back"]) > 0

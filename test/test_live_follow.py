@@ -143,7 +143,7 @@ class Live:
         return np.concatenate([one.rows[name] for one in self.published])
 
     def clearance(self) -> Array:
-        """Return the clearances that were published last, each with its interval points, shape (2, 3)."""
+        """Return the clearances that were published last, each with the ends of its interval, shape (2, 3)."""
         slow = next(one.slow for one in reversed(self.published) if len(one.slow))
         told = dict(zip(CLEARANCE_NAMES, slow["clearance"][-1].tolist(), strict=True))
         return np.array([[told[f"{axis}{end}"] for end in ("", "/p05", "/p95")] for axis in ("horizontal", "vertical")])
@@ -169,7 +169,7 @@ def test_an_estimate_that_stands_is_taken_over_and_undone_when_it_is_withdrawn(t
     # a single twin forgets its pose within some load periods; steered twins were at the machine's pose
     first, most, above = (150, 0.2, 1.3) if how == "parameters" else (50, 0.03, 1.1)
     assert _error(live.column("force")[first:], fine[3000::10][first : len(live.column("force"))]) < most
-    # no change in between looks like an impact
+    # the adoption of the estimate does not look like an impact
     assert (live.column("peak").max(axis=0) < above * fine[2900:].max(axis=0) + 2e3).all()
     assert (live.column("followed") == WITH_INTERVALS).all() == (how == "full")
     live.take([_known(truth, State.WITHDRAWN), *_in_turn(truth, 6.0, 6.3)])
@@ -284,7 +284,7 @@ def test_late_samples_and_poses_end_in_the_bits_of_those_in_order_and_replay_giv
     entries = [*_in_turn(truth, 0.0, 1.0), _known(truth), *_in_turn(truth, 1.0, 2.0)]
     ordered, late = Live(truth.nominal), Live(truth.nominal)
     ordered.take(entries)
-    # samples, and the poses behind them, are late by up to 0.3 s, some of them past the estimate
+    # samples come up to 0.3 s late, some after the estimate, so that poses act late too
     rng = np.random.default_rng(1)
 
     def due(place: int) -> float:

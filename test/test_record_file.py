@@ -179,7 +179,7 @@ def test_a_file_cut_anywhere_gives_its_content_before_the_cut(run: Run, tmp_path
         cut_file.write_bytes(data[:cut])
         reader = RunReader(cut_file)
         records = list(reader)
-        # journal and outputs are in separate chunks; of each, a whole beginning is left
+        # journal and outputs are in separate chunks; the records that are left of either are its first ones
         for kind in (EntryRecord, OutputRecord):
             found = [record for record in records if isinstance(record, kind)]
             assert found == [record for record in whole if isinstance(record, kind)][: len(found)]

@@ -147,7 +147,8 @@ def test_the_estimates_folder_calibration_and_setup_take_parquet(
     np.testing.assert_array_equal(found[0].poses, found[1].poses)
     assert len(found[0].load) == 200 and np.isnan(found[0].poses[:, 2]).all() and not found[0].unreadable
     (tmp_path / "c" / "load.csv").rename(tmp_path / "c" / "excitation.csv")
-    with monkeypatch.context() as patched:  # of too many rows the newest stay, and the others are counted
+    # if there are too many rows, the newest are kept, and the others are counted
+    with monkeypatch.context() as patched:
         patched.setattr(measured, "MOST_ROWS", 50)
         newest = read_measured(tmp_path / "p", Path("paper")), read_recording(tmp_path / "c", Path("paper"))
     for one in newest:

@@ -158,7 +158,7 @@ def test_a_repair_keeps_every_old_file_and_lists_every_part(tmp_path: Path) -> N
     old = [parts[1].read_bytes()[:-1000]]
     for _ in range(2):  # the file is cut, repaired and cut again
         parts[1].write_bytes(old[-1])
-        assert repair(parts[1]) == [parts[1]]  # a single part of several
+        assert repair(parts[1]) == [parts[1]]  # this is one part of several
         assert listed_parts(run.folder) == [part.name for part in parts]
         old.append(parts[1].read_bytes()[:-2000])
     kept = [parts[1].with_name(f"{parts[1].name}.damaged{ending}") for ending in ("", "_2")]
@@ -341,7 +341,7 @@ def test_a_part_that_is_not_there_is_counted_and_no_load_drawn_over_its_hole(whi
         (run.folder / "metadata.yaml").unlink(missing_ok=True)
     assert found.input["samples_used"] == report.samples < COUNT
     times = np.diff(found.predictions[0].series()[0])
-    assert times.max() == 1_000_000  # the rows are of one stretch
+    assert times.max() == 1_000_000  # no rows are missing in between
     assert found.predictions[0].loads.duration_s < whole.predictions[0].loads.duration_s
 
 

@@ -198,7 +198,7 @@ def test_after_a_damaged_chunk_nothing_is_claimed(run: Run, tmp_path: Path) -> N
     for start, length in spans:  # the chunks of the journal, and of the sent messages
         data = bytearray(run.file.read_bytes())
         middle = start + length // 2
-        # a single flipped bit may be in a reference, and lead to other bytes that are equal
+        # one flipped bit in the compressed data may refer to other bytes that are equal, so several bytes are changed
         data[middle : middle + 8] = bytes(byte ^ 0xFF for byte in data[middle : middle + 8])
         damaged = tmp_path / "damaged.mcap"
         damaged.write_bytes(data)

@@ -296,7 +296,8 @@ def test_the_scene_s_loads_follow_a_clock_that_is_paused_looped_and_fast(tmp_pat
         for _ in range(3):  # while paused, three reports show no motion
             probe.figures("output")
         assert len(forces) == count and probe.figures("state")["resets"] == "0"
-        for second in range(1, 8):  # one message a second of the head, each after the previous answer
+        # one message for each second of the head, each after the answer to the message before
+        for second in range(1, 8):
             reach(T0 + second * 1000 * MS)
         assert probe.figures("state")["resets"] == "0"
         reach(T0)  # the clock starts from the beginning again

@@ -363,7 +363,7 @@ def test_a_delay_that_rises_for_good_is_worked_in_marked_and_replayed_exactly(tm
         # the model is so far ahead that the next sample is late even if it is sent at once
         probe.until(lambda: quality and stamp_ns(quality[-1].header) > T0 + 350 * MS, "advances without a sample")
         assert tuple(quality[0].name) == ("held", "corrected")
-        for index in range(300, 600):  # from now on all samples are late by as much
+        for index in range(300, 600):  # from now on all samples are late by the same time
             send(T0 + index * MS, wrench[index])
             probe.pace(index)
         probe.until(lambda: forces and stamp_ns(forces[-1].header) > T0 + 700 * MS, "silence again")
@@ -373,7 +373,7 @@ def test_a_delay_that_rises_for_good_is_worked_in_marked_and_replayed_exactly(tm
     assert 1 <= int(figures["rolled_back"]) < 300  # the first batch is late; later batches are on time again
     marks = [tuple(message.position) for message in quality]
     turns = [mark for mark, _ in itertools.groupby(marks)]
-    # a busy machine may be silent once more in between
+    # on a busy machine there may be another silence in between
     assert turns[:2] == [(1.0, 0.0), (0.0, 1.0)] and (0.0, 0.0) in turns and turns[-1] == (1.0, 0.0)
     held = {stamp_ns(message.header) for message in quality if message.position[0]}
     series = _offline(replace(PAPER, wear=WEAR), [T0 + index * MS for index in range(600)], np.array(wrench))

@@ -43,7 +43,7 @@ def test_other_topics_come_into_the_run_s_folder_with_their_types(tmp_path: Path
             recorder = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=stream, text=True)
         try:
             probe.until(lambda: camera.get_subscription_count() == 1, "the recorder")
-            # a publisher with a weaker offer comes later; both are received, and no message twice
+            # a publisher with a weaker QoS starts later; the messages of both are received, and none twice
             best_effort = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
             weak = probe.node.create_publisher(PoseStamped, "gauge", best_effort)
             probe.until(lambda: weak.get_subscription_count() == 1, "a subscription that the weaker publisher matches")

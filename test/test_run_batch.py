@@ -114,7 +114,7 @@ def test_one_sample_a_call_a_pause_and_a_restored_snapshot_change_no_bit() -> No
 # friction compiles kernels that no other test has
 @pytest.mark.parametrize("friction", [None, pytest.param(Friction(0.2, 0.02), marks=pytest.mark.stress)])
 def test_members_may_lack_terms_that_others_have(friction: Friction | None) -> None:
-    """One member has wear, and friction, which are zero in the other."""
+    """One member has wear and friction; both are zero in the other member."""
     plain = preset("paper")
     scenes = [plain, dataclasses.replace(plain, friction=friction, wear=Wear(1e-9, 0.015, 2.0))]
     wrench = samples(1)[0]

@@ -126,7 +126,7 @@ def test_a_twin_stops_at_its_limits_where_its_last_advance_ended() -> None:
         if name == "scene":
             assert late.time == len(part) == 0 and late.digest() == Twin(BENCH).digest()
             continue
-        # it can continue as if no more had been requested
+        # the twin can continue as if only these rows had been requested
         assert 0 < len(part) < len(times) and late.time == times[len(part) - 1] == stop.value.time_s
         assert np.array_equal(part.q, whole.q[: len(part)])
         late._pace.max_wall_s = np.inf

@@ -56,7 +56,7 @@ def test_stiffness_over_ten_decades(stiffness: float, n: float) -> None:
 @pytest.mark.parametrize("mass", [10.0**k for k in range(-1, 6)])
 @pytest.mark.parametrize("e", [0.0, 0.5, 1.0])
 def test_mass_and_restitution_over_their_range(mass: float, e: float) -> None:
-    """The rebound speed is e times the impact speed for every mass; at e = 0 the limit of the damping leaves 1/1000."""
+    """The rebound speed is e times the impact speed for every mass; the damping's limit makes it 1/1000 at e = 0."""
     contact = Contact("exact_restitution", 1e8, 1.5, restitution=e)
     result = simulate(wall_and_point(contact, speed=0.5, mass=mass), 1.0, tol=1e-10)
     assert result.v[-1, 1] / 0.5 == pytest.approx(max(e, 1e-3), rel=1e-3)

@@ -80,8 +80,8 @@ def draw(rng: np.random.Generator) -> Scene:
     )
 
 
-#: Directions of the harmonics and terms of the law. Each combination compiles its own kernels; these have every value
-#: once.
+#: Directions of the harmonics and terms of the law. Each combination compiles its own kernels; these few contain every
+#: value.
 SOME = {(0, None, None), (0, 1, None), (1, 1, None), (2, None, 1)}
 
 
@@ -131,7 +131,7 @@ def _check_beside_the_loop(seed: int, count: int, some: bool) -> None:
         alone = simulate(scene, 0.7, 0.02, tol=1e-12)
         error = pose_error(scene, many.q[index], alone.q)
         if error > 1e-9:
-            # the scene amplifies rounding errors, also between two single runs
+            # the scene amplifies rounding errors, which makes two runs of the single loop differ too
             assert error < 300.0 * pose_error(scene, simulate(scene, 0.7, 0.02, tol=1e-11).q, alone.q), index
             continue
         close += 1

@@ -26,7 +26,7 @@ from plow_twin.solve.compiled_scene import compile_scene
 
 #: Largest number of steps of a request; a longer request ends with a status.
 BUDGET = 20_000
-#: Number of steps after which a run is long enough.
+#: Number of steps after which a run ends.
 ENOUGH = 100_000
 
 

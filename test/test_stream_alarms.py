@@ -45,7 +45,7 @@ def test_an_alarm_comes_after_its_duration_goes_below_its_hysteresis_and_stays_l
     assert _levels(alarms) == (Level.WARN, Level.WARN)
     _changes(alarms, _publication(5, 94.0))
     assert _levels(alarms) == (Level.NONE, Level.WARN)
-    # a level that is too short raises no alarm, and a level without samples is no evidence
+    # a level that lasts too short a time raises no alarm, and a level without samples is no evidence
     _changes(alarms, _publication(6, 300.0))
     _changes(alarms, _publication(7, 0.0))
     for stamp in range(8, 20):
@@ -59,7 +59,7 @@ def test_an_alarm_comes_after_its_duration_goes_below_its_hysteresis_and_stays_l
     _changes(alarms, _publication(30, 150.0))
     assert alarms.acknowledge() == ["force"] and _levels(alarms) == (Level.WARN, Level.WARN)
     raised = alarms.alarms["force"].raised
-    # value and threshold of the level that was left
+    # value and threshold belong to the level that was left
     assert raised is not None and (raised.value, raised.threshold) == (300.0, 100.0)
 
 

@@ -134,7 +134,8 @@ def test_disagreements_are_listed(study: PaperStudy) -> None:
 
 
 def test_a_second_reconstruction_gets_its_own_verdicts(study: PaperStudy) -> None:
-    # with other signs of loads and arms, and another contact, the scene fits the forces at a and b, but one trend less
+    # with other signs of loads and arms, and another contact, the scene fits the forces at a and b, but misses one more
+    # trend
     scene = preset("paper")
     fx1, fx2, fx3, fy = scene.loads
     loads = (
@@ -192,7 +193,7 @@ def test_published_forces_are_those_of_the_calibration_s_targets() -> None:
 def test_a_set_counts_from_five_milliseconds_on() -> None:
     timeline = [Hold(0.0, 1.0, ""), Hold(1.0, 1.004, "a"), Hold(1.004, 1.010, "ab"), Hold(1.010, 1.014, "a")]
     figures = paper_sets.figures(timeline)
-    assert (figures["a"].count, figures["ab"].count) == (0, 1)  # twice 4 ms are not 5 ms
+    assert (figures["a"].count, figures["ab"].count) == (0, 1)  # two stretches of 4 ms do not make one of 5 ms
     assert figures["a"].share == pytest.approx(8 / 14)
     distance, hold = paper_sets.nearest(timeline, 1.009, "a") or (None, None)
     assert distance == pytest.approx(0.001)

@@ -133,7 +133,7 @@ def test_every_force_of_the_instant_shown_has_its_arrow_and_its_value_inside_the
     of_run, at_stamp = (float(number) for number in re.findall(r"([\d.]+) kN", section.get_title()))
     assert max(float(text.get_text().split()[0]) for text in values) == pytest.approx(at_stamp, abs=0.51)
     peaks = max(max(m.effort) for topic, m in run.outputs if topic == "/contact_peaks" and isinstance(m, JointState))
-    assert of_run == pytest.approx(peaks / 1e3, abs=0.051) and of_run > at_stamp  # equal to the other views
+    assert of_run == pytest.approx(peaks / 1e3, abs=0.051) and of_run > at_stamp  # the other views show the same peak
     assert 1 <= len(values) <= PAIR_COUNT
     x, y = sorted(section.get_xlim()), sorted(section.get_ylim())
     for text in values:

@@ -414,7 +414,8 @@ def test_the_lane_of_contact_sets_has_room_in_a_low_window() -> None:
     curves = blueprint.root_container.contents[1]
     names = [getattr(part, "name", None) for part in curves.contents]
     share = curves.row_shares[names.index("Corners that carry force")] / sum(curves.row_shares)
-    # curves have 555 of 620 pixels; title, time axis, name and lane take 87, as drawn in a window of 1000 x 620
+    # as drawn in a window of 1000 x 620, the curves have 555 of the 620 pixels, and the lane needs 87 with title, axis
+    # and name
     assert share * 555.0 > 87.0
 
 
@@ -422,14 +423,15 @@ def test_the_legends_of_the_clearance_are_not_cut_in_a_low_window(
     view: tuple[ViewSummary, dict[str, pa.Table]],
 ) -> None:
     curves = layout.blueprint(Section.of(load_scene(scene_path("paper"))), 3.0).root_container.contents[1]
-    height = curves.row_shares[-1] / sum(curves.row_shares) * 555.0 - 46.0  # without title and axis
+    height = curves.row_shares[-1] / sum(curves.row_shares) * 555.0 - 46.0  # without the 46 pixels of title and axis
     for group in ("growth", "clearance"):
         names = {
             name
             for entity, name in curve_names(view[0].path).items()
             if entity.startswith(f"/{group}/") and not entity.endswith(("/p05", "/p95"))
         }
-        # a line takes 23 pixels, and of equal names only one is shown; with 94 of 112 pixels the last line was cut
+        # each line of a legend takes 23 pixels, and equal names share a line; a legend of 94 pixels in a plot of 112
+        # lost its last line
         assert names >= {"horizontal", "vertical"} and 23 * len(names) + 2 < 0.77 * height
 
 
