@@ -44,7 +44,8 @@ from plow_twin.solve.method.rest import slow_enough
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, Status, X, Y
 from plow_twin.solve.step import LONGEST_STEP
 
-#: Number of steps to a sample after which rest is checked under a constant load; the check costs as much as they do.
+#: If the way to a sample takes more than this number of steps, rest is checked under a constant load; the check costs
+#: as much as these steps.
 _MAY_REST: Final = 32
 #: A term has vanished if it is below this share of the admissible size of the last order (`method.series`).
 _VANISHED: Final = 0.4
@@ -63,11 +64,12 @@ class Samples(NamedTuple):
     saved: NDArray[np.void]  #: states at the sample before, by lane, shape (8,)
     totals: NDArray[np.void]  #: counts of touches since the sample before, by lane, shape (8,)
     times: NDArray[np.float64]  #: times of the samples in s, shape (n,)
-    wrench: NDArray[np.float64]  #: per mass and inertia, beginning with the last sample before, shape (m, n + 1, 3)
+    #: load per mass and inertia, beginning with the last sample before, shape (m, n + 1, 3)
+    wrench: NDArray[np.float64]
     rows: NDArray[np.void]  #: rows to fill, shape (m, n)
     place: NDArray[np.int64]  #: number of samples that each twin has passed, shape (m,)
     queue: NDArray[np.int64]  #: numbers of the twins that wait for a lane
-    progress: NDArray[np.int64]  #: number of twins taken from the queue; number that left for another method
+    progress: NDArray[np.int64]  #: number of twins taken from the queue; number of twins that left for another method
     other: NDArray[np.int64]  #: numbers of the twins that left for another method, shape (m,)
 
 

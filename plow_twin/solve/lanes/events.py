@@ -25,13 +25,14 @@ from plow_twin.solve.lanes.record import (
 )
 from plow_twin.solve.state import CLIPPED, COS, OFF, ON, SIN, X, Y
 
-#: Events are simultaneous if they are closer than this share of the step before them.
+#: Two events are simultaneous if the time between them is less than this share of the step before them.
 _AT_ONCE = 1e-12
-#: The search of a root ends if its relative change is below `_FOUND` and the curvature's part in it below `_STRAIGHT`,
+#: The search for a root ends if its relative change is below `_FOUND` and the curvature's part in it below `_STRAIGHT`,
 #: because the next change would be of the order of its cube, or if the change is a rounding error (`_ROUNDED`).
 _FOUND, _STRAIGHT, _ROUNDED = 1e-6, 1e-3, 2e-16
 _MOST_CHANGES = 80
-#: Factor on the step beyond which a root found over a longer step lies surely after the step, in spite of rounding.
+#: A root found over a longer step is surely beyond the present step, in spite of rounding, if it exceeds this multiple
+#: of the step.
 _SURELY_LATER = 1.0 + 1e-9
 #: Rows of `lanes.chosen` after the rows of a penetration.
 _DEPTH, _RATE, _CONSTANT = 5, 6, 7
@@ -281,7 +282,7 @@ def first_events(states, lanes, w, order, full, hysteretic) -> None:
     for lane in range(WIDTH):
         lanes.event[lane] = -1
     _list_guards(lanes, order, hysteretic)
-    # every round searches at least one guard of each lane that has any
+    # every round searches at least one guard of each lane that still has guards to search
     for at in range(GUARDS):
         lanes.rounds[0] = at
         count = _choose_guards(lanes, at, hysteretic)
@@ -356,7 +357,7 @@ def _other_mode(mode):
 
 @kernel()
 def _ends_with(guard, order, at, within):
-    """Return a bit for each lane whose guard turns negative at most `within` after `at`."""
+    """Return a bit for each lane whose guard turns negative no later than `within` after `at`."""
     value, slope, zero = exact_row(guard, order), exact_splat(0.0), exact_splat(0.0)
     for k in range(order - 1, -1, -1):
         slope = fused(slope, at, value)

@@ -20,8 +20,8 @@ WIDTH: Final = 8
 COMPONENTS: Final = 8
 #: Indices of the moment's factors of cosine, sine, X and Y.
 DC, DS, DX, DY = range(4)
-#: Numbers of guards: first guards of the eight pairs from 0, second guards from `SECOND`, and from `AGAIN` guards of
-#: pairs that part within the step and may touch again.
+#: Numbering of guards: from 0 the first guards of the eight pairs, from `SECOND` their second guards, from `AGAIN` the
+#: guards of pairs that part within the step and may touch again.
 SECOND: Final = PAIR_COUNT
 AGAIN: Final = 2 * PAIR_COUNT
 GUARDS: Final = 3 * PAIR_COUNT
@@ -45,16 +45,18 @@ LANES: Final = np.dtype(
         ("arms", "f8", (PAIR_COUNT, 2, WIDTH)),  # arm: factors of cosine and sine
         ("ratio", "f8", _PAIRS),  # C / K of pairs that are on
         ("factor", "f8", _PAIRS),  # lambda
-        ("gear", "f8", (PAIR_COUNT, 8, WIDTH)),  # of each slot's pairs: rows, arms, lambda
-        ("chosen", "f8", (8, WIDTH)),  # guards of a round: rows, factors of d and d', further constant
-        ("along", "f8", (2, 6, WIDTH)),  # forces along X and Y: factors of c, s, X or Y and of their rates
-        ("turn", "f8", (2, 8, WIDTH)),  # moment's factors of c and s: factors of c, s, X, Y and of their rates
+        ("gear", "f8", (PAIR_COUNT, 8, WIDTH)),  # factors of each slot's pairs: rows, arms, lambda
+        # guards of a round: the penetration's rows, factors of d and d', a further constant
+        ("chosen", "f8", (8, WIDTH)),
+        ("along", "f8", (2, 6, WIDTH)),  # forces along X and Y: factors of c, s, X or Y, and of the rates of these
+        # factors of c and s in the moment: their factors of c, s, X, Y and of the rates of these
+        ("turn", "f8", (2, 8, WIDTH)),
         ("constant", "f8", (3, WIDTH)),
         ("slope", "f8", (3, WIDTH)),  # sampled loads: slope from the last sample to the next sample
         ("sample", "f8", (3, WIDTH)),  # sampled loads: the last sample
         ("held", "f8", (3, WIDTH)),  # load at the step's start, including the constant loads
         ("knot", "f8", _LANES_OF),  # time of the last sample
-        ("small", "f8", _LANES_OF),  # size of a term over the longest wanted step below which it has vanished
+        ("small", "f8", _LANES_OF),  # a term over the longest wanted step has vanished below this size
         ("direction", "f8", (4, WIDTH)),
         ("inverse_mass", "f8", _LANES_OF),
         ("inverse_inertia", "f8", _LANES_OF),
@@ -65,9 +67,9 @@ LANES: Final = np.dtype(
         ("half_cavity", "f8", _LANES_OF),
         ("y", "f8", (COMPONENTS, WIDTH)),  # state at the step's start
         ("change", "f8", (COMPONENTS, WIDTH)),  # change of the state over the step
-        ("gained", "f8", (2, WIDTH)),  # of one slot: impulse over the step, peak
+        ("gained", "f8", (2, WIDTH)),  # one slot: impulse over the step, peak
         ("sum", "f8", (4, WIDTH)),  # integrals over the step of the changes of cosine, sine, X, Y
-        ("harmonic", "f8", (10, WIDTH)),  # of one load: frequency, sine, cosine, amplitudes of S1, S2, M; phase
+        ("harmonic", "f8", (10, WIDTH)),  # one load: frequency, sine, cosine, amplitudes of S1, S2, M; phase
         ("size", "f8", (2, WIDTH)),  # the terms of the last two orders, as velocities
         ("step", "f8", _LANES_OF),  # step size in s
         ("accurate", "f8", _LANES_OF),  # step size without events
@@ -113,7 +115,8 @@ LANES: Final = np.dtype(
 )
 
 
-#: Terms that lanes can compute: damping of a force with exponent 1, harmonic loads, and the terms of flight and rest.
+#: Terms that a scene in lanes may have: damping of a force with exponent 1, harmonic loads, flight and rest. For a step
+#: of flight or rest the scene leaves its lane.
 _COVERED: Final = {"harmonics", "second", "viscous", "hysteretic", "flight", "rest"}
 
 

@@ -11,7 +11,8 @@ from plow_twin.solve.lanes.record import COMPONENTS, WIDTH, linear_at, penetrati
 from plow_twin.solve.state import COS, SIN, X, Y
 from plow_twin.solve.totals import add_set_times
 
-#: Allowances for rounding: factor on the upper bound of a force, and between a peak and the maximum.
+#: Allowances for rounding: a factor on the upper bound of a force, and the largest ratio of a maximum to a peak that
+#: counts as equal to it.
 _ROUNDED, _SAME = 1.0 + 1e-9, 1.0 + 1e-12
 
 
@@ -52,7 +53,7 @@ def add_step(totals, lanes, w, order, full, viscous, hysteretic) -> None:
     """
     last = order - 1
     if totals is None and hysteretic is None:
-        # under samples the series of a lane may end earlier, and its guard then has one more term
+        # under samples a lane's series may end earlier than the others, and its guard then has one more term
         last = order
     for slot in range(PAIR_COUNT):
         taken = lanes.taken[slot]
