@@ -43,7 +43,7 @@ _FINE = 1e-3
 _COMMON_DEPTH = 8e-3
 #: Largest component of the pose (rad or m) of a head that has not passed through a wall.
 _LARGEST_TURN = 0.6
-#: States in which the estimated clearance is published; an interval below `USEFUL_M` is useful.
+#: States in which the estimated clearance is published; its interval is useful if it is narrower than `USEFUL_M`.
 PUBLISHED = {"estimated", "rough"}
 USEFUL_M = 4e-3
 

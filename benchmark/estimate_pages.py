@@ -39,7 +39,7 @@ TRUTHS: dict[str, tuple[tuple[int, int], ...]] = {
     "hard_shape": ((50000, 6),),
     "hard_kelvin_voigt": ((50000, 23), (54000, 10), (60000, 30)),
 }
-#: Largest RMSE [mm] that each group should have.
+#: Target of each group for the RMSE of the clearances [mm].
 ASKED = {"plain": 0.05, "sensor": 0.06, "stochastic": 0.06, "middle": 0.05, "firm": 0.05, "hard": 0.1}
 _LEVEL = 0.95
 

@@ -56,7 +56,7 @@ class Group:
     shift_m: float = 0.0
     stuck: bool = False
     noisier: float = 1.0
-    #: scale of the sensor, measured over true value of x, y, theta
+    #: scales of the sensor: measured divided by true value of x, y, theta
     sensor_scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
     #: wear coefficient of the truth; the estimate assumes no wear
     wear_m2_n: float = 0.0

@@ -157,7 +157,7 @@ def prepare_batch(p: Array, clearances: Array, tol: float, output_dt: float) -> 
     grid = np.arange(round(T_END / output_dt) + 1) * output_dt
     grids = np.ascontiguousarray(np.repeat(grid[:, None], width, axis=1))
     groups = -(-len(clearances) // width)
-    # the last batch is filled up with the last pair
+    # the last batch is filled up with copies of the last pair
     filled = np.concatenate([clearances, np.repeat(clearances[-1:], groups * width - len(clearances), axis=0)])
     poses = np.zeros((len(grid), 3, len(filled)))
 

@@ -32,7 +32,7 @@ from typing import Any, NamedTuple
 ROOT = Path(__file__).resolve().parent.parent
 NS_PER_S = 1_000_000_000
 PERIOD_S = 10.0
-#: Length of the window of an estimate [s].
+#: Time [s] after which the first window of an estimate has been formed.
 FORMED_S = 34.0
 
 
@@ -188,7 +188,7 @@ def measure(answerer: list[str], rate_hz: float, seconds: float) -> dict[str, fl
             probe.spin(lambda: sender.poll() is not None, seconds + 30.0)
             share = (_cpu_s(process_id) - busy) / (time.monotonic() - begin)
         finally:
-            sender.kill()  # otherwise it would go on and send to the subscriber of the next case
+            sender.kill()  # otherwise the publisher would go on and send to the subscriber of the next case
             sender.wait()
         figures.pop("samples_used", None)
         if "published" in figures:

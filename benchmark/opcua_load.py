@@ -31,7 +31,7 @@ PUBLISHING_MS, QUEUE = 10.0, 10_000
 #: Time without a value after which the bare client ends [s].
 SILENCE_S = 3.0
 MAP = "excitation: {fx: {node: ns=2;s=Load.Fx}, fy: {node: ns=2;s=Load.Fy}, m: {node: ns=2;s=Load.M}}\n"
-#: Targets: largest age at the 99th percentile [ms], largest share of a core.
+#: Targets: largest 99th percentile of the age [ms], largest share of a core.
 MOST_AGE_MS, MOST_CORE = 15.0, 0.5
 
 

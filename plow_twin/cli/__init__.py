@@ -53,7 +53,8 @@ def _ending_at_once() -> Iterator[None]:
         os.write(2, b"plow-twin: interrupted\n")
         os._exit(1)
 
-    ours = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # neither ignored nor handled by the caller
+    # the caller neither ignores nor handles Ctrl-C
+    ours = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     if not ours or threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -69,7 +69,7 @@ def analyse(
         Task(path, scene_file, mapping, further, folder, beside, units)
         for path, folder in zip(found, folders, strict=True)
     ]
-    for task in tasks:  # before any task removes a file
+    for task in tasks:  # all tasks are checked before any task removes a file
         task.check(found)
     results = _run(tasks, workers or os.cpu_count() or 1, dask, quiet) if many else [_alone(tasks[0], quiet)]
     if many and out is not None:
@@ -152,7 +152,7 @@ def _watch(task: Any, every: float, as_json: bool, quiet: bool) -> dict[str, Any
             sys.stdout.flush()
         else:
             _show([facts], False, False, quiet)
-        # so that summing up a long run takes at most a tenth of the time
+        # the pause is so long that summing up a long run takes at most a tenth of the time
         due = time.monotonic() + max(every, 9.0 * (time.monotonic() - begin))
 
     with interruptible() as stopped:

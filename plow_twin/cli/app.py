@@ -33,7 +33,7 @@ from plow_twin.cli.telemetry import telemetry
 from plow_twin.cli.view import view
 from plow_twin.errors import ExcessError, InputError, PlowTwinError, RunInterrupted, UnitError
 
-#: Extra of the package that installs a module.
+#: For each module, the extra of the package that installs it.
 EXTRA_OF_MODULE: Final = {
     "rclpy": "ros",
     "rcl_interfaces": "ros",
@@ -116,7 +116,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run the command line and leave with its exit code."""
     code = run(arguments)
     if threading.current_thread() is threading.main_thread():
-        # the work is done, and a second signal, from terminal and launch at once, would change the exit code
+        # the work is done; a second signal would change the exit code, and a terminal and a launch may each send one
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, signal.SIG_IGN)
     try:

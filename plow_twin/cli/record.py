@@ -41,7 +41,8 @@ def record(
         raise click.BadParameter(
             f"got {exclude!r}, expected a regular expression: {error}", param_hint="--exclude"
         ) from None
-    os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)  # ROS from wheels: folder of message definitions
+    # with ROS from wheels, the folder of the message definitions
+    os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)
     from plow_twin.cli.interruption import interruptible
     from plow_twin.record.reader import RunReader
     from plow_twin.record.running import running_run

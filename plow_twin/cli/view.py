@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from plow_twin.view.rrd import ViewSummary
 
 
-#: Largest factor of the drawn clearance; a larger factor would draw the cavity far from the frame.
+#: Largest factor by which the drawing enlarges the clearance; a larger factor would draw the cavity far from the frame.
 _MOST_EXAGGERATED = 1e4
 
 
@@ -208,8 +208,8 @@ def _serve(file: Path, port: int) -> int:
     command = [program, str(file), "--serve-web", "--bind", LOOPBACK, "--port", str(data_port)]
     click.echo(f"serving until interrupted: {page_address(port, data_port)}")
     sys.stdout.flush()
-    # this replaces the process, so that signals reach the server; errors only, because the program prints the address
-    # of the light theme, in which labels cannot be read
+    # this replaces the process, so that signals reach the server; only errors are logged, because the program would
+    # print the address of the light theme, in which labels cannot be read
     os.execve(program, [*command, "--web-viewer-port", str(port)], {"RUST_LOG": "error", **os.environ})
 
 

@@ -39,7 +39,8 @@ WALLS: Final = {
     "top": (GY, np.array([0.0, 1.0])),
     "bottom": (GY, np.array([0.0, -1.0])),
 }
-#: Derived: fewest rows of a flight, one more than the three coefficients of a parabola. Bound: most rows of a fit.
+#: Derived: smallest number of rows of a flight, one more than the three coefficients of a parabola. Bound: largest
+#: number of rows of a flight that are fitted.
 _FLIGHT_ROWS: Final = (4, 9)
 #: Derived: degrees of freedom of the Student-t likelihood, the value that Lange et al. recommend.
 _FREEDOM: Final = 4.0

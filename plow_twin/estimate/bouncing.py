@@ -37,30 +37,30 @@ Array = NDArray[np.float64]
 _TURNS: Final = np.linspace(-0.16, 0.16, 81)
 _FINEST_TURN: Final = 3e-3
 _NEAR_TURNS: Final = np.linspace(-_FINEST_TURN, _FINEST_TURN, 5)
-#: Bound: most rows in the search for a bias, and in its refinement.
+#: Bound: largest number of rows in the search for a bias, and in the refinement of the bias.
 _MOST_ROWS, _MOST_NEAR_ROWS = 2000, 1200
-#: Derived: fewest rows in a part of a load period; the mean of nine values has a third of their scatter.
+#: Derived: smallest number of rows in a part of a load period; the mean of nine values has a third of their scatter.
 _FEWEST_OF_PHASE = 9
 #: Derived: delays in s that are tried for the measured path, up to two prior deviations to both sides, and for the
 #: drawn paths, up to a tenth of that. `_NO_LAG` is the index of zero delay among the delays of drawn paths.
 _LAGS_S: Final = np.linspace(-0.1, 0.1, 81)
 _OF_DRAWN_S: Final = np.linspace(-0.01, 0.01, 9)
 _NO_LAG = len(_OF_DRAWN_S) // 2
-#: Derived: distances in rows, powers of two, over which changes are taken: of pose and reach in the whole motion, and
-#: of the pose at each phase of the load.
+#: Derived: distances in rows, powers of two, over which changes are computed: the changes of pose and reach in the
+#: whole motion, and the changes of the pose at each phase of the load.
 _CHANGES: Final = (1, 2, 4, 8, 16, 32)
 _CHANGES_BY_PHASE: Final = (1, 4)
 #: Definition: paths of the frame's sides in a scene.
 _SIDES: Final = ("frame.width_m", "frame.height_m")
 #: Guard: squared scatter, in m2 or rad2, that keeps logarithms and quotients finite.
 _NO_SCATTER = 1e-14
-#: Bound: largest work for a motion, as a multiple of the work for ten load periods.
+#: Bound: largest work for a drawn motion, as a multiple of the work for ten load periods.
 _LONGER = 2.0
 #: Guard: smallest and largest penetration in m that is drawn for a hard and for a firm contact.
 _HARD_BOUNDS, _FIRM_BOUNDS = (8e-7, 6e-4), (2e-6, 2e-2)
 #: Bound: number of corrections of a draw's noise.
 _NOISE_ROUNDS = 3
-#: Derived: fewest draws for a regression with twenty features; fewest poses for a 99 % quantile.
+#: Derived: smallest number of draws for a regression with twenty features, and of poses for a 99 % quantile.
 _FEWEST, _FEWEST_WHOLE = 30, 100
 
 

@@ -25,7 +25,7 @@ from plow_twin.solve.compiled_scene import compile_scene
 
 Array = NDArray[np.float64]
 
-#: Guard: numbers beyond this are not forces [N].
+#: Guard: a number above this is not a force [N].
 _LARGEST = 1e12
 #: Bound: largest delay, and step of the delays, in s, at which measured forces and the motion's forces are compared.
 #: Derived: the largest delay is three prior deviations of a sensor's delay.

@@ -36,7 +36,7 @@ Array = NDArray[np.float64]
 _WALL: Final = np.argmax(np.stack(WALLS), axis=0)
 #: Bound: number of Gauss-Newton steps, size in m below which a step is the last, and longest step in m.
 _STEPS, _SMALL, _LONGEST = 8, 2e-5, 3e-3
-#: Guard: shortest interval of rows in s, and fewest rows in half of a test function.
+#: Guard: shortest interval between rows in s, and smallest number of rows in half of a test function.
 _SHORTEST, _FEWEST = 5e-3, 3
 #: Derived: unit of the stiffness in N/m in which its column is as large as the other columns.
 _UNIT = 1e7

@@ -51,11 +51,11 @@ MEMBERS: Final = 128
 APART_S: Final = 4e-3
 #: Bound: smallest and largest number of poses from whose quick changes the noise is computed.
 _NOISE_ROWS: Final = (20, 400)
-#: Bound: samples in one call, so that the rows of all members stay in the processor's cache.
+#: Bound: number of samples in one call, so that the rows of all members stay in the processor's cache.
 _CALL: Final = 20
 #: Definition: rate in 1/s at which the clearances are determined and published.
 _KNOWN_HZ: Final = 10.0
-#: Bound: most poses that wait for the model to reach their stamps, as many as a session keeps for going back.
+#: Bound: largest number of poses that wait for the model to reach their stamps; a session keeps as many for going back.
 _MOST_DUE: Final = MOST_MEASURED
 #: Definition: arrays for one row with and without intervals, for no digest, and for constant clearances.
 _YES: Final = np.ones(1, bool)

@@ -22,7 +22,7 @@ from plow_twin.model.pairs import PAIR_NAMES
 
 Array = NDArray[np.float64]
 
-#: Bound: most rows, about 200 a second for a window of ten load periods.
+#: Bound: largest number of rows, about 200 a second for a window of ten load periods.
 _MOST_ROWS = 6000
 #: Bound: largest number of steps; number of first steps in which predictability is probed; number of draws of a probe;
 #: reduction of the cost, within noise, below which the steps end.

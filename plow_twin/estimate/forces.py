@@ -28,13 +28,13 @@ Array = NDArray[np.float64]
 MEMBERS: Final = 256
 #: Definition: quantiles of an interval.
 POINTS: Final = (0.05, 0.5, 0.95)
-#: Derived: fewest members that have a 5 % point.
+#: Derived: smallest number of members that has a 5 % point.
 FEWEST: Final = 20
 #: Guard: smallest drawn clearance, as a share of the estimated clearance.
 _LEAST_SHARE = 0.02
 #: Derived: tolerance of the members, equal to the fit's.
 TOLERANCE: Final = tuning.TOLERANCE
-#: Bound: samples advanced in one call, so that the rows of all members stay in the processor's cache.
+#: Bound: number of samples advanced in one call, so that the rows of all members stay in the processor's cache.
 _CALL = 10
 
 

@@ -23,13 +23,13 @@ from plow_twin.model.scene import Clearance, Scene
 
 Array = NDArray[np.float64]
 
-#: Guard: numbers beyond this are not gaps [m].
+#: Guard: a number above this is not a gap [m].
 _LARGEST = 1e3
 #: Bound: number of rounds, each of which corrects the pose by the nonlinear residual.
 _ROUNDS = 4
 #: Guard: singular value of the equations below which the sensors do not determine an unknown.
 _SINGULAR = 1e-6
-#: Definition: for each clearance between facing pads, the two pairs.
+#: Definition: the two pairs of each clearance between facing pads.
 GROUPS: Final = {
     "horizontal_top": (1, 3),
     "horizontal_bottom": (7, 5),

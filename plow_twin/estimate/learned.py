@@ -22,7 +22,7 @@ from plow_twin.model.scene import Clearance, Scene
 
 Array = NDArray[np.float64]
 
-#: Bound: fewest members for each learned parameter.
+#: Bound: smallest number of members for each learned parameter.
 _MEMBERS: Final = 4
 #: Guard: largest restitution.
 _MOST_RESTITUTION = 0.999

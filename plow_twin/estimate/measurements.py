@@ -27,7 +27,7 @@ FEWEST_IN_CONTACT, FEWEST_POSES, FEWEST_FOR_SCATTER = 10, 20, 50
 RESOLVING: Final = 0.02
 #: Bound: smallest number of points between two knots over which a load is averaged.
 _FINER = 8
-#: Guard: largest possible number of a pose, in m or rad, and of a load, in N or N m.
+#: Guard: largest possible component of a pose, in m or rad, and of a load, in N or N m.
 _LARGEST_POSE, _LARGEST_LOAD = 1e6, 1e15
 
 

@@ -40,9 +40,10 @@ Rows = NDArray[np.void]
 LATEST_S: Final = 0.25
 #: Bound: smallest interval in s between kept states of the motion.
 _PATH_S: Final = 2e-3
-#: Bound: most outlying poses in a row that are ignored. A longer series is no glitch: the head has jumped.
+#: Bound: largest number of successive outlying poses that are ignored. A longer series is no glitch: the head has
+#: jumped.
 _MOST_OUTLYING: Final = 5
-#: Bound: fewest members that get other parameters at once, because a call costs as much as three members.
+#: Bound: smallest number of members that get other parameters at once, because a call costs as much as three members.
 _AT_ONCE: Final = 8
 #: Definition: all members.
 _ALL: Final = slice(None)

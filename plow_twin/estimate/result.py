@@ -30,7 +30,7 @@ class State(Enum):
 
     ESTIMATED = "estimated"
     ROUGH = "rough"  #: the machine differs from the model, or the interval is wide
-    NOT_OBSERVABLE = "not_observable"  #: the prior's value, because the motion does not determine it
+    NOT_OBSERVABLE = "not_observable"  #: the prior's value, because the motion does not determine the quantity
     PRIOR = "prior"  #: not measured
     WITHDRAWN = "withdrawn"  #: the sensor is broken, or the data contradict themselves or every motion of the model
 

@@ -28,14 +28,14 @@ class Stage:
     keep: int
 
 
-#: Derived: fewest rows within a horizon and within a swing, so that each component has more values than the six
-#: unknowns of the swing's start.
+#: Derived: smallest numbers of rows within a horizon and within a swing, so that each component has more values than
+#: the six unknowns of the swing's start.
 _FEWEST_ROWS = (8, 12)
 #: Prior: the differences of a machine whose sensor has a slow low pass and which has no other difference.
 LOW_PASS: Final = np.array([0.0] * LAG + [UNSTATED["filter"]])
 #: Bound: the rounds in which the number of candidates is reduced.
 STAGES: Final = (Stage(0.1, 4, 5), Stage(0.2, 3, 2))
-#: Bound: most swings, because the cost of a fit grows with their number.
+#: Bound: largest number of swings, because the cost of a fit grows with their number.
 _MOST_SWINGS = 350
 
 

@@ -16,7 +16,8 @@ from plow_twin.estimate.measurements import Poses, filled
 
 Array = NDArray[np.float64]
 
-#: Derived: number of rows in the parabola for the measured pose at a swing's start. A kink of a slow sensor is as long.
+#: Derived: number of rows in the parabola for the measured pose at a swing's start; a kink lasts as long in the poses
+#: of a slow sensor.
 _ROWS: Final = 7
 
 

@@ -32,7 +32,7 @@ _KNOTS = 1.0 / 3.0
 _KNOT = 0.025
 #: Bound: number of rounds of draws; each later round is drawn about the result of the previous round.
 _ROUNDS = 3
-#: Bound: fewest draws for a regression.
+#: Bound: smallest number of draws for a regression.
 _FEWEST = 40
 #: Guard: smallest drawn clearance in m.
 _LEAST_CLEARANCE = 5e-4

@@ -94,8 +94,8 @@ PROBES: Final = np.array([quantity.probe for quantity in QUANTITIES])
 #: Names in the published correlation; softness is the penetration under a force.
 CORRELATED: Final = tuple("softness" if place == SOFTNESS else QUANTITIES[place].name for place in MOVING)
 
-#: Guard: smallest and largest simulated penetration in m. All harder contacts move the head alike; softer contacts let
-#: it through the wall.
+#: Guard: smallest and largest simulated penetration in m. All harder contacts give the same motion; softer contacts let
+#: the head through the wall.
 _HARDEST, _SOFTEST = 3e-5, 0.12
 #: Guard: smallest clearance in m that is simulated.
 _LEAST_CLEARANCE = 5e-4

@@ -30,8 +30,8 @@ Array = NDArray[np.float64]
 #: A stamp in ns and the measured values.
 Row = tuple[int, tuple[float, ...]]
 
-#: Bound: most poses, and most rows of gaps, that are kept. More arrive only if the load has stopped or a clock is ahead
-#: by hours.
+#: Bound: largest number of poses, and of rows of gaps, that are kept. More arrive only if the load has stopped or a
+#: clock is ahead by hours.
 MOST_KEPT = 600_000
 
 

@@ -34,7 +34,7 @@ from plow_twin.model.scene import Scene
 
 #: Bound: interval at which queued data are sent [s].
 _SEND_S: Final = 0.05
-#: Bound: most queued items; this many items wait only if the far side has stopped reading.
+#: Bound: largest number of queued items; this many items wait only if the far side has stopped reading.
 _MOST_WAITING: Final = 1_000_000
 #: Bound: `nice` of the far side.
 _NICE: Final = 10
@@ -92,7 +92,7 @@ class Worker:
     def __init__(self, scene: Scene, windows: Windows, asked: Asked = _ESTIMATE_ALONE) -> None:
         near, far = Pipe()
         command = [sys.executable, "-m", "plow_twin.estimate.worker", str(far.fileno()), *loaded_laws()]
-        # a single thread of linear algebra takes at most one core
+        # linear algebra gets a single thread, so that it takes at most one core
         environment = os.environ | dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")
         self._process = subprocess.Popen(
             command, pass_fds=[far.fileno()], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, env=environment

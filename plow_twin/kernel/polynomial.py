@@ -17,7 +17,7 @@ from plow_twin.kernel.simd import exact_row, set_row
 
 Array = NDArray[np.float64]
 
-#: Most halvings of an interval when a root or a maximum is isolated.
+#: Largest number of halvings of an interval when a root or a maximum is isolated.
 MAX_HALVINGS: Final = 48
 
 

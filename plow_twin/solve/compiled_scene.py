@@ -502,7 +502,8 @@ def _release(scene: Scene, tol: float, length: float, speed: float) -> float:
     release = float((impulse * (exponent + 1.0) * speed / scene.contact.stiffness) ** (1.0 / (exponent + 1.0)))
     friction = scene.friction
     if friction is not None and friction.stick_stiffness_n_m is not None and friction.coefficient > 0.0:
-        # the spring of a sticking corner ends at its release, so the jump of its force must be negligible too
+        # a pair's release also ends the spring of its sticking corner, so the jump of the spring's force must be
+        # negligible too
         stretch = max(1e-3 * tol * length, 1e-15 * geometry.half_diagonal(scene))
         held = stretch * friction.stick_stiffness_n_m / friction.coefficient
         # if a corner crossed this depth in less than 1e-11 s, its series would have non-finite terms

@@ -51,7 +51,7 @@ BALANCE = np.dtype(
         ("nodes", "f8", (_NODES,)),
         ("weights", "f8", (_NODES,)),
         ("now", "f8", (SIZE,)),  # powers and forces at one instant
-        ("before", "f8", (SIZE,)),  # powers and forces one fixed step before
+        ("before", "f8", (SIZE,)),  # powers and forces at the end of the fixed step before
         ("body", "f8", (STATE_SIZE,)),  # body coordinates at a node
         ("ground", "f8", (STATE_SIZE,)),  # body coordinates relative to the ground, with a support
         ("wear_depth", "f8", (PAIR_COUNT,)),  # wear depth at a node

@@ -95,7 +95,7 @@ def grasp(p, state, pair, old) -> None:
     normal = 0.0 if old == CLIPPED else _normal_force(p, state, pair, depth)
     state.anchor[pair], state.grip[pair] = place, 0
     held = p.stick_damping * rate
-    # without a normal force any sliding is slip, as in the guard of a slip
+    # without a normal force any corner that slides slips, as by the guard of a slipping corner
     if abs(held) > p.static_friction * normal or (normal <= 0.0 and rate != 0.0):
         state.grip[pair] = 1 if rate > 0.0 else -1
 
@@ -169,10 +169,11 @@ def grip_guard(p, state, w, order, pair, side) -> int:
         sign = 1.0 if side == 0 else -1.0
         for k in range(order):
             g[k] = p.static_friction * force[k, pair] - sign * drag[k, pair]
-        # the force is clipped at 0: a pair that is on can be outside its wall by the error of the place of its touch
+        # the force is clipped at 0, because the error of the place of its touch can leave a pair that is on outside its
+        # wall
         g[0] = p.static_friction * max(force[0, pair], 0.0) - sign * drag[0, pair]
         size, noise = p.static_friction * abs(force[0, pair]) + abs(drag[0, pair]), 0.0
-        # raise the guard by the rounding error of T, otherwise a corner could slip as soon as it sticks
+        # the guard is raised by the rounding error of T, because otherwise a corner could slip as soon as it sticks
         late = _FINEST * (p.stick_stiffness * p.leverage + p.stick_damping * p.threshold[0])
     else:
         for k in range(order - 1):

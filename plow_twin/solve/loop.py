@@ -77,7 +77,7 @@ def _proceed(p, parts, state, w, totals, target, stop_time, budget) -> int:
         if code != _OK:
             return code
         low = sigma_at(state, state.elapsed)
-        # a step to a stop may end a rounding error beyond it, which must not be left for a further step
+        # a step that ends at a stop may end a rounding error beyond it; this remainder must not become a further step
         stopped = state.ends_at_stop == 1 and target >= state.stop_time
         if target < t0 + state.step_size and not stopped:
             if totals is not None:

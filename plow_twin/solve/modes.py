@@ -93,7 +93,8 @@ def _impact_speed(number, rate, energy) -> float:
     if number <= 0.0 or (energy <= 0.0 and rate == 0.0):
         return 0.0
     full = number - math.log1p(number)
-    # at its turning point (rate 0) an impact of this speed would have this energy; with a rate the impact was faster
+    # at its turning point, where the rate is 0, an impact of this speed has this energy; with a rate the impact was
+    # faster
     low = math.sqrt(number * number * energy / full)
     high = max(low, abs(rate)) * (1.0 + number)
     low = max(low, rate, -number * rate)

@@ -398,7 +398,7 @@ BOUND: Final = np.dtype(
         ("error", "f8"),  # estimated error of the advance in m, 0 if the limit was not reached
         ("z", "f8", (6, 12)),  # state, trial state and four stages, of the head and of a frame on springs
         ("load", "f8", (3,)),
-        ("pairs", "f8", (4, PAIR_COUNT)),  # penetration, rate, force, force before
+        ("pairs", "f8", (4, PAIR_COUNT)),  # penetration, rate, force, and force at the step before
     ]
 )
 
@@ -428,7 +428,7 @@ def state_type(terms: Terms) -> np.dtype[np.void]:
 
 @cache
 def _state_type(stick: bool, support: bool) -> np.dtype[np.void]:
-    # further fields come first, because numba takes a record with further fields at its end for the shorter type
+    # further fields come first, because numba takes a record with further fields at its end for the record without them
     more = (_FRAME_FIELDS if support else []) + (_GRIP_FIELDS if stick else [])
     return _in_lines([*more, *_STATE_FIELDS]) if more else STATE
 

@@ -121,7 +121,7 @@ def _implicit_type(size: int) -> np.dtype[np.void]:
             ("frame", "f8", shape),  # this frame's state, in the lanes of `w.frame`
             ("pairs", "f8", (3, STAGES, PAIR_COUNT)),  # force, law's force (of clipped pairs too), rate, at the nodes
             ("wearing", "f8", (STAGES, PAIR_COUNT)),  # rate of wear at the nodes
-            ("wear_depth", "f8", shape),  # at the start and at the nodes
+            ("wear_depth", "f8", shape),  # wear depth at the start and at the nodes
             ("load", "f8", (3,)),
         ]
     )
