@@ -13,9 +13,9 @@ from urllib.parse import urlsplit
 from plow_twin.access import is_address, is_loopback, read_secret
 from plow_twin.errors import InputError, Problem
 
-#: Name of the environment variable of the token, used without a file.
+#: Name of the environment variable with the token, which is used if there is no token file.
 TOKEN_VARIABLE: Final = "PLOW_TWIN_DASHBOARD_TOKEN"
-#: Fewest characters of a token.
+#: Smallest number of characters of a token.
 _SHORTEST: Final = 16
 
 
@@ -28,7 +28,7 @@ class DashboardError(InputError):
 
 @dataclass(frozen=True)
 class PageAccess:
-    """Address of the screen, and its token; without one everybody on this machine may look and acknowledge."""
+    """Address of the screen, and its token; without a token everybody on this machine may look and acknowledge."""
 
     host: str
     port: int

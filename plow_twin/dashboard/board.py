@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from plow_twin.dashboard.history import History
 
-#: Most events that are kept.
+#: Largest number of events that are kept.
 _EVENTS: Final = 200
 
 
@@ -52,7 +52,7 @@ class Board:
         news.set()
 
     def since(self, version: int) -> dict[str, Any]:
-        """Return the values newer than `version`, the newest that a page has received; 0: all."""
+        """Return the values newer than update `version`, the last that a page has received; 0: all values."""
         found: dict[str, Any] = {
             "version": self.version,
             "age": round(time.monotonic() - self._updated_s, 2),

@@ -20,15 +20,15 @@ from plow_twin.stream.outputs import CLEARANCE_NAMES, Published
 
 Array = NDArray[np.float64]
 
-#: Updates of the screen a second.
+#: Rate of the screen's updates [Hz].
 RATE_HZ: Final = 10.0
-#: Most publications that wait to be summed up.
+#: Largest number of publications that wait to be summed up.
 _MOST: Final = 256
-#: Most events that wait.
+#: Largest number of events that wait.
 _EVENTS: Final = 20
 #: Longest text that is passed on.
 _LONGEST: Final = 1000
-#: Most requests of operators that are handled at once.
+#: Largest number of operators' requests that are handled at once.
 _MOST_ASKED: Final = 8
 _NO_LOAD: Final = np.full(3, np.nan)
 #: States of a clearance that the measurements determine, repeated here so that the estimate is not imported.
@@ -192,10 +192,10 @@ class Feed:
             self._sum_up()
 
     def part(self, name: str, part: Part) -> None:
-        """Add a status: the newest of each name counts."""
+        """Add a status, which replaces the previous status of that name."""
         level, message, values = part
         if name == "estimate" and "estimates" not in values:  # the part of the diagnostics has the same name
-            self._sum_up()  # publications before the estimate
+            self._sum_up()  # first the publications before the estimate
             self.motion.estimate = values
         elif name == "status":
             self.motion.status = values
@@ -208,7 +208,7 @@ class Feed:
         del self._events[:-_EVENTS]
 
     def turn(self) -> None:
-        """Carry out operators' requests, and send an update: called at the rate of the updates."""
+        """Carry out operators' requests, and send an update; to be called at the rate of the updates."""
         self.hear()
         self.send()
         if self._link.broken and not self._ended:

@@ -16,7 +16,7 @@ class History:
 
     Where intervals are known, the 5 % and 95 % points of the eight peaks follow.
 
-    Each has the number of the update that changed it last, so that a page gets only newer values.
+    Each second has the number of the update that changed it last, so that a page gets only newer values.
     """
 
     def __init__(self) -> None:

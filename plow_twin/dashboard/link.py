@@ -8,7 +8,7 @@ import socket
 from contextlib import suppress
 from typing import Any, Final
 
-#: Most bytes of a message, and room for messages that the other side has not yet received [B].
+#: Largest message [B], and room for messages that the other side has not yet received [B].
 LONGEST: Final = 1 << 16
 _ROOM: Final = 1 << 18
 
@@ -34,7 +34,7 @@ class Link:
         return self._end.fileno()
 
     def send(self, message: dict[str, Any]) -> bool:
-        """Send a message; False where the message is not taken: no room, too long, or no receiver."""
+        """Send a message; return False if there is no room or no receiver, or if the message is too long."""
         data = json.dumps(message, separators=(",", ":")).encode()
         if self.broken or len(data) > LONGEST:
             return False

@@ -45,7 +45,7 @@ _SHOWN: Final = (
 )  # fmt: skip
 #: How long a service may take to answer [s].
 _PATIENCE_S: Final = 5.0
-#: Queue depth of topics of which only the newest message is needed, and of topics of which all are.
+#: Queue depth of topics of which only the newest message is needed, and of topics of which all messages are needed.
 _NEWEST, _ALL = 1, 1000
 
 
@@ -55,7 +55,7 @@ class NodeWatch:
     Parameters
     ----------
     namespace, name
-        Of the node.
+        Namespace and name of the node.
     wait_s
         How long to wait for the node [s].
     stopped

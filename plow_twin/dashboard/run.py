@@ -40,7 +40,7 @@ class RunFeed:
     feed
         The feed.
     header
-        Of the recording.
+        Header of the recording.
     stopped
         Returns whether to stop.
     """
@@ -123,7 +123,7 @@ def pose_of(numbers: Array) -> Array:
 
 
 def show_run(path: Path, access: PageAccess, stopped: Callable[[], bool], on_open: Callable[[Screen], object]) -> None:
-    """Show a recording until `stopped`: while it is written, or at once.
+    """Show a recording until `stopped`, following it while it is written; a finished one is shown at once.
 
     Parameters
     ----------

@@ -30,7 +30,7 @@ from plow_twin.dashboard.board import Board
 from plow_twin.dashboard.link import Link
 
 PAGE: Final = Path(__file__).with_name("page")
-#: Most pages at once; a further one is refused.
+#: Largest number of pages at once; a further page is refused.
 MOST_PAGES: Final = 50
 #: Time after which a page is closed that has not received an update, or not sent its token [s].
 _PATIENCE_S: Final = 20.0

@@ -30,7 +30,7 @@ class Comparison:
     peaks : dict of str to ndarray, shape (8,)
         Largest force of each pair in N, by `nominal`, `followed` and `true`.
     error : dict of str to float
-        RMS of the difference from the true forces over their RMS, by `nominal` and `followed`.
+        RMS of the difference from the true forces, divided by the RMS of the true forces, by `nominal` and `followed`.
     estimates_s : list of float
         Times of the run in s at which an estimate was made.
     since_s : float

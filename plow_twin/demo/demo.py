@@ -80,7 +80,7 @@ def run_demo(speed: str, seconds: float, out: Path, quiet: bool, screen: list[st
     out
         Folder in which the run makes a new folder for recording, view and logs.
     quiet
-        No progress and no table.
+        Print no progress and no table.
 
     Returns
     -------
@@ -140,7 +140,7 @@ def _run(
         # publisher and reader keep every sample of the run: none is lost when the machine is busy
         *("-p", "qos_overrides./excitation.subscription.reliability:=reliable"),
         *("-p", f"input_depth:={QUEUE}"),
-        # after the last sample comes the stop, not the hold policy
+        # after the last sample the run stops before the hold policy acts
         *("-p", "excitation_timeout:=60.0", "-p", f"use_sim_time:={str(speed == 'fast').lower()}"),
     ]
     publisher = ["plow_twin.demo.excitation_publisher", "--speed", speed, "--seconds", repr(seconds)]
@@ -208,7 +208,7 @@ def _follow(source: Child, twin: Child, watch: Watch, spin: Any, bar: Progress, 
 
 
 def _until(name: str, reached: Any, spin: Any, twin: Child, timeout_s: float) -> None:
-    """Wait for a thing, by its name; raise `DemoError` after the time limit or when the process has ended."""
+    """Wait until `reached` is true; raise a `DemoError` with `name` after the time limit or when the twin has ended."""
     give_up = time.monotonic() + timeout_s
     while not reached():
         spin()
@@ -280,7 +280,7 @@ def _process(arguments: list[str], log: Path) -> Iterator[Child]:
 
 @contextmanager
 def _watching() -> Iterator[tuple[Watch, Any]]:
-    """Listen to /diagnostics; yields the figures and a function that waits a little for news."""
+    """Listen to /diagnostics; yield the figures and a function that waits briefly for new messages."""
     import rclpy.utilities
     from diagnostic_msgs.msg import DiagnosticArray
     from rclpy.signals import SignalHandlerOptions

@@ -49,9 +49,9 @@ from plow_twin.stream.intake import NS_PER_S
 FIRST_STAMP_NS: Final = NS_PER_S
 #: Largest number of unanswered samples in `fast`.
 WINDOW: Final = 200
-#: Samples that a reliable reader may be behind before samples are lost: 100 s at 1 kHz.
+#: Number of samples by which a reliable reader may be late before samples are lost: 100 s at 1 kHz.
 QUEUE: Final = 100_000
-#: Samples between two messages on /clock.
+#: Number of samples between two messages on /clock.
 _CLOCK_EVERY: Final = 10
 #: Time between two messages on travel [s].
 _TRAVEL_S: Final = 0.1
@@ -195,7 +195,7 @@ class ExcitationPublisher(WithoutEvents):
 def plan(
     scene_name: str, rate_hz: float, seconds: float, cutting: CuttingLoad | None = None, sensor_mm: float | None = None
 ) -> Plan:
-    """Sample the loads of a scene, gravity not included, with a cutting load on top.
+    """Sample the loads of a scene without gravity, and add a cutting load.
 
     With `sensor_mm` the plan has the noisy pose of a head whose clearances are larger by `sensor_mm`.
 

@@ -28,18 +28,18 @@ class RunSummary:
     Attributes
     ----------
     largest, mean_in_contact : ndarray, shape (8,)
-        Largest force, and impulse over the time in contact [N]; each touch makes that time uncertain by a sample
+        Largest force, and impulse divided by the time in contact [N]; each touch makes that time uncertain by a sample
         interval.
     makes : ndarray, shape (8,)
-        Number of makes.
+        Number of touches.
     contact_sets : dict
-        By sense: share of the contact time in which exactly these corners carry force.
+        By sense and set of corners: share of the contact time in which exactly the corners of the set carry force.
     clearance : dict
         Newest value, 5 % and 95 % point [m] of `horizontal` and `vertical`.
     wear_depth : ndarray, shape (8,)
         Newest depth of each pad [m].
     frames : int
-        Messages on contact_forces.
+        Number of messages on contact_forces.
     estimate : dict or None
         The newest estimate that the node has made, as `plow-twin estimate --json` prints it.
     """

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from plow_twin.live.services import Services
 
 _LARGEST: Final = 65536
-#: Requests answered in one turn.
+#: Largest number of requests that are answered in one turn.
 _MOST: Final = 8
 #: How long a client waits for the answer [s].
 _PATIENCE_S: Final = 5.0

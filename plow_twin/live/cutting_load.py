@@ -61,9 +61,9 @@ class Face:
     def travel(self, t: Array) -> tuple[Array, Array, NDArray[np.int64]]:
         """Return position [m], signed speed [m/s] and number of the pass at times `t` (n,) [s], from 0 on.
 
-        In a turn the speed falls linearly to zero and rises to the other side; half of the turn belongs to each pass.
+        In a turn the speed falls linearly to zero and rises in the other direction; each pass has one half of the turn.
         """
-        # the head turns within the face and reaches its end in the middle of the turn
+        # the head turns within the face and reaches the end of the face in the middle of the turn
         steady = (self.length_m - 0.5 * self.speed_m_s * self.turn_s) / self.speed_m_s
         period = steady + self.turn_s
         number = np.floor(t / period).astype(np.int64)
@@ -136,7 +136,7 @@ class CuttingLoad:
         return np.column_stack([force, x * force[:, 1] - y * force[:, 0]])
 
     def _fields(self, number: int, position: Array) -> tuple[Array, Array]:
-        """Return the cutting force over its mean, and the lateral one over its deviation, in one pass."""
+        """Return the cutting force divided by its mean, and the lateral force divided by its deviation, in one pass."""
         step = self.correlation_m / _POINTS
         grid = np.arange(math.ceil(self.face.length_m / step) + 2) * step
         rho = math.exp(-1.0 / _POINTS)

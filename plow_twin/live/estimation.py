@@ -34,7 +34,7 @@ from plow_twin.stream.session import Series, Session
 
 #: Published topics, by base name.
 ESTIMATE, WINDOW_FORCES, FORECAST = ESTIMATES
-#: Names of a forecast's numbers in SI.
+#: Names of a forecast's numbers after conversion to SI, by their names before it.
 _SI: Final = {"hours": "seconds", "km": "metres"}
 #: Rate of checks for a finished estimate [Hz].
 RATE_HZ: Final = 10.0
@@ -57,7 +57,8 @@ class Estimation:
         self.states = {"horizontal": State.PRIOR, "vertical": State.PRIOR}
         self.trust = {"model": "", "sensor": ""}
         self.reasons: tuple[str, ...] = ()
-        #: number of estimates, of windows skipped for newer ones, and the time that the newest estimate took [s]
+        #: number of estimates, number of windows skipped because a newer window came, and the time that the newest
+        #: estimate took [s]
         self.count = self.skipped = 0
         self.wall_s = 0.0
         self.end_ns: int | None = None
@@ -165,7 +166,7 @@ def entry_of(found: Found, session: Session, before: Estimated | None) -> Estima
 
 
 def message_of(found: Found, frame_id: str) -> plain.JointState:
-    """Return the message of an estimate, stamped with the end of its window; empty where it is withdrawn."""
+    """Return the message of an estimate, stamped with the end of its window; empty if the estimate is withdrawn."""
     result = found.estimate
     names: list[str] = []
     numbers: list[float] = []

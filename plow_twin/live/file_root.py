@@ -17,7 +17,7 @@ class Named(Protocol):
 
     @property
     def file_root(self) -> str:
-        """Folder that the files must stay within; empty: no such folder."""
+        """Folder within which the files must be; empty: anywhere."""
 
     @property
     def scene(self) -> str:

@@ -31,10 +31,10 @@ from plow_twin.stream.outputs import Published
 from plow_twin.stream.topics import TOPICS
 
 NAME: Final = "/plow_twin"
-#: Longest wait for a message [s]: a request to stop is seen within it.
+#: Longest wait for a message [s]; a request to stop is noticed within this time.
 _POLL_S: Final = 0.1
 _REPORT_S: Final = 1.0
-#: Share of unused samples from which a likely cause is named.
+#: Share of unused samples above which a likely cause is named.
 _MANY: Final = 0.01
 
 #: Receives `status`, `alarms` or a part of the diagnostics by name, with level, message and values.
@@ -67,7 +67,7 @@ class BridgeFront:
     on_error
         Receives errors in words; may be called from another thread.
     units
-        Units by name (fx, ..., t) that replace the mapping's.
+        Units by name (fx, ..., t), which replace the units of the mapping.
 
     Raises
     ------

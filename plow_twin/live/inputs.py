@@ -1,4 +1,4 @@
-"""The inputs, from any transport: senders followed, messages counted, optional inputs checked."""
+"""The inputs of a live twin from any transport: choice of the sender, counts of messages, checks of optional inputs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from plow_twin.stream.senders import OneSender, Senders
 if TYPE_CHECKING:
     from plow_twin.live.publishing import Front
 
-#: The inputs, as topics are named.
+#: The inputs, by the names of their topics.
 TOPICS: Final = ("excitation", "tool_forces", "travel", "head_pose", "gaps")
 #: Inputs besides the load.
 OPTIONAL: Final = ("travel", "head_pose", "gaps")
@@ -63,7 +63,7 @@ class Inputs:
         self.active = False
         #: whether the source has ended
         self.ended = False
-        #: whether the journal is open: with a clock, or with the first sample
+        #: whether the journal is open: it opens once there is a clock, or with the first sample
         self.started = False
         #: senders of the selected source
         self.senders = Senders()
@@ -74,7 +74,7 @@ class Inputs:
         self.wait_s = 0.0
         self._heard_ns: dict[str, int] = {}
         self._other_heard_ns: dict[str, int] = {}
-        #: messages that could not be read, if the transport counts them
+        #: number of messages that could not be read, if the transport counts them
         self.lost = 0
         self.travel, self.head_pose, self.gaps = (Intake(on_unused=self._unused) for _ in OPTIONAL)
         self._gap_limits: Limits | None = None
@@ -84,7 +84,7 @@ class Inputs:
         #: newest measured pose x, y [m], theta [rad]
         self.measured: tuple[float, float, float] | None = None
         self.refused_publishers = 0
-        #: senders that each input is connected to
+        #: number of senders to which each input is connected
         self.publishers = dict.fromkeys(TOPICS, 0)
 
     def set_limits(self, travel: Limits, pose: Limits, gap: Limits) -> None:
@@ -120,7 +120,7 @@ class Inputs:
     def wanted(self, sender: bytes, number: int, stamp_ns: int, values: Sequence[float], fits: bool = True) -> bool:
         """Note message `number` (from 1) of a sender; if it is not used, count it and return False.
 
-        `fits` states whether it can be read as a sample; `values` are all its numbers.
+        `fits` states whether the message can be read as a sample; `values` are all its numbers.
         """
         lost = self.senders.lost
         followed = self.senders.hear(sender, number)
@@ -242,6 +242,6 @@ class Inputs:
 
 
 def _filled(pose: tuple[float, float, float], newest: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Return a pose, its unmeasured components replaced by those of the newest pose."""
+    """Return a pose whose unmeasured components are replaced by those of the newest pose."""
     x, y, theta = (before if math.isnan(value) else value for value, before in zip(pose, newest, strict=True))
     return x, y, theta

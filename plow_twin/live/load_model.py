@@ -1,11 +1,11 @@
 """The load on the head computed from signals of the drive, with an interval, where the wrench is not measured.
 
-The drive pulls the chain with C = efficiency P / v (or C is measured). Without the drag of chain and plough, the
-cutting force along the face is Z = C - idle. The coal gives a second value: Z = specific_force * depth *
+The drive pulls the chain with C = efficiency P / v (or C is measured). Subtracting the drag of chain and plough gives
+the cutting force along the face, Z = C - idle. The coal gives a second value: Z = specific_force * depth *
 resistance(position). The mean of the two is weighted by their inverse variances. The force into the face is Fx =
-push_ratio Z, the lateral one Fy = lateral_ratio Z, both at one point of the head: M = x Fy - y Fx. All coefficients
-have a standard deviation, which propagates to the result. They are measured at a machine, by idle runs and weighing,
-and have no defaults, because the paper publishes no values.
+push_ratio Z, and the lateral force is Fy = lateral_ratio Z; both act at one point of the head, so that M = x Fy - y Fx.
+All coefficients have a standard deviation, which propagates to the result. They are measured at a machine, by idle runs
+and weighing, and have no defaults, because the paper publishes no values.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ class LoadModel:
     Attributes
     ----------
     push_ratio : tuple of float
-        Force into the face over the cutting force.
+        Ratio of the force into the face to the cutting force.
     at_m : tuple of float
         Point of action x, y [m] from the cavity's centre.
     lateral_ratio : tuple of float
-        Lateral force over the cutting force.
+        Ratio of the lateral force to the cutting force.
     efficiency : tuple of float, optional
-        Power at the chain over motor power.
+        Ratio of the power at the chain to the motor power.
     idle_force_n : tuple of float
         Pull of the chain without cutting [N].
     specific_force_n_m : tuple of float, optional

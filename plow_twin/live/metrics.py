@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 #: Characters that a name of a metric cannot have.
 _OTHER: Final = re.compile(r"[^a-zA-Z0-9_]")
-#: Most readers at once, and longest wait for one [s].
+#: Largest number of readers at once, and longest wait for a reader [s].
 _READERS: Final = 16
 _PATIENCE_S: Final = 10.0
 

@@ -417,13 +417,13 @@ MODEL: Final[Mapping[str, str]] = {
     "wear_coefficient": "wear.coefficient_m2_n",
 }
 SPECS: Final[Mapping[str, Field[Any]]] = {spec.name: spec for spec in fields(Settings)}
-#: A number that YAML 1.1, in ROS launch files, reads as a text: its mantissa has no point.
+#: Pattern of a number. YAML 1.1, which ROS launch files use, reads some numbers as texts: their mantissa has no point.
 _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 #: Longest text [characters]; no path on Linux is longer.
 _LONGEST: Final = 4096
 #: One line without control characters, which a terminal would obey.
 _ONE_LINE: Final = r"^[^\x00-\x1f\x7f-\x9f]*\Z"
-#: Declared by rclpy itself.
+#: Parameters that rclpy itself declares.
 _FOREIGN: Final = ("use_sim_time", "start_type_description_service")
 
 

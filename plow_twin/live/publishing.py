@@ -35,7 +35,7 @@ class Front(Protocol):
     topics : mapping
         Resolved names of the outputs by their base names.
     follows_samples : bool
-        Whether the samples alone move the time (`/clock`, a file): silence is not bridged.
+        Whether only samples advance the time, as with `/clock` or a file, so that silence is not bridged.
     sends_motion : bool
         Whether messages of the motion are sent; otherwise they are at most recorded.
     """
@@ -128,7 +128,7 @@ class Publishing:
 
     @property
     def newest(self) -> Rows | None:
-        """Newest published row, shape (1,); the next one overwrites it."""
+        """Newest published row, shape (1,); the next publication overwrites it."""
         return self._newest
 
     @property

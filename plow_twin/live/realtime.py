@@ -1,4 +1,4 @@
-"""Priority, processors and locked memory of this process, each requested; a refusal is a warning."""
+"""Requests for priority, processors and locked memory of this process; a refusal is a warning."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Final
 
 from plow_twin.live.parameters import Settings
 
-#: `mlockall`: present and future pages.
+#: Flags of `mlockall` for present and for future pages.
 _MCL_CURRENT: Final = 1
 _MCL_FUTURE: Final = 2
 

@@ -1,4 +1,4 @@
-"""A live twin without its transport, and the way of one sample through it: intake, twin, publication, recording.
+"""A live twin without its transport, and the path of a sample through it: intake, twin, publication, recording.
 
 A front, either the ROS node or `plow-twin live`, brings samples and sends messages; this module depends on neither.
 """
@@ -46,7 +46,8 @@ _CATCH_UP_S: Final = 0.002
 _LOOK_FOR_CLOCK_HZ: Final = 20.0
 #: Rate at which unused messages are journalled [Hz].
 _UNUSED_HZ: Final = 5.0
-#: The following twins do not keep up if samples wait this long [s] in each of this many successive seconds.
+#: The twins that follow measurements are too slow if samples wait this long [s] in each of this many successive
+#: seconds.
 _LONGEST_WAIT_S, _WAITING_SECONDS = 0.5, 5
 
 
@@ -90,7 +91,7 @@ class Runtime:
         self.clock = "running"
         #: whether another node publishes under the names of this twin's outputs
         self.others_publish = False
-        #: whether only the parameters follow, because the twins did not keep up
+        #: whether only the parameters follow the measurements, because the twins were too slow
         self.reduced = False
         self._waiting_seconds = 0
         self._clock_before_ns = 0
@@ -175,7 +176,7 @@ class Runtime:
         return self._front.now_ns() == 0
 
     def kept_wear(self) -> KeptWear:
-        """Return the wear for the next runtime of this process; after the close."""
+        """Return the wear for the next runtime of this process; to be called after the close."""
         depth = self.driver.session.wear_depth
         return self.wear_keeper.kept(depth) if self.wear_keeper else KeptWear(tuple(depth.tolist()))
 
@@ -187,12 +188,12 @@ class Runtime:
 
     @property
     def reads_at_once(self) -> bool:
-        """Whether many samples may be applied and published together: they bring their time, and no message is sent."""
+        """Whether many samples may be applied and published at once: they have their own time and nothing is sent."""
         return self._front.follows_samples and not self._front.sends_motion
 
     @property
     def recorder_state(self) -> str:
-        """`off`, `recording`, or `trouble`: something was lost or it has stopped."""
+        """`off`, `recording`, or `trouble` if something was lost or the recording has stopped."""
         if self.recording is None:
             return "off"
         found = self.recording.recorder.counters
@@ -204,12 +205,12 @@ class Runtime:
         return self.inputs.residual(q) if q is not None else None
 
     def newest_sample_age_s(self) -> float | None:
-        """Return the present time minus the stamp of the newest sample used [s], or None before the first."""
+        """Return the present time minus the stamp of the newest sample used [s]; None before the first sample."""
         newest_ns = self.driver.newest_ns
         return None if newest_ns is None else (self._front.now_ns() - newest_ns) * 1e-9
 
     def estimate_age_s(self) -> float | None:
-        """Return the present time minus the end of the newest estimate's window [s], or None before the first."""
+        """Return the present time minus the end of the newest estimate's window [s]; None before the first estimate."""
         end_ns = self.estimation.end_ns if self.estimation else None
         return None if end_ns is None else (self._front.now_ns() - end_ns) * 1e-9
 
@@ -466,7 +467,7 @@ class Runtime:
             self._front.changed()
 
     def _look_for_lag(self) -> None:
-        """Let only the parameters follow if the twins do not keep up."""
+        """Let only the parameters follow the measurements if the twins are too slow."""
         waited_s, self.inputs.wait_s = self.inputs.wait_s, 0.0
         self._waiting_seconds = self._waiting_seconds + 1 if waited_s > _LONGEST_WAIT_S else 0
         if self._waiting_seconds == _WAITING_SECONDS and not self.reduced and not self.waits_for_clock:
@@ -491,7 +492,7 @@ class Runtime:
 
     @property
     def stamp_ns(self) -> int:
-        """Return the time that the model has reached, or the present one before the first sample [ns]."""
+        """Return the time that the model has reached, or the present time before the first sample [ns]."""
         stamp_ns = self.publishing.series_ns or self.driver.session.stamp_ns
         return self._front.now_ns() if stamp_ns is None else stamp_ns
 
@@ -499,7 +500,7 @@ class Runtime:
         if self.recording and self.recording.recorder.snapshot_wanted:
             self._renew_recording()
         if self._front.follows_samples:
-            # without a deadline: a pause, bounded by the number of samples, lets recorder and estimate catch up
+            # there is no deadline, so a pause, bounded by the number of samples, lets recorder and estimate catch up
             while count and self._behind:
                 time.sleep(_CATCH_UP_S)
                 count -= 1

@@ -29,7 +29,7 @@ class StartAbandoned(PlowTwinError):
 
 @dataclass(frozen=True)
 class Prepared:
-    """A scene, its twin with every kernel compiled or loaded, and the seconds that took."""
+    """A scene, its twin with every kernel compiled or loaded, and the seconds that this took."""
 
     scene: Scene
     twin: Driven
@@ -103,7 +103,7 @@ def _prepare(settings: Settings, warm_up: Callable[[], None]) -> Prepared:
 
 
 def leave(code: int, *, at_once: bool = False) -> int:
-    """Return the exit code; end the process here if an abandoned compiler would delay it, or `at_once`."""
+    """Return the exit code; end the process here with `at_once`, or if an abandoned compiler would delay its end."""
     if at_once:  # a stream without a reader can no longer be flushed
         os._exit(code)
     if all(future.done() for future in _started):

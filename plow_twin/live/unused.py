@@ -8,7 +8,7 @@ from typing import Final
 
 from plow_twin.stream.journal import Unused
 
-#: Messages that a journal entry holds in full; further ones are only counted.
+#: Largest number of messages that a journal entry holds in full; further messages are only counted.
 _MOST: Final = 500
 
 

@@ -49,11 +49,11 @@ class WearKeeper:
     Parameters
     ----------
     folder
-        Where it is kept.
+        Folder in which the wear is kept.
     head
         Serial of the head.
     scene
-        Its scene.
+        The scene of the head.
 
     Raises
     ------
@@ -89,7 +89,7 @@ class WearKeeper:
         return kept.depth_m if kept is not None and found in (None, *kept.older_files) else self._saved
 
     def kept(self, depth: NDArray[np.float64]) -> KeptWear:
-        """Return depths [m] for the next runtime of this process; after the close."""
+        """Return depths [m] for the next runtime of this process; to be called after the close."""
         return KeptWear(tuple(depth.tolist()), self._own if self.error else ())
 
     def save(self, depth: NDArray[np.float64]) -> None:
@@ -117,7 +117,7 @@ class WearKeeper:
     def _save(self, values: tuple[float, ...]) -> None:
         try:
             if not self._is_claimed():
-                # moved, removed or hidden by a mount: check which twin has the folder of that name now
+                # the folder was moved, removed or hidden by a mount: check which twin has the folder of that name now
                 self.release()
                 self._claim = claim_folder(self.folder)
             found = read_wear(self.folder)

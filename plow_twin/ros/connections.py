@@ -1,7 +1,8 @@
 """The publishers and subscribers that share a node's topics, from the ROS graph.
 
 The middleware offers events for this purpose. The node requests none, because rmw_fastrtps can deadlock: it takes two
-locks in one order when an event is requested or taken, and in the other order when one arises (ros2/rmw_fastrtps#890).
+locks in one order when an event is requested or taken, and in the other order when an event arises
+(ros2/rmw_fastrtps#890).
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ LOOK_S: Final = 0.2
 _UNNAMED: Final = "_NODE_NAME_UNKNOWN_"
 #: Period of the warning about a wrong time on `/clock` [s].
 _SAY_AGAIN_S: Final = 5.0
-#: Numbers of the types of parameters.
+#: Numbers that ROS gives to the types of parameters.
 _TYPES: Final = frozenset(kind.value for kind in Parameter.Type)
 
 
@@ -40,20 +41,20 @@ class WithoutEvents(Node):
     """
 
     def create_service(self, srv_type: Any, srv_name: str, callback: Callable[..., Any], **options: Any) -> Service:
-        """As rclpy's."""
+        """Create a service as rclpy does; requests to set parameters are checked first."""
         if srv_type in (SetParameters, SetParametersAtomically):
             callback = partial(_set_parameters, callback)
         return super().create_service(srv_type, srv_name, callback, **options)
 
     def create_publisher(self, *arguments: Any, **options: Any) -> Publisher:
-        """As rclpy's."""
+        """Create a publisher as rclpy does, but without events."""
         events = PublisherEventCallbacks(use_default_callbacks=False)
         return super().create_publisher(*arguments, **{"event_callbacks": events, **options})
 
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Callable[[Any], None], *arguments: Any, **options: Any
     ) -> Subscription:
-        """As rclpy's."""
+        """Create a subscription as rclpy does, but without events; times on `/clock` are checked first."""
         if msg_type is Clock:
             callback = partial(self._take_clock, callback)
         events = SubscriptionEventCallbacks(use_default_callbacks=False)

@@ -68,7 +68,7 @@ class InputLoop:
     Parameters
     ----------
     turns
-        Keeps it apart from the executor's thread.
+        Lock that keeps this thread apart from the executor's thread.
     on_error
         Called with the error that ended the thread; `error` keeps it too.
     """

@@ -93,7 +93,7 @@ class InputQueue:
         self._places = ctypes.byref(self._buffer), ctypes.byref(self._info)
         self._signs = 0
         self.fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
-        # the executor must not take from it as well
+        # the executor must not take from this queue as well
         node._subscriptions.remove(subscription)
         with subscription.handle:
             self._listen(subscription.handle.pointer, _count_up(), self.fd)
@@ -101,8 +101,8 @@ class InputQueue:
     def pop(self, most: int, *, all_there_are: bool = False) -> tuple[list[Taken], bool]:
         """Return up to `most` waiting messages in order of arrival, and whether there are more.
 
-        It tries to take as many messages as were signalled, or `most` with `all_there_are`: reading an empty queue
-        costs a fifth of the time of a sample.
+        It takes as many messages as were signalled, or `most` with `all_there_are`: reading an empty queue costs a
+        fifth of the time of a sample.
         """
         try:
             signs = os.eventfd_read(self.fd)

@@ -33,15 +33,15 @@ from plow_twin.ros.messages import ros_status
 from plow_twin.ros.parameter_server import ParameterServer
 from plow_twin.ros.qos import DIAGNOSTICS, OUTPUTS
 
-#: Reports between two log lines about a lasting problem.
+#: Number of reports between two log lines about a lasting problem.
 _SAY_AGAIN: Final = 5
 
 
 class TwinNode(WithoutEvents, LifecycleNode):
     """The twin on ROS 2.
 
-    Takes the keyword arguments of `rclpy.node.Node`, so that several can live in one process and executor. Code that
-    creates a node calls `start`, as the program does with `autostart`. `stop_asked` is polled while the solver is
+    Takes the keyword arguments of `rclpy.node.Node`, so that several nodes can share a process and an executor. Code
+    that creates a node calls `start`, as the program does with `autostart`. `stop_asked` is polled while the solver is
     compiled.
 
     Raises
@@ -244,7 +244,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
     def _publish_diagnostics(self) -> None:
         if self._front is not None:
             if self._front.error is not None:
-                raise self._front.error  # it ends the program with the reason, like an error of any callback
+                raise self._front.error  # this ends the program with the reason, like an error of any callback
             self._connections.look_for_subscribers(self.publishers)
             self._front.look_for_others()
         elif self.lifecycle == "unconfigured" and not self.reason:

@@ -1,4 +1,4 @@
-"""Quality of service: of the outputs from their table, of the inputs with overrides by parameters."""
+"""Quality of service: of the outputs as in their table, of the inputs with overrides by parameters."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ def start_ros(arguments: Sequence[str] | None) -> None:
     Parameters
     ----------
     arguments : sequence of str, optional
-        Arguments of the command line; None: the process's.
+        Arguments of the command line; None: those of the process.
 
     Raises
     ------

@@ -29,7 +29,7 @@ from plow_twin.stream.intake import Intake, Verdict
 _SLOW_DEPTH: Final = 200
 #: Number of publishers whose sequence numbers are remembered; the oldest is forgotten.
 _MOST_PUBLISHERS: Final = 256
-#: Samples from which a publisher's rate is estimated.
+#: Number of samples from which a publisher's rate is estimated.
 _RATE_KNOWN: Final = 20
 _PAIR_NUMBERS: Final = {name: number for number, name in enumerate(PAIR_NAMES)}
 
@@ -73,7 +73,8 @@ class Subscriptions:
         #: number of the next message, by topic and publisher
         self._following: dict[tuple[str, bytes], int] = {}
         self._since_ns = time.time_ns()  # when the excitation was subscribed to
-        #: publishers of the excitation that were unknown then: first message, and losses counted before this message
+        #: publishers of the excitation that were unknown at that time: first message, and losses counted before this
+        #: message
         self._appeared: dict[bytes, tuple[Taken, int]] = {}
         self._before: frozenset[bytes] = frozenset()
         with_covariance = runtime.settings.head_pose_type == "pose_with_covariance"
@@ -186,7 +187,7 @@ class Subscriptions:
             self._not_selected(topic, batch)
 
     def _count_before_first(self, batch: list[Taken]) -> None:
-        """Count messages that publishers, begun after the subscription, sent before the first received message.
+        """Count messages that were sent after the subscription but before their publisher's first received message.
 
         Discovery takes time: a publisher that is new to the node may have been sending for long. Its rate shows
         whether it began before the subscription.

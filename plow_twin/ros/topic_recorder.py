@@ -27,7 +27,7 @@ from plow_twin.ros.input_queue import InputQueue, Taken
 from plow_twin.ros.main import make_executor
 from plow_twin.scene_file.yaml_text import dump_yaml
 
-#: Messages that may wait for a slow disk, by topic.
+#: Number of messages of each topic that may wait for a slow disk.
 _DEPTH: Final = 5000
 _LOOK_S: Final = 0.5
 _FLUSH_S: Final = 1.0

@@ -1,4 +1,4 @@
-"""Points to InfluxDB by its official client: a measurement for each group of values."""
+"""Points sent to InfluxDB by its official client: a measurement for each group of values."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ from plow_twin.dashboard.link import Link
 from plow_twin.telemetry.values import Group, Newest
 from plow_twin.telemetry.way import State
 
-#: Most points that wait for the database: ten minutes of all groups of numbers at 1 Hz; the oldest are dropped first.
+#: Largest number of points that wait for the database: ten minutes of all groups of numbers at 1 Hz; the oldest are
+#: dropped first.
 _WAITING: Final = 2000
-#: Most points in one request.
+#: Largest number of points in one request.
 _AT_ONCE: Final = 500
 #: Longest wait for an answer [ms]; first and longest wait before another attempt [s].
 _ANSWER_MS: Final = 5000
@@ -36,7 +37,7 @@ class Influx:
     org, bucket, token
         Destination of the points, and the permission to write there.
     ca
-        Authority for checking its certificate; None: the system's authorities.
+        Authority for checking the database's certificate; None: the system's authorities.
     """
 
     def __init__(self, url: str, org: str, bucket: str, token: str, ca: str | None) -> None:

@@ -1,4 +1,4 @@
-"""JSON to an MQTT broker: a topic for each group of values."""
+"""JSON sent to an MQTT broker: a topic for each group of values."""
 
 from __future__ import annotations
 
@@ -16,11 +16,12 @@ from plow_twin.live.bridge.paho_client import end_of, make_client, refusal, use_
 from plow_twin.telemetry.values import UNITS, Group, Newest
 from plow_twin.telemetry.way import State, TelemetryError
 
-#: Most messages that wait for the broker: ten minutes of all groups of numbers at 1 Hz; the oldest are dropped first.
+#: Largest number of messages that wait for the broker: ten minutes of all groups of numbers at 1 Hz; the oldest are
+#: dropped first.
 _WAITING: Final = 2000
-#: Most messages that the broker has not yet acknowledged.
+#: Largest number of messages that the broker has not yet acknowledged.
 _UNACKNOWLEDGED: Final = 20
-#: A broker that is silent for 1.5 times this counts as gone [s].
+#: Keep-alive interval [s]; a broker that is silent for 1.5 intervals counts as gone.
 _KEEPALIVE_S: Final = 10
 
 
@@ -47,7 +48,7 @@ class Broker:
     on_connected
         Returns the messages to send before all waiting messages once the broker has accepted.
     waiting
-        Most messages that wait while the broker does not answer; the oldest are dropped and counted.
+        Largest number of messages that wait while the broker does not answer; the oldest are dropped and counted.
     keeps
         Whether waiting messages are sent after a break; otherwise they are dropped and counted.
 

@@ -26,7 +26,7 @@ def send_node(
     Parameters
     ----------
     namespace, name
-        Of the node.
+        Namespace and name of the node.
     scene
         Its scene, if the node's name for the scene cannot be read on this machine.
     ways
@@ -36,9 +36,9 @@ def send_node(
     wait_s
         How long to wait for the node [s].
     stopped
-        Whether to end.
+        Returns whether to end.
     on_error
-        Receives in words when a receiver stops or resumes taking messages.
+        Receives a text when a receiver stops or resumes taking messages.
 
     Raises
     ------

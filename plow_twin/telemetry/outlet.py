@@ -28,14 +28,14 @@ class Outlet(Beside):
     facts, answer
         As in `Feed`.
     on_error
-        Receives in words when the receiver stops or resumes taking messages.
+        Receives a text when the receiver stops or resumes taking messages.
 
     Raises
     ------
     TelemetryError
         The output cannot be opened.
     ModuleNotFoundError
-        Its library is not installed.
+        The output's library is not installed.
     """
 
     def __init__(

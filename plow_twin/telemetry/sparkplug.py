@@ -78,7 +78,7 @@ class Sparkplug:
 
     def __init__(self, group: str, node: str, **options: Any) -> None:
         self._topic = f"spBv1.0/{group}/{{}}/{node}"
-        #: number of the next message, and number of the connection in birth and death
+        #: number of the next message, and number of the connection, which birth and death messages contain
         self._number = 0
         self._connection = -1
         self._rebirth = False

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
-#: None: a number that is not known.
+#: A value; None stands for a number that is not known.
 Value = float | int | str | None
 
 _POINTS: Final = ("", "/p05", "/p95")

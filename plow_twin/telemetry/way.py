@@ -11,7 +11,7 @@ from plow_twin.telemetry.values import Group, Newest
 
 
 class TelemetryError(PlowTwinError):
-    """An output cannot be opened; the message names it with the expectation."""
+    """An output cannot be opened; the message names the output and what was expected."""
 
 
 @dataclass
@@ -23,7 +23,7 @@ class State:
     connected : bool
         Whether the receiver answers.
     sent, lost : int
-        Numbers of messages (or points, or updates) that the receiver has taken, and that were dropped.
+        Numbers of messages (or points, or updates) that the receiver has taken and that were dropped.
     trouble : str
         Why the receiver takes no messages; empty if it does.
     """

@@ -1,1 +1,1 @@
-"""Inputs of a live twin without ROS: files, standard input and MQTT, by the mapping of recordings."""
+"""Inputs of a live twin without ROS: files, standard input and MQTT, read by the same mapping as recordings."""

@@ -15,7 +15,7 @@ from plow_twin.live.bridge.source import BridgeError
 from plow_twin.scene_file.validation import TEXT, mapping, validate
 from plow_twin.scene_file.yaml_text import read_yaml
 
-#: Keys of a file of credentials that name files.
+#: Keys in a credentials file whose values are names of files.
 _FILES: Final = ("ca", "certificate", "key", "user_certificate", "user_key", "password_file")
 _CREDENTIALS: Final = mapping(
     {"user": TEXT, "plain": {"type": "boolean", "description": "true or false"}, **dict.fromkeys(_FILES, TEXT)}
@@ -66,12 +66,12 @@ def host_and_port(access: Access, ports: Mapping[str, int], *, has_path: bool = 
 
 
 def password(path: Path | None, source: str) -> str:
-    """Return the password of a file, or the variable PLOW_TWIN_`source`_PASSWORD.
+    """Return the password in a file, or in the environment variable PLOW_TWIN_`source`_PASSWORD.
 
     Raises
     ------
     InputError
-        The first line of the file is no password.
+        The first line of the file is not a password.
     OSError
         The file cannot be read.
     """
@@ -79,7 +79,7 @@ def password(path: Path | None, source: str) -> str:
 
 
 def read_access(url: str, path: Path | None) -> Access:
-    """Return the access to an OPC UA server with credentials from a YAML file, whose paths are relative to it.
+    """Return the access to an OPC UA server with credentials from a YAML file; paths in it are relative to it.
 
     Raises
     ------

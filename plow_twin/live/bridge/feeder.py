@@ -22,7 +22,7 @@ from plow_twin.record.sources import Arrived
 from plow_twin.stream.driver import Arrival
 from plow_twin.stream.intake import Intake, Verdict
 
-#: A larger jump of the numbers means that the sender has restarted, if the next number continues it.
+#: A larger jump of the message numbers means that the sender has restarted, if the next number follows the new one.
 _RESTART = 1000
 #: Largest number of samples lost between two messages: a day at 10 kHz.
 _MOST_LOST = 10**9
@@ -60,7 +60,7 @@ class Feeder:
         self._by_topic: dict[str, list[tuple[str, Role]]] = {}
         for name, role in roles.items():
             self._by_topic.setdefault(role.topic, []).append((name, role))
-        #: time of a source with its own time [ns]: the newest stamp, except a single stamp far ahead
+        #: time of a source with its own time [ns]: the newest stamp, but not a single stamp that is far ahead
         self.newest_ns = 0
         self._far_ahead_ns: int | None = None
         #: why the first unreadable load was refused; empty: all were read
@@ -87,7 +87,7 @@ class Feeder:
         inputs.senders.alive([self._name])
 
     def begin(self, messages: Iterable[Arrived]) -> None:
-        """Set the time of a source that has its own time, at the first message whose successor continues its time."""
+        """Set the time of a source that has its own time, from the first message whose successor continues its time."""
         read = (role.read(arrived) for arrived in messages for _, role in self._by_topic.get(arrived.topic, ()))
         stamps = (found[0] for found in read if found is not None)
         back_ns = round(self._runtime.settings.jump_back * 1e9)
@@ -157,7 +157,7 @@ class Feeder:
             self._follow_time(stamp_ns)
 
     def _follow_time(self, stamp_ns: int) -> None:
-        """Advance to the time of a sample; a sample far ahead counts only if the next one stays there."""
+        """Advance to the time of a sample; a sample far ahead counts only if the next sample is there too."""
         jump_ns = round(self._runtime.settings.jump_forward * 1e9)
         far_ns, self._far_ahead_ns = self._far_ahead_ns, None
         if far_ns is not None and stamp_ns >= far_ns - jump_ns:

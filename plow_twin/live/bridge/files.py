@@ -1,4 +1,4 @@
-"""CSV or JSON lines, or Parquet, from files, read once or followed while they grow, and from standard input."""
+"""CSV or JSON lines from standard input or files, and Parquet files; files are read once, or followed as they grow."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from plow_twin.record.times import NO_TIME
 from plow_twin.scene_file.csv_rows import MOST_COLUMNS, check_text
 from plow_twin.scene_file.parquet_lines import ParquetLines, is_parquet
 
-#: Most bytes read from a source at once.
+#: Largest number of bytes that are read from a source at once.
 _BLOCK: Final = 1 << 18
 #: Bytes by which a file is recognised.
 _REMEMBERED: Final = 256
@@ -44,9 +44,9 @@ class _Tail:
     lines: Lines = field(default_factory=Lines)
     rows: Rows = field(default_factory=Rows)
     _file: Any = None
-    #: the newest bytes read, which differ in a rewritten file
+    #: the last bytes that were read, which differ in a rewritten file
     _newest: bytes = b""
-    #: lines that were never completed: the file was cut or replaced
+    #: number of lines that were never completed because the file was cut or replaced
     left: int = 0
 
     def __post_init__(self) -> None:
@@ -119,7 +119,7 @@ class _Tail:
 
     @property
     def place(self) -> int:
-        """Bytes of the file that have been read."""
+        """Number of bytes of the file that have been read."""
         return 0 if self._file is None else int(self._file.tell())
 
     def close(self) -> None:
@@ -202,7 +202,7 @@ def _changed_ns(path: Path) -> tuple[int, Any]:
 
 
 def _numbered(path: Path) -> list[tuple[int, str]]:
-    """Return a key by which names with numbers are in their order: load_9 before load_10."""
+    """Return a key that sorts names by the numbers in them: load_9 before load_10."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]
 
 

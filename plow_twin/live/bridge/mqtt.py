@@ -21,7 +21,7 @@ from plow_twin.live.bridge.source import LONGEST, BridgeError, SourceState, read
 from plow_twin.record.merging import StampOf
 from plow_twin.record.sources import Arrived
 
-#: Largest number of messages that wait to be read, and of their bytes; messages beyond it are counted as lost.
+#: Largest number of messages that wait to be read, and of their bytes; further messages are counted as lost.
 _QUEUE: Final = 100_000
 _QUEUED_BYTES: Final = 2**26
 _PORTS: Final = {"mqtt": 1883, "mqtts": 8883}
@@ -35,7 +35,7 @@ class Mqtt(SourceState):
     access
         Address and credentials of the broker.
     connect_s
-        Longest wait for its answer [s].
+        Longest wait for the broker's answer [s].
 
     Raises
     ------
@@ -133,7 +133,7 @@ class Mqtt(SourceState):
         self.trouble = self.trouble or f"the connection broke: {end_of(*facts)}; reconnecting"
 
     def _on_message(self, client: Any, data: Any, message: Any) -> None:
-        # a line that is too long is dropped: it counts as unreadable
+        # a payload that is too long is emptied, so that it counts as unreadable
         payload = message.payload if len(message.payload) <= LONGEST else b""
         if len(self._queue) >= _QUEUE or self._came - self._left + len(payload) > _QUEUED_BYTES:
             self.lost += 1

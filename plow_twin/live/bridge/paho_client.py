@@ -8,7 +8,7 @@ from typing import Any, Final
 
 #: Longest wait before another attempt to connect [s].
 LONGEST_WAIT_S: Final = 30
-#: Smallest number of a refused subscription, where refusals are numbers.
+#: Smallest answer that means a refused subscription, if answers are numbers (paho 1.6).
 _REFUSED: Final = 0x80
 
 

@@ -13,7 +13,7 @@ from plow_twin.record.merging import StampOf
 from plow_twin.record.sources import Arrived, Columns, TopicType, columns_of
 from plow_twin.scene_file.csv_rows import delimiter_of
 
-#: Most messages that a source returns at once.
+#: Largest number of messages that a source returns at once.
 BATCH: Final = 256
 #: Longest line or payload that is read [B].
 LONGEST: Final = 65536
@@ -41,7 +41,7 @@ class Bridge(Protocol):
         Whether the source has ended.
     connected : bool
     lost : int
-        Messages that were dropped before they were read.
+        Number of messages that were dropped before they were read.
     trouble : str
         Why no messages can come at present; empty if they can.
     """
@@ -128,9 +128,9 @@ class Rows:
         #: names of the columns, or keys of the first object; None before the first line
         self.columns: list[str] | None = None
         self._json = False
-        #: by the header
+        #: the delimiter that the header shows
         self.delimiter = ","
-        #: columns of the file that this one replaces
+        #: columns of the previous file, which this file replaces
         self._before: list[str] | None = None
 
     @property
@@ -172,7 +172,7 @@ class Rows:
             return False  # the file repeats its header
         if len(cells) != len(self.columns):
             return None
-        if self.delimiter != ",":  # decimal commas
+        if self.delimiter != ",":  # numbers may have decimal commas
             cells = [cell.replace(",", ".") for cell in cells]
         return dict(zip(self.columns, cells, strict=True))
 

@@ -1,4 +1,4 @@
-"""Lines of a CSV file that are read once, many at a time: the numbers of a role as arrays."""
+"""Lines of a CSV file that is read once: many lines at a time, with the numbers of a role as arrays."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Table:
     topic
         Topic of the messages.
     lines
-        Whole lines, None for one that is too long.
+        Whole lines, None for a line that is too long.
     rows
         Parser of the lines, which knows the header.
     """
@@ -57,12 +57,12 @@ class Table:
         found = [number for number in numbers if number is not None]
         if stamps is None or len(found) < len(numbers):
             return None
-        with np.errstate(all="ignore"):  # a number out of range is dropped as infinite
+        with np.errstate(all="ignore"):  # a number out of range becomes infinite and is dropped
             values = np.stack([role.in_si(name, number) for name, number in zip(role.fields, found, strict=True)], 1)
         return stamps + role.clock_offset_ns, values
 
     def _columns(self) -> list[tuple[bytes, ...]] | None:
-        """Return the cells of each column; None where the lines differ in their number."""
+        """Return the cells of each column; None if lines differ in their number of cells."""
         if self._cells is None:
             comma = self._rows.delimiter.encode()
             whole = [line for line in self._lines if line is not None]
@@ -79,7 +79,7 @@ class Table:
         return self._cells
 
     def _numbers(self, cells: Sequence[bytes]) -> NDArray[np.float64] | None:
-        if self._rows.delimiter != ",":  # decimal commas
+        if self._rows.delimiter != ",":  # numbers may have decimal commas
             cells = b"\n".join(cells).replace(b",", b".").split(b"\n")
         if b"".join(cells).translate(None, OF_NUMBERS):
             return None

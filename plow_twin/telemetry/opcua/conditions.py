@@ -16,14 +16,14 @@ from plow_twin.telemetry.opcua.model import Model
 from plow_twin.telemetry.values import Group, Value
 
 _ALARM_TYPE: Final = ObjectIds.ExclusiveLevelAlarmType
-#: Severity of each level, of 1 to 1000.
+#: Severity of each level on OPC UA's scale from 1 to 1000.
 _SEVERITY: Final = {"none": 1, "warn": 500, "error": 800}
 _LIMIT: Final = {"warn": "High", "error": "HighHigh"}
 
 
 @dataclass
 class Condition:
-    """One alarm: its events, and the state of the newest one."""
+    """One alarm: its events, and the state of the newest event."""
 
     events: Any
     node_id: ua.NodeId

@@ -1,4 +1,4 @@
-"""Samples from an OPC UA server: subscribed to, and read from its history where a message or a time is missing."""
+"""Samples from an OPC UA server: from a subscription, and from the server's history where values are missing."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from plow_twin.record.mapping import Role
 from plow_twin.record.merging import StampOf
 from plow_twin.record.sources import Arrived, TopicType
 
-#: Most samples that wait to be read; samples beyond these are counted as lost, except samples of the history.
+#: Largest number of samples that wait to be read; further samples are counted as lost, except samples of the history.
 _QUEUE: Final = 100_000
 _PORTS: Final = {"opc.tcp": 4840}
-#: Wait for the values of a stamp [s], which come in one message or two successive ones; includes an allowance for a
-#: busy machine.
+#: Time [s] to wait for all values of a stamp, which come in one message or two successive messages; it has a margin for
+#: a busy machine.
 _WAIT_S: Final = 5e-3 * PUBLISHING_MS
 #: The history is read in pieces of this length [ns].
 _PIECE_NS: Final = 10_000_000_000
@@ -40,11 +40,11 @@ _PIECE_NS: Final = 10_000_000_000
 _OVERLAP_NS: Final = 1_000_000_000
 #: A stamp that is further ahead of the system's time than this [ns] neither begins nor ends a break.
 _AHEAD_NS: Final = 86_400_000_000_000
-#: Longest delay of a sent value in the server's history [s].
+#: Longest delay [s] after which a value that was sent is also in the server's history.
 _HISTORY_LAG_S: Final = 5.0
 #: Longest wait for the first values of a subscription [s], which a server sends at once.
 _FIRST_VALUES_S: Final = 10.0
-#: First wait before another attempt to connect, and the longest [s].
+#: First and longest wait before another attempt to connect [s].
 _FIRST_WAIT_S: Final = 1.0
 _LONGEST_WAIT_S: Final = 30.0
 
@@ -59,7 +59,7 @@ class OpcUa(SourceState):
     roles
         The mapping: each role is a topic, its fields are nodes.
     rate_hz
-        Expected rate of the samples [Hz]; 0: not known, the server's fastest sampling is requested.
+        Expected rate of the samples [Hz]; 0: unknown, so that the server's fastest sampling is requested.
     connect_s
         Longest wait for the first connection [s].
     waits
@@ -96,7 +96,7 @@ class OpcUa(SourceState):
         self._samples = {
             topic: Samples(sorted(set(role.fields.values())), _WAIT_S) for topic, role in self._roles.items()
         }
-        #: topics of each node, by its number
+        #: topics of each node, by the node's number
         self._topics_of = [
             [topic for topic, role in self._roles.items() if node in role.fields.values()] for node in self._nodes
         ]
@@ -122,7 +122,7 @@ class OpcUa(SourceState):
         logging.getLogger("asyncua").addHandler(logging.NullHandler())
 
     def topics(self) -> dict[str, TopicType]:
-        """Return the roles of nodes."""
+        """Return the roles as topics, all of the type for nodes."""
         return dict.fromkeys(self._roles, OPCUA)
 
     def start(self, topics: list[str], stamp_ns: StampOf[Arrived] | None = None) -> None:
@@ -215,7 +215,7 @@ class OpcUa(SourceState):
             self.trouble = f"the connection broke: {link.trouble}; reconnecting"
 
     async def _first_values(self) -> list[tuple[int, Any]]:
-        """Return the first values of the new subscription: the history is read up to them."""
+        """Return the first values of the new subscription, up to which the history is read."""
         give_up = time.monotonic() + _FIRST_VALUES_S
         while not self._held_back and time.monotonic() < give_up:
             await asyncio.sleep(0.01)
@@ -230,7 +230,7 @@ class OpcUa(SourceState):
         self._held_back = None
 
     async def _take(self, values: list[tuple[int, Any]], lost: bool) -> None:
-        """Use values of the subscription, after reading the values lost before them."""
+        """Use values of the subscription; values lost before them are first read from the history."""
         if self._held_back is not None:
             self._held_back.append((values, lost))
             return
@@ -261,7 +261,7 @@ class OpcUa(SourceState):
         return found is not None and found[0] <= end_ns
 
     def _is_known(self, number: int, value: Any) -> bool:
-        """Return whether the history had a value; a much older value is new: the server's clock was set back."""
+        """Return whether the history had a value; a much older value is new, since the server's clock was set back."""
         found = reading(value, self._by_server(number), Counts())
         return found is not None and 0 <= self._newest_ns(number) - found[0] < _PIECE_NS
 

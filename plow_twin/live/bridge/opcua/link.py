@@ -1,4 +1,4 @@
-"""A connection to an OPC UA server: one subscription, and the history for its breaks."""
+"""A connection to an OPC UA server: one subscription, and the history, which fills gaps after breaks."""
 
 from __future__ import annotations
 
@@ -19,35 +19,36 @@ from plow_twin.live.bridge.opcua.readings import Counts, date_of
 from plow_twin.live.bridge.opcua.security import identify, secure
 from plow_twin.live.bridge.source import BridgeError
 
-#: Interval at which the server is asked to send [ms]: two thirds of the age that a sample may have at the twin.
+#: Publishing interval requested from the server [ms]: two thirds of the age that a sample may have at the twin.
 PUBLISHING_MS: Final = 10.0
-#: Values of a node that the server is asked to keep between two messages: 1 s at 10 kHz.
+#: Number of values of a node that the server is asked to keep between two messages: 1 s at 10 kHz.
 _QUEUE: Final = 10_000
-#: Interval [s] at which a server without news reports; after three silent intervals it counts as gone.
+#: Keep-alive interval [s]: a server without new values sends a message once in this interval; after three intervals
+#: without a message the server counts as gone.
 _KEEPALIVE_S: Final = 2.0
 #: Time for which the server keeps a subscription without its client [s].
 _LIFETIME_S: Final = 60.0
-#: Most lost messages that are requested again at once.
+#: Largest number of lost messages that are requested again at once.
 _MOST_AGAIN: Final = 100
 #: Longest wait for an answer [s].
 _ANSWER_S: Final = 10.0
 #: Longest wait for the end of a session [s].
 _CLOSE_S: Final = 2.0
-#: Most bytes of a message that a server may send, and of its parts (the standard's least limit is 8 KiB) [B].
+#: Largest message that a server may send, and largest part of a message (the standard's least limit is 8 KiB) [B].
 _LARGEST_MESSAGE: Final = 64 << 20
 _LARGEST_PART: Final = 1 << 20
-#: Most values of the history that are read at once: 10 s of ten nodes at 10 kHz.
+#: Largest number of values of the history that are read at once: 10 s of ten nodes at 10 kHz.
 _MOST_HISTORY: Final = 1_000_000
 #: Sequence numbers begin again at 1 after this number.
 _LAST_NUMBER: Final = 2**32 - 1
 
-#: Takes values by number of their node, and whether values before them are missing.
+#: Function that takes pairs of node number and value, and whether values before these are missing.
 Take = Callable[[list[tuple[int, Any]], bool], Awaitable[None]]
 
 
 @dataclass(frozen=True)
 class Revised:
-    """The server's grants: intervals [ms] and values kept between two messages."""
+    """What the server grants: intervals [ms], and the number of values that it keeps between two messages."""
 
     publishing_ms: float
     sampling_ms: float
@@ -263,7 +264,7 @@ class Link:
     def _missing(self, number: int) -> range:
         """Return the sequence numbers that should have come before this one."""
         expected = self._next_number
-        if expected is not None and number == expected - 1:  # the newest value again
+        if expected is not None and number == expected - 1:  # the newest message was repeated
             return range(0)
         self._next_number = number % _LAST_NUMBER + 1
         return range(0) if expected is None or number < expected else range(expected, number)

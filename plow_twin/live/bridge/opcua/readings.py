@@ -14,7 +14,7 @@ _FARTHEST_NS: Final = 4_000_000_000_000_000_000
 _MICROSECOND: Final = timedelta(microseconds=1)
 _SEVERITY: Final = 0xC0000000
 _UNCERTAIN: Final = 0x40000000
-#: Bits of a status: the server's queue dropped values before this one.
+#: Bits of a status which mean that the server's queue dropped values before this one.
 _OVERFLOW: Final = 0x00000480
 
 
@@ -29,7 +29,7 @@ class Counts:
     unstamped: int = 0
     #: messages that are missing in the server's numbering, and were not sent again
     notifications_lost: int = 0
-    #: values that the server marked: its queue overflowed before them
+    #: values that the server marked because its queue overflowed before them
     overflows: int = 0
     breaks: int = 0
     breaks_filled: int = 0

@@ -9,12 +9,12 @@ from typing import Final
 #: Stands for a value that is not used and counts as not measured.
 NOT_MEASURED: Final = ""
 Value = float | str
-#: Most stamps that wait for values.
+#: Largest number of stamps that wait for values.
 _MOST_WAITING: Final = 10_000
 
 
 class Samples:
-    """Samples of one role: the values of its nodes at one stamp.
+    """Samples of one role; a sample is the values of the role's nodes at one stamp.
 
     A server does not resend an unchanged value: a node without a value at a stamp keeps its last value. A stamp is
     complete when each node has a value there or at a later stamp; otherwise it waits for `wait_s`.
@@ -30,7 +30,7 @@ class Samples:
     def __init__(self, nodes: Sequence[str], wait_s: float) -> None:
         self._wait_s = wait_s
         self._stamps_ns: list[int] = []
-        #: time of arrival of the first value [s], and the values by node
+        #: by stamp: time of arrival of the first value [s], and the values by node
         self._waiting: dict[int, tuple[float, dict[str, Value]]] = {}
         #: stamp of the newest value of each node [ns]
         self.newest_ns = dict.fromkeys(nodes, 0)
@@ -47,7 +47,7 @@ class Samples:
         """Add a value; the same stamp of a node again is ignored."""
         if stamp_ns == self.newest_ns[node]:
             return
-        # a starting server may stamp the first value by another clock, which does not bind later values
+        # a starting server may stamp the first value by another clock; later values may then have older stamps
         self.newest_ns[node] = stamp_ns if node in self._begun else max(stamp_ns, self.newest_ns[node])
         self._begun.discard(node)
         if stamp_ns not in self._waiting:
