@@ -29,7 +29,7 @@ class Compiles(event.Listener):
 
     def on_end(self, event: Any) -> None:
         took = time.thread_time() - self._begun.pop()
-        if not self._begun:  # a kernel that is compiled for another kernel counts with the other
+        if not self._begun:  # the time of a kernel that is compiled for another kernel is part of the other's time
             function = event.data["dispatcher"].py_func
             self._test.append((PROPERTY, (took, f"{function.__module__}.{function.__qualname__}")))
 

@@ -93,7 +93,7 @@ def record_run(
         if recorder.snapshot_wanted:
             journal(session.snapshot())
         if pause_every and index % pause_every == 0:
-            time.sleep(0.02)  # gives the thread time to empty the queue
+            time.sleep(0.02)  # the pause gives the recorder's thread time to empty the queue
     session.close()
     run.loss = recorder.close()
     return run

@@ -216,7 +216,8 @@ main(["simulate", "no such scene"])
 def test_a_missing_extra_is_named_with_its_pip_command(tmp_path: Path) -> None:
     (tmp_path / "mcap.py").write_text("raise ModuleNotFoundError(\"No module named 'mcap'\", name='mcap')")
     (tmp_path / "run.mcap").write_bytes(mcap_bytes.beginning())
-    done = plow_twin("replay", "run.mcap", cwd=tmp_path)  # -m puts the working directory first on the path
+    # `python -m` puts the working directory, and with it this mcap.py, first on the path
+    done = plow_twin("replay", "run.mcap", cwd=tmp_path)
     assert done.returncode == 1
     assert "pip install 'plow_twin[record]'" in done.stderr
     assert "Traceback" not in done.stderr

@@ -80,7 +80,7 @@ def test_each_second_of_a_file_has_its_update_on_the_screen_and_a_way_out_keeps_
     for by_second, expected in ((True, [float(second) for second in range(1, 30)]), (False, [])):
         link, theirs = pair()
         feed = Feed(link, FACTS, by_second=by_second)
-        for index in range(580):  # stamps at 20 Hz, sent as fast as possible
+        for index in range(580):  # the stamps have a rate of 20 Hz, but the publications are sent as fast as possible
             feed.publication(_published(1.0 + 0.05 * index, 1.0 + index // 20))
         with theirs:
             far, peaks = Link(theirs), []
@@ -365,7 +365,7 @@ def test_an_operator_acknowledges_and_marks_and_the_journal_has_both(tmp_path: P
         see(lambda: told.get("motion", {}).get("t", 0) >= 0.999e-3 * COUNT)
         assert told["alarms"]["force_latched"] == "warn" and told["motion"]["clearance"]["horizontal"] > 0.02
         page.send("no JSON")
-        page.send(json.dumps({"do": "reset"}))  # the page never sends this request
+        page.send(json.dumps({"do": "reset"}))  # the page itself never sends this request
         page.send(json.dumps({"do": "mark", "text": "x" * 1000}))
         page.send(json.dumps({"do": "mark", "text": "<b>shift</b> " + "x" * 180}))
         page.send(json.dumps({"do": "acknowledge"}))

@@ -60,7 +60,7 @@ def test_every_call_that_a_page_shows_has_a_verb_and_options_that_exist() -> Non
     unknown = []
     for page, call in calls:
         command, words = commands, re.split(r"\s+", re.split(r"[|&<>]", call)[0].strip())
-        words = words[2:] if words[0] == "--laws" else words  # all verbs have this option
+        words = words[2:] if words[0] == "--laws" else words  # every verb takes the option `--laws`
         while isinstance(command, click.Group) and words and words[0] in command.commands:
             command = command.commands[words.pop(0)]
         known = {option for one in command.params for option in (*one.opts, *one.secondary_opts)} | {"--help"}

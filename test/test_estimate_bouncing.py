@@ -260,6 +260,6 @@ def test_the_regression_gives_the_value_at_the_measured_features() -> None:
     found = regress_near(features, targets, np.array([0.5, 0.2, 0.0]))
     assert found.value[0] == pytest.approx(2.3, abs=0.1)
     assert 0.05 < found.deviation[0] < 0.2
-    # the deviation includes the nonlinear part
+    # the deviation includes the part of the relation that is not linear
     assert found.deviation[1] > 0.2
     assert found.distance < 1.5 < regress_near(features, targets, np.full(3, 6.0)).distance

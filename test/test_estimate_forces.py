@@ -123,7 +123,7 @@ def test_a_folder_without_forces_runs_no_code_of_forces(
     # files that `--out` writes are not measurements
     (tmp_path / "forces.csv").write_text("t,force_top_left_top/p05\n0,1\n")
     for name in ("contact_forces", "force_fit"):
-        monkeypatch.setitem(sys.modules, f"plow_twin.estimate.{name}", None)  # the import of this module fails
+        monkeypatch.setitem(sys.modules, f"plow_twin.estimate.{name}", None)  # an import of this module now fails
     result, _ = _given(tmp_path, None, None, True).run()
     assert result.forces_measured is None
     (tmp_path / "contact_forces.csv").write_text("t,top_left_top\n0,1\n")

@@ -52,7 +52,7 @@ def test_gaps_give_the_clearances_without_a_contact_model(
 def test_gaps_at_one_wall_alone_give_no_clearance(gapped: tuple[Truth, np.ndarray]) -> None:
     truth, gap = gapped
     gap = gap.copy()
-    gap[:, [3, 5]] = np.nan  # no gap at the right wall
+    gap[:, [3, 5]] = np.nan  # the right wall has no gap sensor
     gaps, _ = Gaps.of(truth.poses.t, gap)
     assert fit_gaps(truth.nominal, gaps, truth.poses) is None
     result = estimate(truth.nominal, truth.load, Poses(truth.poses.t[:0], truth.poses.q[:0]), gaps=gaps)

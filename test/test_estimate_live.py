@@ -242,7 +242,7 @@ def test_an_estimate_stays_until_it_is_withdrawn_or_the_pads_are_changed() -> No
     session.apply(Sample(START_NS + 100_000_000, (4e4, -1e4, 0.0)))
     later = clearance(1.8)
     assert later["vertical"] == pytest.approx(0.03, abs=1e-6)
-    # its interval widens by the prior of the wear
+    # the interval of the horizontal clearance widens by the prior of the wear
     assert later["horizontal/p95"] - later["horizontal/p05"] > now["horizontal/p95"] - now["horizontal/p05"]
     second = entry_of(_found(State.NOT_OBSERVABLE, State.WITHDRAWN), session, first)
     assert second.shift == (*first.shift[:3], 0.0, 0.0, 0.0)
@@ -326,7 +326,7 @@ def test_a_frozen_worker_is_reported_and_costs_no_further_memory(monkeypatch: py
         for _ in range(1000):
             worker.add_load(START_NS, (0.0, 0.0, 0.0))
         assert worker.poll() is None
-        # the worker is so slow that the source waits for it even with less data
+        # the pause acts like a slow worker: the source waits for it even with less data
         time.sleep(0.1)
     assert worker.error == "the estimator did not read for 20000 samples"
     assert not worker.ready
@@ -340,7 +340,8 @@ def test_the_death_of_a_worker_is_reported_and_stops_nothing() -> None:
     worker = Worker(preset("paper"), Windows(10.0, 4.0, 1.0))
     os.kill(worker._process.pid, signal.SIGSTOP)
     worker._connection.close()
-    assert worker.poll() is None and not worker.error  # the test does not wait for the worker's end
+    # the worker has not ended yet, and `poll` does not wait for its end
+    assert worker.poll() is None and not worker.error
     worker._process.kill()
     give_up = time.monotonic() + 20.0
     while not worker.error and time.monotonic() < give_up:

@@ -107,6 +107,6 @@ def test_samples_too_rare_for_a_rough_load_leave_its_oscillation_and_the_density
     assert ((share > 0.4) & (share < 1.3)).all(), "samples hardly tell how short the correlation is"
     known = load.believable()
     left = np.stack([np.interp(known.t, fine, column) for column in slow.T], axis=1) - known.wrench
-    # the samples themselves were off by 1, 2 and 3
+    # without `believable`, the samples were off by 1, 2 and 3
     assert (left.std(axis=0) < [0.4, 0.8, 1.2]).all()
     assert (np.array(known.unknown) < (impulse**2).mean(axis=0)).all()

@@ -130,7 +130,7 @@ def test_a_file_is_fed_recorded_and_replayed_and_every_row_is_counted(
 def test_a_time_that_stands_alone_is_no_clock_and_no_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     date = "2026-01-01T00:00:{:06.3f}".format
     rows = [f"{date(index * 1e-3)},1,2,3\n" for index in range(300)]
-    rows[150:150] = ["2080-01-01,1,2,3\n"]  # a stamp that does not continue the stamps before
+    rows[150:150] = ["2080-01-01,1,2,3\n"]  # this stamp does not continue the stamps before it
     rows[200:200] = ["9999-12-31,1,2,3\n", "9999-12-31,1,2,3\n"]
     path = tmp_path / "load.csv"
     path.write_text("time,fx,fy,m\n" + "".join(rows))
@@ -329,9 +329,10 @@ def test_a_mapping_takes_units_offsets_clocks_and_names_its_faults(tmp_path: Pat
     for wrong in (True, [1], {}, None, 10**400):
         assert read(pose + "stamp: at}", a=wrong, b={"c": 4}, turn=1, at=1) is None
     assert time_ns(1_767_323_045_123_456_789, "ns") == 1_767_323_045_123_456_789
-    assert time_ns(0.5) == 1_500_000_000  # times with an arbitrary start; a stamp of 0 would be missing
+    # a time with an arbitrary start is moved by 1 s, because 0 stands for a missing stamp
+    assert time_ns(0.5) == 1_500_000_000
     assert time_ns("yesterday") is None and time_ns(float("inf")) is None and time_ns(1e300) is None
-    # the empty date of many databases, and dates that no stamp can represent
+    # the date that stands for `empty` in many databases, and dates that no stamp can represent
     assert time_ns("9999-12-31") is None and time_ns("2300-01-01T00:00:00") is None and time_ns("0001-01-01") is None
     assert time_ns(10**400) is None and time_ns("20260102") == (20_260_102 + 1) * 10**9
     for text, said in (
@@ -497,7 +498,7 @@ def test_a_file_is_followed_while_it_grows_and_when_it_is_replaced(tmp_path: Pat
         live.until_count("samples_used", 100)
         text = "".join(",".join(map(repr, _row(index))) + "\n" for index in range(100, 200))
         with path.open("a") as stream:
-            stream.write(text[:1234])  # ends in the middle of a number
+            stream.write(text[:1234])  # this text ends in the middle of a number
             stream.flush()
             live.until_count("samples_used", 105)
             stream.write(text[1234:])
@@ -566,7 +567,7 @@ def test_files_with_dates_are_waited_for_and_followed_from_one_to_the_next(
     mapping.write_text("excitation: {topic: load_*, unit: {fx: N}}\n")
     arguments = (str(tmp_path / "load_*.csv"), "--follow", "--map", str(mapping), "--set", "excitation_timeout=3600")
     with _live(*arguments) as live:
-        days[1].write_text("t,fx")  # a header cut in the middle
+        days[1].write_text("t,fx")  # the header is cut in the middle
         time.sleep(0.5)
         days[1].write_text("t,fx,fy,m\n" + text(0, 100))
         live.until_count("samples_used", 100)
@@ -616,14 +617,14 @@ def test_nothing_of_a_followed_file_is_lost_unseen_when_it_is_cut_or_another_tak
     assert read() == [50.0]
     path.write_text("m;fx;t;fy\n0;60;6;0\n")
     assert read() == [60.0]
-    path.write_text("0,7\n0,70,7,0\n")  # cut within a line, whose second half is not used
+    path.write_text("0,7\n0,70,7,0\n")  # the file was cut within a line; the second half of this line is not used
     assert read() == [None, 70.0]
-    path.write_text("t,fx,fy,m\n" + "8,80,0,0\n" * 3)  # written anew, longer than before
+    path.write_text("t,fx,fy,m\n" + "8,80,0,0\n" * 3)  # the file is written anew and becomes longer than before
     assert read() == [80.0] * 3
     path.unlink()
     assert read() == []
     path.write_text("a,b\n1,2\n")
-    assert repr(read()) == "[nan]"  # under another header there is no load; the reader counts these rows
+    assert repr(read()) == "[nan]"  # the new header names no load; the reader counts such rows
     files.close()
 
 
@@ -647,7 +648,7 @@ def test_lines_on_standard_input_are_taken_and_silence_is_held(tmp_path: Path) -
 
 
 def test_a_closed_standard_input_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "stdin", None)  # Python's value for a closed stream
+    monkeypatch.setattr(sys, "stdin", None)  # Python sets a closed stream to None
     with pytest.raises(BridgeError, match="closed standard input"):
         StandardInput()
 
@@ -829,7 +830,8 @@ def test_poses_gaps_and_speeds_that_cannot_be_are_not_used() -> None:
     inputs.active = inputs.started = True
     inputs.set_limits(value_limits(2.0, 1.0), pose_limits(load_scene("paper"), 0.05, 0.7), value_limits(0.1, 1.0))
     second = 10**9
-    for at, speed in ((1, 0.5), (2, 1.4), (3, 2.5), (4, -1.7), (5, 0.0)):  # 2.5 is too large, -1.7 changes too fast
+    # a speed of 2.5 is too large, and the change to -1.7 is too fast
+    for at, speed in ((1, 0.5), (2, 1.4), (3, 2.5), (4, -1.7), (5, 0.0)):
         used += [speed] if inputs.uses_travel(at * second, speed) else []
     assert used == [0.5, 1.4, 0.0] and inputs.travel.counts[Verdict.IMPLAUSIBLE] == 2
     used.clear()
@@ -1053,7 +1055,7 @@ def test_a_file_gives_the_same_journal_outputs_and_counts_in_batches_as_row_by_r
         prepared = Preparation(settings).result(lambda: False)
         front = BridgeFront(Files([path], follow=False), None, settings, prepared, lambda *_: None, pytest.fail)
         if name == "single":
-            front.attach(_Onlooker())  # an observer sees each sample
+            front.attach(_Onlooker())  # an observer sees each sample, so the samples are used one by one
         front.run(lambda: False)
         figures = front.parts()
         counts = {key: figures["input"][2][key] for key in figures["input"][2] if not key.endswith(("_s", "_ms"))}

@@ -167,7 +167,8 @@ def test_values_of_a_stamp_are_a_sample_and_unchanged_fields_stay() -> None:
     samples.add("a", 10, 1.0, 0.0)
     samples.add("b", 10, 2.0, 0.1)
     samples.add("a", 20, 3.0, 0.2)
-    assert samples.take(0.3) == [(10, {"a": 1.0, "b": 2.0})]  # a value of b may still come
+    # the sample at 20 waits, because its value of b may still come
+    assert samples.take(0.3) == [(10, {"a": 1.0, "b": 2.0})]
     samples.add("b", 30, 4.0, 0.4)
     samples.add("a", 30, 5.0, 0.4)
     assert samples.take(0.5) == [(20, {"a": 3.0, "b": 2.0}), (30, {"a": 5.0, "b": 4.0})]
@@ -179,7 +180,7 @@ def test_values_of_a_stamp_are_a_sample_and_unchanged_fields_stay() -> None:
     assert samples.take(2.1) == [(25, {"a": 8.0, "b": 7.0})]
     assert samples.take(9.0) == []
     assert samples.take_incomplete() == 1
-    samples.add("b", 40, 9.0, 9.0)  # the same value is sent again
+    samples.add("b", 40, 9.0, 9.0)  # b at 40 is a value that is sent again
     assert samples.take(99.0) == []
     # an impossible stamp changes nothing
     samples.add_stray("a", 10**18, 1.0, 9.0)
@@ -457,7 +458,7 @@ def test_a_user_signs_in_by_certificate_and_no_other_one_does(
             assert len(_until(bridge, lambda found: len(found) >= 5)) >= 5
         finally:
             bridge.close()
-    # a copied certificate without its key
+    # someone has copied the certificate, but has no key for it
     stolen = replace(access, user_certificate=certificates / "user.pem", user_key=certificates / "other.key.pem")
     bridge = OpcUa(stolen, roles)
     with pytest.raises(BridgeError, match="refused"):

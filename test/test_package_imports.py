@@ -59,7 +59,8 @@ LIBRARIES = {
     "model": {"scipy"},
     "solve": {"scipy"},
     "estimate": {"scipy"},
-    "run": {"matplotlib"},  # the type of `Result.plot`; a test checks that it is not imported
+    # imported for the type of `Result.plot` only; a test checks that it is not loaded at run time
+    "run": {"matplotlib"},
     "scene_file": {"yaml", "jsonschema", "pyarrow"},
     "record": {
         "mcap",
@@ -245,7 +246,8 @@ def test_every_public_name_is_found_and_imported_on_first_use() -> None:
     assert {name for name in dir(plow_twin) if not name.startswith("_")} >= names
     for name in names:
         assert getattr(plow_twin, name) is not None
-    assert set(plow_twin.__all__) == names - {"Recording", "read_recording"}  # these names need libraries of an extra
+    # these two names need libraries of an extra
+    assert set(plow_twin.__all__) == names - {"Recording", "read_recording"}
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
         plow_twin.nonsense  # noqa: B018
     code = (

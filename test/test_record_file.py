@@ -203,7 +203,7 @@ def test_a_damaged_byte_costs_one_chunk_and_is_reported(run: Run, tmp_path: Path
         assert (reader.damaged_chunks, reader.status) == (1, FileStatus.DAMAGED)
         rest = iter(whole)
         assert 0 < len(records) < len(whole)
-        assert all(record in rest for record in records)  # in order, and without further entries
+        assert all(record in rest for record in records)  # the records are in order, and there are no others
 
 
 def write_large(source: Path, target: Path, images: int, image_size: int, attachments: int) -> None:
@@ -214,7 +214,7 @@ def write_large(source: Path, target: Path, images: int, image_size: int, attach
 
     data = source.read_bytes()
     head = 8
-    for _ in range(2):  # the header of the file, and the header of the run
+    for _ in range(2):  # skip the header of the file, and the header of the run
         head += 9 + struct.unpack_from("<Q", data, head + 1)[0]
     schema = struct.pack("<H", 60_000) + text("sensor_msgs/msg/Image") + text("ros2msg") + text("uint8[] data")
     channel = struct.pack("<HH", 60_000, 60_000) + text("/camera") + text("cdr") + struct.pack("<I", 0)
@@ -318,7 +318,7 @@ def test_the_extra_brings_every_library_that_is_imported(monkeypatch: pytest.Mon
     wanted = [*declared["install_requires"], *declared["extras_require"]["record"]]
     names = {re.split("[^A-Za-z0-9_-]", requirement.replace("PyYAML", "yaml"))[0] for requirement in wanted}
     names.add("llvmlite")  # numba requires llvmlite at a fixed version
-    names |= {"pandas", "pyarrow"}  # for tables of a recording, only if installed
+    names |= {"pandas", "pyarrow"}  # libraries for tables of a recording, which are used only if installed
     assert imported - names - sys.stdlib_module_names - {"plow_twin"} == set()
 
 
@@ -369,7 +369,7 @@ def test_frames_of_lz4_are_read_as_its_library_reads_them() -> None:
         direct = independent_blocks(memoryview(frame), len(content))
         assert direct is None or direct.tobytes() == content
         taken += direct is not None
-    assert taken >= 6  # the records that the recorder writes
+    assert taken >= 6  # at least the records that the recorder writes are read directly
     whole = np.frombuffer(lz4.frame.compress(contents[4][:5000], block_linked=False), np.uint8)
     for place in range(len(whole)):
         assert independent_blocks(whole[:place].data, 5000) is None

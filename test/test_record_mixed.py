@@ -254,7 +254,7 @@ def _drive(live: Mixed, random: Random, calls: int) -> None:
             case "samples":
                 count = random.choice([1, 1, 2, 5, 40])
                 arriving = [_swinging(index + offset) for offset in range(count)]
-                if random.random() < 0.2 and skipped:  # late samples are sent with them, in any order
+                if random.random() < 0.2 and skipped:  # late samples may come along with the new ones, in any order
                     arriving += [_swinging(ms) for ms in skipped[-3:]]
                     del skipped[-3:]
                     random.shuffle(arriving)
@@ -267,7 +267,8 @@ def _drive(live: Mixed, random: Random, calls: int) -> None:
                 skipped += range(index, index + gap)
                 index += gap
             case "late" if skipped:
-                near = [ms for ms in skipped if abs(index - ms - span_ms) < 20]  # samples at the edge of the memory
+                # samples whose stamps are at the edge of the twin's memory
+                near = [ms for ms in skipped if abs(index - ms - span_ms) < 20]
                 chosen = near or random.sample(skipped, min(len(skipped), random.choice([1, 1, 4])))
                 skipped = [ms for ms in skipped if ms not in chosen]
                 load = ABSURD if fails and random.random() < 0.2 else None
@@ -280,7 +281,7 @@ def _drive(live: Mixed, random: Random, calls: int) -> None:
             case "wear":
                 live.driver.set_wear(stamp_ns, [1e-5 * random.random()] * 8, "other pads")
                 skipped.clear()
-            case "travel":  # speeds that are late, on time, early and far too late
+            case "travel":  # the speeds are late, on time, early or far too late
                 live.driver.travel(stamp_ns + random.randrange(-span_ms - 50, 50) * MS, 3.0 * random.random())
             case "snapshot":
                 live.driver.snapshot()

@@ -117,7 +117,7 @@ def test_a_damaged_chunk_is_left_out_by_a_repair_and_the_gap_is_named(tmp_path: 
     run = record_run(tmp_path / "run", map(paper_sample, range(COUNT)), chunk_size=50_000)
     whole, spans = run.file.read_bytes(), chunk_spans(run.file)
     assert len(spans) > 6
-    for start, length in spans[2:6]:  # chunks of the journal and of outputs
+    for start, length in spans[2:6]:  # these are chunks of the journal and of outputs
         data = bytearray(whole)
         data[start + length // 2] ^= 0xFF
         run.file.write_bytes(data)
@@ -172,7 +172,7 @@ def test_topics_recorded_beside_a_run_are_examined_and_repaired(tmp_path: Path) 
     for index in range(100):
         writer.add(number, index, index, index, bytes(12))
         writer.flush()
-    writer.lost["/level"] = 7  # a full disk has the same effect
+    writer.lost["/level"] = 7  # losses that the recorder has counted, as on a full disk
     writer.close()
     lost = "beside: 7 lost on /level, as counted by the recorder"
     assert examine(run.folder).problems == [lost]
@@ -182,7 +182,8 @@ def test_topics_recorded_beside_a_run_are_examined_and_repaired(tmp_path: Path) 
     with writer.path.open("rb") as stream:
         summary = make_reader(stream).get_summary()
     assert summary is not None and summary.statistics is not None and summary.statistics.message_count > 5
-    assert summary.channels[1].metadata["topic_type_hash"] == "RIHS01_" + 64 * "0"  # a type of another package
+    # the type belongs to another package, so its hash is unknown
+    assert summary.channels[1].metadata["topic_type_hash"] == "RIHS01_" + 64 * "0"
     assert "own/msg/Level" in (writer.folder / "metadata.yaml").read_text()
 
 
@@ -237,8 +238,8 @@ def test_a_stretch_that_stands_there_twice_is_counted_and_used_once(tmp_path: Pa
     run = record_run(tmp_path / "run", map(paper_sample, range(COUNT)), chunk_size=50_000)
     whole, spans = run.file.read_bytes(), chunk_spans(run.file)
     before = replay(run.folder)
-    head = 9 + 3 * 8 + 2 * 4 + len("zstd") + 8  # length of a chunk's record before its data
-    begin, end = spans[2][0] - head, spans[8][0] - head  # from chunks of the journal to chunks of outputs
+    head = 9 + 3 * 8 + 2 * 4 + len("zstd") + 8  # number of bytes of a chunk's record before its data
+    begin, end = spans[2][0] - head, spans[8][0] - head  # the chunks from one of the journal up to one of outputs
     run.file.write_bytes(whole[:end] + whole[begin:end] + whole[end:])
     after, found = replay(run.folder), examine(run.folder)
     assert after.divergences == 0 and after.samples == before.samples and after.repeated == found.repeated > 0

@@ -125,7 +125,7 @@ def kill_writers(folders: Iterable[Path], rng: random.Random, flush_s: float, lo
             process.stdin.write(f"{folder} {flush_s}\n")
             process.stdin.flush()
             child = int(process.stdout.readline().split()[1])
-            lines = [process.stdout.readline()]  # the writer has begun to write
+            lines = [process.stdout.readline()]  # this line shows that the writer has begun to write
             killer = threading.Timer(rng.uniform(0.0, longest_s), os.kill, [child, signal.SIGKILL])
             killer.start()
             for line in process.stdout:  # lines are read all the time, so that the pipe never fills up
@@ -200,7 +200,7 @@ def test_a_full_queue_is_counted_and_noted_in_the_file(tmp_path: Path) -> None:
     for entry, following in itertools.pairwise(told):
         assert not isinstance(entry, Loss) or isinstance(following, Snapshot)
     assert reader.lost == dict(loss.lost)
-    # the notes of a killed process remain
+    # the notes remain if the process is killed
     data = reader.path.read_bytes()
     (tmp_path / "cut.mcap").write_bytes(data[: data.index(LOSS_RECORD.encode())])
     cut = RunReader(tmp_path / "cut.mcap")
@@ -220,7 +220,7 @@ def test_a_full_disk_stops_the_recording_and_nothing_else(tmp_path: Path) -> Non
     output, _ = process.communicate(timeout=60)
     assert process.returncode == 0
     report = json.loads(output.splitlines()[-1])
-    assert len(output.splitlines()) == 3001  # the caller has continued to its end
+    assert len(output.splitlines()) == 3001  # the caller has continued to its last sample
     assert report["errors"] == [report["error"]] and "File too large" in report["error"]
     assert not report["closed"] and report["refused"] > 0 and report["counted"] == report["lost"]
     reader = RunReader(tmp_path / "run")
@@ -350,7 +350,7 @@ def test_a_ring_keeps_the_last_seconds_and_writes_them_at_a_mark(
     dump = RingWriter.dump
 
     def dump_after_another(ring: RingWriter, folder: Path, loss: Mapping[str, int]) -> None:
-        if folder.name == "ring_2":  # another process makes this folder first
+        if folder.name == "ring_2":  # another process makes this folder before the ring does
             Recorder(folder, HEADER).close()
         dump(ring, folder, loss)
 
@@ -401,7 +401,8 @@ def test_losses_of_callers_do_not_disturb_the_closing_of_the_file(
 
     def close_among_callers(writer: RunWriter, loss: Mapping[str, int], *reason: str | None) -> None:
         before = dict(loss)
-        assert not recorder.output("/late", BASE_NS, joint_state(0))  # the lock is free
+        # this call would wait for ever if `close` held the lock
+        assert not recorder.output("/late", BASE_NS, joint_state(0))
         assert dict(loss) == before
         close(writer, loss, *reason)
 
@@ -478,7 +479,7 @@ def test_of_recorders_that_want_one_folder_each_gets_its_own(tmp_path: Path, mon
     def make(folder: Path) -> Recorder:
         if not quicker:
             quicker.append(Recorder(folder, HEADER))
-        elif len(quicker) == 1:  # the empty folder existed before
+        elif len(quicker) == 1:  # this folder existed before and was empty, so it counts as free
             monkeypatch.setattr("plow_twin.record.writer._is_free", lambda folder: True)
             quicker.append(Recorder(folder, HEADER))
         else:
@@ -533,7 +534,8 @@ def test_with_sync_flushed_data_survive_a_loss_of_power(tmp_path: Path) -> None:
             else:
                 synced.append((rest[1], int(rest[0])))
                 flushes += index >= 0
-                before = index if flushes == 3 else before  # at the latest, the next flush waits for the disk
+                # at the latest, the next flush waits until these entries are on the disk
+                before = index if flushes == 3 else before
             if flushes == 5:
                 process.kill()
     # a loss of power may leave only the synced files

@@ -163,7 +163,8 @@ def test_wear_that_could_not_be_saved_goes_on_unless_the_file_is_another_one(
 
         def fail(descriptor: int) -> None:
             calls.append(descriptor)
-            if len(calls) == 1 + waited:  # an error of the file, or of the folder when the new file already exists
+            # the write of the file fails, or that of the folder when the new file already exists
+            if len(calls) == 1 + waited:
                 raise OSError(28, "No space left on device")
 
         full.setattr(os, "fsync", fail)

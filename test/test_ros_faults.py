@@ -388,7 +388,8 @@ def test_steps_of_the_node_s_own_clock_stop_reset_and_lose_nothing(
 ) -> None:
     settings = {"record_path": tmp_path / "run", "excitation_timeout": 60.0, **RELIABLE_INPUT}
     with bench(tmp_path, **settings) as running:
-        monkeypatch.delenv("LD_PRELOAD")  # only the node has the shifted clock
+        # from here on new processes have the true clock; only the node has the shifted clock
+        monkeypatch.delenv("LD_PRELOAD")
         probe = running.probe
         send = probe.excitation()
         sent = 0

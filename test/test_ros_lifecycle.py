@@ -248,7 +248,7 @@ def active(tmp_path_factory: pytest.TempPathFactory) -> Any:
         ("tolerance", 1e-8, False),
         ("no_such_parameter", 1.0, False),
         ("hold_policy", "x" * 100_000, False),
-        # rclpy raises an error for both of these
+        # rclpy raises an error for both of these values
         ("failure_limit", ParameterValue(type=200), False),
         ("hold_policy", ParameterValue(type=ParameterType.PARAMETER_DOUBLE_ARRAY), False),
     ],

@@ -382,7 +382,7 @@ def test_a_delay_that_rises_for_good_is_worked_in_marked_and_replayed_exactly(tm
     report = replay(record)
     assert (report.exit_code, report.divergences) == (0, 0), report
     assert report.compared["contact_peaks"] >= len(forces) and not report.not_compared
-    # a subscriber received the messages of the file
+    # a subscriber received the same messages that the file has
     topic = f"{running.namespace}/contact_forces"
     recorded = [item.message() for item in RunReader(record) if getattr(item, "topic", "") == topic]
     assert len(recorded) >= len(forces)
@@ -452,7 +452,7 @@ def test_bad_samples_are_dropped_counted_and_never_published(tmp_path: Path) -> 
         send(T0 + 2 * MS, good)  # this sample is late: the motion is corrected
         send(T0 + 4 * MS, (1e8, 0.0, 0.0))
         other.publish(JointState(name=["fx1"], effort=[1.0]))
-        # bytes that are not a message of this type
+        # these bytes are no message of the topic's type
         for kind, topic in ((TwistStamped, "travel"), (PoseStamped, "head_pose"), (JointState, "gaps")):
             probe.publisher(kind, topic).publish(b"\x00\x01\x00\x00" + b"\xff" * 12)
         send(T0 + 4 * MS, good)
@@ -525,7 +525,7 @@ def test_a_stop_under_load_is_clean_and_closes_the_recording(tmp_path: Path, num
         forces = running.probe.listen(JointState, "contact_forces")
         publisher = running.publisher("--seconds", "60")
         running.probe.until(lambda: len(forces) > 500, "a flow of messages", 60.0)
-        # signals as from a terminal and a launch at once
+        # several signals arrive, as when a terminal and a launch each send one
         assert running.twin.stop_again_and_again(number) == 0
         assert "Traceback" not in running.twin.output()
         assert publisher.running

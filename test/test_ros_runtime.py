@@ -146,7 +146,7 @@ def test_no_runtime_outlives_its_cycle() -> None:
         assert node.start()
         assert node.runtime is not None
         seen.append(weakref.ref(node.runtime))
-        node.release()  # the node is released while active
+        node.release()  # here the node is released while it is active
         gc.collect()
         assert seen[-1]() is None
     assert gc.get_freeze_count() == 0
@@ -355,7 +355,7 @@ def test_loss_is_counted_by_the_publishers_numbers() -> None:
         assert node.start()
         assert node._front is not None and node.runtime is not None
         subscriptions = node._front.subscriptions
-        for numbers in ((7, 8), (11,), (10,), (12,)):  # 9 never comes, and 10 comes late
+        for numbers in ((7, 8), (11,), (10,), (12,)):  # number 9 never comes, and 10 comes late
             batch = [Taken(b"one", number, 0, serialize_message(TwistStamped())) for number in numbers]
             subscriptions.receive("travel", batch)
         assert node.runtime.inputs.lost == 1

@@ -93,7 +93,8 @@ def test_parts_that_the_clearance_does_not_decide_are_computed_once(monkeypatch:
 
     monkeypatch.setattr(geometry, "arm_rows", counted)
     centred = preset("bench_kv")
-    beside = dataclasses.replace(centred, initial=Initial(q=(1e-3, 2e-3, 0.01)))  # may touch walls at the start
+    # off centre, the head may touch walls at the start
+    beside = dataclasses.replace(centred, initial=Initial(q=(1e-3, 2e-3, 0.01)))
     gaps = [Clearance(gap, 0.03) for gap in (0.015, 0.020, 0.025)]
     scenes = [dataclasses.replace(scene, clearance=gap) for scene in (centred, beside) for gap in gaps]
     params, _ = compiled_scene.compile_scenes(scenes, 1e-6)

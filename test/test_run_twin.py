@@ -143,7 +143,7 @@ def test_a_failed_advance_keeps_the_last_good_state_and_the_next_one_goes_on(wre
     assert after.status is Status.OK and abs(after.q - good.q).max() < 0.05
 
 
-@pytest.mark.stress  # it compiles a kernel of its own
+@pytest.mark.stress  # this test compiles a kernel of its own
 @pytest.mark.parametrize("depth", [0.2, 1.3])
 def test_a_failed_advance_leaves_no_trace_in_later_ones(depth: float) -> None:
     """The advance fails after the end of the ramp; the impact continues as if the advance had not been tried."""
@@ -157,7 +157,7 @@ def test_a_failed_advance_leaves_no_trace_in_later_ones(depth: float) -> None:
     twins[1].advance(t, idle)
     assert twins[1].advance(t + 0.1, (0.0, -1e6, 0.0)).status is Status.OUT_OF_RANGE
     assert twins[1].advance(t + 0.1, idle).status is Status.OK
-    # equal up to rounding, because a step ends where the failure was
+    # the two are equal only up to rounding, because a step ends where the failure was
     expected, after = twins[0].advance(t + 0.01, idle), twins[1].advance(t + 0.11, idle)
     assert after.q == pytest.approx(expected.q, abs=1e-13) and after.v == pytest.approx(expected.v, rel=1e-9)
 

@@ -93,7 +93,7 @@ def test_corners_pass_their_contact_on_at_45_degrees() -> None:
     push = Constant("push", force_n=(0.0, -90.0), moment_n_m=-3.3)
     lying = Initial(q=(0.0, -WALL + 0.5 * SIDE, 0.0), v=(0.0, 0.0, -0.3))
     scene = block(initial=lying, loads=(push,), friction=Friction(1.0, 0.02))
-    result = simulate(scene, t_end=0.25, output_dt=1e-3, energy_balance=True)  # uses the kernels of `falls`
+    result = simulate(scene, t_end=0.25, output_dt=1e-3, energy_balance=True)  # this call uses the kernels of `falls`
     turned = np.flatnonzero(result.q[:, 2] < -0.25 * math.pi)
     assert turned.size > 0
     at = result.t[turned[0]]

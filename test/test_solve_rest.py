@@ -112,7 +112,8 @@ def test_an_unstable_balance_is_not_rest(corners: tuple[str, ...]) -> None:
 
 
 def test_a_twin_at_rest_is_asked_saved_and_restored_without_a_trace() -> None:
-    scene = dataclasses.replace(fallen(), locked=("x", "theta"))  # with the kernels of other tests
+    # with these degrees of freedom locked, the kernels of other tests are used
+    scene = dataclasses.replace(fallen(), locked=("x", "theta"))
     twin, other = Twin(scene), Twin(scene)
     rows = [twin.advance(t) for t in np.linspace(0.5, 77.7, 300)]
     assert twin._state.at_rest == 1 and not rows[-1].v.any()

@@ -159,7 +159,7 @@ def test_a_load_below_the_limit_is_held_without_creep() -> None:
     scene = replace(block(0.0, 0.0), friction=HELD, loads=(load,))
     result = simulate(scene, 20.0, output_dt=0.05, tol=1e-10)
     settled = result.t > 1.0
-    # a forced oscillation far below the grip's natural frequency
+    # the motion is a forced oscillation far below the grip's natural frequency
     stiffness, lag = 2.0 * GRIP - MASS * omega**2, 2.0 * HELD_DAMPING * omega
     swing = amplitude / math.hypot(stiffness, lag)
     expected = swing * np.sin(omega * result.t - math.atan2(lag, stiffness))
@@ -168,7 +168,8 @@ def test_a_load_below_the_limit_is_held_without_creep() -> None:
     assert creeping.q[-1, 0] > 1000.0 * swing
 
 
-@pytest.mark.stress  # own kernels; the quick run has `test_a_corner_grips_at_its_touch_as_with_fixed_steps`
+# this test compiles its own kernels; the quick run has `test_a_corner_grips_at_its_touch_as_with_fixed_steps` instead
+@pytest.mark.stress
 @pytest.mark.parametrize("name", ["paper", "bench_hc"])
 def test_fixed_steps_come_to_the_same_motion_and_the_energy_balances(name: str) -> None:
     friction = Friction(0.3, stick_stiffness_n_m=5e7, stick_damping_n_s_m=1e5, static_coefficient=0.3)
@@ -246,7 +247,7 @@ def test_painleves_case_is_an_impact_without_collision() -> None:
         rate, t = math.sqrt(abs(p) * stiffness), result.t[1:40]
         expected = stiffness * 1e-3 / rate * (np.sinh(rate * t) if jams else np.sin(rate * t))
         assert result.force[1:40, pair] == pytest.approx(expected, rel=0.02)
-        # the corner is thrown back far faster than it came, or just turns back
+        # if it jams, the corner is thrown back far faster than it came; otherwise it just turns back
         assert (result.v[-1, 1] > 0.1) == jams and (result.statistics["top_right_top"]["max"] > 1e3) == jams
         assert result.force[-1, pair] == 0.0
 

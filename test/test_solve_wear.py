@@ -111,7 +111,7 @@ def test_sliding_in_the_plane_wears_by_the_way_of_the_corner() -> None:
         corners.append(np.trapezoid(result.force[:, pair] * np.hypot(0.05, along), result.t))
     expected = [worn_by(wear.coefficient_m2_n / wear.pad_area_m2 * float(way)) for way in corners]
     impulse = np.array([row["impulse"] for row in result.statistics.values()])
-    # far more than by the travel alone
+    # the pads wear far more than by the travel alone
     assert result.wear_depth.max() > 1.5 * worn_by(wear.coefficient_m2_n / wear.pad_area_m2 * 0.05 * impulse.max())
     assert result.wear_depth == pytest.approx(expected, rel=1e-3, abs=1e-12)
     assert fixed.wear_depth == pytest.approx(result.wear_depth, rel=0.02, abs=1e-11)

@@ -176,7 +176,8 @@ def test_a_model_that_leaves_its_range_says_by_how_much_and_begins_again_as_soon
     failed = bench.driver.failed
     load = compile_loads(SCENE.loads).at(np.arange(4000) * 1e-3) * 3.0
     for index, wrench in enumerate(load.tolist()):
-        bench.sample(T0 + index * MS, (wrench[0], wrench[1], wrench[2]), now_ns=0)  # time of the load, not of the clock
+        # the load's stamps advance, the clock does not
+        bench.sample(T0 + index * MS, (wrench[0], wrench[1], wrench[2]), now_ns=0)
         if failed.count == 1:
             status = direct.advance_samples(np.arange(index + 1) * 1e-3, load[: index + 1]).status
             assert failed.reason == direct.failure(status[-1]) and not status[:-1].any()
@@ -344,7 +345,8 @@ def _troubled(seed: int, count: int) -> list[tuple[str, list[tuple[int, tuple[fl
             case "stray":
                 arrived[0] = (stamp + 100 * NS_PER_S, arrived[0][1])
             case "jump":
-                stamp, now = stamp - 50 * NS_PER_S, now + 4 * NS_PER_S  # more such steps in a row are refused
+                # the intake refuses a further step of this kind soon after
+                stamp, now = stamp - 50 * NS_PER_S, now + 4 * NS_PER_S
             case "nan":
                 arrived[0] = (stamp, (math.nan, 0.0, 0.0))
             case "wild":

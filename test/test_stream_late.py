@@ -101,7 +101,8 @@ def test_any_order_and_any_batches_end_in_the_bits_of_the_samples_in_order(
     while begin < 160:
         size = sizes[number % len(sizes)]
         live.send(*(_arrival(index) for index in arriving[begin : begin + size]), now_ns=begin * MS)
-        live.silence(begin * MS + 900 * MS * (number % 3 == 0))  # every third time the model runs ahead
+        # every third time the clock advances by 0.9 s, so that the model runs ahead
+        live.silence(begin * MS + 900 * MS * (number % 3 == 0))
         if number == 0:
             for index, speed in travels.items():
                 live.driver.travel(T0 + index * MS, speed)
@@ -281,7 +282,7 @@ def test_the_journal_repeats_any_input_at_every_entry(seed: int) -> None:
                 live.driver.reset(T0 + index * MS, "asked for")
             else:
                 live.driver.set_wear(T0 + index * MS, [1e-5 * random.random()] * 8, "other pads")
-        elif chance < 0.96:  # speeds that are late, on time, early and far too late
+        elif chance < 0.96:  # the speeds are late, on time, early or far too late
             live.driver.travel(T0 + (index + random.randrange(-200, 50)) * MS, 3.0 * random.random())
         else:
             live.driver.due()

@@ -71,7 +71,8 @@ def test_a_restored_motion_continues_as_after_its_snapshot_for_any_stamps() -> N
     first = bench.send(700, 900)
     bench.send(900, 1300)
     makes = bench.out[-1].rows["makes"].copy()
-    for shift_ns in (0, 3600 * 10**9, -3600 * 10**9):  # stamps as before, later and earlier
+    # the stamps continue as before, an hour later, or an hour earlier
+    for shift_ns in (0, 3600 * 10**9, -3600 * 10**9):
         bench.driver.restore(T0, kept)
         again = bench.send(699, 900, shift_ns)
         assert again[0].rows["stamp_ns"][0] == T0 + 699 * MS + shift_ns

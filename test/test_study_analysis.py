@@ -76,7 +76,7 @@ def test_csv_files_are_read_by_their_columns(tmp_path: Path) -> None:
         rows.writerows([t, q[0], "", q[2]] for t, q in measured(motion()))
     found = analyse(tmp_path, scene=PAPER)
     signals = found.comparisons(found.predictions[0])
-    assert set(signals) == {"x", "theta"}  # an empty cell was not measured
+    assert set(signals) == {"x", "theta"}  # the cells of y are empty, so y was not measured
     assert signals["x"].lag_s == pytest.approx(LAG_S, abs=0.004)
 
 
@@ -161,7 +161,7 @@ def test_a_run_is_predicted_with_all_that_was_done_to_the_model_while_it_ran(tmp
     assert mine.loads.impulse == pytest.approx(sum(message.velocity for message in peaks), rel=1e-9)
     np.testing.assert_array_equal(mine.loads.largest, force.max(axis=0))
     assert other.loads.impulse != pytest.approx(mine.loads.impulse, rel=0.01)
-    for name, counted in mine.loads.cycles().items():  # a row may be alone between other entries
+    for name, counted in mine.loads.cycles().items():  # a row may stand alone between other entries
         whole = rainflow.count_cycles(force[:, PAIR_NAMES.index(name)], nbins=loads.CYCLE_BINS)
         assert [one["count"] for one in counted] == [count for _, count in whole]
     assert [item.start_s for item in mine.loads.passes] == pytest.approx([0.0, 0.301], abs=1e-9)
@@ -216,7 +216,7 @@ def test_a_partial_recording_beside_a_run_is_read_as_far_as_it_goes_and_its_loss
         stamp = BASE_NS + index * 10**7
         writer.add(number, index, stamp, stamp, bytes(pose_message(stamp, (1e-3, 0.0, 0.0))))
         writer.flush()
-    writer.lost["/pose"] = 7  # a full disk has the same effect
+    writer.lost["/pose"] = 7  # a loss that the recorder has counted, as on a full disk
     writer.close()
     counted = {"truncated_files": 1, "damaged_files": 1, "/pose": 7}
     found = analyse(run.folder)
@@ -513,7 +513,7 @@ def test_rows_beyond_the_limit_are_thinned_evenly(monkeypatch: pytest.MonkeyPatc
 
 
 def test_cycles_are_those_of_the_whole_series_for_any_length(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(loads, "_IN_MEMORY", 4096)  # less than the 40 000 bytes of the series
+    monkeypatch.setattr(loads, "_IN_MEMORY", 4096)  # this limit is below the 40,000 bytes of the series
     forces, series = np.abs(np.random.default_rng(1).normal(size=5000)), loads.Series()
     for part in np.array_split(forces, 7):
         series.add(reversals(part))

@@ -71,7 +71,7 @@ def errors(found: Calibration) -> list[float]:
 def test_known_parameters_are_recovered_from_every_random_start() -> None:
     found, objective = from_recording(3)
     assert len(found.starts) == 3 and max(errors(found)) < RECOVERED
-    assert len({start.before_polish for start in found.starts}) == 3  # each start has taken its own path
+    assert len({start.before_polish for start in found.starts}) == 3  # the three starts have taken different paths
     known = identifiability(space(), objective, found.best.point)
     assert len(known.singular_values) == 4 and known.singular_values[-1] > 1e-2
     assert sum(value**2 for value in known.weakest.values()) == pytest.approx(1.0)

@@ -96,7 +96,8 @@ def test_windows_with_a_stretch_without_samples_are_left_out_and_named(runs: tup
 
 def test_the_window_is_the_period_of_the_load(runs: tuple[Run, Run]) -> None:
     starts = windows_of(read_recording(runs[0].folder)).start_ns
-    assert np.diff(starts)[0] * 1e-9 == pytest.approx(np.pi, rel=0.3)  # 2 rad/s, in data of two and a half periods
+    # the load has 2 rad/s, and the data cover two and a half periods
+    assert np.diff(starts)[0] * 1e-9 == pytest.approx(np.pi, rel=0.3)
 
 
 def change(
@@ -170,7 +171,8 @@ def test_days_and_shifts_begin_in_their_zone() -> None:
     assert by_time("day")("run", stamp) == "2027-01-15"
     assert by_time("day", zone=ZoneInfo("Europe/Berlin"))("run", stamp) == "2027-01-16"
     assert by_time("shift")("run", stamp) == "2027-01-15 22:00"
-    assert by_time("shift")("run", stamp + 5 * 3600 * 10**9) == "2027-01-15 22:00"  # 04:00, still the night shift
+    # at 04:00 the night shift is not over
+    assert by_time("shift")("run", stamp + 5 * 3600 * 10**9) == "2027-01-15 22:00"
     assert by_time("shift", [time(0), time(12)])("run", stamp + 5 * 3600 * 10**9) == "2027-01-16 00:00"
 
 

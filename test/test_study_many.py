@@ -88,7 +88,7 @@ def test_a_killed_worker_loses_nothing_and_a_second_call_uses_finished_chunks(ru
 
 @pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.stress)])
 def test_an_interrupt_ends_the_call_and_its_workers_at_once(number: signal.Signals, tmp_path: Path) -> None:
-    for run in range(2):  # each has some minutes of work
+    for run in range(2):  # each run gives a worker some minutes of work
         (tmp_path / "runs" / f"r{run}").mkdir(parents=True)
         rows = (f"{60 * i},{','.join(map(str, paper_sample(60_000 * i).wrench))}" for i in range(2000))
         (tmp_path / "runs" / f"r{run}" / "load.csv").write_text("t,fx,fy,m\n" + "\n".join(rows))
@@ -100,7 +100,7 @@ def test_an_interrupt_ends_the_call_and_its_workers_at_once(number: signal.Signa
             time.sleep(0.05)
         workers = workers_of(process)
         if number == signal.SIGINT:
-            os.killpg(process.pid, number)  # a terminal does the same
+            os.killpg(process.pid, number)  # a terminal also sends Ctrl-C to the whole process group
         else:
             process.send_signal(number)
         said = process.communicate(timeout=20)[1]
@@ -169,7 +169,7 @@ def test_a_run_is_analysed_while_it_is_recorded(tmp_path: Path) -> None:
     kept: dict[str, Any] = {"flush_period_s": 0.05}
     writer = threading.Thread(target=record_run, args=(tmp_path / "run", entries()), kwargs=kept)
     writer.start()
-    (out := tmp_path / "out").mkdir()  # result of an earlier analysis of another recording
+    (out := tmp_path / "out").mkdir()  # this folder has the result of an earlier analysis of another recording
     for name in ("asked.json", "predicted_1.parquet"):
         (out / name).write_text("{}")
     command = [sys.executable, "-m", "plow_twin", "analyse", str(tmp_path / "run"), "--watch", "0.1", "--json"]
@@ -265,7 +265,7 @@ def test_an_interrupted_analysis_goes_on_and_a_run_that_a_twin_recorded_stays(ru
     half = tmp_path / "out" / "run" / "run_0.mcap"
     half.write_bytes(half.read_bytes()[:-4000])
     other = Task(runs / "r1", PAPER, None, (), tmp_path / "out")
-    other.clear()  # a task that is interrupted later does the same
+    other.clear()  # a task that is interrupted later also begins with this call
     assert task.stored() is None and not half.exists()
     assert task.run()["loads"] == first["loads"]
     recorded = record_run(tmp_path / "mine" / "run", map(paper_sample, range(10))).file
@@ -280,7 +280,8 @@ def test_no_input_is_removed_and_results_of_two_recordings_never_stand_side_by_s
     narrow.write_text(dump_scene(replace(scene, clearance=replace(scene.clearance, horizontal_m=0.02))))
     Task(runs / "r0", PAPER, None, (narrow,), out).run()
     assert (out / "predicted_1.parquet").exists()
-    for path in (out / "run", out / "run" / "run_0.mcap"):  # the task's own input, and another task's
+    # one file is the task's own input, the other belongs to another task
+    for path in (out / "run", out / "run" / "run_0.mcap"):
         with pytest.raises(RecordingError, match="would replace it"):
             Task(path, None, None, (), out).run()
         with pytest.raises(RecordingError, match="would replace it"):

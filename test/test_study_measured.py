@@ -104,7 +104,7 @@ def test_tossed_block_moves_as_the_preset_computed_by_the_solver(drops) -> None:
         measured = drops.pose[index, first:until]
         x, z, theta, *rates = MARKER.state_of_block(fit_flight(drops.pose[index, : first + 1]).state)
         if z < radius + float(block["half"]) * (abs(np.cos(theta)) + abs(np.sin(theta))):
-            continue  # this state is in the table, where a scene would start within an impact
+            continue  # this state penetrates the table, so a scene would start within an impact
         start = Initial((x, z - 1.0, theta), (rates[0], rates[1], rates[2]))
         solved = simulate(replace(scene, initial=start), t_end=len(measured) / 250.0, output_dt=0.004).q
         found = toss(np.array([[x, z, theta, *rates]]), len(solved), np.array([block], block.dtype))[0, :, :3]

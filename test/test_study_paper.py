@@ -68,7 +68,7 @@ def test_the_command_leaves_a_report_its_table_and_the_run(tmp_path: Path, capsy
     files = [(out / "figures" / f"{name}.png").read_bytes() for name in FIGURES]
     assert [base64.b64decode(image) for image in images] == files
     assert all(re.search(rb"Title\0[^\0]+; scene paper, 20\d\d-\d\d-\d\d", file) for file in files)
-    assert not re.search(r'(src|href)="(?!data:)', html)  # the file needs no other resource
+    assert not re.search(r'(src|href)="(?!data:)', html)  # the page needs no other file and no network
 
     document = json.loads((out / "table.json").read_text())
     with (out / "table.csv").open() as file:
@@ -125,7 +125,7 @@ def test_disagreements_are_listed(study: PaperStudy) -> None:
     assert row(study, "a is loaded more than c and d, largest force").verdict is Verdict.DISAGREES
     assert row(study, "b is loaded more than c and d, largest force").verdict is Verdict.AGREES
     assert "at c" in row(study, "counter-clockwise: largest force is at a").computed
-    assert row(study, "clockwise: {a} occurs").verdict is Verdict.DISAGREES  # it occurs for 0.8 ms only
+    assert row(study, "clockwise: {a} occurs").verdict is Verdict.DISAGREES  # the set `a` occurs for 0.8 ms only
     quoted = [entry for entry in study.rows if "contact at 5" in entry.what]
     assert [entry.verdict for entry in quoted] == [Verdict.DISAGREES] * 6
     statements = " ".join(entry.statement for entry in contradictions(study.runs))

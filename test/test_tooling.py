@@ -61,7 +61,7 @@ def test_the_lowest_versions_are_those_that_setup_names(metadata: dict[str, Any]
         match = VERSION.fullmatch(line)
         assert match is not None, line
         stated[match[1]] = match[2]
-    stated["lz4"] = "4.3"  # the first with a wheel for Python 3.11; Ubuntu's 4.0.2 needs a compiler
+    stated["lz4"] = "4.3"  # 4.3 is the first with a wheel for Python 3.11; Ubuntu's 4.0.2 needs a compiler
     lines = (ROOT / "requirements" / "lowest.txt").read_text().splitlines()
     lowest = dict(line.split("==") for line in lines if not line.startswith("#"))
     assert lowest.keys() == stated.keys()
@@ -92,7 +92,7 @@ def test_a_test_that_hangs_is_named_and_ends_the_run(tmp_path: Path) -> None:
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert done.returncode != 0 and "1 failed, 1 passed" in done.stdout
     assert re.search("crashed while running '.*test_that_hangs'", done.stdout)
-    assert "in test_that_hangs" in done.stderr  # the place where the test hangs
+    assert "in test_that_hangs" in done.stderr  # the output names the place where the test hangs
 
 
 #: A kernel, and a test of it that waits until another process has reached the same place.

@@ -34,7 +34,8 @@ def test_the_fitted_motion_leaves_the_sensor_s_noise_alone(picture: FittedPictur
     residual = picture.motion.residual
     assert np.isfinite(residual).mean() > 0.5
     np.testing.assert_allclose(np.nanstd(residual, axis=0), picture.noise, rtol=0.1)
-    assert (np.nanstd(picture.motion.measured, axis=0) > 3.0 * np.array(picture.noise)).all()  # more than noise
+    # the motion is larger than the noise
+    assert (np.nanstd(picture.motion.measured, axis=0) > 3.0 * np.array(picture.noise)).all()
 
 
 def test_each_value_stands_with_its_interval_in_that_of_the_prior(picture: FittedPicture) -> None:
@@ -94,6 +95,6 @@ def test_a_notebook_shows_a_motion_and_scripts_write_it(tmp_path: Path) -> None:
     np.testing.assert_array_equal(angle.lines[0].get_ydata(), 1e3 * result.q[:, 2])
     largest = max(float(np.max(line.get_ydata())) for line in force.lines)
     assert largest == result.force.max() / 1e3 and force.get_ylabel() == "contact force [kN]"
-    assert figure._repr_png_()[:4] == b"\x89PNG"  # a notebook needs no pyplot
+    assert figure._repr_png_()[:4] == b"\x89PNG"  # a notebook can show the figure without pyplot
     figure.savefig(tmp_path / "motion.png")
     assert result.plot("of mine").get_suptitle() == "of mine"

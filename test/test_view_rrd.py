@@ -333,7 +333,7 @@ def test_a_long_run_is_thinned_without_losing_a_peak(run: Run, tmp_path: Path) -
     tables = read(thin.path)
     for pair, name in enumerate(PAIR_NAMES):
         values = scalars(tables[f"/force/{name}"])
-        # at most three values for each span; the end of a batch also ends a span
+        # each span has at most three values, and the end of a batch also ends a span
         assert len(values) <= 750 < COUNT and values.max() == efforts[:, pair].max() / 1e3
     assert thin.section_rows < COUNT // 10
 
@@ -348,7 +348,7 @@ def test_gaps_are_drawn_as_wide_as_asked_with_their_wear() -> None:
     gaps = np.array([-0.01, -0.02, -0.01, -0.03, -0.005, -0.03, -0.005, 0.001])
     walls, touching = section.exaggerated(gaps, 2.0)
     top, right, bottom, left = walls
-    np.testing.assert_allclose(top[:, 1], -(135.0 + 20.0))  # 10 mm, twice as wide, y down
+    np.testing.assert_allclose(top[:, 1], -(135.0 + 20.0))  # the top gap of 10 mm is drawn twice as wide; y points down
     np.testing.assert_allclose(right[:, 0], 165.0 + 60.0)
     np.testing.assert_allclose(bottom[:, 1], 135.0 + 10.0)
     # the left wall is slanted and passes through its points beside the corners
@@ -453,7 +453,8 @@ def test_no_line_is_drawn_over_a_part_that_is_not_there(
             table = tables[name]
             stamps = np.array(table["ros_time"].cast(pa.int64()).to_pylist())
             ends = stamps[[not scalar for scalar in table["Scalars:scalars"].to_pylist()]]
-            behind = ends - np.array([entries[99].stamp_ns, before])  # clearances come at 10 Hz
+            # clearances come at 10 Hz, so they end up to 0.1 s earlier
+            behind = ends - np.array([entries[99].stamp_ns, before])
             assert (behind > -(10**8)).all() and (behind <= 1).all() and after - before > 10**8
         assert [state for state in tables["/contact_set"]["StateChange:state"].to_pylist() if not state] == [[], []]
     lines = [text[0] for text in tables["/events"]["TextLog:text"].to_pylist()]
