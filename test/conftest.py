@@ -31,7 +31,8 @@ def _prepare_environment() -> None:
     worker = os.environ.get("PYTEST_XDIST_WORKER", "")
     number = 8 * (os.getppid() if worker else os.getpid()) + int(worker.removeprefix("gw") or 0)
     os.environ["ROS_DOMAIN_ID"] = str(1 + number % 101)
-    # the processes of a suite use all cores, so threads of linear algebra would only wait for each other, at full load
+    # the processes of a suite use all cores, so more threads of linear algebra would only load the cores while they
+    # wait for each other
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
     logs = tempfile.mkdtemp(prefix="plow_twin-ros-log-")
     atexit.register(shutil.rmtree, logs, ignore_errors=True)

@@ -28,7 +28,7 @@ from plow_twin.model.loads import compile_loads
 
 Figures = dict[str, Any]
 
-#: Damping of a law for the bench scene's head.
+#: Damping of the laws that take one, for the head of a bench scene.
 _DAMPING = {"kelvin_voigt": 6e4, "ramped_damping": 6e4}
 
 

@@ -270,8 +270,8 @@ def test_the_senders_own_numbers_show_loss_repetition_and_a_new_start(tmp_path: 
     lines = [
         json.dumps({"time": 1000 + index, "load": {"f": [index, 2, 3]}, "n": n}) for index, n in enumerate(numbers)
     ]
-    # messages of other senders in between have no number and take none from the next message, nor do two damaged
-    # messages
+    # messages of other senders come in between; they have no number, and neither they nor two damaged messages use up a
+    # number
     lines[150], lines[151] = '{"n": 152, "load"', '{"n"'
     for place, other in ((60, '{"hello": 1}'), (40, "garbage"), (20, '{"n": "x", "status": 3}')):
         lines.insert(place, other)
@@ -293,7 +293,8 @@ def test_the_senders_own_numbers_show_loss_repetition_and_a_new_start(tmp_path: 
     ("numbers", "lost"),
     [
         *((["1", "2", *map(str, range(3, 150)), stray, *map(str, range(151, 301))], 0) for stray in STRAY),
-        # a jump from which the next stamp continues: back to the start of a new count, ahead, or to an impossible time
+        # the numbers continue after a jump back to the start of a new count, a jump ahead, or a jump to an impossible
+        # time
         ([*map(str, range(2000, 2150)), *map(str, range(2, 150))], 1),
         ([*map(str, range(1, 150)), *map(str, range(5000, 5150))], 4850),
         ([*map(str, range(1, 150)), *map(str, range(10**15, 10**15 + 150))], 0),
@@ -578,7 +579,8 @@ def test_files_with_dates_are_waited_for_and_followed_from_one_to_the_next(
         values = live.until_count("samples_used", 200)
         assert (values["samples_in"], values["rolled_back"]) == ("200", "50")
         assert live.stop() == 0
-    # all files that end are read in the order of the numbers in their names; names with a date need no other mapping
+    # without --follow the files are read in the order of the numbers in their names; a single file with a date in its
+    # name needs no other mapping
     days[0].write_text("t,fx,fy,m\n" + text(-30, 0))
     for source, count in ((arguments[0], 230), (str(days[0]), 30)):
         assert run_cli(["live", source, "--map", str(mapping), "--json"]) == 0

@@ -46,7 +46,7 @@ SUBPACKAGES = {
     "__init__": CORE | {"scene_file", "record"},
     "__main__": {"cli"},
 }
-#: Parts of scipy that are imported where they are used; numba imports the package itself.
+#: Parts of scipy that are imported only where they are used; numba imports the package scipy itself.
 SCIPY = ("scipy.linalg", "scipy.optimize", "scipy.special")
 MESSAGES = {
     f"{name}_msgs"

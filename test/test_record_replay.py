@@ -292,7 +292,8 @@ def test_digests_do_not_break_a_run_of_samples(run: Run, monkeypatch: pytest.Mon
 
     monkeypatch.setattr(Session, "advance", counted)
     assert replay(run.folder).exit_code == 0
-    # a digest follows every hundred samples, yet a call, after the one that warms up, processes thousands
+    # a digest follows every hundred samples, yet each call after the first, which warms up, processes thousands of
+    # samples
     assert sum(calls) == COUNT + 2 and len(calls) <= 4
 
 

@@ -320,7 +320,7 @@ def test_an_alarm_stays_until_it_is_acknowledged_and_writes_the_time_before_it(t
         found["topic_metadata"]["name"].rpartition("/")[2]: found["topic_metadata"]["offered_qos_profiles"][0]
         for found in stated["topics_with_message_count"]
     }
-    # the recording states what the graph shows
+    # the recording states the durability that each publisher has in the graph
     recorded = {name: profiles[name]["durability"] for name in profiles.keys() & offered.keys()}
     assert recorded == {name: offered[name] for name in recorded}
     assert {*recorded.values()} == {"volatile", "transient_local"}

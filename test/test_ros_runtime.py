@@ -79,7 +79,7 @@ def _node(**parameters: Any) -> Iterator[TwinNode]:
 
 
 def test_a_failed_configure_leaves_nothing_behind(tmp_path: Path) -> None:
-    # this is the last input, so the other inputs exist by then
+    # the node makes this input last, so the other inputs exist by then
     override = f"qos_overrides./r{os.getpid()}/head_pose.subscription.reliability"
     with _node(**{override: "bogus", "record_path": str(tmp_path / "run")}) as node:
         threads = set(threading.enumerate())

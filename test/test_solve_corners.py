@@ -176,7 +176,7 @@ def test_corners_that_turn_little_are_nearly_a_mirrored_head_with_walls() -> Non
         ends = [simulate(one, t_end=0.03, output_dt=1e-3, tol=1e-10).q for one in (scene, mirrored(scene))]
         return float(np.abs(ends[0] + ends[1]).max())
 
-    # the arms differ by the ratio of clearance to size, and by a turn of this size
+    # block and head differ in the arms of their contacts, by the ratio of clearance to size and by a turn of this size
     assert difference(1e-3) < 0.1 * 0.03
 
 

@@ -182,7 +182,7 @@ def test_block_with_a_falling_restitution_agrees_with_an_independent_integration
 def test_live_twin_and_batch_have_the_motion_of_the_run() -> None:
     scene = impact(LAW, (0.2, -1.0, 3.0), 0.1, friction=Friction(0.2, 0.05), gravity=Gravity())
     run = simulate(scene, t_end=0.05, output_dt=0.01, energy_balance=True)
-    twin = Twin(scene, excitation="sampled")  # zero samples are used, for which the batch's kernel exists
+    twin = Twin(scene, excitation="sampled")  # a zero load is sampled, because the batch uses the same kernel
     np.testing.assert_allclose([twin.advance(float(t)).q for t in run.t[1:]], run.q[1:], atol=1e-9)
     rows = TwinBatch([scene, scene]).advance(0.05)
     np.testing.assert_allclose(rows.q[:, 0], [run.q[-1]] * 2, atol=1e-9)

@@ -61,7 +61,7 @@ def test_the_work_hardly_grows_with_the_damping() -> None:
         twin.advance(0.3)
         steps[damping] = twin.steps
         assert twin._state.implicit_steps > 0
-    # a hundred times as many explicit steps would be needed
+    # explicit steps would be a hundred times as many
     assert steps[1e11] < 10 * steps[1e9]
 
 

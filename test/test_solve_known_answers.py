@@ -45,7 +45,8 @@ def test_depth_and_time_of_an_impact(n: float, duration: float) -> None:
 @pytest.mark.parametrize(
     ("n", "law"),
     [
-        pytest.param(1.0, "exact_restitution", marks=pytest.mark.stress),  # this exponent and this law occur below
+        # another case below has this exponent, and another has this law
+        pytest.param(1.0, "exact_restitution", marks=pytest.mark.stress),
         (1.5, "exact_restitution"),
         (1.0, "kelvin_voigt"),
     ],

@@ -206,7 +206,7 @@ def test_forces_along_the_face_measured_poses_and_other_scenes_are_drawn(tmp_pat
     largest, same, other = (scalars(tables[f"/what_if/{number}"]) for number in range(3))
     np.testing.assert_allclose(same, largest, rtol=0.01, atol=1.0)
     assert len(same) == COUNT and np.abs(other - largest).max() > 10.0
-    # the bars at the corners of the frame, and the texts with their depths
+    # the pads' depths are drawn as bars at the corners of the frame, with texts
     depths = tables["/exaggerated/pads/wear"]["Points2D:labels"].to_pylist()[-1]
     assert len(depths) == 8 and all(depth.endswith(" µm") for depth in depths)
     for group in ("clearance", "growth"):
