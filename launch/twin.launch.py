@@ -1,8 +1,9 @@
 """Start the twin: `ros2 launch plow_twin twin.launch.py scene:=paper record_path:=runs/monday`.
 
 With `autostart:=false` the node waits for lifecycle requests (`ros2 lifecycle set /plow_twin configure`).
-With `view:=true` a process of its own shows the recording in a browser while it is made; it says where. The program may
-stand in another Python environment (`view:=/opt/viewer/bin/plow-twin`): rerun needs numpy 2, ROS 2 Jazzy has 1.26.
+With `view:=true` a separate process shows the recording in a browser while it is written; it prints the address. The
+program may be in another Python environment (`view:=/opt/viewer/bin/plow-twin`): rerun needs numpy 2, ROS 2 Jazzy has
+1.26.
 """
 
 import shutil
@@ -26,7 +27,7 @@ ARGUMENTS = {
     "view": ("", "true, or the program plow-twin of the environment that has rerun; empty: not shown"),
 }
 
-#: Asks a process to stop when `launch` has gone: at SIGTERM that ends without a word to those it has started.
+#: Prefix that stops a process when `launch` has ended, since `launch` ends at SIGTERM without stopping its processes.
 STOP_WITH_LAUNCH = "setpriv --pdeathsig TERM" if shutil.which("setpriv") else ""
 
 
@@ -45,14 +46,14 @@ def generate_launch_description() -> LaunchDescription:
         name="plow_twin",
         namespace=given["namespace"],
         parameters=[given["params_file"], overrides],
-        # the node closes its recording first, within 5 s
+        # time for the node to close its recording, which takes up to 5 s
         sigterm_timeout="6",
         sigkill_timeout="6",
         prefix=STOP_WITH_LAUNCH,
         exec_name="twin",
         output="screen",
     )
-    # without what a sourced ROS 2 adds: the viewer's environment is its own
+    # without the variables that a sourced ROS 2 adds: the viewer has an environment of its own
     apart = [
         "env",
         *(f"--unset={name}" for name in ("PYTHONPATH", "LD_LIBRARY_PATH", "_ROS_WHEELS_BOOTSTRAP_COMPLETE")),

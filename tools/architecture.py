@@ -1,4 +1,4 @@
-"""Draw `docs/images/architecture.svg`: the subpackages of the package from the ground up, and the way of a sample.
+"""Draw `docs/images/architecture.svg`: the subpackages from the lowest to the highest, and the path of a sample.
 
 python tools/architecture.py
 """

@@ -12,7 +12,7 @@ class Units(Extension):
     """Read `_quantity("kg", "mass", ...)`, `_choice("...", ...)` and `metadata={"doc": ...}` as docstrings."""
 
     def on_attribute_instance(self, *, attr: Attribute, **kwargs: Any) -> None:
-        """Give a field without a docstring the one of its declaration."""
+        """Give a field without a docstring the text of its declaration as docstring."""
         if attr.docstring is None and attr.value is not None:
             call = ast.parse(str(attr.value), mode="eval").body
             if isinstance(call, ast.Call) and isinstance(call.func, ast.Name):

@@ -17,7 +17,7 @@ LANES = (
     ("scene 22", ()),
     ("scene 9", ("c-bottom", "d-bottom")),
 )
-#: Guards that may end the steps: the first of each lane, then the second of lane 0 in the place that is left.
+#: Guards that may end the steps: the first guard of each lane, then the second guard of lane 0 in the remaining place.
 ROUND = (("lane 0: b-right",), ("lane 1: d-left",), ("lane 2: a-left",), ("lane 0: c-bottom",))
 #: Ends of steps in each lane: (share of the width, "step" | "event" | "next scene").
 STEPS = (

@@ -1,4 +1,4 @@
-"""A year of a head, from new pads to the limit: the clearance estimated month by month, the forecast narrowing.
+"""A year of a head, from new pads to the limit: monthly estimates of the clearance, and a forecast that narrows.
 
 The head's sensor is synthetic: its poses are those of the simulated machine, with noise, bias and delay.
 """
@@ -30,7 +30,7 @@ out = Path(sys.argv[1] if len(sys.argv) > 1 else "out/examples/a_year")
 out.mkdir(parents=True, exist_ok=True)
 rng = np.random.default_rng(1)
 
-# what is believed of the machine: its load is off by a few per cent, its wear coefficient known to a factor of ten
+# the assumed machine: its load is wrong by a few per cent, and its wear coefficient is known to a factor of ten
 believed = replace(load_scene("paper"), wear=Wear(1e-15, 0.06, SPEED_M_S, prior_m2_n=(3e-16, 3e-15)))
 assert believed.wear is not None
 limits = believed.clearance.horizontal_m + GROWTH_M, believed.clearance.vertical_m + GROWTH_M
@@ -39,13 +39,13 @@ load = compile_loads(believed.loads).at(t)
 true_load = load * (1.0 + 0.04 * rng.standard_normal(3))
 path = wear_path(replace(believed, loads=(Table("true", t, true_load),)), limits, np.inf)
 grown = path.clearance_growth()
-# the coefficient with which the limit comes at the end of the year
+# the wear coefficient with which the limit is reached at the end of the year
 reached = min(float(np.interp(GROWTH_M, column, path.exposure, right=np.inf)) for column in grown.T)
 k_s = reached * believed.wear.pad_area_m2 / (DAYS * DAY_M)
 
 
 def visit(day: float) -> tuple[np.ndarray, Poses]:
-    """Return the true clearances on a day and the poses that the sensor tells of some load periods."""
+    """Return the true clearances on a day, and the poses that the sensor measures during some load periods."""
     exposure = k_s * day * DAY_M / believed.wear.pad_area_m2
     depth = [float(np.interp(exposure, path.exposure, column)) for column in path.depth.T]
     worn = replace(
@@ -83,7 +83,7 @@ for entity in titles:
 
 
 def show(day: float, entity: str, **values: float | None) -> None:
-    """Draw numbers of a day; None: nothing."""
+    """Draw numbers of a day; a number that is None is left out."""
     stream.set_time("day", sequence=round(day))
     for name, value in values.items():
         if value is not None:

@@ -14,7 +14,7 @@ from plow_twin import dump_scene, load_scene, simulate
 out = Path(sys.argv[1] if len(sys.argv) > 1 else "out/examples/calibration")
 out.mkdir(parents=True, exist_ok=True)
 
-# what would be measured: here the motion of a head whose contact is stiffer than the scene believes
+# in place of a measurement: the simulated motion of a head whose contact is stiffer than the assumed contact
 believed = load_scene("bench_kv")
 true = replace(believed, contact=replace(believed.contact, stiffness=3.1e7, damping=8.5e4))
 motion = simulate(true, t_end=2.0, output_dt=0.01)

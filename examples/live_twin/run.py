@@ -1,4 +1,4 @@
-"""A live twin in Python: samples at 1 kHz in; force, impulse and makes out; saved, restored, compared."""
+"""A live twin in Python: samples at 1 kHz give force, impulse and touches; the twin is saved, restored and compared."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ for index in range(1, 5001):
     t = index * 1e-3
     now = twin.advance(t, measured(t))
     assert now.status is Status.OK, now.status
-    # exact between samples too: no impact falls between two of them
+    # the peak includes the motion between samples, so no impact is missed
     peak, makes = np.maximum(peak, now.peak), makes + now.makes
     if index == 4000:
         saved = twin.snapshot()
@@ -28,7 +28,7 @@ for index in range(1, 5001):
 for name, largest, count in zip(PAIR_NAMES, peak, makes, strict=True):
     print(f"{name:20}  largest {largest / 1e3:6.1f} kN, {count:3d} makes")
 
-# another process would go on from here: the same samples give the same bits
+# another process could continue from here: the same samples give the same bits
 other = Twin(load_scene("bench_kv"), excitation="sampled", tol=1e-6)
 other.restore(saved)
 times = np.arange(4001, 5001) * 1e-3

@@ -1,6 +1,6 @@
 """Draw a measured drop of a square, the preset's block simulated from the same first flight, and the 90 % band.
 
-Writes a picture and a recording for rerun in which both bodies move over each other.
+It writes a picture, and a recording for rerun that shows the measured and the simulated body in one place.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ SIDE = 0.06
 
 
 def main() -> None:
-    """Simulate the drop, draw it in its band, and say how far off it is."""
+    """Simulate the drop, draw it in its band, and print its distance from the measured drop."""
     out = Path(sys.argv[1] if len(sys.argv) > 1 else "out/examples/measured_drop")
     drops = Drops.load(DATA)
     pose, given = drops.pose[DROP], int(drops.flight_rows[DROP])

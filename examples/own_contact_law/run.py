@@ -1,4 +1,4 @@
-"""A contact law of one's own: defined in one place, taken by every solver, and measured."""
+"""A contact law of one's own: it is defined in one place, used by every solver, and its restitution is measured."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ add_law(
 
 
 def rebound(contact: Contact) -> float:
-    """Return the speed after an impact over the speed before: a head thrown against the top wall, free of load."""
+    """Return the ratio of the speeds after and before an impact, of a head thrown at the top wall without load."""
     scene = Scene(
         Head(mass_kg=500.0, inertia_kg_m2=100.0), Frame(0.3, 0.3), Clearance(0.02, 0.02), contact, Gravity(0.0),
         initial=Initial(v=(0.0, -0.5, 0.0)), locked=("x", "theta"),
     )  # fmt: skip
-    # far enough to leave one wall, not so far as to meet the other
+    # long enough to leave the wall, and too short to reach the opposite wall
     return abs(simulate(scene, t_end=0.035, tol=1e-10).v[-1, 1]) / 0.5
 
 

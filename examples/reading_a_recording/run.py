@@ -1,6 +1,7 @@
-"""A recording: read with the libraries of others, and computed again bit for bit.
+"""A recording: it is read with the libraries of others, and computed again bit for bit.
 
-Give it the folder of a run of the node (`record_path`, or `plow-twin demo`); without one it records three seconds here.
+The argument is the folder of a run of the node (`record_path`, or `plow-twin demo`); without an argument the example
+records three seconds.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ else:
     shutil.rmtree(run, ignore_errors=True)
     record(run)
 
-# any reader of rosbag2's MCAP will do
+# any library that reads rosbag2's MCAP files can be used
 largest: dict[str, float] = {}
 impulse: dict[str, float] = {}
 with AnyReader([run], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:

@@ -42,7 +42,8 @@ class Curves:
     """Curves with common times: one entity for each column of the rows.
 
     With `span_ns` a curve keeps the least and the largest value in each span of stamps, so that no peak is lost. `rows`
-    counts the rows added, `sent` the values sent of the first curve. A row without values ends the lines at a gap.
+    is the number of rows added, and `sent` is the number of values of the first curve that were sent. A row without
+    values ends the lines at a gap.
     """
 
     def __init__(self, stream: rr.RecordingStream, axis: TimeAxis, entities: Sequence[str], span_ns: int = 0) -> None:

@@ -32,7 +32,8 @@ from plow_twin.view.residuals import Residuals
 from plow_twin.view.section import ARROW_MM_PER_N, LABEL_MM, LOAD_COLOR, PAIR_COLORS, Section
 from plow_twin.view.what_if import WhatIf
 
-#: Largest distance of stamps from the recorder's clock [ns]; stamps beyond it have another clock and no age.
+#: Largest distance of stamps from the recorder's clock [ns]; stamps farther away are from another clock and have no
+#: age.
 _LARGEST_AGE_NS: Final = 3_600_000_000_000
 _GREY: Final = (150, 155, 165)
 _WHITE: Final = (235, 235, 235)
@@ -44,7 +45,7 @@ _PAD_POINTS: Final = [[CLEARANCE_NAMES.index(f"{name}{point}") for name in PAD_N
 _BOUNDS: Final = [
     CLEARANCE_NAMES.index(f"{way}/{point}") for way in ("horizontal", "vertical") for point in ("p05", "p95")
 ]
-#: Rows of a band for each message of a clearance, unless curves are thinned.
+#: Number of rows of a band for each message of a clearance, unless curves are thinned.
 _BAND_ROWS: Final = 10
 #: Interval at which the chart of forces along the face is redrawn [ns].
 _FACE_NS: Final = 1_000_000_000
@@ -66,7 +67,7 @@ class Drawing:
     section_hz
         Rate of the cross-section [Hz].
     exaggerate
-        Factor of the width of the clearance in the second cross-section; None: chosen by its size.
+        Factor of the width of the clearance in the second cross-section; None: chosen by the size of the clearance.
     span_ns
         Span of stamps in which a curve keeps its least and largest value [ns]; 0: it keeps every row.
     others
@@ -137,7 +138,7 @@ class Drawing:
 
     @property
     def first_ns(self) -> int:
-        """The first stamp; 0 before it."""
+        """The first stamp; 0 before it is known."""
         return self._axis.first_ns or 0
 
     def _draw_still(self, scene: Scene, source: Path) -> None:

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Indexes = NDArray[np.int64]
 
-#: Largest number of rows up to which a curve keeps every row.
+#: Largest number of rows of a curve that keeps every row.
 MOST_ROWS: Final = 8000
-#: Most bins, about one for each pixel of an axis: narrower bins would show beats with the load's period.
+#: Largest number of bins, about one for each pixel of an axis: narrower bins would show beats with the load's period.
 _MOST_BINS: Final = 700
 
 

@@ -20,7 +20,7 @@ class Events:
     """Write the log; `count` is the number of its lines."""
 
     def __init__(self, stream: rr.RecordingStream, axis: TimeAxis) -> None:
-        #: lines, and advances that failed
+        #: number of lines, and number of failed advances
         self.count = self.failed = 0
         self._lines = Batches(stream, axis, "events", rr.TextLog, ("text", "level"))
         self._makes_before: NDArray[np.float64] | None = None

@@ -44,7 +44,7 @@ class FaceChart:
         self._speed = self._place_m = 0.0
         self._direction = 0.0
         self._reached_ns: int | None = None
-        #: speeds by their stamps, not yet reached
+        #: speeds whose stamps have not been reached, in order of the stamps
         self._coming: list[Travel] = []
         self.known = False
 
@@ -135,6 +135,6 @@ def _halved(one: dict[int, float]) -> dict[int, float]:
 
 
 def _round_up(value: float) -> float:
-    """Return the next of 1, 2, 5, 10, ... times a power of ten."""
+    """Return the smallest of 1, 2, 5 and 10 times a power of ten that is not below the value."""
     power = 10.0 ** math.floor(math.log10(value))
     return next(step * power for step in (1.0, 2.0, 5.0, 10.0) if step * power >= value)

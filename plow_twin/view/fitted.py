@@ -21,11 +21,12 @@ Array = NDArray[np.float64]
 #: Millimetres and milliradians.
 _SCALE: Final = 1e3
 _COMPONENTS: Final = (("x", "mm"), ("y", "mm"), ("θ", "mrad"))
-#: Characters in a line of the title.
+#: Largest number of characters in a line of the title.
 _LINE: Final = 150
-#: Time between two rows, over the usual time, that counts as a gap.
+#: Smallest time between two rows that counts as a gap, as a multiple of the usual time.
 _GAP: Final = 10.0
-#: Largest drawn distance from the prior's middle, in half widths of the prior; values farther away are drawn at it.
+#: Largest drawn distance from the prior's middle, in half widths of the prior; values farther away are drawn at this
+#: distance.
 _FARTHEST: Final = 2.0
 
 
@@ -34,7 +35,7 @@ class FittedValue:
     """A value with its interval, and its prior, each as middle, low, high in the unit of the label.
 
     `prior` may be None; `note` is the state of the value, or another short word; `is_log` states whether its place in
-    the prior is measured in the logarithm.
+    the prior is measured on a logarithmic scale.
     """
 
     label: str
@@ -130,7 +131,7 @@ class FittedPicture:
         legend_beside(below)
 
     def _values(self, axis: Any) -> None:
-        """Draw each value on the scale of its prior, its numbers beside it."""
+        """Draw each value on the scale of its prior, with its numbers beside it."""
         rows = range(len(self.values))
         axis.axvspan(-1.0, 1.0, color="0.9", lw=0.0, zorder=0)
         for row, value in zip(rows, self.values, strict=True):

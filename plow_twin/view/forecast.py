@@ -33,7 +33,7 @@ def draw_forecast(found: Forecast, path: FilePath, title: str) -> None:
     growing = 1e3 * found.clearances(hours)
     limits = (plan.limit_horizontal_m, plan.limit_vertical_m)
     for axis, (name, limit, colour) in enumerate(zip(("horizontal", "vertical"), limits, _COLOURS, strict=True)):
-        # infinite for a limit that has already been reached
+        # the clearance is infinite if its limit has already been reached
         low, middle, high = np.minimum(growing[:, :, axis], 1e3 * limit)
         middle[~np.isfinite(growing[1, :, axis])] = np.nan
         left.fill_between(hours, low, high, color=colour, alpha=0.2, linewidth=0.0)

@@ -32,8 +32,8 @@ AGE: Final = ("quality/sample_age_ms",)
 INTERVAL: Final = ("quality/sample_interval_ms",)
 TOTAL: Final = tuple(f"clearance/{name}" for name in CLEARANCE_NAMES if not name.startswith("pad_"))
 GROWTH: Final = tuple(f"growth/{name}" for name in CLEARANCE_NAMES if not name.startswith("pad_"))
-#: Areas between the bounds of a clearance: each is a curve that alternates between them. Their names sort before the
-#: names of the clearances, so that the clearances are drawn above the bands.
+#: Areas between the bounds of a clearance: each area is a curve that alternates between the bounds. The names of the
+#: areas sort before the names of the clearances, so that the clearances are drawn above the bands.
 BAND: Final = tuple(f"{group}/band/{way}" for group in ("clearance", "growth") for way in ("horizontal", "vertical"))
 RESIDUAL: Final = ("residual/x", "residual/y", "residual/theta")
 WEAR: Final = tuple(f"wear/{name}" for name in CLEARANCE_NAMES if name.startswith("pad_"))

@@ -31,7 +31,7 @@ def follow(
     exaggerate: float | None = None,
     others: Mapping[str, Scene] | None = None,
 ) -> ViewSummary:
-    """Show a recording until its recorder closes it or ends, or `stop` is true; `exaggerate`, `others` as in `to_rrd`.
+    """Show a recording until its recorder closes it or ends, or `stop` is true; `to_rrd` explains the options.
 
     Raises
     ------

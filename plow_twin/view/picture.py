@@ -201,7 +201,8 @@ def _curves(
 ) -> None:
     """Draw curves, or for bins the band from the smallest to the largest value, unless `only_largest`.
 
-    Bands of forces would all begin at zero. No line crosses a gap; `gaps` has the ends of each [s].
+    `only_largest` is for forces, whose bands would all begin at zero. No line crosses a gap; `gaps` has the ends of
+    each [s].
     """
     axis.set_ylabel(label)
     if not rows:

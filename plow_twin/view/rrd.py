@@ -77,14 +77,14 @@ def to_rrd(
     section_hz
         Rate of the cross-section [Hz].
     exaggerate
-        Factor of the width of the clearance in the second cross-section; None: chosen by its size.
+        Factor of the width of the clearance in the second cross-section; None: chosen by the size of the clearance.
     most_rows
-        Largest number of rows of a curve (of the cross-section: a twentieth of it). A longer run is thinned: a curve
-        keeps the least and the largest value of each span, so that no peak is lost.
+        Largest number of rows of a curve; the limit for the cross-section is a twentieth of this number. A longer run
+        is thinned: a curve keeps the least and the largest value of each span, so that no peak is lost.
     others
         Other scenes, by name, whose forces under the load of the run are drawn too.
     on_progress
-        Receives the share done, 0..1.
+        Receives the share that is done, 0..1.
 
     Raises
     ------

@@ -30,7 +30,7 @@ _CLEARANCE_COLUMNS: Final = np.array(
 _NS: Final = 1e-9
 #: States of a clearance that the measurements determine.
 _KNOWN_STATES: Final = ("estimated", "rough")
-#: Most events and held stretches that are drawn; more would cover the picture.
+#: Largest number of events and of held stretches that are drawn; more would cover the picture.
 _MOST_MARKS: Final = 40
 
 
@@ -133,7 +133,7 @@ class RunCurves:
                     self._newest_ns = stamp_ns
                 case Estimated(end_ns=end_ns, result=result):
                     if not self._estimated:
-                        # from its arrival on it holds
+                        # the estimate holds from its arrival on
                         self._samples(batch.entries.stamp_ns[samples[(samples >= done) & (samples < index)]])
                         done = index
                         self._change(end_ns if self._newest_ns is None else self._newest_ns, "first estimate")

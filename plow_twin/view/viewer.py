@@ -19,18 +19,18 @@ import rerun.blueprint as rrb
 from plow_twin.errors import RecordingError
 
 LOOPBACK: Final = "127.0.0.1"
-#: Memory of the viewer; beyond it the oldest data are dropped.
+#: Memory limit of the viewer; above it the oldest data are dropped.
 _MEMORY: Final = "2GB"
 _START_S: Final = 60.0
 
 
 def viewer_program() -> str:
-    """Return rerun's program itself: the child of the wrapper with the same name would outlive the wrapper.
+    """Return rerun's program itself, not its wrapper of the same name, whose child would outlive the wrapper.
 
     Raises
     ------
     RecordingError
-        It is not installed.
+        The viewer is not installed.
     """
     found = find_spec("rerun_cli")
     beside = Path(found.origin).with_name("rerun") if found is not None and found.origin is not None else None
@@ -105,12 +105,12 @@ def free_port() -> int:
 
 
 def page_port(asked: int) -> int:
-    """Return the port for a page: the given one, or a free one for 0.
+    """Return the port for a page: the given port, or a free port for 0.
 
     Raises
     ------
     RecordingError
-        Another program uses it.
+        Another program uses the port.
     """
     if not asked:
         return free_port()

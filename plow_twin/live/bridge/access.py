@@ -79,7 +79,7 @@ def password(path: Path | None, source: str) -> str:
 
 
 def read_access(url: str, path: Path | None) -> Access:
-    """Return the access to an OPC UA server with credentials from a YAML file; paths in it are relative to it.
+    """Return the access to an OPC UA server with credentials from a YAML file; its paths are relative to its folder.
 
     Raises
     ------

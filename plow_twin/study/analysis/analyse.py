@@ -1,4 +1,4 @@
-"""Analysis of one recording: a run's journal is computed again; any other recording's load passes the live intake."""
+"""Analysis of one recording: the motion follows from a run's journal, or from another load by the live intake."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ _OF_THE_RUN: Final = "of the run"
 _MAP: Final = "map_"
 #: Parameter that marks each run made by an analysis.
 MAPPED_LOAD: Final = f"{_MAP}excitation"
-#: Function that receives the share of the work done, 0..1.
+#: Function that receives the share of the work that is done, 0..1.
 OnProgress = Callable[[float], object]
 
 
@@ -112,7 +112,7 @@ class Prediction:
 
     @property
     def longest_number(self) -> int:
-        """Number of the longest stretch."""
+        """Index of the longest stretch."""
         return self.resets if self._longer() is self.present else self._longest_number
 
     def is_of_longest(self, signal: ThinnedSignal) -> NDArray[np.bool_]:
@@ -143,13 +143,13 @@ class Prediction:
 
     @property
     def stride(self) -> int:
-        """Distance of the rows of the longest stretch that are kept for the signals."""
+        """Number n if every n-th row of the longest stretch is kept for the signals."""
         return self._longer().stride
 
 
 @dataclass
 class Measured:
-    """Measured values by signal, in order of arrival; of very many values, only every second, fourth ... is kept."""
+    """Measured values by signal, in order of arrival; of very many values only every second, fourth, ... is kept."""
 
     signals: dict[str, ThinnedSignal] = field(default_factory=dict)
     #: stretch and stamp [ns] of the latest message of each role
@@ -305,7 +305,7 @@ def analyse(
     others
         Further scenes for predictions.
     out
-        Folder in which a run, `run`, is made from a recording of another program.
+        Folder in which the run `run` is made from a recording of another program.
     tail, on_caught_up
         With a `Tail`, a run of plow_twin is followed while it is written; `on_caught_up` receives the analysis so far
         whenever everything has been read.

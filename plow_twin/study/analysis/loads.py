@@ -81,7 +81,7 @@ class LoadTotals:
     passes: list[Pass] = field(default_factory=list)
     #: largest force in each piece of the face, by pass and piece
     face: dict[tuple[int, int], float] = field(default_factory=dict)
-    #: wear depth that the pads have gained in travel forward and backward [m]
+    #: wear depth that the pads have gained [m], by direction of travel (0 forward, 1 backward)
     pad_wear: Array = field(default_factory=lambda: np.zeros((2, PAIR_COUNT)))
     #: wear depth of the slide at each pair [m], by direction (0 forward, 1 backward) and piece of the face
     slide_wear: dict[tuple[int, int], Array] = field(default_factory=dict)
@@ -177,7 +177,7 @@ class LoadTotals:
         self._worn = walked.rows.wear_depth[-1].copy()
 
     def _wear(self, depth: Array, speed: float, pieces: NDArray[np.int64]) -> None:
-        """Add the wear of the pads and of the places of the slide that they pass, by direction.
+        """Add the wear of the pads, and of the places of the slide that they pass, by direction of travel.
 
         A pad wears over the whole distance, but a place of the slide only while the length of a pad passes it.
         """
@@ -206,7 +206,7 @@ class LoadTotals:
         if self.slide_wear:
             pieces = {piece for _, piece in self.slide_wear}
             total = np.sum(list(self.slide_wear.values()), axis=0) / len(pieces)
-            # mean over the pieces; it is to the wear of the pads as a pad's length is to the face's length
+            # mean over the pieces: the wear of the pads times the ratio of a pad's length to the face's length
             out["slide_mean_m"] = dict(zip(PAIR_NAMES, total.tolist(), strict=True))
             out["slide_pieces"] = len(pieces)
         return out

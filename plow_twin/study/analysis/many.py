@@ -16,7 +16,7 @@ from plow_twin.model.law_modules import load_laws, loaded_laws
 from plow_twin.study.analysis.task import RunTask, run_task
 from plow_twin.study.cluster import completed, connect
 
-#: Function that receives the share of the recordings done, 0..1.
+#: Function that receives the share of the recordings that are done, 0..1.
 OnProgress = Callable[[float], object]
 _OnDone = Callable[[int, dict[str, Any]], object]
 
@@ -55,7 +55,7 @@ def run_many(
 def _here(tasks: Sequence[RunTask], waiting: list[int], workers: int, done: _OnDone) -> None:
     while waiting:
         left = _round(tasks, waiting, workers, done)
-        if len(left) == len(waiting):  # a task has killed its worker, so the first tasks are run one by one
+        if len(left) == len(waiting):  # a task has killed its worker; to find it, the first tasks are run one by one
             left, first = left[workers:], left[:workers]
             for number in first:
                 if _round(tasks, [number], 1, done):
@@ -110,6 +110,6 @@ def _on_cluster(tasks: Sequence[RunTask], waiting: list[int], address: str, done
             number = futures[future]
             try:
                 done(number, future.result())
-            except Exception as error:  # any error may come from a worker
+            except Exception as error:  # a worker can raise any error
                 path = str(tasks[number].path)
                 done(number, {"run": path, "error": f"{path}: {type(error).__name__}: {error}"})

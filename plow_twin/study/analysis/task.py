@@ -54,7 +54,7 @@ class RunTask(Protocol):
         """The recording."""
 
     def stored(self) -> dict[str, Any] | None:
-        """Return the facts if the same work was done before, else None."""
+        """Return the facts if the same work was done before, otherwise None."""
 
     def run(self) -> dict[str, Any]:
         """Return the facts."""
@@ -156,7 +156,7 @@ class Task:
         beside = folder / "scene.yaml" if self.scene is None else None
         return {
             "run": _state(self.path, self.out),
-            # measurements may be beside a single part, also in other parts
+            # measurements may also be in other parts, and in folders beside a single part
             "parts": [] if self.path.is_dir() else [_state(path, self.out) for path in _measured_near(folder)],
             "scene": _scene_state(self.scene),
             "scene_beside": _scene_state(beside) if beside is not None and beside.is_file() else None,

@@ -1,4 +1,4 @@
-"""Rows and values in bounded memory: if there are too many, only every second, then every fourth ... is kept."""
+"""Rows and values in bounded memory: of too many, only every second is kept, then every fourth, and so on."""
 
 from __future__ import annotations
 

@@ -21,13 +21,13 @@ from plow_twin.study.calibration.unknowns import Space
 from plow_twin.study.parameters import Value
 
 Array = NDArray[np.float64]
-#: Function that is called with the share of the work done, 0..1, and the best objective so far.
+#: Function that is called with the share of the work that is done, 0..1, and the best objective so far.
 OnProgress = Callable[[float, float], None]
 
 
 @dataclass(frozen=True)
 class Search:
-    """Effort of one start: points screened, population, generations, and evaluations of the simplex (0 for none)."""
+    """Effort of one start: numbers of screened points, members, generations and simplex evaluations (0: no simplex)."""
 
     screen: int = 200
     population: int = 30

@@ -41,7 +41,7 @@ class TargetRow:
 def fitted_scene(scene: Scene, values: Mapping[str, Value], source: str) -> Scene:
     """Return the scene with the fitted values; every number that they change is marked as reconstructed.
 
-    An unchanged number keeps its mark. A number whose sign alone has changed keeps the source of its size.
+    An unchanged number keeps its mark. A number of which only the sign has changed keeps the source of its magnitude.
     """
     fit = with_parameters(scene, values)
     marks = dict(fit.marks)

@@ -46,7 +46,7 @@ class TargetObjective:
     runs: int = 0
 
     def __post_init__(self) -> None:
-        # marks are never read, and a candidate without marks is made in a third of the time
+        # marks are never read here, and a candidate without marks is made in a third of the time
         self.scene = replace(self.scene, marks={})
 
     def residuals(self, candidates: Sequence[Values], cut: float = np.inf) -> Array:

@@ -39,7 +39,7 @@ class PoseRecording:
 
     @property
     def output_dt(self) -> float:
-        """Interval of the simulated rows in s: the recording's, but at most 0.01 s and at least t_end / 20000."""
+        """Interval of the simulated rows in s: that of the recording, but at most 0.01 s and at least t_end / 20000."""
         end = float(self.t[-1])
         step = float(np.median(np.diff(self.t))) if len(self.t) > 1 else end
         return max(min(step, 0.01), end / _MOST_ROWS)

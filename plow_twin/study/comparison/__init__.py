@@ -1,1 +1,1 @@
-"""Comparison of runs: windows of their contacts, and changes that are more than chance."""
+"""Comparison of runs: windows of their contacts, and statistically significant changes."""

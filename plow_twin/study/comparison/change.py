@@ -22,13 +22,13 @@ _LEAST_VARIATION: Final = 0.01
 _EQUAL_LOAD: Final = 0.01
 #: Percentiles [%] between which the loads of two groups must overlap, because a slope is valid only near its loads.
 _USUAL: Final = (5.0, 95.0)
-#: Probability below which a change is more than chance.
+#: Probability below which a change is statistically significant.
 _LEVEL: Final = 0.05
 #: Number of windows drawn at once, which bounds the memory.
 _AT_ONCE: Final = 2**21
 #: Relative difference that rounding can cause between means of equal numbers.
 _ROUNDING: Final = 1e-12
-#: Largest distance of the starts of two neighbouring windows, in window lengths.
+#: Largest distance between the starts of two neighbouring windows, in window lengths.
 _NEXT: Final = 1.5
 
 
@@ -42,7 +42,7 @@ class Change:
         The change and its 95 % interval.
     chance : float
         Probability of such a change by chance, adjusted for the number of cells that are judged together (Benjamini and
-        Hochberg). Of the cells below 0.05, one in twenty is there by chance.
+        Hochberg). Of the cells below 0.05, about one in twenty is below it only by chance.
     machine, machine_low, machine_high, machine_chance : float or None
         The same numbers at equal load; None if the load varies too little to show how the quantity depends on it, or if
         the loads of the groups do not overlap.
@@ -59,7 +59,7 @@ class Change:
 
     @property
     def verdict(self) -> str:
-        """`chance`, or the cause of a change beyond chance: `machine`, `load`, or `load or machine`."""
+        """`chance`, or the cause of a significant change: `machine`, `load`, or `load or machine`."""
         if self.chance > _LEVEL:
             return "chance"
         if self.machine_chance is None:
@@ -88,7 +88,7 @@ def with_neighbours(load: Array, start_ns: NDArray[np.int64]) -> Array:
 
 
 class Drawn:
-    """Moments of a group. The first row is for all its windows, each other row for a draw from the windows.
+    """Moments of a group. The first row is for all windows of the group, every other row for a draw from these windows.
 
     Parameters
     ----------
@@ -169,7 +169,7 @@ def changes(before: Drawn, after: Drawn) -> list[Change | None]:
 
 
 def _tested(differences: Array, mean: Array, fewest: int) -> tuple[Array, Array, Array, Array]:
-    """Return share, low, high and adjusted chance of each difference; the first row has the values, the others draws.
+    """Return share, low, high and adjusted chance of each difference; row 0 has the values, the other rows draws.
 
     Student's t has the degrees of freedom of the smaller group, so that chances are rather too large than too small.
     """

@@ -37,11 +37,11 @@ class Comparison:
     groups : dict of str to Windows
         All windows of a group.
     runs : dict of str to list of str
-        Runs with windows in each group.
+        Names of the runs that have windows in a group, by group.
     changes : dict
         `Change` by group (except the first), pair and quantity; None if there are too few windows.
     clearance_changes : dict
-        The same by group (except the first) and by `horizontal` and `vertical`.
+        `Change` by group (except the first) and by `horizontal` and `vertical`.
     scenes : list of str
         Names of the scenes of all runs.
     notes : list of str

@@ -20,8 +20,8 @@ from plow_twin.view.section import PAIR_COLORS
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: Largest number of groups that are drawn as boxes; of names on the axis; of letters in a line of a name, beyond which
-#: names are slanted.
+#: Largest number of groups that are drawn as boxes, of names on the axis, and of letters in a line of a name that is
+#: not slanted.
 _MOST_BOXES: Final = 6
 _MOST_LABELS: Final = 12
 _WIDEST: Final = 10

@@ -15,8 +15,8 @@ Array = NDArray[np.float64]
 
 #: Half the side of the square in m.
 _HALF: Final = 0.03
-#: Criteria of an impact: acceleration of fall [m/s^2], deviations of the accelerations of z [m/s^2] and theta [rad/s^2]
-#: from a flight, and largest gap [m].
+#: Criteria of an impact: free-fall acceleration [m/s^2], smallest deviation of the vertical acceleration from it
+#: [m/s^2], smallest angular acceleration [rad/s^2], and largest gap [m].
 _FALL, _JERK, _TWIST, _NEAR = 9.0, 9.0, 300.0, 0.03
 #: Smallest rise in m between two separate bounces.
 _RISE: Final = 0.003
@@ -33,7 +33,7 @@ class Drops:
     flight_rows : ndarray, shape (n,)
         Number of rows before the first impact.
     bounces : tuple of tuple of int
-        Rows of each drop with the lowest places between rises of 3 mm.
+        For each drop, the rows of the lowest places between rises of 3 mm.
     """
 
     pose: Array
@@ -55,7 +55,7 @@ class Drops:
         return cls(pose, flights, tuple(_bounces(one[:, 1]) for one in pose))
 
     def usable(self) -> list[int]:
-        """Return the drops with at least two bounces and with a flight that can be fitted."""
+        """Return the indices of the drops with at least two bounces and with a flight that can be fitted."""
         enough = [i for i, given in enumerate(self.flight_rows) if given > LEAST_ROWS and len(self.bounces[i]) > 1]
         return enough
 

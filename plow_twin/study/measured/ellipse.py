@@ -23,12 +23,13 @@ SEMI_AXES: Final = (0.035, 0.025)
 GYRATION: Final = 0.0192
 #: Stiffness per mass in 1/s^2. It affects only the duration, because place and arms are constant during an impact.
 _STIFFNESS: Final = 1e9
-#: Speed of approach in m/s for which restitutions are given, the middle of the measured speeds.
+#: Speed of approach in m/s to which given restitutions refer: the middle of the measured speeds.
 USUAL_SPEED: Final = 2.5
 _LEAST, _LARGEST = 0.05, 0.98
 #: Upper bound for rates in m/s or rad/s, which no measured body reaches.
 _FASTEST: Final = 1e4
-#: Gap in m at which a simulated impact starts, and time in s after which it is over, 13 half periods of the contact.
+#: Gap in m at which a simulated impact starts, and time in s after which the impact is over: 13 half periods of the
+#: contact's oscillation.
 _GAP, _WHOLE = 1e-9, 40.0 / _STIFFNESS**0.5
 
 
@@ -43,8 +44,8 @@ class EllipseContact:
     exponent : float
         n in F = K d^n.
     restitution : float
-        Restitution of an impact at 2.5 m/s without motion along the surface. For a law without restitution, its damping
-        number lambda v0, or C relative to the critical damping.
+        Restitution of an impact at 2.5 m/s without motion along the surface. For a law that has no restitution: its
+        damping number lambda v0, or its C relative to the critical damping.
     fall : float
         Exponent q of the decrease (v / 2.5 m/s)^-q of the restitution with the speed of approach v.
     fall_along : float
@@ -73,7 +74,7 @@ class EllipseContact:
     tilt: float = -0.0131
 
 
-#: Contact fitted to the impacts with odd numbers.
+#: Contact fitted to the odd-numbered impacts.
 ELLIPSE: Final = EllipseContact()
 
 
@@ -100,7 +101,7 @@ def impact(before: ArrayLike, contact: EllipseContact = ELLIPSE) -> Array:
         x, y [m], theta [rad], vx, vy [m/s], omega [rad/s] in the axes of the data: y points away from the surface, and
         a positive theta turns y towards x.
     contact : EllipseContact
-        Parameters of the contact; by default the fitted ones.
+        Parameters of the contact; by default the fitted parameters.
 
     Returns
     -------
@@ -189,7 +190,7 @@ def impact_scene(before: ArrayLike) -> Scene:
 
 
 def simulated_impact(before: ArrayLike) -> Array:
-    """Return the states after impacts like `impact`, each by a full simulation of the preset `measured_ellipse`.
+    """Return the states after impacts, as `impact` does, but by full simulations of the preset `measured_ellipse`.
 
     Parameters
     ----------

@@ -20,16 +20,17 @@ RATE_HZ: Final = 250.0
 _DT: Final = 1.0 / RATE_HZ
 #: Number of steps in the table of damping numbers.
 _NUMBERS: Final = 1000
-#: Number of touches of a motion with their own scatter.
+#: Number of touches of a motion for which scatter is drawn.
 _TOUCHES: Final = 64
-#: Difference in rad between a row's angle and its extrapolation that only an impact causes.
+#: Difference in rad between a row's angle and the extrapolated angle above which there was an impact.
 _TURN_IN_A_ROW: Final = 0.1
 #: Smallest number of rows of a first flight, from which its speeds are fitted.
 LEAST_ROWS: Final = 4
-#: Largest number of rows of bands, 4 s (a block rests after 1 s); speed in m/s that no drop reaches.
+#: Largest number of rows of the bands, which are 4 s (a block comes to rest within 1 s), and a speed in m/s that no
+#: drop reaches.
 _MOST_ROWS, _FASTEST = 1000, 100.0
 
-#: Fitted to drops with odd numbers.
+#: Parameters of the block, fitted to the odd-numbered drops.
 SQUARE: Final = np.array(
     (0.02535, 0.00548, 0.0211, -2.4e-4, 1e8, 0.293, 0.039, 0.607, 0.228, 0.156, 0.179, 1.28, 9.81, 0.35, 0.73), BLOCK
 )
@@ -76,7 +77,7 @@ class Marker:
         return moved
 
 
-#: Fitted to drops with odd numbers.
+#: Place of the tracked frame on the block, fitted to the odd-numbered drops.
 MARKER: Final = Marker(-0.0308, (2.3e-4, 5.2e-4))
 
 
@@ -220,7 +221,7 @@ def _leaves_flight(rows: Array) -> bool:
 
 
 def _row_times(rows: Array, gravity: float) -> Array:
-    """Return the times of the rows in s, 0 at the last row. A lost row shows by twice the distance to the next row."""
+    """Return the times of the rows in s, 0 at the last row. A doubled distance between two rows means a lost row."""
     way = np.hypot(*np.diff(rows[:, :2], axis=0).T)
     steps = np.ones(len(way))
     for _ in range(3):

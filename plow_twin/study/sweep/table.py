@@ -143,7 +143,7 @@ class Table:
 
     @property
     def failed(self) -> list[int]:
-        """Numbers of the members without a result."""
+        """Indices of the members without a result."""
         return [int(member) for member in np.flatnonzero(self.status)]
 
     def reason(self, member: int) -> str:
@@ -161,7 +161,7 @@ class Table:
 def run_members_of(
     sweep: Sweep, members: Sequence[int], workers: int | None = None, on_done: Callable[[int], None] | None = None
 ) -> Array:
-    """Compute the members with these numbers; return status and statistics, shape (k, 1 + statistics).
+    """Compute the members with these indices; return status and statistics, shape (k, 1 + statistics).
 
     A member has the same bits in any chunk, in any thread, and on any machine of the same build.
     """

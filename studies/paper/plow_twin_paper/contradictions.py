@@ -25,7 +25,7 @@ class Contradiction:
 
 
 def contradictions(runs: PaperRuns) -> list[Contradiction]:
-    """Return the list, numbers from the published values and from the runs."""
+    """Return the contradictions, with numbers from the published values and from the runs."""
     return [_phase(), _zero_load(runs), _doubled(runs), _labels(runs), *_WORDS, _check_length(), *_GAPS]
 
 

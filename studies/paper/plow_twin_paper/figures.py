@@ -1,4 +1,4 @@
-"""All figures of the report, each with the content of the paper's figure and of this one."""
+"""All figures of the report, each with a description of the paper's figure and of its own content."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure on disk, its heading, the content of the paper's figure by its text, and of this one."""
+    """A figure on disk with its heading, and what the paper's figure (by the paper's text) and this figure show."""
 
     path: Path
     heading: str
@@ -97,7 +97,7 @@ def _plans(runs: PaperRuns) -> list[tuple[str, str, str, str, Callable[[], Figur
 
 
 def _falls(runs: PaperRuns) -> str:
-    """Describe how far each curve of Fig. 11 falls below its earlier maximum, between the marks too."""
+    """Describe how far each curve of Fig. 11 falls below its earlier maximum, including between the marks."""
     forces = runs.horizontal.largest_n
     falls = np.max(np.maximum.accumulate(forces, axis=0) - forces, axis=0)
     listed = ", ".join(f"{corner} {1e-3 * fall:.1f}" for corner, fall in zip(CORNERS, falls, strict=True))

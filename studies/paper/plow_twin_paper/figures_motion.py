@@ -21,7 +21,7 @@ _POSE: Final = (("x [mm]", 1e3, "#0072B2"), ("y [mm]", 1e3, "#D55E00"), ("theta 
 
 
 def fig06(runs: PaperRuns) -> Figure:
-    """x, y and theta in time: the whole run, and its last two periods of the load."""
+    """x, y and theta over time: the whole run, and its last two load periods."""
     t, q = runs.case.t, runs.case.q
     with sheet(10.5, 6.0) as figure:
         panels = figure.subplots(3, 2, sharex="col", width_ratios=(1.5, 1))
@@ -90,9 +90,9 @@ def fig09(runs: PaperRuns) -> Figure:
 
 
 def _close_up(runs: PaperRuns, sense: Sense) -> Figure:
-    """Forces of one sense over one period around the quoted times, and below who carries force when."""
+    """Forces of one sense over one period around the quoted times; below, when each point carries force."""
     times = {moment: shown_time(moment.time_s, runs.t_end) for moment in MOMENTS if moment.sense == sense}
-    # a shorter run may contain only some of the quoted times: all are moved back equally
+    # a shorter run may contain only some of the quoted times, so all are moved back equally
     back = max(moment.time_s - time for moment, time in times.items())
     times = {moment: moment.time_s - back for moment in times}
     centre = 0.5 * (min(times.values()) + max(times.values()))
@@ -131,7 +131,7 @@ def _moved(back: float) -> str:
 
 
 def _bars(panel: Any, timeline: list[paper_sets.Hold], left: float) -> None:
-    """Draw who carries force when, one line for each point."""
+    """Draw the times at which each point carries force, one line for each point."""
     for row, corner in enumerate(CORNERS):
         spans = [
             (hold.start_s, hold.duration_s)

@@ -76,7 +76,7 @@ def fig13(runs: PaperRuns) -> Figure:
 
 
 def _mark(panels: Any, found: tuple[float, float], text: str, level: int) -> None:
-    """Shade a time, start and length in s, in all panels and name it above the first."""
+    """Shade a span of time (start and length in s) in all panels, and name it above the first panel."""
     for panel in panels:
         panel.axvspan(found[0], found[0] + found[1], color="#F0E442", alpha=0.85, linewidth=0.0)
     panels[0].annotate(

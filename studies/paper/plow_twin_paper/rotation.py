@@ -2,7 +2,7 @@
 
 A centre of mass off the cavity's centre couples translation and rotation in the mass matrix; the paper leaves that out
 and keeps a constant moment -m g arm (its section 2). The equivalent offset is `com_offset_m = (arm, 0)`. The paper does
-not state the reference point of its inertia: both readings are run.
+not state the reference point of its inertia, so both readings are run.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from plow_twin.run.simulate import Result, simulate
 from plow_twin_paper import sets as paper_sets
 from plow_twin_paper.values import CORNERS, SENSE_NAMES
 
-#: Distance [m] at which poses count as parted.
+#: Distance [m] above which two motions count as separated.
 PARTED_M = 1e-3
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Final
 
-#: Data behind a row besides the numbers of the scene.
+#: Relation of a row to the fit of the scene's numbers.
 FITTED: Final = "fitted to this"
 CHECK: Final = "not fitted to this"
 ASSUMED: Final = "not fitted to this; other clearance assumed 20 mm"
@@ -35,7 +35,7 @@ class Row:
     group, source : str
         Heading of the row and place of the statement in the paper.
     what, published, computed : str
-        The statement, the paper's value and this run's value, for people.
+        The statement, the paper's value and this run's value, as text.
     verdict, criterion
         Whether it agrees, and the rule that decides it.
     inputs : str

@@ -87,11 +87,11 @@ def _trend(group: str, source: str, what: str, values: Array, at: str, falls: bo
 
 
 def longest_faces(runs: PaperRuns, mark: FaceMark, since_s: float = 0.0) -> tuple[float, float] | None:
-    """Return start and length in s of the longest time with that many faces in contact in that sense, if any.
+    """Return start and length in s of the longest time with the mark's number of faces in contact in its sense, if any.
 
     The search goes from `since_s` to the end of the section's 20 s.
 
-    A corner has one pair in each sense, each with another wall, so that points and faces count alike.
+    A corner has one pair in each sense, each with another wall, so that the numbers of points and of faces are equal.
     """
     chosen = paper_sets.of_sense(mark.sense)
     faces = [face for pair, face in enumerate(face_of_pair()) if chosen[pair]]

@@ -32,13 +32,13 @@ from plow_twin_paper.values import (
 Array = NDArray[np.float64]
 OnProgress = Callable[[float], object]
 
-#: Shortest run that contains a settled period of the load.
+#: Length of the shortest run that contains a settled load period.
 SHORTEST_S: Final = 2.0 * PERIOD_S
-#: Longest run: its rows of all forms take some gigabyte.
+#: Length of the longest run, in which the rows of all forms take about a gigabyte.
 LONGEST_S: Final = 1000.0
-#: Rows of the figures [s]; forces change over tens of milliseconds.
+#: Interval of the rows in figures [s]; forces change over tens of milliseconds.
 OUTPUT_DT_S: Final = 1e-3
-#: Steps of a curve between two of the five places at which the paper's curves are read.
+#: Number of steps of a curve between two of the five places at which the paper's curves are read.
 _FINE_STEPS: Final = 10
 
 
@@ -75,8 +75,8 @@ class FaceRun:
 class PaperRuns:
     """All runs, and what they were computed from.
 
-    `scale` is the scene's clearance over the published one: horizontal, vertical; `failed` counts the runs that could
-    not be completed; the case itself is always complete.
+    `scale` is the ratio of the scene's clearances (horizontal, vertical) to the published clearances. `failed` counts
+    the runs that could not be completed; the case itself is always complete.
     """
 
     scene: Scene
@@ -115,9 +115,9 @@ def run_all(scene: Scene, t_end: float, workers: int | None = None, on_progress:
     Parameters
     ----------
     scene : Scene
-        At the clearance of the paper's Figs 6 to 9, whatever its convention: the other clearances are scaled alike.
+        Scene at the clearance of the paper's Figs 6 to 9 in any convention; the other clearances are scaled alike.
     t_end : float
-        End of the runs in s, at least `SHORTEST_S`; the runs of section 5 end at 20 s or earlier with it.
+        End of the runs in s, at least `SHORTEST_S`; the runs of section 5 end at 20 s, or at `t_end` if it is smaller.
     workers, on_progress
         Threads, all cores by default; receives the share done.
 

@@ -96,7 +96,7 @@ def at(timeline: Sequence[Hold], time_s: float) -> str:
 
 
 def nearest(timeline: Sequence[Hold], time_s: float, corners: str) -> tuple[float, Hold] | None:
-    """Return the nearest hold of a set to a time, after its distance in s (negative: earlier)."""
+    """Return the distance in s (negative: earlier) from a time to the nearest hold of a set, and this hold."""
     found = [hold for hold in timeline if hold.corners == corners]
     if not found:
         return None

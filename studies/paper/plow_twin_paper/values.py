@@ -1,7 +1,7 @@
 """The paper's published values, as data with their place in the text; every number here is `given`.
 
 Source: Mao, Zhang et al., "Dynamic characteristics of plough head under contact-impact with clearances", J. Vibration
-and Shock 34(19), 2015. Its curves are known through its text alone, so places are sections and figures. The criteria of
+and Shock 34(19), 2015. Its curves are known only from its text, so places are sections and figures. The criteria of
 agreement at the end are ours.
 """
 
@@ -83,7 +83,8 @@ FACE_MARKS: Final = (FaceMark(1, "ccw", 1), FaceMark(2, "cw", 2), FaceMark(3, "c
 FORCE_TOLERANCE: Final = 0.05
 #: A contact set occurs when it lasts at least this long without a break [s].
 SHORTEST_HOLD_S: Final = 5e-3
-#: Smallest step against a trend that counts, over the curve's largest value: a printed curve shows no smaller step.
+#: Smallest step against a trend that counts, as a share of the curve's largest value; a printed curve shows no smaller
+#: step.
 TREND_SLACK: Final = 0.005
 #: "rare", for sets that the paper does not mention: at most this share of the contact time.
 RARE_SHARE: Final = 0.10
