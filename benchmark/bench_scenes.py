@@ -26,7 +26,7 @@ def bench_scene(name: str) -> Scene:
 
 
 def error_scale(scene: Scene) -> tuple[float, float, float]:
-    """Return the scales of the errors of x, y and theta: gx, gy and gx over the half diagonal."""
+    """Return the scales of the errors of x, y and theta: gx, gy, and gx divided by the half diagonal."""
     gx, gy = scene.clearance.horizontal_m, scene.clearance.vertical_m
     return gx, gy, gx / half_diagonal(scene)
 

@@ -33,7 +33,7 @@ class Machine:
     Attributes
     ----------
     stiffness_share, depth : ndarray, shape (8,)
-        Stiffness of each pair over the contact's stiffness, and distance in m by which its wall lies farther out.
+        Stiffness of each pair relative to the contact's, and distance in m by which its wall lies farther out.
     radius : float
         Radius of the corners in m.
     friction : float

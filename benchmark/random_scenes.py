@@ -65,7 +65,7 @@ class RandomScenes:
 
 
 def distance(scene: Scene, q: NDArray[np.float64], reference: NDArray[np.float64]) -> float:
-    """Return the largest pose error over the smaller clearance; angles are multiplied by the half diagonal."""
+    """Return the largest pose error relative to the smaller clearance; angles are multiplied by the half diagonal."""
     scale = np.array([1.0, 1.0, half_diagonal(scene)]) / length_scale(scene)
     return float((np.abs(q - reference) * scale).max())
 

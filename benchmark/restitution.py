@@ -152,7 +152,7 @@ def ramp_table(rows: Sequence[Row]) -> list[str]:
 
 
 def draw(rows: Sequence[Row], path: Path) -> None:
-    """Draw the delivered over the nominal restitution, and the line on which both are equal."""
+    """Draw the delivered restitution against the nominal one, and the line on which both are equal."""
     import matplotlib
 
     matplotlib.use("Agg")

@@ -38,7 +38,7 @@ GRAVITY, RESTITUTION = 9.81, 0.4
 #: Angular velocities of crank and rod at the start in rad/s; all angles are 0.
 START = (150.0, -75.0)
 PAIRS = ("top_left_top", "top_right_top", "bottom_right_bottom", "bottom_left_bottom")
-#: Columns of the reference: time, crank revolutions, rod angle, rates, height over clearance, four impulses.
+#: Columns of the reference: time, crank revolutions, rod angle, rates, height divided by clearance, four impulses.
 _TIME, _TURNS, _ROD, _RATES, _HEIGHT, _IMPULSES = 0, 1, 2, slice(4, 6), 12, slice(21, 25)
 
 

@@ -89,8 +89,8 @@ def verdict(row: dict[str, Any]) -> list[Any]:
 def summary(name: str, factor: float, rows: list[dict[str, Any]]) -> str:
     """Return the effect of one variation on the clearances and verdicts.
 
-    They are the largest change of a clearance in its standard deviations, the RMSE over the RMSE with the chosen value,
-    the number of intervals that contain the truth among the known clearances, and the number of changed verdicts.
+    They are the largest change of a clearance in its standard deviations, the RMSE relative to that with the chosen
+    value, the number of known clearances whose interval contains the truth, and the number of changed verdicts.
     """
     base = {row["group"]: row for row in rows if row["name"] == ""}
     own = [row for row in rows if row["name"] == name and row["factor"] == factor]

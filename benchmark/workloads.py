@@ -142,7 +142,7 @@ def _shared_load_scene() -> Scene:
 
 
 def add_ratios(rows: Sequence[Row]) -> None:
-    """Fill `value` of the feature rows with the time over that of the first row."""
+    """Fill `value` of the feature rows with the time divided by that of the first row."""
     plain = rows[0].wall_ms
     for row in rows:
         if plain and row.wall_ms is not None:

@@ -291,7 +291,7 @@ def test_stiffness_and_gains_of_a_hard_contact_are_learned_from_the_poses() -> N
     follower.span()
     _run(follower, truth, 5.0, 4.0)
     peak = simulate(truth.scene, 5.0, 1e-4, 1e-6).force[40_000:].max()
-    # with the estimate's stiffness the peak is less than half as large
+    # with the estimate's stiffness the peak would be less than half as large
     assert follower.span().peak[0].max() == pytest.approx(peak, rel=0.25)
     # a twin that follows by its parameters alone keeps the learned parameters
     follower.follow_parameters()

@@ -251,7 +251,7 @@ def test_a_pose_with_a_large_stated_deviation_does_not_make_the_model_suspect() 
 
 
 def test_a_silence_of_the_load_is_not_bridged() -> None:
-    """With a straight line across a lost period, the sensor would be suspect."""
+    """If a straight line bridged a lost period of the load, the sensor would be suspect."""
     truth, _ = known()[0]
     there = (truth.load.t < 11.0) | (truth.load.t > 14.0)
     load = Load(truth.load.t[there], truth.load.wrench[there])

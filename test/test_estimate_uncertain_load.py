@@ -65,7 +65,7 @@ def test_without_an_angle_the_range_of_the_head_gives_a_rough_clearance_whose_in
 
 
 def test_a_quick_load_is_no_reason_to_look_at_the_poses_in_its_own_time() -> None:
-    """In units that give chatter of 8 Hz the paper's period, poses at 100 Hz would be too sparse."""
+    """In units in which a chatter of 8 Hz has the paper's period, poses at 100 Hz would be too sparse."""
     truth = mismatched(replace(KINDS["chatter"], periods=6.0), 80001)
     result = estimate(truth.nominal, truth.load, truth.poses)
     assert result.horizontal_state is State.ROUGH and _holds(result, truth.clearance)

@@ -119,7 +119,7 @@ def doubling_threshold(r: float, stiffness: float) -> float:
 
 
 def test_both_thresholds_of_the_vibrating_table() -> None:
-    """They are a = pi (1-r)/(1+r) and (a^2 + 4 ((1+r^2)/(1+r)^2)^2)^0.5, which for r = 0.5 are 1.0472 and 1.5268.
+    """With r = 0.5, a = pi (1-r)/(1+r) is 1.0472, and (a^2 + 4 ((1+r^2)/(1+r)^2)^2)^0.5 is 1.5268.
 
     The error decreases with K^-1/2, like the contact's duration. At K = 1e9 N/m it is 1e-3 and 4e-4; extrapolated in
     K^-1/2 to a rigid table it is 1e-4.

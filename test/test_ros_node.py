@@ -165,7 +165,7 @@ def test_every_sample_sent_is_used_dropped_or_counted_as_lost(tmp_path: Path, mo
     assert sent == 2 * rate
     # only the next sample would reveal a loss at the very end
     assert 0 <= sent - counted <= 0.01 * sent
-    assert int(figures["samples_missing"]) == 0  # 0, because no rate is expected
+    assert int(figures["samples_missing"]) == 0  # no sample counts as missing, because no rate is expected
 
 
 @pytest.mark.stress

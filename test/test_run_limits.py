@@ -179,7 +179,8 @@ def test_no_scene_works_without_bound(scene: Scene, tol: float) -> None:
         assert "at t = " in str(error)
 
 
-#: A program that prints its steps when the signal arrives, from another thread, and when the call has returned.
+#: A program that prints its number of steps twice: when the signal arrives, from another thread, and when the call has
+#: returned.
 INTERRUPTED = """
 import json, os, signal, threading, time
 from plow_twin import RunInterrupted, load_scene

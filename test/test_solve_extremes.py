@@ -99,7 +99,7 @@ def hourly(hours: int) -> np.ndarray:
 @pytest.mark.stress
 def test_ten_hours_of_driven_motion_do_not_drift() -> None:
     impulse = hourly(10)
-    # the motion, and so its impulses, are periodic except in the first seconds
+    # the motion and therefore its impulses are periodic, except in the first seconds
     assert abs(impulse[1:] / impulse[1] - 1.0).max() < 1e-3
 
 

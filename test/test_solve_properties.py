@@ -260,7 +260,7 @@ def search(structure: str, examples: int) -> None:
 
     every_scene_is_solved_or_named()
     assert ended[Status.OK] >= 0.5 * ended.total(), ended
-    # overdamped and very stiff contacts with an explicit series end with a status, not without end
+    # an overdamped or very stiff contact under explicit steps uses up its steps and ends with a status
     assert ended[Status.BUDGET] < 0.2 * ended.total(), ended
     assert ended[Status.NON_FINITE] == 0, ended
 

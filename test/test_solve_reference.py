@@ -36,7 +36,7 @@ def test_a_tighter_tolerance_gives_a_smaller_error_within_the_tolerance(name: st
 
 
 def test_reconstruction_r1_gives_the_published_table() -> None:
-    """These are the figures of R1 over 60 s; the paper has 153 / 74 kN at a and 177 / 82 kN at b."""
+    """The figures are those of R1 over 60 s; the paper has 153 / 74 kN at a and 177 / 82 kN at b."""
     result = simulate(preset("paper"), 60.0)
     ccw = {"a": "bottom_right_bottom", "b": "top_right_right", "c": "top_left_top", "d": "bottom_left_left"}
     cw = {"a": "bottom_right_right", "b": "top_right_top", "c": "top_left_left", "d": "bottom_left_bottom"}

@@ -227,7 +227,7 @@ def test_a_corner_grips_at_its_touch_as_with_fixed_steps(damping: float) -> None
 
 
 def test_painleves_case_is_an_impact_without_collision() -> None:
-    """Its own friction presses a corner into the wall; the force grows as cosh and stops the slip."""
+    """A corner's own friction presses it into the wall; the force grows as cosh and stops the slip."""
     mass, inertia, stiffness, mu = 1.0, 0.002, 1e8, 0.5
     scene = Scene(
         Head(mass, inertia), Frame(0.1, 0.6), Clearance(0.1, 0.1), Contact("kelvin_voigt", stiffness, damping=1e-3),

@@ -352,7 +352,7 @@ def test_measured_values_are_compared_with_the_stretch_they_belong_to(clock_s: f
 # each rotation compiles its own kernel
 @pytest.mark.parametrize("rotation", ["paper", pytest.param("consistent", marks=pytest.mark.stress)])
 def test_contacts_under_gravity_alone_take_the_energy_of_the_height_lost(rotation: str, tmp_path: Path) -> None:
-    """In flight they take 0; for a head at rest they take m g times the drop of its centre, less the stored energy."""
+    """In flight they take nothing; until the head rests, m g times the drop of its centre less the stored energy."""
     scene = load_scene(PAPER)
     arm, height = scene.gravity.arm_m, 0.1
     assert arm > 0.1

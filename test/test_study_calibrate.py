@@ -155,7 +155,8 @@ def test_the_command_fits_a_recording_and_marks_the_fitted_numbers(
     check_figure(figures[0])
     pose, residual = figures[0].axes[:2]
     np.testing.assert_allclose(pose.lines[0].get_ydata(), 1e3 * rec.q[:, 0])
-    assert np.abs(residual.lines[0].get_ydata()).max() < 1e-6  # in mm; the recording is exact, so nothing remains
+    # the residual in mm vanishes, because the recording is exact
+    assert np.abs(residual.lines[0].get_ydata()).max() < 1e-6
     assert figures[0].axes[-1].get_yticklabels()[0].get_text() == "contact stiffness [MN/mⁿ]"
     assert "singular values" in capsys.readouterr().out
     fit = load_scene(tmp_path / "fit" / "fit.yaml")

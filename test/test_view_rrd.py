@@ -348,7 +348,8 @@ def test_gaps_are_drawn_as_wide_as_asked_with_their_wear() -> None:
     gaps = np.array([-0.01, -0.02, -0.01, -0.03, -0.005, -0.03, -0.005, 0.001])
     walls, touching = section.exaggerated(gaps, 2.0)
     top, right, bottom, left = walls
-    np.testing.assert_allclose(top[:, 1], -(135.0 + 20.0))  # the top gap of 10 mm is drawn twice as wide; y points down
+    # the top gap of 10 mm is drawn twice as wide, and y points down
+    np.testing.assert_allclose(top[:, 1], -(135.0 + 20.0))
     np.testing.assert_allclose(right[:, 0], 165.0 + 60.0)
     np.testing.assert_allclose(bottom[:, 1], 135.0 + 10.0)
     # the left wall is slanted and passes through its points beside the corners

@@ -142,7 +142,7 @@ def forces_at(scene: Scene, q: Array, v: Array, depth: Array | None = None) -> t
     factor = 0.0 if viscous else float(scene.contact.damping or 0.0)
     numbers = float(params["stiffness"]), float(params["exponent"]), factor, viscous, float(params["ramp"])
     force, inside = np.zeros(penetration.shape), penetration > 0.0
-    linear = numbers[1] == 1.0 and not numbers[-1]  # the law accepts arrays only in this case
+    linear = numbers[1] == 1.0 and not numbers[-1]  # the law accepts arrays only if it is linear and has no ramp
     law = _LAW if linear else np.vectorize(_LAW, otypes=[np.float64])
     force[inside] = np.maximum(law(penetration[inside], rate[inside], *numbers), 0.0)
     return penetration, force

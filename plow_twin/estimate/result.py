@@ -89,7 +89,7 @@ class Cell:
     """Estimated properties of a load cell.
 
     rows : number of rows in or near contact with its pair
-    gain : measured force over true force
+    gain : measured force divided by true force
     offset, noise : mean and standard deviation of its readings in flight, in N
     left_over : share of its force that the fit does not explain, beyond the noise
     """
@@ -179,7 +179,7 @@ class Estimate:
     stiffness, damping : Interval
         Stiffness K in N/m^n, and the law's damping or restitution.
     gain_fx, gain_fy, gain_m : Interval
-        True load over believed load.
+        True load divided by believed load.
     bias_x, bias_y, bias_theta : Interval
         Measured minus true pose in m, m, rad.
     delay : Interval

@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 class Scales:
     """Estimated scales.
 
-    scale : (3,) measured over true x, y, theta
+    scale : (3,) measured divided by true x, y, theta
     chi2 : chi^2 of the three scales, on average 3 if they are right
     """
 

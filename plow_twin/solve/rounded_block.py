@@ -15,10 +15,10 @@ from plow_twin.kernel.compiler import kernel
 from plow_twin.model.contact import normal_force
 
 #: Parameters of a block, per mass: half the distance between the centres of its corners' arcs [m], their radius [m],
-#: radius of gyration [m], height of the table [m], stiffness K [1/s^2], tangential stiffness over K [1], tangential
-#: damping over critical damping [1], restitution at an impact speed of 1 m/s and the power with which it falls,
-#: friction at 1 m/s and the power with which it falls, the power of the moving mass in the impact, gravity [m/s^2],
-#: drag of place and of angle [1/s].
+#: radius of gyration [m], height of the table [m], stiffness K [1/s^2], tangential stiffness relative to K [1],
+#: tangential damping relative to critical damping [1], restitution at an impact speed of 1 m/s and the power with which
+#: it falls, friction at 1 m/s and the power with which it falls, the power of the moving mass in the impact, gravity
+#: [m/s^2], drag of place and of angle [1/s].
 BLOCK = np.dtype(
     [
         (name, "f8")
@@ -35,8 +35,8 @@ _STEPS = 70.0
 _SLOWEST, _LEAST, _LARGEST = 0.01, 0.05, 0.9
 #: Impact speed in m/s below which restitution and friction are constant.
 _SMALLEST_IMPACT = 0.05
-#: Reference mobility of a corner (times the mass) for the powers of the moving mass: the mobility of a uniform square
-#: that lands on the end of an edge.
+#: Mobility of a corner (times the mass) to which the moving mass of an impact is related: that of a uniform square that
+#: lands on the end of an edge.
 _USUAL_MOBILITY = 1.5
 
 

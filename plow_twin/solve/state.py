@@ -116,31 +116,31 @@ RESTITUTIONS: Final = 1000
 
 #: Constants of one scene at one tolerance, divided by mass and inertia where that saves work.
 _PARAM_FIELDS: Final[list[tuple[Any, ...]]] = [
-    ("penetration_rows", "f8", (5, PAIR_COUNT)),  # coefficients of the penetrations for c, s, X, Y, 1
-    ("arm_rows", "f8", (4, PAIR_COUNT)),  # coefficients of the arms for c, s, X, Y
-    ("slip_rows", "f8", (4, PAIR_COUNT)),  # coefficients of the place along the wall for c, s, X, Y
-    ("slip_arm_rows", "f8", (4, PAIR_COUNT)),  # coefficients of the arm about G of a force along the wall
+    ("penetration_rows", "f8", (5, PAIR_COUNT)),  # factors of c, s, X, Y and 1 in the penetrations
+    ("arm_rows", "f8", (4, PAIR_COUNT)),  # factors of c, s, X and Y in the arms
+    ("slip_rows", "f8", (4, PAIR_COUNT)),  # factors of c, s, X and Y in the corners' places along their walls
+    ("slip_arm_rows", "f8", (4, PAIR_COUNT)),  # factors of c, s, X and Y in the arms about G of forces along the walls
     ("wear_per_impulse", "f8", (PAIR_COUNT,)),  # depth of each pad per impulse, k_s v / A
-    ("speed_per_wear", "f8"),  # A / k_s, speed over depth per impulse; 0 if sliding in the plane does not wear
-    ("running_in", "f8"),  # share by which a new pad wears faster
-    ("running_in_rate", "f8"),  # 1 / h0 in 1/m, the rate at which this share falls with the depth
+    ("speed_per_wear", "f8"),  # A / k_s = v / `wear_per_impulse`; 0 if sliding in the plane does not wear
+    ("running_in", "f8"),  # share by which a new pad wears faster than a worn one
+    ("running_in_rate", "f8"),  # 1 / h0 in 1/m, the rate at which `running_in` falls with the depth
     ("enabled", "i8", (PAIR_COUNT,)),  # 1 if the pair can touch
     ("inverse_mass", "f8"),
     ("inverse_inertia", "f8"),
     ("stiffness", "f8"),
     ("exponent", "f8"),
-    ("viscous", "f8"),  # C in N s/m, or 0
-    ("damping_number", "f8"),  # D of lambda = D / v0, or a negative number if lambda is constant
-    ("speed_floor", "f8"),  # smallest v0
-    ("ramp", "f8"),  # penetration over which C grows, or 0
+    ("viscous", "f8"),  # C in N s/m; 0 for a law without C
+    ("damping_number", "f8"),  # D of lambda = D / v0; negative if lambda is constant
+    ("speed_floor", "f8"),  # smallest v0 that lambda = D / v0 uses
+    ("ramp", "f8"),  # penetration over which C grows to its full value; 0 without a ramp
     ("gravity", "f8"),
     ("constant", "f8", (3,)),  # Fx/m, Fy/m - g, M/I of the constant loads
     ("direction", "f8", (2, 2)),  # directions (x, y) of the harmonic forces S1, S2
-    ("offset", "f8", (2,)),  # centre of mass from the cavity's centre
-    ("free", "f8", (3,)),  # 1 free, 0 locked
+    ("offset", "f8", (2,)),  # place of the centre of mass relative to the cavity's centre
+    ("free", "f8", (3,)),  # 1 for a free degree of freedom, 0 for a locked one
     ("friction", "f8"),  # mu
-    ("slip_speed", "f8"),  # regularisation speed in m/s
-    ("static_friction", "f8"),  # mu up to which a corner sticks
+    ("slip_speed", "f8"),  # regularisation speed of friction in m/s
+    ("static_friction", "f8"),  # static coefficient of friction, up to which a corner sticks
     ("stick_stiffness", "f8"),
     ("stick_damping", "f8"),
     ("frame_mobility", "f8", (3,)),  # 1/m, 1/m, 1/I of a frame on springs, otherwise 0
@@ -151,8 +151,8 @@ _PARAM_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("threshold", "f8", (_ROWS,)),  # admissible size of term k of a velocity over a step
     ("velocity_tolerance", "f8"),  # admissible error of a velocity
     ("position_tolerance", "f8"),  # admissible error of a position
-    ("weight", "f8"),  # factor from a cosine or sine to a velocity, for the size of terms
-    ("radius", "f8"),  # factor from an angle to a length
+    ("weight", "f8"),  # factor that makes a cosine or sine a velocity, for the size of terms
+    ("radius", "f8"),  # factor that makes an angle a length
     ("release", "f8"),  # penetration below which the force is negligible
     ("fastest", "f8"),  # largest angular frequency of the harmonics
     ("leverage", "f8"),  # distance of a corner of the frame from its centre
@@ -168,9 +168,9 @@ _OPTION_FIELDS: Final[dict[str, list[tuple[Any, ...]]]] = {
     "falling": [  # a restitution that falls with the impact
         ("damping_numbers", "f8", (RESTITUTIONS + 1,)),  # e D(e) on a grid from 0 to 1
         ("restitution", "f8"),  # restitution of impacts up to `fall_speed`
-        ("fall", "f8"),  # power with which it falls with the impact
+        ("fall", "f8"),  # power with which the restitution falls with the impact
         ("fall_speed", "f8"),  # in m/s
-        ("fall_mass", "f8"),  # power of the effective mass
+        ("fall_mass", "f8"),  # power of the effective mass in the impact
         ("fall_along", "f8"),  # loss of restitution per speed along the wall, in s/m
     ],
 }
@@ -215,22 +215,22 @@ _STATE_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("decay_times_before", "f8"),
     ("order", "i8"),  # order of the series of the current step
     ("event_pair", "i8"),  # the pair whose event ends the step, or -1
-    ("event_mode", "i8"),  # the mode after the event
+    ("event_mode", "i8"),  # the mode of this pair after the event
     ("touching", "i8"),  # bits of pairs that touch at the step's start, whose series need the square root of time
     ("events_at_once", "i8"),  # number of events at the present instant so far
     ("piece", "i8"),  # index of the sampled load's present piece
     ("ends_at_stop", "i8"),  # 1 if the step ends at `stop_time`
-    ("refused", "i8"),  # failed attempts at implicit steps since a contact changed
+    ("refused", "i8"),  # number of failed attempts at implicit steps since a contact changed
     ("refused_before", "i8"),  # `refused` before the current step was laid out
-    ("in_flight", "i8"),  # 1 during a step of free flight
-    ("at_rest", "i8"),  # 1 during a step of rest
+    ("in_flight", "i8"),  # 1 if the current step is a step of free flight
+    ("at_rest", "i8"),  # 1 if the current step is a step of rest
     # counted since the start
     ("steps", "i8"),
-    ("evaluations", "i8"),  # evaluations of the equations of motion, one for each order of a series
+    ("evaluations", "i8"),  # number of evaluations of the equations of motion, one for each order of a series
     ("events", "i8"),
     ("guard_roots", "i8"),  # number of searches for a guard's root
-    ("recoveries", "i8"),  # steps beyond an instant at which modes changed back and forth
-    ("bounded", "i8"),  # advances with a coarse end
+    ("recoveries", "i8"),  # number of steps beyond an instant at which modes changed back and forth
+    ("bounded", "i8"),  # number of advances with a coarse end
     ("implicit_steps", "i8"),
 ]
 STATE: Final = _in_lines(_STATE_FIELDS)
@@ -247,10 +247,10 @@ _FRAME_FIELDS: Final[list[tuple[Any, ...]]] = [("frame", "f8", (6,))]
 WORK: Final = np.dtype(
     [
         ("series", "f8", _WIDE),  # state
-        ("left", "f8", _WIDE),  # factors of the Cauchy products
+        ("left", "f8", _WIDE),  # first factors of the Cauchy products
         ("right", "f8", _WIDE),
         ("penetration", "f8", _WIDE),  # penetration
-        ("rate", "f8", _WIDE),  # its rate in time
+        ("rate", "f8", _WIDE),  # rate of the penetration in time
         ("arm", "f8", _WIDE),
         ("damped", "f8", _WIDE),  # ramped damping only: the ramp times the rate
         ("force", "f8", _WIDE),
@@ -258,22 +258,22 @@ WORK: Final = np.dtype(
         ("guard", "f8", _WIDE),
         ("bernstein", "f8", _WIDE),
         ("power", "f8", (4, *_WIDE)),  # powers of the penetration
-        ("ramp", "f8", (3, *_WIDE)),  # square and cube of the penetration, share of C
+        ("ramp", "f8", (3, *_WIDE)),  # ramped damping only: square and cube of the penetration, acting share of C
         ("slip", "f8", (6, *_WIDE)),  # friction: slip rate r / v_s, k r_k, tanh r, 1 - tanh^2 r, force, arm
         ("frame", "f8", _WIDE),  # a frame on springs (`solve.support`)
-        ("frame_left", "f8", (3, *_WIDE)),  # factors of its Cauchy products
+        ("frame_left", "f8", (3, *_WIDE)),  # first factors of the Cauchy products of a frame on springs
         ("frame_right", "f8", (3, *_WIDE)),
         ("seen", "f8", _WIDE),  # implicit steps: the head relative to the frame
         ("frame_sum", "f8", (PAIR_COUNT,)),
         ("grip", "f8", (3, PAIR_COUNT)),  # friction with stick: factors of normal force, place and slip rate
         ("per_pair", "f8", (9, PAIR_COUNT)),  # masks and sums of the eight pairs
         ("moved", "f8", (STATE_SIZE,)),
-        ("saved", "f8", (2, PAIR_COUNT)),  # y and wear depth at the start of an advance
+        ("saved", "f8", (2, PAIR_COUNT)),  # body coordinates and wear depth at the start of an advance
         ("frame_now", "f8", (6,)),  # state of the frame at the last reading of the motion
         ("frame_saved", "f8", (6,)),  # state of the frame at the start of an advance
         ("load", "f8", (3, _ROWS)),  # S1, S2, M
         ("world", "f8", (4, _ROWS)),  # forces per mass in head and world axes
-        ("column", "f8", (2, _ROWS)),  # one polynomial
+        ("column", "f8", (2, _ROWS)),  # a polynomial, for example one guard
         ("halves", "f8", (MAX_HALVINGS + 2, _ROWS)),
         ("bounds", "f8", (MAX_HALVINGS + 2, 2)),
         ("wrench", "f8", (2, 3)),  # linear load: value and slope at the step's start
@@ -298,8 +298,8 @@ TOTALS: Final = np.dtype(
         ("impulse", "f8", (PAIR_COUNT,)),
         ("time_in_contact", "f8", (PAIR_COUNT,)),
         ("makes", "i8", (PAIR_COUNT,)),
-        ("set_time", "f8", (2, 16)),  # time in each set of corners, counter-clockwise and clockwise pairs
-        ("logged", "i8"),  # events in the log
+        ("set_time", "f8", (2, 16)),  # time in which each set of corners carries force, for ccw and for cw pairs
+        ("logged", "i8"),  # number of events in the log
     ]
 )
 
@@ -334,7 +334,7 @@ ROW: Final = np.dtype(
         # since the publication before), and the clearances [m] with their quantiles
         ("followed", "i8"),  # `FOLLOWED`: clearances are filled; `WITH_INTERVALS`: all fields are filled
         *((f"{name}_{end}", "f8", (PAIR_COUNT,)) for name in ("force", "peak", "impulse") for end in ("low", "high")),
-        ("known_clearance", "f8", (6,)),  # horizontal clearance and its quantiles, vertical clearance and its quantiles
+        ("known_clearance", "f8", (6,)),  # horizontal, then vertical clearance, each with its quantiles
     ]
 )
 

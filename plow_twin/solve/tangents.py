@@ -52,7 +52,7 @@ COLUMNS: Final = np.dtype(
         ("rate", "f8", _OF_PAIRS),
         ("force", "f8", _OF_PAIRS),
         ("load", "f8", (3, _ROWS, WIDTH)),  # change of the load per mass and inertia, in world axes
-        ("now", "f8", (6, WIDTH)),  # displacements at the step's start, along head axes
+        ("now", "f8", (6, WIDTH)),  # displacements along head axes at the step's start
         ("factor", "f8", _EIGHT),  # change of each pair's lambda
         ("edge", "f8", _EIGHT),  # derivative of each pair's penetration by a clearance
         ("constant", "f8", (3, WIDTH)),  # derivative of the steady load

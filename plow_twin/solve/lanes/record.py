@@ -33,14 +33,14 @@ _LANES_OF: Final = (WIDTH,)
 LANES: Final = np.dtype(
     [
         ("series", "f8", (COMPONENTS, _ROWS, WIDTH)),  # state
-        ("moment", "f8", (4, _ROWS, WIDTH)),  # factors of cosine, sine, X and Y in the contacts' moment
+        ("moment", "f8", (4, _ROWS, WIDTH)),  # factors of c, s, X and Y in the moment of the contacts
         ("load", "f8", (3, _ROWS, WIDTH)),  # S1, S2, M
-        ("depth", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # with lambda d' only: penetrations of each slot's pairs
-        ("push", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # F / K of each slot's pairs
-        ("guard", "f8", (GUARDS, _ROWS, WIDTH)),  # eight guards, of any lanes, for each round
+        ("depth", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # with lambda d' only: penetrations of the pairs in each slot
+        ("push", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # F / K of the pairs in each slot
+        ("guard", "f8", (GUARDS, _ROWS, WIDTH)),  # for each round eight guards, which may belong to any lanes
         ("bernstein", "f8", (_ROWS, WIDTH)),
-        ("bulge", "f8", (_ROWS, WIDTH)),  # forces whose maximum must still be found, as it may exceed the peak
-        ("bulge_step", "f8", _LANES_OF),  # sizes of these forces' steps
+        ("bulge", "f8", (_ROWS, WIDTH)),  # forces whose maximum must still be found, because it may exceed the peak
+        ("bulge_step", "f8", _LANES_OF),  # step sizes that belong to the forces in `bulge`
         ("rows", "f8", (PAIR_COUNT, 5, WIDTH)),  # penetration: factors of cosine, sine, X, Y, constant
         ("arms", "f8", (PAIR_COUNT, 2, WIDTH)),  # arm: factors of cosine and sine
         ("ratio", "f8", _PAIRS),  # C / K of pairs that are on
@@ -48,14 +48,14 @@ LANES: Final = np.dtype(
         ("gear", "f8", (PAIR_COUNT, 8, WIDTH)),  # factors of each slot's pairs: rows, arms, lambda
         # guards of a round: the penetration's rows, factors of d and d', a further constant
         ("chosen", "f8", (8, WIDTH)),
-        ("along", "f8", (2, 6, WIDTH)),  # forces along X and Y: factors of c, s, X or Y, and of the rates of these
-        # factors of c and s in the moment: their factors of c, s, X, Y and of the rates of these
+        ("along", "f8", (2, 6, WIDTH)),  # factors of c, s, X or Y and of their rates in the forces along X and Y
+        # moment = c Gc + s Gs - X fy + Y fx: factors of c, s, X, Y and of their rates in Gc and Gs
         ("turn", "f8", (2, 8, WIDTH)),
         ("constant", "f8", (3, WIDTH)),
         ("slope", "f8", (3, WIDTH)),  # sampled loads: slope from the last sample to the next sample
-        ("sample", "f8", (3, WIDTH)),  # sampled loads: the last sample
+        ("sample", "f8", (3, WIDTH)),  # sampled loads: value of the last sample
         ("held", "f8", (3, WIDTH)),  # load at the step's start, including the constant loads
-        ("knot", "f8", _LANES_OF),  # time of the last sample
+        ("knot", "f8", _LANES_OF),  # sampled loads: time of the last sample
         ("small", "f8", _LANES_OF),  # a term over the longest wanted step has vanished below this size
         ("direction", "f8", (4, WIDTH)),
         ("inverse_mass", "f8", _LANES_OF),
@@ -82,7 +82,7 @@ LANES: Final = np.dtype(
         ("peak", "f8", _PAIRS),
         ("impulse", "f8", _PAIRS),
         ("time_in_contact", "f8", _PAIRS),
-        ("out", "f8", (COMPONENTS, WIDTH)),  # one scene at eight instants, or eight scenes
+        ("out", "f8", (COMPONENTS, WIDTH)),  # values of one scene at eight instants, or of eight scenes
         ("told", "f8", (3, PAIR_COUNT, WIDTH)),  # penetration, rate, force
         ("time", "f8", _LANES_OF),
         ("member", "i8", _LANES_OF),  # the scene in a lane, -1 for an empty lane
@@ -99,7 +99,7 @@ LANES: Final = np.dtype(
         ("todo", "i8", _LANES_OF),  # a bit for each guard that remains to be searched
         ("guarded", "i8", (GUARDS, WIDTH)),  # numbers of the guards of each round, or -1
         ("owner", "i8", (GUARDS, WIDTH)),  # lanes of these guards
-        ("row_place", "i8", _LANES_OF),  # places of a round's guards in `rows`
+        ("row_place", "i8", _LANES_OF),  # index in `rows` of each guard of a round
         ("bulge_pair", "i8", _LANES_OF),
         ("bulge_lane", "i8", _LANES_OF),
         ("orders", "i8", _LANES_OF),  # order of each lane's series; the terms beyond have vanished
