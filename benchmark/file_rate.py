@@ -50,7 +50,7 @@ def main() -> None:
         few, many = Path(folder, "few.csv"), Path(folder, "many.csv")
         write_load(few, FEW)
         write_load(many, rows)
-        measure(few)  # compiles the solver if necessary
+        measure(few)  # this run compiles the solver if necessary
         for outputs in ("", "none", "all"):
             options = ["--set", f"record_outputs={outputs}", "--record"] if outputs else []
             start = measure(few, *options, *[f"{folder}/few_{outputs}"][: len(options)])

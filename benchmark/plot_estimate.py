@@ -58,7 +58,7 @@ def _draw_errors(panel: Any, rows: Sequence[dict[str, Any]], axis: str, color: s
     bars = np.array([1e3 * NORMAL_P95 * row[f"{axis}_sd_m"] for row in known])
     panel.errorbar(stiffness, errors, bars, fmt=".", color=color, label=title, linewidth=0.8, markersize=4)
     unknown = [row["stiffness"] for row in rows if row[f"{axis}_state"] != State.ESTIMATED.value]
-    # a truth without an estimate is a tick at the lower edge
+    # a truth without an estimate is drawn as a tick at the lower edge
     panel.plot(unknown, [-0.98 * _MOST_MM] * len(unknown), "|", color=color, markersize=9)
 
 

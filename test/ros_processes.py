@@ -30,9 +30,9 @@ with warnings.catch_warnings():
     import rosidl_generator_py  # noqa: F401
 
 ROOT = Path(__file__).resolve().parent.parent
-#: Long enough for the solver's first compilation on a slow machine [s].
+#: Time [s] that is long enough for the solver's first compilation on a slow machine.
 START_S = 200.0
-#: Long enough for discovery on a machine that does other work [s].
+#: Time [s] that is long enough for discovery on a machine that does other work.
 WAIT_S = 60.0
 #: Twice the longest time that a stop took while three processes shared two cores [s].
 STOP_S = 10.0
@@ -106,7 +106,7 @@ class Probe:
         self._clients: dict[str, Any] = {}
         self.status: list[DiagnosticStatus] = []
         self.reports: list[dict[str, DiagnosticStatus]] = []
-        # deeper than the twin's queue, so that no quick change is missed
+        # this queue is deeper than the twin's, so that no quick change is missed
         latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.node.create_subscription(DiagnosticStatus, "status", self.status.append, latched)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._report, 100)

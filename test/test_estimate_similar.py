@@ -17,7 +17,7 @@ from plow_twin.estimate.similar import Units
 
 def test_a_machine_of_another_size_is_estimated_as_one_of_the_paper_s_size() -> None:
     truth, result = known()[0]
-    desk = Units(8.0, 1024.0, 4.0)  # a machine an eighth as large, a thousandth as heavy, four times as fast
+    desk = Units(8.0, 1024.0, 4.0)  # a machine that is an eighth as large, a thousandth as heavy and four times as fast
     scene = desk.scene(truth.nominal)
     found = estimate(scene, desk.load(truth.load), desk.poses(truth.poses))
     assert found.t_end == result.t_end / 4.0 and found.bias_x is not None and found.delay is not None

@@ -87,7 +87,7 @@ class Mixed:
         bound = self.settings.max_evaluations or None
         twin = Twin(SCENE, tol=self.settings.tolerance, excitation="sampled", max_evaluations=bound)
         session = Session(twin, on_entry=self.recording.recorder.journal, rollback_span_s=self.settings.rollback_span)
-        intake = Intake(jump_back_s=60.0)  # without limits, an advance may fail
+        intake = Intake(jump_back_s=60.0)  # the input has no limits, so an advance may fail
         every_sample = self.settings.publish_mode == "on_sample"
         self.driver = Driver(session, intake, policy(self.settings), every_sample=every_sample)
         session.start()

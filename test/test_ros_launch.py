@@ -23,7 +23,7 @@ from launch.launch_description_sources import PythonLaunchDescriptionSource
 
 from launch import LaunchDescription
 
-#: Long enough for the solver's first compilation on a slow machine [s].
+#: Time [s] that is long enough for the solver's first compilation on a slow machine.
 START_S = 200.0
 
 try:

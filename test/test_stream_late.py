@@ -228,7 +228,7 @@ def test_clocks_out_of_step_end_in_an_error_and_not_in_resets_for_ever() -> None
     dropped = sum(count for key, count in counted.items() if key.startswith("dropped_"))
     assert counted["samples_used"] + dropped + (live.driver._steps._jumped is not None) == 400
     assert counted["dropped_unsteady"] > 50
-    # when the stamps are steady again, a step is a step of the clock again
+    # when the stamps are steady again, a jump counts as a step of the clock again
     live.send(_arrival(60_000), _arrival(60_001), now_ns=20_000 * MS)
     assert live.driver.resets == 6 and not live.driver.unsteady(20_000 * MS)
 

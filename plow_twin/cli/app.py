@@ -66,7 +66,7 @@ EXTRA_OF_MODULE: Final = {
     "distributed": "dask",
 }
 
-#: Longest message [characters], because a file may have a million names to choose from.
+#: Longest message [characters]; a message may list names to choose from, of which a file may have a million.
 _LONGEST: Final = 16_000
 
 
@@ -120,7 +120,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, signal.SIG_IGN)
     try:
-        if sys.stdout is not None:  # None if it was closed at the start
+        if sys.stdout is not None:  # standard output is None if it was closed at the start
             sys.stdout.flush()
     except BrokenPipeError:
         # the reader is gone, and Python must not report this at exit

@@ -59,7 +59,7 @@ class Outlet:
             left = len(self._waiting)
             self._thread.join(_PATIENCE_S)
             if self._thread.is_alive() and len(self._waiting) == left:
-                self.lost += left + 1  # including the line that is being written
+                self.lost += left + 1  # this count includes the line that is being written
                 return False
         if self._broken:
             raise BrokenPipeError

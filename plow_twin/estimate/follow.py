@@ -163,7 +163,7 @@ class Follower:
 
     def _forget(self) -> None:
         """Forget all poses."""
-        #: waiting poses and estimates in order of time, each with time in s, number, and pose or text of the estimate
+        #: poses and estimates that wait, in order of time: time in s, number, and the pose or the text of the estimate
         self._due: list[tuple[float, int, list[float] | str]] = []
         #: times of recently used poses
         self._used: deque[float] = deque()
