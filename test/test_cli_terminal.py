@@ -119,7 +119,7 @@ def test_ctrl_c_is_not_lost_in_a_destructor() -> None:
     with pytest.raises(KeyboardInterrupt), progress("replaying", quiet=True) as on_progress:
         on_progress(0.1)
         left = Ends()
-        del left  # here Python drops the exception
+        del left  # here Python drops the exception that `__del__` raises
         on_progress(0.2)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 

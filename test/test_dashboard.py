@@ -454,7 +454,7 @@ _SEEN = """JSON.stringify({pads: document.querySelectorAll('#pads tbody tr').len
     seconds: screenState.seconds.length, fooled: Boolean(window.fooled)})"""
 
 
-#: Script that returns the smallest contrast of a text with its background by WCAG 2, without disabled controls.
+#: Script that returns the smallest contrast of a text with its background (WCAG 2); disabled controls are left out.
 _CONTRAST = """(() => {
     const parts = (color) => color.match(/[\\d.]+/g).map(Number);
     const light = (color) => parts(color).slice(0, 3).map((part) => part / 255)

@@ -817,7 +817,7 @@ def test_readers_of_metrics_that_ask_nothing_are_bounded() -> None:
                 with urlopen(f"http://127.0.0.1:{port}/metrics", timeout=30.0) as page:
                     assert b"plow_twin_state_model_time_s 1.5" in page.read()
                 break
-            except OSError:  # the server has not noticed yet that they are gone
+            except OSError:  # the server has not noticed yet that the idle connections are gone
                 assert time.monotonic() < give_up
 
 

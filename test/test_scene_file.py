@@ -315,7 +315,7 @@ def scenes(draw: st.DrawFn) -> Scene:
         sliding=draw(st.sampled_from(["travel", "total"])), running_in_ratio=ratio, running_in_depth_m=draw(POSITIVE),
     )  # fmt: skip
     rate = ratio * wear.coefficient_m2_n * wear.travel_speed_m_s / wear.pad_area_m2
-    # a pad that wears faster than its damper lets the head move is refused
+    # a scene is refused if a pad wears faster than its damper lets the head move
     bearable = not LAWS[contact.law].additive or not (contact.damping or 0.0) * rate > 1.0
     letters = draw(st.lists(NAME, max_size=len(CORNER_NAMES), unique=True))
     labels = dict(zip(letters, draw(st.permutations(CORNER_NAMES)), strict=False))

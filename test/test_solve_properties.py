@@ -223,7 +223,7 @@ def check_energy(
     slack = (1e3 * case.tol + 1e-9) * scale + work_error
     # for speeds below a thousandth of the clearance per second the tolerance is absolute
     slack += case.tol * length_scale(case.scene) * np.sqrt(2.0 * case.scene.head.mass_kg * kinetic.max())
-    # the tolerance is for the pose, and under force an error of the pose is an error of the energy
+    # an error of the pose within the tolerance changes the energy by the force times the error
     slack += 100.0 * case.tol * length_scale(case.scene) * peak.sum(axis=1).max()
     rise = gain - np.minimum.accumulate(gain)
     assert (rise <= slack).all(), (rise.max() / scale, case.tol, int(rise.argmax()))

@@ -50,7 +50,7 @@ _NO_LAG = len(_OF_DRAWN_S) // 2
 #: whole motion, and the changes of the pose at each phase of the load.
 _CHANGES: Final = (1, 2, 4, 8, 16, 32)
 _CHANGES_BY_PHASE: Final = (1, 4)
-#: Definition: paths of the frame's sides in a scene.
+#: Definition: the paths by which a scene names the sides of the frame.
 _SIDES: Final = ("frame.width_m", "frame.height_m")
 #: Guard: squared scatter, in m2 or rad2, that keeps logarithms and quotients finite.
 _NO_SCATTER = 1e-14

@@ -143,7 +143,7 @@ class Unknowns:
         deviation[GY] = deviation_of(scene, "clearance.vertical_m")
         deviation[SOFTNESS] = deviation_of(scene, "contact.stiffness")
         if is_stated(scene, "contact.stiffness"):
-            # from ln K to ln(u + u0)
+            # the deviation is converted from ln K to ln(u + u0)
             u = math.exp(unknowns.softness_of(contact.stiffness)) - tuning.RESOLVED
             deviation[SOFTNESS] *= u / (u + tuning.RESOLVED) / contact.exponent
         damped = "contact.damping" if contact.restitution is None else "contact.restitution"

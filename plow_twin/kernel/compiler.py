@@ -24,7 +24,7 @@ from plow_twin.kernel.linked import EntryCompiler, LinkedCompiler, garbage_kept,
 #: Relaxations of `fast` kernels: sums may be reordered and fused, but NaN and infinity are still handled correctly.
 FASTMATH: Final = frozenset({"contract", "reassoc", "nsz", "arcp"})
 
-#: The warning about the cache, after it has been issued once.
+#: Holds the warning about the cache once it has been issued.
 _said: list[str] = []
 
 
