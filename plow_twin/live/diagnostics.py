@@ -42,7 +42,7 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "samples_missing": "samples missing at expected_rate, by gaps in the stamps",
         "samples_lost": "samples of the followed publisher that never arrived, by its numbering",
         "samples_not_followed": "messages of publishers that are not followed",
-        "queue_peak": "most samples in the input queue",
+        "queue_peak": "largest number of samples in the input queue",
         "queue_wait_ms": "longest wait in the input queue [ms]",
         "messages_lost": "messages of all inputs that never arrived",
         "dropped_non_finite": "a number is not finite",
@@ -52,7 +52,7 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "dropped_late": "older than every state that is kept",
         "dropped_implausible": "beyond limit_force or another limit",
         "dropped_unsteady": "the stamps have jumped too often",
-        "dropped_stray": "the stamp jumped, and the next continued from before the jump",
+        "dropped_stray": "the stamp jumped, but the next stamp continued the stamps before the jump",
         "dropped_malformed": "names do not match the loads of the scene",
         "dropped_not_selected": "not the selected excitation source",
         "dropped_inactive": "the node was not active",
@@ -77,7 +77,7 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "gaps_implausible": "dropped: beyond the limits of the input",
         "gaps_not_followed": "messages of publishers that are not followed",
         "head_pose_residual": "model minus newest measured pose: x, y [m], theta [rad]",
-        "refused_publishers": "publishers that cannot connect, by type or quality of service",
+        "refused_publishers": "publishers that cannot connect because of type or quality of service",
     },
     "output": {
         "published": "messages on contact_forces",
@@ -92,9 +92,9 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "recent_latency_p99_ms": "the 99 % points since the last report [ms]",
         "recent_age_p99_ms": "the 99 % points since the last report [ms]",
         "periods_missed": "missed periods of publish_rate or step_rate",
-        "period_mean_ms": "mean, standard deviation and largest of the period [ms]",
-        "period_deviation_ms": "mean, standard deviation and largest of the period [ms]",
-        "period_max_ms": "mean, standard deviation and largest of the period [ms]",
+        "period_mean_ms": "mean, standard deviation and largest value of the period [ms]",
+        "period_deviation_ms": "mean, standard deviation and largest value of the period [ms]",
+        "period_max_ms": "mean, standard deviation and largest value of the period [ms]",
     },
     "estimate": {
         "ready": "1 once the estimator is compiled; until then data wait",
@@ -114,7 +114,7 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "poses_outlying": "poses left out as too far from their predictions",
         "poses_dropped": "poses dropped: over an hour ahead of the load, or too many waiting",
         "taken_over": "number of redraws of the twins: by an estimate, its withdrawal or a change of the machine",
-        "reduced": "1 if the twins did not keep up and only the parameters follow",
+        "reduced": "1 if the twins were too slow and only the parameters follow",
     },
     "recorder": {
         "recording": "file being written",
@@ -133,7 +133,7 @@ STATUS_KEYS: Final[dict[str, str]] = {
     "stream": "waiting, running, stale, ended or failed",
     "stale_inputs": "silent inputs, separated by commas",
     "clock": "running; under use_sim_time also waiting (for /clock) or paused",
-    "recorder": "off, recording, or trouble (a loss, or it has stopped)",
+    "recorder": "off, recording, or trouble (items were lost, or the recording has stopped)",
     "solver_failures": "failed advances: their samples have no forces",
     "horizontal": "state of the interval: prior, estimated, rough, not_observable or withdrawn",
     "vertical": "state of the interval: prior, estimated, rough, not_observable or withdrawn",
@@ -141,7 +141,7 @@ STATUS_KEYS: Final[dict[str, str]] = {
     "model": "agreement with the measurements: ok or suspect",
     "sensor": "agreement with the measurements: ok or suspect",
     "follow": "off, or the source of the twin's numbers: prior or estimate",
-    **{f"publishers_{topic}": "publishers that the node is connected to" for topic in TOPICS},
+    **{f"publishers_{topic}": "number of publishers that the node is connected to" for topic in TOPICS},
 }
 
 

@@ -56,8 +56,8 @@ class Settings:
     file_root: str = _plain(
         "",
         Effect.START,
-        "folder that scene, record_path and wear_state_path must stay within; empty: these cannot be changed after the "
-        "start, except for the name of a preset",
+        "folder within which scene, record_path and wear_state_path must be; empty: after the start they can only be "
+        "changed to the name of a preset",
     )
     services_off: str = _plain(
         "", Effect.START, "services that are refused, separated by commas, e.g. set_wear,acknowledge_alarms"
@@ -95,7 +95,7 @@ class Settings:
         0.0,
         1e5,
         Effect.CONFIGURE,
-        "expected rate of the samples; missing ones are counted by gaps in the stamps; 0: off",
+        "expected rate of the samples, from which gaps in the stamps are counted as missing samples; 0: not counted",
     )
     publish_mode: str = _choice(
         "on_sample",
@@ -151,11 +151,16 @@ class Settings:
         "full",
         ("off", "parameters", "full"),
         Effect.CONFIGURE,
-        "with `estimate`: off: nothing follows the machine; parameters: each estimate sets the numbers of "
-        "the model; full: each measured pose also corrects the motion, with intervals of the forces",
+        "how the twin follows the machine with `estimate`; off: not at all; parameters: each estimate sets the numbers "
+        "of the model; full: each measured pose also corrects the motion, and the forces have intervals",
     )
     follow_members: int = _number(
-        128, "twins", 20, 4096, Effect.CONFIGURE, "number of twins with follow: full; each costs the same"
+        128,
+        "twins",
+        20,
+        4096,
+        Effect.CONFIGURE,
+        "number of twins with follow: full; each takes the same computing time",
     )
     forecast_limits: tuple[float, ...] = _number(
         (0.0, 0.0),
@@ -180,12 +185,12 @@ class Settings:
         "",
         Effect.CONFIGURE,
         "scenarios as multiples of load and wear coefficient: NAME:load=X,coefficient=Y; NAME:...; the answer of "
-        "~/forecast has a forecast of each",
+        "~/forecast has a forecast for each scenario",
     )
     wear_state_path: str = _plain(
         "",
         Effect.CONFIGURE,
-        "folder in which the wear of the pads outlives the process; the wear of another head or scene is refused; "
+        "folder that keeps the wear of the pads after the process ends; the wear of another head or scene is refused; "
         "empty: not kept",
     )
     wear_save_period: float = _number(10.0, "s", 0.1, 3600.0, Effect.CONFIGURE, "interval at which the wear is saved")
@@ -197,12 +202,12 @@ class Settings:
         0.0,
         100.0,
         Effect.CONFIGURE,
-        "rate of the topic markers: walls, pads and forces for RViz; needs visualization_msgs; 0: off; the node only",
+        "rate of the topic markers: walls, pads and forces for RViz; needs visualization_msgs; node only; 0: off",
     )
     tf: bool = _plain(
         False,
         Effect.CONFIGURE,
-        "with the markers, the head's pose on /tf, from frame_id to child_frame_id; needs tf2_msgs; the node only",
+        "send the head's pose on /tf with the markers, from frame_id to child_frame_id; needs tf2_msgs; node only",
     )
     record_path: str = _plain(
         "",
@@ -235,7 +240,9 @@ class Settings:
         Effect.CONFIGURE,
         "keep only the last seconds, in memory, and write them to a folder at each alarm or mark; 0: record everything",
     )
-    record_sync: bool = _plain(False, Effect.CONFIGURE, "wait for the disk every half second, against a loss of power")
+    record_sync: bool = _plain(
+        False, Effect.CONFIGURE, "wait for the disk every half second, so that the recording survives a loss of power"
+    )
     excitation_timeout: float = _number(
         0.5,
         "s",
@@ -259,7 +266,7 @@ class Settings:
         "largest plausible force component; 0: ten times the scene's loads and weight",
     )
     limit_moment: float = _number(
-        0.0, "N m", 0.0, 1e300, Effect.NOW, "largest plausible moment; 0: ten times the scene's"
+        0.0, "N m", 0.0, 1e300, Effect.NOW, "largest plausible moment; 0: derived from the scene's loads and weight"
     )
     limit_force_rate: float = _number(
         0.0, "N/s", 0.0, 1e300, Effect.NOW, "largest plausible rate of a force; 0: limit_force in a millisecond"
@@ -386,7 +393,7 @@ class Settings:
         0.0,
         10.0,
         Effect.CONFIGURE,
-        "distances between head_pose and the model at its stamp that raise a warning and an error; 0: never",
+        "distances of head_pose from the model at the same stamp that raise a warning and an error; 0: never",
     )
     alarm_duration: float = _number(
         0.0, "s", 0.0, 3600.0, Effect.CONFIGURE, "time that a level must last before it raises an alarm"

@@ -83,8 +83,9 @@ def excitation_limits(
 ) -> Limits:
     """Return the limits of Fx, Fy [N] and M [N m] and of their rates; a limit of 0 is derived from the scene.
 
-    The derived limit of a force is ten times the sum of all loads of the scene and the head's weight; the limit of the
-    moment is this force at an arm of half the frame's diagonal. Each may change by as much within a millisecond.
+    The derived limit of a force is ten times the sum of all loads of the scene and the head's weight. The limit of the
+    moment is this force times half the frame's diagonal, plus ten times the largest moment of the loads. Each value may
+    change by its limit within a millisecond.
     """
     amplitude = compile_loads(scene.loads).largest()
     total = float(amplitude[:2].sum()) + scene.head.mass_kg * abs(scene.gravity.acceleration_m_s2)

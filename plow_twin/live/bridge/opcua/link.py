@@ -48,7 +48,7 @@ Take = Callable[[list[tuple[int, Any]], bool], Awaitable[None]]
 
 @dataclass(frozen=True)
 class Revised:
-    """What the server grants: intervals [ms], and the number of values that it keeps between two messages."""
+    """The intervals [ms] that the server grants, and the number of values that it keeps between two messages."""
 
     publishing_ms: float
     sampling_ms: float
