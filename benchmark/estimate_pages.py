@@ -55,7 +55,7 @@ def truths(group: str, seeds: Sequence[tuple[int, int]]) -> list[dict[str, Any]]
 def right_models() -> str:
     """Return the table of errors and coverage for the truths that the model describes."""
     lines = [
-        "| group | truths | RMSE gx, gy [mm] | asked | estimated gx, gy | 90 % interval holds gx | gy | "
+        "| group | truths | RMSE gx, gy [mm] | target | estimated gx, gy | 90 % interval contains gx | gy | "
         "median width [mm] | flagged | range of motion [mm] | CPU [s], most |",
         "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
@@ -75,7 +75,7 @@ def right_models() -> str:
             f"{one['h_range_rmse_mm']:.1f}, {one['v_range_rmse_mm']:.1f} | "
             f"{one['cpu_s']:.1f}, {one['cpu_s_most']:.1f} |"
         )
-    lines += ["", f"Of {total} right models {flagged} are flagged ({flagged / total:.1%})."]
+    lines += ["", f"Of {total} truths with the right model {flagged} are flagged as suspect ({flagged / total:.1%})."]
     return "\n".join(lines)
 
 
@@ -136,8 +136,8 @@ def mismatch() -> str:
     """Return the table of estimates for machines that differ from the model."""
     now = load_rows(RESULTS / "estimate_mismatch.jsonl")
     lines = [
-        "| what differs | clearances | published | interval below 4 mm | RMSE [mm] | "
-        "90 % interval holds | median width [mm] | beyond 3 deviations |",
+        "| what differs | clearances | share published | interval below 4 mm | RMSE [mm] | "
+        "90 % interval contains truth | median width [mm] | error beyond 3 deviations |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for name in (None, *KINDS):

@@ -76,7 +76,7 @@ def work() -> str:
     starts = [row.wall_ms for row in rows if row.section == "start"]
     assert pairs is not None and pairs.wall_ms is not None and None not in starts
     lines = [
-        ["one live twin under samples at 1 kHz", f"{one.value:.0f} times real time"],
+        ["one live twin under samples at 1 kHz", f"{one.value:.0f} times as fast as real time"],
         *([row.scene.partition(", ")[2], f"{row.value:.2f} of a core"] for row in many),
         ["1,000 pairs of clearances, 20 s each, every one within 1e-4", f"{1e-3 * pairs.wall_ms:.2f} s"],
         ["an hour of the bench scene", f"{1e-3 * (hours['kv'].wall_ms or 0.0):.1f} s"],
@@ -84,7 +84,7 @@ def work() -> str:
         ["first start of a live twin, with compiling", f"{1e-3 * (starts[0] or 0.0):.0f} s"],
         ["later starts", f"{1e-3 * (starts[1] or 0.0):.1f} s"],
     ]
-    return table(["work on one core", "takes"], lines)
+    return table(["work on one core", "time, share or speed"], lines)
 
 
 def missed() -> str:
@@ -105,7 +105,8 @@ def random_scenes() -> str:
     """Return a sentence for each tolerance with the largest error of the random scenes that amplify little."""
     rows = [verdict for verdict in targets.verdicts(solver_rows()) if "random scenes" in verdict.work]
     asked = [re.search(r"tol=([\d.e-]+)", row.work) for row in rows]
-    return "\n".join(f"- at {tol[1]}: {row.measured}" for tol, row in zip(asked, rows, strict=True) if tol)
+    texts = [row.measured.replace("failed", "scenes failed") for row in rows]
+    return "\n".join(f"- tolerance {tol[1]}: {text}" for tol, text in zip(asked, texts, strict=True) if tol)
 
 
 def stored(name: str, columns: int | None = None) -> Callable[[], str]:
@@ -122,7 +123,7 @@ def stored(name: str, columns: int | None = None) -> Callable[[], str]:
 def measured_sum() -> str:
     """Return the table of errors of the drops over two bounces, without scores."""
     _, *rows = estimate_pages.narrowed(measured_pages.measured_drops(), (0, 1, 2, 4))
-    return table(["block", "off over one bounce", "over two", "inside the 90 % band after one"], rows)
+    return table(["block", "error over one bounce", "over two", "inside the 90 % band after one"], rows)
 
 
 def life_table() -> str:

@@ -458,8 +458,8 @@ def of_drops(drops: Drops) -> dict[str, Any]:
     """Return for both blocks the distances over 1, 2, 3 bounces, and coverage and score of the bands by bounce."""
     found: dict[str, Any] = {}
     kinds = {
-        "rounded corners, what falls, marker": (SQUARE, MARKER),
-        "sharp corners, nothing falls": (sharp(), Marker()),
+        "rounded corners, falling restitution and friction, marker": (SQUARE, MARKER),
+        "sharp corners, constant restitution and friction": (sharp(), Marker()),
     }
     for name, (block, marker) in kinds.items():
         far: list[list[tuple[float, float]]] = [[], [], []]

@@ -51,7 +51,7 @@ def measured_drops() -> str:
         pairs = zip(one["distance_mm"], one["angle_rad"], strict=True)
         rows.insert(place, [name, *(f"{mm:.1f} mm, {rad:.2f} rad" for mm, rad in pairs), "", "", ""])
     counts = next(iter(_part("square").values()))["drops"]
-    head = ["block", *(f"off over {n} ({count} drops)" for n, count in zip((1, 2, 3), counts, strict=True))]
+    head = ["block", *(f"error over {n} ({count} drops)" for n, count in zip((1, 2, 3), counts, strict=True))]
     return _lines([*head, "inside after bounce 1", "after bounce 2", "median CRPS of x, z, theta"], rows)
 
 

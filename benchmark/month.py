@@ -137,8 +137,8 @@ def summary(rows: list[dict[str, Any]]) -> str:
     grown = 1e3 * np.array([row["grown_m"] for row in rows]).mean(axis=1)
     used, ends = sum(row["visits"] for row in rows), np.median(ratio, axis=0)
     return "\n".join([
-        f"| months | grown by [mm] | visits used | P50 within {FACTOR} | P90 within {FACTOR} | 90 % interval holds | "
-        "its ends over the truth, median |",
+        f"| months | growth [mm] | visits used | P50 within a factor {FACTOR} | P90 | 90 % interval contains truth | "
+        "P05 and P95 over truth, median |",
         "|---|---|---|---|---|---|---|",
         f"| {len(rows)} | {grown.min():.2f} to {grown.max():.2f} | {used} of {len(rows) * len(DAYS)} | {near[1]} | "
         f"{near[2]} | {held} | {ends[0]:.2f}, {ends[3]:.2f} |",

@@ -23,7 +23,9 @@ if TYPE_CHECKING:
     epilog="Exit codes: 0 done; 1 failed; 2 wrong usage; 3 done, but a run was left out.",
 )
 @click.argument("recordings", metavar="RUN...", type=PLACE, nargs=-1, required=True)
-@click.option("--by", type=click.Choice(["run", "day", "shift"]), default="run", show_default=True, help="Groups.")
+@click.option(
+    "--by", type=click.Choice(["run", "day", "shift"]), default="run", show_default=True, help="What makes a group."
+)
 @click.option("--shifts", default="06:00,14:00,22:00", show_default=True, help="Times at which shifts begin.")
 @click.option("--zone", default="UTC", show_default=True, help="Time zone of days and shifts, e.g. Europe/Berlin.")
 @click.option("--window", type=POSITIVE, metavar="S", help="Length of a window; by default the load's period.")

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     "members",
     metavar="N",
     type=click.IntRange(20, 4096),
-    help="Forces of each pair with 90 % intervals, from N twins drawn from the estimate (256 is plenty).",
+    help="Compute each pair's forces with 90 % intervals, from N twins drawn from the estimate (256 are enough).",
 )
 @click.option(
     "--follow",
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     "--follow-dt",
     metavar="S",
     type=click.FloatRange(min=0.0, min_open=True),
-    help="Distance of the rows of followed.csv [s]; by default one row for each sample of the load.",
+    help="Time between the rows of followed.csv [s]; by default one row for each sample of the load.",
 )
 @click.option(
     "--follow-members",
@@ -84,14 +84,14 @@ def estimate(
     """Estimate clearances, contact, load gains, bias and delay from INPUT, with 90 % intervals.
 
     INPUT is a folder with scene.yaml (the nominal scene), load.csv (t, fx, fy, m: the measured load) and pose.csv (t,
-    x, y, theta: the measured pose, an empty cell was not measured). It may also have gaps.csv (t and columns named
-    after pairs: measured gaps), also instead of pose.csv, and contact_forces.csv (likewise: measured forces); each
-    table may be .parquet. INPUT may also be a run of plow_twin or another recording (MCAP, rosbag2's sqlite3, CSV,
-    Parquet). If the node of a run made estimates, the newest is computed again from the journal and compared bit for
-    bit; otherwise the measured pose must be recorded beside the run.
+    x, y, theta: the measured pose; a cell is empty if it was not measured). It may also have gaps.csv (t, and columns
+    named after pairs: measured gaps), with or without pose.csv, and contact_forces.csv (the same columns: measured
+    forces). Each table may be .parquet. INPUT may also be a run of plow_twin or another recording (MCAP, rosbag2's
+    sqlite3, CSV, Parquet). If the node of a run made estimates, the newest is computed again from the journal and
+    compared bit for bit; otherwise the measured pose must be recorded beside the run.
 
     With --follow, each row of followed.csv has forces and clearances with 90 % intervals, from the measurements up to
-    its time.
+    the time of the row.
     """
     import numpy as np
 

@@ -83,8 +83,8 @@ def forecast(
 ) -> int:
     """Forecast when a clearance of SCENE, which has a section `wear`, reaches its limit.
 
-    SCENE is a scene file, a preset, or a run of plow_twin. For a run, the forecast uses its scene with the wear at its
-    end, and the newest estimate of its node since the pads were set.
+    SCENE is a scene file, a preset, or a run of plow_twin. For a run, the forecast uses the run's scene with the wear
+    at the run's end, and the newest estimate that its node has made since the pads were set.
     """
     from plow_twin.estimate.coefficient import coefficient
     from plow_twin.estimate.forecast import Plan, Scenario, with_clearances

@@ -50,7 +50,7 @@ _LOST = re.compile(r"dropped_.*|.*_dropped|.*_lost")
     epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 done with counted loss.",
 )
 @click.argument("source")
-@click.option("--scene", help="Scene file or preset; by default the parameter scene.")
+@click.option("--scene", help="Scene file or preset; by default that of the parameter `scene`.")
 @map_option
 @unit_option
 @click.option("--params", type=FILE, help="YAML file of parameters, as for the node.")
@@ -66,21 +66,23 @@ _LOST = re.compile(r"dropped_.*|.*_dropped|.*_lost")
 @click.option(
     "--user",
     default="",
-    help="User at the broker or server; password in PLOW_TWIN_MQTT_PASSWORD, PLOW_TWIN_OPCUA_PASSWORD or a file.",
+    help="User at the broker or server; password in a file, PLOW_TWIN_MQTT_PASSWORD or PLOW_TWIN_OPCUA_PASSWORD.",
 )
 @click.option("--password-file", type=FILE, help="File whose first line is the password.")
 @click.option("--user-cert", type=FILE, help="Certificate of the user at an OPC UA server, instead of --user.")
-@click.option("--user-key", type=FILE, help="Key of that certificate.")
+@click.option("--user-key", type=FILE, help="Private key of --user-cert.")
 @click.option("--tls-ca", type=FILE, help="Certificate authority for the broker's or server's certificate.")
 @click.option("--tls-cert", type=FILE, help="Certificate of this client.")
-@click.option("--tls-key", type=FILE, help="Key of that certificate.")
+@click.option("--tls-key", type=FILE, help="Private key of --tls-cert.")
 @click.option(
     "--client-id", default="plow_twin", show_default=True, help="Client name under which the broker keeps messages."
 )
 @click.option("--plain", is_flag=True, help="Allow brokers and servers on other machines without encryption.")
 @click.option("--lines", is_flag=True, help="Status, alarms and diagnostics as JSON lines on standard output.")
-@click.option("--control", type=PLACE, help="Socket to open, for plow-twin call SOCKET acknowledge_alarms.")
-@click.option("--metrics", type=click.IntRange(1, 65535), help="Port of a page for Prometheus, on this machine.")
+@click.option("--control", type=PLACE, help="Open this socket, through which plow-twin call reaches the twin.")
+@click.option(
+    "--metrics", type=click.IntRange(1, 65535), help="Serve the diagnostics to Prometheus on this port of this machine."
+)
 @telemetry_options
 @dashboard_option
 @access_options

@@ -15,8 +15,10 @@ FOLDER: Final = click.Path(path_type=Path, file_okay=False)
 NEW_FILE: Final = click.Path(path_type=Path, dir_okay=False)
 PLACE: Final = click.Path(path_type=Path)
 
-quiet_option = click.option("--quiet", "-q", is_flag=True, help="No progress and no tables; files and errors only.")
-json_option = click.option("--json", "as_json", is_flag=True, help="The result as JSON on standard output.")
+quiet_option = click.option(
+    "--quiet", "-q", is_flag=True, help="Show no progress and no tables; write files and errors only."
+)
+json_option = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON on standard output.")
 map_option = click.option(
     "--map", "mapping", type=FILE,
     help="YAML mapping: which topics, columns or nodes are load, travel, pose, gaps, forces, and their units.",
@@ -32,8 +34,8 @@ def node_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options that name a running node: `--namespace`, `--name` and `--scene`."""
     for option in (
         click.option("--scene", help="Scene of the node, if the node's path to it cannot be read here."),
-        click.option("--name", default="plow_twin", show_default=True, help="Its name."),
-        click.option("--namespace", default="", help="Its namespace."),
+        click.option("--name", default="plow_twin", show_default=True, help="Name of the node."),
+        click.option("--namespace", default="", help="Namespace of the node."),
     ):
         command = option(command)
     return command

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     epilog="Exit codes: 0 the same, bit for bit; 1 diverged or failed; 2 wrong usage; 3 the same, with counted loss.",
 )
 @click.argument("recording", type=EXISTING)
-@click.option("--digests-only", is_flag=True, help="Compare the digests of the state alone.")
+@click.option("--digests-only", is_flag=True, help="Compare only the digests of the state.")
 @click.option(
     "--write",
     type=FOLDER,

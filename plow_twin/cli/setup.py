@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 )
 @click.argument("file", type=FILE)
 @click.option("--scene", help="Scene file or preset of the machine; without it a stub is written.")
-@click.option("--column", "given", multiple=True, metavar="NAME=COLUMN", help="A column: fx=Load_1, t=Zeit.")
+@click.option("--column", "given", multiple=True, metavar="NAME=COLUMN", help="Column of a quantity, e.g. fx=Load_1.")
 @unit_option
 @click.option("--out", type=FOLDER, default=Path(), help="Folder for the files.")
 @quiet_option

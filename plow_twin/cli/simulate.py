@@ -27,9 +27,7 @@ MOST_ROWS: Final = 10_000_000
 @click.command(short_help="Simulate a scene.", epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene.")
 @click.argument("scene")
 @click.option("--t-end", metavar="T", type=POSITIVE, required=True, help="Time to simulate [s].")
-@click.option(
-    "--output-dt", type=POSITIVE, help="Distance of the output rows [s]; a thousandth of the motion by default."
-)
+@click.option("--output-dt", type=POSITIVE, help="Time between output rows [s]; by default a thousandth of --t-end.")
 @click.option("--tol", type=POSITIVE, default=1e-9, show_default=True, help="Tolerance, relative to the clearance.")
 @click.option("--out", type=NEW_FILE, help="Write the output rows to this .csv or .npz file.")
 @json_option
@@ -41,7 +39,9 @@ MOST_ROWS: Final = 10_000_000
     help="events: every touch is located; rk4, euler: fixed steps, for comparison.",
 )
 @click.option("--dt", type=POSITIVE, help="Step of rk4 and euler [s].")
-@click.option("--energy-balance", is_flag=True, help="Balance of energy and momentum; takes some four times as long.")
+@click.option(
+    "--energy-balance", is_flag=True, help="Compute the balance of energy and momentum; takes some four times as long."
+)
 @click.option(
     "--trust",
     is_flag=True,

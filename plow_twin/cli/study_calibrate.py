@@ -31,7 +31,8 @@ if TYPE_CHECKING:
     "unknowns",
     multiple=True,
     metavar="RANGE",
-    help="PATH=LOW:HIGH[:log], PATH=CHOICE,CHOICE.. or, for a sign, PATH; may be repeated. Default: the target file.",
+    help="PATH=LOW:HIGH[:log], PATH=CHOICE,CHOICE.. or, for a sign, PATH; may be repeated. By default the unknowns of "
+    "the target file.",
 )
 @click.option("--target", metavar="FILE", help="Figures to fit: a target file, or `paper` for those of the paper.")
 @click.option(
@@ -55,7 +56,7 @@ if TYPE_CHECKING:
 @click.option(
     "--excess",
     type=POSITIVE,
-    help="Objective above the best up to which a point is near optimal; by default 10 % of the best.",
+    help="Largest excess over the best objective of a point that is near optimal; by default 10 % of the best.",
 )
 @click.option("--out", type=FOLDER, required=True, help="Folder of the results.")
 @click.option(

@@ -32,7 +32,12 @@ _COLUMN, _FIRST_COLUMN = 12, 8
 @click.option("--x", "first", required=True, metavar="AXIS", help="PATH=LOW:HIGH:COUNT[:log] or PATH=VALUE,VALUE..")
 @click.option("--y", "second", metavar="AXIS", help="A second parameter, in the same form.")
 @click.option(
-    "--statistic", "statistics", multiple=True, required=True, metavar="PATH", help="E.g. max.ccw.a; may be repeated."
+    "--statistic",
+    "statistics",
+    multiple=True,
+    required=True,
+    metavar="PATH",
+    help="Statistic to compute, e.g. max.ccw.a; may be repeated.",
 )
 @click.option("--t-end", metavar="T", type=POSITIVE, required=True, help="Time to simulate [s].")
 @click.option("--tol", type=POSITIVE, default=1e-9, show_default=True, help="Tolerance, relative to the clearance.")
@@ -43,7 +48,7 @@ _COLUMN, _FIRST_COLUMN = 12, 8
 @click.option(
     "--chunk",
     type=click.IntRange(1),
-    help="Members stored together; by default 16, or twice the number of cores if larger.",
+    help="Number of members stored together; by default 16, or twice the number of cores if larger.",
 )
 @click.option("--resume/--fresh", default=True, show_default=True, help="Keep or discard the results in the folder.")
 @quiet_option

@@ -22,7 +22,7 @@ def telemetry_options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option(
             "--out-access",
             type=FILE,
-            help="YAML file with users, certificates and files of secrets of the outputs.",
+            help="YAML file that names users, certificates and secret files of the outputs.",
         ),
         click.option(
             "--out-rate",

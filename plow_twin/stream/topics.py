@@ -133,7 +133,7 @@ TOPICS: Final = (
     ),
     Topic(
         "head_state", ODOMETRY, Cadence.EACH,
-        "pose in `frame_id`, twist in the head's own axes; covariances zero: not known",
+        "pose in `frame_id`, twist in the head's own axes; covariances of zero mean: not known",
         columns={"position": (("q", 2),), "orientation": (("orientation", 2),), "twist": (("twist", 3),)},
     ),
     Topic(
@@ -175,9 +175,9 @@ TOPICS: Final = (
     ),
     Topic(
         "alarms", STATUS, Cadence.CHANGE,
-        "value, `<name>_level` and `<name>_latched` of `force` [N], `clearance` [m], `clearance_rate`, `wear_rate` "
-        "[m/s] and, with a threshold, `residual` [m]; of a latched alarm `<name>_raised` (value), `<name>_threshold`, "
-        "`<name>_place` (pad or axis), `<name>_stamp_ns`; message = the same in words",
+        "`<name>` (value), `<name>_level` and `<name>_latched` for `force` [N], `clearance` [m], `clearance_rate`, "
+        "`wear_rate` [m/s] and, with a threshold, `residual` [m]; for a latched alarm also `<name>_raised` (value), "
+        "`<name>_threshold`, `<name>_place` (pad or axis), `<name>_stamp_ns`; message = the same in words",
         latched=True, depth=1,
     ),
     Topic("status", STATUS, Cadence.CHANGE, "what the node is doing", latched=True, depth=1),

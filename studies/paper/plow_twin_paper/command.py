@@ -40,7 +40,9 @@ _STYLES = {"yes": "blue", "no": "dark_orange", "not computed": "dim"}
     show_default=True,
     help="Another scene to compare, at the clearances of the paper's Fig. 6.",
 )
-@click.option("--recording/--no-recording", default=True, show_default=True, help="Leave the run as MCAP and .rrd too.")
+@click.option(
+    "--recording/--no-recording", default=True, show_default=True, help="Also write the run as MCAP and .rrd."
+)
 @quiet_option
 def paper(out: Path, t_end: float, workers: int | None, scene: str, recording: bool, quiet: bool) -> int:
     """Reproduce the paper's figures and numbers with the preset `paper` and write a report into a folder.
