@@ -153,7 +153,7 @@ def _check_limits(limits_m: tuple[float, float], scene: Scene) -> None:
 
 
 def _scene(name: str) -> tuple[Scene, dict[str, Any] | None, dict[str, int]]:
-    """Return the scene (of a run: at its end), the newest estimate of its pads, and the losses of the journal."""
+    """Return the scene (for a run, at its end), the newest estimate of its pads, and the losses of the journal."""
     from plow_twin.record.estimated import left_by
     from plow_twin.record.reader import RunReader, own_run
     from plow_twin.scene_file import load_scene

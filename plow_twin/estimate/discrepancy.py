@@ -301,7 +301,7 @@ class _Linearised:
         return covariance @ self._score, covariance
 
     def averaged(self, rng: np.random.Generator) -> tuple[Array, Array, Array, bool]:
-        """Return mean and covariance over the draws, how often each quantity differs, whether the scene may be exact.
+        """Return the draws' mean and covariance, how often each quantity differs, and whether the scene may be exact.
 
         The scene may be exact if it is exact in any draw. A quantity that the fit includes always differs.
         """
