@@ -75,7 +75,7 @@ class Span:
     Attributes
     ----------
     start, end : float
-        In s.
+        Beginning and end of the span in s.
     peak, impulse : ndarray, shape (3, 8)
         Largest force in N and impulse in N s of each pair. The rows are the median twin's values and the 5 % and 95 %
         points.
@@ -584,7 +584,7 @@ def follower(scene: Scene, follow: str, members: int, tol: float) -> Follower:
 
 
 def _load_share(text: str) -> Array:
-    """Return the load's error in an estimate (JSON) over half the load's range, (3,); zero unless it is rough."""
+    """Return the load's error in a rough estimate (JSON), in units of half the load's range, (3,); else zero."""
     found = json.loads(text) if text else {}
     rough = State.ROUGH.value in [found.get(axis, {}).get("state") for axis in ("horizontal", "vertical")]
     figures = found.get("figures", {}) if rough else {}
