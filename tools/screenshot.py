@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Draw a recording as rerun shows it, without a screen: tools/screenshot.py RUN [OUT.png] [--at SECONDS].
 
-Needs the package with its `view` extra and a Vulkan driver; Debian's mesa-vulkan-drivers will do.
+Needs the package with its `view` extra and a Vulkan driver; Debian's mesa-vulkan-drivers are sufficient.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ MENU = 37
 
 
 def start_viewer(port: int, home: Path) -> subprocess.Popen[bytes]:
-    """Start a viewer without a window that only this machine can reach; its settings lie in a `home` of its own."""
+    """Start a viewer without a window that only this machine can reach; it has its own settings folder `home`."""
     rerun = Path(sys.executable).with_name("rerun")
     settings = {name: str(home) for name in ("HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME", "XDG_CACHE_HOME")}
     environment = {**os.environ, **settings}

@@ -11,7 +11,7 @@ print(f"ready after {twin.warm_up():.1f} s")
 
 
 def measured(t: float) -> tuple[float, float, float]:
-    """Stand for the sensors: Fx, Fy [N] and M [N m] about the centre of the cavity."""
+    """Return what sensors would measure: Fx, Fy [N] and M [N m] about the centre of the cavity."""
     return 40e3 * np.sin(2.0 * t), 11e3 * np.sin(2.0 * t), 30e3 * np.sin(2.0 * t)
 
 

@@ -61,7 +61,7 @@ def main() -> None:
 
 
 def write_rrd(path: Path, scene: Scene, measured: np.ndarray, simulated: np.ndarray) -> None:
-    """Write both bodies in mm, y downwards, a row each 4 ms."""
+    """Write the motion of both bodies in mm, with y downwards and one row for each 4 ms."""
     stream = rr.RecordingStream("plow_twin")
     stream.save(str(path))
     table = rr.LineStrips2D([[[-800.0, 0.0], [800.0, 0.0]]], colors=[(128, 128, 128)])

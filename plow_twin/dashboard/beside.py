@@ -14,7 +14,7 @@ END_S: Final = 3.0
 
 
 class Beside:
-    """A running process and the link to it; a context that ends it.
+    """A running process and the link to it, as a context manager that ends the process.
 
     Parameters
     ----------

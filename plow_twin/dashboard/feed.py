@@ -1,6 +1,6 @@
 """The feed of a process beside a twin: it sums up publications and sends the sums at a fixed rate.
 
-An update without room is not queued: its peaks and all newest values go into the next update.
+An update for which there is no room is not queued: its peaks and all newest values go into the next update.
 """
 
 from __future__ import annotations
@@ -174,9 +174,9 @@ class Feed:
         self._waiting: list[Published] = []
         self._loads: list[Array] = []
         self.motion = Motion()
-        #: second of stamps of the newest publication
+        #: stamp of the newest publication in whole seconds
         self._second = 0
-        #: updates that the server took, and updates that it had no room for
+        #: number of updates that the server took, and number of updates for which it had no room
         self.taken = self.not_taken = 0
 
     def publication(self, published: Published) -> None:
@@ -202,7 +202,7 @@ class Feed:
         self._parts[name] = level, message[:_LONGEST], {key: text[:_LONGEST] for key, text in values.items()}
 
     def event(self, kind: str, text: str, *, done: bool = True, stamp_ns: int | None = None) -> None:
-        """Add an event, at the stamp reached unless it has another [ns]."""
+        """Add an event at `stamp_ns`, by default the stamp reached [ns]."""
         at_ns = self.motion.stamp_ns if stamp_ns is None else stamp_ns
         self._events.append({"t": at_ns * 1e-9, "kind": kind, "text": text[:_LONGEST], "done": done})
         del self._events[:-_EVENTS]
@@ -227,7 +227,7 @@ class Feed:
                 self._do(asked)
 
     def send(self) -> bool:
-        """Send an update; without room, count it and return False."""
+        """Send an update; if there is no room, count it and return False."""
         self._sum_up()
         update: dict[str, Any] = {**self._news, "not_taken": self.not_taken}
         if self._parts:
@@ -266,7 +266,7 @@ def _joined(rows: list[NDArray[np.void]], name: str) -> NDArray[Any]:
 
 
 def part_of(message: Message) -> Part:
-    """Return a status or named numbers in the form of the page; forces as their peaks."""
+    """Return a status or named numbers in the form of the page; of forces, the peaks are returned."""
     if isinstance(message, DiagnosticStatus):
         return message.level, message.message, dict(message.values)
     if not isinstance(message, JointState):

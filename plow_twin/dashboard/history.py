@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections import deque
 from typing import Any, Final
 
-#: Seconds of stamps that are kept.
+#: Span of stamps that is kept [s].
 SPAN_S: Final = 3600
 #: The clearances of a second, in the order in which they are sent.
 _CLEARANCES: Final = tuple(f"{name}{point}" for name in ("horizontal", "vertical") for point in ("", "/p05", "/p95"))
 
 
 class History:
-    """The seconds, each a list: time [s], eight peaks, six extremes of the load, six clearances, whether it was held.
+    """The kept seconds, each a list of time [s], eight peaks, six extremes of load, six clearances and the hold flag.
 
     Where intervals are known, the 5 % and 95 % points of the eight peaks follow.
 
@@ -61,7 +61,7 @@ class History:
 
 
 def _joined(before: list[Any], now: list[Any]) -> list[Any]:
-    """Merge a second with later values of the same second: extremes of peaks and loads, the newest clearances."""
+    """Merge a second with later values of it: the extremes of peaks and loads, and the newest clearances."""
     largest = [_extreme(max, *pair) for pair in zip(before[1:9], now[1:9], strict=True)]
     lowest = [_extreme(min, *pair) for pair in zip(before[9:12], now[9:12], strict=True)]
     highest = [_extreme(max, *pair) for pair in zip(before[12:15], now[12:15], strict=True)]

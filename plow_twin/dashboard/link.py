@@ -1,4 +1,4 @@
-"""The link between a twin and the screen's server: whole messages both ways, bounded, without waiting."""
+"""The link between a twin and the screen's server: whole, bounded messages in both directions, without waiting."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def pair() -> tuple[Link, socket.socket]:
 
 
 def number(value: float) -> float | None:
-    """Return a number as JSON has it, with seven digits; None if it is not finite."""
+    """Return a number for JSON, rounded to seven digits; None if it is not finite."""
     return float(f"{value:.7g}") if math.isfinite(value) else None
 
 

@@ -1,4 +1,4 @@
-"""The screen of a recording: while it is written, and afterwards its last hour."""
+"""The screen of a recording: live while it is written, and its last hour afterwards."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _WAIT_S: Final = 2e-3
 
 
 class RunFeed:
-    """Passes a recording to a feed, second by second of its stamps.
+    """Passes a recording to a feed, one second of its stamps at a time.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ class RunFeed:
             self._feed.motion.was_held |= self._feed.motion.held
             while not (self._feed.send() or self._stopped()):
                 time.sleep(_WAIT_S)
-        self._say(batch)  # an estimate replaces the clearances before it
+        self._say(batch)  # an estimate replaces the clearances that were published before it
 
     def _counted(self) -> dict[str, str]:
         """Return the counts of the inputs so far, named as in the diagnostics of the twin."""

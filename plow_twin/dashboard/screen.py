@@ -13,7 +13,7 @@ from plow_twin.dashboard.feed import Array, Feed
 
 
 class Screen(Beside):
-    """A running server and its feed; a context that ends it.
+    """A running server and its feed, as a context manager that ends the server.
 
     Parameters
     ----------

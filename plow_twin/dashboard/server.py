@@ -32,7 +32,7 @@ from plow_twin.dashboard.link import Link
 PAGE: Final = Path(__file__).with_name("page")
 #: Largest number of pages at once; a further page is refused.
 MOST_PAGES: Final = 50
-#: Time after which a page is closed that has not received an update, or not sent its token [s].
+#: Time [s] after which a page is closed if it has not received an update or has not sent its token.
 _PATIENCE_S: Final = 20.0
 #: Longest time without a message to a page, and shortest time between two requests of a page [s].
 _WORD_S, _WISH_S = 1.0, 0.2
@@ -108,12 +108,12 @@ class Pages:
                 return
             await self._serve(socket)
         except (WebSocketDisconnect, TimeoutError, RuntimeError):
-            return  # the page has gone, or does not read
+            return  # the page has gone, or does not read its updates
         finally:
             self._board.pages -= 1
 
     async def _is_admitted(self, socket: WebSocket) -> bool:
-        """Ask for the token; a wrong token costs a second."""
+        """Ask for the token; after a wrong token, wait a second."""
         wish = await asyncio.wait_for(_wish(socket), _PATIENCE_S)
         if self._access.admits(wish.get("token")):
             return True

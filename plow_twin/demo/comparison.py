@@ -44,7 +44,7 @@ class Comparison:
 
 
 def compare_forces(run: Path, wider_m: float) -> Comparison | None:
-    """Compare the forces of a run with those of a machine with larger clearances; None without forces.
+    """Compare the forces of a run with those of a machine with larger clearances; return None if the run has no forces.
 
     Parameters
     ----------

@@ -85,7 +85,7 @@ def run_demo(speed: str, seconds: float, out: Path, quiet: bool, screen: list[st
     Returns
     -------
     int
-        0 done, 1 failed, 3 done with counted loss.
+        0: done; 1: failed; 3: done, but with losses, which are counted.
     """
     folder = out / datetime.now().strftime("%Y%m%d_%H%M%S_%f")
     folder.mkdir(parents=True)
@@ -137,7 +137,7 @@ def _run(
     node = [
         *("plow_twin.ros.main", "--ros-args", "-p", f"scene:={_worn_scene(folder)}"),
         *("-p", f"record_path:={(folder / 'run').resolve()}", "-p", f"expected_rate:={_RATE_HZ}"),
-        # publisher and reader keep every sample of the run: none is lost when the machine is busy
+        # publisher and reader keep every sample of the run, so that no sample is lost when the machine is busy
         *("-p", "qos_overrides./excitation.subscription.reliability:=reliable"),
         *("-p", f"input_depth:={QUEUE}"),
         # after the last sample the run stops before the hold policy acts
@@ -200,7 +200,7 @@ def _follow(source: Child, twin: Child, watch: Watch, spin: Any, bar: Progress, 
         now = watch.number("state", "model_time_s")
         if now > reached:
             moved, reached = time.monotonic(), now
-        # before the first sample the publisher starts, which is slow on a busy machine
+        # until the first sample the publisher is starting, which is slow on a busy machine
         elif time.monotonic() - moved > (patience := _STUCK_S if reached else _START_TIMEOUT_S):
             raise DemoError(f"no progress for {patience:g} s at model time {reached:g} s\n{twin.output()}")
         bar.update(task, completed=reached)
@@ -226,7 +226,7 @@ class Child:
         self._stream: IO[bytes] = log.open("wb")
         command = [sys.executable, "-m", *arguments]
         bound = shutil.which("setpriv")
-        if bound is not None:  # ends with this process, in any case
+        if bound is not None:  # the child ends with this process in any case
             command = [bound, "--pdeathsig", "TERM", *command]
         self._process = subprocess.Popen(
             command, stdout=self._stream, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL
@@ -309,7 +309,7 @@ def _progress(console: Console, quiet: bool) -> Iterator[Progress]:
 
 
 def _view(folder: Path) -> Path | None:
-    """Make the .rrd where rerun is installed."""
+    """Make the .rrd if rerun is installed."""
     try:
         from plow_twin.view import to_rrd
     except ModuleNotFoundError as error:

@@ -269,7 +269,7 @@ def _cutting(options: argparse.Namespace) -> CuttingLoad | None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Send a scene's load; return 0 when all was sent, 1 without a twin, 2 on wrong usage, 3 when answers failed."""
+    """Send a scene's load; return 0 if all was sent, 1 without a twin, 2 for wrong usage, 3 if answers were missing."""
     import rclpy.utilities
 
     given = list(sys.argv if arguments is None else ["excitation_publisher", *arguments])

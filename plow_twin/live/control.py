@@ -1,4 +1,4 @@
-"""A local socket that offers the node's services on a running twin without ROS.
+"""A local socket through which a twin that runs without ROS offers the node's services.
 
 A request and its answer are one datagram each, so that no client can hold up the twin.
 """
@@ -31,7 +31,7 @@ class ControlError(PlowTwinError):
 
 
 class Control:
-    """The socket of a running twin, for its user alone; a context that removes it.
+    """The socket of a running twin, for its user alone, as a context manager that removes the socket.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ class Control:
 
 
 def call(path: Path, service: str, text: str | None = None) -> tuple[bool, str]:
-    """Ask the twin behind a socket for a service; return whether it was done, and its answer.
+    """Ask the twin behind a socket for a service; return whether the service was done, and the twin's answer.
 
     Raises
     ------
@@ -110,7 +110,7 @@ def call(path: Path, service: str, text: str | None = None) -> tuple[bool, str]:
         kind = "a folder" if path.is_dir() else "a file" if path.exists() else "nothing there"
         raise ControlError(f"{path}: got {kind}, expected the socket that plow-twin live --control has opened")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as client:
-        client.bind("")  # a name of its own, outside of the file system
+        client.bind("")  # the client gets a name outside the file system
         client.settimeout(_PATIENCE_S)
         try:
             client.connect(str(path))

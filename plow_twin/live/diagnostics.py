@@ -255,7 +255,7 @@ def failures(runtime: Runtime) -> list[str]:
 
 
 class Health:
-    """The parts of `/diagnostics`; remembers counters, for differences since the last report."""
+    """The parts of `/diagnostics`; it keeps the counters of the last report, from which differences are computed."""
 
     def __init__(self) -> None:
         self._before: dict[str, int] = {}

@@ -53,7 +53,7 @@ class Estimation:
         self._topics = [topic for topic, wanted in sent.items() if wanted]
         #: time at which other pads were set [ns]; None once the empty message about them has been sent
         self._set_ns: int | None = None
-        #: origin of the clearances, and trust in model and sensor, by the newest estimate
+        #: origin of the clearances, and trust in model and sensor, according to the newest estimate
         self.states = {"horizontal": State.PRIOR, "vertical": State.PRIOR}
         self.trust = {"model": "", "sensor": ""}
         self.reasons: tuple[str, ...] = ()
@@ -75,7 +75,7 @@ class Estimation:
 
     @property
     def shortage(self) -> str:
-        """Why no estimate was made; empty: an estimate was made, or the source has not ended."""
+        """Why no estimate was made; empty if an estimate was made or the source has not ended."""
         return "" if self.count else self.worker.ended or ""
 
     def add(self, entry: Entry) -> None:

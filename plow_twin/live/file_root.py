@@ -1,4 +1,4 @@
-"""Bounds of the files that parameters may name, because anybody on the ROS graph may set parameters."""
+"""Limits on the files that parameters may name, because anybody on the ROS graph may set parameters."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Named(Protocol):
 
 
 def outside(settings: Named) -> list[Problem]:
-    """Return a problem for each parameter that names a file outside of `file_root`, links followed."""
+    """Return a problem for each parameter that names a file outside `file_root`; symbolic links are followed."""
     if not settings.file_root:
         return []
     root = Path(settings.file_root).resolve()

@@ -127,7 +127,7 @@ class BridgeFront:
         return (self._feeder.newest_ns or 1) if self.follows_samples else time.time_ns()
 
     def send(self, topic: str, message: memoryview | Message) -> None:
-        """Report an alarm, an estimate, or its forecast and peak forces; the recording holds the motion."""
+        """Report an alarm, or an estimate with its forecast and peak forces; the motion is only recorded."""
         if isinstance(message, DiagnosticStatus):
             self._tell(topic, (message.level, message.message, dict(message.values)))
         elif isinstance(message, JointState):
@@ -198,7 +198,7 @@ class BridgeFront:
         return []
 
     def causes(self) -> list[str]:
-        """Return in words likely causes of samples that were not used or that reset the motion, and silences."""
+        """Return in words the silences, and likely causes of samples that were not used or that reset the motion."""
         counts, found = self.runtime.driver.intake.counts, []
         many = _MANY * max(1, sum(counts.values()))
         if self._feeder.unfit:

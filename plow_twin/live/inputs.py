@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 TOPICS: Final = ("excitation", "tool_forces", "travel", "head_pose", "gaps")
 #: Inputs besides the load.
 OPTIONAL: Final = ("travel", "head_pose", "gaps")
-#: Time after its last sample for which another sender counts as present [ns].
+#: Time [ns] for which another sender counts as present after its last sample.
 _OTHER_SENDER_NS: Final = 3_000_000_000
 #: Time after which an optional input that was heard counts as silent [ns].
 _SILENT_NS: Final = 10_000_000_000
@@ -113,7 +113,7 @@ class Inputs:
             self._queue_peak = (max(most, messages), max(before_s, longest_s))
 
     def pop_queue_peak(self) -> tuple[int, float]:
-        """Return the most messages that waited in the queue, and their longest wait [s], since the last call."""
+        """Return the largest number of messages that waited, and their longest wait [s], since the last call."""
         peak, self._queue_peak = self._queue_peak, (0, 0.0)
         return peak
 

@@ -1,4 +1,4 @@
-"""The load on the head computed from signals of the drive, with an interval, where the wrench is not measured.
+"""The load on the head with its interval, computed from signals of the drive if the wrench is not measured.
 
 The drive pulls the chain with C = efficiency P / v (or C is measured). Subtracting the drag of chain and plough gives
 the cutting force along the face, Z = C - idle. The coal gives a second value: Z = specific_force * depth *

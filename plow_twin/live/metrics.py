@@ -18,7 +18,7 @@ from plow_twin.live.part import Part
 if TYPE_CHECKING:
     from prometheus_client.metrics_core import Metric
 
-#: Characters that a name of a metric cannot have.
+#: Characters that a metric's name cannot have.
 _OTHER: Final = re.compile(r"[^a-zA-Z0-9_]")
 #: Largest number of readers at once, and longest wait for a reader [s].
 _READERS: Final = 16
@@ -30,7 +30,7 @@ class MetricsError(PlowTwinError):
 
 
 class Metrics:
-    """A page of metrics on the loopback address, for Prometheus to read; a context that closes it.
+    """A page of metrics on the loopback address, which Prometheus reads, as a context manager that closes the page.
 
     Each number of each part is a gauge `plow_twin_<part>_<key>`, as of the newest report; texts are left out.
 

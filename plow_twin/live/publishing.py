@@ -86,7 +86,7 @@ class Publishing:
     on_alarm
         Receives a text when an alarm is latched.
     catch_up
-        Computes a publication's intervals after its forces have been sent, if intervals come later.
+        Computes a publication's intervals after its forces have been sent, if intervals are sent later.
     """
 
     def __init__(
@@ -108,9 +108,10 @@ class Publishing:
             self._messages = Messages(*frames, intervals=settings.follows == "full")
         self.latency = DurationHistogram()
         self.age = DurationHistogram()
-        #: publications, and publications withheld because a number was not finite
+        #: number of publications, and of publications withheld because a number was not finite
         self.published = self.withheld = 0
-        #: publications computed without a sample, and publications that correct earlier ones because of late samples
+        #: number of publications computed without a sample, and of publications that correct earlier ones because of
+        #: late samples
         self.held_frames = self.corrected_frames = 0
         #: steady time at which the samples of the next publication were received [ns]; 0: it has no samples
         self.received_ns = 0
@@ -141,7 +142,7 @@ class Publishing:
 
         The intervals come last, because `catch_up` first advances many twins for them.
 
-        In between, latency and age are counted, alarms are judged, and the publication is recorded.
+        Between forces and intervals, latency and age are counted, alarms are judged, and the publication is recorded.
         """
         rows, _ = published
         if not len(rows):

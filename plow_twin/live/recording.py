@@ -83,7 +83,7 @@ class Recording:
         self.recorder = in_free_folder(Path(settings.record_path), make)
 
     def publication(self, published: Published, sent: Mapping[str, bytes]) -> None:
-        """Take the messages of a sent publication; `sent`: their bytes, if any."""
+        """Take the messages of a sent publication; `sent` has their bytes, if there are any."""
         wanted = self._decimation.select(published)
         if wanted is not None:
             self.recorder.publication(wanted, sent if wanted is published else {})
@@ -112,7 +112,7 @@ class Recording:
 
     @property
     def behind(self) -> bool:
-        """Whether so much is queued that losses are near."""
+        """Whether so much is queued that losses may soon occur."""
         return self.recorder.counters.queued > _QUEUE_SIZE // 2
 
     def renew(self, session: Session) -> bool:

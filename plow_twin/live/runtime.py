@@ -85,7 +85,7 @@ class Runtime:
         self.scene = prepared.scene
         #: seconds that compiling or loading the solver took
         self.compile_s = prepared.compile_s
-        #: turns of the loop that publishes at a fixed rate or follows the clock; None: samples set the pace
+        #: periods of the loop that publishes at a fixed rate or follows the clock; None if samples set the pace
         self.periods = _periods(settings)
         #: state of the clock: `waiting` for the first `/clock`, `paused` or `running`
         self.clock = "running"
@@ -316,7 +316,7 @@ class Runtime:
         if name in MODEL:
             self.driver.set_model(self.stamp_ns, model_changes(settings))
             self._front.changed()
-        elif not isinstance(value, tuple):  # a list takes effect by its service, which journals it
+        elif not isinstance(value, tuple):  # a list takes effect through its service, which journals it
             self.driver.parameter(name, value)
 
     def _set_limits(self, settings: Settings) -> None:
@@ -331,7 +331,7 @@ class Runtime:
         )
 
     def step(self, arrived: list[Arrival]) -> Iterator[Outgoing]:
-        """Use samples in order of arrival; yield the messages, each before more is computed."""
+        """Use samples in order of arrival; yield each message before anything further is computed."""
         if self.waits_for_clock:
             self.start()
         if self.waits_for_clock:

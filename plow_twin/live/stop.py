@@ -20,7 +20,7 @@ def stop_signals() -> list[signal.Signals]:
 class StopSignals:
     """SIGINT, SIGTERM and SIGHUP set a flag, or raise `StopRequested` while `interrupt` is set (a long start).
 
-    It is a context, which restores the signals' handlers when it is left.
+    It is a context manager, which restores the signals' handlers on exit.
     """
 
     def __init__(self) -> None:

@@ -16,9 +16,9 @@ Wrench = tuple[float, float, float]
 class ToolForces:
     """The wrench of measured forces along the directions of the scene's loads.
 
-    1 N along a load's own direction, at its point of action, gives a fixed wrench about the centre; a pure moment
-    counts in N m. A table, or a constant of zero, has no direction of its own and cannot be measured in this way: it
-    may be named, and its effort is ignored.
+    A force of 1 N along a load's own direction, at its point of action, gives a fixed wrench about the centre; the
+    effort of a pure moment is in N m. A table, or a constant of zero, has no direction of its own and cannot be
+    measured in this way: it may be named, and its effort is ignored.
     """
 
     def __init__(self, scene: Scene) -> None:

@@ -14,7 +14,7 @@ _MOST: Final = 500
 
 @dataclass
 class _Pending:
-    """Messages of one input, sender and reason since their last entry."""
+    """Unused messages with one input, sender and reason since the last journal entry about them."""
 
     count: int = 0
     stamps_ns: list[int] = field(default_factory=list)

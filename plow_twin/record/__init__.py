@@ -1,1 +1,1 @@
-"""Runs to MCAP and back: messages, recorder, reader and replay."""
+"""Runs written to MCAP files and read back: messages, recorder, reader and replay."""

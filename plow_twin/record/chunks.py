@@ -46,7 +46,7 @@ _MOST_DECLARED: Final = 10_000
 _CHANNEL_BITS: Final = 63
 #: Number of record heads that are read at once.
 _AHEAD: Final = 64
-#: pread for compiled code, because a recording has many more record heads than opened chunks.
+#: pread for the compiled code that reads record heads, since a recording has many more of them than opened chunks.
 _pread: Final[Any] = types.ExternalFunction("pread", types.intp(types.int32, types.uintp, types.uintp, types.int64))
 _CHUNK_HEAD: Final = struct.Struct("<QQQII")
 #: Bytes of a message record before its data: opcode, length, channel, sequence, log time, publish time.
@@ -136,7 +136,7 @@ class ChunkReader:
     _room: int = field(default=256, init=False)
     #: unpacked size of the chunks so far [B]
     _unpacked: int = field(default=0, init=False)
-    #: schema and channel records by opcode and number, because chunks may repeat them
+    #: schema and channel records by opcode and number, kept because chunks may repeat them
     _declared: dict[tuple[int, bytes], bytes] = field(default_factory=dict, init=False)
     _others: Indexes = field(default_factory=lambda: np.empty(256, np.int64), init=False)
 
@@ -371,13 +371,13 @@ def metadata_records(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
     with open_mcap(path) as stream:
         try:
             found = [(record.name, dict(record.metadata)) for record in make_reader(stream).iter_metadata()]
-        except Exception:  # no index at the end, or a damaged one
+        except Exception:  # no index at the end, or a damaged index
             found = _metadata_by_heads(stream.fileno())
     yield from found
 
 
 def _metadata_by_heads(descriptor: int) -> list[tuple[str, dict[str, str]]]:
-    """Return the metadata records of a file without an index by stepping from record head to record head."""
+    """Return the metadata records of a file that has no index, found by stepping from record head to record head."""
     from mcap.data_stream import ReadDataStream
     from mcap.records import Metadata
 

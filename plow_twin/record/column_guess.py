@@ -1,4 +1,4 @@
-"""Guess of the columns (load, pose, time) and units of an unknown CSV file by their names and magnitudes."""
+"""Guess of the columns (load, pose, time) and units of an unknown CSV file, from names and magnitudes."""
 
 from __future__ import annotations
 
@@ -179,7 +179,7 @@ def _read(path: Path) -> tuple[Guess, list[list[str]]]:
 def _find_time(
     guess: Guess, rows: Sequence[Sequence[str]], numbers: Mapping[str, Array], given: str, unit: str
 ) -> None:
-    """Find the time's column, by its name or as the only rising column, and its unit if the numbers show it."""
+    """Find the time column, by its name or as the only rising column, and its unit if the numbers show the unit."""
     alike = [name for name in guess.names if re.fullmatch(_TIME, _plain(name))]
     rising = [name for name, found in numbers.items() if len(found) > 2 and (np.diff(found) > 0.0).all()]
     choices = [given] if given else alike or rising

@@ -52,7 +52,7 @@ def whole_file(path: Path, *, sync: bool = False) -> Iterator[BinaryIO]:
         if sync:
             sync_path(place.parent)
     except OSError as error:
-        if error.errno is None:  # raised by a library, with its own text
+        if error.errno is None:  # a library has raised the error, with its own text
             raise
         raise OSError(error.errno, error.strerror, str(path)) from error
 

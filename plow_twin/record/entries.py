@@ -85,7 +85,7 @@ class Entries:
     def samples(self) -> tuple[Indexes, NDArray[np.float64]]:
         """Return the stamps and wrenches of the samples."""
         places = np.flatnonzero(self.sample)
-        return self.stamp_ns[places], self.wrench.take(places, axis=0)  # a mask of rows takes five times as long
+        return self.stamp_ns[places], self.wrench.take(places, axis=0)  # indexing by a mask takes five times as long
 
     @cached_property
     def others(self) -> Mapping[int, Entry | Dropped]:
@@ -237,6 +237,6 @@ def in_order(batch: Batch) -> Iterator[Record]:
 
 @compiled
 def unwrap(sequence: Indexes, base: int, out: Indexes) -> None:
-    """Write the unwrapped numbers, each the value nearest to `base`."""
+    """Write the unwrapped numbers; each is the possible value nearest to `base`."""
     for n in range(sequence.size):
         out[n] = base + ((sequence[n] - base + _HALF) & (_WHOLE - 1)) - _HALF

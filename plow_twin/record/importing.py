@@ -1,4 +1,4 @@
-"""The load of any recording fed to a twin, with the same intake, handling of late samples and journal as a live run."""
+"""The load of any recording as input of a twin, with the intake, late samples and journal as in a live run."""
 
 from __future__ import annotations
 

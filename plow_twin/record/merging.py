@@ -20,7 +20,7 @@ _JUMP_NS: Final = 10_000_000_000
 
 
 def merged(streams: Iterable[Iterator[T]], stamp_ns: StampOf[T]) -> Iterator[T]:
-    """Yield the messages of all streams by their stamps, each stream in its own order.
+    """Yield the messages of all streams in the order of their stamps; each stream keeps its own order.
 
     A message without a stamp stays where it is in its stream, and so does a single wrong stamp. After a step back of
     its clock, a stream waits until the other streams have reached their steps.

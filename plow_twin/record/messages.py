@@ -38,7 +38,7 @@ class JointState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Odometry:
-    """Pose in `frame_id`, twist in `child_frame_id`; `orientation` is the quaternion (x, y, z, w).
+    """Pose in the frame `frame_id` and twist in `child_frame_id`; `orientation` is the quaternion (x, y, z, w).
 
     Covariances are row-major 6 x 6 over (x, y, z, rotation about x, y, z); all zeros: unknown.
     """

@@ -15,7 +15,7 @@ from plow_twin.stream.topics import TOPICS
 
 METADATA_VERSION: Final = 9
 _INFINITE: Final = {"sec": 9223372036, "nsec": 854775807}
-#: Prefix of the keys in `custom_data` that count lost messages; the topic follows.
+#: Prefix of the keys in `custom_data` that count lost messages; the topic follows the prefix.
 LOST: Final = "plow_twin_lost "
 
 
@@ -31,7 +31,7 @@ class TopicCount:
 
 
 def qos_profile(base_name: str) -> dict[str, Any]:
-    """Return the QoS that the node offers on a topic by its base name; reliable, depth 10 for other topics."""
+    """Return the QoS that the node offers on a topic (by base name); other topics are reliable with depth 10."""
     for topic in TOPICS:
         if topic.name == base_name:
             return offered(True, topic.latched, topic.depth)
@@ -146,7 +146,7 @@ def _parsed(read: tuple[Any, list[Problem]]) -> Any:
 
 
 def recorded_losses(folder: Path) -> dict[str, int]:
-    """Return the losses by topic in `metadata.yaml`; empty where it cannot be read."""
+    """Return the losses by topic in `metadata.yaml`; empty if the file cannot be read."""
     try:
         custom = _information(folder)["custom_data"] or {}
         return {key.removeprefix(LOST): int(count) for key, count in custom.items() if key.startswith(LOST)}
@@ -160,7 +160,7 @@ def missing_files(folder: Path, without: Collection[str] = ()) -> list[str]:
         listed = listed_parts(folder)
     except RecordingError:
         return []
-    # old versions of rosbag2 write the folder's name before the file's
+    # old versions of rosbag2 write the folder's name before the file's name
     return [
         name
         for name in listed

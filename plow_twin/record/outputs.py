@@ -1,4 +1,4 @@
-"""The messages made from the record of a publication by the table of topics, equal in a live run and in a replay."""
+"""The messages made from a publication's record by the table of topics; they are equal in a live run and a replay."""
 
 from __future__ import annotations
 

@@ -91,7 +91,7 @@ class RunReader:
         self._place = Path(self.path)
         self._headers: dict[Path, RunHeader] = {}
         self._counted: Counter[str] = Counter()
-        self._noted: dict[int, Loss | Dropped] = {}  # by sequence number, because an entry may be in two chunks
+        self._noted: dict[int, Loss | Dropped] = {}  # kept by sequence number, because an entry may be in two chunks
         self._look_for_parts()
         self.path = self.parts[0]
         for part in self.parts:
@@ -150,7 +150,7 @@ class RunReader:
 
     @property
     def lost(self) -> dict[str, int]:
-        """Losses by topic: the recorder's counts at close, or its notes in the journal if it was killed."""
+        """Losses by topic: the counts of the recorder at close, or if it was killed, its notes in the journal."""
         noted: Counter[str] = Counter()
         for entry in self._noted.values():
             noted[entry.topic if isinstance(entry, Dropped) else "journal"] += entry.count
@@ -289,7 +289,7 @@ class RunReader:
 
 
 class _Merger:
-    """Put journal and outputs into one order."""
+    """Merge journal and outputs in order of their sequence numbers."""
 
     def __init__(self, reader: RunReader, outputs: bool) -> None:
         self._run = reader
@@ -318,7 +318,7 @@ class _Merger:
         self._chunks = None
 
     def is_journal(self, part: Path, numbers: set[int]) -> bool:
-        """Return whether one of these channels is the journal's."""
+        """Return whether one of these channels belongs to the journal."""
         assert self._chunks is not None
         return any(self._chunks.channels[number].topic in self._journal for number in numbers)
 
@@ -340,7 +340,7 @@ class _Merger:
             elif channel.message_type in MESSAGE_TYPES:
                 sent.append(number)
                 named = channel.topic, channel.message_type
-                if self._topics.get(number) != named:  # a new dictionary, as earlier outputs refer to the old one
+                if self._topics.get(number) != named:  # not changed in place, as earlier outputs use it
                     self._topics = {**self._topics, number: named}
         if journal:
             chosen = messages if len(journal) == len(there) else _of(messages, journal)

@@ -98,12 +98,12 @@ class Recorder:
     header
         Scene and settings, which replay needs beside the journal.
     queue_size
-        Items that may wait for the thread; the last quarter is kept for the journal.
+        Number of items that may wait for the thread; the last quarter of the queue is kept for the journal.
     flush_period_s
         Interval between writes to the operating system [s]: a killed process loses at most the entries of that time and
         the messages of twice that time.
     chunk_size
-        Bytes [B] in one compressed chunk.
+        Size of waiting journal and outputs [B] at which their chunks are closed.
     min_free_bytes
         Free space on the disk [B] below which recording pauses.
     part_bytes, part_s
@@ -155,7 +155,7 @@ class Recorder:
             part_bytes, part_s, keep_bytes = 0, ring_s / PARTS, 0
         self._writer = self._ring or RunWriter(self._folder, header, chunk_size, min_free_bytes, sync=sync)
         self.path = self._writer.path
-        self._mark: Path | None = None  # folder that the ring is written to next
+        self._mark: Path | None = None  # folder to which the ring is written next
         self._marks = self._marks_lost = 0
         self._mark_error: str | None = None
         each, slow, marked = (
@@ -178,7 +178,7 @@ class Recorder:
         self._flush_period_s = flush_period_s
         self._now_ns = now_ns
         self._on_error = on_error
-        self._lock = threading.Lock()  # held for microseconds, never while the thread writes
+        self._lock = threading.Lock()  # the lock is held for microseconds, never while the thread writes
         self._sequence = -1
         self._journal_gap = 0
         self._snapshot_due = False
@@ -227,9 +227,9 @@ class Recorder:
             return self._mark
 
     def journal(self, entry: Entry) -> bool:
-        """Queue a journal entry; False when it was lost.
+        """Queue a journal entry; return False if it was lost.
 
-        After a loss only a `Snapshot` is accepted: replay needs the state to go on.
+        After a loss only a `Snapshot` is accepted, because a replay needs the state to continue.
         """
         now = self._now_ns()
         with self._lock:
@@ -257,7 +257,7 @@ class Recorder:
             return False
 
     def output(self, topic: str, stamp_ns: int, message: Message) -> bool:
-        """Queue a message that was sent on `topic` (resolved name) for time `stamp_ns`; False when it was lost."""
+        """Queue a message that was sent on `topic` (resolved name) for time `stamp_ns`; return False if it was lost."""
         now = self._now_ns()
         with self._lock:
             if fits := self._admitted(now, 2, (topic,)):
@@ -265,7 +265,7 @@ class Recorder:
         return fits
 
     def publication(self, published: Published, sent: Mapping[str, bytes] = MappingProxyType({})) -> bool:
-        """Queue the messages of a publication of one row; False when they were lost.
+        """Queue the messages of a publication of one row; return False if they were lost.
 
         `sent` has the bytes of the messages by base name of the topic. If it is empty, the recorder makes the messages
         that follow from the journal.
@@ -298,7 +298,7 @@ class Recorder:
         return item.sequence + np.arange(samples) + np.cumsum(ends)
 
     def publications(self, published: Published, sequence: NDArray[np.int64]) -> bool:
-        """Queue publications whose messages were not sent, each after the entry with its number; False when lost."""
+        """Queue publications whose messages were not sent, each after the entry with its number; False if lost."""
         now, count = self._now_ns(), len(published.rows)
         topics = Counter(dict.fromkeys(self._topics_of[False, False], count))
         topics.update(dict.fromkeys(set(self._topics_of[True, False]) - topics.keys(), len(published.slow)))
@@ -435,7 +435,7 @@ class Recorder:
             else:
                 publications = self._write_publications(publications)
                 item.write(self._writer)
-        # samples first, because their chunk must precede the chunk of the messages sent after them
+        # samples are written first, because their chunk must precede the chunk of the messages sent after them
         self._write_samples(samples)
         self._write_publications(publications)
 
@@ -538,7 +538,7 @@ class Recorder:
 
 
 class _SeriesItem(NamedTuple):
-    """Samples and digests of the journal on their way to the file; `sequence` is the number of the first."""
+    """Samples and digests of the journal on their way to the file; `sequence` is the number of the first entry."""
 
     sequence: int
     log_time_ns: int

@@ -1,4 +1,4 @@
-"""A recording as tables of numbers: for numpy, pandas and Arrow, batch by batch or whole."""
+"""A recording as tables of numbers for numpy, pandas and Arrow, read batch by batch or as a whole."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ class Recording:
 
     @cached_property
     def scene(self) -> Scene:
-        """The scene of the run, made when asked for: the tables can be read without a usable scene.
+        """The scene of the run, made when it is requested, since the tables can be read without a usable scene.
 
         Raises
         ------
@@ -183,13 +183,13 @@ class Table:
         return np.concatenate([part.stamp_ns for part in parts]), np.concatenate([part.values for part in parts])
 
     def arrow(self) -> pa.Table:
-        """Return an Arrow table; needs pyarrow."""
+        """Return an Arrow table; this needs pyarrow."""
         import pyarrow as pa
 
         return pa.Table.from_batches(map(self.arrow_batch, self.batches()), self.arrow_schema())
 
     def pandas(self) -> pd.DataFrame:
-        """Return a data frame indexed by the stamps in UTC; needs pandas."""
+        """Return a data frame indexed by the stamps in UTC; this needs pandas."""
         import pandas as pd
 
         stamps, values = self.numpy()

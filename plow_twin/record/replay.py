@@ -152,7 +152,7 @@ class _Replay:
             _warm_up(scene, header.tol, self.templates, rows=not digests_only)
         self.sink: RunWriter | None = None
         self.rows = np.zeros(0, ROW)  # rows of the last run of samples
-        self.published: Published | None = None  # from the last run of samples; messages of its last row may follow
+        self.published: Published | None = None  # of the last run of samples; messages of its last row may follow
         self.session = Session(
             twin, header.origin_ns, rollback_span_s=float(header.parameters.get("rollback_span", 0.0))
         )
@@ -161,7 +161,7 @@ class _Replay:
         self.next_sequence = 0
         self.in_a_row = 0  # length of the gapless run of entries before the next entry
         self.synced = False  # the session has the state of the live session
-        self.outputs_synced = False  # and its windows between messages equal the live ones
+        self.outputs_synced = False  # and its windows between messages equal those of the live session
         self.outputs_whole = True  # no message of the current batch may be missing without a note
         self.resumed = False  # no advance yet since the state was taken from a snapshot
         self.messages: Mapping[str, Message] | None = None
@@ -234,7 +234,7 @@ class _Replay:
             self._note(Divergence(*difference))
 
     def _messages(self, sent: SentMessages, begin: int, end: int) -> None:
-        chosen = (sent.kind[begin:end] >= 0) == (self.sink is None)  # with a sink, only other topics
+        chosen = (sent.kind[begin:end] >= 0) == (self.sink is None)  # with a sink, only other topics are used
         for index in (begin + np.flatnonzero(chosen)).tolist():
             self.output(sent.record(index))
 
@@ -416,7 +416,7 @@ class _Replay:
             self.first_ns = entry.stamp_ns if self.first_ns is None else self.first_ns
         try:
             self.session.apply(entry)
-        except ValueError:  # the live session refused it too, or the next comparison fails
+        except ValueError:  # the live session refused the entry too, or the next comparison fails
             self.report.refused += 1
 
     def _snapshot(self, snapshot: Snapshot) -> None:
@@ -431,7 +431,7 @@ class _Replay:
             self.session.apply(snapshot)
         except (ValueError, struct.error) as error:
             raise RecordingError(f"{self.report.path}: snapshot at {snapshot.stamp_ns} ns: {error}") from error
-        if before is not None:  # only messages were lost, so the motion must be the same
+        if before is not None:  # only messages were lost, so the motion must be the same as before
             self._compare("snapshot", snapshot.stamp_ns, "state", self.session.twin.digest(), before)
         self.synced = self.resumed = True
         # the windows of the outputs are known only if every publication was recorded

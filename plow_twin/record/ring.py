@@ -15,7 +15,7 @@ from plow_twin.record.mcap_file import ByteFile
 from plow_twin.record.metadata_yaml import LOST, PartFacts, bag_metadata, write_metadata
 from plow_twin.record.writer import RunWriter, make_folder
 
-#: Number of parts of a full ring; the oldest is dropped as a whole.
+#: Number of parts of a full ring; the oldest part is dropped as a whole.
 PARTS: Final = 8
 
 

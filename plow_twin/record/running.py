@@ -40,7 +40,7 @@ def running_run(path: Path, wait_s: float, stop: Callable[[], bool] = lambda: Fa
                     claimed = is_claimed(stream.fileno())
                 if claimed and read_header(parts[0]) is not None:
                     return candidate
-            except (RecordingError, OSError):  # not begun yet, or just removed
+            except (RecordingError, OSError):  # the recording has not begun yet, or was just removed
                 continue
         if stop() or time.monotonic() >= deadline:
             return None
@@ -48,7 +48,7 @@ def running_run(path: Path, wait_s: float, stop: Callable[[], bool] = lambda: Fa
 
 
 def _candidates(path: Path) -> list[Path]:
-    """Return `path` and the folders `<path>_2`, ... that a recorder makes when it exists, the newest first."""
+    """Return `path` and the folders `<path>_2`, ... that a recorder makes when `path` exists, the newest first."""
     numbered: list[tuple[int, Path]] = [(1, path)]
     if path.parent.is_dir():
         for other in path.parent.glob(f"{path.name}_*"):

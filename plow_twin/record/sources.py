@@ -78,9 +78,9 @@ class Arrived:
     #: receive time [ns], or `NO_TIME` if it is unknown
     log_time_ns: int
     content: Any
-    #: whether the broker had retained it since before the subscription
+    #: whether the broker had retained the message since before the subscription
     retained: bool = False
-    #: whether messages before it are missing, because a part is absent or damaged
+    #: whether messages before this message are missing, because a part is absent or damaged
     after_hole: bool = False
 
 
@@ -180,7 +180,7 @@ class Decoder:
             try:
                 types = parsed_types(schema, message_type)
                 self._store.register({name: type_ for name, type_ in types.items() if name not in self._store.types})
-            except Exception:  # a schema in another language, damaged or endless
+            except Exception:  # the schema is in another language, damaged or endless
                 self._losses.unknown_types[topic] = message_type
         if message_type in self._store.types:
             return True

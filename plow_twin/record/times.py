@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-#: Columns and keys with the time, unless the mapping names others.
+#: Names of the column or key with the time, unless the mapping gives another name.
 TIMES: Final = ("t", "time")
 #: Length of each unit of time [ns].
 STAMP_UNITS: Final = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
@@ -94,5 +94,5 @@ def _date_ns(text: str) -> int | None:
     except ValueError:
         return None
     time = time if time.tzinfo else time.replace(tzinfo=UTC)
-    digits = _NANOSECONDS.search(text)  # digits that a datetime does not keep
+    digits = _NANOSECONDS.search(text)  # the digits that a datetime does not keep
     return (time - _EPOCH) // timedelta(microseconds=1) * 1000 + (int(digits[1].ljust(3, "0")) if digits else 0)

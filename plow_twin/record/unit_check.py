@@ -23,7 +23,7 @@ from plow_twin.stream.limits import excitation_limits, largest_displacement
 Array = NDArray[np.float64]
 _START_S: Final = START_NS * 1e-9
 
-#: Number of messages that are checked: 20 s at 1 kHz contain several periods of a load.
+#: Number of messages that are checked: 20 s at 1 kHz, which contain several periods of a load.
 CHECKED: Final = 20_000
 #: An idling machine has forces above a hundredth of the scene's largest force. Forces between a ten-thousandth and a
 #: hundredth look like kN, and forces a thousand times smaller like MN; others may be the noise of an idle sensor.
@@ -32,9 +32,10 @@ _BROKEN_SHARE: Final = 1e-4
 _SMALLER: Final = {"kN": 1.0, "MN": 1e-3}
 #: Largest angle of the model [rad], 45 degrees.
 _LARGEST_ANGLE_RAD: Final = 0.25 * np.pi
-#: A swing of this many times the angle that the clearance allows is in degrees; wear and pressed contacts allow less.
+#: A swing that exceeds the angle allowed by the clearance this many times is in degrees, since wear and pressed
+#: contacts allow less.
 _BEYOND_CLEARANCE: Final = 3.0
-#: A swing up to this [rad] is believed, because soft pads let a head turn farther than a narrow clearance.
+#: A swing up to this [rad] is accepted, because soft pads let a head turn farther than a narrow clearance does.
 _BELIEVED_SWING_RAD: Final = 0.1
 #: Stamps further apart than this [s] are too coarse for a load that changes smoothly from sample to sample.
 _SLOW_S: Final = 0.5
@@ -53,7 +54,7 @@ _FEW: Final = 20
 _SORT: Final = "sort the rows by time"
 _NAME_TIME: Final = "name the column of the time in a mapping (stamp: NAME)"
 _WRITE_SECONDS: Final = "write seconds, or dates such as 2026-01-02T03:04:05.678Z"
-#: Load cells send at 10 kHz at most; stamps closer together than this [s] are in another unit.
+#: Load cells send at most at 10 kHz; stamps that are closer together than this [s] are in another unit.
 _SHORTEST_SPACING_S: Final = 1e-4
 #: Stamps above this [s] are dates: 1e9 s is in the year 2001.
 _DATES_S: Final = 1e9
@@ -201,13 +202,13 @@ def _stated(doubt: UnitDoubt, roles: Mapping[str, Role]) -> bool:
 
 
 def _usual_magnitude(values: Array, percent: float = 99.0) -> float:
-    """Return the magnitude that one value in a hundred exceeds, because an outlier is no evidence of the unit."""
+    """Return the magnitude that one value in a hundred exceeds, since an outlier does not show the unit."""
     known = np.abs(values)[np.isfinite(values)]
     return float(np.percentile(known, percent)) if known.size else 0.0
 
 
 def _load(magnitudes: Mapping[tuple[str, str], float], scene: Scene) -> list[UnitDoubt]:
-    """Doubt the forces together, as a single component may be small, and the moment in proportion to the forces."""
+    """Doubt the forces together, since one component may be small, and the moment in proportion to the forces."""
     found = [magnitudes[key] for key in (("excitation", "fx"), ("excitation", "fy")) if key in magnitudes]
     usual = _largest_force(scene)
     largest = max(found, default=0.0)

@@ -1,4 +1,4 @@
-"""Advancing of a session by many samples at a time, from the journal of a run or from the load of any recording.
+"""Advance of a session by many samples at a time, from the journal of a run or from the load of any recording.
 
 Time follows the stamps. The load is linear from sample to sample and is never held.
 """
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 BATCH: Final = 4096
 #: Entries at which a walk stops; late samples are sorted in across all other entries.
 _ACTING: Final = (Travel, Reset, Loss, Restore, Snapshot, SetModel, SetWear)
-#: Further such entries for a motion that follows measurements.
+#: Further entries at which a walk stops if the motion follows measurements.
 _FOLLOWED: Final = (Pose, PartOfPose, Estimated, Parameter)
 #: Failed advances in a row after which the model is reset.
 _FAILURE_LIMIT: Final = 10
@@ -182,7 +182,7 @@ class JournalWalk:
     Parameters
     ----------
     own
-        Walkers that take their state from the journal after a loss and when wear was set.
+        Walkers that take their state from the journal after a loss, and after wear was set.
     others
         Walkers that keep their own states.
     whole

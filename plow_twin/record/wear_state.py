@@ -18,13 +18,13 @@ from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.model.scene import Scene
 from plow_twin.record.durable import write_whole
 
-#: Name of the file in the folder that the user gives.
+#: Name of the wear file in the folder that the user gives.
 FILE_NAME: Final = "wear.json"
 VERSION: Final = 1
 
 
 class WearStateError(PlowTwinError, ValueError):
-    """A file of wear cannot be used; the message names the file and the reason."""
+    """A wear file cannot be used; the message names the file and the reason."""
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ def save_wear(folder: Path, content: bytes) -> None:
     Raises
     ------
     OSError
-        The disk refuses the file; it is still the old version, or the new version without confirmation by the disk.
+        The disk refuses the file, which then has the old content, or the new content without confirmation by the disk.
     """
     folder.mkdir(parents=True, exist_ok=True)
     write_whole(folder / FILE_NAME, content, sync=True)

@@ -1,4 +1,4 @@
-"""Access for compiled code to eight bytes at any place of an array as one number.
+"""Access for compiled code to eight bytes at any place of an array, as one number.
 
 Numbers are little-endian, as in MCAP and in the CDR of this package.
 """

@@ -1,1 +1,1 @@
-"""The twin as a ROS 2 node: parameters, messages, QoS, diagnostics; glue only."""
+"""The twin as a ROS 2 node: parameters, messages, QoS and diagnostics, without computations."""

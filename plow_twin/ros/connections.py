@@ -127,7 +127,7 @@ class Connections:
         if key in self._said:
             return False
         if other.node_name == _UNNAMED and key not in self._unnamed:
-            self._unnamed.add(key)  # the next look-up knows the name, if there is one
+            self._unnamed.add(key)  # the next look-up finds the name, if the node has a name
             return False
         self._said.add(key)
         self._node.get_logger().warning(f"{topic}: {text}")
@@ -135,13 +135,13 @@ class Connections:
 
 
 def type_name(message_class: Any) -> str:
-    """Return the name of a message type, as the graph has it."""
+    """Return the name of a message type, as in the ROS graph."""
     package, folder = message_class.__module__.split(".")[:2]
     return f"{package}/{folder}/{message_class.__name__}"
 
 
 def _in_full(own: QoSProfile) -> QoSProfile:
-    """Return one of the node's own profiles with its defaults resolved as in the graph."""
+    """Return one of the node's own profiles, with its defaults resolved as in the ROS graph."""
     return QoSProfile(
         depth=own.depth,
         reliability=own.reliability,

@@ -15,14 +15,14 @@ from typing import Any, Final, Protocol
 
 from plow_twin.live.timer import Timer
 
-#: Largest number of messages taken at once; timers and waiting threads run in between.
+#: Largest number of messages taken at once; timers and waiting threads run between two such batches.
 _MOST: Final = 200
 #: Period at which all queues are polled [s], even without a notification.
 _LOOK_S: Final = 0.1
 
 
 class Turns:
-    """A fair, reentrant lock: a waiting thread enters before the thread that has just left."""
+    """A fair, reentrant lock: a waiting thread gets it before the thread that has just released it."""
 
     def __init__(self) -> None:
         self._inside, self._next = threading.Lock(), threading.Lock()
@@ -44,7 +44,7 @@ class Turns:
 
 
 class Queue(Protocol):
-    """Messages that wait; `fd` becomes readable when one has arrived."""
+    """Messages that wait; `fd` becomes readable when a message has arrived."""
 
     fd: int
 
@@ -70,7 +70,7 @@ class InputLoop:
     turns
         Lock that keeps this thread apart from the executor's thread.
     on_error
-        Called with the error that ended the thread; `error` keeps it too.
+        Called with the error that ended the thread; `error` keeps the error too.
     """
 
     def __init__(self, turns: Turns, on_error: Callable[[Exception], None]) -> None:
@@ -147,7 +147,7 @@ class InputLoop:
                     left = [fd for fd in ready if self._receive(fd)]
                     if time.monotonic() >= self._due:
                         self._look_at_timers()
-        except Exception as error:  # a thread that ended unnoticed would stop the twin
+        except Exception as error:  # the error is reported, since a thread that ended unnoticed would stop the twin
             self.error = error
             self._on_error(error)
 

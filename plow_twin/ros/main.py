@@ -41,7 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    """Return the parser of `--help`; all other arguments are ROS 2's."""
+    """Return the parser of `--help`; all other arguments belong to ROS 2."""
     return argparse.ArgumentParser(
         "twin",
         usage="twin [--help] [--ros-args -p NAME:=VALUE ... --params-file FILE -r FROM:=TO ...]",
@@ -52,7 +52,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(arguments: Sequence[str] | None, stop: StopSignals) -> int:
-    # imported after the handlers are set: a stop during these imports must not end in a traceback
+    # imported after the handlers are set, because a stop during these imports must not end in a traceback
     import rclpy.utilities
 
     from plow_twin.live.parameters import ParameterError
@@ -73,7 +73,7 @@ def _run(arguments: Sequence[str] | None, stop: StopSignals) -> int:
         while not stop.stopped and rclpy.utilities.ok():
             if starting and node.prepared:
                 starting = False
-                if node.lifecycle == "unconfigured":  # a lifecycle manager may have configured it already
+                if node.lifecycle == "unconfigured":  # a lifecycle manager may have configured the node already
                     node.start()
             executor.spin_once(timeout_sec=_SPIN_S)
         executor.remove_node(node)

@@ -24,7 +24,8 @@ _GREY: Final = (0.6, 0.6, 0.6)
 _BLUE: Final = (0.3, 0.55, 0.9)
 _ORANGE: Final = (0.9, 0.6, 0.1)
 _RED: Final = (0.9, 0.2, 0.2)
-#: Width of lines and arrows, and length of an arrow for a force of the head's weight, as shares of the frame's height.
+#: Width of lines and arrows, and length of the arrow for a force as large as the head's weight, as shares of the
+#: frame's height.
 _LINE: Final = 0.015
 _ARROW: Final = 0.5
 
@@ -129,7 +130,7 @@ class _Transforms:
 
 
 def _transforms(node: Node) -> _Transforms:
-    """Return the sender of transforms; raises `ModuleNotFoundError` where tf2_msgs is not installed."""
+    """Return the sender of transforms; raise `ModuleNotFoundError` if tf2_msgs is not installed."""
     from tf2_msgs.msg import TFMessage
 
     return _Transforms(node, TFMessage)

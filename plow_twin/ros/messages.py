@@ -30,7 +30,8 @@ def stamp_ns(header: Header) -> int:
 def deviations(covariance: Sequence[float]) -> tuple[float, ...]:
     """Return the standard deviations of x, y [m] and theta [rad] of a covariance, row-major 6 x 6.
 
-    A negative variance gives NaN, so that the message is not used. Empty if all are 0, which means unknown.
+    A negative variance gives NaN, so that the message is not used. The result is empty if all variances are 0, which
+    means unknown.
     """
     variances = [float(covariance[7 * axis]) for axis in (0, 1, 5)]
     found = tuple(math.sqrt(variance) if variance >= 0.0 else math.nan for variance in variances)

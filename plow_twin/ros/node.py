@@ -71,9 +71,9 @@ class TwinNode(WithoutEvents, LifecycleNode):
         self._status = self.create_publisher(DiagnosticStatus, "status", OUTPUTS["status"])
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", DIAGNOSTICS)
         for name in SERVICES:
-            # never destroyed: a waiting request to a destroyed service would end rclpy's executor
+            # the services are never destroyed: a waiting request to a destroyed service would end rclpy's executor
             self.create_service(Trigger, f"~/{name}", partial(self._answer, name))
-        # steady clock: reports continue while /clock is paused
+        # a steady clock, so that reports continue while /clock is paused
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(1.0, self._publish_diagnostics, clock=steady)
         self.create_timer(LOOK_S, self._look_for_publishers, clock=steady)
@@ -134,7 +134,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Take samples from now on."""
         super().on_activate(state)
-        # present objects live long: the garbage collector need not visit them while samples arrive
+        # the present objects live long, so the garbage collector need not visit them while samples arrive
         gc.collect()
         gc.freeze()
         self._configured().activate()
@@ -208,7 +208,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
                 self.runtime.parameter(name, value, self._table.settings)
 
     def _refuse_invalid_transitions(self) -> None:
-        """Answer an impossible transition instead of ending the process, as rclpy's own callback would."""
+        """Answer a request for an impossible transition, at which rclpy's own callback would end the process."""
         service = self._service_change_state
         change = service.callback
 

@@ -22,7 +22,7 @@ from plow_twin.record.sources import Arrived
 
 
 class OpcUaInput:
-    """The nodes of a server as the queue of some inputs, and the receiver of these inputs.
+    """The nodes of a server, as the queue of some inputs and the receiver of these inputs.
 
     It waits for the server at the start and after a break.
 
@@ -33,7 +33,7 @@ class OpcUaInput:
     front
         Sends the resulting messages.
     warn
-        Called with each trouble of the connection, in words.
+        Called with a text for each problem of the connection.
 
     Raises
     ------
@@ -74,7 +74,7 @@ class OpcUaInput:
         self._feeder.feed(batch)
 
     def look(self) -> None:
-        """Update losses and the state of the connection; called at intervals."""
+        """Update losses and the state of the connection; to be called at intervals."""
         bridge = self._bridge
         self._inputs.lost += bridge.lost - self._lost
         self._lost = bridge.lost

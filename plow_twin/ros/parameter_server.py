@@ -16,7 +16,7 @@ from plow_twin.live.parameters import SPECS, Effect, Settings
 
 
 def descriptor(spec: Field[Any]) -> ParameterDescriptor:
-    """Return the ROS descriptor of one parameter: meaning, unit, range, when it takes effect."""
+    """Return the ROS descriptor of one parameter: its meaning, unit, range, and when it takes effect."""
     unit = f" [{spec.metadata['unit']}]" if "unit" in spec.metadata else ""
     message = ParameterDescriptor(
         name=spec.name,
@@ -95,7 +95,7 @@ class ParameterServer:
         node.add_post_set_parameters_callback(self._after)
 
     def _before(self, asked: list[Parameter]) -> list[Parameter]:
-        """Convert integers to doubles, and name all bad values in one message: rclpy's own checks stop at the first."""
+        """Convert integers to doubles, and name all bad values in one message; rclpy's checks stop at the first one."""
         found = parameters.problems({parameter.name: parameter.value for parameter in asked})
         if found:
             self._node.get_logger().warning(str(parameters.ParameterError(found, "parameters refused")))

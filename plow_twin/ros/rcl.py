@@ -1,4 +1,4 @@
-"""The public, stable C interface below rclpy, for serialised messages: it is used for each sample.
+"""The public, stable C interface below rclpy for serialised messages, which is used for each sample.
 
 rclpy delivers messages one by one, without the publisher's identity, and checks the type of each message sent.
 """
@@ -44,7 +44,7 @@ def libraries() -> tuple[ctypes.CDLL, ctypes.CDLL]:
 
 @cache
 def _publish() -> Any:
-    # PyDLL keeps the interpreter's lock, as rclpy does: releasing and taking the lock takes longer than sending
+    # PyDLL keeps the interpreter's lock, as rclpy does, because releasing and taking the lock takes longer than sending
     publish = ctypes.PyDLL("librcl.so").rcl_publish_serialized_message
     publish.argtypes = [ctypes.c_void_p] * 3
     return publish

@@ -14,7 +14,7 @@ class RosArgumentsError(PlowTwinError):
 
 
 def start_ros(arguments: Sequence[str] | None) -> None:
-    """Make the default context; signals are left to the program.
+    """Make the default context of ROS; the program handles signals itself.
 
     Parameters
     ----------

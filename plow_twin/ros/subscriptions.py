@@ -1,4 +1,4 @@
-"""The subscriptions: from messages in their queues to plain numbers for the runtime."""
+"""The subscriptions, which turn messages in their queues into plain numbers for the runtime."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class Subscriptions:
         self._names: dict[tuple[str, bytes], str] = {}
         #: number of the next message, by topic and publisher
         self._following: dict[tuple[str, bytes], int] = {}
-        self._since_ns = time.time_ns()  # when the excitation was subscribed to
+        self._since_ns = time.time_ns()  # time at which the excitation was subscribed to
         #: publishers of the excitation that were unknown at that time: first message, and losses counted before this
         #: message
         self._appeared: dict[bytes, tuple[Taken, int]] = {}
@@ -86,7 +86,7 @@ class Subscriptions:
         self._subscribe(JointState, "gaps", _SLOW_DEPTH)
 
     def look(self) -> None:
-        """Look up the publishers of the inputs; called without the lock, because samples would have to wait."""
+        """Look up the publishers of the inputs; to be called without the lock, for which samples would have to wait."""
         found = {topic: self._connections.publishers(taken) for topic, taken in self._taken_from.items()}
         present = {topic: self._noted(topic, publishers) for topic, (publishers, _) in found.items()}
         refused = sum(count for _, count in found.values())
@@ -97,7 +97,7 @@ class Subscriptions:
             self._inputs.refused_publishers += refused
             self._inputs.publishers |= {topic: len(publishers) for topic, publishers in present.items()}
             for topic in present:
-                self.look_for_senders(topic)  # repeated, because messages may have been taken since
+                self.look_for_senders(topic)  # repeated, because messages may have been taken in the meantime
         self._front.changed()
 
     def look_for_senders(self, topic: str) -> None:
@@ -124,7 +124,7 @@ class Subscriptions:
         return present
 
     def name_of(self, topic: str, sender: bytes) -> str:
-        """Return node and identity of a publisher; the identity alone if it vanished before it was looked up."""
+        """Return node and identity of a publisher, or only the identity if it vanished before it was looked up."""
         if topic in self._elsewhere:
             return sender.decode(errors="replace")
         if (topic, sender) not in self._names:
@@ -189,8 +189,8 @@ class Subscriptions:
     def _count_before_first(self, batch: list[Taken]) -> None:
         """Count messages that were sent after the subscription but before their publisher's first received message.
 
-        Discovery takes time: a publisher that is new to the node may have been sending for long. Its rate shows
-        whether it began before the subscription.
+        Discovery takes time, so a publisher that is new to the node may have been sending for a long time. Its rate
+        shows whether it began before the subscription.
         """
         newest = {message.sender: message for message in batch}
         for sender, (first, counted) in list(self._appeared.items()):
@@ -266,7 +266,7 @@ class Subscriptions:
             with_covariance = self._pose is PoseWithCovarianceStamped
             pose = message.pose.pose if with_covariance else message.pose
             turn, stamp = pose.orientation, stamp_ns(message.header)
-            if turn.z == turn.w == 0.0:  # no rotation about z: the field was never filled, or the head is upside down
+            if turn.z == turn.w == 0.0:  # no turn about z: the field was never filled, or the head is upside down
                 self._inputs.head_pose.refuse(Verdict.MALFORMED, stamp, (pose.position.x, pose.position.y))
                 continue
             theta = 2.0 * math.atan2(turn.z, turn.w)

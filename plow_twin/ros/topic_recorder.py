@@ -1,4 +1,4 @@
-"""`plow-twin record`: the received bytes of any topics, with their message definitions, beside a run of the twin."""
+"""`plow-twin record`: records the received bytes of any topics with their message definitions, beside a twin's run."""
 
 from __future__ import annotations
 
@@ -70,13 +70,13 @@ class TopicRecorder:
         self._node, self._writer, self._wanted = node, writer, wanted
         #: type, number in the file, and subscribed qualities of service, by topic
         self._topics: dict[str, tuple[str, int, set[_Quality]]] = {}
-        #: for each known publisher, the subscription that takes its messages
+        #: for each known publisher, the quality of service of the subscription that takes its messages
         self._taken_as: dict[tuple[str, bytes], _Quality] = {}
         self._turns = Turns()
         self._loop = InputLoop(self._turns, lambda error: None)
         #: reason for each topic that is not recorded
         self.skipped: dict[str, str] = {}
-        #: messages sent but never received, by the publishers' sequence numbers
+        #: number of messages sent but never received, from the publishers' sequence numbers
         self.missed: dict[str, int] = {}
         self._newest: dict[tuple[str, bytes], int] = {}
         self._loop.every(_FLUSH_S, writer.flush)
@@ -194,7 +194,7 @@ def record_topics(
     Parameters
     ----------
     folder
-        Created for the recording; `<folder>_2`, ... if it exists and is not empty.
+        Folder that is made for the recording; `<folder>_2`, ... if it exists and is not empty.
     topics
         Names; a relative name is in the root namespace.
     every
@@ -248,7 +248,7 @@ def schema_of(message_type: str) -> str:
     Raises
     ------
     LookupError
-        The type is unknown to both.
+        Neither source knows the type.
     """
     from ament_index_python.packages import get_package_share_directory
 
@@ -274,7 +274,7 @@ _BUILT_IN: Final = re.compile(r"(bool|byte|char|float32|float64|u?int(8|16|32|64
 
 
 def _used(text: str, package: str) -> list[str]:
-    """Return the message types among the types of a message's fields."""
+    """Return those types of a message's fields that are message types."""
     used = []
     for line in text.splitlines():
         kind = line.split("#")[0].strip().partition(" ")[0].partition("[")[0]

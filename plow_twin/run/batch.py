@@ -46,7 +46,8 @@ class TwinBatch:
     ----------
     scenes : sequence of Scene
         A scene for each twin; the scenes' loads are not used. All contact laws must have the same terms: C d', a ramp,
-        or lambda (zero without damping), and exponents that are all 1, all integers of at least 2, or all fractions.
+        or lambda (which is zero without damping). Their exponents must be all 1, all integers of at least 2, or all
+        fractions.
     tol : float
         As for `Twin`.
     start : float
@@ -56,7 +57,7 @@ class TwinBatch:
     max_steps : int
         As for `Twin`.
     max_wall_s : float
-        Seconds that a call for advances may take.
+        Time [s] that a call for advances may take.
 
     Raises
     ------

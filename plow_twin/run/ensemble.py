@@ -93,7 +93,7 @@ def simulate_many(
     workers : int, optional
         Number of threads; all cores by default. The kernels run without the interpreter's lock.
     on_progress : callable, optional
-        Called with the number of finished members, by one thread at a time.
+        Called with the number of finished members, never by two threads at the same time.
     max_steps : int
         Largest number of steps of a member; a member that needs more ends with the status `BUDGET`.
     max_wall_s : float

@@ -97,7 +97,7 @@ class LaneRun:
 
 
 def _joined(compiled: Sequence[CompiledScene], members: Sequence[int]) -> tuple[NDArray[np.void], NDArray[np.int64]]:
-    """Return the harmonics of all members in one array, and the begin and count of each member's, shape (m, 2)."""
+    """Return the harmonics of all members in one array, and first index and count for each member, shape (m, 2)."""
     parts, extent, begin = [np.zeros(0, HARMONIC)], np.zeros((len(compiled), 2), np.int64), 0
     known: dict[int, tuple[int, int]] = {}
     for index in members:

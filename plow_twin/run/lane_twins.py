@@ -1,4 +1,4 @@
-"""Live twins in the lanes of a SIMD vector, advanced in slices; some advances are left to another method."""
+"""Live twins in the lanes of a SIMD vector, advanced in slices; another method makes the advances that lanes cannot."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ from plow_twin.solve.tangents import ALONG, STATE_COLUMNS, follow_columns
 
 Array = NDArray[np.float64]
 
-#: Displacement of a shadow as a share of the clearance, its least value near a wall, and the tolerance of a shadow.
+#: Displacement of a shadow as a share of the clearance, smallest displacement near a wall, and tolerance of a shadow.
 DISPLACEMENT: Final = 1e-7
 _LEAST_DISPLACEMENT: Final = 1e-10
 SHADOW_TOLERANCE: Final = 1e-12

@@ -66,7 +66,7 @@ class Result:
     wear_depth : ndarray, shape (8,)
         Wear depth of each pad at the end in m.
     wall_s, compile_s : float
-        Time taken by the run, and by compiling before it, in s.
+        Time in s that the run took, and that compiling before the run took.
     energy_balance : EnergyBalance or None
         Balance of energy and momentum, on request.
     sensitivity : Sensitivity or None
@@ -103,7 +103,7 @@ class Result:
         Returns
         -------
         matplotlib.figure.Figure
-            Notebooks show it; `savefig` writes it.
+            Notebooks show the figure, and `savefig` writes it.
 
         Raises
         ------
@@ -171,9 +171,9 @@ def simulate(
     sensitivity : bool or sequence of str
         Whether to follow the linearised motion too, which shows whether the tolerance is met (`Result.sensitivity`);
         `ToleranceWarning` is issued if errors grow too much. With paths of parameters (`sensitivity_parameters`), the
-        derivatives by these parameters are computed too. This takes some five times the work of the run, and a hundred
-        times and more for scenes with friction, wear, a ramp, a table, a locked degree of freedom or overdamped
-        contact.
+        derivatives with respect to these parameters are computed too. This takes some five times the work of the run,
+        and a hundred times and more for scenes with friction, wear, a ramp, a table, a locked degree of freedom or
+        overdamped contact.
 
     Returns
     -------
@@ -288,8 +288,8 @@ def output_times(t_end: float, output_dt: float | None) -> Array:
     return times if t_end - times[-1] <= 1e-9 * output_dt else np.append(times, t_end)
 
 
-#: Scratch space of the last run, for reuse; a run at the same time (in another thread, or from `on_progress`) makes its
-#: own.
+#: Scratch space of the last run, for reuse; a simultaneous run (in another thread, or started from `on_progress`) makes
+#: its own.
 _spare: Final[deque[Work]] = deque(maxlen=1)
 #: Kinds of run whose kernels this process has compiled or loaded.
 _ready: set[tuple[object, ...]] = set()

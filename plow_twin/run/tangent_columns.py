@@ -21,8 +21,8 @@ _COVERED: Final = {"harmonics", "second", "viscous", "hysteretic", "integer", "f
 def fits_tangents(compiled: CompiledScene) -> bool:
     """Return whether the linearised equations can have all terms of a scene; its exponent must be an integer or 1.5.
 
-    There are no implicit steps of the linearised equations. A law with a restitution is nevertheless covered, because
-    it needs implicit steps for slow touches only.
+    The linearised equations have no implicit steps. A law with a restitution is nevertheless covered, because it needs
+    implicit steps for slow touches only.
     """
     terms, contact = compiled.parts.terms, compiled.scene.contact
     there = {name for name, term in zip(Terms._fields, terms, strict=True) if term is not None}

@@ -1,4 +1,4 @@
-"""The live twin: one head that can be advanced by any interval under sampled or analytic loads, saved and restored."""
+"""The live twin: one head that is advanced by any interval under sampled or analytic loads, and can be saved."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ def open_csv(path: Path) -> IO[str]:
 
 
 def tables(folder: Path) -> list[Path]:
-    """Return the CSV and Parquet files of a folder in order of their names; of two with the same name, the CSV file."""
+    """Return the CSV and Parquet files of a folder by name; of two files with the same name, only the CSV file."""
     found = {path.stem: path for ending in (SUFFIX, ".csv") for path in folder.glob(f"*{ending}")}
     return [found[name] for name in sorted(found)]
 
@@ -68,7 +68,7 @@ def check_text(begin: bytes) -> None:
 
 
 def delimiter_of(header: str) -> str:
-    """Return the delimiter of a header line: comma, semicolon or tab, the most frequent outside quotes."""
+    """Return the delimiter of a header line: of comma, semicolon and tab, the most frequent one outside quotes."""
     return max(",;\t", key=re.sub(r'"[^"]*"', "", header).count)
 
 

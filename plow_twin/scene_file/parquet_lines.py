@@ -1,4 +1,4 @@
-"""Parquet files as equivalent lines of CSV, so that every reader of CSV can read them within its bounds."""
+"""Parquet files as equivalent lines of CSV, which every reader of CSV can read within its bounds."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class ParquetLines(io.RawIOBase):
         csv.Error
             The file is not Parquet, or is damaged; reading raises this too.
         ExcessError
-            The unpacked file is larger than any telemetry.
+            The unpacked file would be larger than telemetry can be.
     """
 
     def __init__(self, path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Reading of a scene file to a `Scene`."""
+"""Conversion of a scene file to a `Scene`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""YAML of untrusted files: safe and bounded, with numbers by the YAML 1.2 core schema and floats written exactly.
+"""YAML of untrusted files, read safely and within bounds, with numbers by the YAML 1.2 core schema and exact floats.
 
 The events of the parser are counted before a document is built, because libyaml recurses in C for nested collections,
 and a few lines of aliases can expand to any number of values.
@@ -17,7 +17,7 @@ import yaml
 
 from plow_twin.errors import Problem
 
-try:  # libyaml, if PyYAML has it, is ten times as fast on recorded tables
+try:  # libyaml, if PyYAML includes it, is ten times as fast on recorded tables
     from yaml import CSafeDumper as _Dumper
     from yaml import CSafeLoader as _Loader
 except ImportError:
@@ -119,7 +119,7 @@ def _excess(text: str, most_values: float) -> Problem | None:
     """Return the bound that the events of a document exceed, or None; YAML errors are raised."""
     scalar = _Size()
     values = repeated = 0
-    sizes: dict[str, _Size | None] = {}  # by anchor; None while the node has not ended
+    sizes: dict[str, _Size | None] = {}  # size by anchor; None while the node has not ended
     outer, is_mapping, anchor = _Size(), False, None
     stack: list[tuple[_Size, bool, str | None]] = []  # size, kind and anchor of the collections around it
     event: Any

@@ -34,7 +34,7 @@ _MOST_WAITING: Final = 1000
 
 
 class Level(IntEnum):
-    """Severity of an alarm, in the levels of a diagnostic status."""
+    """Severity of an alarm, on the levels of a diagnostic status."""
 
     NONE = 0
     WARN = 1
@@ -183,7 +183,7 @@ class Alarms:
         self._duration_ns = round(duration_s * NS_PER_S)
         self._model = _Model() if "residual" in self.alarms else None
         self._clearances: deque[tuple[int, float]] = deque()
-        #: names of the alarms that the newest row or pose has latched at a higher level
+        #: names of the alarms that the newest row or pose has raised to a higher latched level
         self.raised: list[str] = []
 
     def feed(self, published: Published) -> Iterator[int]:

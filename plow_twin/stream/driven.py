@@ -62,7 +62,7 @@ class Following(Driven, Protocol):
     defers: bool
 
     def catch_up(self) -> None:
-        """Finish the work that the newest row left; every other call does this first."""
+        """Finish the work that was left after the newest row; every other call does this first."""
 
     def add_pose(self, t: float, q: ArrayLike, known: float = ...) -> None:
         """Add a pose measured at model time `t` in s, shape (3,), NaN where not measured.

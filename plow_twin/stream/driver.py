@@ -1,4 +1,4 @@
-"""Handling of arriving samples and of silence, by intake, hold policy and session."""
+"""Handling of arriving samples and of silence, with intake, hold policy and session."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ class Driver:
 
     @property
     def newest_ns(self) -> int | None:
-        """Stamp of the newest sample used [ns]; None before the first and after a reset."""
+        """Stamp of the newest sample used [ns]; None before the first sample and after a reset."""
         return self._newest_ns
 
     def samples(self, arrived: Iterable[Arrival], now_ns: int) -> Iterator[Published]:
@@ -161,7 +161,7 @@ class Driver:
         """Use many samples in order of arrival, stamps (n,) [ns] and wrenches (n, 3), as `samples` does.
 
         Samples without a jump are applied together as a `Series`, which the caller journals and publishes before the
-        next one is computed. All other samples go through `samples`. The outcome is the same.
+        next one is computed. All other samples go through `samples`. The outcome is the same as from `samples` alone.
         """
         run: list[Sample] = []
         goes_on = self.intake.go_on(stamps, wrench)
@@ -296,8 +296,8 @@ class Driver:
     def travel(self, stamp_ns: int, speed_m_s: float) -> None:
         """Use a speed along the face [m/s] from its stamp on; the sign is the direction, and wear uses the magnitude.
 
-        A stamp that is further ahead than `jump_forward_s`, or older than every kept state, is on another clock: such a
-        speed acts from the time reached on, and is counted.
+        A stamp that is further ahead than `jump_forward_s`, or older than every kept state, is from another clock; such
+        a speed acts from the time reached on, and is counted.
         """
         reached_ns, oldest_ns = self.session.stamp_ns, self.session.history.oldest_ns
         if reached_ns is not None:
@@ -364,7 +364,7 @@ class Driver:
         self.clock.restart()
 
     def unsteady(self, now_ns: int) -> bool:
-        """Return whether stamps have jumped repeatedly of late: resets were refused, or many stamps were stray."""
+        """Return whether stamps have recently jumped repeatedly: resets were refused, or many stamps were stray."""
         refused = self._unsteady_ns is not None and now_ns - self._unsteady_ns < _RESET_WINDOW_NS
         return refused or self._steps.unsteady(now_ns)
 
@@ -481,7 +481,7 @@ class Driver:
 
 
 def counters(driver: Driver) -> dict[str, int]:
-    """Return every counter of a driver under its published name."""
+    """Return every counter of a driver by its published name."""
     intake = driver.intake
     return {
         "samples_in": intake.arrived,

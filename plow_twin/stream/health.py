@@ -1,4 +1,4 @@
-"""Figures of the running system in bounded memory: quantiles of durations, and model time over wall time."""
+"""Figures of the running system in bounded memory: quantiles of durations, and the ratio of model time to wall time."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class DurationHistogram:
 
 
 class Periods:
-    """Times between the turns of a loop: their mean, scatter and maximum, and the number of missed periods.
+    """Times between the turns of a loop: mean, standard deviation and maximum, and the number of missed periods.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The decision whether an arriving sample is used, and the numbers of unused samples by reason."""
+"""The decision whether an arriving sample is used, and counts of unused samples by reason."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class Intake:
     jump_forward_s
         A stamp that is newer than the model's time by more than this [s] is a step of the sender's clock.
     expected_rate_hz
-        Rate of the samples [Hz], from which gaps in the stamps are counted as missing samples; 0: not known.
+        Rate of the samples [Hz], from which gaps in the stamps are counted as missing samples; 0: unknown.
     limits
         Largest values; None: any finite value is plausible.
     on_unused
@@ -125,7 +125,7 @@ class Intake:
 
     @property
     def missing(self) -> int:
-        """Number of missing samples at the expected rate, from first to newest stamp; extra samples fill gaps."""
+        """Number of missing samples at the expected rate from first to newest stamp; extra samples make up for gaps."""
         if self._newest_ns is None or self.expected_rate_hz <= 0.0:
             return self._missing_before
         asked = round((self._newest_ns - self._first_ns) * self.expected_rate_hz / NS_PER_S) + 1

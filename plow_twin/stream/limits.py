@@ -40,7 +40,7 @@ class Limits:
         return True
 
     def kept(self, values: NDArray[np.float64], duration_s: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return, for each row (n, k) after the first, whether `keep` is True for it and the previous row, (n-1,).
+        """Return for each row (n, k) after the first whether `keep` is True for it and the previous row, shape (n-1,).
 
         `duration_s`, shape (n-1,), is the time between rows in s.
         """

@@ -59,7 +59,7 @@ _MOTION: Final = ("t", "stamp_ns", "held", "q", "v", "penetration", "rate", "for
 _SUMMED: Final = ("q", "v", "penetration", "rate", "force", "impulse", "peak")
 #: Indices in `clearance` of the numbers of `known_clearance`.
 _KNOWN: Final = np.array([0, len(_CLEARANCES), len(_CLEARANCES) + 1, 1, len(_CLEARANCES) + 2, len(_CLEARANCES) + 3])
-#: Number of rows made at once, because numpy makes many rows in the time of one.
+#: Number of rows made at once, because numpy makes many rows in the same time as one row.
 _STOCK: Final = 256
 
 
@@ -178,7 +178,8 @@ class Outputs:
         self._corrected_ns = 0
         #: the window before this correction, if it contained an advance
         self._before: Rows | None = None
-        #: shift of the clearances and their quantiles by an estimate, as in `CLEARANCE_NAMES`; None without an estimate
+        #: shift by an estimate of the clearances and their quantiles, in the order of `CLEARANCE_NAMES`; None without
+        #: an estimate
         self._shift: Array | None = None
 
     def set_shift(self, shift: Sequence[float]) -> None:
@@ -336,7 +337,7 @@ class Outputs:
         return found
 
     def modelled(self, wear_depth: Array) -> Array:
-        """Return the model's horizontal clearance with its two points, then the vertical likewise, shape (6,) [m]."""
+        """Return the model's horizontal clearance and its two points, then the vertical ones, shape (6,) [m]."""
         middle = clearances(self._scene, wear_depth)
         low, high = (clearances(self._scene, points) for points in prior_points(self._scene, wear_depth))
         return np.stack((middle, low, high), axis=1)[:2].ravel()

@@ -1,7 +1,7 @@
 """Choice of the sender to follow among several senders of one input, and the count of its lost samples.
 
 The middleware numbers the messages of each publisher from 1 on. A gap in the numbers is a loss on the way or in an
-overrun queue, at any rate and also in bursts.
+overrun queue; this holds at any rate, and in bursts too.
 """
 
 from __future__ import annotations

@@ -52,8 +52,8 @@ DIGEST_INTERVAL: Final = 100
 #: speed along the face, number of waiting speeds.
 _HEADER: Final = struct.Struct("<?qqq?dq")
 _TRAVEL: Final = struct.Struct("<qd")
-#: Largest lead of a pose over the time reached [ns]. A bag that is played fast has poses before their load; a pose with
-#: a larger lead is from another clock.
+#: Largest lead of a pose over the time reached [ns]. In a bag that is played fast, poses arrive before the load of
+#: their time; a pose with a larger lead is from another clock.
 _AHEAD_NS: Final = 3_600_000_000_000
 _WEAR_SIZE: Final = 8 * PAIR_COUNT
 _NO_LOAD: Final = np.zeros((1, 3))
@@ -65,7 +65,7 @@ def _ignore(entry: Entry) -> None:
 
 
 class _Measured(NamedTuple):
-    """A pose or an estimate given to the twin: its number, the time reached at that moment and its stamp [ns].
+    """A pose or an estimate that was given to the twin: its index, the time reached at that moment, and its stamp [ns].
 
     It has an effect from model time `known` [s] on, also when the session has gone back for a late sample.
     """
@@ -166,7 +166,7 @@ class Session:
         #: number of dropped poses: too far ahead of the load, or removed from `_measured` because it was full
         self.poses_dropped = 0
         self._scene = twin.scene
-        #: changed numbers of the scene by key
+        #: changed numbers of the scene, by their keys
         self.changes: dict[str, float] = {}
         self.origin_ns = origin_ns
         #: the time that the model has reached [ns], None before the first stamp
@@ -345,8 +345,8 @@ class Session:
         Returns
         -------
         Series or None
-            None, with nothing changed, if the samples must be applied one by one, because an advance fails, a number is
-            not finite, or something else happens on the way.
+            None, with nothing changed, if the samples must be applied one by one, for example because an advance fails
+            or a number is not finite.
         """
         if self.stamp_ns is None or self.held or self._travels or not (self.outputs.is_clear or not each):
             return None
@@ -666,7 +666,7 @@ class Session:
         elif travel.stamp_ns > self.stamp_ns:
             insort(self._travels, travel, key=lambda item: item.stamp_ns)
         elif oldest_ns is not None and travel.stamp_ns <= oldest_ns:
-            # too old for its place: the speed acts from the newest sample on, or from the only kept state
+            # the speed is too old to act at its stamp: it acts from the newest sample on, or from the only kept state
             self._set_speed(Travel(oldest_ns if newest_ns is None else newest_ns, travel.speed_m_s))
         elif newest_ns is None or oldest_ns is None or travel.stamp_ns >= newest_ns:
             self._set_speed(travel)
@@ -732,14 +732,14 @@ class Session:
         self._forget()
 
     def _changed_twin(self, changes: Mapping[str, float]) -> Driven:
-        """Return a twin with other numbers; the present and the waiting speeds must be possible for it."""
+        """Return a twin with other numbers, for which the present and the waiting speeds must be possible."""
         found = changed_twin(self.twin, self._scene, changes)
         for speed in (self._speed, *(travel.speed_m_s for travel in self._travels)):
             check_travel_speed(found.scene, speed)
         return found
 
     def _carry(self, before: Driven) -> None:
-        """Take pose, rates, load and time from another twin; the wear is the present wear."""
+        """Take pose, rates, load and time from another twin, and keep the present wear."""
         now = before.advance(before.time)
         self.twin.reset(before.time, wear_depth=self.wear_depth, pose=(now.q, now.v))
         if self._sampled:

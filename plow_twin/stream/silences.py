@@ -95,12 +95,12 @@ class Silences:
         return f"{self.total_ns * 1e-9:.3f} s without samples, {where}"
 
     def facts(self) -> dict[str, int | float]:
-        """Return number and length [s] of all silences, and the start of the longest from the first sample [s]."""
+        """Return number and total length [s] of silences, and start of the longest after the first sample [s]."""
         begin_s = (self.longest_ns[0] - (self._first_ns or 0)) * 1e-9
         return {"count": self.count, "total_s": self.total_ns * 1e-9, "longest_from_s": begin_s} if self.count else {}
 
     def _begin(self, stamp_ns: int) -> int:
-        """Return the newest stamp [ns]; at the start it is the given stamp."""
+        """Return the newest stamp [ns], which is the given stamp at the start."""
         if self._first_ns is None:
             self._first_ns = stamp_ns
         if self._newest_ns is None:

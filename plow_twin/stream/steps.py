@@ -1,4 +1,4 @@
-"""Distinction of steps of a sender's clock from single wrong stamps: a sample whose stamp jumps waits for the next."""
+"""Distinction of a step of the sender's clock from a wrong stamp: a sample whose stamp jumps waits for the next one."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Steps:
         """Add a sample; return the samples that can be judged now, in order of arrival."""
         jumped, jumps = self._jumped, self._intake.jumps(stamp_ns, reached_ns)
         arrival = stamp_ns, wrench, now_ns
-        if jumped is None or stamp_ns <= 0:  # a sample without a stamp is no evidence
+        if jumped is None or stamp_ns <= 0:  # a sample without a stamp shows nothing about the clock
             if not jumps:
                 return (arrival,)
             self._jumped = arrival
@@ -75,7 +75,7 @@ class Steps:
             self._intake.refuse(Verdict.STRAY, *jumped[:2])
 
     def unsteady(self, now_ns: int) -> bool:
-        """Return whether many stamps were stray lately."""
+        """Return whether many recent stamps were stray."""
         strays_ns = self._strays_ns
         if not strays_ns:
             return False

@@ -1,4 +1,4 @@
-"""The table of the topics that a live twin sends, which sending, recording, replay and the documentation use."""
+"""The table of the topics that a live twin sends; sending, recording, replay and the documentation use it."""
 
 from __future__ import annotations
 
@@ -60,8 +60,8 @@ class Topic:
     names : tuple of str
         Names in a `JointState`.
     columns : mapping
-        For each field of the message, the fields of the record that fill it, each with its count of numbers, in order.
-        A topic without columns has messages that are not made from a record alone.
+        For each field of the message, the fields of the record that fill it, in order, each with its count of numbers.
+        Messages of a topic without columns are not made from a record alone.
     """
 
     name: str
@@ -81,7 +81,7 @@ class Topic:
 
     @property
     def count(self) -> int:
-        """Number of numbers in a message from the record."""
+        """Number of the message's numbers that come from the record."""
         return sum(count for _, count in self.parts)
 
     def record_of(self, published: Published) -> NDArray[np.void]:

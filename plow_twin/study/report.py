@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def require(*modules: str) -> None:
-    """Raise `ModuleNotFoundError` if a module is missing, before work that may take minutes."""
+    """Raise `ModuleNotFoundError` if a module is missing; to be called before work that may take minutes."""
     for module in modules:
         import_module(module)
 

@@ -1,6 +1,7 @@
 """A run as one self-contained HTML file with summary, picture, curves and tables.
 
-The file does not contain rerun's viewer, whose program for browsers is too large for a page (`docs/recording.md`).
+The file does not contain rerun's viewer, because its program for browsers is too large for a page
+(`docs/recording.md`).
 """
 
 from __future__ import annotations

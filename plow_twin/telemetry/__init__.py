@@ -1,1 +1,1 @@
-"""Outputs to a plant: the twin's results to MQTT, Sparkplug B, InfluxDB and OPC UA, each by a process of its own."""
+"""Outputs to a plant: the twin's results by MQTT, Sparkplug B, InfluxDB and OPC UA, each sent by a separate process."""

@@ -27,7 +27,7 @@ _CREDENTIALS: Final = mapping(
 
 
 class AccessError(InputError):
-    """The description of an output is wrong."""
+    """The description of an output cannot be used."""
 
     def __init__(self, key: str, got: object, expected: str) -> None:
         super().__init__([Problem(key, got, expected)], "telemetry")
@@ -108,7 +108,7 @@ class Credentials:
         return str(path)
 
     def secret(self, section: str, key: str, variable: str) -> str:
-        """Return the first line of a file, or a variable of the environment."""
+        """Return the first line of a file, or else an environment variable."""
         path = self.file(section, key)
         return os.environ.get(f"PLOW_TWIN_{variable}", "") if path is None else read_secret(Path(path))
 
@@ -212,7 +212,7 @@ def _broker_options(host: str, port: int, credentials: Credentials, *, tls: bool
 def _address(
     option: str, url: str, schemes: tuple[str, ...], expected: str, *, plain: bool
 ) -> tuple[str, int, str, bool]:
-    """Return host, port, path, and whether the connection is encrypted (the last of the schemes)."""
+    """Return host, port, path, and whether the connection is encrypted, as the last of the schemes means."""
     try:
         parts = urlsplit(url)
         port = parts.port or _PORTS.get(parts.scheme, 0)

@@ -46,7 +46,7 @@ class Broker:
     will
         Returns the message that the broker sends when the next connection breaks.
     on_connected
-        Returns the messages to send before all waiting messages once the broker has accepted.
+        Returns the messages to send before all waiting messages, once the broker has accepted the connection.
     waiting
         Largest number of messages that wait while the broker does not answer; the oldest are dropped and counted.
     keeps
@@ -77,7 +77,7 @@ class Broker:
         self._most, self._keeps = waiting, keeps
         self._waiting: deque[Message] = deque()
         self._unacknowledged: set[int] = set()
-        #: held while messages are put in order
+        #: the lock is held while messages are put in order
         self.lock = threading.RLock()
         self.client = make_client(client_id, clean=True)
         self._set_will()
@@ -187,7 +187,7 @@ class MqttOut:
             self._broker.send(Message(f"{self._prefix}/{name}", _payload(name, group), name != "peaks"))
 
     async def turn(self) -> None:
-        """Do nothing: the connection has a thread."""
+        """Do nothing, because the connection has its own thread."""
 
     async def close(self, patience_s: float) -> None:
         """Send waiting messages, then the message that the twin is offline."""

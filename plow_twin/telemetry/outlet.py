@@ -19,7 +19,7 @@ _START_S: Final = 60.0
 
 
 class Outlet(Beside):
-    """A running output; a context that ends it.
+    """A running output, as a context manager that ends it.
 
     Parameters
     ----------

@@ -33,7 +33,7 @@ WAYS: Final = {
 _NICE: Final = 5
 #: Longest time between two reports [s].
 _REPORT_S: Final = 0.5
-#: Time at the end for the receiver to take waiting messages [s].
+#: Time [s] at the end for the receiver to take waiting messages.
 _END_S: Final = 2.0
 
 
@@ -82,7 +82,7 @@ async def _run(link: Link, first: dict[str, Any]) -> None:
 
 
 def main() -> None:
-    """Serve the output whose link is the descriptor given as argument."""
+    """Serve the output; the argument is the descriptor of its link."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(_NICE)
     end = socket.socket(fileno=int(sys.argv[1]))

@@ -57,7 +57,7 @@ def _messages() -> tuple[Any, Any]:
                 added.type_name = f".plow_twin.sparkplug.{of}"
     pool = descriptor_pool.DescriptorPool()
     pool.Add(file)
-    # a function since protobuf 4.22, a method of a factory before
+    # this is a function since protobuf 4.22, and a method of a factory before
     class_of = getattr(message_factory, "GetMessageClass", None) or message_factory.MessageFactory(pool).GetPrototype
     return tuple(class_of(pool.FindMessageTypeByName(f"plow_twin.sparkplug.{name}")) for name in ("Payload", "Metric"))
 
@@ -134,7 +134,7 @@ class Sparkplug:
         return self._numbered("NBIRTH", payload)
 
     def _next_death(self) -> Message:
-        """Return the death message of the next connection, which the broker gets before a birth."""
+        """Return the death message of the next connection, which the broker receives before the birth message."""
         self._connection = (self._connection + 1) % 256
         return self._death()
 

@@ -1,4 +1,4 @@
-"""Rows collected into columns: for rerun, logging 20 thousand rows at once costs as much as logging one row."""
+"""Rows collected into columns, because rerun logs 20,000 rows at once in the time that it needs for one row."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from plow_twin.record.template import compiled
 Array = NDArray[np.float64]
 Indexes = NDArray[np.int64]
 
-#: Rows kept in memory before they are sent.
+#: Number of rows that are kept in memory before they are sent.
 BLOCK_ROWS: Final = 20_000
 ROS_TIME: Final = "ros_time"
 STEP: Final = "step"
@@ -72,7 +72,7 @@ class Curves:
             self.flush()
 
     def end(self) -> None:
-        """End the lines: the next row begins new ones."""
+        """End the lines; the next row begins new lines."""
         if self._last is not None:
             self._append(*self._last, np.zeros((1, len(self.entities))), ends=True)
         self._last = None

@@ -31,7 +31,7 @@ def masks_of(force: Array) -> Indexes:
 
 
 class ContactSets:
-    """Write each change of the set; of a thinned run only the first change and the last set in each span [ns]."""
+    """Write each change of the set; of a thinned run, write only the first change and the last set in each span."""
 
     def __init__(self, stream: rr.RecordingStream, axis: TimeAxis, labels: tuple[str, ...], span_ns: int) -> None:
         self._names = tuple(label or name for label, name in zip(labels, CORNER_NAMES, strict=True))
@@ -99,7 +99,7 @@ class ContactSets:
             self._end_span((self._at + 1) * self._span_ns)
 
     def end(self) -> None:
-        """End the lane: from here on the set is unknown."""
+        """End the lane, because the set is unknown from here on."""
         if self._last is not None:
             self._states.add(*self._last, state=[])
         self._before = self._at = self._last = self._left = None

@@ -343,7 +343,7 @@ class Drawing:
         self.band.add(stamps, steps, np.where(bound[:, None], sides[:, :, 1], sides[:, :, 0]))
 
     def _color_bands(self, stamps: Indexes, steps: Indexes) -> None:
-        """Colour the bands: the first stroke opaque, all others faint."""
+        """Colour the bands: the first stroke is opaque, and all others are faint."""
         behind = int(np.searchsorted(stamps, stamps[0] + 2 * self.band.span_ns))
         changes = [0, min(max(1, behind), len(stamps) - 1)]
         for entity in layout.BAND:

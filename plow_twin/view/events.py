@@ -1,4 +1,4 @@
-"""The event log: touches, changes of status, settings, silences and losses, one line each."""
+"""The event log, with a line for each touch, change of status, setting, silence and loss."""
 
 from __future__ import annotations
 

@@ -65,7 +65,7 @@ class FaceChart:
         self.known = self.known or bool(speed_m_s)
 
     def forces(self, stamps: Indexes, force: Array) -> None:
-        """Add forces [N], shape (n,), each under the speed at its time."""
+        """Add forces [N], shape (n,), each with the speed at its time."""
         while len(stamps) and self._coming and stamps[-1] > self._coming[0].stamp_ns:
             count = int(np.searchsorted(stamps, self._coming[0].stamp_ns, "right"))
             self._forces(stamps[:count], force[:count])
@@ -74,7 +74,7 @@ class FaceChart:
         self._forces(stamps, force)
 
     def _forces(self, stamps: Indexes, force: Array) -> None:
-        """Add forces under the present speed."""
+        """Add forces with the present speed."""
         if not len(stamps):
             return
         last = int(stamps[0]) if self._reached_ns is None else self._reached_ns

@@ -1,4 +1,4 @@
-"""The picture of a fit: measured against fitted motion, residuals, and values with intervals beside the prior.
+"""The picture of a fit: the measured and the fitted motion, residuals, and values with intervals beside the prior.
 
 `plow_twin.view.fitted_file` writes it.
 """

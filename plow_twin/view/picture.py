@@ -152,7 +152,7 @@ def _draw_section(axis: Any, section: Section, instant: Instant, curves: RunCurv
             sideways = abs(vector[0]) > abs(vector[1])
             side = "center" if not sideways else "left" if vector[0] > 0.0 else "right"
             axis.annotate(text, origin + 1.1 * vector, color=color, ha=side, va="center", fontsize=8)
-        # annotations do not widen the limits of the axes; these points do
+        # annotations do not widen the limits of the axes, so these points do
         axis.update_datalim(
             np.concatenate([origins + 1.1 * vectors + side for side in (-_LABEL_ROOM_MM, _LABEL_ROOM_MM)])
         )
@@ -177,7 +177,7 @@ def _y_upwards(axis: Any) -> None:
 
 
 def _draw_gaps(axis: Any, penetration: NDArray[np.float64]) -> None:
-    """Draw a bar for each pair: to one side its gap, to the other its penetration."""
+    """Draw a bar for each pair: its gap to one side, or its penetration to the other side."""
     places = np.arange(len(PAIR_NAMES))
     colors = ["tab:orange" if value > 0.0 else "0.6" for value in penetration]
     bars = axis.barh(places, 1e3 * penetration, color=colors)
@@ -259,7 +259,7 @@ def _clearance(axis: Any, curves: RunCurves) -> None:
 
 
 def _with_interval(value: float, low: float, high: float) -> str:
-    """Return a clearance in mm: with three digits without an interval, otherwise with two and the interval."""
+    """Return a clearance in mm: with three decimals if it has no interval, otherwise with two and the interval."""
     if high - low < 1e-3:
         return f"{value:.3f} mm"
     return f"{value:.2f} mm ({low:.2f} to {high:.2f})"

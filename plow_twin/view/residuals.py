@@ -1,4 +1,4 @@
-"""Residuals: measured poses of the journal minus the model's at the same stamps."""
+"""Residuals: measured poses of the journal minus the model's poses at the same stamps."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ import rerun.blueprint as rrb
 
 from plow_twin.errors import RecordingError
 
-#: Bytes copied at once [B]; a pipe holds less.
+#: Largest number of bytes that are copied at once; a pipe holds fewer.
 _CHUNK: Final = 1 << 20
 
 

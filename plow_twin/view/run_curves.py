@@ -62,7 +62,7 @@ class RunCurves:
     peak: float = 0.0
     held_s: list[tuple[float, float]] = field(default_factory=list)
     failed_s: list[tuple[float, float]] = field(default_factory=list)
-    #: all stretches without samples, in words
+    #: description of all stretches without samples
     silences: str = ""
     failed: int = 0
     changes: list[tuple[float, str]] = field(default_factory=list)

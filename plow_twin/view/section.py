@@ -30,7 +30,7 @@ _PAD_MM: Final = 60.0
 #: Distance of a label below its place [mm].
 LABEL_MM: Final = 16.0
 
-#: One hue per corner, lighter for the pair with the vertical wall (Okabe and Ito's palette).
+#: One hue for each corner; the pair with the vertical wall has a lighter colour (Okabe and Ito's palette).
 _HUES: Final = ((0, 114, 178), (230, 159, 0), (213, 94, 0), (0, 158, 115))
 _LIGHTER: Final = ((86, 180, 233), (240, 228, 66), (255, 158, 105), (110, 220, 185))
 PAIR_COLORS: Final = tuple(color for pair in zip(_HUES, _LIGHTER, strict=True) for color in pair)
@@ -46,8 +46,8 @@ _OUTWARDS: Final[Array] = np.stack((NORMAL_X, NORMAL_Y), axis=1)
 class Section:
     """Sizes [mm] that are constant in a run.
 
-    A head that carries walls is drawn as the moving cavity about the frame, a head that carries corners as the block
-    that moves in the cavity.
+    A head that carries walls is drawn as the cavity that moves about the frame; a head that carries corners is drawn as
+    the block that moves in the cavity.
     """
 
     frame: Array
@@ -85,7 +85,7 @@ class Section:
 
         A block's corners are named by their place, so beyond 45 degrees each corner has another name.
         """
-        # to the middle of the arc
+        # distance to the middle of the arc
         within = self.radius * (1.0 - math.sqrt(0.5))
         corners = ((0.5 * self.frame - within) * _SIGNS)[::2]
         if not self.is_block:
@@ -140,7 +140,7 @@ class Section:
     def arrows(self, pose: tuple[float, float, float], force: Array) -> tuple[Array, Array, NDArray[np.intp]]:
         """Origins and vectors of the forces on the head, shape (k, 2), and the pairs that they belong to, (k,)."""
         drawn = np.flatnonzero(force >= FAINT_N)
-        # a frame corner pushes the wall of the head outwards, a wall pushes the corner of a block inwards
+        # a frame corner pushes the wall of the head outwards; a wall pushes the corner of a block inwards
         theta = math.pi if self.is_block else pose[2]
         normal_x = math.cos(theta) * NORMAL_X[drawn] - math.sin(theta) * NORMAL_Y[drawn]
         normal_y = math.sin(theta) * NORMAL_X[drawn] + math.cos(theta) * NORMAL_Y[drawn]

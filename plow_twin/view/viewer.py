@@ -92,7 +92,7 @@ def _address(port: int) -> str:
 def page_address(web_port: int, port: int) -> str:
     """Return the address of the page that shows the data on a port.
 
-    It asks for the dark theme, because the light theme's labels make the cross-section's names illegible.
+    The address requests the dark theme, because the labels of the light theme make the cross-section's names illegible.
     """
     return f"http://{LOOPBACK}:{web_port}/?url={quote(_address(port), safe='')}&theme=dark"
 

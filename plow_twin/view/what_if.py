@@ -68,7 +68,7 @@ class WhatIf:
             self._curves[0].add(stamps, steps, _largest_kn(peak))
 
     def end_lines(self) -> None:
-        """End the lines: the next rows begin new ones."""
+        """End the lines; the next rows begin new lines."""
         for curve in self._curves:
             curve.end()
 

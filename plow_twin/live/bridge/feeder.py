@@ -1,4 +1,4 @@
-"""Messages of a bridge as inputs of a live twin, by the mapping."""
+"""Messages of a bridge, turned into inputs of a live twin by the mapping."""
 
 from __future__ import annotations
 
@@ -63,11 +63,11 @@ class Feeder:
         #: time of a source with its own time [ns]: the newest stamp, but not a single stamp that is far ahead
         self.newest_ns = 0
         self._far_ahead_ns: int | None = None
-        #: why the first unreadable load was refused; empty: all were read
+        #: reason why the first unreadable load was refused; empty if every load could be read
         self.unfit = ""
         self._number = 0
-        #: unnumbered messages since the last number, each assumed to have the next number; and how many of all these
-        #: assumptions were wrong
+        #: number of unnumbered messages since the last numbered message, each assumed to have the next number; and
+        #: number of all such assumptions that were wrong
         self._assumed = self._unnumbered = 0
         #: number of the newest message if it does not continue the earlier numbers
         self._odd: int | None = None
@@ -206,7 +206,7 @@ class Feeder:
         return [(stamp_ns, wrench)]
 
     def _numbered(self, role: Role, arrived: Arrived) -> tuple[bytes, int, bool]:
-        """Return sender, message number (counted here if the message has none), and whether the message came before."""
+        """Return sender, message number (counted here if the message has none), and whether it is a repetition."""
         number = role.number(arrived) if role.sequence else None
         if number is None:
             # unreadable or not numbered: assume the next number, until a message has that number
@@ -226,7 +226,7 @@ class Feeder:
             return self._name, number, True
         elif self._goes_on(number):
             self._odd = None
-        else:  # assume the next number until the next message decides
+        else:  # assume the next number until the next message shows which number is right
             self._odd, number = number, self._number + 1
         again, self._number = number == self._number, number
         return self._name, number + self._unnumbered, again

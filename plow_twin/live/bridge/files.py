@@ -25,7 +25,7 @@ from plow_twin.scene_file.parquet_lines import ParquetLines, is_parquet
 
 #: Largest number of bytes that are read from a source at once.
 _BLOCK: Final = 1 << 18
-#: Bytes by which a file is recognised.
+#: Number of bytes by which a file is recognised.
 _REMEMBERED: Final = 256
 #: Interval at which a followed file is read [s].
 _LOOK_S: Final = 0.02
@@ -166,7 +166,7 @@ class _Dated:
         return _Tail(max(there, key=_changed_ns)).columns(grows=grows) if there else None
 
     def files(self) -> list[Path]:
-        """Return the files by the numbers in their names."""
+        """Return the files in the order of the numbers in their names."""
         return sorted(self._pattern.parent.glob(self._pattern.name), key=_numbered)
 
     def read(self) -> list[Arrived]:
@@ -207,7 +207,7 @@ def _numbered(path: Path) -> list[tuple[int, str]]:
 
 
 def messages(topic: str, lines: list[bytes | None], rows: Rows) -> list[Arrived]:
-    """Return the messages of whole lines, received now."""
+    """Return the messages in whole lines; their receive time is now."""
     now_ns = time.time_ns()
     found = []
     for line in lines:
@@ -218,12 +218,12 @@ def messages(topic: str, lines: list[bytes | None], rows: Rows) -> list[Arrived]
 
 
 class Files(SourceState):
-    """Files, each a topic under its name without ending; files of a pattern (`load_*.csv`) are one topic.
+    """Files; each is a topic with its name without the ending, and the files of a pattern (`load_*.csv`) are one topic.
 
     Parameters
     ----------
     paths
-        The files, or patterns; when they are read once, their messages are put in order by the times in them.
+        The files, or patterns; when they are read once, their messages are put in the order of the times in them.
     follow
         Continue at the end with lines that are appended later, and wait for a file that is not there yet.
 

@@ -40,7 +40,7 @@ class Mqtt(SourceState):
     Raises
     ------
     BridgeError
-        The address is invalid, no broker answers, or the broker refuses.
+        The address is invalid, no broker answers, or the broker refuses the connection.
     """
 
     def __init__(self, access: Access, connect_s: float = 10.0) -> None:
@@ -113,7 +113,7 @@ class Mqtt(SourceState):
             self.trouble = f"refused: {refused}"
             self._answer.set()
             return
-        # in a resumed session, brokers may also mark messages as retained that they kept for the session
+        # in a resumed session, brokers may also mark as retained the messages that they kept for the session
         resumed = is_resumed(flags)
         self._from_before = not resumed
         if self._subscribed and resumed:

@@ -36,7 +36,7 @@ class Bridge(Protocol):
     Attributes
     ----------
     ends : bool
-        Whether the source has an end and its own time: a file that is read once.
+        Whether the source has an end and its own time, as a file that is read once has.
     finished : bool
         Whether the source has ended.
     connected : bool
@@ -139,7 +139,7 @@ class Rows:
         return self.columns is not None and not self._json
 
     def header(self, source: str) -> Columns:
-        """Return the columns of `source`; raises as `columns_of`."""
+        """Return the columns of `source`; the errors are those of `columns_of`."""
         return columns_of(source, self.columns or ())
 
     def of_another_file(self) -> Rows:

@@ -15,7 +15,7 @@ from plow_twin.record.times import OF_NUMBERS, TIMES, times_ns
 
 
 class Table:
-    """Some lines of a file under its header, as messages one by one or as a role of all lines at once.
+    """Some lines of a file with a header, to be read as single messages, or as the numbers of a role in all lines.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ class Table:
         return len(self._lines)
 
     def __iter__(self) -> Iterator[Arrived]:
-        """Yield the message of each line that has one."""
+        """Yield the message of each line that contains a message."""
         now_ns = time.time_ns()
         for line in self._lines:
             content = self._rows.read(line)

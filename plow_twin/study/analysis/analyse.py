@@ -55,7 +55,7 @@ _TOLERANCE: Final = 1e-9
 _STEP_NS: Final = 1_000_000_000
 #: Largest measured value, in any unit, because squares of larger values may overflow.
 _LARGEST: Final = 1e15
-#: Name for the scene in a run's header.
+#: Name in results of the scene that a run's header contains.
 _OF_THE_RUN: Final = "of the run"
 _MAP: Final = "map_"
 #: Parameter that marks each run made by an analysis.
@@ -299,7 +299,7 @@ def analyse(
     scene
         Scene file or preset; by default the scene of a run, or `scene.yaml` beside another recording.
     mapping
-        YAML that maps topics to roles.
+        YAML file that maps topics to roles.
     units
         Units by name (fx, x, ..., t), which replace the units of the mapping; only for recordings of other programs.
     others
@@ -422,7 +422,7 @@ def _measured_beside(path: Path, mapping: Path | None, node: str) -> tuple[Measu
         for name, count in source.losses.counts.items():
             if count and (
                 name == "undecodable" or number >= len(places)
-            ):  # the run itself has counted the other losses
+            ):  # the other losses are counted with the run itself
                 unused[name] += count
     return measured, unknown, unused
 
@@ -498,7 +498,7 @@ def _is_recording(folder: Path, results: Sequence[Path]) -> bool:
         return False
     if (folder / "metadata.yaml").is_file() or any(folder.glob(f"{glob.escape(folder.name)}_*")):
         return True
-    if (folder / "analysis.json").is_file():  # the run in this folder is the result of an analysis
+    if (folder / "analysis.json").is_file():  # the run in this folder is a result of an analysis
         results = [*results, (folder / "run").resolve()]
     runs = [item for item in folder.iterdir() if _holds(item, _KINDS[:2]) and item.resolve() not in results]
     return not set(runs) - set(beside_folders(folder))

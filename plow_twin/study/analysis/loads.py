@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 CYCLE_BINS: Final = 16
 #: Length of a piece of the face [m].
 FACE_BIN_M: Final = 1.0
-#: Memory for the reversals of a pair [B], enough for 131 072 reversals; a longer series is on the disk.
+#: Memory for the reversals of a pair [B], enough for 131,072 reversals; a longer series is kept on the disk.
 _IN_MEMORY: Final = 2**20
 
 
@@ -45,7 +45,7 @@ class Pass:
 
 
 class Series:
-    """A series of any length that is written once and can be read repeatedly. A long series is on the disk."""
+    """A series of any length that is written once and can be read repeatedly. A long series is kept on the disk."""
 
     def __init__(self) -> None:
         self._file = tempfile.SpooledTemporaryFile(_IN_MEMORY)  # noqa: SIM115 (goes with this object)
@@ -117,7 +117,7 @@ class LoadTotals:
             self.sets[int(mask)] += int(count)
         for pair, kept in enumerate(self._reversals):
             turning = reversals(rows.peak[:, pair])
-            if turning.any() or kept.last != 0.0:  # one zero is enough for a long time without contact
+            if turning.any() or kept.last != 0.0:  # one zero stands for a long time without contact
                 kept.add(turning)
         loss = self._contact_loss(walked, steps)
         self.contact_loss_j += float(loss.sum())

@@ -82,7 +82,7 @@ def _correlation(one: Array, other: Array) -> float | None:
         return None
     one, other = one - one.mean(), other - other.mean()
     size = math.sqrt(float(one @ one) * float(other @ other))
-    # rounding could give more than 1
+    # limited, because rounding could give more than 1
     return min(1.0, max(-1.0, float(one @ other) / size)) if size > 1e-300 else None
 
 
@@ -133,7 +133,7 @@ def _correlations(longer: Array, shorter: Array) -> Array:
 
 
 def _lag(t: Array, predicted: Array, times: Array, values: Array) -> float | None:
-    """Return the lag with the largest correlation, found on a grid and refined between its points."""
+    """Return the lag with the largest correlation, searched on a grid and refined between the grid's points."""
     from scipy.optimize import minimize_scalar
 
     span = float(times[-1] - times[0])

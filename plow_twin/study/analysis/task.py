@@ -221,5 +221,5 @@ def run_task(task: RunTask) -> dict[str, Any]:
         return task.run()
     except PlowTwinError as error:
         return {"run": str(task.path), "error": str(error)}
-    except Exception as error:  # whatever the error of one recording, the others continue
+    except Exception as error:  # the other recordings continue, whatever the error of one recording is
         return {"run": str(task.path), "error": f"{task.path}: {error!r}"}

@@ -58,7 +58,7 @@ class Calibration:
     starts: tuple[Start, ...]
     seed: int
     runs: int
-    #: all points of the last populations; some of them fit almost as well as the best point
+    #: all points of the last populations, some of which fit almost as well as the best point
     population: Array = field(repr=False)
     population_objective: Array = field(repr=False)
 

@@ -1,4 +1,4 @@
-"""The result of a calibration as tables and files: the fitted scene with marks, the targets, and the uniqueness."""
+"""The result of a calibration as tables and files: the fitted scene with marks, the targets, and how unique it is."""
 
 from __future__ import annotations
 

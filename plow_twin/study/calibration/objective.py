@@ -1,4 +1,4 @@
-"""Objectives of a calibration: a candidate's residuals from targets or from a recorded motion, as one row."""
+"""Objectives of a calibration: each candidate has one row of residuals, from targets or from a recorded motion."""
 
 from __future__ import annotations
 

@@ -91,7 +91,7 @@ class Target:
 
 
 def _wrong_way(s: Array, least: Array) -> Array:
-    """Return the sum of downward steps of a sequence that should rise, plus its shortfall from the least rise."""
+    """Return the sum of downward steps of a sequence that should rise, plus the shortfall of its rise from `least`."""
     down = np.maximum(0.0, -np.diff(s, axis=1)).sum(axis=1)
     return np.asarray(down + np.maximum(0.0, least - (s[:, -1] - s[:, 0])))
 

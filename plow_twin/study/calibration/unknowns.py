@@ -43,7 +43,7 @@ class Unknown:
         return float(self.low + (self.high - self.low) * place)
 
     def place(self, value: Value) -> float:
-        """Return the place 0..1 of a value; a choice has the middle of its share."""
+        """Return the place 0..1 of a value; the place of a choice is the middle of its share."""
         if self.choices:
             return (self.choices.index(value) + 0.5) / len(self.choices)
         number = float(value)

@@ -1,4 +1,4 @@
-"""Comparison of groups of windows: distributions, changes with intervals, and the load's share in the changes."""
+"""Comparison of groups of windows: distributions, changes with intervals, and the load's share in changes."""
 
 from __future__ import annotations
 
@@ -171,7 +171,7 @@ def changes(before: Drawn, after: Drawn) -> list[Change | None]:
 def _tested(differences: Array, mean: Array, fewest: int) -> tuple[Array, Array, Array, Array]:
     """Return share, low, high and adjusted chance of each difference; row 0 has the values, the other rows draws.
 
-    Student's t has the degrees of freedom of the smaller group, so that chances are rather too large than too small.
+    Student's t has the degrees of freedom of the smaller group, so that chances are too large rather than too small.
     """
     drawn = np.divide(differences, mean, out=np.full_like(mean, np.nan), where=mean > 0.0)
     low, high = np.nanpercentile(drawn[1:], (2.5, 97.5), axis=0)

@@ -45,8 +45,8 @@ class Comparison:
     scenes : list of str
         Names of the scenes of all runs.
     notes : list of str
-        Doubts about the runs: stretches without samples, times covered by several runs, different sample rates or
-        scenes.
+        Reasons to doubt the comparison: stretches without samples, times covered by several runs, different sample
+        rates or scenes.
     """
 
     groups: dict[str, Windows]
@@ -127,7 +127,7 @@ def by_time(kind: str, shifts: Sequence[time] = SHIFTS, zone: tzinfo = UTC) -> L
         if kind == "day":
             return at.strftime("%Y-%m-%d")
         before = [begin for begin in begins if begin <= at.time()]
-        if not before:  # the last shift of the previous day
+        if not before:  # the time belongs to the last shift of the previous day
             return f"{(at - timedelta(days=1)).strftime('%Y-%m-%d')} {begins[-1].strftime('%H:%M')}"
         return f"{at.strftime('%Y-%m-%d')} {before[-1].strftime('%H:%M')}"
 

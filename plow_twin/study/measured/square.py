@@ -46,7 +46,7 @@ class Marker:
     Attributes
     ----------
     turn : float
-        Measured minus true angle of the block [rad].
+        Measured angle minus true angle of the block [rad].
     lever : tuple of 2 float
         Vector from the block's centre to the tracked point, in the block's axes [m].
     """
@@ -59,7 +59,7 @@ class Marker:
         return self._moved(measured - [0.0, 0.0, self.turn, 0.0, 0.0, 0.0], -1.0)
 
     def measured(self, block: Array) -> Array:
-        """Return the poses or states of the marker, shape (..., 3) or (..., 6), from the block's."""
+        """Return the poses or states of the marker, shape (..., 3) or (..., 6), given those of the block."""
         turned = np.zeros(block.shape[-1])
         turned[2] = self.turn
         return self._moved(block, 1.0) + turned

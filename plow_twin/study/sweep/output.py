@@ -81,7 +81,7 @@ def _curve(axes: Axes, table: Table, index: int) -> None:
 
     (axis,) = table.sweep.axes
     numbers, places = _scaled(table, index), _places(axis)
-    # words are not joined by lines, because there are no values between them
+    # points of words are not joined by lines, because there are no values between words
     style = "none" if isinstance(axis.values[0], str) else "-"
     axes.plot(places, numbers, marker="o", markersize=3 if style == "-" else 6, linestyle=style)
     for member in table.failed:
@@ -130,7 +130,7 @@ def _places(axis: Axis) -> np.ndarray[Any, np.dtype[np.float64]]:
 
 
 def _edges(axis: Axis) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Return the borders of the cells, halfway between the values (in the logarithm on a log axis)."""
+    """Return the borders of the cells, halfway between the values (between their logarithms on a log axis)."""
     places = np.log(_places(axis)) if axis.log else _places(axis)
     if len(places) == 1:
         half = 0.5 * abs(places[0]) or 0.5

@@ -17,7 +17,7 @@ from plow_twin.telemetry.values import UNITS, Group
 #: Namespace of the types and the instance.
 NAMESPACE: Final = "https://plow-twin.readthedocs.io/opcua"
 _NODESETS: Final = Path(__file__).with_name("nodesets")
-#: Listed so that each builds only on earlier files.
+#: The files are listed so that each depends only on earlier files.
 _FILES: Final = ("Opc.Ua.Di", "Opc.Ua.Machinery", "Opc.Ua.Mining.General")
 _DI, _MINING = "http://opcfoundation.org/UA/DI/", "http://opcfoundation.org/UA/Mining/General/"
 _FUNCTIONAL_GROUP, _DEVICE_SET, _EQUIPMENT, _IDENTIFICATION = 1005, 5001, 1002, 1003
@@ -98,7 +98,7 @@ class Model:
             if name in UNITS and "/" not in key:
                 await instantiate(folder, interval, node_id, browse_name, instantiate_optional=False)
                 node = self._server.get_node(node_id)
-                for point in _POINTS:  # otherwise only the type would have the points
+                for point in _POINTS:  # added here too, since otherwise only the type would have the points
                     await self._server.get_node(self.node_id(f"{begin}.{key}.{point}")).set_modelling_rule(True)
                 await self._set_unit(node, UNITS[name])
             elif name in UNITS:

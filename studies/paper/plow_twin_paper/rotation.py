@@ -49,7 +49,7 @@ class RotationRow:
     consistent_centre: float
 
     def change(self, value: float) -> float | None:
-        """Return the relative difference of a value from that of the constant moment; None if the latter is zero."""
+        """Return the relative difference of a value from that of the constant moment; None if that is zero."""
         return (value - self.constant) / abs(self.constant) if self.constant else None
 
 

@@ -119,14 +119,14 @@ def run_all(scene: Scene, t_end: float, workers: int | None = None, on_progress:
     t_end : float
         End of the runs in s, at least `SHORTEST_S`; the runs of section 5 end at 20 s, or at `t_end` if it is smaller.
     workers, on_progress
-        Threads, all cores by default; receives the share done.
+        Number of threads, by default all cores; function that receives the share that is done.
 
     Raises
     ------
     SceneError
         The scene cannot be compared: labels, loads or clearances.
     SolverError
-        The run of Figs 6 to 9 could not be continued. The others may fail: their rows are then not computed.
+        The run of Figs 6 to 9 could not be continued. Other runs may fail; their rows are then not computed.
     """
     check_scene(scene)
     scale = (scene.clearance.horizontal_m / CASE_M[0], scene.clearance.vertical_m / CASE_M[1])
@@ -150,7 +150,7 @@ def run_all(scene: Scene, t_end: float, workers: int | None = None, on_progress:
 def _sweeps(
     scene: Scene, scale: tuple[float, float], t_end: float, workers: int | None, tell: OnProgress
 ) -> tuple[tuple[Sweep, Sweep], int]:
-    """Return the curves of Figs 10 and 11 and how many of their runs failed; their forces are NaN."""
+    """Return the curves of Figs 10 and 11, and how many of their runs failed; failed runs have NaN forces."""
     fine = np.linspace(GRID_M[0], GRID_M[-1], _FINE_STEPS * (len(GRID_M) - 1) + 1)
     cells = [(FIXED_M, value) for value in fine] + [(value, FIXED_M) for value in fine]
     scenes = [_at(scene, scale, *cell) for cell in cells]

@@ -1,4 +1,4 @@
-"""The study of the paper: every published figure and number computed again, compared and written down."""
+"""The study of the paper: every published figure and number is computed again, compared and written to a report."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ def _changes(runs: PaperRuns) -> list[Change]:
 
 
 def row_as_plain(row: Row) -> dict[str, Any]:
-    """Return a row as in JSON and CSV; the difference is a share, published values are `given`."""
+    """Return a row as in JSON and CSV; the difference is a share, and published values are `given`."""
     return asdict(row) | {
         "difference": row.difference,
         "verdict": row.verdict.value,

@@ -36,7 +36,7 @@ _PORTS: Final = {"opc.tcp": 4840}
 _WAIT_S: Final = 5e-3 * PUBLISHING_MS
 #: The history is read in pieces of this length [ns].
 _PIECE_NS: Final = 10_000_000_000
-#: Longest delay of one node's values after the values of another [ns].
+#: Longest delay of one node's values after those of another node [ns].
 _OVERLAP_NS: Final = 1_000_000_000
 #: A stamp that is further ahead of the system's time than this [ns] neither begins nor ends a break.
 _AHEAD_NS: Final = 86_400_000_000_000
@@ -50,7 +50,7 @@ _LONGEST_WAIT_S: Final = 30.0
 
 
 class OpcUa(SourceState):
-    """A subscription to the nodes of a mapping that outlives a broken connection.
+    """A subscription to the nodes of a mapping; the subscription outlives a broken connection.
 
     Parameters
     ----------

@@ -117,7 +117,7 @@ class Link:
         BridgeError
             The certificate is not trusted, or a node cannot be subscribed to.
         OSError, UaError, TimeoutError
-            There is no server, or it refuses.
+            There is no server, or it refuses the connection.
         """
         if self._access.certificate is not None:
             await secure(self._client, self._access, self._host)
@@ -132,7 +132,7 @@ class Link:
         """Disconnect."""
         try:
             await asyncio.wait_for(self._client.disconnect(), _CLOSE_S)
-        except Exception:  # in any state of the connection
+        except Exception:  # the connection may be in any state
             self._client.disconnect_socket()
 
     def _placed(self, node: ua.NodeId, uris: Sequence[str]) -> ua.NodeId:
