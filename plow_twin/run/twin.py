@@ -1,4 +1,4 @@
-"""The live twin: one head that is advanced by any interval under sampled or analytic loads, and can be saved."""
+"""The live twin: one head, advanced by any interval under sampled or analytic loads, that can be saved and restored."""
 
 from __future__ import annotations
 

@@ -2,10 +2,10 @@
 
 A load is given by its name: `loads.fx1.phase_rad`. Four paths are settings of a study, not fields of a scene:
 
-    loads.<name>.sign       sign of the load's force (of its first component that is not zero); -1 reverses the whole
-    force loads.<name>.arm_sign   the same for the force's point of action loads.<name>.scale      factor of the load's
-    force and free moment clearance.scale         factor of both clearances: 1 for a total, 2 for a published clearance
-    per side
+    loads.<name>.sign       sign of the load's force (of its first component that is not zero); -1 reverses the force
+    loads.<name>.arm_sign   the same for the force's point of action
+    loads.<name>.scale      factor of the load's force and free moment
+    clearance.scale         factor of both clearances: 1 for a total, 2 for a published clearance per side
 
 `frame.labels` takes one of eight words such as `bottom_right_ccw`, which means that a is at the bottom right, and b, c,
 d follow counter-clockwise. The four settings act after the other paths. `contact.damping` replaces a restitution, and
