@@ -91,7 +91,7 @@ def main() -> None:
             client.open(str(rrd))
             client.set_time("run_time", duration=options.at, play_state="paused")
             bring_forward(client, options.tab)
-            time.sleep(8.0)  # lets the plots settle and the greeting disappear
+            time.sleep(8.0)  # time for the plots to settle and the greeting to disappear
             client.save_screenshot(str(shot))
         finally:
             os.killpg(viewer.pid, signal.SIGTERM)  # the program is a child of the script that starts it

@@ -21,7 +21,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Point links to examples into the gallery, and insert a file that a page names as `<!-- file: -->`."""
+    """Make links to examples point into the gallery, and insert a file that a page names as `<!-- file: -->`."""
     text = re.sub(r"\]\((?:\.\./)*examples/(\w+)/README\.md\)", r"](examples.md#\1)", markdown)
     text = re.sub(r"\[([^\]]+)\]\(\.\./[^)]+\)", r"`\1`", text)
     return re.sub(r"<!-- file: (.+) -->", lambda named: _shown(ROOT / named[1]), text)

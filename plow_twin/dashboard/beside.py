@@ -21,7 +21,7 @@ class Beside:
     module
         Module that is run; its arguments are the descriptor of the link, then `descriptors`.
     first
-        First message; it carries the secrets, because other users can read a command line.
+        First message to the process. It carries the secrets, because other users can read a command line.
     descriptors
         Further descriptors for the process.
     """

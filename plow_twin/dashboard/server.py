@@ -1,7 +1,7 @@
 """The server of the screen, a process of its own: `python -m plow_twin.dashboard.server LINK SOCKET`.
 
-Each page gets newer values once it has received the last update: a slow page gets fewer updates, a frozen page gets
-none, and no page waits for another.
+Each page gets newer values once it has received the last update: a slow page gets fewer updates, a frozen page gets no
+updates, and no page waits for another page.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ class Pages:
     link
         Receiver of their requests.
     access
-        Who may look.
+        Rules of who may see the pages.
     """
 
     def __init__(self, board: Board, link: Link, access: PageAccess) -> None:

@@ -34,7 +34,7 @@ from plow_twin.stream.session import Series, Session
 
 #: Published topics, by base name.
 ESTIMATE, WINDOW_FORCES, FORECAST = ESTIMATES
-#: Names of a forecast's numbers after conversion to SI, by their names before it.
+#: Names of a forecast's numbers in SI units, by their names in the units of the forecast.
 _SI: Final = {"hours": "seconds", "km": "metres"}
 #: Rate of checks for a finished estimate [Hz].
 RATE_HZ: Final = 10.0

@@ -4,8 +4,8 @@ The drive pulls the chain with C = efficiency P / v (or C is measured). Subtract
 the cutting force along the face, Z = C - idle. The coal gives a second value: Z = specific_force * depth *
 resistance(position). The mean of the two is weighted by their inverse variances. The force into the face is Fx =
 push_ratio Z, and the lateral force is Fy = lateral_ratio Z; both act at one point of the head, so that M = x Fy - y Fx.
-All coefficients have a standard deviation, which propagates to the result. They are measured at a machine, by idle runs
-and weighing, and have no defaults, because the paper publishes no values.
+All coefficients have a standard deviation, which propagates to the result. The coefficients are measured at a machine,
+by idle runs and weighing, and have no defaults, because the paper publishes no values.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ class LoadModel:
 
 
 def read_load_model(path: Path | None) -> LoadModel | None:
-    """Return the load model of a mapping file, or None without one.
+    """Return the load model of a mapping file, or None if it has no load model.
 
     Raises
     ------

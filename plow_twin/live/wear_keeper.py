@@ -75,7 +75,7 @@ class WearKeeper:
     def load(self, kept: KeptWear | None = None) -> tuple[float, ...] | None:
         """Return the depths [m] to continue with, or None.
 
-        They come from the file, unless `kept` depths could not replace that file.
+        The depths come from the file, unless `kept` depths could not replace that file.
 
         Raises
         ------

@@ -98,7 +98,7 @@ class Role:
         return (value * self.scale.get(name, 1.0) + self.offset.get(name, 0.0)) * self.factor.get(name, 1.0)
 
     def stamp_ns(self, arrived: Arrived) -> int | None:
-        """Return the stamp of a message [ns], or None without one."""
+        """Return the stamp of a message [ns], or None if it has no stamp."""
         stamp_ns = self._sent_ns(arrived)
         return None if stamp_ns is None else stamp_ns + self.clock_offset_ns
 
@@ -155,7 +155,7 @@ class Role:
         return isinstance(content, Mapping) and all(_at(content, path) in (None, "") for path in self.fields.values())
 
     def number(self, arrived: Arrived) -> int | None:
-        """Return the sender's number of the message, or None without one."""
+        """Return the sender's number of the message, or None if it has no number."""
         value = _follow(arrived.content, self.sequence)
         return int(value) if value is not None and math.isfinite(value) and value == int(value) >= 0 else None
 
@@ -207,7 +207,7 @@ def _plain_number(value: Any) -> float | None:
 
 
 def _follow(content: Any, path: str) -> float | None:
-    """Return the number at a path, or None without one."""
+    """Return the number at a path, or None if there is no number."""
     if isinstance(content, Mapping):
         return _plain_number(_at(content, path))
     value = content

@@ -108,7 +108,7 @@ class RunReader:
                 try:
                     header = read_header(file)
                 except RecordingError:
-                    if len(files) > 1 and not file.exists():  # removed meanwhile
+                    if len(files) > 1 and not file.exists():  # the file was removed in the meantime
                         continue
                     raise
                 if header is not None:
@@ -247,7 +247,7 @@ class RunReader:
         """Return the size of the parts on the disk [B]."""
         found = 0
         for part in self.parts:
-            with suppress(FileNotFoundError):  # removed meanwhile
+            with suppress(FileNotFoundError):  # the file was removed in the meantime
                 found += part.stat().st_size
         return found
 
@@ -357,7 +357,7 @@ class _Merger:
         yield from self._read_to(newest)
 
     def finish(self) -> Iterator[Batch]:
-        """Yield the rest."""
+        """Yield what still waits."""
         newest = max((part.newest for part in self._outputs), default=-1)
         yield from self._read_to(self._newest(newest) + 1)
 
@@ -479,7 +479,7 @@ def mcap_path(path: Path) -> Path:
 
 
 def part_number(path: Path) -> tuple[int, str]:
-    """Return the sort key of a part: the number at the end of its name (-1 without one), and the name."""
+    """Return the sort key of a part: the number at the end of its name (-1 without a number), and the name."""
     digits = re.search(r"(\d+)$", path.stem)
     return (int(digits[1]) if digits else -1, path.name)
 

@@ -298,7 +298,7 @@ class Recorder:
         return item.sequence + np.arange(samples) + np.cumsum(ends)
 
     def publications(self, published: Published, sequence: NDArray[np.int64]) -> bool:
-        """Queue publications whose messages were not sent, each after the entry with its number; False if lost."""
+        """Queue publications whose messages were not sent, each after its journal entry; return False if lost."""
         now, count = self._now_ns(), len(published.rows)
         topics = Counter(dict.fromkeys(self._topics_of[False, False], count))
         topics.update(dict.fromkeys(set(self._topics_of[True, False]) - topics.keys(), len(published.slow)))

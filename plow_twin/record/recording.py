@@ -81,7 +81,7 @@ class Recording:
     Attributes
     ----------
     path : Path
-        Its first file.
+        The first file of the recording.
     header : RunHeader
         Settings of the run.
     """

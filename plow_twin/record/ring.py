@@ -60,7 +60,7 @@ class RingWriter(RunWriter):
         return sum(len(content) for _, _, content in self._kept) + self.part_bytes
 
     def shortage(self) -> str | None:
-        """Return None: memory does not fill up."""
+        """Return None, because memory does not fill up."""
         return None
 
     def split(self, loss: Mapping[str, int], keep_bytes: int = 0) -> None:

@@ -396,7 +396,7 @@ class CsvSource:
         return found
 
     def messages(self, wanted: Callable[[str], bool], stamp_ns: StampOf[Arrived] | None = None) -> Iterator[Arrived]:
-        """Yield the rows of all files by their stamps, which are by default in the column `t`, `time` or the first."""
+        """Yield the rows of all files in order of their stamps, by default those in column `t`, `time` or the first."""
         streams = [self._rows(part) for part in self.parts if wanted(part.stem)]
         if len(streams) == 1:
             return streams[0]

@@ -22,7 +22,7 @@ _NANOSECONDS: Final = re.compile(r"[.,]\d{6}(\d{1,3})")
 #: Times below this [s] count from an unknown start, not from 1970. They are moved away from 0, because a stamp of 0
 #: means a missing stamp.
 EPOCH_S: Final = 1e9
-#: Stamp of a time of 0 [ns].
+#: Stamp that a time of 0 receives [ns].
 START_NS: Final = 1_000_000_000
 #: Characters of plain decimal numbers.
 OF_NUMBERS: Final = b"0123456789+-.eE "

@@ -41,11 +41,11 @@ if TYPE_CHECKING:
 
 #: Number of samples in one advance of the session.
 BATCH: Final = 4096
-#: Entries at which a walk stops; late samples are sorted in across all other entries.
+#: Entries at which a walk stops. Across all other entries, late samples are sorted in.
 _ACTING: Final = (Travel, Reset, Loss, Restore, Snapshot, SetModel, SetWear)
 #: Further entries at which a walk stops if the motion follows measurements.
 _FOLLOWED: Final = (Pose, PartOfPose, Estimated, Parameter)
-#: Failed advances in a row after which the model is reset.
+#: Number of failed advances in a row after which the model is reset.
 _FAILURE_LIMIT: Final = 10
 
 

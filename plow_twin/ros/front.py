@@ -37,7 +37,7 @@ class RosFront:
     node
         The node.
     settings
-        Its parameters.
+        Parameters of the node.
     changed
         Called when the state of the stream may have changed.
     prepared, kept_wear

@@ -41,7 +41,7 @@ class Markers:
     node
         The node.
     settings
-        Its parameters.
+        Parameters of the node.
     scene
         The scene.
     """

@@ -27,7 +27,7 @@ class Pace:
     Parameters
     ----------
     state_type : dtype
-        Type of the state, which is kept from the beginning of the present advance.
+        Type of the state. The state at the beginning of the present advance is kept.
     implicit : bool
         Whether the scene may need implicit steps.
     max_wall_s : float

@@ -198,7 +198,7 @@ class StretchProduct:
     def follow(self, matrices: Array, changes: Array, ends: NDArray[np.bool_]) -> tuple[Array, Array, Array, Array]:
         """Multiply by one stretch after the other; the attributes then belong to the end of the last stretch.
 
-        Within a stretch the growth is that of places only, because in the middle of an impact a stiff contact turns any
+        Within a stretch only the growth of places counts, because in the middle of an impact a stiff contact turns any
         displacement into a large, temporary difference of velocities.
 
         Parameters
@@ -377,8 +377,9 @@ def displacement_beside(
 ) -> float | None:
     """Return the largest displacement of shadows, in shares of the clearance, for a stretch that begins here.
 
-    A stretch does not begin in a contact with a spring, which would turn a displacement into a larger velocity than any
-    error of the solver has. If a damper holds the head, a displacement persists, so a small displacement is sufficient.
+    A stretch does not begin during a contact with a spring, because the spring would turn a displacement into a
+    velocity larger than any error of the solver. If a damper holds the head, a displacement persists, so a small
+    displacement is sufficient.
 
     Parameters
     ----------
@@ -418,7 +419,7 @@ def _beside(
     before: Sequence[State],
     work: Work,
 ) -> list[State]:
-    """Return a state and its shadows: one for each free place or rate, displaced by `moved`, and one per changed scene.
+    """Return a state and its shadows: one displaced by `moved` in each free place or rate, and one per changed scene.
 
     Shadows of changed scenes are not displaced; they keep the damping that was set at a touch, given by `before`.
     """

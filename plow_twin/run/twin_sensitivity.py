@@ -1,4 +1,4 @@
-"""Growth of errors and effects of parameters along a live twin's motion, from shadows that are advanced with it."""
+"""Growth of errors and effects of parameters along a live twin's motion, from shadows that advance with the twin."""
 
 from __future__ import annotations
 

@@ -87,7 +87,7 @@ class Alarm:
         self.lowest = min((found for found in thresholds if found > 0.0), default=math.inf)
 
     def feed(self, value: float, stamp_ns: int, duration_ns: int) -> bool:
-        """Judge a value and return whether the level has changed; a higher level must first last for `duration_ns`."""
+        """Judge a value and return whether the level has changed; a higher level counts once it lasts `duration_ns`."""
         self.value = value
         before = self.level
         if not before and value < self.lowest:

@@ -175,7 +175,8 @@ class Estimated:
 
     `samples` and `poses` count the window's rows of load and pose; the fit began at `guess`, or with a search if
     `guess` is empty. `shift` has 6 numbers [m], which are added from here on to the model's horizontal clearance (with
-    wear), to its 5 % and 95 % points, and likewise to the vertical clearance. `result` is the whole estimate (JSON).
+    wear) and its 5 % and 95 % points, and to the vertical clearance and its points. `result` is the whole estimate
+    (JSON).
     """
 
     start_ns: int

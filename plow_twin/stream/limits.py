@@ -58,8 +58,8 @@ class Limits:
 def pose_limits(scene: Scene, displacement: float = 0.0, rate: float = 0.0) -> Limits:
     """Return the limits of a pose x, y [m], theta [rad] and of its rates; a limit given as 0 follows from the scene.
 
-    The derived limits are `largest_displacement`, and a change by as much within a millisecond. An angle may be up to
-    half a turn (or any angle, if the head is a block) and change by half a turn within a millisecond.
+    The derived limits are `largest_displacement`, and a change by this displacement within a millisecond. An angle may
+    be up to half a turn (or any angle, if the head is a block) and change by half a turn within a millisecond.
     """
     displacement = displacement or largest_displacement(scene)
     rate = rate or displacement / _SHORTEST_S

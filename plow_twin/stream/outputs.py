@@ -185,7 +185,7 @@ class Outputs:
     def set_shift(self, shift: Sequence[float]) -> None:
         """Shift the horizontal and the vertical clearance of the model, and their points, from now on.
 
-        `shift` has 6 numbers [m]: for the horizontal clearance, for its 5 % and 95 % points, and likewise for the
+        `shift` has 6 numbers [m]: for the horizontal clearance, for its 5 % and 95 % points, and the same for the
         vertical clearance. The shift is not part of `state`, so that an estimate stays when late samples are inserted.
         """
         values = np.zeros(len(CLEARANCE_NAMES))

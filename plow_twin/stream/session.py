@@ -67,7 +67,7 @@ def _ignore(entry: Entry) -> None:
 class _Measured(NamedTuple):
     """A pose or an estimate that was given to the twin: its index, the time reached at that moment, and its stamp [ns].
 
-    It has an effect from model time `known` [s] on, also when the session has gone back for a late sample.
+    The measurement has an effect from model time `known` [s] on, also when the session has gone back for a late sample.
     """
 
     number: int
@@ -452,7 +452,7 @@ class Session:
         self._on_entry(entry)
 
     def check_model(self, changes: Mapping[str, float]) -> None:
-        """Raise an `ArgumentError` if the model cannot be changed in this way while it runs."""
+        """Raise an `ArgumentError` if these changes are impossible while the model runs."""
         self._changed_twin(changes)
 
     def pop_error_estimate(self) -> float:
@@ -480,7 +480,7 @@ class Session:
         )
         travels = b"".join(_TRAVEL.pack(travel.stamp_ns, travel.speed_m_s) for travel in self._travels)
         stamp_ns = self.stamp_ns if self.stamp_ns is not None else self.origin_ns or 0
-        # the changes of the model come last, because most runs have none
+        # the changes of the model come last, because most runs have no changes
         changes = json.dumps(self.changes).encode() if self.changes else b""
         data = header + travels + self.wear_depth.tobytes() + self.outputs.state() + self.twin.snapshot() + changes
         return Snapshot(stamp_ns, data)

@@ -46,7 +46,7 @@ class WayOut:
     name : str
         Name of its part of the diagnostics.
     address : str
-        Its address, without credentials.
+        Address of the output, without credentials.
     modules : tuple of str
         Modules that its process needs.
     first : dict

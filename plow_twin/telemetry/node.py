@@ -32,7 +32,7 @@ def send_node(
     ways
         The outputs; each has its own process and its own listener.
     rate_hz
-        Updates a second [Hz].
+        Rate of updates [Hz].
     wait_s
         How long to wait for the node [s].
     stopped

@@ -71,7 +71,7 @@ class Sparkplug:
     Parameters
     ----------
     group, node
-        Its names in the topics.
+        Names of group and node in the topics.
     options
         As in `Broker`.
     """

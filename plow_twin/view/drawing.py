@@ -303,7 +303,7 @@ class Drawing:
                 self._pads(stamps, steps, numbers)
 
     def _poses(self, measured: Sequence[tuple[int, Pose]], steps: Indexes, head: Rows, at: Indexes) -> None:
-        """Draw measured poses, if any, beside the model's."""
+        """Draw the measured poses, if there are any, beside the poses of the model."""
         if not (measured or self.measured.rows):
             return
         theta = 2.0 * np.arctan2(head.numbers[:, 2], head.numbers[:, 3])

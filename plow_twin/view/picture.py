@@ -220,7 +220,7 @@ def _curves(
 
 
 def _widest(times: NDArray[np.float64], begin: float, end: float) -> int:
-    """Return the index after the longest step of times [s] that overlaps a gap, or the end if none does."""
+    """Return the index after the longest step of times [s] that overlaps a gap, or the end if no step does."""
     steps = np.where((times[1:] > begin) & (times[:-1] < end), np.diff(times), 0.0)
     return int(steps.argmax()) + 1 if steps.any() else len(times)
 

@@ -174,7 +174,7 @@ class RunCurves:
             self._break_lines()
 
     def _failed(self, stamp_ns: int, since_ns: int, advances: int) -> None:
-        """Add the first failed advance of a series, or, at the series' end, the others."""
+        """Add the first failed advance of a series, or at the series' end, all other advances."""
         first = self.first_ns or 0
         self.failed += advances
         if stamp_ns == since_ns:

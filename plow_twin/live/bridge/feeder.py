@@ -26,7 +26,7 @@ from plow_twin.stream.intake import Intake, Verdict
 _RESTART = 1000
 #: Largest number of samples lost between two messages: a day at 10 kHz.
 _MOST_LOST = 10**9
-#: Number 0 or 1 after at least this many messages means a restart; after fewer it is a late message.
+#: After at least this many messages, a message with the number 0 or 1 means a restart; after fewer messages it is late.
 _FIRST = 10
 #: Smallest relative change of a deviation of the load that is journalled.
 _NOTABLE = 0.02
@@ -124,7 +124,7 @@ class Feeder:
             self._send(topic, message)
 
     def _feed_table(self, table: Table) -> bool:
-        """Process lines as a table; return False, without effect, if the load cannot be read in this way."""
+        """Process lines as a table; if the load cannot be read so, return False without any effect."""
         roles, inputs = self._by_topic.get(table.topic, []), self._runtime.inputs
         role = next((role for name, role in roles if name == "excitation"), None)
         if role is None or role.sequence or not (self._at_once and inputs.active):

@@ -157,7 +157,7 @@ class _Dated:
 
     @property
     def path(self) -> Path:
-        """Return the present file, or the pattern while there is none."""
+        """Return the present file, or the pattern while there is no file."""
         return self._tails[-1].path if self._tails else self._pattern
 
     def columns(self, *, grows: bool) -> list[str] | None:
@@ -197,7 +197,7 @@ class _Dated:
 def _changed_ns(path: Path) -> tuple[int, Any]:
     try:
         return path.stat().st_mtime_ns, _numbered(path)
-    except FileNotFoundError:  # gone meanwhile
+    except FileNotFoundError:  # the file has gone in the meantime
         return 0, _numbered(path)
 
 
@@ -246,7 +246,7 @@ class Files(SourceState):
         self._merged: Iterator[Arrived] | None = None
         #: the messages of a single topic
         self._tables: Iterator[Messages] | None = None
-        #: bytes of the files that are read once, and how many of them have been read
+        #: total size of the files that are read once [B], and how many of these bytes have been read
         self._size = self._done = 0
 
     def topics(self) -> dict[str, TopicType]:

@@ -288,7 +288,7 @@ class Link:
 
 
 def _bound(client: Client) -> None:
-    """Make a client disconnect from a server that sends oversized messages: asyncua accepts any size."""
+    """Make a client disconnect from a server that sends oversized messages, since asyncua itself accepts any size."""
     connection = client.uaclient
     make = connection._make_protocol
 
