@@ -10,8 +10,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Final
 
-#: Subpackages whose code decides the bits of a run.
-NUMERIC_SUBPACKAGES: Final = ("kernel", "model", "solve", "run", "stream", "record")
+#: Subpackages whose code decides the bits of a run; `estimate` decides those of a twin that follows its machine.
+NUMERIC_SUBPACKAGES: Final = ("kernel", "model", "solve", "run", "estimate", "stream", "record")
 
 
 def package_version() -> str:

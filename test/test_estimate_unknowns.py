@@ -11,7 +11,7 @@ from scenes import preset
 from plow_twin import Mark, Provenance
 from plow_twin.estimate.measurements import Load, Poses
 from plow_twin.estimate.similar import Units
-from plow_twin.estimate.unknowns import Unknowns
+from plow_twin.estimate.unknowns import OF_SCENE, SIZE, Unknowns
 from plow_twin.model.loads import compile_loads
 
 
@@ -35,3 +35,22 @@ def test_the_prior_is_the_scene_s_or_that_of_the_mark() -> None:
     other = units.scene(replace(scene, marks=marks))
     far = Unknowns.stated(other, units.load(load), units.poses(poses)).deviations()
     assert far[0] == 2.0 * stated[0] and far[3] == pytest.approx(stated[3])
+
+
+def test_a_stated_deviation_of_a_zero_clearance_is_converted_to_other_units() -> None:
+    scene = replace(preset("paper"), marks={"clearance.horizontal_m": Provenance(Mark.ASSUMED, "", 1e-3)})
+    tight = replace(scene, clearance=replace(scene.clearance, horizontal_m=0.0))
+    assert Units(0.5, 2.0, 0.25).scene(tight).marks["clearance.horizontal_m"].deviation == 2e-3
+
+
+def test_the_scene_of_a_vector_depends_only_on_the_quantities_that_are_declared_for_it() -> None:
+    """`Problem` keeps the scene while these quantities stay the same."""
+    scene = preset("paper")
+    t = np.arange(0.0, 10.0, 0.1)
+    unknowns = Unknowns.stated(scene, Load(t, compile_loads(scene.loads).at(t)), Poses(t, np.zeros((len(t), 3))))
+    nominal = unknowns.nominal()
+    for place in range(SIZE):
+        moved = nominal.copy()
+        moved[place] += 1e-3
+        depends = unknowns.scene_of(moved) != unknowns.scene_of(nominal)
+        assert depends == (place in range(SIZE)[OF_SCENE])

@@ -26,7 +26,7 @@ from plow_twin.estimate.arrow import OWN, Arrow, Factor
 from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.measurements import RESOLVING, Poses
 from plow_twin.estimate.sensor import Memory, moved_by_lever
-from plow_twin.estimate.unknowns import BIAS, DAMPING, DELAY, GAIN, MOVING, PROBES, QUANTITIES, SIZE, Unknowns
+from plow_twin.estimate.unknowns import BIAS, DAMPING, DELAY, GAIN, MOVING, OF_SCENE, PROBES, QUANTITIES, SIZE, Unknowns
 from plow_twin.kernel.low_pass import lagged
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import Scene
@@ -110,8 +110,8 @@ class Point:
 class Linear:
     """Jacobians by the shared unknowns and by the starting state of the row's swing.
 
-    rows : (n, 3, 17) of the predicted measurements
-    ends : (s - 1, 6, 17) of the ends of linked swings
+    rows : (n, 3, SIZE + 6) of the predicted measurements
+    ends : (s - 1, 6, SIZE + 6) of the ends of linked swings
     """
 
     rows: Array
@@ -122,7 +122,7 @@ class Linear:
 class Piece:
     """A part of the normal equations, for the shared unknowns and the consecutive swings that begin with `swing`.
 
-    rows, weighted : (m, 17) or (m, 23)
+    rows, weighted : (m, SIZE + 6) or (m, SIZE + 12)
     residual : (m,)
     """
 
@@ -359,7 +359,7 @@ class Problem:
 
     def _scene_of(self, shared: Array) -> Scene:
         """Return the scene of a vector, cached because many successive vectors have the same scene."""
-        key = shared[: GAIN.start].tobytes()
+        key = shared[OF_SCENE].tobytes()
         if self._scene[0] != key:
             self._scene = key, self.unknowns.scene_of(shared)
         return self._scene[1]

@@ -14,7 +14,7 @@ from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.measurements import RESOLVING, Poses
 from plow_twin.estimate.priors import UNSTATED
 from plow_twin.estimate.start import cut, first_vectors, range_of_motion
-from plow_twin.estimate.unknowns import BIAS, DELAY, GX, GY, SOFTNESS, Unknowns
+from plow_twin.estimate.unknowns import BIAS, DELAY, GAIN, GX, GY, SOFTNESS, Unknowns
 
 Array = NDArray[np.float64]
 
@@ -150,7 +150,7 @@ def states_at(window: Window, shared: Array) -> Array:
 def better_states(problem: Problem, shared: Array, states: Array) -> Array:
     """Replace each starting state by the end of the previous swing, if that fits the swing's first poses better."""
     window, scene = problem.window, problem.unknowns.scene_of(shared)
-    gain = shared[4:7]
+    gain = shared[GAIN]
     out, scale = states.copy(), np.maximum(np.nanstd(window.poses.q, axis=0), 1e-6)
     times = window.poses.t - shared[DELAY]
     for index in range(window.swings - 1):

@@ -189,11 +189,12 @@ class Units:
 
 def _converted(scene: Scene, its: Scene) -> dict[str, Provenance]:
     """Return the marks with deviations converted to the units of `its`."""
-    marks = dict(scene.marks)
-    for path in KINDS:
+    marks, length = dict(scene.marks), its.frame.width_m / scene.frame.width_m
+    for path, kind in KINDS.items():
         mark, (part, name) = marks.get(path), path.split(".")
         value = getattr(getattr(scene, part), name, None)
-        if mark is not None and mark.deviation is not None and value:
-            ratio = getattr(getattr(its, part), name) / value
+        # a clearance may be zero
+        if mark is not None and mark.deviation is not None and (value or kind == "clearance"):
+            ratio = length if kind == "clearance" else getattr(getattr(its, part), name) / value
             marks[path] = replace(mark, deviation=mark.deviation * ratio)
     return marks

@@ -86,6 +86,8 @@ DAMPING: Final = _place("damping")
 GAIN: Final = slice(_place("gain_fx"), _place("gain_m") + 1)
 BIAS: Final = slice(_place("bias_x"), _place("bias_theta") + 1)
 DELAY: Final = _place("delay")
+#: Definition: slice of the quantities on which the scene of a vector depends (`Unknowns.scene_of`).
+OF_SCENE: Final = slice(0, GAIN.start)
 SIZE: Final = len(QUANTITIES)
 #: Indices of the quantities that move the head.
 MOVING: Final = tuple(place for place, quantity in enumerate(QUANTITIES) if quantity.step is not None)
