@@ -164,7 +164,7 @@ async def _wish(socket: WebSocket) -> dict[str, Any]:
 
 
 def application(board: Board, link: Link, access: PageAccess) -> ASGIApp:
-    """Return the application: the files of the page, and its data."""
+    """Return the application, which serves the files and the data of the page."""
     pages = Pages(board, link, access)
     routes = [WebSocketRoute("/data", pages.page), Mount("/", StaticFiles(directory=PAGE, html=True))]
     return Guard(Starlette(routes=routes), access)

@@ -5,8 +5,8 @@ measurement of known truth.
 
 With `--cutting` it adds a stochastic cutting load and publishes the speed along the face on `travel`.
 
-`real` sends each sample at its time on a grid of the steady clock; a late sample is sent at once, and none is left out.
-`fast` publishes `/clock`, and runs ahead of the twin's `contact_peaks` by a bounded number of samples.
+`real` sends each sample at its time on a grid of the steady clock; a late sample is sent at once, and no sample is left
+out. `fast` publishes `/clock`, and runs ahead of the twin's `contact_peaks` by a bounded number of samples.
 """
 
 from __future__ import annotations

@@ -148,7 +148,7 @@ def entry_of(found: Found, session: Session, before: Estimated | None) -> Estima
     """Return the journal's entry of an estimate.
 
     A clearance that is not observable keeps its last estimate, with an interval that widens like the wear's prior; a
-    withdrawn clearance is the model's.
+    withdrawn clearance has the model's value.
     """
     model = session.outputs.modelled(session.wear_depth)
     shift = np.array(before.shift) if before is not None else np.zeros(6)

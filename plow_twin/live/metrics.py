@@ -78,7 +78,7 @@ class Metrics:
 
 
 def _bound(server: Any) -> None:
-    """Make a server close readers beyond `_READERS`, and silent readers: each takes a thread and a file."""
+    """Make a server close readers beyond `_READERS`, and silent readers; each reader takes a thread and a file."""
     free = threading.BoundedSemaphore(_READERS)
     start, serve = server.process_request, server.process_request_thread
     handler = server.RequestHandlerClass

@@ -46,7 +46,7 @@ class Front(Protocol):
     sends_motion: bool
 
     def now_ns(self) -> int:
-        """Return the time on the clock of the stamps [ns]."""
+        """Return the present time [ns] on the clock of the stamps."""
 
     def send(self, topic: str, message: memoryview | Message) -> None:
         """Send a message on the topic with a base name."""

@@ -149,7 +149,7 @@ class Runtime:
         self._set_limits(settings)
 
     def start(self) -> None:
-        """Open the journal, once the front can no longer fail. Without a clock the first sample opens it."""
+        """Open the journal, once the front can no longer fail; without a clock, the first sample opens the journal."""
         self.waits_for_clock = self.without_clock
         self.inputs.started = not self.waits_for_clock
         self.clock = "waiting" if self.waits_for_clock else "running"

@@ -38,8 +38,8 @@ class StopSignals:
     def ignore(self) -> None:
         """Ignore the signals, at the end of a program.
 
-        The interpreter restores their default handlers while it ends: a second signal, as from terminal and launch
-        together, would end the process with an error after its work is done.
+        The interpreter restores their default handlers while it ends. A second signal, as when terminal and launch both
+        send one, would then end the process with an error after its work is done.
         """
         for number in self._before:
             signal.signal(number, signal.SIG_IGN)

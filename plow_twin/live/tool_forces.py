@@ -18,7 +18,7 @@ class ToolForces:
 
     A force of 1 N along a load's own direction, at its point of action, gives a fixed wrench about the centre; the
     effort of a pure moment is in N m. A table, or a constant of zero, has no direction of its own and cannot be
-    measured in this way: it may be named, and its effort is ignored.
+    measured in this way; a message may name such a load, but the effort is ignored.
     """
 
     def __init__(self, scene: Scene) -> None:

@@ -4,7 +4,7 @@ The wear coefficient is k_s (1 + (r - 1) exp(-h / h0)). If a pad's depth with k_
 
     h = z + h0 ln(r - (r - 1) exp(-z / h0))        z = h + h0 ln((1 + (r - 1) exp(-h / h0)) / r)
 
-In the end the pad is h0 ln r deeper than with k_s alone. Under a constant force F z grows with the sliding distance s
+In the end the pad is h0 ln r deeper than with k_s alone. Under a constant force F, z grows with the sliding distance s
 as z = k_s F s / A, and the coefficient approaches k_s as exp(-s / s0) with s0 = h0 A / (k_s F), the exponential
 transient of Queener, Smith and Mitchell, Wear 8 (1965) 391. The coefficient depends on the depth alone, so no further
 state is needed: running-in continues from a saved depth, and starts again with new pads.

@@ -99,7 +99,7 @@ class AlarmCheck:
         self._recorded: deque[OutputRecord] = deque()
         #: whether every publication so far is present
         self.possible = possible
-        #: numbers of recorded messages that were compared and that could not be compared
+        #: number of recorded messages that were compared, and of those that could not be compared
         self.compared = self.not_compared = 0
 
     def give_up(self) -> None:

@@ -126,7 +126,7 @@ def compare(  # type: ignore[no-untyped-def]
     data, fixed, ends
         As in `Templates`.
     different : ndarray of bool, shape (n,)
-        Receives whether each message differs; the function returns their number.
+        Receives whether each message differs; the function returns the number of messages that differ.
     """
     count = 0
     for n in range(starts.size):

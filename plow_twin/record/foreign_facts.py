@@ -54,8 +54,8 @@ def foreign_facts(path: Path, mapping: Path | None, units: Mapping[str, str]) ->
     Returns
     -------
     facts : dict
-        Topics with their types; for each role its topic, the numbers of messages and of messages that do not fit, span
-        [s], rate [Hz], and the least and the largest value of each number in SI.
+        Topics with their types. For each role: its topic, the numbers of messages and of unfit messages, the span [s],
+        the rate [Hz], and the least and the largest value of each number in SI.
     lossy : bool
         Whether something could not be read.
 

@@ -88,11 +88,25 @@ class _Rows:
 class Measured:
     """Measurements of one run.
 
-    load : (n, 4) t [s], Fx, Fy [N], M [N m] as measured; poses : (k, 4) t [s], x, y [m], theta [rad], NaN for an empty
-    cell; lost : numbers of rows and messages that could not be read or used, by reason, and unreadable : their sum;
-    pose_deviation, load_deviation, gaps_deviation : stated standard deviations, 0 if not stated; gaps : (m, 9) t [s]
-    and the gaps of the eight pairs [m], NaN without a sensor; forces : (m, 9) t [s] and the contact forces of the eight
-    pairs [N].
+    Attributes
+    ----------
+    scene : Scene
+    load : ndarray, shape (n, 4)
+        t [s] and the measured load Fx, Fy [N], M [N m].
+    poses : ndarray, shape (k, 4)
+        t [s] and x, y [m], theta [rad], NaN for an empty cell.
+    unreadable : int
+        Number of rows and messages that could not be read or used.
+    pose_deviation, load_deviation : tuple of float
+        Stated standard deviations, 0 if not stated.
+    gaps : ndarray, shape (m, 9)
+        t [s] and the gaps of the eight pairs [m], NaN without a sensor.
+    gaps_deviation : float
+        Stated standard deviation of the gaps, 0 if not stated.
+    lost : mapping of str to int
+        The numbers that `unreadable` sums up, by reason.
+    forces : ndarray, shape (m, 9)
+        t [s] and the contact forces of the eight pairs [N].
     """
 
     scene: Scene

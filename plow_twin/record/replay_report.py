@@ -76,5 +76,5 @@ class ReplayReport:
 
     @property
     def exit_code(self) -> int:
-        """0: equal bit for bit; 1: diverged; 3: equal as far as possible, with losses."""
+        """0: equal bit for bit; 1: diverged; 3: equal as far as it could be compared, with losses."""
         return 1 if self.first_divergence is not None else 3 if self.loss else 0

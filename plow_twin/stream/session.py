@@ -80,7 +80,8 @@ class _Measured(NamedTuple):
 class Applied(NamedTuple):
     """Result of applying samples.
 
-    A row for each sample, the publications, the requested digests, and the numbers of failed advances and late samples.
+    The fields are a row for each sample, the publications, the requested digests, and the numbers of failed advances
+    and late samples.
     """
 
     rows: Rows
@@ -93,8 +94,8 @@ class Applied(NamedTuple):
 class Series(NamedTuple):
     """Samples that have been applied together and are not in the journal yet.
 
-    Stamps [ns], shape (n,), and wrenches (n, 3); the publications, with a row after each sample or with no row; the
-    digests, and the number of samples before each digest, shape (m,).
+    The fields are stamps [ns], shape (n,), and wrenches (n, 3); the publications, with a row after each sample or
+    without rows; and the digests, with the number of samples before each digest, shape (m,).
     """
 
     stamps: NDArray[np.int64]

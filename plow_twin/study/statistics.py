@@ -1,11 +1,11 @@
 """Statistics of a run by path.
 
     max.top_left_top          largest force of one pair
-    max.ccw.a                 of the pair of corner a that stops a counter-clockwise swing; cw: of its other pair
-    max.a   max.ccw   max     of the pairs of a corner; of the pairs of a sense; of all pairs
-    contact_sets.ccw.ad       share of the contact time of this sense with force at exactly these corners
-    contact_set_time.ccw.ad   the same time in s
-    contact_points.ccw.2      share of this contact time with force at exactly two corners
+    max.ccw.a                 largest force of corner a's pair that stops a counter-clockwise swing (cw: its other pair)
+    max.a   max.ccw   max     largest force over the pairs of a corner; over the pairs of a sense; over all pairs
+    contact_sets.ccw.ad       share of the sense's contact time in which exactly corners a and d carry force
+    contact_set_time.ccw.ad   this time in s
+    contact_points.ccw.2      share of the sense's contact time in which exactly two corners carry force
     events   steps            number of contact changes; number of steps of the solver
 
 Instead of `max` [N], a path may begin with `mean_in_contact` or `mean_over_time` [N], `impulse` [N s],

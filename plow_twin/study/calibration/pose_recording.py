@@ -29,7 +29,7 @@ _MOST_ROWS: Final = 20_000
 
 @dataclass(frozen=True)
 class PoseRecording:
-    """Recorded motion: t, shape (n,), in s on the clock of the scene; q, shape (n, 3): x, y [m], theta [rad]."""
+    """Recorded motion: times t [s], shape (n,), on the scene's clock, and q, shape (n, 3): x, y [m], theta [rad]."""
 
     t: Array
     q: Array

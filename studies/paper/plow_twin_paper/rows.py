@@ -37,7 +37,7 @@ class Row:
     what, published, computed : str
         The statement, the paper's value and this run's value, as text.
     verdict, criterion
-        Whether it agrees, and the rule that decides it.
+        Whether the values agree, and the rule that decides this.
     inputs : str
         Whether the scene's fitted numbers were fitted to this very statement.
     published_value, value : float, optional
