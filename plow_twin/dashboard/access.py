@@ -66,7 +66,7 @@ class PageAccess:
         return hmac.compare_digest(given.encode("utf-8", "replace"), self.token.encode())
 
     def answers_to(self, host: str) -> bool:
-        """Return whether the page answers to a name in `Host`: it refuses names that others may own.
+        """Return whether the page answers to a name in `Host`; the page refuses names that others may own.
 
         Otherwise the owner of a name could point it to this address and read the screen (DNS rebinding).
         """

@@ -180,7 +180,7 @@ class Feed:
         self.taken = self.not_taken = 0
 
     def publication(self, published: Published) -> None:
-        """Add a publication of at least one row: it is kept for the next update."""
+        """Add a publication of at least one row, which is kept for the next update."""
         second = int(published.rows["stamp_ns"][-1]) // NS_PER_S
         if self._by_second and second != self._second and self._waiting:
             self.send()

@@ -355,7 +355,7 @@ def _print(console: Console, watch: Watch, summary: RunSummary, sent: int, lost:
 
 
 def _print_clearances(console: Console, summary: RunSummary) -> None:
-    """Print the clearances estimated from the synthetic sensor, or the model's with its prior."""
+    """Print the clearances estimated from the synthetic sensor, or those of the model with its prior."""
     for name, (value, low, high) in summary.clearance.items():
         found = None if summary.estimate is None else summary.estimate[name]
         if found is None:

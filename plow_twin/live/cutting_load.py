@@ -1,7 +1,7 @@
 """A cutting load along the face: Gamma-distributed about its mean, correlated in space, new in each pass.
 
-The fluctuation depends on the place along the face and the pass: the same seed gives the same load there at any
-sampling rate and speed.
+The fluctuation depends on the place along the face and on the pass: at one place and pass, the same seed gives the same
+load at any sampling rate and speed.
 
 References
 ----------
@@ -52,7 +52,7 @@ _SCHEMA: Final[Schema] = {
 
 @dataclass(frozen=True)
 class Face:
-    """The face and the motion of the plough along it: there at `speed_m_s`, a turn of `turn_s`, and back."""
+    """The face and the motion of the plough along it: one way at `speed_m_s`, a turn of `turn_s`, and back."""
 
     length_m: float = 250.0
     speed_m_s: float = 2.0

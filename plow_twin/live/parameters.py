@@ -594,7 +594,7 @@ def _yaml_value(value: Any) -> str:
     if isinstance(value, tuple):
         return f"[{', '.join(map(_yaml_value, value))}]"
     if isinstance(value, float):
-        # YAML 1.1 reads 1e-09 as a text: the mantissa needs a point
+        # YAML 1.1 reads 1e-09 as a text, so the mantissa needs a point
         return f"{value!r}" if "e" not in repr(value) else f"{value:.1e}"
     return f'"{value}"' if isinstance(value, str) else str(value)
 

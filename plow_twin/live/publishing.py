@@ -52,7 +52,7 @@ class Front(Protocol):
         """Send a message on the topic with a base name."""
 
     def look_for_senders(self, topic: str) -> None:
-        """Find out whether the followed sender of an input is still there."""
+        """Find out whether the followed sender of an input still exists."""
 
     def sender_name(self, topic: str, sender: bytes) -> str:
         """Return the name of a sender of an input."""

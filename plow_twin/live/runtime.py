@@ -335,7 +335,7 @@ class Runtime:
         if self.waits_for_clock:
             self.start()
         if self.waits_for_clock:
-            # kept until the clock comes: a player of a recording may start the clock a little later
+            # kept until the clock comes, because a player of a recording may start the clock a little later
             room = self.settings.input_depth - len(self._early)
             self._early += arrived[:room]
             for stamp_ns, wrench in arrived[max(room, 0) :]:
@@ -351,7 +351,8 @@ class Runtime:
     def step_series(self, stamps: NDArray[np.int64], wrench: NDArray[np.float64]) -> Iterator[Outgoing]:
         """Use many samples of a source with its own time, like `step`; stamps [ns], shape (n,), wrenches (n, 3)."""
         if self.waits_for_clock or self.publishing.watch is not None or self.settings.record_ring:
-            # one by one: an observer gets each sample, and a ring the state after the sample that raised its alarm
+            # one by one, so that an observer gets each sample, and a ring the state after the sample that raised its
+            # alarm
             yield from self.step(list(zip(stamps.tolist(), map(tuple, wrench.tolist()), strict=True)))
             return
         self.publishing.received_ns = now_ns = time.monotonic_ns()

@@ -45,7 +45,7 @@ class UnusedMessages:
             pending.values.append(tuple(map(float, values)))
 
     def note_lost(self, topic: str, sender: bytes, count: int) -> None:
-        """Note messages that were sent and have not arrived; a negative `count`: they have arrived after all."""
+        """Note messages that were sent and have not arrived; a negative `count` means that they did arrive later."""
         if self._wanted and count:
             self._pending.setdefault((topic, sender, "lost"), _Pending()).count += count
 

@@ -37,7 +37,7 @@ _TIME: Final = r"t|time|timestamp|stamp|zeit|zeitstempel|date|datetime|datum"
 _UNIT: Final = re.compile(
     r"(.+?)\s*(?:[\[(]\s*([^\])]+?)\s*[\])]|[ _](kN ?m|N ?m|kN|N|mm|cm|m|mrad|rad|deg|ms|us|ns|s))"
 )
-#: Times above these count from 1970 in the named unit: each limit is a date in 2001.
+#: Times above these limits count from 1970 in the named unit; each limit is a date in 2001.
 _DATES: Final = (("ns", 1e18), ("us", 1e15), ("ms", 1e12), ("s", 1e9))
 #: Largest number of cells that are examined, so that fewer rows of a wide file are examined.
 _MOST_CELLS: Final = 2_000_000

@@ -24,7 +24,7 @@ ROLES: Final[dict[str, tuple[str, ...]]] = {
 }
 #: Type of a topic whose fields are nodes of an OPC UA server.
 OPCUA: Final = "opcua"
-#: The stamp of a node's value that becomes the sample's stamp: the sensor's or the server's.
+#: The stamp of a node's value that becomes the sample's stamp: that of the sensor or that of the server.
 SOURCE_STAMP: Final = "source"
 SERVER_STAMP: Final = "server"
 #: Keys that a node may have besides its identifier.

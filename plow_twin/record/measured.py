@@ -155,7 +155,7 @@ def is_measured(folder: Path) -> bool:
 
 
 def _table(folder: Path, name: str) -> Path:
-    """Return the path of a table: the Parquet file if there is no CSV file."""
+    """Return the path of a table, which is the Parquet file if there is no CSV file."""
     file = folder / name
     other = file.with_suffix(SUFFIX)
     return other if other.is_file() and not file.is_file() else file

@@ -1,4 +1,4 @@
-"""Run a recording again: the model advances by the journal alone, and recorded messages are compared with the model's.
+"""Run a recording again: the journal alone moves the model, whose messages are compared with the recorded messages.
 
 Nothing is copied from the recorded messages. The state is taken from a recorded snapshot only at the start of the
 journal and after a loss; every other snapshot is compared.

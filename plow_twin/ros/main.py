@@ -13,12 +13,12 @@ from plow_twin.live.stop import StopRequested, StopSignals
 if TYPE_CHECKING:
     from rclpy.executors import Executor
 
-#: Longest wait for an event [s]: an unbounded wait of the events executor does not end at shutdown.
+#: Longest wait for an event [s]; an unbounded wait of the events executor would not end at shutdown.
 _SPIN_S: Final = 0.1
 
 
 def make_executor() -> Executor:
-    """Return the events executor if rclpy has it: it does a third of the work per message."""
+    """Return the events executor, which does a third of the work per message, if rclpy has it."""
     try:
         from rclpy.experimental.events_executor import EventsExecutor
     except ImportError:

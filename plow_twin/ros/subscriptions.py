@@ -46,7 +46,7 @@ class Subscriptions:
     front
         Sends the resulting messages.
     loop, turns
-        The thread that takes the messages, and the lock that keeps it apart from the executor's.
+        The thread that takes the messages, and the lock that keeps it apart from the executor's thread.
     elsewhere
         Inputs that come from a server instead of topics.
     """

@@ -73,7 +73,7 @@ class Periods:
         self._recent: list[float] = []
 
     def begin(self) -> None:
-        """Reset: the next turn has no predecessor."""
+        """Start afresh, so that the next turn has no predecessor."""
         self._before_s = math.nan
 
     def turn(self, now_s: float) -> None:

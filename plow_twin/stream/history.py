@@ -173,7 +173,7 @@ class History:
 
 
 class RecentStamps:
-    """Stamps of a stream whose values only need sorting: a value less than `span_s` late can still be used."""
+    """Stamps of a stream whose values only need sorting, so that a value less than `span_s` late can be used."""
 
     def __init__(self, span_s: float) -> None:
         self._span_ns = round(span_s * 1e9)

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 def __getattr__(name: str) -> Any:
-    """Import the viewer's library on first use: a picture does not need it."""
+    """Import the viewer's library on first use, because a picture does not need it."""
     if name in ("ViewSummary", "to_rrd"):
         from plow_twin.view import rrd
 

@@ -16,7 +16,7 @@ from plow_twin.record.reader import RunReader
 from plow_twin.view.drawing import Drawing, Sink
 from plow_twin.view.rrd import ViewSummary
 
-#: Rate of the spans in which a curve keeps two values [Hz]: an hour of all curves takes some 200 MB in the viewer.
+#: Rate of the spans in which a curve keeps two values [Hz]; an hour of all curves then takes some 200 MB in the viewer.
 CURVE_HZ: Final = 25.0
 #: Rates of the cross-section [Hz]: live, and for the part that was recorded before the view started.
 SECTION_HZ: Final = 20.0

@@ -157,7 +157,7 @@ class Feeder:
             self._follow_time(stamp_ns)
 
     def _follow_time(self, stamp_ns: int) -> None:
-        """Advance to the time of a sample; a sample far ahead counts only if the next sample is there too."""
+        """Advance to the time of a sample; a sample far ahead counts only if the next sample is far ahead too."""
         jump_ns = round(self._runtime.settings.jump_forward * 1e9)
         far_ns, self._far_ahead_ns = self._far_ahead_ns, None
         if far_ns is not None and stamp_ns >= far_ns - jump_ns:

@@ -338,7 +338,7 @@ def is_pattern(path: Path) -> bool:
 
 
 def _sent_ns(row: Arrived, stamp_ns: StampOf[Arrived] | None) -> int | None:
-    """Return the stamp in a row, or None: the time of reading is no substitute."""
+    """Return the stamp in a row, or None, since the time of reading cannot replace a stamp."""
     return None if stamp_ns is None else stamp_ns(Arrived(row.topic, NO_TIME, row.content))
 
 
@@ -366,7 +366,7 @@ class StandardInput(SourceState):
         return {STDIN_TOPIC: self._rows.header("-")}
 
     def start(self, topics: list[str], stamp_ns: StampOf[Arrived] | None = None) -> None:
-        """Do nothing: there is one topic."""
+        """Do nothing, because there is only one topic."""
 
     def poll(self, timeout_s: float) -> list[Arrived]:
         """Return the messages that have come."""

@@ -53,7 +53,7 @@ class Bridge(Protocol):
     trouble: str
 
     def topics(self) -> Mapping[str, TopicType] | None:
-        """Return types by topic, or None: the mapping may name any topic."""
+        """Return types by topic, or None if the mapping may name any topic."""
 
     def start(self, topics: list[str], stamp_ns: StampOf[Arrived] | None = None) -> None:
         """Subscribe to these topics; messages of files that are read once are ordered by `stamp_ns`."""
@@ -152,7 +152,7 @@ class Rows:
         """Return the content of a line: None if it is unreadable, False for a header or an empty line."""
         if line is None:
             return None
-        line = line.strip(b"\r \xef\xbb\xbf")  # keep tabs: they may separate empty cells
+        line = line.strip(b"\r \xef\xbb\xbf")  # tabs are kept, because they may separate empty cells
         if not line.strip() or line.startswith(b"#"):
             return False
         if self.columns is None and (self._json or line.startswith(b"{")):

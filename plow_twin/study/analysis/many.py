@@ -64,7 +64,7 @@ def _here(tasks: Sequence[RunTask], waiting: list[int], workers: int, done: _OnD
 
 
 def _round(tasks: Sequence[RunTask], waiting: list[int], workers: int, done: _OnDone) -> list[int]:
-    """Run tasks and return the lost ones; when a worker dies, all unfinished tasks are lost."""
+    """Run tasks and return the lost tasks; when a worker dies, all unfinished tasks are lost."""
     left = []
     others = active_children()
     pool = ProcessPoolExecutor(min(workers, len(waiting)), get_context("spawn"), _begin, (loaded_laws(),))

@@ -57,7 +57,7 @@ class OpcUa(SourceState):
     access
         The server.
     roles
-        The mapping: each role is a topic, its fields are nodes.
+        The mapping, in which each role is a topic and its fields are nodes.
     rate_hz
         Expected rate of the samples [Hz]; 0: unknown, so that the server's fastest sampling is requested.
     connect_s

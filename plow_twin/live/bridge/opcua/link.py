@@ -206,7 +206,7 @@ class Link:
         granted = await self._client.uaclient.create_subscription(asked, self._on_publish)
         self._subscription = granted.SubscriptionId
         self._keepalive_s = granted.RevisedPublishingInterval * granted.RevisedMaxKeepAliveCount * 1e-3
-        # report an unchanged value with a new stamp too: a sample is made of values with the same stamp
+        # an unchanged value with a new stamp is reported too, because a sample is made of values with the same stamp
         by_stamp = ua.DataChangeFilter(Trigger=ua.DataChangeTrigger.StatusValueTimestamp)
         results = await self._monitor(range(len(self._nodes)), by_stamp)
         refused = [

@@ -85,7 +85,7 @@ def _read(path: Path) -> x509.Certificate:
 
 
 def _check_trust(server: x509.Certificate, trusted: x509.Certificate, host: str, access: Access) -> None:
-    """Raise a `BridgeError` unless the server's certificate is the trusted one, or is issued by it for this host."""
+    """Raise a `BridgeError` unless the trusted certificate is the server's own, or has issued it for this host."""
     now = datetime.now(UTC)
     if not server.not_valid_before_utc <= now <= server.not_valid_after_utc:
         raise BridgeError(
