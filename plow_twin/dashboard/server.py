@@ -89,7 +89,7 @@ class Pages:
     link
         Receiver of their requests.
     access
-        Rules of who may see the pages.
+        Rules for access to the pages.
     """
 
     def __init__(self, board: Board, link: Link, access: PageAccess) -> None:

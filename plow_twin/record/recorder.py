@@ -280,7 +280,8 @@ class Recorder:
     def series(self, series: Series) -> NDArray[np.int64]:
         """Queue the samples and digests of a series as entries of the journal, or lose all of them.
 
-        Returns, for the publication after each sample, the number of the entry before it, shape (n,).
+        Returns, for the publication after each sample, the number of the journal entry before this publication, shape
+        (n,).
         """
         now, samples = self._now_ns(), len(series.stamps)
         count = samples + len(series.digests)

@@ -72,7 +72,7 @@ class Template:
 
     @property
     def count(self) -> int:
-        """Number of numbers in a message."""
+        """Count of the numbers in a message."""
         return len(self.places)
 
 

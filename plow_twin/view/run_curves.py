@@ -167,7 +167,7 @@ class RunCurves:
         self._held_since_ns = None
 
     def _bridged(self, begin_ns: int, end_ns: int) -> None:
-        """End the lines at a silence without a journal entry, and mark it, while there are few marks."""
+        """End the lines at a silence without a journal entry, and mark the silence as long as there are few marks."""
         if self._held_since_ns is None and len(self.held_s) < _MOST_MARKS:
             self._held_since_ns = begin_ns
             self._end_of_held(end_ns)
