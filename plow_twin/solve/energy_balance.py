@@ -116,6 +116,8 @@ def _powers_under(p, offset, free, slip, stick, state, wear_depth, y, ground, lo
     fx = fy = torque = 0.0
     for pair in range(PAIR_COUNT):
         force = pairs[2, pair]
+        if force == 0.0:
+            continue
         push_x, push_y, moment, power = push(
             p, slip, stick, state, True, pair, force, y[COS], y[SIN], y[THETA], y[OMEGA], y[X], y[Y], y[VX], y[VY]
         )
