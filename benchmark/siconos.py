@@ -65,7 +65,7 @@ def inertia_and_force(angles: Array, rates: Array) -> tuple[Array, Array]:
 
 
 def across(angles: Array) -> Array:
-    """Return the derivatives of the slider's height by the angles, shape (2,)."""
+    """Return the derivatives of the slider's height with respect to the angles, shape (2,)."""
     return np.array([CRANK * math.cos(angles[0]), ROD * math.cos(angles[1])])
 
 

@@ -130,7 +130,7 @@ def test_a_recording_is_replayed_while_it_is_written_as_far_as_it_goes(folder: P
 def test_lacking_resources_are_named(lacking: dict[str, object], code: int, said: str, folder: Path) -> None:
     found, lines = _run(folder, *LIVE, **lacking)  # type: ignore[arg-type]
     assert found == code and said in lines[0], lines
-    assert len(lines) <= (2 if code == 3 else 1), lines  # exit code 3, a loss, may add a line
+    assert len(lines) <= (2 if code == 3 else 1), lines  # a loss (exit code 3) may add a second line
 
 
 #: For each library of an extra, a command that needs it.

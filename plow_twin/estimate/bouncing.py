@@ -267,7 +267,8 @@ def hidden_by_geometry(unknowns: Unknowns, poses: Poses, period: float, reach: A
         return off
 
     unseen = np.sqrt(moved(width) ** 2 + moved(0.0, height) ** 2 + moved(scale=priors.SCALES[2]) ** 2)
-    # a stated deviation of the sides includes their corners
+    # the prior of round corners is not needed if the scene states the corners' radius, or the deviation of a side,
+    # which covers the corners too
     known = scene.frame.corner_radius_m is not None or any(is_stated(scene, path) for path in _SIDES)
     across = 0.0 if known else -2.0 * priors.ROUNDING
     return unseen, moved(across, across) if across else np.zeros(2)
@@ -587,7 +588,7 @@ class MotionFeatures:
         self.q = filled(poses)
         self.noise = noise_level(self.q)
         self._period, self._parts = period, tuning.PATH_PHASES // 2
-        #: which poses are at least one period after the first; earlier ones still depend on the start
+        #: which poses are at least one period after the first pose; earlier poses still depend on the start
         self._settled = poses.t - poses.t[0] >= period
         self._whole = self._there.all(axis=1)
         if self._whole.sum() <= _FEWEST_WHOLE:

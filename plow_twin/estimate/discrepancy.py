@@ -137,7 +137,7 @@ class _Column:
 
 
 def _columns(problem: Problem, found: Fit) -> tuple[dict[str, _Column], Array]:
-    """Return the further quantities, and the derivatives of the prediction by a constant load, shape (n, 3, 3).
+    """Return the further quantities, and the derivatives of the prediction with respect to a constant load, (n, 3, 3).
 
     A quantity is left out if its prior holds it fixed, or if the model cannot be run with its changed value.
     """
@@ -178,7 +178,7 @@ def _columns(problem: Problem, found: Fit) -> tuple[dict[str, _Column], Array]:
 
 
 def _of_sensor(problem: Problem, point: Point) -> Iterator[tuple[str, Array]]:
-    """Yield the derivatives of the prediction, (n, 3), by each scale and by the clock's drift, with their names."""
+    """Yield the derivative of the prediction, (n, 3), with respect to each scale and the clock drift, with its name."""
     t = problem.window.poses.t
     for index, axis in enumerate(("x", "y", "theta")):
         column = np.zeros_like(point.predicted)

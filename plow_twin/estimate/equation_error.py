@@ -98,7 +98,7 @@ class EquationError:
         half = max(_FEWEST, round(0.5 * tuning.MODULATED / step))
         s, span = np.arange(1 - half, half) / half, half * step
         bump = 1.0 - s * s
-        # (1 - s^2)^3 and its first two derivatives by time
+        # step times (1 - s^2)^3, and its first two time derivatives
         self._value = step * bump**3
         self._slope = -6.0 * step / span * s * bump**2
         self._curve = step / span**2 * (24.0 * s * s * bump - 6.0 * bump**2)
@@ -155,7 +155,7 @@ class EquationError:
         return body @ self._rows - self._half_size, directions
 
     def _columns(self, corners: Array, normals: Array, reach: Array, stiffness: float) -> Array:
-        """Return the derivatives by stiffness, damping, four walls and three constant loads, shape (m, 3, 9)."""
+        """Return the derivatives with respect to stiffness, damping, four walls and three constant loads, (m, 3, 9)."""
         beyond = np.maximum(corners - reach[_WALL], 0.0)
         touching = (beyond > 0.0).astype(np.float64)
         spring = self._weighed(np.einsum("nik,nk->ni", normals, beyond), self._value)

@@ -342,7 +342,7 @@ class Problem:
     def linearise(self, point: Point) -> Linear:
         """Return the Jacobians of the prediction and of the ends of the swings."""
         rows, ends = np.zeros((len(point.residual), 3, SIZE + OWN)), np.zeros((len(point.defect), 6, SIZE + OWN))
-        # the derivatives by states and gains come first, because they use the point's scene
+        # the derivatives with respect to states and gains come first, because they use the point's scene
         together = self._evaluate(point.shared, point.states + np.diag(_DISPLACED)[:, None])
         for j in range(6):
             if together is not None:
@@ -365,8 +365,9 @@ class Problem:
         return self._scene[1]
 
     def by_differences(self, point: Point) -> Array:
-        """Return the derivatives of the prediction by the differences, shape (n, 3, 7); zero if the model cannot be
-        run.
+        """Return the derivatives of the prediction with respect to the differences, shape (n, 3, 7).
+
+        They are zero if the model cannot be run.
         """
         if self._columns[0] is not point:
             out = np.zeros((*point.residual.shape, len(DIFFERENCES)))
@@ -405,7 +406,10 @@ class Problem:
 
 
 def _by_state(point: Point, other: Point, index: int, moved: float) -> tuple[Array, Array]:
-    """Return the derivatives of predictions and ends by a component of the starting states, `moved` in `other`."""
+    """Return the derivatives of predictions and ends with respect to a component of the starting states.
+
+    In `other` this component is larger by `moved`.
+    """
     ends = point.defect - other.defect
     ends[:, index] += moved  # the start of the next swing has moved too
     return np.nan_to_num((point.residual - other.residual) / moved), ends / moved
@@ -505,8 +509,9 @@ def freed(swings: int, unknowns: int) -> float:
 def joint_step(problem: Problem, found: Fit, columns: Array, precision: Array, pull: Array) -> tuple[Array, Array]:
     """Return the linearised step of the shared and the further unknowns together, and its covariance.
 
-    `columns`, shape (n, 3, k), are the derivatives of the prediction by the further unknowns. `precision` and `pull`,
-    shape (k,), are the prior's terms in their normal equations. The starting state of each swing is eliminated.
+    `columns`, shape (n, 3, k), are the derivatives of the prediction with respect to the further unknowns. `precision`
+    and `pull`, shape (k,), are the prior's terms in their normal equations. The starting state of each swing is
+    eliminated.
     """
     size = SIZE + len(precision)
     normal = np.diag(np.concatenate([1.0 / problem.deviation**2, precision]))

@@ -73,7 +73,7 @@ class _Block:
 
     normal, score : (b, b), (b,) for the other unknowns
     state : (6,) step of the starting state if the other unknowns stay
-    answer : (6, b) derivative of this step by the steps of the other unknowns
+    answer : (6, b) derivative of this step with respect to the steps of the other unknowns
     root : (6, 6) Cholesky factor of the starting state's covariance, for random draws
     """
 

@@ -34,7 +34,7 @@ _FREE = 100.0
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """Features of motions, (n, m), and their derivatives by the delay, (n, m) in 1/s."""
+    """Features of motions, (n, m), and their derivatives with respect to the delay, (n, m) in 1/s."""
 
     like: Array
     late: Array
@@ -94,7 +94,7 @@ def _terms(points: Array) -> Array:
 
 
 def _slopes(points: Array) -> Array:
-    """Return the derivatives of the terms by each parameter, shape (n, 7, terms)."""
+    """Return the derivatives of the terms with respect to each parameter, shape (n, 7, terms)."""
     count, size = points.shape
     slopes = np.zeros((count, size, 1 + size + len(_CURVED)))
     each = np.arange(size)

@@ -36,7 +36,7 @@ from plow_twin.record.unused import InputCounts
 from plow_twin.stream.journal import Digest, Failed, Sample, Snapshot
 
 _CHUNK_SIZE: Final = 2**20
-#: Key in the loss record of a repaired part.
+#: Key under which `metadata.yaml` lists the repaired parts, without the prefix `plow_twin_`.
 REPAIRED_KEY: Final = "repaired"
 _HASH: Final = "topic_type_hash"
 

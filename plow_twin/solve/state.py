@@ -284,7 +284,8 @@ WORK: Final = np.dtype(
         ("decay", "f8", (1,)),  # decay rate of the damping in 1/s, 0 if it does not limit steps
         ("switch", "i8", (PAIR_COUNT,)),  # modes that pairs take at the step's end, -1 for no change
         ("inverse", "f8", (_ROWS + 2,)),  # 1/k
-        ("damping", "f8", (3, 3)),  # rest under harmonics: minus the derivatives of the accelerations by rate
+        # rest under harmonics: minus the derivatives of the accelerations with respect to the rates
+        ("damping", "f8", (3, 3)),
         ("rub", "f8", (6, *_WIDE)),  # wear: s' / v, sliding distance per travel, force times this distance; running-in
         ("binomial", "f8", (_ROWS, _ROWS)),  # 1 / C(order, k)
         ("beyond", "f8", (3,)),  # newest advance out of range: angle [rad], largest penetration [m], pair of the latter

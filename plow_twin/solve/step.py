@@ -190,7 +190,7 @@ def _switch(p, state, pair, new, totals, log, fraction, stick) -> None:
                 state.mode[pair] = RELEASED
     if stick is not None and state.mode[pair] == ON and old != ON:
         grasp(p, state, pair, old)
-    # the log shows a released pair as on
+    # the log has no mode RELEASED, so a RELEASED pair counts as ON
     old, new = ON if old == RELEASED else old, ON if new == RELEASED else new
     if log is not None and old != new:
         log_event(log, totals, state.step_start, pair, old, new, penetration_and_rate(p, state, pair)[1])

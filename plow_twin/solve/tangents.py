@@ -35,7 +35,7 @@ from plow_twin.solve.step import complete_step, lay_out_series_step
 
 #: Number of columns computed side by side.
 WIDTH: Final = 8
-#: Number of columns that are derivatives by the state; they come first.
+#: Number of columns that are derivatives with respect to the state; they come first.
 STATE_COLUMNS: Final = 6
 #: Indices of a column's components.
 PLACE_X, PLACE_Y, PLACE_THETA, RATE_X, RATE_Y, RATE_THETA = range(6)
@@ -54,7 +54,7 @@ COLUMNS: Final = np.dtype(
         ("load", "f8", (3, _ROWS, WIDTH)),  # change of the load per mass and inertia, in world axes
         ("now", "f8", (6, WIDTH)),  # displacements along head axes at the step's start
         ("factor", "f8", _EIGHT),  # change of each pair's lambda
-        ("edge", "f8", _EIGHT),  # derivative of each pair's penetration by a clearance
+        ("edge", "f8", _EIGHT),  # derivative of each pair's penetration with respect to a clearance
         ("constant", "f8", (3, WIDTH)),  # derivative of the steady load
         ("stiffness", "f8", (WIDTH,)),
         ("viscous", "f8", (WIDTH,)),
@@ -69,14 +69,14 @@ ALONG: Final = np.dtype(
         ("spin", "f8", (_ROWS, PAIR_COUNT)),  # omega in each lane
         ("turned", "f8", (_ROWS, PAIR_COUNT)),  # omega times the state
         ("arm_rate", "f8", (_ROWS, PAIR_COUNT)),
-        ("arm_turned", "f8", (_ROWS, PAIR_COUNT)),  # derivative of an arm by the angle
+        ("arm_turned", "f8", (_ROWS, PAIR_COUNT)),  # derivative of an arm with respect to the angle
         ("by_depth", "f8", (_ROWS, PAIR_COUNT)),  # derivatives of the force
         ("by_rate", "f8", (_ROWS, PAIR_COUNT)),
         ("elastic", "f8", (_ROWS, PAIR_COUNT)),  # d^n
-        ("slope", "f8", (_ROWS, PAIR_COUNT)),  # derivative of d^n by d
+        ("slope", "f8", (_ROWS, PAIR_COUNT)),  # derivative of d^n with respect to d
         ("lift", "f8", (_ROWS, PAIR_COUNT)),  # 1 + lambda d'
         ("damped", "f8", (_ROWS, PAIR_COUNT)),  # d^n d'
-        ("push", "f8", (4, _ROWS)),  # fx, fy, derivative of the moment by the angle, -fy
+        ("push", "f8", (4, _ROWS)),  # fx, fy, derivative of the moment with respect to the angle, -fy
         ("mode", "i8", (PAIR_COUNT,)),  # modes before the step's event
         ("waiting", "i8"),  # number of ends in a row at which no stretch began
     ]
@@ -120,7 +120,7 @@ def _expand_along(p, state, w, along, order, viscous, hysteretic, integer, fract
 
 @kernel(fast=True)
 def _expand_law(p, state, w, along, order, viscous, hysteretic, integer, fraction) -> None:
-    """Write the derivatives by penetration and by rate of a force that is not linear in them."""
+    """Write the derivatives, with respect to penetration and rate, of a force that is not linear in them."""
     for k in range(order):
         elastic, slope = row(w.penetration, k), splat(1.0 if k == 0 else 0.0)
         if integer is not None:
@@ -346,7 +346,7 @@ def _touch(p, state, w, columns, pair, viscous) -> None:
 def _start_columns(c, s, columns, first) -> None:
     """Begin a stretch: each column of the state starts with a displacement of 1, each column of a parameter with 0.
 
-    A contact that has already fixed its impact speed keeps the derivatives of its lambda by the parameters.
+    A contact that has already fixed its impact speed keeps the derivatives of its lambda with respect to parameters.
     """
     for lane in range(WIDTH):
         column = first + lane
@@ -424,7 +424,7 @@ def follow_columns(
     Parameters
     ----------
     columns : ndarray of `COLUMNS`, shape (b,)
-        Blocks of eight columns; the first six columns are derivatives by the state.
+        Blocks of eight columns; the first six columns are derivatives with respect to the state.
     omegas, amplitudes
         Angular frequencies [rad/s], shape (h,), of the loads that columns change, and the changes of their amplitudes,
         shape (b, h, 2, 3, 8).

@@ -86,7 +86,7 @@ def _hand_over(p, state, stick, totals, log, old, new) -> None:
 
 @kernel()
 def _log(log, totals, time, pair, old, new, rate) -> None:
-    # the log shows a released pair as on
+    # the log has no mode RELEASED, so a RELEASED pair counts as ON
     old, new = ON if old == RELEASED else old, ON if new == RELEASED else new
     if old != new:
         log_event(log, totals, time, pair, old, new, rate)

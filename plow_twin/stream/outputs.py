@@ -57,7 +57,7 @@ FOLLOWED_FIELDS: Final = (
 _MOTION: Final = ("t", "stamp_ns", "held", "q", "v", "penetration", "rate", "force", "wear_depth", *FOLLOWED_FIELDS)
 #: Fields whose numbers `summary` checks for being finite by summing them up.
 _SUMMED: Final = ("q", "v", "penetration", "rate", "force", "impulse", "peak")
-#: Indices in `clearance` of the numbers of `known_clearance`.
+#: Index in `clearance` to which each of the six numbers of `known_clearance` is written.
 _KNOWN: Final = np.array([0, len(_CLEARANCES), len(_CLEARANCES) + 1, 1, len(_CLEARANCES) + 2, len(_CLEARANCES) + 3])
 #: Number of rows made at once, because numpy makes many rows in the same time as one row.
 _STOCK: Final = 256

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 #: Time to wait for a scheduler [s].
 CONNECT_TIMEOUT_S = 20.0
-#: Time to wait for the first worker of a cluster [s], because a cluster may still grow.
+#: Longest time that a cluster may be without a worker [s], at the start or after its workers have left.
 WORKER_TIMEOUT_S = 300.0
 #: Time between two checks for a worker while no result arrives [s].
 _LOOK_S: Final = 2.0

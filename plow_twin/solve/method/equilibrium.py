@@ -25,7 +25,9 @@ def held(p, state, y, least) -> bool:
 
 @kernel()
 def stiffness_at(p, acts, state, w, gyration) -> None:
-    """Write the accelerations at `w.rest[0]` to `w.rest[1]`, and minus their derivatives by place to `w.hessian`.
+    """Write the accelerations at `w.rest[0]` to `w.rest[1]`.
+
+    Minus their derivatives with respect to place is written to `w.hessian`.
 
     The matrix has shape (3, 3). The angle is multiplied by the radius of gyration, which makes the matrix symmetric.
     """

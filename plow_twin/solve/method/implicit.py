@@ -113,7 +113,8 @@ def _implicit_type(size: int) -> np.dtype[np.void]:
             ("z", "f8", (STAGES + 1, 2 * size)),  # state at the start and at the nodes
             ("rate", "f8", (2, 2 * size)),  # rates for a difference quotient
             ("accelerations", "f8", (STAGES, size)),
-            ("jacobians", "f8", (STAGES, 2, size, size)),  # derivatives of the accelerations by place and by velocity
+            # derivatives of the accelerations with respect to place and to velocity
+            ("jacobians", "f8", (STAGES, 2, size, size)),
             ("matrix", "f8", (size * STAGES, size * STAGES)),
             ("residual", "f8", (size * STAGES,)),
             ("body", "f8", shape),  # body coordinates
@@ -209,7 +210,10 @@ def note_decay(state, decay, step_size) -> None:
 
 @kernel()
 def _jacobian(p, acts, state, t, z, implicit, base, out) -> None:
-    """Write the accelerations at z to `base` (n,), and their derivatives by place and velocity to `out` (2, n, n)."""
+    """Write the accelerations at z to `base` (n,).
+
+    Their derivatives with respect to place and velocity are written to `out` (2, n, n).
+    """
     rate, moved, n = implicit.rate[0], implicit.rate[1], base.size
     accelerate(p, acts, True, state, t, z, implicit.load, rate)
     for j in range(2 * n):
@@ -227,7 +231,7 @@ def _jacobian(p, acts, state, t, z, implicit, base, out) -> None:
 
 @kernel()
 def _newton_matrix(implicit, h) -> None:
-    """Write the derivatives of the residual by the nodes' velocities, with places x_i = x_0 + h sum a_ij v_j."""
+    """Write the derivatives of the residual with respect to the nodes' velocities; x_i = x_0 + h sum a_ij v_j."""
     a, jacobians, matrix, s = implicit.weights, implicit.jacobians, implicit.matrix, implicit.nodes.size
     n = implicit.accelerations.shape[1]
     for i in range(s):

@@ -45,7 +45,7 @@ def without_harmonics(p, harmonics, t, rate, spare) -> None:
 
 @kernel()
 def _damping_at(p, acts, state, w, gyration) -> None:
-    """Write minus the derivatives of the accelerations by rate, at `w.rest[0]`, to `w.damping`."""
+    """Write minus the derivatives of the accelerations with respect to the rates, at `w.rest[0]`, to `w.damping`."""
     z, rate, moved = w.rest[0], w.rest[1], w.rest[2]
     accelerate(p, acts, True, state, state.step_start, z, w.rest[3, :3], rate)
     for j in range(3):
