@@ -10,7 +10,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Final
 
-#: Subpackages whose code decides the bits of a run; `estimate` decides those of a twin that follows its machine.
+#: Subpackages whose code determines the bits of a run's results; `estimate` does so if the twin follows its machine.
 NUMERIC_SUBPACKAGES: Final = ("kernel", "model", "solve", "run", "estimate", "stream", "record")
 
 

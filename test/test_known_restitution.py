@@ -102,7 +102,7 @@ def test_ramped_damping_is_that_of_another_integrator(z: float, ramp: float) -> 
     def rates(_t: float, state: list[float]) -> tuple[float, float]:
         u, rate = state
         share = min(max(u / ramp, 0.0), 1.0)
-        # a contact that is clipped on the way out pushes again when the ramp has reduced the damping
+        # a contact that is CLIPPED on the way out pushes again when the ramp has reduced the damping
         return rate, -max(0.0, u + 2.0 * z * share * share * (3.0 - 2.0 * share) * rate)
 
     def parted(_t: float, state: list[float]) -> float:

@@ -164,7 +164,7 @@ def test_the_bench_scene_meets_its_reference_with_every_event(tol: float) -> Non
     stride = round(0.1 / (exact["t"][1] - exact["t"][0]))
     assert pose_error(preset("bench_kv"), found.q[0], exact["q"][::stride]) < 10.0 * tol
     assert found.events[0] == 366 and found.makes.sum() == 120
-    # a clipped pair that separates changes no force, so its event ends no step
+    # a CLIPPED pair that separates changes no force, so its event ends no step
     assert found.steps[0] < 0.95 * simulate(preset("bench_kv"), 20.0, 0.1, tol=tol).solver["steps"]
 
 

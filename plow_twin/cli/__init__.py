@@ -21,7 +21,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     if os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
         sys.exit("plow-twin: NUMBA_DISABLE_JIT is set, expected it unset, as the solver is compiled")
     with _ending_at_once():
-        # Ctrl-C during an import may raise another error
+        # Ctrl-C ends the process at once here, because an interrupted import may raise another error instead
         try:
             import plow_twin.run.twin  # noqa: F401
             from plow_twin.cli.app import main as run
@@ -53,7 +53,7 @@ def _ending_at_once() -> Iterator[None]:
         os.write(2, b"plow-twin: interrupted\n")
         os._exit(1)
 
-    # the caller neither ignores nor handles Ctrl-C
+    # whether the caller neither ignores nor handles Ctrl-C
     ours = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     if not ours or threading.current_thread() is not threading.main_thread():
         yield

@@ -176,7 +176,7 @@ def _watch(task: Any, every: float, as_json: bool, quiet: bool) -> dict[str, Any
 def _show_contacts(console: Console, results: Sequence[dict[str, Any]]) -> None:
     """Print the contacts that the model computed, runs side by side."""
     shown = table("Contacts computed", "run", "time [s]", "impacts [1/min]", "largest force [kN]", "at")
-    # a long name takes two lines
+    # a long name of a run continues on the next line
     shown.columns[0].no_wrap, shown.columns[0].overflow = False, "fold"
     for facts in results:
         loads = facts["loads"]

@@ -116,7 +116,8 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run the command line and leave with its exit code."""
     code = run(arguments)
     if threading.current_thread() is threading.main_thread():
-        # the work is done; a second signal would change the exit code, and a terminal and a launch may each send one
+        # the work is done, so further signals are ignored: a terminal and a launch may each send a signal, and the
+        # second one would change the exit code
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, signal.SIG_IGN)
     try:

@@ -133,7 +133,7 @@ def _show(found: Comparison) -> None:
     console.print(_KEY, highlight=False)
 
 
-#: The sign in the table for each cause of a change, and the key to the signs.
+#: The sign that a table shows for each cause of a change, and the explanation of the signs.
 _SIGNS: Final = {"chance": "", "machine": "M", "load": "L", "load or machine": "?"}
 _KEY: Final = (
     "M: the machine changed, L: the load changed, ?: either; no letter: may be chance. All numbers of a table are "

@@ -32,7 +32,7 @@ FAILED: Final = 1
 WRONG_INPUT: Final = 2
 DONE_WITH_LOSS: Final = 3
 
-#: Function that is called with the share of the work done, 0..1.
+#: Function that is called with the share of the work that is done (0 to 1).
 OnProgress = Callable[[float], None]
 
 

@@ -213,7 +213,7 @@ def _followed(given: _Given, members: int, dt: float | None) -> tuple[list[str],
     return offline.table(stretch.rows)
 
 
-#: Advice for numbers in another unit.
+#: Advice to a user whose numbers are in another unit.
 _REMEDY: Final = "convert the file, or state the unit in a mapping (--map)"
 
 

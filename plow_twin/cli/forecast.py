@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from plow_twin.model.scene import Scene
 
 
-#: A limit below this share of the clearance was probably given in m, whose number is a thousandth of that in mm.
+#: A limit below this share of the clearance was probably given in m instead of mm, which makes it a thousandth.
 _METRES: Final = 1e-2
 
 

@@ -9,7 +9,7 @@ from typing import Final
 
 #: Largest number of lines that wait for the reader; the oldest are dropped first.
 MOST_WAITING: Final = 1000
-#: Longest time [s] at the end in which the reader takes no line.
+#: Longest time [s] that the end waits for a reader that takes no line.
 _PATIENCE_S: Final = 2.0
 
 

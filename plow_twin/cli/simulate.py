@@ -114,7 +114,7 @@ def _run(
     try:
         title = f"simulating {t_end:g} s (the first run compiles)"
         with progress(title, quiet) as on_progress, warnings.catch_warnings():
-            # printed with the results
+            # the warning is printed with the results
             warnings.simplefilter("ignore", ToleranceWarning)
             return run(model, t_end, *settings, **limits, on_progress=on_progress), None
     except (LimitError, RunInterrupted) as stop:

@@ -31,7 +31,7 @@ _LONGEST: Final = 1000
 #: Largest number of operators' requests that are handled at once.
 _MOST_ASKED: Final = 8
 _NO_LOAD: Final = np.full(3, np.nan)
-#: States of a clearance that the measurements determine, repeated here so that the estimate is not imported.
+#: States of a clearance whose value comes from measurements, repeated here so that `estimate` need not be imported.
 _KNOWN_STATES: Final = ("estimated", "rough")
 
 
@@ -194,8 +194,8 @@ class Feed:
     def part(self, name: str, part: Part) -> None:
         """Add a status, which replaces the previous status of that name."""
         level, message, values = part
-        if name == "estimate" and "estimates" not in values:  # the part of the diagnostics has the same name
-            self._sum_up()  # first the publications before the estimate
+        if name == "estimate" and "estimates" not in values:  # the diagnostics' part of this name has that key
+            self._sum_up()  # the publications before the estimate come first
             self.motion.estimate = values
         elif name == "status":
             self.motion.status = values

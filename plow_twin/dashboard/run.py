@@ -72,7 +72,7 @@ class RunFeed:
             self._feed.motion.was_held |= self._feed.motion.held
             while not (self._feed.send() or self._stopped()):
                 time.sleep(_WAIT_S)
-        self._say(batch)  # an estimate replaces the clearances that were published before it
+        self._say(batch)  # this comes last, because an estimate replaces the clearances published before it
 
     def _counted(self) -> dict[str, str]:
         """Return the counts of the inputs so far, named as in the diagnostics of the twin."""
@@ -151,7 +151,7 @@ def show_run(path: Path, access: PageAccess, stopped: Callable[[], bool], on_ope
         for batch in reader.batches():
             if len(batch.entries) or batch.outputs:
                 run.add(batch)
-            else:  # all that is recorded so far
+            else:  # all that is recorded so far has been read
                 screen.feed.turn()
             if stopped() or screen.has_ended:
                 return

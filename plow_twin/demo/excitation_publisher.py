@@ -47,7 +47,7 @@ from plow_twin.stream.intake import NS_PER_S
 
 #: Stamp of the first sample under /clock [ns]: zero would count as unstamped.
 FIRST_STAMP_NS: Final = NS_PER_S
-#: Largest number of unanswered samples in `fast`.
+#: Largest number of unanswered samples at the speed `fast`.
 WINDOW: Final = 200
 #: Number of samples by which a reliable reader may be late before samples are lost: 100 s at 1 kHz.
 QUEUE: Final = 100_000

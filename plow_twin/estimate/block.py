@@ -197,8 +197,8 @@ def _solve(scene: Scene, met: list[Impact], known: Estimate, level: Array) -> tu
     prior[_BIAS] = np.array([quantity.deviation for quantity in QUANTITIES])[BIAS]
     # the prior of the paper's machine, scaled to the machine's size
     prior[_LEVER] = UNSTATED["lever_x"] * geometry.half_diagonal(scene) / PAPER_LENGTH
-    # the prior is for the logarithm of the stiffness, and the penetration is a power of the stiffness; this deviation
-    # keeps the 95 % point
+    # the prior is for the logarithm of the stiffness, and the penetration is a power of the stiffness; the deviation of
+    # the penetration is chosen so that the 95 % point stays the same
     spread = deviation_of(scene, "contact.stiffness") / (scene.contact.exponent + 1.0)
     prior[_DEPTH] = math.expm1(NORMAL_P95 * spread) / NORMAL_P95
     for axis in (GX, GY):
@@ -217,7 +217,7 @@ def _solve(scene: Scene, met: list[Impact], known: Estimate, level: Array) -> tu
         design[row, _LEVER] = one.turned
     # an unknown with a prior deviation of zero keeps its value
     free = prior > 0.0
-    # corners are not points, so each impact is wrong by at least the uncertainty of the frame
+    # each impact is wrong by at least the uncertainty of the frame's sides, because corners are not points
     least = max(float(level[:2].max()), *(deviation_of(scene, f"frame.{side}") for side in ("width_m", "height_m")))
     scales = np.geomspace(least, max(float(prior[_CLEARANCES].max()), 2.0 * least), _SCALES)
     step, deviation = np.zeros(_SIZE), np.zeros(_SIZE)

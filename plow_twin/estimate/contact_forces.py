@@ -167,7 +167,7 @@ def cells_of(feeling: Feeling, found: Fit, forces: ContactForces) -> tuple[Cells
     measured = forces.force - offset
     found_out, pairs = [], []
     largest = float(np.nanmax(felt.force))
-    # a cell that reads exactly 0 in flight still has this resolution
+    # a cell that reads exactly 0 in flight has a resolution too, which is at least this
     noise = np.maximum(noise, 1e-4 * largest)
     for i, name in enumerate(PAIR_NAMES):
         there = np.isfinite(measured[:, i]) & (felt.swing >= 0)

@@ -46,7 +46,8 @@ if TYPE_CHECKING:
     from plow_twin.estimate.contact_forces import ContactForces
 
 Array = NDArray[np.float64]
-#: Shared unknowns, noise and differences from the previous window, 21 numbers; empty without a guess.
+#: First guess of a window, taken from the previous window: the shared unknowns, the noise and the differences, 21
+#: numbers in all. An empty tuple means that there is no guess.
 Guess = tuple[float, ...]
 
 #: Bound: a window has at most this many load periods or this many seconds, whichever is longer. Of longer data the
@@ -572,7 +573,7 @@ def thinned(load: Load, period: float) -> tuple[Load, bool]:
         if len(thin.t) <= most:
             break
     broad = len(thin.t) > most
-    # the head follows the mean values of a broad-band load
+    # a broad-band load is averaged, because the head follows its mean values
     felt = load.averaged(tuning.KNOTS[1] * int(most)) if len(thin.t) > tuning.KNOTS[1] * most else thin
     return replace(felt, unknown=load.unknown), broad
 

@@ -57,7 +57,8 @@ _CALL: Final = 20
 _KNOWN_HZ: Final = 10.0
 #: Bound: largest number of poses that wait for the model to reach their stamps; a session keeps as many for going back.
 _MOST_DUE: Final = MOST_MEASURED
-#: Definition: arrays for one row with and without intervals, for no digest, and for constant clearances.
+#: Definition: masks of one row with intervals and of one row without; an empty array of digests; the change of constant
+#: clearances.
 _YES: Final = np.ones(1, bool)
 _NO: Final = np.zeros(1, bool)
 _NO_DIGESTS: Final = np.zeros(0, np.int64)

@@ -151,7 +151,7 @@ class _Joint:
             return not_used("the model cannot be run")
         linear, jacobian = self._linearised(at)
         for index in range(_ROUNDS):
-            if index < _DRAWN_ROUNDS:  # at first the draws are limited by the poses alone
+            if index < _DRAWN_ROUNDS:  # in the first round only the poses limit the draws
                 self._weigh(at.force)
                 known = self._blocks(at, linear, jacobian if index else 0.0 * jacobian)
                 self._jitter = self._unpredicted(at, jacobian, known)

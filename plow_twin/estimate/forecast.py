@@ -223,7 +223,7 @@ def _forecast(
         coefficient, load = known.draw(plan.draws, rng), 1.0 + tuning.PATH_DEVIATION * rng.standard_normal(plan.draws)
     coefficient = coefficient * multiple
     size = np.array([scene.clearance.horizontal_m, scene.clearance.vertical_m])
-    # even a clearance that is hardly known stays above zero
+    # a drawn clearance stays above zero, even if the clearance is hardly known
     now = np.maximum(rng.normal(0.0, 1.0, (plan.draws, 2)) * deviation_m, -_LEAST_SHARE * size)
     most = float(coefficient.max() * load.max()) * travel / wear.pad_area_m2
     # a smaller present clearance is further from its limit, so the path must be longer
@@ -290,7 +290,7 @@ def with_clearances(scene: Scene, horizontal_m: float, vertical_m: float, depth:
     if depth is None:
         depth = np.zeros(PAIR_COUNT)
         if wear.running_in_ratio > 1.0:
-            # half of the growth at each of two walls
+            # each of the two walls has half of the growth
             depth += 0.5 * max(horizontal_m - new.horizontal_m, 0.0) * np.abs(NORMAL_X)
             depth += 0.5 * max(vertical_m - new.vertical_m, 0.0) * np.abs(NORMAL_Y)
     grown = 0.5 * depth @ np.abs(NORMAL_X), 0.5 * depth @ np.abs(NORMAL_Y)

@@ -151,7 +151,7 @@ def _fit_one_set(
         unknown[:, : equations.shape[1]] += left @ inverse.T
     x, y = _displacement(unknown, scene)
     clearance = np.median(unknown[:, 2:4], axis=0)
-    # the errors of the sensors are constant; noise averages out
+    # the errors of the sensors are constant, so only the noise averages out
     spread = error * np.sqrt((inverse[2:4] ** 2).sum(axis=1))
     noise = unknown[:, 2:4].std(axis=0) / np.sqrt(len(t))
     q = np.stack([x, y, unknown[:, 4]], axis=1)

@@ -84,7 +84,7 @@ class Learner:
         self._least, self._most = own.min(axis=0), own.max(axis=0)
         self.mean, self.covariance = own[0].copy(), np.cov(own.T).reshape(len(learned), -1)
         self._widest = np.sqrt(np.diag(self.covariance))
-        # standardised differences of the members from the mean; the median twin is at the mean
+        # standardised differences of the members from the mean; the first member, the median twin, is at the mean
         white = own - own.mean(axis=0)
         white[0] = 0.0
         self._white = white @ np.linalg.inv(np.linalg.cholesky(self.covariance)).T

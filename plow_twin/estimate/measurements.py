@@ -104,7 +104,7 @@ class Poses:
         about = np.stack([np.roll(self.q, shift, axis=0) for shift in (-2, -1, 1, 2)])
         low, high = about.min(axis=0), about.max(axis=0)
         far = tuning.SPIKE[0] * level + (high - low)
-        # comparisons with NaN are false
+        # a value with a NaN beside it is no spike, because comparisons with NaN are false
         spikes = (self.q > high + far) | (self.q < low - far)
         spikes[[0, 1, -2, -1]] = False
         count = int(spikes.sum())

@@ -75,7 +75,7 @@ def with_differences(problem: Problem, found: Fit) -> tuple[Problem, Fit] | None
         differences[LAG] = max(differences[LAG], 0.0)
         change = differences - problem.differences
         size = float(change @ np.linalg.solve(covariance[SIZE:, SIZE:], change))
-        # grading a fit allows for a change within the noise by a linear step
+        # a change within the noise needs no further fit, because grading a fit allows for it by a linear step
         if index and size < tuning.SETTLED:
             break
         problem = Problem(

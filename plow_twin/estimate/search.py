@@ -33,7 +33,7 @@ class Stage:
 _FEWEST_ROWS = (8, 12)
 #: Prior: the differences of a machine whose sensor has a slow low pass and which has no other difference.
 LOW_PASS: Final = np.array([0.0] * LAG + [UNSTATED["filter"]])
-#: Bound: the rounds in which the number of candidates is reduced.
+#: Bound: the rounds of the search, after each of which fewer candidates are kept.
 STAGES: Final = (Stage(0.1, 4, 5), Stage(0.2, 3, 2))
 #: Bound: largest number of swings, because the cost of a fit grows with their number.
 _MOST_SWINGS = 350
@@ -115,7 +115,7 @@ def refine(
     window = cut(unknowns.scene, poses, period, shortest)
     near = Problem(forward, unknowns, window, horizon=min(max(0.2 * period, rows[0]), horizon), differences=differences)
     starts = [shared]
-    if unknowns.is_hard(shared):  # good for hard contacts only
+    if unknowns.is_hard(shared):  # this start is good for hard contacts only
         starts.append(range_of_hard(unknowns, poses, shared))
     fits = []
     for start in starts:

@@ -16,8 +16,8 @@ from plow_twin.estimate.measurements import Poses, filled
 
 Array = NDArray[np.float64]
 
-#: Derived: number of rows in the parabola for the measured pose at a swing's start; a kink lasts as long in the poses
-#: of a slow sensor.
+#: Derived: number of rows to which a parabola is fitted for the measured pose at a swing's start. The poses of a slow
+#: sensor round off a kink over as many rows.
 _ROWS: Final = 7
 
 

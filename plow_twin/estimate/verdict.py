@@ -63,7 +63,7 @@ def judge(problem: Problem, fit: Fit, period: float) -> Verdict:
     if not fit.converged:
         verdict.figures["not_converged"] = 1.0
     if verdict.sensor:
-        # with a faulty sensor the model cannot be judged
+        # measurements of a faulty sensor cannot show whether the model is right
         verdict.model.clear()
     _scale(problem, fit, verdict)
     return verdict

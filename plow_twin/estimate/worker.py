@@ -107,8 +107,8 @@ class Worker:
         self._closed = threading.Event()
         #: reason why estimating has ended; empty before
         self.error = ""
-        #: None until everything before `finish` is done; then the reason why the last window could not be estimated, or
-        #: empty
+        #: None until everything before `finish` is done; then an empty text, or the reason why the last window could
+        #: not be estimated
         self.ended: str | None = None
         self._thread = threading.Thread(target=self._send_queue, name="estimate", daemon=True)
         self._thread.start()

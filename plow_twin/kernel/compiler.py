@@ -150,7 +150,7 @@ def share(cache_file: Any) -> None:
         with cache_file._open_for_write(cache_file._data_path(name)) as file:
             file.write(code)
         overloads = cache_file._load_index()
-        if not overloads and Path(cache_file._index_path).exists():  # this index belongs to other sources
+        if not overloads and Path(cache_file._index_path).exists():  # the index on the disk belongs to other sources
             for old in Path(cache_file._cache_path).glob(f"{glob.escape(stem)}*.nbc"):
                 if old.name != name:
                     old.unlink(missing_ok=True)

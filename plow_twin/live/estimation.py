@@ -51,7 +51,7 @@ class Estimation:
         self.worker = Worker(scene, windows, asked)
         sent = {ESTIMATE: True, WINDOW_FORCES: bool(asked.members), FORECAST: asked.plan is not None}
         self._topics = [topic for topic, wanted in sent.items() if wanted]
-        #: time at which other pads were set [ns]; None once the empty message about them has been sent
+        #: time at which other pads were set [ns], until empty messages have withdrawn the estimate; otherwise None
         self._set_ns: int | None = None
         #: origin of the clearances, and trust in model and sensor, according to the newest estimate
         self.states = {"horizontal": State.PRIOR, "vertical": State.PRIOR}

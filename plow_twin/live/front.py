@@ -106,7 +106,7 @@ class BridgeFront:
         self.runtime = Runtime(self, settings, prepared)
         self._feeder = Feeder(self.roles, self.runtime, self.send, model if "drive" in self.roles else None)
         self._health = diagnostics.Health()
-        #: work that is done in turns while the source is read
+        #: work that is done between the messages while the source is read
         self.timers: list[Timer] = []
         self._watchers: list[Watcher] = []
         #: further parts of the diagnostics, by name
@@ -276,7 +276,7 @@ class BridgeFront:
 
     def _report(self) -> None:
         self.changed()
-        # the twin sends alarms only when a level changes; reports have their present values
+        # the twin itself sends alarms only when a level changes, so reports send their present values
         self.send(ALARMS, alarms_message(self.runtime.alarms, self.name, self._settings.hardware_id))
         for name, part in self.parts().items():
             self._tell(name, part)

@@ -71,7 +71,8 @@ class LoadModel:
         if not opinions:
             return None
         deviations = [max(deviation, 1.0) for _, deviation in opinions]
-        # relative to the smallest deviation: huge numbers do not overflow here, and a later check refuses them
+        # weights are relative to the smallest deviation, so that huge numbers do not overflow; a later check refuses
+        # them
         smallest = min(deviations)
         shares = [smallest / deviation for deviation in deviations]
         total = sum(share * share for share in shares)

@@ -115,7 +115,7 @@ class Publishing:
         self.held_frames = self.corrected_frames = 0
         #: steady time at which the samples of the next publication were received [ns]; 0: it has no samples
         self.received_ns = 0
-        #: stamp of the sample of a series whose alarms are being reported [ns]
+        #: while alarms of a series are reported: stamp of the sample that caused them [ns]
         self.series_ns: int | None = None
         self._newest: Rows | None = None
         self._catch_up = catch_up

@@ -351,8 +351,8 @@ class Runtime:
     def step_series(self, stamps: NDArray[np.int64], wrench: NDArray[np.float64]) -> Iterator[Outgoing]:
         """Use many samples of a source with its own time, like `step`; stamps [ns], shape (n,), wrenches (n, 3)."""
         if self.waits_for_clock or self.publishing.watch is not None or self.settings.record_ring:
-            # one by one, so that an observer gets each sample, and a ring the state after the sample that raised its
-            # alarm
+            # samples are used one by one, so that an observer gets each of them, and a ring gets the state after the
+            # sample that raised its alarm
             yield from self.step(list(zip(stamps.tolist(), map(tuple, wrench.tolist()), strict=True)))
             return
         self.publishing.received_ns = now_ns = time.monotonic_ns()

@@ -66,7 +66,7 @@ class WearKeeper:
         self._claim: int | None = claim_folder(folder)
         self._identity = scene_identity(scene)
         self._saved: tuple[float, ...] | None = None
-        self._own: tuple[bytes, ...] = ()  # possible contents of the file: as read, or as written last
+        self._own: tuple[bytes, ...] = ()  # contents that the file may have: those that were read or written last
         self._writer = ThreadPoolExecutor(1, thread_name_prefix="wear")
         self._writing: Future[None] | None = None
         #: why the wear could not be saved the last time; empty if it was saved
@@ -117,7 +117,8 @@ class WearKeeper:
     def _save(self, values: tuple[float, ...]) -> None:
         try:
             if not self._is_claimed():
-                # the folder was moved, removed or hidden by a mount: check which twin has the folder of that name now
+                # the folder was moved, removed or hidden by a mount; another twin may have claimed the folder that has
+                # its name now
                 self.release()
                 self._claim = claim_folder(self.folder)
             found = read_wear(self.folder)

@@ -147,7 +147,7 @@ class AlarmCheck:
 
     def _take(self, sequence: NDArray[np.int64], step: NDArray[np.int64], published: Published) -> None:
         if len(published.rows) == 1 and not published.finite:
-            return  # the message was not sent
+            return  # such a message is not sent
         for index in self._alarms.feed(published):
             self._say(int(sequence[index]), int(step[index]))
 

@@ -123,7 +123,7 @@ def readable_beside(run: Path, lost: Counter[str]) -> list[Path]:
     for folder in beside_folders(run):
         lost.update(recorded_losses(folder))
         parts = [*folder.glob("*.mcap")]
-        if any(is_begun(part) and is_mcap(part) for part in parts):  # the reader counts the unreadable files
+        if any(is_begun(part) and is_mcap(part) for part in parts):  # this folder's reader counts its unreadable files
             found.append(folder)
         else:
             lost.update("damaged_files" if is_begun(part) else "truncated_files" for part in parts)

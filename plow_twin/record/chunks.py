@@ -55,7 +55,7 @@ _MESSAGE_FIELDS: Final = MESSAGE_HEAD - _HEAD_SIZE
 _COLUMNS: Final = 6
 #: Chunks below this size [B] are scanned together.
 _SMALL: Final = 2**18
-#: The same limit if the large chunks between the small ones are not opened.
+#: The same limit for a reader that may skip the large chunks between the small ones.
 _SMALL_ALONE: Final = 2**20
 
 

@@ -128,7 +128,7 @@ def examine(path: Path) -> RunReport:
     report.parts = [_part(part) for part in reader.parts]
     expected: int | None = None if reader.header.part else 0
     run_time = RunTime(reader.header.parameters)
-    in_a_row = 0  # length of the gapless run of entries before the expected entry
+    in_a_row = 0  # number of consecutive entries directly before the expected entry
     inputs = InputCounts(reader.header.excitation_source)
     for batch in reader.batches(outputs=False):
         entries = batch.entries

@@ -196,7 +196,7 @@ class RunReader:
         size, before = self.size(), 0
         finished, cut = True, False
         for part in self._parts_to_read():
-            self.damaged_chunks += cut  # the previous part was cut: its last records may be missing here
+            self.damaged_chunks += cut  # if the previous part was cut off, its last records may be missing
             cut = False
             if self.tail is None and len(self.parts) > 1 and not is_begun(part):
                 finished, cut = False, True

@@ -163,7 +163,7 @@ class Recorder:
         )
         if header.follow == "full":
             each += tuple(map(header.topic, names_of(Cadence.FOLLOWED)))
-        #: topics of a publication by (has a slow part, is marked)
+        #: topics of a publication, by whether it has a slow part and whether it is marked
         self._topics_of = {
             (False, False): each, (True, False): each + slow, (False, True): each + marked,
             (True, True): each + slow + marked,
@@ -243,7 +243,7 @@ class Recorder:
                 if self._journal_gap:
                     self._push_entry(now, Loss(self._journal_gap))
                     self._journal_gap = 0
-                if snapshot:  # a note of the loss comes first, so that all later messages can be compared
+                if snapshot:  # notes of losses come before it, so that all messages after it can be compared
                     self._push_notes(now)
                 self._push_entry(now, entry)
                 self._snapshot_due = self._snapshot_due and not snapshot

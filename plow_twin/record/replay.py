@@ -159,9 +159,9 @@ class _Replay:
         absent = FOLLOWED_TOPICS if header.follow != "full" else ()
         self.topics = {header.topic(name): name for name in PUBLICATION_TOPICS if name not in absent}
         self.next_sequence = 0
-        self.in_a_row = 0  # length of the gapless run of entries before the next entry
+        self.in_a_row = 0  # number of consecutive entries directly before the next entry
         self.synced = False  # the session has the state of the live session
-        self.outputs_synced = False  # and its windows between messages equal those of the live session
+        self.outputs_synced = False  # its windows between messages equal those of the live session, too
         self.outputs_whole = True  # no message of the current batch may be missing without a note
         self.resumed = False  # no advance yet since the state was taken from a snapshot
         self.messages: Mapping[str, Message] | None = None
@@ -364,7 +364,7 @@ class _Replay:
     def entry(self, record: EntryRecord) -> None:
         """Apply or compare one entry of the journal."""
         if not self.report.entries and self.header.part:
-            self.next_sequence = record.sequence  # the earlier parts are missing
+            self.next_sequence = record.sequence  # the earlier parts of the recording are missing
             self.alarms.give_up()
         missing = (record.sequence - self.next_sequence) & _SEQUENCE_MASK
         if 0 < (-missing & _SEQUENCE_MASK) <= self.in_a_row:  # a repeated entry

@@ -33,7 +33,7 @@ class SentMessages:
         sequence = _joined(part.sequence for part in outputs)
         kind = _joined(tables[id(part.topics)][part.messages.channel] for part in outputs)
         begins = np.cumsum([0, *map(len, outputs)])
-        if (sequence[1:] < sequence[:-1]).any():  # the file is not from our recorder: each message becomes a part
+        if (sequence[1:] < sequence[:-1]).any():  # the file is from another recorder, so each message becomes a part
             order = np.argsort(sequence, kind="stable")
             owner = np.searchsorted(begins, order, side="right") - 1
             places = zip(owner.tolist(), (order - begins[owner]).tolist(), strict=True)

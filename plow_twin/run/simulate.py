@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 Method = Literal["events", "rk4", "euler"]
 Array = NDArray[np.float64]
 
-#: Type of a contact event: time in s, pair, contact mode before and after (0 off, 1 on, 2 clipped), penetration rate in
+#: Type of a contact event: time in s, pair, contact mode before and after (0 OFF, 1 ON, 2 CLIPPED), penetration rate in
 #: m/s.
 EVENT_DTYPE: Final = EVENT
 _ROWS_BY_DEFAULT = 1000

@@ -15,13 +15,13 @@ from plow_twin.solve.state import CLIPPED, CROSSING, OFF, ON, RATIO, RELEASED, S
 
 #: Two events are simultaneous if the time between them is less than this share of the step before them.
 _AT_ONCE = 1e-12
-#: Penetration at which a pair that is on is released, as a share of `Params.release`. The pair acts again at
+#: Penetration at which a pair changes from ON to RELEASED, as a share of `Params.release`. The pair is ON again at
 #: `Params.release` itself.
 _LET_GO = 0.25
 #: Allowances for rounding where all guards are proved at once: a factor on the sums, and an error of 1 + lambda d'.
 _ROUNDED, _ROUNDING = 1.0 + 1e-9, 1e-9
 _ALL_PAIRS = 2**PAIR_COUNT - 1
-#: Penetration below which a released pair counts as resting on its wall, as a share of `Params.release`.
+#: Penetration below which a RELEASED pair counts as resting on its wall, as a share of `Params.release`.
 _ON_THE_WALL = 1e-6
 
 
@@ -49,7 +49,7 @@ def _guards(p, state, w, order, penetrating, viscous, ramp) -> None:
     for pair in range(PAIR_COUNT):
         first = max(guard[0, pair], 0.0)
         if state.mode[pair] == ON:
-            # a pair is released at a quarter of the depth at which it acts again, so that it cannot alternate
+            # a pair becomes RELEASED at a quarter of the depth at which it is ON again, so that it cannot alternate
             first -= min(_LET_GO * p.release, 0.5 * first)
         elif state.mode[pair] == RELEASED and first <= _ON_THE_WALL * p.release:
             # the guard of a pair that rests on its wall turns negative a little outside the wall

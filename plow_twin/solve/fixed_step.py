@@ -86,7 +86,7 @@ def end_coarsely(p, parts, state, totals, target, bound) -> int:
     dt = (target - start) / bound.steps
     _to_world(p, parts.terms.support, state, z)
     for pair in range(PAIR_COUNT):
-        # a clipped or released pair counts as on, because it is inside its wall too
+        # a CLIPPED or RELEASED pair counts as ON, because it is inside its wall too
         state.mode[pair] = OFF if state.mode[pair] == OFF else ON
     pair_outputs(p, state, state.wear_depth, y, pen, rate, now)
     state.bounded += 1

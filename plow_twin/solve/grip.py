@@ -169,8 +169,8 @@ def grip_guard(p, state, w, order, pair, side) -> int:
         sign = 1.0 if side == 0 else -1.0
         for k in range(order):
             g[k] = p.static_friction * force[k, pair] - sign * drag[k, pair]
-        # the force is clipped at 0, because the error of the place of its touch can leave a pair that is on outside its
-        # wall
+        # a negative force counts as 0: a pair that is ON can lie slightly outside its wall, because the place of its
+        # touch has an error
         g[0] = p.static_friction * max(force[0, pair], 0.0) - sign * drag[0, pair]
         size, noise = p.static_friction * abs(force[0, pair]) + abs(drag[0, pair]), 0.0
         # the guard is raised by the rounding error of T, because otherwise a corner could slip as soon as it sticks
@@ -188,7 +188,7 @@ def grip_guard(p, state, w, order, pair, side) -> int:
         for k in range(1, order):
             power *= state.sigma_end
             noise = max(noise, _ROUNDING_OVER_STEP * abs(g[k]) * power)
-    # a first value within rounding error is clipped at 0, so that the higher orders decide
+    # a negative first value within rounding error is set to 0, so that the higher orders decide
     if abs(g[0]) <= _ROUNDING * size + noise:
         g[0] = max(g[0], 0.0)
     g[0] += late

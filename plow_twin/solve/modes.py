@@ -93,8 +93,8 @@ def _impact_speed(number, rate, energy) -> float:
     if number <= 0.0 or (energy <= 0.0 and rate == 0.0):
         return 0.0
     full = number - math.log1p(number)
-    # at its turning point, where the rate is 0, an impact of this speed has this energy; with a rate the impact was
-    # faster
+    # `low` is the speed of an impact that has this energy at its turning point, where the rate is 0; with a rate the
+    # impact was faster
     low = math.sqrt(number * number * energy / full)
     high = max(low, abs(rate)) * (1.0 + number)
     low = max(low, rate, -number * rate)
@@ -126,7 +126,7 @@ def _start_inside(p, state, pair, energy) -> None:
         number = p.damping_number
         speed = _impact_speed(number, rate, energy * mobility)
         if _falls(p) is not None:
-            # speed and damping depend on each other
+            # speed and damping depend on each other, so they are computed in turns
             for _ in range(_ROUNDS):
                 number = _damping_number(p, y, pair, speed)
                 speed = _impact_speed(number, rate, energy * mobility)

@@ -29,7 +29,8 @@ ACTS, DAMPS, BASE, SIGN, RATIO, SUM, FIRST, SECOND, RAMPS = range(9)
 OFF: Final = 0
 ON: Final = 1
 CLIPPED: Final = 2
-#: A pair penetrates less than `Params.release`, so that its force is negligible (exponents that are not integers).
+#: Mode for exponents that are not integers: the pair penetrates by less than `Params.release`, so its force is
+#: negligible.
 RELEASED: Final = 3
 #: Outcome of an event that does not change the mode: a pair crosses the end of its damping's ramp.
 CROSSING: Final = 4

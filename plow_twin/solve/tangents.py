@@ -70,7 +70,8 @@ ALONG: Final = np.dtype(
         ("turned", "f8", (_ROWS, PAIR_COUNT)),  # omega times the state
         ("arm_rate", "f8", (_ROWS, PAIR_COUNT)),
         ("arm_turned", "f8", (_ROWS, PAIR_COUNT)),  # derivative of an arm with respect to the angle
-        ("by_depth", "f8", (_ROWS, PAIR_COUNT)),  # derivatives of the force
+        # derivatives of the force with respect to penetration and to its rate
+        ("by_depth", "f8", (_ROWS, PAIR_COUNT)),
         ("by_rate", "f8", (_ROWS, PAIR_COUNT)),
         ("elastic", "f8", (_ROWS, PAIR_COUNT)),  # d^n
         ("slope", "f8", (_ROWS, PAIR_COUNT)),  # derivative of d^n with respect to d

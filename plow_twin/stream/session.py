@@ -243,7 +243,7 @@ class Session:
             case SetWear(_, depth):
                 self._on_entry(entry)
                 self._restart(np.array(depth))
-                # the estimate belongs to other pads
+                # the estimate no longer applies, because it belongs to other pads
                 self.outputs.clear_shift()
             case Estimated(shift=shift):
                 self._on_entry(entry)

@@ -132,7 +132,7 @@ def _plot(
     legend: rrb.Corner2D = rrb.Corner2D.RightTop,
     contents: Sequence[str] = ("$origin/**",),
 ) -> rrb.TimeSeriesView:
-    # rerun offers a corner inside the plot, or no legend
+    # rerun can put a legend only into a corner inside the plot
     return rrb.TimeSeriesView(origin=origin, contents=list(contents), name=name, plot_legend=legend)
 
 

@@ -45,7 +45,7 @@ def follow(
     for batch in reader.batches():
         if len(batch.entries) or batch.outputs:
             drawing.add(batch)
-        else:  # all that is recorded so far
+        else:  # all that is recorded so far has been read
             drawing.section_hz = SECTION_HZ
             drawing.flush()
             drawing.stream.flush()

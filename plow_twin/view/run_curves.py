@@ -28,7 +28,7 @@ _CLEARANCE_COLUMNS: Final = np.array(
     [CLEARANCE_NAMES.index(f"{axis}{point}") for axis in ("horizontal", "vertical") for point in ("", "/p05", "/p95")]
 )
 _NS: Final = 1e-9
-#: States of a clearance that the measurements determine.
+#: States of a clearance whose value comes from measurements.
 _KNOWN_STATES: Final = ("estimated", "rough")
 #: Largest number of events and of held stretches that are drawn; more would cover the picture.
 _MOST_MARKS: Final = 40
@@ -210,7 +210,7 @@ class RunCurves:
             self.clearance.add(self._seconds(rows.stamp_ns), values)
             self._clearance = values[-1]
             if self._estimate is not None and rows.sequence[-1] > self._estimate[0]:
-                self._estimate = None  # publications since then include the estimate
+                self._estimate = None  # publications after an estimate include it
         if "contact_forces" in found and "head_state" in found:
             for instant in _largest(found["contact_forces"], found["head_state"]):
                 if self.instant is None or instant.force.max() > self.instant.force.max():

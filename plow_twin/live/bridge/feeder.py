@@ -104,7 +104,7 @@ class Feeder:
             roles = self._by_topic.get(arrived.topic, ())
             for name, role in roles:
                 if len(roles) > 1 and role.empty(arrived):
-                    continue  # a row of another role
+                    continue  # the row has values of other roles only
                 if name in ("excitation", "drive"):
                     samples += self._sample(role, arrived)
                 elif name in self._optional:
@@ -199,7 +199,7 @@ class Feeder:
         wrench, deviation = load
         absurd = intake.limits is not None and intake.limits.exceeded(wrench)
         if absurd or not all(map(math.isfinite, (*wrench, *deviation))):
-            return [(stamp_ns, wrench)]  # neither the sample nor its deviation will be used
+            return [(stamp_ns, wrench)]  # the sample will be refused, so its deviation is not used either
         if any(abs(new - old) > _NOTABLE * max(new, old) for new, old in zip(deviation, self._deviation, strict=True)):
             self._deviation = deviation
             self._runtime.driver.spread(stamp_ns, deviation)

@@ -80,7 +80,7 @@ class _Tail:
     def _block(self) -> bytes:
         if self._file is None or self._is_another():
             rest = b"" if self._file is None or self._is_anew() else self._read()
-            if rest:  # the rest of a file that was moved away
+            if rest:  # these bytes are the rest of a file that was moved away
                 return rest
             try:
                 with _readable(self.path):
@@ -108,7 +108,7 @@ class _Tail:
 
     def _is_another(self) -> bool:
         """Return whether the file was rewritten, or another file is at its path."""
-        if isinstance(self._file, ParquetLines):  # the file is read once
+        if isinstance(self._file, ParquetLines):  # such a file is read once
             return False
         try:
             found = self.path.stat()

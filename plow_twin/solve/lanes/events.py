@@ -27,8 +27,9 @@ from plow_twin.solve.state import CLIPPED, COS, OFF, ON, SIN, X, Y
 
 #: Two events are simultaneous if the time between them is less than this share of the step before them.
 _AT_ONCE = 1e-12
-#: The search for a root ends if its relative change is below `_FOUND` and the curvature's part in it below `_STRAIGHT`,
-#: because the next change would be of the order of its cube, or if the change is a rounding error (`_ROUNDED`).
+#: The search for a root ends when its relative change is below `_FOUND` and the curvature's part in it is below
+#: `_STRAIGHT`, because then the next change would be of the order of this change's cube. It also ends when the relative
+#: change is a rounding error, below `_ROUNDED`.
 _FOUND, _STRAIGHT, _ROUNDED = 1e-6, 1e-3, 2e-16
 _MOST_CHANGES = 80
 #: A root found over a longer step is surely beyond the present step, in spite of rounding, if it exceeds this multiple

@@ -43,7 +43,7 @@ LANES: Final = np.dtype(
         ("bulge_step", "f8", _LANES_OF),  # step sizes that belong to the forces in `bulge`
         ("rows", "f8", (PAIR_COUNT, 5, WIDTH)),  # penetration: factors of cosine, sine, X, Y, constant
         ("arms", "f8", (PAIR_COUNT, 2, WIDTH)),  # arm: factors of cosine and sine
-        ("ratio", "f8", _PAIRS),  # C / K of pairs that are on
+        ("ratio", "f8", _PAIRS),  # C / K of pairs that are ON
         ("factor", "f8", _PAIRS),  # lambda
         ("gear", "f8", (PAIR_COUNT, 8, WIDTH)),  # factors of each slot's pairs: rows, arms, lambda
         # guards of a round: the penetration's rows, factors of d and d', a further constant
@@ -56,7 +56,7 @@ LANES: Final = np.dtype(
         ("sample", "f8", (3, WIDTH)),  # sampled loads: value of the last sample
         ("held", "f8", (3, WIDTH)),  # load at the step's start, including the constant loads
         ("knot", "f8", _LANES_OF),  # sampled loads: time of the last sample
-        ("small", "f8", _LANES_OF),  # a term over the longest wanted step has vanished below this size
+        ("small", "f8", _LANES_OF),  # size below which a term over the longest wanted step counts as vanished
         ("direction", "f8", (4, WIDTH)),
         ("inverse_mass", "f8", _LANES_OF),
         ("inverse_inertia", "f8", _LANES_OF),
@@ -78,7 +78,7 @@ LANES: Final = np.dtype(
         ("reach", "f8", _LANES_OF),  # guards of a round: end of the interval that is searched
         ("root", "f8", _LANES_OF),  # guards of a round: first root
         ("begin", "f8", _LANES_OF),  # guards of a round: time at which the pair has parted, else 0
-        ("parted", "f8", _PAIRS),  # time at which a clipped pair parts within the step, else infinity
+        ("parted", "f8", _PAIRS),  # time at which a CLIPPED pair parts within the step, else infinity
         ("peak", "f8", _PAIRS),
         ("impulse", "f8", _PAIRS),
         ("time_in_contact", "f8", _PAIRS),
@@ -88,8 +88,8 @@ LANES: Final = np.dtype(
         ("member", "i8", _LANES_OF),  # the scene in a lane, -1 for an empty lane
         ("mode", "i8", _PAIRS),
         ("switch", "i8", _PAIRS),  # modes that pairs take at the step's end, -1 for no change
-        ("on", "i8", (PAIR_COUNT,)),  # a bit for each lane in which the pair is on
-        ("off", "i8", (PAIR_COUNT,)),  # a bit for each lane in which the pair is off and can touch
+        ("on", "i8", (PAIR_COUNT,)),  # a bit for each lane in which the pair is ON
+        ("off", "i8", (PAIR_COUNT,)),  # a bit for each lane in which the pair is OFF and can touch
         ("taken", "i8", (PAIR_COUNT,)),  # a bit for each lane with a pair in the slot
         ("slot", "i8", _PAIRS),  # the pair in each slot
         ("watched", "i8", _LANES_OF),  # a bit for each guard that is always searched
@@ -104,9 +104,9 @@ LANES: Final = np.dtype(
         ("bulge_lane", "i8", _LANES_OF),
         ("orders", "i8", _LANES_OF),  # order of each lane's series; the terms beyond have vanished
         ("before", "i8", _LANES_OF),  # number of steps up to the last sample
-        ("carrying", "i8", _LANES_OF),  # a bit for each pair that is on
+        ("carrying", "i8", _LANES_OF),  # a bit for each pair that is ON
         # single numbers come last, so that every row before them fills a cache line
-        ("parting", "i8", (1,)),  # a bit for each lane in which a clipped pair parts
+        ("parting", "i8", (1,)),  # a bit for each lane in which a CLIPPED pair parts
         ("rounds", "i8", (1,)),
         ("bulges", "i8", (1,)),  # number of forces in `bulge`
         ("vanished", "i8", (1,)),  # a bit for each lane whose series ends early

@@ -120,7 +120,7 @@ def _implicit_type(size: int) -> np.dtype[np.void]:
             ("body", "f8", shape),  # body coordinates
             ("seen", "f8", shape),  # body coordinates relative to a frame on springs
             ("frame", "f8", shape),  # this frame's state, in the lanes of `w.frame`
-            # at the nodes: force, force by the law (of clipped pairs too), rate of penetration
+            # at the nodes: force, force that the law gives (also for CLIPPED pairs), rate of penetration
             ("pairs", "f8", (3, STAGES, PAIR_COUNT)),
             ("wearing", "f8", (STAGES, PAIR_COUNT)),  # rate of wear at the nodes
             ("wear_depth", "f8", shape),  # wear depth at the start and at the nodes

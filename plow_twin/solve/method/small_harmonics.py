@@ -29,7 +29,7 @@ from plow_twin.solve.state import ON, X, Y
 
 #: Number of halvings after which an eigenvalue is taken as zero.
 _HALVINGS = 40
-#: Evaluations of the equations of motion in this check.
+#: Number of evaluations of the equations of motion in this check.
 EVALUATIONS = 4
 
 
@@ -49,7 +49,7 @@ def _damping_at(p, acts, state, w, gyration) -> None:
     z, rate, moved = w.rest[0], w.rest[1], w.rest[2]
     accelerate(p, acts, True, state, state.step_start, z, w.rest[3, :3], rate)
     for j in range(3):
-        # the laws are linear in the rate
+        # a unit rate gives the exact derivative, because the laws are linear in the rate
         unit = gyration if j == 2 else 1.0
         z[3 + j] = 1.0 / unit
         accelerate(p, acts, True, state, state.step_start, z, w.rest[3, :3], moved)

@@ -26,8 +26,8 @@ _TOUCHES: Final = 64
 _TURN_IN_A_ROW: Final = 0.1
 #: Smallest number of rows of a first flight, from which its speeds are fitted.
 LEAST_ROWS: Final = 4
-#: Largest number of rows of the bands, which are 4 s (a block comes to rest within 1 s), and a speed in m/s that no
-#: drop reaches.
+#: Largest number of rows of the bands, which is 4 s (a block comes to rest within 1 s). A speed in m/s that no drop
+#: reaches.
 _MOST_ROWS, _FASTEST = 1000, 100.0
 
 #: Parameters of the block, fitted to the odd-numbered drops.

@@ -96,7 +96,7 @@ class Link:
         #: namespaces of the server, by number
         self.uris = list(uris)
         self._sampling_ms, self._take, self._counts = sampling_ms, take, counts
-        # a late answer does not mean that the server has gone
+        # the watchdog waits for three intervals, because a late answer does not mean that the server has gone
         self._client = Client(access.url, timeout=_ANSWER_S, watchdog_intervall=3.0 * _KEEPALIVE_S)
         _bound(self._client)
         if access.user:
@@ -132,7 +132,7 @@ class Link:
         """Disconnect."""
         try:
             await asyncio.wait_for(self._client.disconnect(), _CLOSE_S)
-        except Exception:  # the connection may be in any state
+        except Exception:  # any error can occur, because the connection may be in any state
             self._client.disconnect_socket()
 
     def _placed(self, node: ua.NodeId, uris: Sequence[str]) -> ua.NodeId:
