@@ -47,8 +47,9 @@ class Row:
     steps: int | None = None
     evaluations: int | None = None
     events: int | None = None
-    #: the section's figure: members beyond the listed error, multiple of real time, share of a core, error in
-    #: tolerances, ratio of times, or number of compiled kernels
+    #: the figure that the case's section compares. Depending on the section it is the number of members beyond the
+    #: listed error, a multiple of real time, a share of a core, an error in tolerances, a ratio of times, or a number
+    #: of compiled kernels
     value: float | None = None
     #: growth of a small displacement at t = 0 (in the sections of random scenes and of the ensemble)
     amplification: float | None = None

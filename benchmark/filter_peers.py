@@ -83,7 +83,7 @@ class Members:
         self._params = new_records(PARAMS, count)
         self._params[:] = compiled.params
         clearance = scene.clearance
-        # the penetrations' rows are linear in the clearances
+        # two other clearances give the slopes of the penetrations' rows, which are linear in the clearances
         self._rows = np.array(compiled.params["penetration_rows"])
         wider = (
             Clearance(clearance.horizontal_m + 1e-3, clearance.vertical_m),

@@ -382,7 +382,7 @@ def soak(minutes: float, rate_hz: float) -> bool:
                 "threads": _status(process_id, "Threads"),
                 "files": len(os.listdir(f"/proc/{process_id}/fd")),
                 "core": round((_cpu_s(process_id) - busy) / PERIOD_S, 3),
-                "age_p50_ms": round(ages[len(ages) // 2], 3) if ages else None,  # None without a clock
+                "age_p50_ms": round(ages[len(ages) // 2], 3) if ages else None,  # without a clock there are no ages
                 "age_p99_ms": round(ages[len(ages) * 99 // 100], 3) if ages else None,
                 "queued": int(figures.get("queued") or 0),
                 **_account(figures),
@@ -419,7 +419,7 @@ def _growth(minutes: list[float], sizes: list[float]) -> tuple[float, float]:
     hours, means = np.array([part.mean(axis=1) for part in blocks]).T / np.array([[60.0], [1.0]])
     (slope, start), away = np.polyfit(hours, means, 1), hours - hours.mean()
     spread = math.sqrt(((means - slope * hours - start) ** 2).sum() / (len(blocks) - 2) / (away**2).sum())
-    return float(slope), 2.776 * spread  # Student's t of four degrees of freedom
+    return float(slope), 2.776 * spread  # 97.5 % point of Student's t with four degrees of freedom
 
 
 def _account(figures: dict[str, str]) -> dict[str, int]:

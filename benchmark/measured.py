@@ -186,7 +186,7 @@ def drumwright_shell(slip, rate, tt, nn, tn, e, mu):  # type: ignore[no-untyped-
     away, along = (tn * slip - tt * rate) / determinant, (tn * rate - nn * slip) / determinant
     slides = np.abs(along) > mu * away
     side = np.sign(along)
-    # the impulse on the cone's edge, in the direction (side mu, 1), with the least energy and no approach
+    # the impulse along the edge of the friction cone, (side mu, 1), that leaves the least energy and no approach
     least = -(side * mu * slip + rate) / (tt * mu**2 + 2.0 * side * mu * tn + nn)
     stopped = -rate / (nn + tn * mu * side)
     away = np.where(slides, np.maximum(least, stopped), away)

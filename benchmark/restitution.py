@@ -186,7 +186,7 @@ def write_csv(rows: Sequence[Row], path: Path) -> None:
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["law", "asked", "ramp", "delivered"])
-        # the first nine digits are the same on every machine
+        # nine digits are written, because these are the same on every machine
         writer.writerows([row.law, f"{row.asked:g}", f"{row.ramp:g}", f"{row.delivered:.9f}"] for row in rows)
 
 

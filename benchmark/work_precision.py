@@ -43,8 +43,8 @@ LEAN_STEPS = (*FIXED_STEPS, 5e-6, 2e-6, 1e-6)
 _LADDER = _decades(2, 13)
 #: Tolerances of CVODE in C, down to the tolerance at which it breaks down.
 _C_LADDER = _decades(2, 14)
-#: Tolerances of `solve_ivp`, whose loop in Python is slow: it is run with sparse output only, and Radau and BDF, which
-#: take seconds, only at whole decades.
+#: Tolerances of `solve_ivp`. Its loop in Python is slow, so it is run with sparse output only. Radau and BDF take
+#: seconds, so they are run only at whole decades.
 _SOLVE_IVP = {"LSODA": _decades(3, 12), "DOP853": _decades(3, 12), "Radau": _decades(3, 8, 1), "BDF": _decades(3, 8, 1)}
 _MUJOCO = {"Euler": (1e-3, 5e-4, 2e-4, 1e-4), "implicitfast": (1e-3, 5e-4), "RK4": (1e-3, 5e-4, 2e-4)}
 _EXUDYN = {"VelocityVerlet": (1e-3, 5e-4, 2e-4, 1e-4), "RK44": (1e-3, 5e-4, 2e-4), "RK67": (1e-3, 5e-4)}

@@ -116,8 +116,8 @@ def test_a_target_is_reached_when_the_peer_takes_so_many_times_as_long() -> None
         "print(sorted(levels.contenders([row(w.OURS_BARE, 'tol', 1.0, 1e-7), *ladder])))\n"
     )
     within, beyond, without, contenders = run(f"exec({code!r})").strip().splitlines()
-    # at 1e-6 the target, a thirtieth of the peer's time, is 0.667 ms; at 1e-9 the peer has no row, so the target is
-    # reached
+    # at 1e-6 the target is 0.667 ms, a thirtieth of the peer's time; at 1e-9 the peer has no row, so the target counts
+    # as reached
     assert within == "[True, True]" and beyond == "[False, True]"
     assert without == "[]" and contenders == "[0, 1, 2]"
 

@@ -91,7 +91,7 @@ def test_errors_that_a_function_raises_are_documented(package: griffe.Module) ->
         if function.is_function:
             raised = {*re.findall(r"^ +raise (\w+)\(", function.source, re.MULTILINE)}
             said = function.docstring.value
-            # an ArgumentError is a ValueError
+            # a docstring that names ValueError covers ArgumentError, which is a ValueError
             said += "ArgumentError" if "ValueError" in said else ""
             lacking += [f"{name}: {error}" for error in raised if error not in said]
     assert lacking == []

@@ -48,7 +48,7 @@ def test_height_of_the_table_follows_from_measured_drops(drops) -> None:
     known = [one for one in found if one.vertical_state.known]
     assert len(known) > 0.9 * len(found)
     true = SQUARE.clearance.vertical_m
-    # the height of the table is half of the clearance
+    # the error of the table's height is half the error of the clearance
     off = 0.5 * np.array([one.vertical.mean - true for one in known])
     assert np.median(np.abs(off)) < 5e-4
     inside = np.mean([one.vertical.p05 < true < one.vertical.p95 for one in known])
@@ -73,14 +73,14 @@ def test_walls_that_are_never_met_are_not_observable(drops) -> None:
     assert found.bias_x is None and found.bias_y is None and found.bias_theta is not None
     assert found.horizontal_state is State.NOT_OBSERVABLE
     assert found.horizontal.mean == SQUARE.clearance.horizontal_m
-    # this is the deviation that the scene states
+    # the deviation is the one that the scene states
     assert found.horizontal.deviation == pytest.approx(2e-3)
     assert found.stiffness is not None and found.stiffness.deviation == pytest.approx(1e6, rel=0.05)
     assert any("0 impacts on the right wall" in reason for reason in found.reasons)
 
 
 def test_impact_on_something_else_is_left_out_and_named(drops) -> None:
-    # the block hits an obstacle 0.7 m from the origin
+    # in this drop the block hits an obstacle 0.7 m from the origin
     found = of_drop(drops, 10)
     assert found.horizontal_state is State.NOT_OBSERVABLE
     assert any(reason.startswith("left wall: 1 impacts left out, got one at 0.69") for reason in found.reasons)

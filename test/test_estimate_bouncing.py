@@ -80,7 +80,7 @@ def test_a_method_that_disagrees_widens_the_interval() -> None:
     both = with_bounced(fitted, bounced, 0)
     assert both.horizontal.deviation == pytest.approx(2.4e-5)
     assert both.horizontal.mean == pytest.approx(0.0300108)
-    # the two results are 8 deviations apart, and the interval contains both
+    # the two vertical results are 8 deviations apart, so the interval is widened to contain both
     assert both.vertical.p05 < 0.0201 and both.vertical.p95 > 0.0202
     assert both.vertical.deviation == pytest.approx(8.0 * 2.4e-5)
     unlike = with_bounced(fitted, replace(bounced, distance=2.0 * tuning.MOST_DISTANCE), 0)
@@ -212,7 +212,7 @@ def test_what_a_hard_motion_hides_widens_the_clearances_and_not_the_twins() -> N
     assert back.apparent == result.apparent
     scenes, _ = draw_scenes(truth.nominal, back, 50, np.random.default_rng(0))
     assert np.std([scene.clearance.horizontal_m for scene in scenes]) < 7e-5
-    # a deviation of the sides that the scene states includes the corners
+    # nothing is added for round corners, because a deviation of the sides that the scene states covers the corners
     exact = Provenance(Mark.MEASURED, deviation=0.0)
     marks = {**truth.nominal.marks, "frame.width_m": exact, "frame.height_m": exact}
     stated = replace(unknowns, scene=replace(truth.nominal, marks=marks))

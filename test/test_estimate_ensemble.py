@@ -49,7 +49,7 @@ def test_a_thinned_load_gives_the_same_forces(noise: float) -> None:
     load = Load(t, wrench)
     few = followed(load, truth.load.period())
     assert len(few.t) < 0.3 * len(t)
-    # both begin 3.1 s after the first sample, however dense the samples are
+    # with both loads the forces begin 3.1 s after the first sample, however dense the samples are
     each = [forces_of(truth.nominal, result, one, 60, 3.1, over_time=False) for one in (load, few)]
     assert each[0].start == each[1].start == pytest.approx(3.1)
     for one, other in ((each[0].peak, each[1].peak), (each[0].impulse, each[1].impulse)):

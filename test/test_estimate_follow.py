@@ -185,7 +185,7 @@ def test_a_rough_estimate_of_the_same_motion_does_not_replace_one_that_is_not_ro
     same.restore(follower.snapshot())
     for one in (follower, same):
         _run(one, truth, 0.6, 0.5)
-        assert not _take(one, rough)  # only 0.1 s of its window of 1 s is new
+        assert not _take(one, rough)  # the estimate is refused, because only 0.1 s of its window of 1 s is new
         _run(one, truth, 0.8, 0.6)
         assert _take(one, rough)
 

@@ -101,7 +101,7 @@ def test_quantiles_scale_with_the_coefficient_and_the_horizon_cuts(tmp_path: Pat
     assert other["p50"]["hours"] < 0.55 * facts["p50"]["hours"]
     assert other["probability_before_stop"] >= facts["probability_before_stop"]
     assert picture.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
-    # the clearance is at its limit when the limit is reached
+    # just before the median time at which a limit is reached, a clearance is at its limit
     now = life.clearances(np.zeros(1))[1, 0]
     assert now == pytest.approx([0.025, 0.030], abs=1e-9)
     late = life.clearances(np.array([0.99 * p50]))[1, 0]

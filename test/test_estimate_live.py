@@ -48,8 +48,7 @@ from estimate_truths import GROUPS, Truth, draw
 #: Stamp of the first sample [ns].
 START_NS = 1_700_000_000_000_000_000
 WINDOW_S, INTERVAL_S, WAIT_S = 10.0, 4.0, 2.0
-#: Settings with which a busy machine loses no sample and no pose, because a window with missing rows would not be the
-#: same.
+#: Settings with which a busy machine loses no sample and no pose: with missing rows a window would differ.
 RELIABLE = {
     f"qos_overrides.{{ns}}/{topic}.subscription.reliability": "reliable"
     for topic in ("excitation", "head_pose", "gaps")
@@ -199,7 +198,7 @@ def test_the_live_estimate_is_published_and_given_again_by_the_journal(tmp_path:
     # gaps were measured too, and give the clearances of the groups of pads
     group = facts["groups"]["horizontal_top"]
     assert group["mean_m"] == pytest.approx(truth.clearance[0], abs=3e-4) and group["p95_m"] - group["p05_m"] > 4e-4
-    # the results that depend on the estimate are the same too
+    # forecast and forces depend on the estimate, and are the same too
     assert facts["forecast"] == json.loads(answer.message)
     told = dict(zip(forecasts[-1].name, forecasts[-1].position, strict=True))
     assert told["seconds/p50"] == pytest.approx(3600.0 * facts["forecast"]["p50"]["hours"])
@@ -287,7 +286,7 @@ def test_other_pads_and_other_model_numbers_discard_earlier_estimates(
     # an estimate of the previous machine is being computed
     estimation.worker.found.append(_found(State.ESTIMATED, State.ESTIMATED))
     session.apply(SetModel(START_NS, json.dumps({"clearance.horizontal_m": 0.026})))
-    # the clearance is that of the model again: an estimate is not kept if the other clearance is not observable
+    # the clearance is that of the model again, because an estimate is not kept if the other clearance is not observable
     assert estimation.entry is None and set(estimation.states.values()) == {State.PRIOR}
     assert estimation.forecast is not None and estimation.poll(session) == {}
     told()

@@ -284,7 +284,7 @@ def test_a_machine_at_rest_does_not_make_the_model_suspect() -> None:
         result = estimate(truth.nominal, Load.of(t, load)[0], Poses.of(t, rests)[0])
         assert result.horizontal_state is result.vertical_state is State.NOT_OBSERVABLE
         assert (result.model, result.sensor) == ("ok", "ok") and "the head rests" in result.reasons[0]
-    # a head that has just come to rest has the small scatter of a hard wall, but no other sign of it
+    # the poses of a head that has just come to rest scatter as little as at a hard wall, but show no other sign of one
     rests[:200] += np.linspace(1e-2, 0.0, 200)[:, None]
     result = estimate(truth.nominal, Load.of(t, idle)[0], Poses.of(t, rests)[0])
     assert (result.horizontal_state, result.model) == (State.NOT_OBSERVABLE, "ok")

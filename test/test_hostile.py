@@ -255,7 +255,7 @@ def test_absurd_recordings_end_with_one_line(kind: str, tmp_path: Path) -> None:
     assert len(answers) == len(asked), done.stderr[-2000:]
     for name, words, code, text, memory_mb in answers:
         where = (name, words[0], code, memory_mb, text[-500:])
-        unread = name == "header_file" and words[0] != "replay"  # commands that need no scene
+        unread = name == "header_file" and words[0] != "replay"  # these commands need no scene
         assert code in ((3,) if name in WITH_LOSS else (2,) if name in ABOVE else (0,) if unread else (1, 2)), where
         assert memory_mb < MOST_MB and "Traceback" not in text, where
         assert code == 3 or len(text.strip().splitlines()) <= 2, where

@@ -293,8 +293,8 @@ def test_the_senders_own_numbers_show_loss_repetition_and_a_new_start(tmp_path: 
     ("numbers", "lost"),
     [
         *((["1", "2", *map(str, range(3, 150)), stray, *map(str, range(151, 301))], 0) for stray in STRAY),
-        # the numbers continue after a jump back to the start of a new count, a jump ahead, or a jump to an impossible
-        # time
+        # the numbers go on after a jump back to the start of a new count, after a jump ahead, and after a jump so large
+        # that it cannot be a loss
         ([*map(str, range(2000, 2150)), *map(str, range(2, 150))], 1),
         ([*map(str, range(1, 150)), *map(str, range(5000, 5150))], 4850),
         ([*map(str, range(1, 150)), *map(str, range(10**15, 10**15 + 150))], 0),
@@ -494,7 +494,7 @@ def test_a_file_is_followed_while_it_grows_and_when_it_is_replaced(tmp_path: Pat
     path, run = tmp_path / "load.csv", tmp_path / "run"
     _csv(path, 100)
     arguments = (str(path), "--follow", "--record", str(run), "--set", "excitation_timeout=3600")
-    # the default, not the handler of a `nohup` around the tests
+    # the twin gets the default handler of SIGHUP, not that of a `nohup` around the tests
     with _live(*arguments, preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL)) as live:
         live.until_count("samples_used", 100)
         text = "".join(",".join(map(repr, _row(index))) + "\n" for index in range(100, 200))
@@ -575,12 +575,12 @@ def test_files_with_dates_are_waited_for_and_followed_from_one_to_the_next(
         with days[1].open("a") as before:
             days[2].write_text("t,fx,fy,m\n" + text(150, 200))
             live.until_count("samples_used", 150)
-            before.write(text(100, 150))  # the writer wrote these rows late, so the motion is corrected
+            before.write(text(100, 150))  # these rows are written late, so the motion is corrected
         values = live.until_count("samples_used", 200)
         assert (values["samples_in"], values["rolled_back"]) == ("200", "50")
         assert live.stop() == 0
-    # without --follow the files are read in the order of the numbers in their names; a single file with a date in its
-    # name needs no other mapping
+    # without --follow the files are read in the order of the numbers in their names; the same mapping suits a single
+    # file with a date in its name
     days[0].write_text("t,fx,fy,m\n" + text(-30, 0))
     for source, count in ((arguments[0], 230), (str(days[0]), 30)):
         assert run_cli(["live", source, "--map", str(mapping), "--json"]) == 0

@@ -240,7 +240,7 @@ def test_intervals_of_peaks_and_impulses_are_those_of_the_span_that_is_published
     for name in ("force", "peak", "impulse"):
         value, low, high = (live.column(f"{name}{end}") for end in ("", "_low", "_high"))
         assert (low <= value).all() and (value <= high).all() and (high > low).any()
-    # the peaks of one publication are at least those of its parts
+    # the peaks of one long publication are at least those of the short publications in the same time
     other = Live(truth.nominal)
     for entry in _in_turn(truth, 0.0, 1.0):
         other.session.apply(entry)

@@ -458,7 +458,7 @@ def test_a_user_signs_in_by_certificate_and_no_other_one_does(
             assert len(_until(bridge, lambda found: len(found) >= 5)) >= 5
         finally:
             bridge.close()
-    # someone has copied the certificate, but has no key for it
+    # a certificate is refused if it was copied by someone who does not have its key
     stolen = replace(access, user_certificate=certificates / "user.pem", user_key=certificates / "other.key.pem")
     bridge = OpcUa(stolen, roles)
     with pytest.raises(BridgeError, match="refused"):

@@ -52,7 +52,7 @@ MESSAGES = {
     f"{name}_msgs"
     for name in ("diagnostic", "geometry", "lifecycle", "nav", "rosgraph", "sensor", "std", "visualization", "tf2")
 }
-#: Libraries beside numpy, by subpackage.
+#: For each subpackage, the libraries beside numpy that it may import.
 LIBRARIES = {
     "build": {"numba", "llvmlite"},
     "kernel": {"numba", "llvmlite"},

@@ -54,7 +54,7 @@ def test_losses_of_a_recording_are_known_after_one_reading_of_its_tables(run: Ru
     cut.write_bytes(whole[: len(whole) * 3 // 4])
     alone, read = plow_twin.read_recording(cut), plow_twin.read_recording(cut)
     read["contact_peaks"].numpy()
-    cut.unlink()  # no byte is read a second time
+    cut.unlink()  # the file is no longer needed, because no byte is read a second time
     assert read.losses()
     cut.write_bytes(whole[: len(whole) * 3 // 4])
     assert alone.losses() == read.losses()

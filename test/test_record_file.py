@@ -179,7 +179,7 @@ def test_a_file_cut_anywhere_gives_its_content_before_the_cut(run: Run, tmp_path
         cut_file.write_bytes(data[:cut])
         reader = RunReader(cut_file)
         records = list(reader)
-        # journal and outputs are in separate chunks; the records that are left of either are its first ones
+        # journal and outputs are in separate chunks, so the first records of each are left
         for kind in (EntryRecord, OutputRecord):
             found = [record for record in records if isinstance(record, kind)]
             assert found == [record for record in whole if isinstance(record, kind)][: len(found)]
@@ -214,7 +214,7 @@ def write_large(source: Path, target: Path, images: int, image_size: int, attach
 
     data = source.read_bytes()
     head = 8
-    for _ in range(2):  # skip the header of the file, and the header of the run
+    for _ in range(2):  # these two records are skipped: the header of the file, and the header of the run
         head += 9 + struct.unpack_from("<Q", data, head + 1)[0]
     schema = struct.pack("<H", 60_000) + text("sensor_msgs/msg/Image") + text("ros2msg") + text("uint8[] data")
     channel = struct.pack("<HH", 60_000, 60_000) + text("/camera") + text("cdr") + struct.pack("<I", 0)

@@ -195,7 +195,7 @@ def test_a_full_queue_is_counted_and_noted_in_the_file(tmp_path: Path) -> None:
     assert [r.publish_time_ns for r in records if isinstance(r, OutputRecord)] == kept_messages
     assert sum(entry.count for entry in entries if isinstance(entry, Loss)) == loss.lost[JOURNAL]
     assert sum(entry.count for entry in entries if isinstance(entry, Dropped)) == loss.lost[TOPIC]
-    # notes of lost messages may be in between, because a loss is noted before the snapshot
+    # notes of lost messages are left out, because they may come between the note of a lost entry and the snapshot
     told = [entry for entry in entries if not isinstance(entry, Dropped)]
     for entry, following in itertools.pairwise(told):
         assert not isinstance(entry, Loss) or isinstance(following, Snapshot)

@@ -55,7 +55,7 @@ def test_saved_wear_is_loaded_to_the_bit_and_no_other_file_stays_behind(tmp_path
     _save(folder)
     assert _loaded(folder, "head 7", SCENE) == DEPTH
     assert os.listdir(folder) == [FILE_NAME]
-    # loads and the numbers of the contact do not concern the pads
+    # the wear is kept for a scene with other loads, because loads do not concern the pads
     assert _loaded(folder, "head 7", replace(SCENE, loads=())) == DEPTH
 
 
@@ -163,7 +163,7 @@ def test_wear_that_could_not_be_saved_goes_on_unless_the_file_is_another_one(
 
         def fail(descriptor: int) -> None:
             calls.append(descriptor)
-            # the write of the file fails, or that of the folder when the new file already exists
+            # the write of the file fails, or the write of the folder, when the new file already exists
             if len(calls) == 1 + waited:
                 raise OSError(28, "No space left on device")
 

@@ -230,7 +230,7 @@ def test_damaged_bytes_on_every_input_are_counted_to_the_last_one(tmp_path: Path
         assert running.twin.stop() == 0
     report = replay(tmp_path / "run")
     assert report.exit_code == 0 and report.samples > 2900
-    # the file agrees, message by message
+    # the file accounts for every message
     assert sum(report.inputs["tool_forces"].values()) == 3000
 
 
@@ -296,7 +296,7 @@ def test_the_scene_s_loads_follow_a_clock_that_is_paused_looped_and_fast(tmp_pat
         for _ in range(3):  # while paused, three reports show no motion
             probe.figures("output")
         assert len(forces) == count and probe.figures("state")["resets"] == "0"
-        # one message for each second of the head, each after the answer to the message before
+        # the clock advances by a second with each message, which is sent once the message before is answered
         for second in range(1, 8):
             reach(T0 + second * 1000 * MS)
         assert probe.figures("state")["resets"] == "0"

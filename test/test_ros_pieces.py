@@ -54,7 +54,7 @@ def test_the_policy_allows_exactly_the_names_of_the_node(tmp_path: Path) -> None
     assert _rights("/plow_twin/twin", "service", "reply", ns) == answered
     assert _rights("/plow_twin/manager", "service", "request", ns) == answered
     assert {f"{ns}/plow_twin/{service}" for service in SERVICES} <= answered
-    # the sender of the load has no other rights
+    # the sender of the load may publish the inputs, and has no other rights
     assert not _rights("/plow_twin/plant", "service", "request", ns)
     assert _rights("/plow_twin/plant", "topic", "publish", ns) - {"/rosout"} == taken - {"/parameter_events"}
 

@@ -79,7 +79,7 @@ def _node(**parameters: Any) -> Iterator[TwinNode]:
 
 
 def test_a_failed_configure_leaves_nothing_behind(tmp_path: Path) -> None:
-    # the node makes this input last, so the other inputs exist by then
+    # the node makes this input last, so the other inputs exist when it fails
     override = f"qos_overrides./r{os.getpid()}/head_pose.subscription.reliability"
     with _node(**{override: "bogus", "record_path": str(tmp_path / "run")}) as node:
         threads = set(threading.enumerate())
@@ -309,7 +309,7 @@ def test_under_a_flood_of_samples_due_work_is_done_and_others_have_their_turn() 
 
 
 def test_a_queue_that_fills_while_it_is_emptied_is_emptied_to_its_end() -> None:
-    # as many messages are requested as were signalled; newer messages must not displace the rest of a turn
+    # a turn requests as many messages as were signalled; newer messages must not displace those that are left
     with _node() as node:
         heard: list[int] = []
         subscription = node.create_subscription(TwistStamped, "burst", lambda _: None, sensor_input(1000), raw=True)

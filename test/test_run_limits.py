@@ -112,7 +112,7 @@ def test_a_twin_stops_at_its_limits_where_its_last_advance_ended() -> None:
     samples = np.stack([4e4 * np.sin(2.0 * times), 1e4 * np.cos(2.0 * times), 3e4 * np.sin(2.0 * times)], axis=1)
     free = Twin(BENCH, excitation="sampled")
     whole = free.advance_samples(times, samples)
-    # a limit of steps belongs to the motion, so an advance beyond it is undone and gets a status
+    # a limit of steps belongs to the motion, so an advance that needs more steps is undone and gets a status
     tied = Twin(BENCH, excitation="sampled", max_steps=1)
     assert {tied.advance(t, load).status.name for t, load in zip(times[:50], samples, strict=False)} == {"OK", "BUDGET"}
     for name in ("sampled", "scene"):

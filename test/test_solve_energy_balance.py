@@ -29,7 +29,8 @@ SCENES = {
     "locked": replace(PAPER, locked=("y",)),
 }
 SCENES["offset, wear"] = replace(SCENES["offset"], wear=SCENES["wear"].wear)
-# each of these compiles its own kernels; test_solve_ramp covers a ramp, test_solve_falling the law of `paper`
+# only the full run has these scenes, each of which compiles its own kernels; in the quick run test_solve_ramp covers a
+# ramp, and test_solve_falling the law of `paper`
 FULL_COUNT = ("paper", "bench_hc", "offset", "ramp", "wear", "locked")
 
 

@@ -250,7 +250,7 @@ def search(structure: str, examples: int) -> None:
     shrinking = settings.get_current_profile_name() == "stress"
     phases = [Phase.generate, Phase.shrink] if shrinking else [Phase.generate]
 
-    # the full run covers the other cases
+    # the quick run draws only cases whose kernels other tests compile; the full run covers the other cases
     drawn = cases(structure) if shrinking else cases(structure).filter(has_kernels_of_others)
 
     @settings(max_examples=examples, phases=phases, suppress_health_check=list(HealthCheck))

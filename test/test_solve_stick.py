@@ -243,7 +243,7 @@ def test_painleves_case_is_an_impact_without_collision() -> None:
         assert result.energy_balance is not None and result.energy_balance.relative_imbalance < 1e-8
         p = 1.0 / mass + 0.05**2 / inertia - (1.0 if jams else -1.0) * mu * 0.05 * 0.3 / inertia
         assert (p < 0.0) == jams
-        # d'' = -p N while the corner slips
+        # the corner moves by d'' = -p N while it slips
         rate, t = math.sqrt(abs(p) * stiffness), result.t[1:40]
         expected = stiffness * 1e-3 / rate * (np.sinh(rate * t) if jams else np.sin(rate * t))
         assert result.force[1:40, pair] == pytest.approx(expected, rel=0.02)

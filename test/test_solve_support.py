@@ -53,8 +53,8 @@ def test_two_masses_pressed_together_move_as_their_eigenmodes() -> None:
     omega, amplitude = 40.0, 4e3
     scene = pressed(Harmonic("up and down", (0.0, amplitude), omega_rad_s=omega))
     result = simulate(scene, 1.0, output_dt=0.01, tol=1e-10)
-    # the state: y of the head and v of the frame (from the place where contact begins), their rates, weight, sine and
-    # cosine of the load
+    # the state has y of the head and v of the frame (both from the place where contact begins), their rates, the
+    # weight, and sine and cosine of the load
     k, c, mass = 2.0 * LAW.stiffness, 2.0 * (LAW.damping or 0.0), HEAD.mass_kg
     matrix = np.zeros((7, 7))
     matrix[0, 2] = matrix[1, 3] = 1.0

@@ -233,7 +233,7 @@ def test_running_in_and_sliding_in_the_plane_wear_live_as_offline_and_go_on_afte
         return simulate(worn, 2e-3 * (STEPS - 1), 0.1, tol=Twin(scene).tol).wear_depth
 
     new = lived(WearKeeper(tmp_path, "head 7", scene))
-    # equal within the solver's tolerance of the motion
+    # the wear is equal within the solver's tolerance of the motion
     assert new == pytest.approx(offline(np.zeros(8)), rel=1e-3, abs=1e-12)
     assert new.max() > 1.5 * wear.running_in_depth_m
     worn = lived(WearKeeper(tmp_path, "head 7", scene))

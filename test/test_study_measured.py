@@ -67,7 +67,7 @@ def test_impact_is_an_impulse_at_the_lowest_point_that_gains_no_energy(impacts) 
     after = impact(before, contact)
     change = after - before
     along, up = contact_arms(before[:, 2])
-    # the data's x has the opposite sign of an x that is right-handed with theta, hence the plus
+    # the plus stands here because the data's x has the opposite sign of an x that is right-handed with theta
     moment = along * change[:, 4] + up * change[:, 3]
     np.testing.assert_allclose(change[:, 5], moment / GYRATION**2, atol=1e-9)
     assert (energy(after) < energy(before)).all()

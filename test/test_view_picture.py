@@ -75,7 +75,8 @@ def test_an_estimate_and_a_changed_parameter_are_marked_and_are_no_wear(tmp_path
     clearance = figures[0].axes[4]
     assert clearance.get_ylabel().endswith("[mm]")
     horizontal = np.asarray(clearance.lines[0].get_ydata(), float)
-    np.testing.assert_allclose(np.unique(horizontal.round(6)), [25.0, 26.0, 31.0])  # a changed model ends the estimate
+    # the change of the model ends the estimate
+    np.testing.assert_allclose(np.unique(horizontal.round(6)), [25.0, 26.0, 31.0])
     marks = {text.get_text(): text.xy[0] for text in clearance.texts if isinstance(text, Annotation)}
     # the estimate of a window that ended earlier is valid from its arrival on
     assert marks == {"first estimate": pytest.approx(0.399), "parameters set": pytest.approx(0.5)}

@@ -431,8 +431,8 @@ def test_the_legends_of_the_clearance_are_not_cut_in_a_low_window(
             for entity, name in curve_names(view[0].path).items()
             if entity.startswith(f"/{group}/") and not entity.endswith(("/p05", "/p95"))
         }
-        # each line of a legend takes 23 pixels, and equal names share a line; a legend of 94 pixels in a plot of 112
-        # lost its last line
+        # each line of a legend takes 23 pixels, and equal names share a line; when a legend needed 94 pixels of a plot
+        # 112 pixels high, its last line was cut off
         assert names >= {"horizontal", "vertical"} and 23 * len(names) + 2 < 0.77 * height
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Final
 
-#: Relation of a row to the fit of the scene's numbers.
+#: How a row of the comparison relates to the fit of the scene's numbers.
 FITTED: Final = "fitted to this"
 CHECK: Final = "not fitted to this"
 ASSUMED: Final = "not fitted to this; other clearance assumed 20 mm"
