@@ -34,7 +34,8 @@ from estimate_truths import GROUPS, PERIOD, Truth, draw
 
 Array = NDArray[np.float64]
 MEMBERS = 48
-#: A machine with a soft contact, a horizontal clearance 8 mm larger than believed, and load gains up to 10 % off.
+#: Seed of a machine with a soft contact, a horizontal clearance 8 mm larger than believed, and load gains up to 10 %
+#: off.
 SEED = 71003
 
 

@@ -75,7 +75,7 @@ def _csv(path: Path, count: int, more: str = "", times: float = 1.0) -> Path:
     return path
 
 
-#: Damaged numbers as texts.
+#: Damaged message numbers, as texts.
 STRAY = ("5000000", "1e30", "0", "-7", "nan")
 
 

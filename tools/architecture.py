@@ -11,7 +11,7 @@ from xml.sax.saxutils import escape
 OUT = Path(__file__).resolve().parent.parent / "docs" / "images" / "architecture.svg"
 WIDTH, ROW, GAP, LEFT = 920, 54, 14, 20
 COLUMN = 470
-#: From the top down; a subpackage imports only from rows below it.
+#: Rows of subpackages from the top down; a subpackage imports only from rows below it.
 SUBPACKAGES = (
     (("cli", "plow-twin"),),
     (("demo", "publisher, summary"), ("study", "calibration, sweep, analysis")),

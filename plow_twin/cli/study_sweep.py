@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from plow_twin.study.store import Store
     from plow_twin.study.sweep.table import Axis, Table
 
-#: Largest number of rows of a table on the terminal; larger tables are thinned out, and files have all rows.
+#: Largest number of rows of a table on the terminal; longer tables are cut or thinned out, and files have all rows.
 MOST_ROWS: Final = 24
 #: Width of a column of numbers, and of the first column with its frame [characters].
 _COLUMN, _FIRST_COLUMN = 12, 8

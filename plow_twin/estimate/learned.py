@@ -22,7 +22,7 @@ from plow_twin.model.scene import Clearance, Scene
 
 Array = NDArray[np.float64]
 
-#: Bound: smallest number of members for each learned parameter.
+#: Bound: smallest number of members, as a multiple of the number of learned parameters plus one.
 _MEMBERS: Final = 4
 #: Guard: largest restitution.
 _MOST_RESTITUTION = 0.999

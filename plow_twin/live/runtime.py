@@ -312,7 +312,7 @@ class Runtime:
         for intake in (self.driver.intake, self.driver.clock):
             intake.jump_back_s, intake.jump_forward_s = settings.jump_back, settings.jump_forward
         if self.waits_for_clock:
-            return  # the journal is still empty
+            return  # `start` opens the journal with the settings of that time
         if name in MODEL:
             self.driver.set_model(self.stamp_ns, model_changes(settings))
             self._front.changed()

@@ -411,7 +411,7 @@ class _Heads:
             count = look_ahead(self._descriptor, self._size, place, self._table)
             self._rows, self._next = self._table[:count].tolist(), 0
             if not self._rows:
-                os.pread(self._descriptor, 1, place)  # raises the error if the file cannot be read
+                os.pread(self._descriptor, 1, place)  # if the file cannot be read, this call raises the error
                 return 0, 0
         _, opcode, length, *self._index = self._rows[self._next]
         self._next += 1

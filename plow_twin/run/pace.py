@@ -13,7 +13,7 @@ from plow_twin.solve.state import PACE, first_of, new_records
 
 #: Default time [s] after which a call ends with an error.
 MOST_SECONDS: Final = 3600.0
-#: Number of steps in a slice; explicit steps take microseconds, implicit steps up to a millisecond.
+#: Number of steps in a slice: explicit steps, which take microseconds; implicit steps, which take up to a millisecond.
 _SLICE, _SLICE_IMPLICIT = 2048, 64
 
 

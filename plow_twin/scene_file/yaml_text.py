@@ -37,7 +37,7 @@ MOST_KEYS: Final = 50_000
 MOST_REPEATED: Final = 50_000
 
 _FLOAT: Final = re.compile(r"^(?:[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?|[-+]?\.inf|\.nan)$", re.I)
-# tag, pattern, first characters; the first match decides
+# each line has a tag, a pattern, and the possible first characters; the first line that matches decides
 _CORE_SCHEMA: Final = (
     ("tag:yaml.org,2002:null", re.compile(r"^(?:~|null|Null|NULL|)$"), ["~", "n", "N", ""]),
     ("tag:yaml.org,2002:bool", re.compile(r"^(?:true|True|TRUE|false|False|FALSE)$"), list("tTfF")),
@@ -161,7 +161,7 @@ def _excess(text: str, most_values: float) -> Problem | None:
         if is_mapping:
             outer.keys += 1
         outer.keys += node.keys
-        if outer.keys > 2 * MOST_KEYS:  # items are keys and values
+        if outer.keys > 2 * MOST_KEYS:  # both the key and the value of each item have been counted
             return _above(event, (outer.keys + 1) // 2, MOST_KEYS, "keys")
         if outer.depth <= node.depth:
             outer.depth = node.depth + 1

@@ -95,7 +95,7 @@ def grasp(p, state, pair, old) -> None:
     normal = 0.0 if old == CLIPPED else _normal_force(p, state, pair, depth)
     state.anchor[pair], state.grip[pair] = place, 0
     held = p.stick_damping * rate
-    # without a normal force any corner that slides slips, as by the guard of a slipping corner
+    # without a normal force every corner that slides counts as slipping, as it does for the guard of a slipping corner
     if abs(held) > p.static_friction * normal or (normal <= 0.0 and rate != 0.0):
         state.grip[pair] = 1 if rate > 0.0 else -1
 

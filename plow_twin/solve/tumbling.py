@@ -18,8 +18,8 @@ from plow_twin.solve.modes import penetration_and_rate
 from plow_twin.solve.state import COS, OFF, OMEGA, ON, RELEASED, SIN, THETA
 from plow_twin.solve.totals import log_event
 
-#: The two pairs of each wall: that of the corner that leads in a counter-clockwise turn, and that of the corner behind
-#: it.
+#: The two pairs of each wall: first the pair of the corner that leads in a counter-clockwise turn, then the pair of the
+#: corner behind it.
 _HANDED_OVER = tuple(
     (PAIR_NAMES.index(leading), PAIR_NAMES.index(following))
     for leading, following in (

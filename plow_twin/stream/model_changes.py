@@ -12,7 +12,7 @@ from plow_twin.errors import ArgumentError
 from plow_twin.model.scene import Scene
 from plow_twin.stream.driven import Driven
 
-#: Keys of these numbers in the scene file, each with the smallest accepted value.
+#: Numbers of a scene that can change while the model runs: keys in the scene file, each with its smallest value.
 CHANGEABLE: Final[Mapping[str, float]] = {
     "clearance.horizontal_m": 0.0,
     "clearance.vertical_m": 0.0,

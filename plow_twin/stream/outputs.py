@@ -57,7 +57,7 @@ FOLLOWED_FIELDS: Final = (
 _MOTION: Final = ("t", "stamp_ns", "held", "q", "v", "penetration", "rate", "force", "wear_depth", *FOLLOWED_FIELDS)
 #: Fields whose numbers `summary` checks for being finite by summing them up.
 _SUMMED: Final = ("q", "v", "penetration", "rate", "force", "impulse", "peak")
-#: Index in `clearance` to which each of the six numbers of `known_clearance` is written.
+#: Index in `clearance` of each of the six numbers of `known_clearance`, and of an estimate's six shifts.
 _KNOWN: Final = np.array([0, len(_CLEARANCES), len(_CLEARANCES) + 1, 1, len(_CLEARANCES) + 2, len(_CLEARANCES) + 3])
 #: Number of rows made at once, because numpy makes many rows in the same time as one row.
 _STOCK: Final = 256
@@ -167,7 +167,7 @@ class Outputs:
 
     def __init__(self, scene: Scene) -> None:
         self._scene, self._publish = scene, _publish()
-        #: sums since the previous publication, and the newest advance if it has not been published (`waits`)
+        #: sums since the previous publication, and the newest advance if it still waits to be published (`_waits`)
         self._window = np.zeros(1, ROW)
         self._waits = 0
         self._stock = Stock()

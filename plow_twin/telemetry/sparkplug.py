@@ -85,7 +85,7 @@ class Sparkplug:
         self._newest = Newest()
         #: newest value of each metric that was sent
         self._sent: dict[tuple[str, str], Value] = {}
-        # messages of a break are not sent later, because the next birth has all newest values
+        # messages that a break has delayed are dropped, because the next birth message has all newest values
         self._broker = Broker(will=self._next_death, on_connected=self._born, keeps=False, **options)
         self._broker.client.on_message = self._asked
         self.state = self._broker.state

@@ -38,7 +38,8 @@ BAND: Final = tuple(f"{group}/band/{way}" for group in ("clearance", "growth") f
 RESIDUAL: Final = ("residual/x", "residual/y", "residual/theta")
 WEAR: Final = tuple(f"wear/{name}" for name in CLEARANCE_NAMES if name.startswith("pad_"))
 
-#: Views hide the bounds at first: bands already show the clearances' bounds, and a legend shows at most eight names.
+#: Contents of a view that hides the bounds at first, because bands already show the clearances' bounds, and because a
+#: legend shows at most eight names.
 _WITHOUT_BOUNDS: Final = (
     "$origin/**",
     *(f"- $origin/{name}" for name in CLEARANCE_NAMES if name.endswith(("/p05", "/p95"))),
@@ -56,7 +57,8 @@ _WHAT_IF_COLORS: Final = (
     (204, 121, 167),
     (240, 228, 66),
 )
-#: Several strokes of a band overlap at each pixel: wide and faint strokes give an even area without stripes.
+#: Opacity of a band's stroke, at most 255. Several strokes overlap at each pixel, so wide and faint strokes give an
+#: even area without stripes.
 _BAND_ALPHA: Final = 10
 _BAND_WIDTH: Final = 6.0
 _CLEARANCE_COLORS: Final = {"horizontal": (86, 180, 233), "vertical": (240, 160, 60)}
@@ -114,7 +116,7 @@ def blueprint(
             _plot("wear", "Wear [mm]", rrb.Corner2D.LeftTop, _WITHOUT_BOUNDS),
             active_tab=0,
         ),
-        row_shares=[4.7, 2.2, 2.7, 3.4],  # the lane of the sets fits even in a window of 600 pixels
+        row_shares=[4.7, 2.2, 2.7, 3.4],  # with these shares the lane of the sets fits even in a window of 600 pixels
     )
     return rrb.Blueprint(
         rrb.Horizontal(

@@ -30,7 +30,8 @@ _CLEARANCE_COLUMNS: Final = np.array(
 _NS: Final = 1e-9
 #: States of a clearance whose value comes from measurements.
 _KNOWN_STATES: Final = ("estimated", "rough")
-#: Largest number of events and of held stretches that are drawn; more would cover the picture.
+#: Largest number of marks of each kind that are drawn (silent, held and failed stretches, changes); more marks would
+#: cover the picture.
 _MOST_MARKS: Final = 40
 
 

@@ -85,7 +85,7 @@ class Section:
 
         A block's corners are named by their place, so beyond 45 degrees each corner has another name.
         """
-        # distance to the middle of the arc
+        # distance along each axis from the corner of the sides to the middle of its arc
         within = self.radius * (1.0 - math.sqrt(0.5))
         corners = ((0.5 * self.frame - within) * _SIGNS)[::2]
         if not self.is_block:

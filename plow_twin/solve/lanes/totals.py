@@ -93,7 +93,7 @@ def _impulses(lanes, gear, viscous, hysteretic):
         if viscous is not None:
             impulse = fused(exact_row(lanes.viscous, 0), way, impulse)
         else:
-            # lambda / 2 times the change of d^2
+            # the dampers add lambda / 2 times the change of d^2
             damped = exact_row(gear, 7) * (way * fused(way, exact_splat(0.5), depth))
             impulse = fused(exact_row(lanes.stiffness, 0), damped, impulse)
     return impulse

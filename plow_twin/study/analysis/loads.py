@@ -24,7 +24,8 @@ Array = NDArray[np.float64]
 CYCLE_BINS: Final = 16
 #: Length of a piece of the face [m].
 FACE_BIN_M: Final = 1.0
-#: Memory for the reversals of a pair [B], enough for 131,072 reversals; a longer series is kept on the disk.
+#: Memory for the reversals of a pair [B], enough for 131,072 reversals. A longer series is kept on the disk and read
+#: back in blocks of this size.
 _IN_MEMORY: Final = 2**20
 
 

@@ -33,7 +33,7 @@ _PERIOD_SPAN_S: Final = 60.0
 #: Length of a window if the load has no period [s].
 _NO_PERIOD_S: Final = 10.0
 #: Smallest number of messages in a window, as a share of those in a full window. Windows that an end or a gap has cut
-#: to fewer messages are left out.
+#: to fewer messages are left out. Sample rates of runs may differ by the same share without a note.
 FULL: Final = 0.9
 _PADS: Final = np.array([CLEARANCE_NAMES.index(name) for name in PAD_NAMES])
 _TOTALS: Final = np.array([CLEARANCE_NAMES.index(name) for name in ("horizontal", "vertical")])

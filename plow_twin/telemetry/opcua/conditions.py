@@ -92,7 +92,7 @@ class Conditions:
             before = condition.level, condition.acknowledged
             condition.level = str(values[f"{name}_level"] or "none")
             raised = values[f"{name}_time"]
-            if raised != condition.raised:  # None: no alarm is latched
+            if raised != condition.raised:  # None means that no alarm is latched
                 condition.raised, condition.acknowledged = raised, raised is None
             if (condition.level, condition.acknowledged) != before:
                 await self._send(name, condition)
