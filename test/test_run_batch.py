@@ -40,6 +40,8 @@ def in_lanes() -> dict[str, list[Scene]]:
         "C d'": {},
         "lambda d'": {"law": "hunt_crossley", "damping": 0.7},
         "D / v0": {"law": "exact_restitution", "damping": None, "restitution": 0.4},
+        "d^1.5": {"law": "hunt_crossley", "damping": 0.7, "exponent": 1.5, "stiffness": 1e8},
+        "d^2": {"law": "hertz", "damping": None, "exponent": 2.0, "stiffness": 1e9},
     }
     return {
         name: [dataclasses.replace(one, contact=dataclasses.replace(one.contact, **law)) for one in members()]

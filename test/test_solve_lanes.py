@@ -50,8 +50,11 @@ FIELDS = (
 )
 
 
-def draw(rng: np.random.Generator) -> Scene:
-    """Draw geometry, law, stiffness, loads of several frequencies and directions, pairs and initial rates."""
+def draw(rng: np.random.Generator, powers: bool = False) -> Scene:
+    """Draw geometry, law, stiffness, loads of several frequencies and directions, pairs and initial rates.
+
+    With `powers` the exponent is not 1.
+    """
     mass, width, height = 10 ** rng.uniform(1.0, 3.5), *rng.uniform(0.1, 0.5, 2)
     stiffness = 10 ** rng.uniform(5.5, 10.0)
     damping = 2.0 * np.sqrt(stiffness * mass) * 10 ** rng.uniform(-3.0, 0.0)
@@ -61,6 +64,14 @@ def draw(rng: np.random.Generator) -> Scene:
         Contact("hunt_crossley", stiffness, 1.0, damping=10 ** rng.uniform(-1.0, 1.0)),
         Contact("exact_restitution", stiffness, 1.0, restitution=rng.uniform(0.3, 0.95)),
     ][rng.choice(4, p=[0.2, 0.4, 0.2, 0.2])]
+    if powers:
+        exponent = float(rng.choice([1.5, 2.0, 2.2, 3.0, 4.0], p=[0.5, 0.15, 0.1, 0.15, 0.1]))
+        stiffness *= 1e3 ** (exponent - 1.0)  # as stiff as with exponent 1 at about 1 mm
+        contact = [
+            Contact("hertz", stiffness, exponent),
+            Contact("hunt_crossley", stiffness, exponent, damping=10 ** rng.uniform(-1.0, 1.0)),
+            Contact("exact_restitution", stiffness, exponent, restitution=rng.uniform(0.3, 0.95)),
+        ][rng.integers(3)]
     force, parallel = 4.0 * 9.81 * mass, rng.random() < 0.5
     directions = [rng.uniform(-1.0, 1.0, 2)] * 3 if parallel else list(rng.uniform(-1.0, 1.0, (3, 2)))
     loads = tuple(
@@ -80,18 +91,22 @@ def draw(rng: np.random.Generator) -> Scene:
     )
 
 
-#: Directions of the harmonics and terms of the law. Each combination compiles its own kernels; these few contain every
-#: value.
-SOME = {(0, None, None), (0, 1, None), (1, 1, None), (2, None, 1)}
+#: Directions of the harmonics and terms of the law: viscous, hysteretic, integer, fraction. Each combination compiles
+#: its own kernels; these have every value once, without and with exponents other than 1.
+SOME = {
+    False: {(0, None, None, None, None), (0, 1, None, None, None), (1, 1, None, None, None), (2, None, 1, None, None)},
+    True: {(0, None, None, None, 1), (1, None, 1, None, 1), (2, None, 1, 1, None)},
+}
 
 
-def drawn(seed: int, count: int, some: bool = True) -> list[Scene]:
+def drawn(seed: int, count: int, some: bool = True, powers: bool = False) -> list[Scene]:
     rng, found = np.random.default_rng(seed), list[Scene]()
     while len(found) < count:
-        compiled = compile_scene(scene := draw(rng), 1e-6)
+        compiled = compile_scene(scene := draw(rng, powers), 1e-6)
         terms = compiled.parts.terms
-        kind = (terms.harmonics or 0) + (terms.second or 0), terms.viscous, terms.hysteretic
-        if fits_lanes(compiled) and (not some or kind in SOME):
+        directions = (terms.harmonics or 0) + (terms.second or 0)
+        kind = directions, terms.viscous, terms.hysteretic, terms.integer, terms.fraction
+        if fits_lanes(compiled) and (not some or kind in SOME[powers]):
             found.append(scene)
     return found
 
@@ -100,8 +115,9 @@ def same(one: Ensemble, i: int, other: Ensemble, k: int) -> bool:
     return all(np.array_equal(getattr(one, name)[i], getattr(other, name)[k], equal_nan=True) for name in FIELDS)
 
 
-def test_a_scene_has_the_same_bits_alone_and_in_any_company() -> None:
-    scenes = drawn(1, 19)
+@pytest.mark.parametrize(("powers", "seed"), [(False, 1), (True, 2)])
+def test_a_scene_has_the_same_bits_alone_and_in_any_company(powers: bool, seed: int) -> None:
+    scenes = drawn(seed, 19, powers=powers)
     together = simulate_many(scenes, 1.0, 0.05, 1e-7, workers=1)
     assert together.events.min() < together.events.max() // 10  # lanes end at very different times and are filled again
     backwards = simulate_many(scenes[::-1], 1.0, 0.05, 1e-7, workers=3)
@@ -120,8 +136,8 @@ def test_rows_and_limits_on_the_time_between_two_looks_move_no_bit(monkeypatch: 
     assert np.array_equal(finer.steps, whole.steps)
 
 
-def _check_beside_the_loop(seed: int, count: int, some: bool) -> None:
-    scenes = drawn(seed, count, some)
+def _check_beside_the_loop(seed: int, count: int, some: bool, powers: bool) -> None:
+    scenes = drawn(seed, count, some, powers)
     many = simulate_many(scenes, 0.7, 0.02, 1e-12)
     close = 0
     for index, scene in enumerate(scenes):
@@ -147,15 +163,16 @@ def _check_beside_the_loop(seed: int, count: int, some: bool) -> None:
     assert close >= count // 4
 
 
-def test_random_scenes_move_as_in_the_loop_of_a_single_scene() -> None:
-    _check_beside_the_loop(3, 16, some=True)
+@pytest.mark.parametrize("powers", [False, True])
+def test_random_scenes_move_as_in_the_loop_of_a_single_scene(powers: bool) -> None:
+    _check_beside_the_loop(3, 16, True, powers)
 
 
 @pytest.mark.stress
 @settings(max_examples=10)
-@given(st.integers(0, 2**32 - 1))
-def test_many_random_scenes_move_as_in_the_loop_of_a_single_scene(seed: int) -> None:
-    _check_beside_the_loop(seed, 40, some=False)
+@given(st.integers(0, 2**32 - 1), st.booleans())
+def test_many_random_scenes_move_as_in_the_loop_of_a_single_scene(seed: int, powers: bool) -> None:
+    _check_beside_the_loop(seed, 40, False, powers)
 
 
 @pytest.mark.parametrize("tol", [1e-3, 1e-6, 1e-9])
@@ -166,6 +183,15 @@ def test_the_bench_scene_meets_its_reference_with_every_event(tol: float) -> Non
     assert found.events[0] == 366 and found.makes.sum() == 120
     # a CLIPPED pair that separates changes no force, so its event ends no step
     assert found.steps[0] < 0.95 * simulate(preset("bench_kv"), 20.0, 0.1, tol=tol).solver["steps"]
+
+
+@pytest.mark.parametrize("tol", [1e-3, 1e-6, 1e-9])
+def test_the_bench_scene_with_exponent_one_and_a_half_meets_its_reference_with_every_event(tol: float) -> None:
+    scene, exact = preset("bench_hc"), reference("bench_hc")
+    found, alone = simulate_many([scene], 20.0, 0.1, tol), simulate(scene, 20.0, 0.1, tol=tol)
+    stride = round(0.1 / (exact["t"][1] - exact["t"][0]))
+    assert pose_error(scene, found.q[0], exact["q"][::stride]) < 10.0 * tol
+    assert found.events[0] == len(alone.events) and found.steps[0] < alone.solver["steps"]
 
 
 @pytest.mark.parametrize("build", [fallen, swaying])
@@ -179,7 +205,7 @@ def test_rest_and_flight_are_left_to_their_methods(build: Callable[[], Scene]) -
 def test_scenes_that_lanes_do_not_cover_run_one_by_one() -> None:
     scene = preset("bench_kv")
     others = [
-        preset("bench_hc"),
+        dataclasses.replace(scene, contact=Contact("ramped_damping", 2e7, 1.5, damping=6e4, ramp_m=1e-3)),
         dataclasses.replace(scene, contact=dataclasses.replace(scene.contact, damping=1e9)),
         dataclasses.replace(scene, friction=Friction(0.2, 0.02)),
         dataclasses.replace(scene, wear=Wear(1e-11, 0.015, 2.0)),

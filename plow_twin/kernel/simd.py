@@ -274,6 +274,58 @@ def magnitude(typingctx: Any, value: Any) -> Any:
     return value(value), codegen
 
 
+@_operation
+def square_root(typingctx: Any, value: Any) -> Any:
+    """Return the square root of each lane."""
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        kind = ir.FunctionType(_VECTOR, [_VECTOR])
+        root = cgutils.get_or_insert_function(builder.module, kind, "llvm.sqrt.v8f64")
+        return builder.call(root, [arguments[0]])
+
+    return value(value), codegen
+
+
+_BITS = ir.VectorType(ir.IntType(64), _WIDTH)
+
+
+def _each(number: int) -> Any:
+    return ir.Constant(_BITS, [number] * _WIDTH)
+
+
+@_operation
+def exponent_of(typingctx: Any, value: Any) -> Any:
+    """Return the binary exponent of each lane's positive number, an integer as float64; 1024 for infinity."""
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        bits = builder.lshr(builder.bitcast(arguments[0], _BITS), _each(52))
+        return builder.sitofp(builder.sub(builder.and_(bits, _each(0x7FF)), _each(1023)), _VECTOR)
+
+    return value(value), codegen
+
+
+@_operation
+def significand_of(typingctx: Any, value: Any) -> Any:
+    """Return each lane's positive number divided by 2 to the power of its `exponent_of`, from 1 to below 2."""
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        bits = builder.and_(builder.bitcast(arguments[0], _BITS), _each(2**52 - 1))
+        return builder.bitcast(builder.or_(bits, _each(1023 << 52)), _VECTOR)
+
+    return value(value), codegen
+
+
+@_operation
+def power_of_two(typingctx: Any, exponent: Any) -> Any:
+    """Return 2 to the power of each lane's integer from -1022 to 1023, given as float64."""
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        number = builder.add(builder.fptosi(arguments[0], _BITS), _each(1023))
+        return builder.bitcast(builder.shl(number, _each(52)), _VECTOR)
+
+    return exponent(exponent), codegen
+
+
 def _elementwise(operation: Callable[..., Any], emit: str) -> None:
     """Define a binary operator for two vectors, and for a vector and a number."""
 

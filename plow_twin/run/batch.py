@@ -67,8 +67,8 @@ class TwinBatch:
     Notes
     -----
     At `max_wall_s` a call raises `LimitError`, and after Ctrl-C `RunInterrupted`; all twins then have the state from
-    before the call. If every contact has exponent 1 and no scene has wear, friction, support, locks, an offset centre
-    of mass or overdamped contact, each SIMD vector advances eight twins. Such a twin has the same bits alone and in any
+    before the call. If no scene has a ramp, wear, friction, support, locks, an offset centre of mass or overdamped
+    contact, each SIMD vector advances eight twins. Such a twin has the same bits alone and in any
     batch, and agrees with a `Twin` to the tolerance. Other twins have the bits of a `Twin` with the same terms.
     """
 

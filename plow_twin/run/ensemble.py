@@ -1,6 +1,7 @@
 """Runs of many scenes at once on all cores; members may differ in clearance, stiffness, load or initial state.
 
-Scenes with a linear contact force share SIMD vectors (`solve.lanes`); other scenes run one by one.
+Scenes without further terms than their law and harmonic loads share SIMD vectors (`solve.lanes`); other scenes run one
+by one.
 """
 
 from __future__ import annotations
@@ -81,9 +82,8 @@ def simulate_many(
 ) -> Ensemble:
     """Simulate every scene from t = 0 to `t_end`; the bits of a member depend on its scene alone.
 
-    Scenes with a linear contact force (exponent 1, undamped or Kelvin-Voigt) and without other terms run eight at a
-    time in the lanes of a SIMD vector and agree with `simulate` to the tolerance. All other scenes have the bits of
-    `simulate`.
+    Scenes with any law without a ramp, constant or harmonic loads and no other terms run eight at a time in the lanes
+    of a SIMD vector and agree with `simulate` to the tolerance. All other scenes have the bits of `simulate`.
 
     Parameters
     ----------

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from plow_twin.kernel.compiler import for_arguments
 from plow_twin.run.pace import Pace
 from plow_twin.solve.lanes.advance import Samples, advance_lanes
-from plow_twin.solve.lanes.record import WIDTH, new_lanes
+from plow_twin.solve.lanes.record import WIDTH, new_lanes, powers
 from plow_twin.solve.state import STATE, TOTALS, Terms, new_records
 
 #: Total number of steps of all lanes in a slice, which takes about a millisecond.
@@ -76,8 +76,8 @@ class LaneTwins:
             )  # fmt: skip
             terms = self._terms
             arguments = (
-                samples, terms.viscous, terms.hysteretic, terms.rest, self._order, self._lanes, self._work,
-                self._max_steps, _SLICE,
+                samples, terms.viscous, terms.hysteretic, *powers(terms), terms.rest, self._order, self._lanes,
+                self._work, self._max_steps, _SLICE,
             )  # fmt: skip
             if self._kernel is None:
                 self._kernel = for_arguments(advance_lanes, arguments)

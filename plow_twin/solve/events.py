@@ -17,12 +17,12 @@ from plow_twin.solve.state import CLIPPED, CROSSING, OFF, ON, RATIO, RELEASED, S
 _AT_ONCE = 1e-12
 #: Penetration at which a pair changes from ON to RELEASED, as a share of `Params.release`. The pair is ON again at
 #: `Params.release` itself.
-_LET_GO = 0.25
+LET_GO = 0.25
 #: Allowances for rounding where all guards are proved at once: a factor on the sums, and an error of 1 + lambda d'.
 _ROUNDED, _ROUNDING = 1.0 + 1e-9, 1e-9
 _ALL_PAIRS = 2**PAIR_COUNT - 1
 #: Penetration below which a RELEASED pair counts as resting on its wall, as a share of `Params.release`.
-_ON_THE_WALL = 1e-6
+ON_THE_WALL = 1e-6
 
 
 @kernel(fast=True)
@@ -50,10 +50,10 @@ def _guards(p, state, w, order, penetrating, viscous, ramp) -> None:
         first = max(guard[0, pair], 0.0)
         if state.mode[pair] == ON:
             # a pair becomes RELEASED at a quarter of the depth at which it is ON again, so that it cannot alternate
-            first -= min(_LET_GO * p.release, 0.5 * first)
-        elif state.mode[pair] == RELEASED and first <= _ON_THE_WALL * p.release:
+            first -= min(LET_GO * p.release, 0.5 * first)
+        elif state.mode[pair] == RELEASED and first <= ON_THE_WALL * p.release:
             # the guard of a pair that rests on its wall turns negative a little outside the wall
-            first = max(guard[0, pair] + _LET_GO * p.release, 0.0)
+            first = max(guard[0, pair] + LET_GO * p.release, 0.0)
         guard[0, pair] = first if p.enabled[pair] == 1 else 1.0
 
 

@@ -35,7 +35,7 @@ from plow_twin.solve.state import (
 
 #: A penetration below this share of the release penetration, or a speed below this share of the speed needed to reach
 #: it, counts as zero.
-_SHALLOW = 1e-3
+SHALLOW = 1e-3
 #: Number of iterations for the damping and speed of an impact under way, which depend on each other.
 _ROUNDS = 8
 #: Number of halvings of a bracket, enough for the last bit of a double.
@@ -216,7 +216,7 @@ def weigh_pairs(p, state, w, viscous, fraction, ramp, stick) -> bool:
         raised = mode[pair] == ON or (ramp is not None and mode[pair] == CLIPPED)
         if fraction is not None and raised and state.touching >> pair & 1 == 0:
             penetration = penetration_and_rate(p, state, pair)[0]
-            if penetration > _SHALLOW * p.release:
+            if penetration > SHALLOW * p.release:
                 per_pair[BASE, pair] = 0.5 / math.sqrt(penetration) if p.exponent == 1.5 else 1.0 / penetration
             else:
                 # the step after the touch was interrupted at a depth that is too shallow for a series of d^n
@@ -235,7 +235,7 @@ def weigh_pairs(p, state, w, viscous, fraction, ramp, stick) -> bool:
 def slow_touch(p) -> float:
     """Return the speed in m/s below which a touch alone does not carry a pair to the release penetration."""
     acceleration = p.threshold[0] * p.weight / p.radius
-    return _SHALLOW * math.sqrt(2.0 * acceleration * p.release)
+    return SHALLOW * math.sqrt(2.0 * acceleration * p.release)
 
 
 @kernel(fast=True)

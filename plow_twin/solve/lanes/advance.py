@@ -27,6 +27,7 @@ from plow_twin.solve.lanes.loop import (
     move,
     turn,
 )
+from plow_twin.solve.lanes.maps import choose_maps, note_durations
 from plow_twin.solve.lanes.record import (
     COMPONENTS,
     WIDTH,
@@ -38,7 +39,7 @@ from plow_twin.solve.lanes.record import (
     write_place,
     write_state,
 )
-from plow_twin.solve.lanes.series import accurate_steps, expand
+from plow_twin.solve.lanes.series import accurate_steps, accurate_steps_by_power, expand, raised
 from plow_twin.solve.lanes.totals import add_step, sum_step
 from plow_twin.solve.method.rest import slow_enough
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, Status, X, Y
@@ -147,7 +148,7 @@ def _fail(s, lanes, lane, code) -> None:
 
 
 @kernel()
-def _tell(lanes, reached, viscous, hysteretic) -> None:
+def _tell(lanes, reached, viscous, hysteretic, power, fraction) -> None:
     """Write poses and rates of all lanes to `lanes.out`; write penetrations, their rates and forces to `lanes.told`.
 
     In lanes that have `reached` a sample, the force at the sample raises the peak.
@@ -166,6 +167,10 @@ def _tell(lanes, reached, viscous, hysteretic) -> None:
             push = fused(exact_row(lanes.ratio, pair), closing, depth)
         if hysteretic is not None:
             push = fused(exact_row(lanes.factor, pair) * closing, depth, depth)
+        if power is not None:
+            push = raised(lanes, depth, fraction)
+            if hysteretic is not None:
+                push = fused(exact_row(lanes.factor, pair) * closing, push, push)
         acts = lanes.on[pair] & below(zero, depth) & below(zero, push)
         force, peak = choose(acts, exact_row(lanes.stiffness, 0) * push, zero), exact_row(lanes.peak, pair)
         set_row(lanes.told[0], pair, depth)
@@ -259,7 +264,7 @@ def _look(s, rest, lanes, lane, budget, in_range) -> int:
 
 
 @kernel()
-def _get_ready(s, viscous, hysteretic, rest, lanes, budget) -> bool:
+def _get_ready(s, viscous, hysteretic, power, fraction, rest, lanes, budget) -> bool:
     """Write the rows of reached samples and fill empty lanes; return whether any lane has a step to take."""
     while True:
         in_range, reached, live, changed = bits_in_range(lanes), 0, False, False
@@ -283,7 +288,7 @@ def _get_ready(s, viscous, hysteretic, rest, lanes, budget) -> bool:
                 _fail(s, lanes, lane, code)
                 changed = True
         if reached != 0:
-            _tell(lanes, reached, viscous, hysteretic)
+            _tell(lanes, reached, viscous, hysteretic, power, fraction)
             for lane in range(WIDTH):
                 if reached >> lane & 1:
                     _write_row(s, lanes, lane)
@@ -297,35 +302,44 @@ def _get_ready(s, viscous, hysteretic, rest, lanes, budget) -> bool:
 
 
 @kernel()
-def _step(s, viscous, hysteretic, order, lanes, w) -> None:
+def _step(s, viscous, hysteretic, power, fraction, order, lanes, w) -> None:
     """Take one step in each lane."""
     time = exact_row(lanes.time, 0) - exact_row(lanes.knot, 0)
     for j in range(3):
         sampled = fused(exact_row(lanes.slope, j), time, exact_row(lanes.sample, j))
         set_row(lanes.held, j, exact_row(lanes.constant, j) + sampled)
-    if hysteretic is None and lanes.stale[0] == 1:
+    if hysteretic is None and power is None and lanes.stale[0] == 1:
         weigh_lanes(lanes)
         lanes.stale[0] = 0
-    used = expand(lanes, w, order, None, None, viscous, hysteretic, 1)
-    infinite = accurate_steps(s.params, lanes, order)
+    if fraction is not None:
+        choose_maps(s.params, None, None, None, None, hysteretic, fraction, 1, lanes, w)
+    used = expand(lanes, w, order, None, None, viscous, hysteretic, power, fraction, 1)
+    if power is None:
+        infinite = accurate_steps(s.params, lanes, order)
+    else:
+        infinite = accurate_steps_by_power(lanes, w, order, fraction)
     if infinite != 0:
         for lane in range(WIDTH):
             if infinite >> lane & 1:
                 _fail(s, lanes, lane, _NON_FINITE)
-    first_events(s.states, lanes, w, used, order, hysteretic)
+    first_events(s.states, lanes, w, used, order, hysteretic, power, fraction)
     go_past_an_instant(s.params, s.states, lanes)
-    note_switches(lanes, used, viscous)
-    sum_step(lanes, w, used)
-    add_step(None, lanes, w, used, order, viscous, hysteretic)
+    note_switches(lanes, used, viscous, fraction)
+    if fraction is not None:
+        note_durations(lanes)
+    sum_step(lanes, w, used, power)
+    add_step(None, lanes, w, used, order, viscous, hysteretic, power, fraction)
     move(lanes)
     for lane in range(WIDTH):
         member = lanes.member[lane]
         if member >= 0:
-            complete(s.params[member], s.states[member], s.totals[lane], lanes, lane, hysteretic)
+            complete(s.params[member], s.states[member], s.totals[lane], lanes, lane, hysteretic, fraction)
 
 
 @kernel(entry=True)
-def advance_lanes(s, viscous, hysteretic, rest, order, eight, work, budget, iterations) -> bool:
+def advance_lanes(
+    s, viscous, hysteretic, power, fraction, rest, order, eight, work, budget, iterations
+) -> bool:  # fmt: skip
     """Advance the twins in the queue through all samples, eight at a time; return False if `iterations` are used up.
 
     `eight` and `work`, shape (1,), are lanes and scratch space. `budget` is the largest number of steps of an advance
@@ -334,7 +348,7 @@ def advance_lanes(s, viscous, hysteretic, rest, order, eight, work, budget, iter
     """
     s, lanes, w = _unowned_samples(s), eight[0], work[0]
     for _ in range(iterations):
-        if not _get_ready(s, viscous, hysteretic, rest, lanes, budget):
+        if not _get_ready(s, viscous, hysteretic, power, fraction, rest, lanes, budget):
             return True
-        _step(s, viscous, hysteretic, order, lanes, w)
+        _step(s, viscous, hysteretic, power, fraction, order, lanes, w)
     return False

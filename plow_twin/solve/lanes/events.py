@@ -1,8 +1,8 @@
 """The first event of each lane's step.
 
 Few guards can turn negative within a step. Each lane lists these guards, and each round searches eight of them, of any
-lanes. If a clipped pair parts, the step does not end, because no force changes; the rest of the step is then searched
-for the pair's next touch.
+lanes. If a clipped or released pair parts, the step does not end, because no force changes; the rest of the step is
+then searched for the pair's next touch.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.polynomial import first_root
 from plow_twin.kernel.simd import below, choose, exact_row, exact_splat, fused, gathered, lowest_bit, magnitude, set_row
 from plow_twin.model.pairs import PAIR_COUNT
+from plow_twin.solve.events import LET_GO, ON_THE_WALL
 from plow_twin.solve.lanes.record import (
     AGAIN,
     GUARDS,
@@ -23,7 +24,7 @@ from plow_twin.solve.lanes.record import (
     places_of,
     to_bernstein,
 )
-from plow_twin.solve.state import CLIPPED, COS, OFF, ON, SIN, X, Y
+from plow_twin.solve.state import CLIPPED, COS, OFF, ON, RELEASED, SIN, X, Y
 
 #: Two events are simultaneous if the time between them is less than this share of the step before them.
 _AT_ONCE = 1e-12
@@ -40,15 +41,19 @@ _DEPTH, _RATE, _CONSTANT = 5, 6, 7
 
 
 @kernel()
-def _list_guards(lanes, order, hysteretic) -> None:
+def _list_guards(lanes, order, hysteretic, power, fraction) -> None:
     """Write to `lanes.todo` a bit for each guard of a lane that may turn negative.
 
     The guard of a pair that is off is -d. A pair that is on has the guard F / K = d + (C / K) d', or with lambda d' the
-    two guards d and 1 + lambda d'. The guards of a clipped pair are d and the force with the opposite sign.
+    two guards d and 1 + lambda d'. The guards of a clipped pair are d and the force with the opposite sign, those of a
+    released pair (`modes`) d and the distance to the release penetration.
     """
     for lane in range(WIDTH):
         lanes.todo[lane] = lanes.watched[lane]
     _list_off(lanes, order)
+    if power is not None:
+        _list_powers(lanes, order, hysteretic, fraction)
+        return
     one, none, h = exact_splat(1.0), exact_splat(0.0), exact_row(lanes.step, 0)
     damped = exact_row(lanes.viscous, 0) / exact_row(lanes.stiffness, 0)
     for slot in range(PAIR_COUNT):
@@ -56,13 +61,47 @@ def _list_guards(lanes, order, hysteretic) -> None:
         if taken == 0:
             break
         if hysteretic is None:
-            ends = _write_guard(lanes, None, gear, one, damped, none, lanes.push[slot], order, h)
+            ends = _write_guard(lanes, None, gear, one, damped, none, lanes.push[slot], order, h, None)
             _note(lanes, slot, 0, ends & taken)
         else:
-            ends = _write_guard(lanes, None, gear, one, none, none, lanes.guard[0], order, h)
+            ends = _write_guard(lanes, None, gear, one, none, none, lanes.guard[0], order, h, None)
             _note(lanes, slot, 0, ends & taken)
-            pull = _write_guard(lanes, None, gear, none, exact_row(gear, 7), one, lanes.guard[0], order, h)
+            pull = _write_guard(lanes, None, gear, none, exact_row(gear, 7), one, lanes.guard[0], order, h, None)
             _note(lanes, slot, SECOND, pull & taken)
+
+
+@kernel()
+def _list_powers(lanes, order, hysteretic, fraction) -> None:
+    """List the guards of pairs that are on, for exponents other than 1."""
+    one, none, h = exact_splat(1.0), exact_splat(0.0), exact_row(lanes.step, 0)
+    for slot in range(PAIR_COUNT):
+        taken = lanes.taken[slot]
+        if taken == 0:
+            break
+        depth = exact_row(lanes.depth[slot], 0)
+        first = choose(below(none, depth), depth, none)
+        if fraction is not None:
+            let_go, half = exact_row(lanes.release, 0) * LET_GO, first * 0.5
+            first = first - choose(below(half, let_go), half, let_go)
+        _note(lanes, slot, 0, _may_end(lanes.depth[slot], one, first, order, h) & taken)
+        if hysteretic is not None:
+            factor = exact_row(lanes.gear[slot], 7)
+            first = fused(factor, exact_row(lanes.rate[slot], 0), one)
+            _note(lanes, slot, SECOND, _may_end(lanes.rate[slot], factor, first, order - 1, h) & taken)
+
+
+@kernel()
+def _may_end(series, factor, first, order, h):
+    """Return a bit for each lane whose guard, `first` and `factor` times the series' terms, may turn negative.
+
+    The test is that of `_write_guard`.
+    """
+    reach = term = exact_splat(0.0)
+    for k in range(order, 0, -1):
+        term = exact_row(series, k) * factor
+        if k > 1:
+            reach = fused(magnitude(term) - term, exact_splat(0.5), reach) * h
+    return below(fused(term, h, first), reach * h)
 
 
 @kernel()
@@ -110,7 +149,7 @@ def _row_of(array, k, places):
 
 
 @kernel()
-def _write_guard(lanes, places, rows, of_depth, of_rate, constant, guard, order, h):
+def _write_guard(lanes, places, rows, of_depth, of_rate, constant, guard, order, h, fraction):
     """Write to `guard` the series of the guards `of_depth` d + `of_rate` d' + `constant`, with the penetrations d.
 
     `places` has the guards' lanes; None means one guard of each lane in turn. Returns a bit for each guard that may
@@ -119,26 +158,46 @@ def _write_guard(lanes, places, rows, of_depth, of_rate, constant, guard, order,
     """
     cosine, sine, x, y = lanes.series[COS], lanes.series[SIN], lanes.series[X], lanes.series[Y]
     reach = term = deeper = zero = exact_splat(0.0)
+    dc, ds, dx, dy = lanes.rates[0], lanes.rates[1], lanes.rates[2], lanes.rates[3]
+    damped = below(zero, magnitude(of_rate))
     for k in range(order, 0, -1):
         depth = linear_at(
             rows, _row_of(cosine, k, places), _row_of(sine, k, places), _row_of(x, k, places), _row_of(y, k, places)
         )
-        term = fused(of_rate * (k + 1.0), deeper, of_depth * depth)
-        deeper = depth
+        if fraction is None:
+            term = fused(of_rate * (k + 1.0), deeper, of_depth * depth)
+            deeper = depth
+        else:
+            # the series' variable may be a root of time
+            term = of_depth * depth
+            if damped != 0 and k < order:
+                deeper = linear_at(
+                    rows, _row_of(dc, k, places), _row_of(ds, k, places), _row_of(dx, k, places), _row_of(dy, k, places)
+                )
+                term = fused(of_rate, deeper, term)
         set_row(guard, k, term)
         if k > 1:
             reach = fused(magnitude(term) - term, exact_splat(0.5), reach) * h
     depth = penetration_at(
         rows, _row_of(cosine, 0, places), _row_of(sine, 0, places), _row_of(x, 0, places), _row_of(y, 0, places)
     )
+    if fraction is not None:  # noqa: SIM102 - left out by types
+        if damped != 0:
+            deeper = linear_at(
+                rows, _row_of(dc, 0, places), _row_of(ds, 0, places), _row_of(dx, 0, places), _row_of(dy, 0, places)
+            )
     first = fused(of_rate, deeper, of_depth * depth) + constant
-    first = choose(below(zero, first), first, zero)
+    kept = below(zero, first)
+    if fraction is not None:
+        # a pair that parts within the step is inside its wall at the step's start
+        kept |= below(zero, exact_row(lanes.begin, 0))
+    first = choose(kept, first, zero)
     set_row(guard, 0, first)
     return below(fused(term, h, first), reach * h)
 
 
 @kernel()
-def _choose_guards(lanes, at, hysteretic) -> int:
+def _choose_guards(lanes, at, hysteretic, fraction) -> int:
     """Choose up to eight guards: first the next guard of each lane, then the guards after it; return their number."""
     count, before = 0, -1
     while before < count < WIDTH:
@@ -149,7 +208,7 @@ def _choose_guards(lanes, at, hysteretic) -> int:
                 guard = lowest_bit(todo)
                 lanes.todo[lane] = todo & ~(1 << guard)
                 lanes.guarded[at, count], lanes.owner[at, count] = guard, lane
-                _write_choice(lanes, lane, guard, count, hysteretic)
+                _write_choice(lanes, lane, guard, count, hysteretic, fraction)
                 count += 1
     for i in range(count, WIDTH):
         lanes.guarded[at, i], lanes.owner[at, i] = -1, 0
@@ -157,7 +216,7 @@ def _choose_guards(lanes, at, hysteretic) -> int:
 
 
 @kernel()
-def _write_choice(lanes, lane, guard, i, hysteretic) -> None:
+def _write_choice(lanes, lane, guard, i, hysteretic, fraction) -> None:
     """Write the factors of guard `i` of a round and the end of its search."""
     chosen, pair = lanes.chosen, guard % PAIR_COUNT
     mode, sign, constant, rate = lanes.mode[pair, lane], 1.0, 0.0, lanes.viscous[lane] / lanes.stiffness[lane]
@@ -171,13 +230,29 @@ def _write_choice(lanes, lane, guard, i, hysteretic) -> None:
     else:
         constant = 1.0 if mode == ON else -1.0
         sign, rate = 0.0, constant * lanes.factor[pair, lane]
+    if fraction is not None:
+        if guard < AGAIN and mode == RELEASED and guard >= SECOND:
+            sign, rate, constant = -1.0, 0.0, lanes.release[lane]
+        elif guard < SECOND and mode != OFF:
+            constant = _allowance(lanes, pair, lane, mode)
     chosen[_DEPTH, i], chosen[_RATE, i], chosen[_CONSTANT, i] = sign, rate, constant
     lanes.begin[i], lanes.reach[i] = begin, lanes.step[lane] - begin
     lanes.row_place[i] = pair * 5 * WIDTH + lane
 
 
 @kernel()
-def _shift(lanes, guard, order, again) -> None:
+def _allowance(lanes, pair, lane, mode) -> float:
+    """Return the constant in a pair's guard d for exponents that are not integers (`solve.events`)."""
+    rows, y, let_go = lanes.rows[pair], lanes.y, LET_GO * lanes.release[lane]
+    depth = rows[0, lane] * y[COS, lane] + rows[1, lane] * y[SIN, lane] + rows[4, lane]
+    depth = max(depth + rows[2, lane] * y[X, lane] + rows[3, lane] * y[Y, lane], 0.0)
+    if mode == ON:
+        return -min(let_go, 0.5 * depth)
+    return let_go if mode == RELEASED and depth <= ON_THE_WALL * lanes.release[lane] else 0.0
+
+
+@kernel()
+def _shift(lanes, guard, order, again, fraction) -> None:
     """Shift the guards of pairs that have parted to begin at the time of parting."""
     x, zero = exact_row(lanes.begin, 0), exact_splat(0.0)
     for r in range(order):
@@ -185,7 +260,11 @@ def _shift(lanes, guard, order, again) -> None:
         for j in range(order - 1, r - 1, -1):
             after = exact_row(guard, j) + x * after
             set_row(guard, j, after)
-    set_row(guard, 0, choose(again, zero, exact_row(guard, 0)))
+    first = zero
+    if fraction is not None:
+        # a released pair may have parted a little outside the wall
+        first = choose(below(zero, exact_row(guard, 0)), exact_row(guard, 0), zero)
+    set_row(guard, 0, choose(again, first, exact_row(guard, 0)))
 
 
 @kernel()
@@ -254,10 +333,10 @@ def _leaves(guard, i, order, h) -> bool:
 
 @kernel()
 def _note_root(lanes, lane, at, i, order) -> None:
-    """Use the root of a guard to end the step, or to record the parting of a clipped pair."""
+    """Use the root of a guard to end the step, or to record the parting of a clipped or released pair."""
     guard, root = lanes.guarded[at, i], lanes.root[i] + lanes.begin[i]
     pair = guard % PAIR_COUNT
-    if guard < SECOND and lanes.mode[pair, lane] == CLIPPED:
+    if guard < SECOND and lanes.mode[pair, lane] > ON:
         lanes.parted[pair, lane] = root
         lanes.parting[0] |= 1 << lane
         if not _leaves(lanes.guard[at], i, order, lanes.step[lane]):
@@ -270,7 +349,7 @@ def _note_root(lanes, lane, at, i, order) -> None:
 
 
 @kernel()
-def first_events(states, lanes, w, order, full, hysteretic) -> None:
+def first_events(states, lanes, w, order, full, hysteretic, power, fraction) -> None:
     """Shorten each lane's step to end at its first event; write the guard to `lanes.event`, or -1 without an event.
 
     `order` is the order of the series. Guards always have `full` orders, the largest, because the bits of their
@@ -282,21 +361,21 @@ def first_events(states, lanes, w, order, full, hysteretic) -> None:
     lanes.parting[0] = 0
     for lane in range(WIDTH):
         lanes.event[lane] = -1
-    _list_guards(lanes, order, hysteretic)
+    _list_guards(lanes, order, hysteretic, power, fraction)
     # every round searches at least one guard of each lane that still has guards to search
     for at in range(GUARDS):
         lanes.rounds[0] = at
-        count = _choose_guards(lanes, at, hysteretic)
+        count = _choose_guards(lanes, at, hysteretic, fraction)
         if count == 0:
             return
-        bits = _write_chosen(lanes, at, order, full) & ((1 << count) - 1)
+        bits = _write_chosen(lanes, at, order, full, fraction) & ((1 << count) - 1)
         if bits != 0:
             _search(states, lanes, w, at, full, bits)
     lanes.rounds[0] = GUARDS
 
 
 @kernel()
-def _write_chosen(lanes, at, order, full):
+def _write_chosen(lanes, at, order, full, fraction):
     """Write the guards of a round; return a bit for each that may turn negative."""
     chosen, guard, zero = lanes.chosen, lanes.guard[at], exact_splat(0.0)
     places = places_of(lanes.row_place)
@@ -306,11 +385,11 @@ def _write_chosen(lanes, at, order, full):
         set_row(guard, k, zero)
     bits = _write_guard(
         lanes, places_of(lanes.owner[at]), chosen, exact_row(chosen, _DEPTH), exact_row(chosen, _RATE),
-        exact_row(chosen, _CONSTANT), guard, order, exact_row(lanes.reach, 0),
+        exact_row(chosen, _CONSTANT), guard, order, exact_row(lanes.reach, 0), fraction,
     )  # fmt: skip
     again = below(zero, exact_row(lanes.begin, 0))
     if again != 0:
-        _shift(lanes, guard, order, again)
+        _shift(lanes, guard, order, again, fraction)
     return bits | again & below(zero, exact_row(lanes.reach, 0))
 
 
@@ -343,10 +422,13 @@ def _search(states, lanes, w, at, order, bits) -> None:
 
 
 @kernel()
-def _next_mode(mode, viscous):
+def _next_mode(lanes, lane, mode, viscous, fraction):
     """Return the mode that follows `mode` when the pair's first guard turns negative."""
     if mode == OFF:
-        return ON
+        return ON if fraction is None or lanes.exponent[lane] == 1.5 else RELEASED
+    if fraction is not None:  # noqa: SIM102 - left out by types
+        if mode == ON:
+            return RELEASED
     return CLIPPED if mode == ON and viscous is not None else OFF
 
 
@@ -367,7 +449,7 @@ def _ends_with(guard, order, at, within):
 
 
 @kernel()
-def note_switches(lanes, order, viscous) -> None:
+def note_switches(lanes, order, viscous, fraction) -> None:
     """Write the modes that pairs take at the end of the steps to `lanes.switch`, -1 for pairs that keep their mode.
 
     Pairs whose events differ in time only by rounding switch together, so that a symmetric motion stays symmetric.
@@ -390,21 +472,21 @@ def note_switches(lanes, order, viscous) -> None:
                 pair = guard % PAIR_COUNT
                 # a first guard takes precedence over a second guard
                 if lanes.switch[pair, lane] < 0 and lanes.parted[pair, lane] >= lanes.step[lane]:
-                    _note_switch(lanes, lane, guard, viscous)
+                    _note_switch(lanes, lane, guard, viscous, fraction)
     for lane in range(WIDTH):
         if lanes.event[lane] >= 0:
-            _note_switch(lanes, lane, lanes.event[lane], viscous)
+            _note_switch(lanes, lane, lanes.event[lane], viscous, fraction)
 
 
 @kernel()
-def _note_switch(lanes, lane, guard, viscous) -> None:
+def _note_switch(lanes, lane, guard, viscous, fraction) -> None:
     """Record the mode that follows when a guard turns negative."""
     pair = guard % PAIR_COUNT
     mode = lanes.mode[pair, lane]
     if guard >= AGAIN:
-        mode = ON
+        mode = _next_mode(lanes, lane, OFF, viscous, fraction)
     elif guard >= SECOND:
         mode = _other_mode(mode)
     else:
-        mode = _next_mode(mode, viscous)
+        mode = _next_mode(lanes, lane, mode, viscous, fraction)
     lanes.switch[pair, lane] = mode

@@ -13,6 +13,7 @@ from plow_twin.kernel.simd import below, exact_row, exact_splat, fused, magnitud
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.kinematics import pose_of, rate_at
 from plow_twin.solve.lanes.events import first_events, note_switches
+from plow_twin.solve.lanes.maps import choose_maps, duration_of, note_durations, sigma_of
 from plow_twin.solve.lanes.record import (
     COMPONENTS,
     WIDTH,
@@ -23,13 +24,13 @@ from plow_twin.solve.lanes.record import (
     weigh_lanes,
     write_place,
 )
-from plow_twin.solve.lanes.series import accurate_steps, expand, expand_loads
+from plow_twin.solve.lanes.series import accurate_steps, accurate_steps_by_power, expand, expand_loads
 from plow_twin.solve.lanes.totals import add_step, find_peaks, sum_step
 from plow_twin.solve.lanes.waves import turn_lanes
 from plow_twin.solve.method.flight import safe_time
 from plow_twin.solve.method.rest import slow_enough
-from plow_twin.solve.modes import LARGEST_ANGLE, within_range
-from plow_twin.solve.state import COS, OFF, OMEGA, SIN, THETA, VX, VY, Status, X, Y
+from plow_twin.solve.modes import LARGEST_ANGLE, slow_touch, within_range
+from plow_twin.solve.state import COS, OFF, OMEGA, ON, RELEASED, SIN, THETA, VX, VY, Status, X, Y
 from plow_twin.solve.step import LONGEST_STEP, ONE_INSTANT, PAST_AN_INSTANT
 
 
@@ -108,7 +109,7 @@ def _look(members, flight, rest, lanes, lane, w, t_end, budget, in_range) -> int
 
 
 @kernel()
-def _fill_rows(lanes, lane, order, t, i, end, q, v) -> int:
+def _fill_rows(lanes, lane, order, fraction, t, i, end, q, v) -> int:
     """Fill the rows within a lane's step from row i on, eight at once; return the first row after the step."""
     last, begin, sigma = i, lanes.time[lane], lanes.root
     while last < t.size and t[last] < end:
@@ -116,7 +117,7 @@ def _fill_rows(lanes, lane, order, t, i, end, q, v) -> int:
     while i < last:
         count = min(last - i, WIDTH)
         for j in range(WIDTH):
-            sigma[j] = max(t[i + min(j, count - 1)] - begin, 0.0)
+            sigma[j] = sigma_of(lanes, lane, max(t[i + min(j, count - 1)] - begin, 0.0), fraction)
         at = exact_row(sigma, 0)
         # four sums side by side keep the processor busy, since no sum waits for another
         for first in range(0, COMPONENTS, 4):
@@ -150,7 +151,7 @@ def turn(out, first, second) -> None:
 
 @kernel()
 def _part(state, sums, lanes, lane) -> None:
-    """Set the clipped pairs that leave their wall within a lane's step to off."""
+    """Set the clipped and released pairs that leave their wall within a lane's step to off."""
     for pair in range(PAIR_COUNT):
         if lanes.parted[pair, lane] < lanes.step[lane]:
             lanes.mode[pair, lane] = OFF
@@ -159,18 +160,35 @@ def _part(state, sums, lanes, lane) -> None:
 
 
 @kernel()
-def _touch(p, lanes, pair, lane) -> None:
-    """Start a contact: fix its lambda = D / v0 by the impact speed v0 (`modes.touch`)."""
-    if p.damping_number >= 0.0:
-        y = lanes.y
-        rate = rate_at(
-            p, pair, y[COS, lane], y[SIN, lane], y[OMEGA, lane], y[X, lane], y[Y, lane], y[VX, lane], y[VY, lane]
-        )
-        lanes.factor[pair, lane] = p.damping_number / max(rate, p.speed_floor)
+def _rate(p, lanes, pair, lane) -> float:
+    """Return the rate of a lane's penetration at the step's end."""
+    y = lanes.y
+    return rate_at(
+        p, pair, y[COS, lane], y[SIN, lane], y[OMEGA, lane], y[X, lane], y[Y, lane], y[VX, lane], y[VY, lane]
+    )
 
 
 @kernel()
-def _switch(p, state, sums, lanes, lane, hysteretic) -> None:
+def _touch(p, lanes, pair, lane) -> None:
+    """Start a contact: fix its lambda = D / v0 by the impact speed v0 (`modes.touch`)."""
+    if p.damping_number >= 0.0:
+        lanes.factor[pair, lane] = p.damping_number / max(_rate(p, lanes, pair, lane), p.speed_floor)
+
+
+@kernel()
+def _touch_or_release(p, lanes, pair, lane) -> None:
+    """Begin the contact of a pair whose force is d^n; a slow touch begins with a released pair (`step`)."""
+    lanes.touched[lane] &= ~(1 << pair)
+    if lanes.mode[pair, lane] == ON:
+        if _rate(p, lanes, pair, lane) > slow_touch(p):
+            lanes.touched[lane] |= 1 << pair
+            lanes.touch_time[lane] = lanes.time[lane]
+        else:
+            lanes.mode[pair, lane] = RELEASED
+
+
+@kernel()
+def _switch(p, state, sums, lanes, lane, hysteretic, fraction) -> None:
     """Change the modes of a lane's pairs at the step's end."""
     for pair in range(PAIR_COUNT):
         new, old = lanes.switch[pair, lane], lanes.mode[pair, lane]
@@ -182,19 +200,28 @@ def _switch(p, state, sums, lanes, lane, hysteretic) -> None:
             sums.makes[pair] += 1
             if hysteretic is not None:
                 _touch(p, lanes, pair, lane)
-        sums.logged += 1
+        if fraction is None:
+            sums.logged += 1
+        else:
+            if old == OFF:
+                _touch_or_release(p, lanes, pair, lane)
+            else:
+                lanes.touched[lane] &= ~(1 << pair)
+            # a released pair is counted as on
+            sums.logged += 0 if old in (ON, RELEASED) and new in (ON, RELEASED) else 1
 
 
-@kernel(inline="source")
-def end_of(lanes, lane):
+@kernel(inline="code")
+def end_of(lanes, lane, fraction):
     """Return the time at which a lane's step ends."""
-    if lanes.ends_at_stop[lane] == 1 and lanes.whole[lane] < LONGEST_STEP:
-        return lanes.stop[lane]
-    return lanes.time[lane] + lanes.step[lane]
+    stops = lanes.ends_at_stop[lane] == 1
+    if fraction is None:
+        stops = stops and lanes.whole[lane] < LONGEST_STEP
+    return lanes.stop[lane] if stops else lanes.time[lane] + duration_of(lanes, lane, fraction)
 
 
 @kernel()
-def complete(p, state, sums, lanes, lane, hysteretic) -> None:
+def complete(p, state, sums, lanes, lane, hysteretic, fraction) -> None:
     """Move the time, counts and modes of a lane to the end of its step; its state must already be there."""
     begin, parted = lanes.time[lane], False
     state.steps += 1
@@ -204,18 +231,20 @@ def complete(p, state, sums, lanes, lane, hysteretic) -> None:
             parted |= lanes.parted[pair, lane] < lanes.step[lane]
     if parted:
         _part(state, sums, lanes, lane)
-    end = end_of(lanes, lane)
+    end = end_of(lanes, lane, fraction)
     lanes.time[lane] = end
     at_once = end - begin <= ONE_INSTANT * (1.0 + abs(begin))
     if not at_once:
-        state.last_step_size = end - begin
+        state.last_step_size = lanes.before_it[lane] = end - begin
+    if not at_once or lanes.event[lane] < 0:
+        lanes.touched[lane] = 0
     if lanes.event[lane] < 0:
         state.events_at_once = 0
         if not parted:
             return
     else:
         state.events_at_once = state.events_at_once + 1 if at_once else 0
-        _switch(p, state, sums, lanes, lane, hysteretic)
+        _switch(p, state, sums, lanes, lane, hysteretic, fraction)
     note_modes(p, lanes, lane)
     lanes.stale[0] = 1
 
@@ -277,10 +306,12 @@ def _unowned_members(members):
 
 @kernel(entry=True)
 def run_lanes(
-    members, waves, second, viscous, hysteretic, flight, rest, order, lanes, w, queue, t_end, budget, iterations, t
-) -> bool:
+    members, waves, second, viscous, hysteretic, power, fraction, flight, rest, order, lanes, w, queue, t_end, budget,
+    iterations, t,
+) -> bool:  # fmt: skip
     """Advance the members numbered in `queue` to `t_end`, eight at a time; return False if `iterations` are used up.
 
+    `power` is 1 for exponents other than 1, `fraction` for exponents that are not integers, otherwise they are None.
     `t` holds the times of the rows, `order` is the series' order, and `budget` the largest number of steps of a scene.
     A scene leaves its lane with a `Status`, with `OTHER_METHOD` or, when the iterations are used up, with `PAUSED`.
     """
@@ -307,10 +338,10 @@ def run_lanes(
                 _leave(members, lanes, w, order, lane, code, t)
         if live == 0:
             return True
-        if lanes.stale[0] == 1 and hysteretic is None:
+        if lanes.stale[0] == 1 and hysteretic is None and power is None:
             weigh_lanes(lanes)
             lanes.stale[0] = 0
-        _step(members, waves, second, viscous, hysteretic, order, lanes, w, t)
+        _step(members, waves, second, viscous, hysteretic, power, fraction, order, lanes, w, t)
     for lane in range(WIDTH):
         if lanes.member[lane] >= 0:
             _leave(members, lanes, w, order, lane, _PAUSED, t)
@@ -318,31 +349,41 @@ def run_lanes(
 
 
 @kernel()
-def _step(members, waves, second, viscous, hysteretic, order, lanes, w, t) -> None:
+def _step(members, waves, second, viscous, hysteretic, power, fraction, order, lanes, w, t) -> None:
     """Take one step in each lane."""
+    if fraction is not None:
+        choose_maps(
+            members.params, members.harmonics, members.extent, waves, second, hysteretic, fraction, None, lanes, w
+        )
     if waves is not None:
-        expand_loads(members.harmonics, members.extent, second, lanes, w, order)
-    expand(lanes, w, order, waves, second, viscous, hysteretic, None)
-    infinite = accurate_steps(members.params, lanes, order)
+        expand_loads(members.harmonics, members.extent, second, fraction, lanes, w, order)
+    expand(lanes, w, order, waves, second, viscous, hysteretic, power, fraction, None)
+    if power is None:
+        infinite = accurate_steps(members.params, lanes, order)
+    else:
+        infinite = accurate_steps_by_power(lanes, w, order, fraction)
     if infinite != 0:
         for lane in range(WIDTH):
             if infinite >> lane & 1:
                 _leave(members, lanes, w, order, lane, _NON_FINITE, t)
-    first_events(members.states, lanes, w, order, order, hysteretic)
+    first_events(members.states, lanes, w, order, order, hysteretic, power, fraction)
     go_past_an_instant(members.params, members.states, lanes)
-    note_switches(lanes, order, viscous)
-    sum_step(lanes, w, order)
-    add_step(members.totals, lanes, w, order, order, viscous, hysteretic)
+    note_switches(lanes, order, viscous, fraction)
+    if fraction is not None:
+        note_durations(lanes)
+    sum_step(lanes, w, order, power)
+    add_step(members.totals, lanes, w, order, order, viscous, hysteretic, power, fraction)
     for lane in range(WIDTH):
         member = lanes.member[lane]
         if member >= 0 and members.first[member] < t.size:
-            first, end = members.first[member], end_of(lanes, lane)
+            first, end = members.first[member], end_of(lanes, lane, fraction)
             if t[first] < end:
                 members.first[member] = _fill_rows(
-                    lanes, lane, order, t, first, end, members.q[member], members.v[member]
+                    lanes, lane, order, fraction, t, first, end, members.q[member], members.v[member]
                 )
     move(lanes)
     for lane in range(WIDTH):
         member = lanes.member[lane]
         if member >= 0:
-            complete(members.params[member], members.states[member], members.totals[member], lanes, lane, hysteretic)
+            p, state, sums = members.params[member], members.states[member], members.totals[member]
+            complete(p, state, sums, lanes, lane, hysteretic, fraction)

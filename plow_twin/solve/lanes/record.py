@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 import numpy as np
@@ -12,7 +13,7 @@ from plow_twin.kernel.polynomial import sum_to_bernstein
 from plow_twin.kernel.simd import choose, exact_row, exact_splat, fused, set_row
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.compiled_scene import CompiledScene, options
-from plow_twin.solve.state import CLIPPED, COS, MAX_ORDER, OFF, ON, Terms, new_records
+from plow_twin.solve.state import COS, MAX_ORDER, OFF, ON, Terms, new_records
 
 #: Number of scenes in a vector.
 WIDTH: Final = 8
@@ -25,6 +26,8 @@ DC, DS, DX, DY = range(4)
 SECOND: Final = PAIR_COUNT
 AGAIN: Final = 2 * PAIR_COUNT
 GUARDS: Final = 3 * PAIR_COUNT
+#: Largest number of consecutive orders that may vanish (`Params.lacuna`).
+MOST_LACUNA: Final = 6
 
 _ROWS: Final = MAX_ORDER + 1
 _PAIRS: Final = (PAIR_COUNT, WIDTH)
@@ -35,7 +38,8 @@ LANES: Final = np.dtype(
         ("series", "f8", (COMPONENTS, _ROWS, WIDTH)),  # state
         ("moment", "f8", (4, _ROWS, WIDTH)),  # factors of c, s, X and Y in the moment of the contacts
         ("load", "f8", (3, _ROWS, WIDTH)),  # S1, S2, M
-        ("depth", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # with lambda d' only: penetrations of the pairs in each slot
+        # penetrations of the pairs in each slot, unless F is linear in d and d'
+        ("depth", "f8", (PAIR_COUNT, _ROWS, WIDTH)),
         ("push", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # F / K of the pairs in each slot
         ("guard", "f8", (GUARDS, _ROWS, WIDTH)),  # for each round eight guards, which may belong to any lanes
         ("bernstein", "f8", (_ROWS, WIDTH)),
@@ -70,7 +74,7 @@ LANES: Final = np.dtype(
         ("gained", "f8", (2, WIDTH)),  # one slot: impulse over the step, peak
         ("sum", "f8", (4, WIDTH)),  # integrals over the step of the changes of cosine, sine, X, Y
         ("harmonic", "f8", (10, WIDTH)),  # one load: frequency, sine, cosine, amplitudes of S1, S2, M; phase
-        ("size", "f8", (2, WIDTH)),  # the terms of the last two orders, as velocities
+        ("size", "f8", (MOST_LACUNA, WIDTH)),  # the terms of the last orders, as velocities
         ("step", "f8", _LANES_OF),  # step size in s
         ("accurate", "f8", _LANES_OF),  # step size without events
         ("stop", "f8", _LANES_OF),  # time at which a step must end
@@ -105,6 +109,25 @@ LANES: Final = np.dtype(
         ("orders", "i8", _LANES_OF),  # order of each lane's series; the terms beyond have vanished
         ("before", "i8", _LANES_OF),  # number of steps up to the last sample
         ("carrying", "i8", _LANES_OF),  # a bit for each pair that is ON
+        # exponents other than 1 only
+        ("power", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # d^n of each slot's pairs
+        ("base", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # d, or d / sigma^2 from a touch on; d^2 if n is an integer
+        ("rate", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # d' of each slot's pairs
+        ("per_base", "f8", _PAIRS),  # 1 / base at the step's start
+        ("exponent", "f8", _LANES_OF),
+        ("threshold", "f8", (MOST_LACUNA, WIDTH)),  # admissible sizes of the last orders, as velocities
+        ("stretch", "f8", _LANES_OF),  # log2 of the velocity's tolerance over that of the position and the order
+        # exponents that are not integers only
+        ("rates", "f8", (4, _ROWS, WIDTH)),  # rates of cosine, sine, X and Y
+        ("alpha", "f8", _LANES_OF),  # time since the step's start: alpha sigma + beta sigma^2 / 2
+        ("beta", "f8", _LANES_OF),
+        ("duration", "f8", _LANES_OF),  # step size in s, where `step` and `whole` are values of sigma
+        ("before_it", "f8", _LANES_OF),  # size of the step before in s
+        ("touch_time", "f8", _LANES_OF),  # time of the last touch
+        ("release", "f8", _LANES_OF),  # penetration below which the force is negligible
+        ("may_stop", "i8", _LANES_OF),  # 1 if a step that is `whole` ends at `stop`
+        ("touched", "i8", _LANES_OF),  # a bit for each pair that touches at the step's start
+        ("touching", "i8", (PAIR_COUNT,)),  # a bit for each lane whose pair in the slot touches at the step's start
         # single numbers come last, so that every row before them fills a cache line
         ("parting", "i8", (1,)),  # a bit for each lane in which a CLIPPED pair parts
         ("rounds", "i8", (1,)),
@@ -115,19 +138,24 @@ LANES: Final = np.dtype(
 )
 
 
-#: Terms that a scene in lanes may have: damping of a force with exponent 1, harmonic loads, flight and rest. For a step
-#: of flight or rest the scene leaves its lane.
-_COVERED: Final = {"harmonics", "second", "viscous", "hysteretic", "flight", "rest"}
+#: Terms that a scene in lanes may have: those of its law without a ramp, harmonic loads, flight and rest. For a step of
+#: flight or rest the scene leaves its lane.
+_COVERED: Final = {"harmonics", "second", "viscous", "hysteretic", "integer", "fraction", "flight", "rest"}
 
 
 def fits_lanes(compiled: CompiledScene, *, sampled: bool = False) -> bool:
     """Return whether a scene can run in lanes.
 
-    Its exponent must be 1, it may have no other terms than damping and harmonics (or samples), and no `Options`.
+    It may have no other terms than those of its law and harmonics (or samples), no ramp, and no `Options`.
     """
     parts = compiled.parts._replace(terms=compiled.parts.terms._replace(segments=None)) if sampled else compiled.parts
     there = (name for name, term in zip(Terms._fields, parts.terms, strict=True) if term is not None)
     return parts.implicit is None and _COVERED.issuperset(there) and not any(options(compiled.scene))
+
+
+def powers(terms: Terms) -> tuple[int | None, int | None]:
+    """Return 1 for exponents other than 1, and 1 for exponents that are not integers, otherwise None."""
+    return 1 if terms.integer or terms.fraction else None, terms.fraction
 
 
 def new_lanes() -> NDArray[np.void]:
@@ -163,6 +191,12 @@ def load_lane(p, state, totals, lanes, lane, member) -> None:
     lanes.radius[lane], lanes.weight[lane] = p.radius, p.weight
     lanes.stiffness[lane], lanes.viscous[lane] = p.stiffness, p.viscous
     lanes.half_cavity[lane] = p.half_cavity
+    lanes.exponent[lane], lanes.release[lane] = p.exponent, p.release
+    for i in range(MOST_LACUNA):
+        lanes.threshold[i, lane] = p.threshold[p.order - i] if i < p.lacuna else np.inf
+    lanes.stretch[lane] = math.log2(p.velocity_tolerance / (p.position_tolerance * (p.order + 1)))
+    lanes.before_it[lane], lanes.touch_time[lane] = state.last_step_size, state.touch_time
+    lanes.touched[lane] = state.touching
     state.in_flight = state.at_rest = 0
     note_modes(p, lanes, lane)
 
@@ -180,6 +214,7 @@ def write_state(state, lanes, lane) -> None:
     """Write the whole state of a lane to a state's record."""
     write_place(state, lanes, lane)
     state.time = lanes.time[lane]
+    state.touching, state.touch_time = lanes.touched[lane], lanes.touch_time[lane]
     for pair in range(PAIR_COUNT):
         state.mode[pair], state.damping_factor[pair] = lanes.mode[pair, lane], lanes.factor[pair, lane]
 
@@ -197,7 +232,7 @@ def save_lane(state, totals, lanes, lane) -> None:
 @kernel()
 def clear_lane(lanes, lane) -> None:
     """Empty a lane."""
-    lanes.member[lane], lanes.watched[lane], rest = -1, 0, ~(1 << lane)
+    lanes.member[lane], lanes.watched[lane], lanes.touched[lane], rest = -1, 0, 0, ~(1 << lane)
     for pair in range(PAIR_COUNT):
         lanes.on[pair] &= rest
         lanes.off[pair] &= rest
@@ -219,7 +254,7 @@ def note_modes(p, lanes, lane) -> None:
             carrying |= 1 << pair
             _take_slot(lanes, lane, pair, taken)
             taken += 1
-        elif mode == CLIPPED:
+        elif mode != OFF:
             watched |= 1 << pair | 1 << SECOND + pair
     for slot in range(taken):
         lanes.taken[slot] |= bit

@@ -2,8 +2,8 @@
 
 If the contact force is linear in penetration and rate, the sum of a scene's acting pairs is one affine map of the
 state. An order then takes twelve Cauchy products, for any number and choice of acting pairs. With lambda d' the force
-K d (1 + lambda d') is K (d + lambda / 2 (d^2)'), which takes half a product more for each slot. A slot holds one acting
-pair of each lane; the pairs of different lanes in a slot may differ.
+K d (1 + lambda d') is K (d + lambda / 2 (d^2)'), which takes half a product more for each slot, and d^n (1 + lambda d')
+three. A slot holds one acting pair of each lane; the pairs of different lanes in a slot may differ.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ import math
 import numpy as np
 
 from plow_twin.kernel.compiler import kernel
-from plow_twin.kernel.simd import below, choose, exact_row, exact_splat, fused, magnitude, set_row
+from plow_twin.kernel.simd import below, choose, exact_row, exact_splat, fused, magnitude, set_row, square_root
 from plow_twin.model.pairs import PAIR_COUNT
-from plow_twin.solve.lanes.record import DC, DS, DX, DY, WIDTH, linear_at, penetration_at
-from plow_twin.solve.lanes.waves import turn_lanes
+from plow_twin.solve.lanes.record import DC, DS, DX, DY, MOST_LACUNA, WIDTH, linear_at, penetration_at
+from plow_twin.solve.lanes.waves import coarse_exp2, coarse_log2, turn_lanes
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, X, Y
 
 #: Largest usable term; products of larger terms would not be finite.
@@ -52,12 +52,13 @@ def _add_wave(load, k, lanes, first, sine, cosine) -> None:
 
 
 @kernel()
-def expand_loads(harmonics, extent, second, lanes, w, order) -> None:
+def expand_loads(harmonics, extent, second, fraction, lanes, w, order) -> None:
     """Write the series of the harmonic loads S1, S2, M of each lane's scene.
 
     `extent`, shape (n, 2), has the index of each scene's first harmonic and the number of its harmonics.
     """
     zero, most = exact_splat(0.0), 0
+    alpha, beta = exact_row(lanes.alpha, 0), exact_row(lanes.beta, 0)
     for k in range(order):
         for j in range(3):
             set_row(lanes.load[j], k, zero)
@@ -67,17 +68,23 @@ def expand_loads(harmonics, extent, second, lanes, w, order) -> None:
     for i in range(most):
         _gather_harmonic(harmonics, extent, lanes, i)
         omega, sine, cosine = (exact_row(lanes.harmonic, 0), exact_row(lanes.harmonic, 1), exact_row(lanes.harmonic, 2))
+        sine_before = cosine_before = zero
         for k in range(order):
             _add_wave(lanes.load[0], k, lanes, 3, sine, cosine)
             if second is not None:
                 _add_wave(lanes.load[1], k, lanes, 5, sine, cosine)
             _add_wave(lanes.load[2], k, lanes, 7, sine, cosine)
             scale = omega * w.inverse[k + 1]
-            sine, cosine = scale * cosine, scale * sine * -1.0
+            if fraction is None:
+                sine, cosine = scale * cosine, scale * sine * -1.0
+            else:
+                new_sine = scale * fused(alpha, cosine, beta * cosine_before)
+                new_cosine = scale * fused(alpha, sine, beta * sine_before) * -1.0
+                sine_before, cosine_before, sine, cosine = sine, cosine, new_sine, new_cosine
 
 
 @kernel()
-def expand(lanes, w, limit, waves, second, viscous, hysteretic, segments) -> int:
+def expand(lanes, w, limit, waves, second, viscous, hysteretic, power, fraction, segments) -> int:
     """Write the series of the state; return the order.
 
     Under sampled loads the series of a lane ends at the order whose terms vanish over the longest wanted step. Its
@@ -95,7 +102,12 @@ def expand(lanes, w, limit, waves, second, viscous, hysteretic, segments) -> int
         exact_row(lanes.constant, 1),
         exact_row(lanes.constant, 2),
     )
-    active = calm = 0
+    active = calm = history = 0
+    recent = 2
+    if power is not None:
+        recent = MOST_LACUNA
+    alpha, beta = exact_row(lanes.alpha, 0), exact_row(lanes.beta, 0)
+    older_c = older_s = x_rate = y_rate = vx_rate = vy_rate = om_rate = c_rate = s_rate = angle_rate = zero
     before_c = before_s = zero
     reach = exact_splat(1.0)
     if segments is not None:
@@ -109,12 +121,15 @@ def expand(lanes, w, limit, waves, second, viscous, hysteretic, segments) -> int
         if segments is not None and k > 0:
             reach = reach * exact_row(lanes.whole, 0)
             quiet = below(_size(lanes, vx, vy, om, c, s) * reach, exact_row(lanes.small, 0))
+            if power is not None:
+                calm, history = _long_quiet(history), history << WIDTH | quiet
             if k >= _FEWEST_ORDERS and quiet & calm & active != 0:
                 active = _end_series(lanes, active, quiet & calm, k)
                 if active == 0:
                     order = k
                     break
-            calm = quiet
+            if power is None:
+                calm = quiet
         # the newest orders are added last, so that most of the sum need not wait until they are computed
         px = py = pvx = pvy = pc = ps = torque = other = wc = ws = zero
         for j in range(1, k):
@@ -151,9 +166,18 @@ def expand(lanes, w, limit, waves, second, viscous, hysteretic, segments) -> int
             rise_x, rise_y = exact_row(lanes.slope, 0), exact_row(lanes.slope, 1)
             ax = fused(rise_x, before_c, fused(rise_y, before_s, ax))
             ay = fused(rise_y, before_c, fused(rise_x, before_s * -1.0, ay))
-            if k == 1:
-                turned_by = exact_row(lanes.slope, 2)
-            before_c, before_s = c, s
+            if fraction is None:
+                if k == 1:
+                    turned_by = exact_row(lanes.slope, 2)
+                before_c, before_s = c, s
+            else:
+                # the series of the time t(sigma) has the terms alpha and beta / 2
+                if k == 1:
+                    turned_by = exact_row(lanes.slope, 2) * alpha
+                if k == 2:
+                    turned_by = exact_row(lanes.slope, 2) * beta * 0.5
+                before_c, before_s = fused(alpha, c, beta * older_c * 0.5), fused(alpha, s, beta * older_s * 0.5)
+                older_c, older_s = c, s
         if waves is not None:
             wc, ws = _add_ends(load[0], k, c0, s0, c, s, share, wc, ws)
             ax = fused(exact_row(direction, 0), wc, fused(exact_row(direction, 1), ws, ax))
@@ -168,10 +192,16 @@ def expand(lanes, w, limit, waves, second, viscous, hysteretic, segments) -> int
                 ax = fused(exact_row(direction, 2), wc, fused(exact_row(direction, 3), ws, ax))
                 ay = fused(exact_row(direction, 3), wc, fused(exact_row(direction, 2), ws * -1.0, ay))
             turned_by = turned_by + exact_row(load[2], k)
-        if hysteretic is not None:
-            acts = _ALL
-            if segments is not None:
-                acts = active
+        acts = _ALL
+        if segments is not None:
+            acts = active
+        if power is not None:
+            if fraction is not None:
+                _set_rates(lanes, k, dx, dy, dc, ds)
+            fx, fy, gc, gs = _push_by_power(
+                lanes, w, k, acts, hysteretic, fraction, c, s, x, y, dc, ds, dx, dy, alpha, beta
+            )
+        elif hysteretic is not None:
             fx, fy, gc, gs = _push(lanes, w, k, acts, c, s, x, y, dc, ds, dx, dy)
         elif k == 0:
             fx, fy, gc, gs = _start(lanes, viscous, c, s, x, y, dc, ds, dx, dy)
@@ -193,12 +223,46 @@ def expand(lanes, w, limit, waves, second, viscous, hysteretic, segments) -> int
             ax, ay, turned_by = choose(active, ax, zero), choose(active, ay, zero), choose(active, turned_by, zero)
             om = choose(active, om, zero)
         part = w.inverse[k + 1]
-        x, y, vx, vy, c, s = dx * part, dy * part, ax * part, ay * part, dc * part, ds * part
-        angle, om = om * part, turned_by * part
-        if k >= limit - 2:
-            set_row(lanes.size, k - (limit - 2), _size(lanes, vx, vy, om, c, s))
+        if fraction is None:
+            x, y, vx, vy, c, s = dx * part, dy * part, ax * part, ay * part, dc * part, ds * part
+            angle, om = om * part, turned_by * part
+        else:
+            steady, bent = alpha * part, beta * part
+            x, x_rate, y, y_rate = fused(dx, steady, x_rate * bent), dx, fused(dy, steady, y_rate * bent), dy
+            vx, vx_rate, vy, vy_rate = fused(ax, steady, vx_rate * bent), ax, fused(ay, steady, vy_rate * bent), ay
+            c, c_rate, s, s_rate = fused(dc, steady, c_rate * bent), dc, fused(ds, steady, s_rate * bent), ds
+            angle, angle_rate = fused(om, steady, angle_rate * bent), om
+            om, om_rate = fused(turned_by, steady, om_rate * bent), turned_by
+            if segments is not None and active != _ALL:
+                x, y, vx, vy = (
+                    choose(active, x, zero), choose(active, y, zero), choose(active, vx, zero),
+                    choose(active, vy, zero),
+                )  # fmt: skip
+                c, s, om, angle = (
+                    choose(active, c, zero), choose(active, s, zero), choose(active, om, zero),
+                    choose(active, angle, zero),
+                )  # fmt: skip
+        if k >= limit - recent:
+            set_row(lanes.size, k - (limit - recent), _size(lanes, vx, vy, om, c, s))
     _set_state(series, order, x, y, vx, vy, om, c, s, angle)
     return order
+
+
+@kernel(inline="code")
+def _long_quiet(history) -> int:
+    """Return the bits that are set in each of the last orders but the newest."""
+    bits = history
+    for i in range(1, MOST_LACUNA - 1):
+        bits &= history >> WIDTH * i
+    return bits
+
+
+@kernel(inline="code")
+def _set_rates(lanes, k, dx, dy, dc, ds) -> None:
+    set_row(lanes.rates[0], k, dc)
+    set_row(lanes.rates[1], k, ds)
+    set_row(lanes.rates[2], k, dx)
+    set_row(lanes.rates[3], k, dy)
 
 
 @kernel()
@@ -301,6 +365,148 @@ def _push(lanes, w, k, acts, c, s, x, y, dc, ds, dx, dy):
 
 
 @kernel(inline="code")
+def _push_by_power(lanes, w, k, acts, hysteretic, fraction, c, s, x, y, dc, ds, dx, dy, alpha, beta):
+    """Return what `_push` does, for F = K d^n (1 + lambda d') with exponents n other than 1."""
+    fx = fy = gc = gs = zero = exact_splat(0.0)
+    for slot in range(PAIR_COUNT):
+        gear, depth = lanes.gear[slot], lanes.depth[slot]
+        if lanes.taken[slot] == 0:
+            break
+        rate = linear_at(gear, dc, ds, dx, dy)
+        if k == 0:
+            set_row(depth, 0, penetration_at(gear, c, s, x, y))
+        set_row(lanes.rate[slot], k, rate)
+        if fraction is not None:
+            rate = rate * alpha
+            if k > 0:
+                rate = fused(exact_row(lanes.rate[slot], k - 1), beta, rate)
+        deeper = rate * w.inverse[k + 1]
+        if acts != _ALL:
+            deeper = choose(acts, deeper, zero)
+        set_row(depth, k + 1, deeper)
+        if fraction is not None:
+            power, damped = _raise(lanes, w, slot, k, hysteretic)
+        else:
+            power, damped = _multiply(lanes, slot, k, hysteretic)
+        if fraction is None:
+            power = choose(lanes.taken[slot], power, zero)
+        if acts != _ALL:
+            power, damped = choose(acts, power, zero), choose(acts, damped, zero)
+        set_row(lanes.power[slot], k, power)
+        push = power
+        if hysteretic is not None:
+            damped = fused(power, exact_row(lanes.rate[slot], 0), damped)
+            push = fused(exact_row(gear, 7), damped, push)
+        set_row(lanes.push[slot], k, push)
+        fx, fy, gc, gs = _add_force(lanes, gear, push, fx, fy, gc, gs)
+    return fx, fy, gc, gs
+
+
+@kernel(inline="code")
+def _multiply(lanes, slot, k, hysteretic):
+    """Return order k of the penetration's power and of its product with the rate, without the power's order k.
+
+    The exponents are integers from 2 to 4, which may differ from lane to lane.
+    """
+    depth, square, power, exponent = lanes.depth[slot], lanes.base[slot], lanes.power[slot], lanes.exponent
+    set_row(square, k, _product(depth, depth, k))
+    found = exact_row(square, k)
+    higher = below(exact_splat(2.5), exact_row(exponent, 0))
+    if higher != 0:
+        # d^3 = d^2 d, d^4 = d^2 d^2
+        fourth = below(exact_splat(3.5), exact_row(exponent, 0))
+        found = choose(higher, choose(fourth, _product(square, square, k), _product(square, depth, k)), found)
+    damped = exact_splat(0.0)
+    if hysteretic is not None:
+        for j in range(k):
+            damped = fused(exact_row(power, j), exact_row(lanes.rate[slot], k - j), damped)
+    return found, damped
+
+
+@kernel(inline="code")
+def _product(a, b, k):
+    """Return order k of the product of two series of each lane."""
+    total = exact_splat(0.0)
+    for j in range(k + 1):
+        total = fused(exact_row(a, j), exact_row(b, k - j), total)
+    return total
+
+
+@kernel(inline="code")
+def _raise(lanes, w, slot, k, hysteretic):
+    """Return what `_multiply` does, for exponents n that are not integers.
+
+    The recurrence for the power P of the base b is that of `model.contact.power_term`. The base is d, or d / sigma^2 in
+    lanes whose pair touches at the step's start, where P begins with sigma^3 (n = 1.5).
+    """
+    power, base, rate = lanes.power[slot], lanes.base[slot], lanes.rate[slot]
+    touching, zero, above = lanes.touching[slot], exact_splat(0.0), exact_row(lanes.exponent, 0) + 1.0
+    here, weight, per = exact_row(lanes.depth[slot], k), exact_splat(-1.0 * k), exact_splat(w.inverse[max(k, 1)])
+    if touching != 0:
+        if k > 1:
+            set_row(base, k - 2, choose(touching, here, exact_row(base, k - 2)))
+        if k == 2:
+            _invert(lanes, slot, here, touching)
+        here = choose(touching, zero, here)
+        weight = choose(touching, exact_splat(3.0 - k), weight)
+        per = choose(touching, exact_splat(w.inverse[max(k - 3, 1)]), per)
+    set_row(base, k, here)
+    if k == 0:
+        _invert(lanes, slot, here, ~touching)
+        # the powers of lanes without a pair in the slot stay zero
+        return choose(lanes.taken[slot] & ~touching, _first_power(lanes, here), zero), zero
+    found = damped = zero
+    for j in range(1, k):
+        lower = exact_row(power, k - j)
+        weight = weight + above
+        found = fused(lower, exact_row(base, j) * weight, found)
+        if hysteretic is not None:
+            damped = fused(lower, exact_row(rate, j), damped)
+    first = exact_row(power, 0)
+    found = fused(first, here * (weight + above), found)
+    damped = fused(first, exact_row(rate, k), damped)
+    found = found * (per * exact_row(lanes.per_base, slot))
+    if touching != 0 and k <= 3:
+        found = choose(touching, zero, found)
+        if k == 3:
+            found = choose(touching, _first_power(lanes, exact_row(base, 0)), found)
+    return found, damped
+
+
+@kernel(inline="code")
+def _invert(lanes, slot, value, bits) -> None:
+    """Keep 1 / `value` in some lanes, 0 in lanes without a pair in the slot."""
+    there = choose(lanes.taken[slot], exact_splat(1.0) / value, exact_splat(0.0))
+    set_row(lanes.per_base, slot, choose(bits, there, exact_row(lanes.per_base, slot)))
+
+
+@kernel()
+def raised(lanes, value, fraction):
+    """Return value^n of each lane, 0 for negative values."""
+    if fraction is not None:
+        return _first_power(lanes, value)
+    zero, square, exponent = exact_splat(0.0), value * value, exact_row(lanes.exponent, 0)
+    higher, fourth = below(exact_splat(2.5), exponent), below(exact_splat(3.5), exponent)
+    power = choose(higher, choose(fourth, square, value) * square, square)
+    return choose(below(zero, value), power, zero)
+
+
+@kernel()
+def _first_power(lanes, value):
+    """Return value^n of each lane for exponents that are not integers, 0 for negative values."""
+    zero, half = exact_splat(0.0), exact_splat(1.5)
+    value = choose(below(zero, value), value, zero)
+    found = value * square_root(value)
+    others = below(exact_row(lanes.exponent, 0), half) | below(half, exact_row(lanes.exponent, 0))
+    if others != 0:
+        set_row(lanes.root, 0, value)
+        for lane in range(WIDTH):
+            lanes.root[lane] = lanes.root[lane] ** lanes.exponent[lane]
+        found = choose(others, exact_row(lanes.root, 0), found)
+    return found
+
+
+@kernel(inline="code")
 def _force(row, viscous, c, s, z, dc, ds, dz):
     """Return order k > 0 of a contact force along X or Y."""
     force = fused(exact_row(row, 2), z, fused(exact_row(row, 0), c, exact_row(row, 1) * s))
@@ -357,3 +563,35 @@ def accurate_steps(params, lanes, order) -> int:
         lanes.step[lane] = lanes.accurate[lane] = step
         lanes.ends_at_stop[lane] = 1 if step == whole else 0
     return infinite
+
+
+@kernel()
+def accurate_steps_by_power(lanes, w, order, fraction) -> int:
+    """Do what `accurate_steps` does, for exponents other than 1, from the last `MOST_LACUNA` orders.
+
+    A coarse logarithm suffices, because a step that is longer by 1e-4 has an error that is larger by 0.2 %.
+    """
+    whole, least, zero, infinite = exact_row(lanes.whole, 0), exact_splat(1e3), exact_splat(0.0), 0
+    for i in range(MOST_LACUNA):
+        size = exact_row(lanes.size, MOST_LACUNA - 1 - i)
+        infinite |= ~below(size, exact_splat(_FINITE))
+        here = coarse_log2(exact_row(lanes.threshold, i) / size) * w.inverse[order - i]
+        least = choose(below(here, least), here, least)
+    shorter = below(coarse_exp2(least), whole)
+    # over a long step an error of velocity becomes an error of position
+    stretch = least + exact_row(lanes.stretch, 0)
+    stretch = choose(below(zero, stretch), stretch, zero)
+    step = choose(shorter, coarse_exp2(fused(stretch, exact_splat(-w.inverse[order]), least)), whole)
+    live = 0
+    for lane in range(WIDTH):
+        lanes.ends_at_stop[lane] = 1
+        if lanes.member[lane] >= 0 and lanes.vanished[0] >> lane & 1 == 0:
+            live |= 1 << lane
+            lanes.orders[lane] = order
+            lanes.ends_at_stop[lane] = 1 - (shorter >> lane & 1)
+        if fraction is not None:
+            lanes.ends_at_stop[lane] &= lanes.may_stop[lane]
+    step = choose(live, step, whole)
+    set_row(lanes.step, 0, step)
+    set_row(lanes.accurate, 0, step)
+    return infinite & live

@@ -7,6 +7,7 @@ from plow_twin.kernel.polynomial import maximum
 from plow_twin.kernel.simd import below, choose, exact_row, exact_splat, fused, lowest_bit, magnitude, set_row
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.lanes.events import cross, isolate
+from plow_twin.solve.lanes.maps import duration_of
 from plow_twin.solve.lanes.record import COMPONENTS, WIDTH, linear_at, penetration_at, to_bernstein
 from plow_twin.solve.state import COS, SIN, X, Y
 from plow_twin.solve.totals import add_set_times
@@ -17,10 +18,10 @@ _ROUNDED, _SAME = 1.0 + 1e-9, 1.0 + 1e-12
 
 
 @kernel()
-def sum_step(lanes, w, order) -> None:
+def sum_step(lanes, w, order, power) -> None:
     """Write the change of the state over each lane's step, and the integrals of the changes of cosine, sine, X and Y.
 
-    A change is the difference from the value at the step's start.
+    A change is the difference from the value at the step's start. Only impulses with exponent 1 need the integrals.
     """
     h, zero = exact_row(lanes.step, 0), exact_splat(0.0)
     # four sums side by side keep the processor busy, since no sum waits for another
@@ -33,6 +34,8 @@ def sum_step(lanes, w, order) -> None:
         set_row(lanes.change, i + 1, b * h)
         set_row(lanes.change, i + 2, c * h)
         set_row(lanes.change, i + 3, d * h)
+    if power is not None:
+        return
     cosine, sine, x, y = lanes.series[COS], lanes.series[SIN], lanes.series[X], lanes.series[Y]
     a = b = c = d = zero
     for k in range(order, 0, -1):
@@ -46,25 +49,29 @@ def sum_step(lanes, w, order) -> None:
 
 
 @kernel()
-def add_step(totals, lanes, w, order, full, viscous, hysteretic) -> None:
+def add_step(totals, lanes, w, order, full, viscous, hysteretic, power, fraction) -> None:
     """Add the laid-out steps to the sums in the lanes, and the times of sets of corners to `totals` unless it is None.
 
     `order` and `full` have the meaning that they have in `first_events`.
     """
     last = order - 1
-    if totals is None and hysteretic is None:
+    if totals is None and hysteretic is None and power is None:
         # under samples a lane's series may end earlier than the others, and its guard then has one more term
         last = order
     for slot in range(PAIR_COUNT):
         taken = lanes.taken[slot]
         if taken == 0:
             break
-        set_row(lanes.gained, 0, _impulses(lanes, lanes.gear[slot], viscous, hysteretic))
+        if power is None:
+            gained = _impulses(lanes, lanes.gear[slot], viscous, hysteretic)
+        else:
+            gained = _impulses_by_power(lanes, w, slot, last, fraction)
+        set_row(lanes.gained, 0, gained)
         for lane in range(WIDTH):
             if taken >> lane & 1:
                 pair = lanes.slot[slot, lane]
                 lanes.impulse[pair, lane] += max(lanes.gained[0, lane], 0.0)
-                lanes.time_in_contact[pair, lane] += lanes.step[lane]
+                lanes.time_in_contact[pair, lane] += duration_of(lanes, lane, fraction)
                 lanes.gained[1, lane] = lanes.peak[pair, lane]
         raised = _raise_peaks(totals, lanes, w, slot, last, last + full - order, taken)
         while raised != 0:
@@ -76,7 +83,7 @@ def add_step(totals, lanes, w, order, full, viscous, hysteretic) -> None:
         return
     for lane in range(WIDTH):
         if lanes.member[lane] >= 0 and lanes.carrying[lane] != 0:
-            add_set_times(totals[lanes.member[lane]], lanes.carrying[lane], lanes.step[lane])
+            add_set_times(totals[lanes.member[lane]], lanes.carrying[lane], duration_of(lanes, lane, fraction))
 
 
 @kernel()
@@ -97,6 +104,21 @@ def _impulses(lanes, gear, viscous, hysteretic):
             damped = exact_row(gear, 7) * (way * fused(way, exact_splat(0.5), depth))
             impulse = fused(exact_row(lanes.stiffness, 0), damped, impulse)
     return impulse
+
+
+@kernel()
+def _impulses_by_power(lanes, w, slot, order, fraction):
+    """Return the impulses of a slot's pairs over the step from the series of F / K."""
+    h, push, first = exact_row(lanes.step, 0), lanes.push[slot], exact_splat(0.0)
+    second = first
+    for k in range(order, -1, -1):
+        term = exact_row(push, k)
+        first = fused(first, h, term * w.inverse[k + 1])
+        if fraction is not None:
+            second = fused(second, h, term * w.inverse[k + 2])
+    if fraction is not None:
+        first = fused(first, exact_row(lanes.alpha, 0), exact_row(lanes.beta, 0) * h * second)
+    return exact_row(lanes.stiffness, 0) * h * first
 
 
 @kernel()

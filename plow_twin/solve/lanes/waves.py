@@ -1,11 +1,22 @@
-"""Sine and cosine of eight numbers in a SIMD vector."""
+"""Functions of eight numbers in a SIMD vector: sine and cosine, and a coarse logarithm and power for step sizes."""
 
 from __future__ import annotations
 
 import math
 
 from plow_twin.kernel.compiler import kernel
-from plow_twin.kernel.simd import below, choose, exact_row, exact_splat, fused, magnitude, set_row
+from plow_twin.kernel.simd import (
+    below,
+    choose,
+    exact_row,
+    exact_splat,
+    exponent_of,
+    fused,
+    magnitude,
+    power_of_two,
+    set_row,
+    significand_of,
+)
 
 #: Largest angle for which the product of the number of quarter turns and the first part of pi / 2 is exact.
 _LARGEST = 1e5
@@ -22,6 +33,33 @@ _COSINE = (
     -1.13596475577881948265e-11, 2.08757232129817482790e-09, -2.75573143513906633035e-07, 2.48015872894767294178e-05,
     -1.38888888888741095749e-03, 4.16666666666666019037e-02,
 )  # fmt: skip
+#: Interpolation at Chebyshev points of log2 on [1, 2] (error 1.2e-4), and of 2^x on [0, 1] (relative error 3.5e-6).
+_LOGARITHM = (
+    -0.07844067620915011, 0.6260321821639458, -2.0783351682517304, 4.029211391071475, -2.4983531488141586,
+)  # fmt: skip
+_POWER = (
+    0.013670309453307137, 0.05174499776419958, 0.24160435727003668, 0.6929729221730628, 1.0000034929076977,
+)  # fmt: skip
+
+
+@kernel(inline="code")
+def coarse_log2(value):
+    """Return the binary logarithm of each lane's positive number with an error of 1.2e-4."""
+    part = significand_of(value)
+    found = exact_splat(_LOGARITHM[0])
+    for i in range(1, 5):
+        found = fused(found, part, exact_splat(_LOGARITHM[i]))
+    return found + exponent_of(value)
+
+
+@kernel(inline="code")
+def coarse_exp2(value):
+    """Return 2 to the power of each lane's number, at most 1e3 in size, with a relative error of 3.5e-6."""
+    whole = (value - 0.5 + _ROUNDS) - _ROUNDS
+    part, found = value - whole, exact_splat(_POWER[0])
+    for i in range(1, 5):
+        found = fused(found, part, exact_splat(_POWER[i]))
+    return found * power_of_two(whole)
 
 
 @kernel()

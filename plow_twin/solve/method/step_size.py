@@ -15,7 +15,7 @@ from plow_twin.solve.modes import penetration_and_rate
 from plow_twin.solve.state import CLIPPED, ON
 
 #: The parting of a pair is searched for within this many steps of the last size, with a series of this order.
-_PARTING_REACH, PARTING_ORDER = 1.3, 6
+PARTING_REACH, PARTING_ORDER = 1.3, 6
 #: The same reach under friction with stick, whose guards make steps shorter.
 _PARTING_REACH_STICK = 8.0
 #: Largest number of Newton steps to the parting, and the relative change at which they end; the next step corrects the
@@ -139,7 +139,7 @@ def time_to_separation(p, parts, state, w, span, harmonics, stick):
 
     The root of a short series is accurate enough, because the next step corrects its error.
     """
-    near, reach = False, _PARTING_REACH
+    near, reach = False, PARTING_REACH
     if stick is not None:
         reach = _PARTING_REACH_STICK
     for pair in range(PAIR_COUNT):
@@ -154,23 +154,32 @@ def time_to_separation(p, parts, state, w, span, harmonics, stick):
     terms = one_by_one(parts.terms)
     order = expand(p, state, w, PARTING_ORDER, True, span, *terms)
     state.evaluations += order
-    first = np.inf
+    first, column = np.inf, w.column[0]
     for pair in range(PAIR_COUNT):
-        if state.mode[pair] != ON or w.penetration[1, pair] >= 0.0:
-            continue
-        t = -w.penetration[0, pair] / w.penetration[1, pair]
-        if t > reach * state.last_step_size:
-            continue
-        for _ in range(_NEWTON_STEPS):
-            value, slope = w.penetration[order, pair], 0.0
-            for k in range(order - 1, -1, -1):
-                slope = slope * t + value
-                value = value * t + w.penetration[k, pair]
-            if not slope < 0.0:
-                break
-            change = value / slope
-            t -= change
-            if abs(change) < _ROOT_FOUND * t:
-                first = min(first, t)
-                break
+        if state.mode[pair] == ON:
+            for k in range(order + 1):
+                column[k] = w.penetration[k, pair]
+            first = min(first, parting_of(column, order, reach * state.last_step_size))
     return first if 0.0 < first < np.inf else 0.0
+
+
+@kernel()
+def parting_of(penetration, order, reach) -> float:
+    """Return where a penetration's series first vanishes by Newton's method; infinity if not before `reach`."""
+    if penetration[1] >= 0.0:
+        return np.inf
+    t = -penetration[0] / penetration[1]
+    if t > reach:
+        return np.inf
+    for _ in range(_NEWTON_STEPS):
+        value, slope = penetration[order], 0.0
+        for k in range(order - 1, -1, -1):
+            slope = slope * t + value
+            value = value * t + penetration[k]
+        if not slope < 0.0:
+            break
+        change = value / slope
+        t -= change
+        if abs(change) < _ROOT_FOUND * t:
+            return t
+    return np.inf

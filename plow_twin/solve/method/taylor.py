@@ -17,7 +17,7 @@ from plow_twin.solve.method.step_size import (
 
 #: After a touch the square root of the time since the touch is the series' variable for this many steps of the last
 #: size.
-_TOUCH_REACH = 2.5
+TOUCH_REACH = 2.5
 
 
 @kernel(inline="source")
@@ -74,7 +74,7 @@ def _choose_map(p, parts, fraction, stick, state, w, span, penetrating):
         state.alpha, state.beta = 2.0 * root, -2.0
         return (root if parting <= span else root - math.sqrt(parting - span)), parting > span
     since = state.step_start - state.touch_time
-    if 0.0 < since < _TOUCH_REACH * state.last_step_size:
+    if 0.0 < since < TOUCH_REACH * state.last_step_size:
         # for some steps after a touch the square root of the time since the touch is the better variable
         root = math.sqrt(since)
         state.alpha, state.beta = 2.0 * root, 2.0
