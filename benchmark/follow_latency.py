@@ -27,7 +27,7 @@ from plow_twin.stream.journal import Estimated
 from plow_twin.stream.topics import TOPICS
 
 _T0 = 1_795_000_000_000_000_000
-#: In s: sampling interval, length of the run, length of the warm-up (which is not measured), time of the estimate.
+#: Sampling interval, length of the run, length of the warm-up (which is not measured) and time of the estimate, in s.
 _STEP, _END, _FIRST, _ESTIMATED = 1e-3, 6.0, 1.0, 0.5
 
 

@@ -53,7 +53,7 @@ def generate_launch_description() -> LaunchDescription:
         exec_name="twin",
         output="screen",
     )
-    # without the variables that a sourced ROS 2 adds: the viewer has an environment of its own
+    # the viewer runs without the variables that a sourced ROS 2 adds, because it has an environment of its own
     apart = [
         "env",
         *(f"--unset={name}" for name in ("PYTHONPATH", "LD_LIBRARY_PATH", "_ROS_WHEELS_BOOTSTRAP_COMPLETE")),

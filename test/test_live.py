@@ -626,7 +626,7 @@ def test_nothing_of_a_followed_file_is_lost_unseen_when_it_is_cut_or_another_tak
     path.unlink()
     assert read() == []
     path.write_text("a,b\n1,2\n")
-    assert repr(read()) == "[nan]"  # the new header names no load; the reader counts such rows
+    assert repr(read()) == "[nan]"  # the new header names no load, so this row has no load
     files.close()
 
 
@@ -644,7 +644,7 @@ def test_lines_on_standard_input_are_taken_and_silence_is_held(tmp_path: Path) -
         assert (values["samples_used"], values["dropped_malformed"]) == ("100", "2")
         live.process.stdin = None
         live.process.communicate(timeout=60.0)
-        assert live.process.returncode == 3  # exit code for a loss: two lines were not used
+        assert live.process.returncode == 3  # the exit code means a loss, because two lines were not used
     report = replay(tmp_path / "run")
     assert (report.samples, report.exit_code) == (100, 0)
 

@@ -449,7 +449,7 @@ def test_bad_samples_are_dropped_counted_and_never_published(tmp_path: Path) -> 
         send(0, good)
         send(T0, good)
         send(T0 + 3 * MS, good, force_z=1.0)
-        send(T0 + 2 * MS, good)  # this sample is late: the motion is corrected
+        send(T0 + 2 * MS, good)  # this sample is late, so the motion is corrected
         send(T0 + 4 * MS, (1e8, 0.0, 0.0))
         other.publish(JointState(name=["fx1"], effort=[1.0]))
         # these bytes are no message of the topic's type

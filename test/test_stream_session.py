@@ -188,7 +188,7 @@ def test_clearance_is_base_plus_mean_wear_of_each_side_with_the_priors_interval(
     rows["wear_depth"] = np.arange(1.0, 9.0) * 1e-3
     published = outputs.add(rows, np.array([T0]), THE_ONE)
     named = dict(zip(CLEARANCE_NAMES, published.slow["clearance"][0], strict=True))
-    # pads 1, 7 left; 3, 5 right; 0, 2 top; 4, 6 bottom
+    # the pads are 1 and 7 on the left, 3 and 5 on the right, 0 and 2 at the top, 4 and 6 at the bottom
     assert named["horizontal"] == pytest.approx(0.025 + (2e-3 + 8e-3) / 2 + (4e-3 + 6e-3) / 2)
     assert named["vertical"] == pytest.approx(0.030 + (1e-3 + 3e-3) / 2 + (5e-3 + 7e-3) / 2)
     assert named["pad_top_right_right"] == 4e-3

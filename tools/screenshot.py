@@ -97,7 +97,7 @@ def main() -> None:
             os.killpg(viewer.pid, signal.SIGTERM)  # the program is a child of the script that starts it
             viewer.wait()
         picture = Image.open(shot).convert("RGB").resize(SIZE, Image.Resampling.LANCZOS)
-        # without the menu; a picture with 256 colours has a third of the bytes
+        # the menu is cut off, and 256 colours are used because the picture then has a third of the bytes
         picture.crop((0, MENU, *SIZE)).quantize(256).save(options.out, optimize=True)
     print(options.out)
 

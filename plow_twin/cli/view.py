@@ -248,6 +248,6 @@ def _follow(
         sys.stdout.flush()
         while (
             viewer is not None and viewer.process.poll() is None and not stopped()
-        ):  # the run has ended: the viewer stays open
+        ):  # the run has ended, but the viewer stays open
             time.sleep(0.2)
     return code

@@ -30,7 +30,8 @@ class Beside:
         self.link, theirs = pair()
         with theirs:
             numbers = (theirs.fileno(), *descriptors)
-            # a session of its own, so that Ctrl-C reaches only the twin; the end of the twin also ends the process
+            # the process gets a session of its own, so that Ctrl-C reaches only the twin, whose end also ends the
+            # process
             self.process = subprocess.Popen(
                 [sys.executable, "-m", module, *map(str, numbers)],
                 stdin=subprocess.DEVNULL,

@@ -39,7 +39,7 @@ class Motion:
     """The newest motion, and the extremes since they were last cleared."""
 
     def __init__(self) -> None:
-        #: stamp reached [ns]; 0: no publication yet
+        #: stamp reached [ns]; 0 means that nothing has been published yet
         self.stamp_ns = 0
         self.pose = np.full(3, np.nan)
         self.penetration = np.full(PAIR_COUNT, np.nan)

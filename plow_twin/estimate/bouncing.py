@@ -596,7 +596,7 @@ class MotionFeatures:
         self._smooth = max(min(smooth_width(poses, tuning.AVERAGED), int(self._whole.sum()) // 8), 1)
         self._reach_phase = ((poses.t[self._whole] - poses.t[0]) / period % 1.0 * tuning.PATH_PHASES).astype(int)
         phase = np.minimum(((poses.t - poses.t[0]) / period % 1.0 * self._parts).astype(int), self._parts - 1)
-        #: for each component the rows that have it, by part of a period; parts with few rows are left out
+        #: for each component, the rows of each part of a period that have it; parts with few rows are left out
         self._parts_of = [
             [rows for k in range(self._parts) if len(rows := np.flatnonzero((phase == k) & there)) > 8]
             for there in self._there.T

@@ -35,8 +35,8 @@ from plow_twin.model.scene import Friction, Scene
 
 Array = NDArray[np.float64]
 
-#: Step: for the difference quotients by quantities of a scene, named by their paths; a fifth to a half of their prior
-#: deviations.
+#: Step: for the difference quotients with respect to quantities of a scene, which are named by their paths. A step is a
+#: fifth to a half of the quantity's prior deviation.
 STATED: Final = {
     "head.mass_kg": 0.02,
     "head.inertia_kg_m2": 0.02,
@@ -45,8 +45,8 @@ STATED: Final = {
     "contact.exponent": 0.02,
     "friction.coefficient": 0.01,
 }
-#: Step: for the difference quotients by a wall's relative stiffness, and by a constant load in units of half the load's
-#: range.
+#: Step: for the difference quotients with respect to a wall's relative stiffness, and with respect to a constant load
+#: in units of half the load's range.
 _WALL_STEP, _PUSH_STEP = 0.02, 5e-3
 #: Guard: smallest error of the load in units of half the load's range.
 _LEAST_PUSH = 1e-5

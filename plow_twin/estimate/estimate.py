@@ -214,7 +214,7 @@ def _from_motion(
     if guess:
         numbers = np.array(guess)
         shared, noise, differences = np.split(numbers, [SIZE, SIZE + 3])
-        # a guess from a fit is close to the optimum; contacts harder than `FITTED` are not fitted
+        # a guess is close to the optimum if it comes from a fit, but contacts harder than `FITTED` are not fitted
         certain = unknowns.penetration_of(float(shared[SOFTNESS])) > tuning.FITTED
         near = refine(forward, unknowns, poses, period, unknowns.within(shared), noise, drift, differences, certain)
         verdict = judge(*near, period) if near else None

@@ -35,7 +35,7 @@ Array = NDArray[np.float64]
 
 #: Guard: precision of an unknown without a prior.
 NO_PRIOR = 1e-6
-#: Step: for the difference quotients by a starting state, in m, m, rad, m/s, m/s, rad/s.
+#: Step: for the difference quotients with respect to a starting state, in m, m, rad, m/s, m/s, rad/s.
 _DISPLACED = np.array([2e-4, 2e-4, 1e-3, 5e-3, 5e-3, 3e-2])
 #: Guard: smallest spectral density of an unknown acceleration. It gives a rate of 0.1 mm/s or 0.1 mrad/s after a
 #: second; neither solver nor sensor resolves less.
@@ -47,7 +47,7 @@ WALLS: Final = ((1, 7), (3, 5), (0, 2), (6, 4))
 #: x and y, and the squared time constant of its low pass in s2.
 TURNS, LEVER, LAG = slice(0, 4), slice(4, 6), 6
 DIFFERENCES: Final = ("turn_left", "turn_right", "turn_top", "turn_bottom", "lever_x", "lever_y", "filter")
-#: Step: for the difference quotients by these differences.
+#: Step: for the difference quotients with respect to these differences.
 DIFFERENCE_STEPS: Final = np.array([2e-4, 2e-4, 2e-4, 2e-4, 1e-3, 1e-3, 4e-6])
 #: Derived: smallest number of rows of a swing. Two rows of three numbers only determine the six numbers of the swing's
 #: start.

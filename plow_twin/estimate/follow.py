@@ -177,7 +177,7 @@ class Follower:
     def _draw(self, text: str, time: float, worn: Array) -> None:
         """Draw members in the scene's initial state from an estimate (JSON), or from the prior if `text` is empty."""
         self._text = text
-        #: the followed estimate; None for the prior
+        #: the followed estimate; None while the prior is followed
         self.estimate = Estimate.from_dict(json.loads(text)) if text else None
         self._load_share = _load_share(text)
         self._known = self._prior if self.estimate is None else _whole(self.estimate, self._prior)

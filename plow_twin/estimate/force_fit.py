@@ -27,8 +27,8 @@ _MOST_ROWS = 6000
 #: Bound: largest number of steps; number of first steps in which predictability is probed; number of draws of a probe;
 #: reduction of the cost, within noise, below which the steps end.
 _ROUNDS, _DRAWN_ROUNDS, _PROBES, _ENOUGH = 8, 3, 3, 0.5
-#: Step: for the two-sided difference quotients by the delay in s and by a starting state. With the longer one-sided
-#: steps of the fit of the poses, clearances were wrong by 4 of their deviations.
+#: Step: for the two-sided difference quotients with respect to the delay in s and to a starting state. With the longer
+#: one-sided steps of the fit of the poses, clearances were wrong by 4 of their deviations.
 _DELAY_STEP = 2e-5
 _STATE_STEPS = np.array([1e-5, 1e-5, 5e-5, 2e-4, 2e-4, 1.4e-3])
 

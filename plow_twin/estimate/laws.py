@@ -24,7 +24,7 @@ _LEAST = 1e-9
 #: on these (clearances).
 _CURVED, _CHANGING = (0, 1), (5, 6)
 #: Bound: number of Levenberg-Marquardt steps to the likeliest parameters, damping of the first step, gain that ends the
-#: steps. Step: for the difference quotients by the parameters.
+#: steps. Step: for the difference quotients with respect to the parameters.
 _STEPS, _DAMPED, _ENOUGH, _SMALL = 30, 1e-2, 1e-2, 1e-4
 
 

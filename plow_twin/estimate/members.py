@@ -101,7 +101,7 @@ class Ensemble:
         self._stiffness, self._exponent = np.array([one.contact.stiffness for one in scenes]), scene.contact.exponent
         self._pressed = tuning.PRESSED * scene.head.mass_kg * Gravity().acceleration_m_s2
         self.good = np.ones(members, dtype=bool)
-        #: force; peak and impulse since the beginning of the span
+        #: force of each member's pairs, and their peak and impulse since the beginning of the span
         self._sums = np.zeros((members, 3, PAIR_COUNT))
         self._peak, self._impulse = self._sums[:, 1], self._sums[:, 2]
         #: sum of the squares of each member's normalised innovations

@@ -105,7 +105,7 @@ class Worker:
         #: whether the far side has compiled its kernels
         self.ready = False
         self._closed = threading.Event()
-        #: reason why estimating has ended; empty before
+        #: reason why estimating has ended; empty until it ends
         self.error = ""
         #: None until everything before `finish` is done; then an empty text, or the reason why the last window could
         #: not be estimated
@@ -256,7 +256,7 @@ def _request_short_slices() -> None:
 
 def main() -> None:
     """Run the far side; the arguments are the descriptor of its end of the pipe, and modules of contact laws."""
-    # Ctrl-C goes to the whole group; the near side ends this process
+    # Ctrl-C reaches the whole process group, but the near side ends this process
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(_NICE)
     _request_short_slices()

@@ -424,7 +424,8 @@ MODEL: Final[Mapping[str, str]] = {
     "wear_coefficient": "wear.coefficient_m2_n",
 }
 SPECS: Final[Mapping[str, Field[Any]]] = {spec.name: spec for spec in fields(Settings)}
-#: Pattern of a number. YAML 1.1, which ROS launch files use, reads some numbers as texts: their mantissa has no point.
+#: Pattern of a number. YAML 1.1, which ROS launch files use, reads a number such as 1e-9 as a text, because its
+#: mantissa has no point.
 _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 #: Longest text [characters]; no path on Linux is longer.
 _LONGEST: Final = 4096

@@ -113,7 +113,7 @@ class Publishing:
         #: number of publications computed without a sample, and of publications that correct earlier ones because of
         #: late samples
         self.held_frames = self.corrected_frames = 0
-        #: steady time at which the samples of the next publication were received [ns]; 0: it has no samples
+        #: steady time at which the samples of the next publication were received [ns]; 0 means that it has no samples
         self.received_ns = 0
         #: while alarms of a series are reported: stamp of the sample that caused them [ns]
         self.series_ns: int | None = None

@@ -519,7 +519,8 @@ class Runtime:
         assert self.recording is not None
         renewed = self.recording.renew(self.driver.session)
         if renewed and self.estimation and self.estimation.entry and self.driver.session.following is None:
-            # the snapshot of a twin lacks the estimate; the snapshot of a follower has it
+            # the estimate is journalled again, because the snapshot of a twin lacks it; the snapshot of a follower has
+            # it
             self.recording.recorder.journal(self.estimation.entry)
 
 

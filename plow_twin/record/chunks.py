@@ -217,7 +217,7 @@ class ChunkReader:
             if len(data) != length or size > RECORD_LIMIT:
                 return None
             content = decompress(compression, data, size)
-        except Exception:  # each decompressor has its own errors; all mean damage
+        except Exception:  # each decompressor has its own errors, and all of them mean damage
             return None
         if len(content) != size or (crc and crc32(content) != crc):
             return None
@@ -276,7 +276,7 @@ class ChunkReader:
                 self.channels[channel.id] = Channel(
                     channel.topic, name, channel.message_encoding, text, channel.metadata
                 )
-        except Exception:  # damage: the messages of the channel are skipped
+        except Exception:  # the record is damaged, so the messages of the channel are skipped
             self.damaged += 1
 
     def _metadata(self, record: bytes) -> None:

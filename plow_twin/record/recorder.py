@@ -495,7 +495,7 @@ class Recorder:
         self._writer.flush()
         self._unflushed.clear()
         reason = self._writer.reason_to_stop()
-        if reason is not None:  # the folder may be gone too: do not ask for free space
+        if reason is not None:  # the folder may be gone too, so its free space is not looked up
             return reason
         if self._part_is_full():
             self._split_due = True

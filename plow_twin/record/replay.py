@@ -152,7 +152,8 @@ class _Replay:
             _warm_up(scene, header.tol, self.templates, rows=not digests_only)
         self.sink: RunWriter | None = None
         self.rows = np.zeros(0, ROW)  # rows of the last run of samples
-        self.published: Published | None = None  # of the last run of samples; messages of its last row may follow
+        # publications of the last run of samples; messages of its last row may follow
+        self.published: Published | None = None
         self.session = Session(
             twin, header.origin_ns, rollback_span_s=float(header.parameters.get("rollback_span", 0.0))
         )

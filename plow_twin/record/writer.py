@@ -200,7 +200,7 @@ class RunWriter:
     def _write(
         self, chunk: ChunkBuilder, topic: str, sequence: int, log_time_ns: int, stamp_ns: int, message: Message
     ) -> None:
-        # MCAP times are unsigned; the exact stamp is in the message
+        # a negative time becomes 0, because MCAP times are unsigned; the message has its exact stamp
         log_time_ns, stamp_ns = max(0, log_time_ns), max(0, stamp_ns)
         channel = self._channel(topic, message.TYPE)
         chunk.add(channel, sequence & _SEQUENCE_MASK, log_time_ns, stamp_ns, encode(message))

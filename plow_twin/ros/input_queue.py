@@ -44,7 +44,8 @@ class _Info(ctypes.Structure):
     ]
 
 
-#: `_Info`: times of sending and reception, sequence number, publisher; `SerializedMessage`: address, length.
+#: Layout of `_Info` (times of sending and reception, sequence number, publisher), and of the address and the length in
+#: `SerializedMessage`.
 _INFO, _PLACE = struct.Struct("=qqQ16x16s"), struct.Struct("=QQ")
 #: Return code of rcl for an empty queue.
 _NOTHING_TAKEN: Final = 401

@@ -18,7 +18,7 @@ Read = tuple[int, tuple[float, ...], bool, bool]
 #: A message that cannot be read.
 UNREADABLE: Final[Read] = (0, (), False, False)
 
-#: Stamp and length of the name of the frame, then force and torque; big endian and little endian.
+#: Layouts in big endian and in little endian: stamp and length of the frame's name; force and torque.
 _WRENCH_LAYOUTS: Final = tuple((struct.Struct(f"{order}iII"), struct.Struct(f"{order}6d")) for order in "><")
 
 

@@ -73,8 +73,8 @@ class Subscriptions:
         #: number of the next message, by topic and publisher
         self._following: dict[tuple[str, bytes], int] = {}
         self._since_ns = time.time_ns()  # time at which the excitation was subscribed to
-        #: publishers of the excitation that were unknown at that time: first message, and losses counted before this
-        #: message
+        #: for each publisher of the excitation that was unknown at that time: its first message, and the losses counted
+        #: before this message
         self._appeared: dict[bytes, tuple[Taken, int]] = {}
         self._before: frozenset[bytes] = frozenset()
         with_covariance = runtime.settings.head_pose_type == "pose_with_covariance"
@@ -266,7 +266,7 @@ class Subscriptions:
             with_covariance = self._pose is PoseWithCovarianceStamped
             pose = message.pose.pose if with_covariance else message.pose
             turn, stamp = pose.orientation, stamp_ns(message.header)
-            if turn.z == turn.w == 0.0:  # no turn about z: the field was never filled, or the head is upside down
+            if turn.z == turn.w == 0.0:  # without a turn about z the field was never filled, or the head is upside down
                 self._inputs.head_pose.refuse(Verdict.MALFORMED, stamp, (pose.position.x, pose.position.y))
                 continue
             theta = 2.0 * math.atan2(turn.z, turn.w)

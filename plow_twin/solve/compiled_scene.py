@@ -206,7 +206,7 @@ class _Unchanged(NamedTuple):
     """All results that do not depend on a scene's clearance; `values` has fields of its `PARAMS`."""
 
     loads: LoadSet
-    acceleration: float  #: largest, in m/s^2
+    acceleration: float  #: largest acceleration in m/s^2
     start_speed: float  #: in m/s
     harmonics: Harmonics | None
     terms: Terms

@@ -206,13 +206,16 @@ _STATE_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("sigma_end", "f8"),  # the series' variable at the step's end
     ("alpha", "f8"),  # time since the step's start: alpha sigma + beta sigma^2 / 2
     ("beta", "f8"),
-    ("stop_time", "f8"),  # where a step must end: a sample, a knot of the load, the end of the run
+    ("stop_time", "f8"),  # time at which a step must end for a sample, a knot of the load, or the end of the run
     ("last_step_size", "f8"),
     ("touch_time", "f8"),  # time of the last touch
     ("time", "f8"),  # the present time, bit for bit as the caller gave it
     ("implicit_size", "f8"),  # size of the next implicit step
     ("decay_times", "f8"),  # number of decay times in overdamped contact since a contact changed
-    ("implicit_size_before", "f8"),  # this and the next: values before the current step was laid out
+    (
+        "implicit_size_before",
+        "f8",
+    ),  # this field and the next have their values from before the current step was laid out
     ("decay_times_before", "f8"),
     ("order", "i8"),  # order of the series of the current step
     ("event_pair", "i8"),  # the pair whose event ends the step, or -1
@@ -289,7 +292,11 @@ WORK: Final = np.dtype(
         ("damping", "f8", (3, 3)),
         ("rub", "f8", (6, *_WIDE)),  # wear: s' / v, sliding distance per travel, force times this distance; running-in
         ("binomial", "f8", (_ROWS, _ROWS)),  # 1 / C(order, k)
-        ("beyond", "f8", (3,)),  # newest advance out of range: angle [rad], largest penetration [m], pair of the latter
+        (
+            "beyond",
+            "f8",
+            (3,),
+        ),  # newest advance out of range: angle [rad], largest penetration [m], and the pair with this penetration
     ]
 )
 

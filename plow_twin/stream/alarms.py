@@ -76,7 +76,7 @@ class Alarm:
     value: float = 0.0
     level: Level = Level.NONE
     latched: Level = Level.NONE
-    #: cause of the latched level; None: no level is latched
+    #: cause of the latched level; None if no level is latched
     raised: Raised | None = None
     _since_ns: int | None = None
     #: value below which the alarm has no level
@@ -120,7 +120,7 @@ class Alarm:
 
     def stays(self, values: NDArray[np.float64]) -> bool:
         """Return whether the level stays the same for all these values."""
-        if self.level or self.lowest == math.inf:  # inf: the alarm has no threshold
+        if self.level or self.lowest == math.inf:  # an infinite value means that the alarm has no threshold
             return not self.level
         return float(values.max(initial=-math.inf)) < self.lowest
 

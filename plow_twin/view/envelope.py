@@ -27,7 +27,7 @@ class Envelope:
     def __init__(self, width: int, most_rows: int = MOST_ROWS, most_bins: int = _MOST_BINS) -> None:
         self._most_rows, self._most_bins = most_rows, most_bins
         self._segment = 0
-        #: width of a bin [s]; 0: every row is kept
+        #: width of a bin [s]; 0 while every row is kept
         self._bin_s = 0.0
         # segment (n,); bin number (n,), or time [s] while every row is kept; least and largest values (n, width)
         self._kept = _Rows(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, width)), np.zeros((0, width)))

@@ -101,7 +101,7 @@ def blueprint(
         active_tab=0,
     )
     curves = rrb.Vertical(
-        # the widest view shows the title; a narrower view would cut it
+        # the title stands in the widest view, because a narrower view would cut it off
         _plot("force", f"Largest contact force [kN]{title and '; '}{title}"),
         rrb.StateTimelineView(origin=ENTITY, name="Corners that carry force"),
         _plot("load", "Load on the head"),

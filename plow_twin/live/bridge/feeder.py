@@ -209,7 +209,7 @@ class Feeder:
         """Return sender, message number (counted here if the message has none), and whether it is a repetition."""
         number = role.number(arrived) if role.sequence else None
         if number is None:
-            # unreadable or not numbered: assume the next number, until a message has that number
+            # a message without a readable number is assumed to have the next number, until a message has that number
             self._assumed += 1
             self._number += 1
             return self._name, self._number + self._unnumbered, False

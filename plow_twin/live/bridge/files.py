@@ -90,7 +90,7 @@ class _Tail:
             self.close()
             self._file, self._newest = file, b""
             self.rows = self.rows.of_another_file()
-            # an incomplete line: a number in it may have been cut
+            # an incomplete line is left out, because a number in it may have been cut
             self.left += self.lines.begun
             self.lines = Lines()
         return self._read()

@@ -50,7 +50,7 @@ class Conditions:
 
     def __init__(self, server: Server, model: Model) -> None:
         self._server, self._model = server, model
-        #: asks the twin to acknowledge its alarms, and returns whether the request was passed on; None: acknowledging
+        #: asks the twin to acknowledge its alarms, and returns whether the request was passed on; None if acknowledging
         #: is not allowed
         self.acknowledge: Callable[[], bool] | None = None
         self._conditions: dict[str, Condition] = {}

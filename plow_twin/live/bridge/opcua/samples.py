@@ -30,7 +30,7 @@ class Samples:
     def __init__(self, nodes: Sequence[str], wait_s: float) -> None:
         self._wait_s = wait_s
         self._stamps_ns: list[int] = []
-        #: by stamp: time of arrival of the first value [s], and the values by node
+        #: for each stamp, the time at which its first value arrived [s], and its values by node
         self._waiting: dict[int, tuple[float, dict[str, Value]]] = {}
         #: stamp of the newest value of each node [ns]
         self.newest_ns = dict.fromkeys(nodes, 0)
