@@ -196,7 +196,7 @@ def _believed(kind: Kind, nominal: Scene, rng: np.random.Generator, t: Array) ->
     if kind.shape == "cutting":
         return paper + noise * [8e3, 4e3, 1.1e4]
     if kind.shape == "pressed":
-        # a steady push against one wall, plus broad-band noise
+        # this load is a steady push against one wall, plus broad-band noise
         return noise * [8e3, 4e3, 1.1e4] + [6e4, -5e3, 2e4]
     if kind.shape == "chatter":
         turn = 2.0 * np.pi * 8.0 * t

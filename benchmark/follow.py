@@ -33,7 +33,7 @@ RESULTS = Path(__file__).resolve().parent / "results" / "follow.jsonl"
 GROUPS = {
     "soft": Group("K 3e6 .. 3e8", stiffness=(3e6, 3e8)),
     "hard": Group("K 1e9 .. 1e11", stiffness=(1e9, 1e11)),
-    # machines that differ from the model
+    # the machines of the following groups differ from the model
     "friction": Group("friction 0.1", friction=0.1),
     "law": Group("law: Kelvin-Voigt", law="kelvin_voigt"),
     "shape": Group("load: third harmonic of 10 %", third_harmonic=0.1),

@@ -481,7 +481,7 @@ def of_drops(drops: Drops) -> dict[str, Any]:
             edges = [start, *lows[1:3]]
             for bounce, (first, last) in enumerate(pairwise(edges)):
                 off = rows[: last - start, :3] - pose[start:last]
-                # means over all bounces so far
+                # the distances are means over all bounces so far
                 far[bounce].append((float(np.hypot(off[:, 0], off[:, 1]).mean()), float(np.abs(off[:, 2]).mean())))
                 inside[bounce].append(holds[first:last].mean(axis=0))
             if len(lows) > 3:

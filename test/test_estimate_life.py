@@ -301,7 +301,7 @@ def test_unusable_input_of_a_forecast_is_refused_and_not_left_out(
     scene = replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0, prior_m2_n=(5e-15, 2e-14)))
     file, found, history = (tmp_path / name for name in ("scene.yaml", "estimate.json", "history.csv"))
     file.write_text(dump_scene(scene))
-    # the history as a spreadsheet program writes it
+    # a spreadsheet program writes the history like this
     sheet = "\ufeffkm;horizontal_mm;horizontal_sd_mm;vertical_mm;vertical_sd_mm\n0,0;25;1;30;1\n9;25;1;30;1\n"
     history.write_text(sheet)
     limits = ["--limit-horizontal", "28", "--limit-vertical", "34"]

@@ -293,7 +293,7 @@ def test_other_pads_and_other_model_numbers_discard_earlier_estimates(
     session.apply(SetWear(START_NS + 1, (0.0,) * 8, "new pads"))
     assert (estimation.forecast, estimation.reasons, estimation.end_ns) == (None, (), None)
     assert estimation.forecast_error and set(estimation.trust.values()) == {""}
-    # latched alarms are released too
+    # the empty messages also release latched alarms
     messages = estimation.poll(session)
     assert {topic: (message.stamp_ns, message.name) for topic, message in messages.items()} == dict.fromkeys(
         ("estimate", "forecast"), (START_NS + 1, ())

@@ -20,7 +20,7 @@ PROGRAM = Path(__file__).resolve().parent / "golden.py"
 #: Largest relative change of a count that rounding may cause on another build.
 OTHER_BUILD = 0.02
 
-# compiling all kernels takes long
+# the limit is high, because compiling all kernels takes long
 pytestmark = pytest.mark.timeout(600)
 
 

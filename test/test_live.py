@@ -508,7 +508,7 @@ def test_a_file_is_followed_while_it_grows_and_when_it_is_replaced(tmp_path: Pat
         path.write_text("t,fx,fy,m\n" + "".join(",".join(map(repr, _row(index))) + "\n" for index in range(200, 300)))
         values = live.until_count("samples_used", 300)
         assert values["samples_in"] == "300"
-        assert live.stop(signal.SIGHUP) == 0  # as if the terminal were closed
+        assert live.stop(signal.SIGHUP) == 0  # a terminal that is closed sends this signal
     report = replay(run)
     assert (report.samples, report.exit_code) == (300, 0)
 

@@ -230,7 +230,7 @@ def test_wear_continues_from_its_depth_and_widens_the_estimate(truth: Truth) -> 
     live.take(_in_turn(truth, 2.011, 4.0))
     grown = live.session.wear_depth - before
     assert (grown >= 0.0).all() and grown.max() > 1e-6
-    # the last message is 0.1 s old
+    # the last message is 0.1 s old, so it lacks the newest wear
     assert live.clearance()[0, 0] - at_first[0, 0] == pytest.approx(0.5 * grown[[1, 3, 5, 7]].sum(), rel=0.2)
 
 
@@ -309,7 +309,7 @@ def test_publications_do_not_change_the_motion_where_poses_samples_and_a_hold_ar
     live.take([Hold(_stamp(1.2)), *part[150:], _known(truth, State.WITHDRAWN), *_in_turn(truth, 1.5, 1.6)])
     live.session.close()
     assert isinstance(live.journal[-1], Digest)
-    # this run publishes nothing
+    # this second run publishes nothing, and has the same state
     assert _again(live.journal, truth.nominal).twin.digest() == live.twin.digest()
 
 

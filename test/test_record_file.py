@@ -50,7 +50,7 @@ from plow_twin.stream.journal import (
 )
 
 JOURNAL = {Sample: "samples", Digest: "digests"}
-# a journal stores integers of 64 bits
+# integers have 64 bits, as a journal stores them
 whole = st.integers(-(2**63), 2**63 - 1)
 counts = st.integers(1, 2**63 - 1)
 stamps = st.integers(-(2**31) * 10**9, (2**31 - 1) * 10**9)

@@ -87,7 +87,7 @@ def test_a_file_of_a_historian_gives_the_same_run_as_its_csv(
     capsys.readouterr()
     assert runs[0] == runs[1] and runs[0]["samples_used"] == "3000"
     ours, theirs = (_samples(tmp_path / f"run_{number}") for number in (0, 1))
-    assert ours == theirs and ours[0][0] == BEGIN_NS  # equal to the nanosecond
+    assert ours == theirs and ours[0][0] == BEGIN_NS  # the stamps are equal to the nanosecond
 
 
 def test_instants_are_the_same_in_each_zone_and_naive_times_are_utc(tmp_path: Path) -> None:
@@ -103,7 +103,7 @@ def test_instants_are_the_same_in_each_zone_and_naive_times_are_utc(tmp_path: Pa
             assert [stamp for name, stamp, _ in read if name == "excitation"] == (stamps * precision_ns).tolist()
             found.append([(name, values["fx"]) for name, _, values in read if name == "excitation"])
     assert all(rows == found[0] for rows in found)
-    # the same times as text
+    # dates as texts give the same times
     assert time_ns("2026-01-02T03:03:19.123456789Z") == time_ns("2026-01-02 04:03:19.123456789+01:00") == BEGIN_NS
     assert time_ns("2026-01-02 03:03:19.1234567") == BEGIN_NS - 89
     assert time_ns("2026-01-02T03:03:19.123Z") == BEGIN_NS - 456_789
@@ -189,7 +189,7 @@ def test_an_analysis_reads_a_folder_of_parquet_files(tmp_path: Path, capsys: pyt
     assert cli(["analyse", str(tmp_path / "plant"), *words]) == 0
     whole = json.loads(capsys.readouterr().out)
     assert whole["signals"] and whole["input"]["samples_used"] == 2000 and not whole["lossy"]
-    assert cli(["live", str(tmp_path / "plant"), *words]) == 3  # poses without a number
+    assert cli(["live", str(tmp_path / "plant"), *words]) == 3  # the loss is that of poses without a number
     assert json.loads(capsys.readouterr().out)["input"]["samples_used"] == "2000"
 
 

@@ -264,7 +264,9 @@ def test_a_full_disk_is_named_and_a_repair_leaves_nothing_half_done(tmp_path: Pa
 def test_a_full_disk_ends_the_writing_of_a_replay_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = record_run(tmp_path / "run", map(paper_sample, range(COUNT)), frame_every=10**9, pause_every=0)
     before, full = run.file.read_bytes(), tmp_path / "full"
-    assert cli(["replay", str(run.folder), "--write", str(tmp_path / "whole"), "-q"]) == 0  # its kernels are cached
+    assert (
+        cli(["replay", str(run.folder), "--write", str(tmp_path / "whole"), "-q"]) == 0
+    )  # this run puts the kernels into the cache
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, limits[1]))
     try:
@@ -350,9 +352,9 @@ def test_parts_that_are_removed_while_others_are_read_are_passed_over(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """If the oldest parts are removed (`record_keep_mb`), a reader may be slower than the recorder."""
-    monkeypatch.setattr("plow_twin.record.reader._LEAST", 1)  # the parts are read in their order
+    monkeypatch.setattr("plow_twin.record.reader._LEAST", 1)  # with small batches the parts are read one by one
     run = record_run(tmp_path / "run", map(paper_sample, range(COUNT)), **SMALL)
-    (run.folder / "metadata.yaml").unlink()  # metadata.yaml is written at the end of a run
+    (run.folder / "metadata.yaml").unlink()  # a run that still goes on has no metadata.yaml
     parts = RunReader(run.folder).parts
     assert len(parts) >= 4
     reader = RunReader(run.folder)

@@ -212,7 +212,7 @@ def test_arguments_that_ros_cannot_read_are_reported_without_a_traceback(tmp_pat
 def test_a_parameter_file_with_integers_for_doubles_and_a_typing_error(tmp_path: Path) -> None:
     path = tmp_path / "twin.yaml"
     path.write_text(yaml.safe_dump({"/**": {"ros__parameters": {"excitation_timeout": 2, "hold_polcy": "zero"}}}))
-    # YAML reads 1e-8 as a text
+    # the tolerance comes as a text, because YAML 1.1 reads 1e-8 as one
     with bench(tmp_path, arguments=("--params-file", str(path)), tolerance="1e-8") as running:
         request = GetParameters.Request(names=["excitation_timeout", "tolerance"])
         service = f"{running.namespace}/plow_twin/get_parameters"

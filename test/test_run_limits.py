@@ -91,7 +91,7 @@ def test_ctrl_c_ends_a_run_with_the_rows_computed_so_far(fixed: dict[str, object
 
     with pytest.raises(RunInterrupted, match=r"interrupted at t = \S+ s of 10000 s") as stop:
         simulate(preset("paper"), 1e4, output_dt=0.1, on_progress=press, **fixed)
-    # the first slice of work is the last one
+    # the run ends after its first slice of work
     assert 2048 <= stop.value.result.solver["steps"] < 3000
     assert isinstance(stop.value, KeyboardInterrupt) and len(stop.value.result.t) > 1
 

@@ -44,7 +44,7 @@ def test_an_hour_of_swinging_costs_36_steps_and_is_exact() -> None:
     scene, amplitude, omega = swaying(), 1e-3, 20.0
     result = simulate(scene, 3600.0, 3.7, energy_balance=True)
     assert result.solver["steps"] == 36 and len(result.events) == 0
-    # rounding of phases of 72,000 rad is 1e-11
+    # the errors come from rounding: a phase of 72,000 rad is rounded by 1e-11
     shape = np.array([1.0, 0.5, 1.0]) * amplitude
     assert np.abs(result.q + shape * np.sin(omega * result.t)[:, None]).max() < 1e-13
     assert np.abs(result.v + shape * omega * np.cos(omega * result.t)[:, None]).max() < 2e-12

@@ -160,7 +160,7 @@ def test_a_lasting_change_of_a_load_that_windows_cut_through_is_the_load_s() -> 
     load = random.normal(1.0, 0.02, 40)
     apart = change((1e5 * load**2, load), (1.4e5 * load**2, 1.4 * load), random, draws=100)
     assert apart is not None and apart.verdict == "load or machine"
-    equal = np.full(93, 0.025)  # the mean of equal numbers is rounded
+    equal = np.full(93, 0.025)  # means of these equal numbers differ by rounding
     constant = change((equal[:62], np.ones(62)), (equal, np.ones(93)), random, draws=100)
     assert constant is not None and constant.verdict == "chance"
 
@@ -171,7 +171,7 @@ def test_days_and_shifts_begin_in_their_zone() -> None:
     assert by_time("day")("run", stamp) == "2027-01-15"
     assert by_time("day", zone=ZoneInfo("Europe/Berlin"))("run", stamp) == "2027-01-16"
     assert by_time("shift")("run", stamp) == "2027-01-15 22:00"
-    # at 04:00 the night shift is not over
+    # 04:00 belongs to the night shift of the day before
     assert by_time("shift")("run", stamp + 5 * 3600 * 10**9) == "2027-01-15 22:00"
     assert by_time("shift", [time(0), time(12)])("run", stamp + 5 * 3600 * 10**9) == "2027-01-16 00:00"
 

@@ -177,7 +177,7 @@ def test_sets_from_the_events_are_the_solver_s_own(study: PaperStudy) -> None:
         assert all(first.end_s == second.start_s for first, second in itertools.pairwise(timeline))
         shares = {name: figures.share for name, figures in paper_sets.figures(timeline).items()}
         assert shares == pytest.approx(dict(study.runs.case.contact_sets[sense]), abs=1e-9)
-    forces = study.runs.case.force  # events and rows agree
+    forces = study.runs.case.force  # the sets from the events agree with the forces of the rows
     letters, chosen = paper_sets.letters_of_pairs(study.runs.scene), paper_sets.of_sense("cw")
     for index in range(0, len(forces), 997):
         seen = {letters[pair] for pair in range(8) if chosen[pair] and forces[index, pair] > 0.0}

@@ -92,7 +92,9 @@ def test_opcua_clients_read_a_typed_model_and_acknowledge_alarms_where_that_is_a
             await _soon(lambda: _is_good(horizontal))
             value, low = await horizontal.read_data_value(), await node("clearance.horizontal.p05").read_value()
             assert (value.Value.Value, low, unit.DisplayName.Text) == (pytest.approx(0.025), pytest.approx(0.025), "m")
-            assert value.SourceTimestamp.timestamp() == pytest.approx(1.0 + 1499e-3, abs=0.01)  # the last sample's time
+            assert value.SourceTimestamp.timestamp() == pytest.approx(
+                1.0 + 1499e-3, abs=0.01
+            )  # this is the last sample's time
             assert not (await node("life.seconds.p50").read_data_value(raise_on_bad_status=False)).StatusCode.is_good()
             for written in (horizontal, node("flags.stream"), node("alarms.force")):
                 with pytest.raises(ua.UaStatusCodeError):
@@ -219,5 +221,5 @@ def test_influxdb_gets_lines_also_from_the_time_while_it_was_down(tmp_path: Path
     clearance = [line for line in lines if line.startswith("plow_twin_clearance,head=plough_head ")][-1]
     fields, _, stamp = clearance.partition(" ")[2].rpartition(" ")
     assert "horizontal=0.025," in fields and "horizontal/p05=" in fields
-    assert int(stamp) == 1_000_000_000 + 499 * 1_000_000  # the last sample's time
+    assert int(stamp) == 1_000_000_000 + 499 * 1_000_000  # this is the last sample's time
     assert any('stream="running"' in line for line in lines if line.startswith("plow_twin_flags"))

@@ -25,7 +25,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         try:
             import plow_twin.run.twin  # noqa: F401
             from plow_twin.cli.app import main as run
-        except (ImportError, OSError, MemoryError) as error:  # memory is short, or a library is missing
+        except (ImportError, OSError, MemoryError) as error:  # a library is missing, or memory is short
             newer = (
                 "" if sys.version_info < (3, 13) else f"; this is Python 3.{sys.version_info[1]}, expected 3.11 or 3.12"
             )

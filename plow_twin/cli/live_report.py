@@ -43,7 +43,7 @@ class Report:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is not None:  # otherwise another report follows
+        if kind is not None:  # after an orderly end the caller closes both outputs
             with suppress(BrokenPipeError):
                 self.close_lines()
             self.close()

@@ -194,7 +194,7 @@ class Feed:
     def part(self, name: str, part: Part) -> None:
         """Add a status, which replaces the previous status of that name."""
         level, message, values = part
-        if name == "estimate" and "estimates" not in values:  # the diagnostics' part of this name has that key
+        if name == "estimate" and "estimates" not in values:  # the part of the diagnostics has this key
             self._sum_up()  # the publications before the estimate come first
             self.motion.estimate = values
         elif name == "status":

@@ -412,7 +412,7 @@ def program(name: str, module: str) -> str:
     beside = Path(sys.executable).with_name(name)
     path, arguments = (beside, []) if beside.exists() else (Path(sys.executable), ["-m", module])
     relative = os.path.relpath(path)
-    # a bare name would be looked for on PATH
+    # the path gets a separator, because the shell would look for a bare name on PATH
     relative = relative if os.sep in relative else os.path.join(os.curdir, relative)
     return shlex.join([min(str(path), relative, key=len), *arguments])
 

@@ -469,7 +469,7 @@ def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: 
         states.append(_state(bool(sensor), observed, rough))
     exponent = unknowns.scene.contact.exponent
     log = Interval.normal(*bounced.ln_penetration)
-    # clipped, because a regression that extrapolates is not bounded
+    # the result is clipped, because a regression that extrapolates is not bounded
     log = Interval(*np.clip([log.mean, log.p05, log.p95], *_LN_PENETRATIONS).tolist())
     mean, soft, hard = (unknowns.force / np.exp(value) ** exponent for value in (log.mean, log.p95, log.p05))
     bias = [Interval.normal(*pair) for pair in zip(bounced.bias, bounced.bias_deviation, strict=True)]

@@ -309,7 +309,7 @@ class Load:
         kept.
         """
         correlation, its, of_samples = self._roughness()
-        # correlations within three standard errors of zero
+        # samples count as uncorrelated if their correlation is within three standard errors of zero
         rare = (correlation < 3.0 / math.sqrt(len(self.t))) & (self.interval() > RESOLVING)
         fx, fy, moment = np.where(rare, its, of_samples - its).tolist()
         if not rare.any():
@@ -333,7 +333,7 @@ class Load:
         times = self.t[0] + (self.t[-1] - self.t[0]) * place / (count - 1)
         left = np.minimum(place.astype(np.int64), count - 2)
         share = place - left
-        # the normal equations are tridiagonal
+        # the bands of the normal equations, whose matrix is tridiagonal
         bands = np.zeros((2, count))
         bands[1] = np.bincount(left, (1.0 - share) ** 2, count) + np.bincount(left + 1, share**2, count)
         bands[0, 1:] = np.bincount(left, share * (1.0 - share), count)[:-1]

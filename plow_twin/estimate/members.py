@@ -337,7 +337,7 @@ class Ensemble:
         if self._learner is not None:
             self._learner.add(self._numbers[use], seen[use], center, noise[there])
         off = _off(q, then, there)
-        # clipped, so that a bad pose does not outweigh all others
+        # the innovation is clipped, so that a bad pose does not outweigh all others
         most = tuning.OUTLYING * noise[there]
         self.square += ((off.clip(-most, most) / noise[there]) ** 2).sum(axis=1)
         weight = np.linalg.solve(scatter, seen[use].T @ about[use] / freedom)

@@ -36,7 +36,7 @@ def to_bernstein(g: Array, n: int, h: float, inverse_binomial: Array, b: Array) 
 @kernel()
 def sum_to_bernstein(b: Array, n: int) -> None:
     """Turn  g_k h^k / C(n, k)  in each of b's eight columns into the Bernstein coefficients of g on [0, h]."""
-    # two sweeps at once halve the number of stores
+    # two sweeps are made at once, which halves the number of stores
     for r in range(1, n + 1, 2):
         before = exact_row(b, r)
         once = before + exact_row(b, r - 1)

@@ -123,7 +123,7 @@ class BridgeFront:
 
     def now_ns(self) -> int:
         """Return the system's time, or the samples' own time [ns]."""
-        # 0 would mean that there is no time yet
+        # the time is at least 1, because 0 would mean that there is no time yet
         return (self._feeder.newest_ns or 1) if self.follows_samples else time.time_ns()
 
     def send(self, topic: str, message: memoryview | Message) -> None:

@@ -77,7 +77,7 @@ class BagWriter:
             if short is not None:
                 raise OSError(short)
             self._file.chunk(self._chunk)
-        except OSError as error:  # the next flush tries again
+        except OSError as error:  # these messages are lost, and the next flush tries again
             self._chunk.clear()
             self.lost.update(waiting)
             self.error = f"{self.path}: {error.strerror or error}"

@@ -350,7 +350,7 @@ def is_begun(path: Path) -> bool:
         with path.open("rb") as stream:
             head = stream.read(len(MAGIC))
     except OSError:
-        return True  # the reader reports why the file cannot be read
+        return True  # the reader will report why the file cannot be read
     return len(head) == len(MAGIC) or not MAGIC.startswith(head)
 
 
@@ -371,7 +371,7 @@ def metadata_records(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
     with open_mcap(path) as stream:
         try:
             found = [(record.name, dict(record.metadata)) for record in make_reader(stream).iter_metadata()]
-        except Exception:  # no index at the end, or a damaged index
+        except Exception:  # the file has no index at its end, or a damaged index
             found = _metadata_by_heads(stream.fileno())
     yield from found
 

@@ -192,7 +192,8 @@ def _find_time(
     if not np.isfinite(found).any():
         index = guess.names.index(guess.time)
         stamps = [time_ns(row[index]) for row in rows]
-        first = next((stamp for stamp in stamps if stamp is not None), 0)  # a float resolves today's date to 0.2 us
+        # times count from the first stamp, because a float resolves today's date only to 0.2 us
+        first = next((stamp for stamp in stamps if stamp is not None), 0)
         guess.stamps_s = np.array([np.nan if stamp is None else (stamp - first) * 1e-9 for stamp in stamps])
         if stamps and np.isnan(guess.stamps_s).all():
             got = f"{rows[0][index]!r} in the column {guess.time}"
@@ -234,7 +235,7 @@ def _find_units(guess: Guess, numbers: Mapping[str, Array], scene: Scene, given:
             guess.units[name] = doubt.likely
             guess.because[name] += f", {doubt.likely} by its size"
             guess.values[doubt.role, name] *= UNITS[QUANTITIES[doubt.role, name]][doubt.likely]
-    # both forces have the same unit
+    # a force without a known unit takes the unit of the other force
     both = [name for name in ("fx", "fy") if ("excitation", name) in guess.columns]
     for name in both:
         other = next((guess.units[one] for one in both if one in guess.units), "")

@@ -316,7 +316,7 @@ def _rewrite(part: Path, *, last: bool) -> None:
     def on_metadata(name: str, record: dict[str, str]) -> None:
         if name == LOSS_RECORD:
             loss.update(record)
-        elif name != DAMAGE_RECORD:  # damage is noted again below
+        elif name != DAMAGE_RECORD:  # notes of damage are written anew below
             file.metadata(name, record)
 
     reader = ChunkReader(part, on_metadata)

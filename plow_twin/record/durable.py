@@ -37,7 +37,7 @@ def whole_file(path: Path, *, sync: bool = False) -> Iterator[BinaryIO]:
             with path.open("wb") as stream:
                 yield stream
             return
-        place = path.resolve()  # a symbolic link stays a link
+        place = path.resolve()  # the target of a symbolic link is replaced, so that the link stays
         beside = place.with_name(f".{place.name}.{os.getpid()}")
         try:
             with beside.open("wb") as stream:

@@ -340,7 +340,7 @@ class _Merger:
             elif channel.message_type in MESSAGE_TYPES:
                 sent.append(number)
                 named = channel.topic, channel.message_type
-                if self._topics.get(number) != named:  # not changed in place, as earlier outputs use it
+                if self._topics.get(number) != named:  # a new mapping is made, because earlier outputs use the old one
                     self._topics = {**self._topics, number: named}
         if journal:
             chosen = messages if len(journal) == len(there) else _of(messages, journal)
@@ -449,7 +449,7 @@ def read_header(path: Path) -> RunHeader | None:
 
     for _ in ChunkReader(path, on_metadata):
         break
-    if not found:  # programs that rewrite a file put this record last
+    if not found:  # programs that rewrite a file put the header's record last
         for name, record in metadata_records(path):
             on_metadata(name, record)
     return found[0] if found else None

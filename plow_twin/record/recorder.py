@@ -184,10 +184,10 @@ class Recorder:
         self._snapshot_due = False
         self._output_gaps: Counter[str] = Counter()
         self._lost: Counter[str] = Counter()
-        self._unflushed: Counter[str] = Counter()  # written, but not yet flushed
+        self._unflushed: Counter[str] = Counter()  # counts of items that are written, but not yet flushed
         self._written = 0
         self._error: str | None = None
-        self._paused: str | None = None  # why items are refused at present
+        self._paused: str | None = None  # reason why items are refused at present
         self._closed = False
         self._accepting = True
         self._stopping = threading.Event()
@@ -392,7 +392,7 @@ class Recorder:
                 self._give_up(reason)
             if self._mark is not None:
                 self._split()
-            with self._lock:  # callers may still count losses
+            with self._lock:  # the lock is needed, because callers may still count losses
                 lost = dict(self._lost)
             self._writer.close(lost, reason or self._paused)
             self._closed = True
@@ -474,7 +474,7 @@ class Recorder:
                 self._dump(self._ring, self._mark, lost)
             except (OSError, RecordingError) as failed:  # the ring stays in memory
                 error = f"{self._mark}: the last {self._ring_s:g} s not written: {failed}"
-            with self._lock:  # so that a caller that reads the new count may mark again at once
+            with self._lock:  # with the lock, a caller that reads the new count may mark again at once
                 self._mark = None
                 if error is None:
                     self._marks += 1
@@ -488,7 +488,7 @@ class Recorder:
 
         try:
             ring.dump(folder, lost)
-        except TakenError:  # another process has made this folder
+        except TakenError:  # another process has made this folder in the meantime
             in_free_folder(self._folder, lambda other: ring.dump(other, lost))
 
     def _flush(self) -> str | None:

@@ -168,7 +168,7 @@ class _Replay:
         self.messages: Mapping[str, Message] | None = None
         self.first_ns: int | None = None
         self.gaps = 0
-        self.lost_entries = 0  # as stated by the notes in the journal
+        self.lost_entries = 0  # the number that the notes in the journal state
         self.inputs = InputCounts(header.excitation_source)
         self.alarms = AlarmCheck(header, self.all_outputs)
 
@@ -193,7 +193,7 @@ class _Replay:
             if not (goes_on and still):
                 breaks[index : index + 2] = True
         samples = np.flatnonzero(entries.sample)
-        late = samples[1:][np.diff(entries.stamp_ns[samples]) < 0]  # applied one by one
+        late = samples[1:][np.diff(entries.stamp_ns[samples]) < 0]  # late samples are applied one by one
         breaks[late] = True
         breaks[late[late + 1 < count] + 1] = True
         ends = np.append(np.flatnonzero(breaks), count)

@@ -84,7 +84,7 @@ class RingWriter(RunWriter):
             The folder cannot be written; the ring stays as it is.
         """
         make_folder(folder)
-        with ExitStack() as undone:  # removes an incomplete ring
+        with ExitStack() as undone:  # this removes an incomplete ring
             undone.callback(_remove, folder)
             self._dump(folder, loss, undone)
             undone.pop_all()

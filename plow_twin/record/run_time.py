@@ -64,7 +64,7 @@ class RunTime:
             case Reset() | SetWear() | Restore():
                 self._reached_ns = None
                 self.silences.restart()
-            case Loss():  # samples may be among the lost entries
+            case Loss():  # the time across a loss is no silence, because samples may be among the lost entries
                 self.silences.restart()
             case Parameter(name, value) if name == _TIMEOUT:
                 self.silences.timeout_s = float(value)

@@ -281,14 +281,14 @@ class SqliteSource:
         self._behind_holes = _behind_holes(parts, missing)
 
     def _open(self, path: Path) -> sqlite3.Connection:
-        log = path.with_name(path.name + "-wal")  # has the last messages of a killed recorder
+        log = path.with_name(path.name + "-wal")  # this log has the last messages of a killed recorder
         kept = log.is_file() and log.stat().st_size > 0
         place = quote(path.resolve().as_posix())
         connection = sqlite3.connect(f"file:{place}?mode=ro" + ("" if kept else "&immutable=1"), uri=True)
         if kept:
             try:
                 connection.execute("SELECT 1 FROM sqlite_master")
-            except sqlite3.OperationalError:  # read-only folder: the log cannot be opened
+            except sqlite3.OperationalError:  # in a read-only folder the log cannot be opened
                 connection.close()
                 connection = sqlite3.connect(f"file:{place}?mode=ro&immutable=1", uri=True)
                 self._unread.add(path)

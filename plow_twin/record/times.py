@@ -94,5 +94,5 @@ def _date_ns(text: str) -> int | None:
     except ValueError:
         return None
     time = time if time.tzinfo else time.replace(tzinfo=UTC)
-    digits = _NANOSECONDS.search(text)  # the digits that a datetime does not keep
+    digits = _NANOSECONDS.search(text)  # these are the digits that a datetime does not keep
     return (time - _EPOCH) // timedelta(microseconds=1) * 1000 + (int(digits[1].ljust(3, "0")) if digits else 0)

@@ -220,7 +220,7 @@ def _load(magnitudes: Mapping[tuple[str, str], float], scene: Scene) -> list[Uni
             largest *= UNITS["force"][unit]
     if largest < _IDLE_SHARE * usual:
         return doubts
-    # small forces come with a small moment
+    # the expected moment is reduced with the forces, because small forces come with a small moment
     beside = float(compile_loads(scene.loads).largest()[2]) * min(1.0, largest / usual) if usual else 0.0
     moment = magnitudes.get(("excitation", "m"), 0.0)
     if _BROKEN_SHARE * beside < moment < _IDLE_SHARE * beside:

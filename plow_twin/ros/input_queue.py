@@ -107,7 +107,7 @@ class InputQueue:
         """
         try:
             signs = os.eventfd_read(self.fd)
-        except BlockingIOError:  # polled without a notification
+        except BlockingIOError:  # the queue is polled without a notification
             signs = 0
         self._signs += signs
         wanted = most if all_there_are else min(most, self._signs)

@@ -122,7 +122,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
             self._front = RosFront(self, settings, self._publish_status, prepared, self._kept_wear)
         except (PlowTwinError, OSError, ModuleNotFoundError) as error:
             self.reason = f"scene {settings.scene!r}, record_path {settings.record_path!r}: {error}"
-        except Exception:  # rclpy would swallow it
+        except Exception:  # rclpy would swallow any other error
             self.reason = traceback.format_exc()
         else:
             self.get_logger().info(f"scene {settings.scene}: solver ready in {prepared.compile_s:.2f} s")

@@ -321,7 +321,7 @@ def _by_equations(scene: Scene, t_end: float, tol: float, parameters: Sequence[s
 
 def _by_shadows(scene: Scene, t_end: float, tol: float, parameters: Sequence[str]) -> _Stretches:
     """Follow the motion and displaced motions."""
-    # the tolerance is 1e-5 of a displacement
+    # `SHADOW_TOLERANCE` is 1e-5 of a displacement
     fine = min(max(SHADOW_TOLERANCE, TOLERANCE_RANGE[0]), tol)
     compiled = compile_scene(scene, fine)
     changed = [ChangedScene.of(scene, path, fine) for path in parameters]

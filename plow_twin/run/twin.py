@@ -447,7 +447,7 @@ class Twin:
     def _digests(self, states: NDArray[np.void], wrench: NDArray[np.float64]) -> list[str]:
         """Return the digests of states with their last samples, shape (m, 3)."""
         size = states.itemsize
-        rows = np.empty((len(states), size + 32), np.uint8)  # the layout of `snapshot`
+        rows = np.empty((len(states), size + 32), np.uint8)  # each row has the layout of `snapshot`
         rows[:, :size] = states.view(np.uint8).reshape(len(states), size)
         rows[:, size : size + 24] = np.ascontiguousarray(wrench).view(np.uint8)
         rows[:, size + 24 :] = np.frombuffer(np.float64(self._travel_speed).tobytes(), np.uint8)

@@ -102,7 +102,7 @@ def load_yaml(text: str, name: str, sections: str, *, most_values: float = math.
         return None, [Problem(_place(mark) if mark else name, str(error.problem), "YAML")]
     except yaml.YAMLError as error:
         return None, [Problem(name, " ".join(str(error).split()), "YAML")]
-    except ValueError as error:  # an integer with thousands of digits
+    except ValueError as error:  # an integer may have thousands of digits
         return None, [Problem(name, str(error), "numbers")]
 
 
@@ -143,7 +143,7 @@ def _excess(text: str, most_values: float) -> Problem | None:
                 sizes[anchor] = outer
             outer, is_mapping, anchor = stack.pop()
         elif kind is yaml.AliasEvent:
-            known = sizes.get(event.anchor, scalar)  # the composer reports a missing anchor
+            known = sizes.get(event.anchor, scalar)  # a missing anchor is reported later, by the composer
             if known is None:
                 return Problem(_place(event.start_mark), "an alias to itself", "an alias to an earlier node")
             node = known

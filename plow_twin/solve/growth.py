@@ -160,7 +160,7 @@ def follow_growth(matrices, changes, ends, since, kept, whole, basis, scratch, t
         matrix, count = matrices[index], kept[0]
         grown, size = since[1], len(matrix)
         _multiply_all(matrix, since[0], count, grown)
-        # the product since the beginning of this stretch
+        # index `count` holds the product since the beginning of this stretch
         grown[:, count] = matrix
         ended = ends[index] == 1
         growth[index] = _largest(grown, count + 1, size if ended else size // 2, scratch)

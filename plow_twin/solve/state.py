@@ -212,10 +212,8 @@ _STATE_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("time", "f8"),  # the present time, bit for bit as the caller gave it
     ("implicit_size", "f8"),  # size of the next implicit step
     ("decay_times", "f8"),  # number of decay times in overdamped contact since a contact changed
-    (
-        "implicit_size_before",
-        "f8",
-    ),  # this field and the next have their values from before the current step was laid out
+    # these two fields have their values from before the current step was laid out
+    ("implicit_size_before", "f8"),
     ("decay_times_before", "f8"),
     ("order", "i8"),  # order of the series of the current step
     ("event_pair", "i8"),  # the pair whose event ends the step, or -1
@@ -292,11 +290,8 @@ WORK: Final = np.dtype(
         ("damping", "f8", (3, 3)),
         ("rub", "f8", (6, *_WIDE)),  # wear: s' / v, sliding distance per travel, force times this distance; running-in
         ("binomial", "f8", (_ROWS, _ROWS)),  # 1 / C(order, k)
-        (
-            "beyond",
-            "f8",
-            (3,),
-        ),  # newest advance out of range: angle [rad], largest penetration [m], and the pair with this penetration
+        # newest advance out of range: angle [rad], largest penetration [m], and the pair with this penetration
+        ("beyond", "f8", (3,)),
     ]
 )
 

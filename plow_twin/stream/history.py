@@ -88,7 +88,7 @@ class History:
         self._later.append((stamps_ns, wrench))
         last_ns = self._kept_ns[-1] if self._kept_ns else None
         if last_ns is not None and stamps_ns.item(-1) // self._spacing_ns == last_ns // self._spacing_ns:
-            return  # the usual case, since stamps rise
+            return  # this is the usual case, because stamps rise
         cells = stamps_ns // self._spacing_ns
         begins = np.ones(len(cells), bool)
         begins[1:] = cells[1:] != cells[:-1]

@@ -255,7 +255,7 @@ class Drawing:
         for index in sorted(entries.others):
             self._back(samples[: np.searchsorted(samples, index)], stamps, steps)
             entry, stamp_ns = entries.others[index], int(stamps[index])
-            if not hasattr(entry, "stamp_ns"):  # drawn at the stamp reached
+            if not hasattr(entry, "stamp_ns"):  # an entry without a stamp is drawn at the stamp reached
                 reached = np.flatnonzero(advance[:index])
                 stamp_ns = int(stamps[reached[-1]]) if reached.size else self.stamp_ns
             self.events.entry(stamp_ns, max(int(steps[index]), 0), entry, self.header.excitation_source)
@@ -359,7 +359,7 @@ class Drawing:
                 self.pads.add(int(stamps[row]), int(steps[row]), centers=middles, half_sizes=halves)
                 labels = [f"{depth:.3g} mm" if depth >= 1.0 else f"{1e3 * depth:.3g} µm" for depth in depth_mm[row]]
                 self.pad_names.add(int(stamps[row]), int(steps[row]), positions=places, labels=labels)
-            elif self._worn:  # the pads are new
+            elif self._worn:  # new pads were set, so the drawn wear is removed
                 self.pads.add(int(stamps[row]), int(steps[row]), centers=[], half_sizes=[])
                 self.pad_names.add(int(stamps[row]), int(steps[row]), positions=[], labels=[])
             self._worn = bool(depth_mm[row].any())

@@ -54,7 +54,8 @@ def draw_forecast(found: Forecast, path: FilePath, title: str) -> None:
                 xytext=(offset, -10.0),
                 textcoords="offset points",
                 ha=side,
-                bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0},  # covers the line of another point
+                # the box covers the line of another point
+                bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0},
             )
     if plan.stop_h is not None and plan.stop_h <= end:
         right.axvline(plan.stop_h, color="#1b7837", linestyle=":", label="planned stop")

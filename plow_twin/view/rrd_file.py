@@ -84,5 +84,5 @@ class RrdFile:
                     shutil.copyfileobj(outlet, self._file, _CHUNK)
             except OSError as error:
                 self._error = error
-                while outlet.read(_CHUNK):  # without a reader the stream would wait
+                while outlet.read(_CHUNK):  # reading goes on, because without a reader the stream would wait
                     pass

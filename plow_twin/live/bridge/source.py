@@ -169,7 +169,7 @@ class Rows:
                 return False
             self.columns = self._before
         if [cell.strip() for cell in cells] == self.columns:
-            return False  # the file repeats its header
+            return False  # this line repeats the header
         if len(cells) != len(self.columns):
             return None
         if self.delimiter != ",":  # numbers may have decimal commas

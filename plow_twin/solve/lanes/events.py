@@ -119,7 +119,7 @@ def _list_off(lanes, order) -> None:
     """
     h, series, cosine, sine = exact_row(lanes.step, 0), lanes.series, lanes.series[COS], lanes.series[SIN]
     x, y = series[X], series[Y]
-    # sums of abs(term k) h^k for k > 1
+    # these are the sums of abs(term k) h^k for k > 1
     later_c = later_s = later_x = later_y = exact_splat(0.0)
     for k in range(order, 1, -1):
         later_c = fused(later_c, h, magnitude(exact_row(cosine, k)))
@@ -168,7 +168,7 @@ def _write_guard(lanes, places, rows, of_depth, of_rate, constant, guard, order,
             term = fused(of_rate * (k + 1.0), deeper, of_depth * depth)
             deeper = depth
         else:
-            # the series' variable may be a root of time
+            # the rate needs a series of its own, because the variable of the series may be a root of time
             term = of_depth * depth
             if damped != 0 and k < order:
                 deeper = linear_at(

@@ -207,7 +207,7 @@ def _switch(p, state, sums, lanes, lane, hysteretic, fraction) -> None:
                 _touch_or_release(p, lanes, pair, lane)
             else:
                 lanes.touched[lane] &= ~(1 << pair)
-            # a released pair is counted as on
+            # a RELEASED pair counts as ON
             sums.logged += 0 if old in (ON, RELEASED) and new in (ON, RELEASED) else 1
 
 

@@ -413,7 +413,7 @@ def _multiply(lanes, slot, k, hysteretic):
     found = exact_row(square, k)
     higher = below(exact_splat(2.5), exact_row(exponent, 0))
     if higher != 0:
-        # d^3 = d^2 d, d^4 = d^2 d^2
+        # d^3 is d^2 times d, and d^4 is the square of d^2
         fourth = below(exact_splat(3.5), exact_row(exponent, 0))
         found = choose(higher, choose(fourth, _product(square, square, k), _product(square, depth, k)), found)
     damped = exact_splat(0.0)

@@ -567,6 +567,6 @@ def _identity(path: Path) -> object:
     """Return a run's random id with the number of its first part; the path of any other recording."""
     try:
         header = read_header(mcap_path(path))
-    except (RecordingError, OSError):  # the error is reported where the recording is used
+    except (RecordingError, OSError):  # the error will be reported where the recording is used
         header = None
     return path if header is None or not header.run_id else (header.run_id, header.part)

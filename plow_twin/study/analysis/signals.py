@@ -82,7 +82,7 @@ def _correlation(one: Array, other: Array) -> float | None:
         return None
     one, other = one - one.mean(), other - other.mean()
     size = math.sqrt(float(one @ one) * float(other @ other))
-    # limited, because rounding could give more than 1
+    # the value is limited, because rounding could give more than 1
     return min(1.0, max(-1.0, float(one @ other) / size)) if size > 1e-300 else None
 
 

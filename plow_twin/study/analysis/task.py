@@ -210,7 +210,7 @@ def _scene_state(scene: Path | None) -> list[str] | None:
         return None
     try:
         text = dump_scene(load_scene(scene_path(str(scene))))
-    except (PlowTwinError, OSError, ValueError):  # the analysis reports the error
+    except (PlowTwinError, OSError, ValueError):  # the analysis will report the error
         text = ""
     return [str(scene), hashlib.blake2b(text.encode(), digest_size=16).hexdigest()]
 

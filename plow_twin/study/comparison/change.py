@@ -124,7 +124,7 @@ class Drawn:
         centred = whole - usual
         means, products = [np.zeros((1, whole.shape[1]))], [centred[:, :width].T @ centred / self.size]
         done = 0
-        while done < draws:  # as many draws at once as the memory allows
+        while done < draws:  # each round makes as many draws as the memory allows
             count = min(draws - done, max(1, _AT_ONCE // self.size))
             done += count
             times = np.stack(
