@@ -53,8 +53,8 @@ TOLERANCE = 1e-4
 MEMBERS = 128
 #: Index in the filters' state of the first unknown of the estimate; pose and rate come before it.
 _FIRST = 6
-#: Process noise in each step: of x, y [m], theta [rad] and their rates; of the unknowns, as a share of the prior's
-#: standard deviation. Both were set by hand, with trials on seeds 200 and 201 only.
+#: Process noise in each step: first that of x, y [m], theta [rad] and their rates, then that of the unknowns as a share
+#: of the prior's standard deviation. Both were set by hand, with trials on seeds 200 and 201 only.
 _STATE_NOISE = np.array([1e-5, 1e-5, 4e-5, 3e-3, 3e-3, 1e-2])
 _UNKNOWN_NOISE = 3e-4
 

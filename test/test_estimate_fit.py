@@ -83,8 +83,8 @@ def test_starts_that_meet_end_the_search(
     problem, found = search.candidate(forward, unknowns, truth.poses, truth.load.period()) or (None, None)
     assert problem is not None and found is not None
     assert least <= fitted.call_count <= most
-    # one call gives the derivatives with respect to all six components of the starting states, and one call each gives
-    # those with respect to every other unknown
+    # one call gives the derivatives with respect to all six components of the starting states, and each other unknown
+    # takes one call
     run = Mock(side_effect=forward.run)
     monkeypatch.setattr(forward, "run", run)
     problem.linearise(found.point)

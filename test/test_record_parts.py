@@ -264,9 +264,8 @@ def test_a_full_disk_is_named_and_a_repair_leaves_nothing_half_done(tmp_path: Pa
 def test_a_full_disk_ends_the_writing_of_a_replay_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = record_run(tmp_path / "run", map(paper_sample, range(COUNT)), frame_every=10**9, pause_every=0)
     before, full = run.file.read_bytes(), tmp_path / "full"
-    assert (
-        cli(["replay", str(run.folder), "--write", str(tmp_path / "whole"), "-q"]) == 0
-    )  # this run puts the kernels into the cache
+    # this run puts the kernels into the cache
+    assert cli(["replay", str(run.folder), "--write", str(tmp_path / "whole"), "-q"]) == 0
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, limits[1]))
     try:

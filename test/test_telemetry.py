@@ -92,9 +92,8 @@ def test_opcua_clients_read_a_typed_model_and_acknowledge_alarms_where_that_is_a
             await _soon(lambda: _is_good(horizontal))
             value, low = await horizontal.read_data_value(), await node("clearance.horizontal.p05").read_value()
             assert (value.Value.Value, low, unit.DisplayName.Text) == (pytest.approx(0.025), pytest.approx(0.025), "m")
-            assert value.SourceTimestamp.timestamp() == pytest.approx(
-                1.0 + 1499e-3, abs=0.01
-            )  # this is the last sample's time
+            # this is the last sample's time
+            assert value.SourceTimestamp.timestamp() == pytest.approx(1.0 + 1499e-3, abs=0.01)
             assert not (await node("life.seconds.p50").read_data_value(raise_on_bad_status=False)).StatusCode.is_good()
             for written in (horizontal, node("flags.stream"), node("alarms.force")):
                 with pytest.raises(ua.UaStatusCodeError):

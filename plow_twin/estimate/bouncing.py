@@ -41,8 +41,8 @@ _NEAR_TURNS: Final = np.linspace(-_FINEST_TURN, _FINEST_TURN, 5)
 _MOST_ROWS, _MOST_NEAR_ROWS = 2000, 1200
 #: Derived: smallest number of rows in a part of a load period; the mean of nine values has a third of their scatter.
 _FEWEST_OF_PHASE = 9
-#: Derived: delays in s that are tried for the measured path, up to two prior deviations to both sides, and for the
-#: drawn paths, up to a tenth of that. `_NO_LAG` is the index of zero delay among the delays of drawn paths.
+#: Derived: delays in s that are tried. For the measured path they reach two prior deviations to both sides, and for the
+#: drawn paths a tenth of that. `_NO_LAG` is the index of zero delay among the delays of drawn paths.
 _LAGS_S: Final = np.linspace(-0.1, 0.1, 81)
 _OF_DRAWN_S: Final = np.linspace(-0.01, 0.01, 9)
 _NO_LAG = len(_OF_DRAWN_S) // 2

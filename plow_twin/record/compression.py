@@ -80,7 +80,7 @@ def independent_blocks(data: memoryview, size: int) -> Bytes | None:
         place += 4
         if length == 0:
             return content if done == size else None
-        if length > len(data) - place:  # truncated, or an uncompressed block (the highest bit of its length is set)
+        if length > len(data) - place:  # the block is truncated, or not compressed (the highest bit is set)
             return None
         count = block(source + place, target + done, length, size - done)
         if count < 0:

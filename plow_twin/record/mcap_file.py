@@ -255,7 +255,7 @@ class McapFile:
             raw = entries.tobytes()
             parts.append(struct.pack("<BQHI", 7, 6 + len(raw), channel, len(raw)) + raw)
             place += len(parts[-1])
-        self._file.write(b"".join(parts))  # the chunk and its index in one write
+        self._file.write(b"".join(parts))  # one call writes the chunk and its index
         self._undeclared = []
         for channel, entries in index.items():
             self._counts[channel] += len(entries)

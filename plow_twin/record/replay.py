@@ -315,7 +315,7 @@ class _Replay:
         assert self.sink is not None
         entry = record.entry
         if isinstance(entry, Snapshot) and self.synced:
-            entry = self.session.snapshot()  # the windows of its outputs fit the publications written here
+            entry = self.session.snapshot()  # the windows of this snapshot fit the publications written here
         self.sink.write_entry(record.sequence, record.log_time_ns, entry)
         published = self.session.outputs.pop() if self.synced and isinstance(entry, Sample | Hold | Unload) else NOTHING
         if len(published.rows) and published.finite:

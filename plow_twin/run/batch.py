@@ -352,7 +352,7 @@ class TwinBatch:
 
             worker.lanes.advance(times, ends, rows, worker.pace, alone)
 
-        # copied as bytes, because numpy copies a record field by field
+        # records are copied as bytes, because numpy copies a record field by field
         states, begun = self._states.view(np.uint8), list[Future[None]]()
         before = states.copy()
         try:

@@ -284,8 +284,8 @@ def sensitivity_of(scene: Scene, t_end: float, tol: float, parameters: Sequence[
 class _Stretches(NamedTuple):
     """Derivatives at the times `_ends` with respect to the previous stretch's last state, scaled by `scale_of`."""
 
-    matrices: Array  #: with respect to the state, shape (n, k, k)
-    changes: Array  #: with respect to the parameters, shape (n, p, k)
+    matrices: Array  #: derivatives with respect to the state, shape (n, k, k)
+    changes: Array  #: derivatives with respect to the parameters, shape (n, p, k)
     ends: NDArray[np.bool_]  #: whether a stretch ends and the next stretch begins, shape (n,)
 
 

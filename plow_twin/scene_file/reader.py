@@ -142,7 +142,7 @@ def _number(raw: Any, path: str, marks: dict[str, Provenance]) -> float | tuple[
         marks[path] = Provenance(Mark(raw["mark"]), raw.get("source", ""), _deviation(raw))
         raw = raw["value"]
     if isinstance(raw, list):
-        # the items of a list may be marked
+        # each item of a list may have a mark of its own
         return tuple(float(_number(item, f"{path}[{index}]", marks)) for index, item in enumerate(raw))  # type: ignore[arg-type]
     return float(raw)
 

@@ -48,8 +48,8 @@ from plow_twin.solve.state import (
 
 #: Tightest and loosest tolerance.
 TOLERANCE_RANGE = (1e-13, 1e-1)
-#: Admissible error of one step as a share of the tolerance; small, because the errors of hundreds of steps add up and
-#: impacts amplify them.
+#: Admissible error of one step as a share of the tolerance; it is small, because the errors of hundreds of steps add up
+#: and impacts amplify them.
 STEP_SHARE = 3e-4
 #: Largest admissible error of a step relative to the length scale; it limits the error of a step at a loose tolerance.
 LARGEST_STEP_ERROR = 1e-6

@@ -60,7 +60,7 @@ class Feeder:
         self._by_topic: dict[str, list[tuple[str, Role]]] = {}
         for name, role in roles.items():
             self._by_topic.setdefault(role.topic, []).append((name, role))
-        #: time of a source with its own time [ns]: the newest stamp, but not a single stamp that is far ahead
+        #: time of a source that has its own time [ns]: its newest stamp, unless that is a single stamp far ahead
         self.newest_ns = 0
         self._far_ahead_ns: int | None = None
         #: reason why the first unreadable load was refused; empty if every load could be read

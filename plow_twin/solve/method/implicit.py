@@ -495,7 +495,7 @@ def _write_series(p, support, state, h, w, implicit, ramp, wear, stick) -> float
     last, place = w.series[s - 1], w.series[s]
     size += 4.0 * (abs(last[VX]) + abs(last[VY]) + p.radius * abs(last[OMEGA]))
     size += scale * (abs(place[X]) + abs(place[Y]) + p.radius * abs(place[THETA])) + more
-    # the part of the last term on [0, h] that polynomials of lower degree cannot represent
+    # this is the part of the last term on [0, h] that polynomials of lower degree cannot represent
     return (size * h ** (s - 1) + grip * _GAIN * p.threshold[0]) * 2.0 ** (1 - 2 * s)
 
 
