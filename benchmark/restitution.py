@@ -23,7 +23,7 @@ PICTURE = ROOT / "docs" / "images" / "restitution.png"
 PAGE = ROOT / "benchmark" / "results" / "restitution.md"
 BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
 
-#: Nominal restitutions in the CSV file, and those in the page.
+#: Nominal restitutions for which the CSV file has rows, and those that the page shows.
 ASKED = tuple(round(0.01 * k, 2) for k in range(101))
 SHOWN = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0)
 #: Damping ratios C / (2 sqrt(K m)) of the Kelvin-Voigt table.

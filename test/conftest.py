@@ -19,7 +19,7 @@ from hypothesis import Phase, settings
 ROOT = Path(__file__).resolve().parent.parent
 SKIPS = ROOT / "test" / "skips.txt"
 FIRST = ROOT / "test" / "first.txt"
-#: Name of the variable with the folder of the locks of `_compile_once`.
+#: Name of the environment variable that names the folder in which `_compile_once` has its locks.
 LOCKS = "PLOW_TWIN_COMPILING"
 
 

@@ -28,7 +28,7 @@ def test_the_prior_is_the_scene_s_or_that_of_the_mark() -> None:
         "contact.damping": Provenance(Mark.ASSUMED, "", 0.2 * (scene.contact.damping or 0.0)),
     }
     stated = Unknowns.stated(replace(scene, marks=marks), load, poses).deviations()
-    # 10 % of the stiffness are 10 % of the penetration; a penetration of 0.1 mm is treated as zero
+    # 10 % more stiffness makes 10 % less penetration; a penetration of 0.1 mm is treated as zero
     np.testing.assert_allclose(stated[:4], [2e-3, 2e-3, 0.1, 0.2], rtol=0.02)
     # the deviations are the same in the units of a machine of another size
     units = Units(0.5, 2.0, 0.25)

@@ -719,7 +719,7 @@ def test_nothing_lives_longer_than_the_time_remembered_but_the_index_of_the_reco
     # between these points 8,000 samples and 25,000 messages pass; the number of objects for the last seconds varies by
     # some hundreds
     assert more - objects < 800 and larger - size < 100_000, found
-    # the index takes about 140 B for each chunk, 2 MB an hour, until the part ends
+    # until the part ends, the index takes about 140 B for each chunk, which is 2 MB an hour
     assert 0 < after - before < 20_000
     figures = front.parts()["input"][2]
     assert int(figures["samples_used"]) == int(figures["samples_in"]) and int(figures["rolled_back"]) > 0

@@ -267,7 +267,7 @@ def _drive(live: Mixed, random: Random, calls: int) -> None:
                 skipped += range(index, index + gap)
                 index += gap
             case "late" if skipped:
-                # samples whose stamps are at the edge of the twin's memory
+                # these samples have stamps at the edge of the twin's memory
                 near = [ms for ms in skipped if abs(index - ms - span_ms) < 20]
                 chosen = near or random.sample(skipped, min(len(skipped), random.choice([1, 1, 4])))
                 skipped = [ms for ms in skipped if ms not in chosen]

@@ -195,7 +195,7 @@ def test_a_cut_file_is_replayed_as_far_as_it_goes(run: Run, tmp_path: Path) -> N
 def test_after_a_damaged_chunk_nothing_is_claimed(run: Run, tmp_path: Path) -> None:
     spans = chunk_spans(run.file)
     lost_entries = lost_messages = False
-    for start, length in spans:  # the chunks of the journal, and of the sent messages
+    for start, length in spans:  # these are the chunks of the journal, and of the sent messages
         data = bytearray(run.file.read_bytes())
         middle = start + length // 2
         # one flipped bit in the compressed data may refer to other bytes that are equal, so several bytes are changed

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-# both belong to a sourced ROS 2, and neither is on PyPI
+# both packages belong to a sourced ROS 2, and neither is on PyPI
 pytest.importorskip("launch_testing")
 pytest.importorskip("launch_ros")
 

@@ -18,7 +18,7 @@ from numba.extending import intrinsic, lower_builtin, models, register_model
 
 _WIDTH = 8
 _VECTOR = ir.VectorType(ir.DoubleType(), _WIDTH)
-#: Sums may be fused and reordered, as by `kernel(fast=True)`.
+#: Flags that let sums be fused and reordered, as `kernel(fast=True)` does.
 _FLAGS = ("contract", "reassoc", "nsz", "arcp")
 
 

@@ -335,7 +335,7 @@ class Runtime:
         if self.waits_for_clock:
             self.start()
         if self.waits_for_clock:
-            # kept until the clock comes, because a player of a recording may start the clock a little later
+            # samples are kept until the clock comes, because a player of a recording may start the clock a little later
             room = self.settings.input_depth - len(self._early)
             self._early += arrived[:room]
             for stamp_ns, wrench in arrived[max(room, 0) :]:

@@ -449,7 +449,7 @@ class _Replay:
         if not self.synced or record.sequence != here or (name in _CUMULATIVE and not self.outputs_synced):
             self.report.not_compared[name] += 1
             return
-        if self.messages is None:  # the first message of a publication
+        if self.messages is None:  # this is the first message of a publication
             if self.published is not None:
                 published = self.published.at(len(self.published.rows) - 1)
             else:

@@ -66,7 +66,7 @@ class Columns:
         return f"columns {names}{hint}"
 
 
-#: The name of a ROS type, `json`, or columns.
+#: Type of a topic: the name of a ROS type, `json`, or the columns of a table.
 TopicType: TypeAlias = str | Columns
 
 

@@ -97,7 +97,9 @@ class Subscriptions:
             self._inputs.refused_publishers += refused
             self._inputs.publishers |= {topic: len(publishers) for topic, publishers in present.items()}
             for topic in present:
-                self.look_for_senders(topic)  # repeated, because messages may have been taken in the meantime
+                self.look_for_senders(
+                    topic
+                )  # the look-up is repeated, because messages may have been taken in the meantime
         self._front.changed()
 
     def look_for_senders(self, topic: str) -> None:
@@ -137,7 +139,7 @@ class Subscriptions:
         subscription = self._node.create_subscription(
             kind,
             topic,
-            lambda message: None,  # never called: the input queue delivers the messages with their publishers
+            lambda message: None,  # this is never called, because the input queue delivers the messages
             sensor_input(depth),
             qos_overriding_options=OVERRIDABLE,
             raw=True,

@@ -129,7 +129,7 @@ class AdvanceSeries(_Rows):
     t = _Column[np.float64]()
 
     def __getitem__(self, index: int) -> Advance:
-        return Advance(self.rows[index].copy())  # a copy, so that not all rows are kept in memory
+        return Advance(self.rows[index].copy())  # the row is copied, so that not all rows are kept in memory
 
 
 class AdvanceBatch(_Rows):

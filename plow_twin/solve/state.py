@@ -333,7 +333,7 @@ ROW: Final = np.dtype(
         ("corrected", "i8"),  # 1 if late samples have changed the motion since the publication before
         ("marked", "i8"),  # 1 if `held` or `corrected` is 1, here or in the publication before
         ("orientation", "f8", (2,)),  # z and w of the head's quaternion
-        ("twist", "f8", (3,)),  # rates along the head's own axes [m/s], about z [rad/s]
+        ("twist", "f8", (3,)),  # rates along the head's own axes [m/s], and about z [rad/s]
         # written if the motion follows measurements: 5 % and 95 % quantiles over the drawn twins (of peak and impulse
         # since the publication before), and the clearances [m] with their quantiles
         ("followed", "i8"),  # `FOLLOWED`: clearances are filled; `WITH_INTERVALS`: all fields are filled

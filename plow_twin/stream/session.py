@@ -667,7 +667,8 @@ class Session:
         elif travel.stamp_ns > self.stamp_ns:
             insort(self._travels, travel, key=lambda item: item.stamp_ns)
         elif oldest_ns is not None and travel.stamp_ns <= oldest_ns:
-            # the speed is too old to act at its stamp: it acts from the newest sample on, or from the only kept state
+            # the speed is too old to act at its stamp, so it acts from the newest sample on, or from the only kept
+            # state
             self._set_speed(Travel(oldest_ns if newest_ns is None else newest_ns, travel.speed_m_s))
         elif newest_ns is None or oldest_ns is None or travel.stamp_ns >= newest_ns:
             self._set_speed(travel)

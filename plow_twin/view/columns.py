@@ -18,7 +18,7 @@ Indexes = NDArray[np.int64]
 BLOCK_ROWS: Final = 20_000
 ROS_TIME: Final = "ros_time"
 STEP: Final = "step"
-#: Time since the first stamp.
+#: Name of the timeline that counts from the first stamp.
 RUN_TIME: Final = "run_time"
 
 

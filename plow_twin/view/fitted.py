@@ -18,7 +18,7 @@ from plow_twin.view.figures import legend_beside, signed
 
 Array = NDArray[np.float64]
 
-#: Millimetres and milliradians.
+#: Factor from m and rad to mm and mrad.
 _SCALE: Final = 1e3
 _COMPONENTS: Final = (("x", "mm"), ("y", "mm"), ("θ", "mrad"))
 #: Largest number of characters in a line of the title.

@@ -10,7 +10,7 @@ from plow_twin.record.rows import Rows
 from plow_twin.stream.journal import Pose
 from plow_twin.view.columns import Array, Indexes
 
-#: Millimetres and milliradians.
+#: Factor from m and rad to mm and mrad.
 _SCALE = 1e3
 
 

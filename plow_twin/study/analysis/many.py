@@ -55,7 +55,7 @@ def run_many(
 def _here(tasks: Sequence[RunTask], waiting: list[int], workers: int, done: _OnDone) -> None:
     while waiting:
         left = _round(tasks, waiting, workers, done)
-        if len(left) == len(waiting):  # a task has killed its worker; to find it, the first tasks are run one by one
+        if len(left) == len(waiting):  # to find the task that has killed its worker, the first tasks are run one by one
             left, first = left[workers:], left[:workers]
             for number in first:
                 if _round(tasks, [number], 1, done):

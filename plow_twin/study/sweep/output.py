@@ -46,7 +46,7 @@ def write_parquet(table: Table, path: Path) -> None:
         "package_version": package_version(),
         "builds": [json.loads(build) for build in table.builds],
     }
-    # sorted keys, so that the same table gives the same bytes
+    # keys are sorted, so that the same table gives the same bytes
     arrow = pa.table(columns).replace_schema_metadata({METADATA_KEY: json.dumps(facts, sort_keys=True)})
     with whole_file(path) as stream:
         pq.write_table(arrow, stream)
