@@ -1,13 +1,20 @@
-"""Arrays inside kernels that are not reference counted."""
+"""Arrays inside kernels: without a reference count, and copied, searched and checked in few lines.
+
+These lines compile faster than numba's own code. Its assignment of a slice brings the formatting of an error message,
+which takes 2 s in each process that compiles a twin.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, cast
 
 from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
+
+from plow_twin.kernel.compiler import kernel
 
 
 def _unowned(typingctx: Any, array: Any) -> Any:
@@ -29,3 +36,32 @@ def _unowned(typingctx: Any, array: Any) -> Any:
 
 
 unowned = cast("Callable[[Any], Any]", intrinsic(_unowned))
+
+
+@kernel()
+def copy_into(target: Any, source: Any) -> None:
+    """Copy the numbers of an array to an array of the same size."""
+    for i in range(target.size):
+        target[i] = source[i]
+
+
+@kernel()
+def all_finite(numbers: Any) -> bool:
+    """Return whether no number is NaN or infinite."""
+    finite = True
+    for number in numbers:
+        finite = finite and math.isfinite(number)
+    return finite
+
+
+@kernel()
+def count_up_to(rising: Any, limit: float) -> int:
+    """Return how many of the rising numbers are at most `limit`."""
+    low, high = 0, rising.size
+    while low < high:
+        middle = (low + high) // 2
+        if rising[middle] <= limit:
+            low = middle + 1
+        else:
+            high = middle
+    return low

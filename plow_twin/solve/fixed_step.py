@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from plow_twin.kernel.arrays import all_finite, copy_into
 from plow_twin.kernel.compiler import kernel
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.dense_output import pair_outputs
@@ -98,14 +99,13 @@ def end_coarsely(p, parts, state, totals, target, bound) -> int:
             moving = size // 2 + j
             off, drift = abs(k[1, j] - k[2, j]), abs(k[1, moving] - k[2, moving])
             bound.error += radius * dt / 3.0 * (off + (left + dt) * drift)
-        if not np.isfinite(z).all():
+        if not all_finite(z):
             return _NON_FINITE
         state.steps += 1
         _to_body(p, parts.terms.support, state, z)
         turn_corners(p, state, terms.stick, totals, None)
         _wear(p, terms.wear, terms.sliding, terms.running_in, state, now, dt)
-        for pair in range(PAIR_COUNT):
-            before[pair] = now[pair]
+        copy_into(before, now)
         pair_outputs(p, state, state.wear_depth, y, pen, rate, now)
         _switch(p, state, pen, rate, start + (n + 1) * dt, totals, None)
         pair_outputs(p, state, state.wear_depth, y, pen, rate, now)
@@ -154,7 +154,7 @@ def integrate_fixed(
             row = (n + stride - 1) // stride
             pose_of(p, y, parts.terms.offset, q[row], v[row])
             if frame is not None:
-                frame[row] = state.frame
+                copy_into(frame[row], state.frame)
             if force is not None:
                 pair_outputs(p, state, state.wear_depth, y, penetration[row], rate, force[row])
         if n >= steps:
@@ -170,13 +170,13 @@ def integrate_fixed(
             state.evaluations += 1
         else:
             _runge_kutta(p, acts, state, t, dt, z, trial, k, load)
-        if not np.isfinite(z).all():
+        if not all_finite(z):
             return _NON_FINITE
         state.steps += 1
         _to_body(p, support, state, z)
         turn_corners(p, state, terms.stick, totals, log)
         _wear(p, terms.wear, terms.sliding, terms.running_in, state, now, dt)
-        before[:] = now
+        copy_into(before, now)
         pair_outputs(p, state, state.wear_depth, y, pen, rate, now)
         _switch(p, state, pen, rate, t + dt, totals, log)
         pair_outputs(p, state, state.wear_depth, y, pen, rate, now)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
+from plow_twin.kernel.arrays import copy_into
 from plow_twin.kernel.compiler import kernel
 
 #: Largest number of earlier times from which growth is followed; when it is reached, every second time is dropped.
@@ -161,7 +162,8 @@ def follow_growth(matrices, changes, ends, since, kept, whole, basis, scratch, t
         grown, size = since[1], len(matrix)
         _multiply_all(matrix, since[0], count, grown)
         # index `count` holds the product since the beginning of this stretch
-        grown[:, count] = matrix
+        for k in range(size):
+            copy_into(grown[k, count], matrix[k])
         ended = ends[index] == 1
         growth[index] = _largest(grown, count + 1, size if ended else size // 2, scratch)
         _multiply(matrix, whole[0], totals[index])
@@ -173,9 +175,11 @@ def follow_growth(matrices, changes, ends, since, kept, whole, basis, scratch, t
                 rows[index, i, j] = value
         if not ended:
             continue
-        whole[0][:], whole[1][:] = totals[index], rows[index]
+        copy_into(whole[0].reshape(-1), totals[index].reshape(-1))
+        copy_into(whole[1].reshape(-1), rows[index].reshape(-1))
         _stretch_basis(matrix, basis, scratch[3], logs[index])
         step = 1 if count + 1 < most else 2
         kept[0] = (count + step) // step
         for i in range(kept[0]):
-            since[0, :, i] = grown[:, i * step]
+            for k in range(size):
+                copy_into(since[0, k, i], grown[k, i * step])

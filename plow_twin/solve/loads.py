@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
+from plow_twin.kernel.arrays import count_up_to
 from plow_twin.kernel.compiler import kernel
 
 
@@ -17,7 +16,7 @@ def load_at(p, harmonics, segments, t, out) -> None:
     if harmonics is not None:
         add_harmonics(p, harmonics, t, out)
     if segments is not None:
-        piece = max(np.searchsorted(segments.knot, t, side="right") - 1, 0)
+        piece = max(count_up_to(segments.knot, t) - 1, 0)
         ahead = max(t - segments[piece].knot, 0.0)
         for j in range(3):
             out[j] += segments[piece].start[j] + segments[piece].slope[j] * ahead

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from plow_twin.kernel.arrays import unowned
+from plow_twin.kernel.arrays import copy_into, unowned
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import row, set_row, splat
 from plow_twin.model.pairs import PAIR_COUNT
@@ -60,7 +60,7 @@ def _present(p, harmonics, flight, support, state, w, y) -> None:
     else:
         set_row(y, 0, row(state.y, 0))
         if support is not None:
-            w.frame_now[:] = state.frame
+            copy_into(w.frame_now, state.frame)
 
 
 @kernel()
@@ -128,7 +128,7 @@ def _undo(support, state, w, target) -> None:
     set_row(state.y, 0, row(w.saved, 0))
     set_row(state.wear_depth, 0, row(w.saved, 1))
     if support is not None:
-        state.frame[:] = w.frame_saved
+        copy_into(state.frame, w.frame_saved)
     state.touch_time += target - state.time
     state.step_start, state.step_size, state.elapsed, state.time = target, -1.0, 0.0, target
 
@@ -146,7 +146,7 @@ def _advance(p, parts, states, index, saved, w, totals, target, stop_time, budge
         saved[0] = state
         _present(p, parts.harmonics, parts.terms.flight, parts.terms.support, state, w, w.saved[0])
         if parts.terms.support is not None:
-            w.frame_saved[:] = w.frame_now
+            copy_into(w.frame_saved, w.frame_now)
         _worn_now(state, w, parts.terms.wear, w.saved[1])
     before, begin = saved[0].steps, state.steps
     code = _proceed(p, parts, state, w, totals, target, stop_time, min(before + budget, begin + pace.left))
@@ -315,7 +315,7 @@ def _rows_in_flight(p, harmonics, flight, state, w, t, i, q, v, penetration, for
     This is a function of its own, because the loop over rows in `integrate` is a tenth faster without this branch.
     """
     if flight is not None:
-        t0, y, rate = state.step_start, np.empty(8), np.empty(8)
+        t0, y, rate = state.step_start, w.read[0], w.read[1]
         while i < t.size and t[i] < t0 + state.step_size:
             fly(p, harmonics, flight, state, w, max(t[i] - t0, 0.0), y)
             pose_of(p, y, None, q[i], v[i])
@@ -333,9 +333,9 @@ def integrate(
 
     `penetration`, `force`, `frame` (n, 6) and `balance` may be None. The steps do not depend on the rows' times.
     """
-    parts, log = _unowned_loads(parts), unowned(log)
+    parts, log, t = _unowned_loads(parts), unowned(log), unowned(t)
     q, v, pair_penetration, pair_force = unowned(q), unowned(v), unowned(penetration), unowned(force)
-    rate, y, wear_depth, wear = np.empty(8), np.empty(8), np.empty(8), parts.terms.wear
+    y, rate, wear_depth, wear = w.read[0], w.read[1], w.read[2], parts.terms.wear
     i = first[0]
     if balance is not None and state.steps == 0:
         start_balance(p, parts, state, state.y, state.step_start, balance)
@@ -357,7 +357,7 @@ def integrate(
             sigma = sigma_at(state, max(t[i] - t0, 0.0))
             sum_series(parts.terms.support, state, w, sigma, y)
             if frame is not None:
-                frame[i] = w.frame_now
+                copy_into(frame[i], w.frame_now)
             pose_of(p, y, parts.terms.offset, q[i], v[i])
             if force is not None:
                 _worn_at(state, w, wear, sigma, wear_depth)
@@ -372,7 +372,7 @@ def integrate(
         return _RANGE
     while i < t.size:
         if frame is not None:
-            frame[i] = state.frame
+            copy_into(frame[i], state.frame)
         pose_of(p, state.y, parts.terms.offset, q[i], v[i])
         if force is not None:
             pair_outputs(p, state, state.wear_depth, state.y, pair_penetration[i], rate, pair_force[i])

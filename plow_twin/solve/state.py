@@ -271,6 +271,7 @@ WORK: Final = np.dtype(
         ("per_pair", "f8", (9, PAIR_COUNT)),  # masks and sums of the eight pairs
         ("moved", "f8", (STATE_SIZE,)),
         ("saved", "f8", (2, PAIR_COUNT)),  # body coordinates and wear depth at the start of an advance
+        ("read", "f8", (3, PAIR_COUNT)),  # body coordinates, rate and wear depth at a time of output
         ("frame_now", "f8", (6,)),  # state of the frame at the last reading of the motion
         ("frame_saved", "f8", (6,)),  # state of the frame at the start of an advance
         ("load", "f8", (3, _ROWS)),  # S1, S2, M

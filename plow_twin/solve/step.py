@@ -11,6 +11,7 @@ from typing import Final
 
 import numpy as np
 
+from plow_twin.kernel.arrays import copy_into
 from plow_twin.kernel.compiler import kernel
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.contact_force import law_terms
@@ -58,11 +59,10 @@ def _set_load(p, segments, state, w):
 
 
 @kernel()
-def _begin_step(p, parts, state, w, stop_time):
+def _begin_step(p, segments, state, w, stop_time, viscous, fraction, ramp, stick):
     """Begin the layout of a step; return its largest length and whether any pair penetrates."""
-    terms = parts.terms
-    penetrating = weigh_pairs(p, state, w, terms.viscous, terms.fraction, terms.ramp, terms.stick)
-    state.stop_time = min(stop_time, _set_load(p, parts.segments, state, w))
+    penetrating = weigh_pairs(p, state, w, viscous, fraction, ramp, stick)
+    state.stop_time = min(stop_time, _set_load(p, segments, state, w))
     state.alpha, state.beta, state.elapsed, state.event_pair = 1.0, 0.0, 0.0, -1
     state.steps += 1
     return min(state.stop_time - state.step_start, LONGEST_STEP), penetrating
@@ -72,7 +72,9 @@ def _begin_step(p, parts, state, w, stop_time):
 def lay_out_step(p, parts, state, w, stop_time) -> bool:
     """Lay out the next step, which ends at `stop_time` at the latest; return False if it is not finite."""
     terms = parts.terms
-    span, penetrating = _begin_step(p, parts, state, w, stop_time)
+    span, penetrating = _begin_step(
+        p, parts.segments, state, w, stop_time, terms.viscous, terms.fraction, terms.ramp, terms.stick
+    )
     if flight.lay_out(p, parts, flight.own(parts), state, w, span, penetrating) or rest.lay_out(
         p, parts, rest.own(parts), state, w, span, penetrating
     ):
@@ -94,7 +96,9 @@ def lay_out_step(p, parts, state, w, stop_time) -> bool:
 def lay_out_series_step(p, parts, state, w, stop_time) -> bool:
     """Lay out the next step by Taylor series, even if the head is in free flight or at rest."""
     terms = parts.terms
-    span, penetrating = _begin_step(p, parts, state, w, stop_time)
+    span, penetrating = _begin_step(
+        p, parts.segments, state, w, stop_time, terms.viscous, terms.fraction, terms.ramp, terms.stick
+    )
     if not taylor.lay_out(p, parts, taylor.own(parts), state, w, span, penetrating):
         return False
     _end_at_event(p, state, w, span, penetrating, law_terms(terms), terms.stick)
@@ -133,7 +137,7 @@ def complete_step(p, harmonics, flight, support, state, w, totals, log, wear, fr
         wear_depth_at(state, w, sigma, state.wear_depth)
     evaluate(p, harmonics, flight, support, state, w, sigma, y)
     if support is not None:
-        state.frame[:] = w.frame_now
+        copy_into(state.frame, w.frame_now)
     angle = named_angle(p, y, y[THETA])
     y[COS], y[SIN] = math.cos(angle), math.sin(angle)
     before = state.step_start

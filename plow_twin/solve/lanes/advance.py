@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.kernel.arrays import unowned
+from plow_twin.kernel.arrays import copy_into, unowned
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import below, choose, exact_row, exact_splat, fused, set_row
 from plow_twin.model.pairs import PAIR_COUNT
@@ -138,9 +138,9 @@ def _fail(s, lanes, lane, code) -> None:
     state.step_start = state.time = s.times[i]
     out.t, out.status, out.steps = s.times[i], code, steps
     pose_of(p, state.y, None, out.q, out.v)
-    out.wear_depth[:] = state.wear_depth
+    copy_into(out.wear_depth, state.wear_depth)
     pair_outputs(p, state, out.wear_depth, state.y, out.penetration, out.rate, out.force)
-    out.peak[:] = out.force
+    copy_into(out.peak, out.force)
     s.place[member] += 1
     if s.place[member] < s.times.size:
         s.progress[0] -= 1

@@ -79,12 +79,17 @@ def own(parts):
     return parts.terms.flight
 
 
-@kernel()
+@kernel(inline="source")
 def lay_out(p, parts, own, state, w, span, penetrating) -> bool:
     """Lay out a step of free flight if it is longer than a step of a series."""
-    if own is None:
+    return _lay_out(p, parts.harmonics, own, state, w, span, penetrating)
+
+
+@kernel()
+def _lay_out(p, harmonics, flight, state, w, span, penetrating) -> bool:
+    if flight is None:
         return False
-    size = 0.0 if penetrating else safe_time(p, parts.harmonics, state, w, span)
+    size = 0.0 if penetrating else safe_time(p, harmonics, state, w, span)
     state.in_flight = 1 if size > 0.0 else 0
     state.sigma_end, state.order = size, 1
     state.ends_at_stop = 1 if size == span else 0

@@ -565,7 +565,7 @@ def own(parts):
     return parts.implicit, terms.ramp, rubbing, terms.slip, terms.stick, terms.support
 
 
-@kernel()
+@kernel(inline="source")
 def lay_out(p, parts, own, state, w, span, penetrating) -> bool:
     """Lay out an implicit step if damping limits explicit steps; `w.decay[0]` gets the decay rate."""
     return _lay_out(p, parts, *own, state, w, span, penetrating)

@@ -90,13 +90,18 @@ def own(parts):
     return parts.terms.rest
 
 
-@kernel()
+@kernel(inline="source")
 def lay_out(p, parts, own, state, w, span, penetrating) -> bool:
     """Lay out a step of rest if the head is at rest and its load is constant."""
-    if own is None:
+    return _lay_out(p, acting(parts), parts.harmonics, own, state, w, span, penetrating)
+
+
+@kernel()
+def _lay_out(p, acts, harmonics, rest, state, w, span, penetrating) -> bool:
+    if rest is None:
         return False
     steady = penetrating and w.wrench[1, 0] == 0.0 and w.wrench[1, 1] == 0.0 and w.wrench[1, 2] == 0.0
-    state.at_rest = 1 if steady and _settle(p, acting(parts), parts.harmonics, state, w) else 0
+    state.at_rest = 1 if steady and _settle(p, acts, harmonics, state, w) else 0
     if state.at_rest == 0:
         return False
     write_rest(p, state, w)

@@ -27,7 +27,7 @@ def own(parts):
     return terms.slip, terms.ramp, terms.fraction, terms.stick, parts.implicit
 
 
-@kernel()
+@kernel(inline="source")
 def lay_out(p, parts, own, state, w, span, penetrating) -> bool:
     """Lay out a step by Taylor series; return False if the series is not finite."""
     return _lay_out(p, parts, *own, state, w, span, penetrating)
