@@ -43,7 +43,7 @@ def main() -> None:
     folder = Path(sys.argv[1] if len(sys.argv) > 1 else tempfile.mkdtemp())
     took: dict[str, Any] = {}
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-    # an empty cache, so that compiled code of another installation is not used
+    # the cache is empty, so that compiled code of another installation is not used
     environment["NUMBA_CACHE_DIR"] = environment["PLOW_TWIN_CACHE"] = str(folder / "cache")
 
     def step(name: str) -> None:

@@ -239,7 +239,7 @@ def test_a_stretch_that_stands_there_twice_is_counted_and_used_once(tmp_path: Pa
     whole, spans = run.file.read_bytes(), chunk_spans(run.file)
     before = replay(run.folder)
     head = 9 + 3 * 8 + 2 * 4 + len("zstd") + 8  # number of bytes of a chunk's record before its data
-    begin, end = spans[2][0] - head, spans[8][0] - head  # the chunks from one of the journal up to one of outputs
+    begin, end = spans[2][0] - head, spans[8][0] - head  # from a chunk of the journal to one of outputs
     run.file.write_bytes(whole[:end] + whole[begin:end] + whole[end:])
     after, found = replay(run.folder), examine(run.folder)
     assert after.divergences == 0 and after.samples == before.samples and after.repeated == found.repeated > 0

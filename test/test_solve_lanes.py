@@ -66,7 +66,7 @@ def draw(rng: np.random.Generator, powers: bool = False) -> Scene:
     ][rng.choice(4, p=[0.2, 0.4, 0.2, 0.2])]
     if powers:
         exponent = float(rng.choice([1.5, 2.0, 2.2, 3.0, 4.0], p=[0.5, 0.15, 0.1, 0.15, 0.1]))
-        stiffness *= 1e3 ** (exponent - 1.0)  # as stiff as with exponent 1 at about 1 mm
+        stiffness *= 1e3 ** (exponent - 1.0)  # at about 1 mm this is as stiff as exponent 1
         contact = [
             Contact("hertz", stiffness, exponent),
             Contact("hunt_crossley", stiffness, exponent, damping=10 ** rng.uniform(-1.0, 1.0)),

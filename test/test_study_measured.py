@@ -149,7 +149,7 @@ def test_bands_are_ordered_start_narrow_and_repeat(drops) -> None:
 def test_bad_rows_of_a_flight_are_named(drops) -> None:
     flight = drops.pose[0, : drops.flight_rows[0]]
     wrong: list[Any] = [np.zeros((3, 3)), np.zeros((8, 2)), np.full((8, 3), np.nan), [], [["a", "b", "c"]] * 5]
-    # a whole drop that ends at rest, a pose below the table, and millimetres
+    # the last three are a whole drop that ends at rest, a pose below the table, and lengths in millimetres
     wrong += [drops.pose[0], flight - [0.0, 1.0, 0.0], flight * [1e3, 1e3, 1.0]]
     for rows in wrong:
         with pytest.raises(ArgumentError, match="first_flight"):

@@ -17,7 +17,7 @@ def rebound(contact: Contact) -> float:
         Head(mass_kg=500.0, inertia_kg_m2=100.0), Frame(0.3, 0.3), Clearance(0.02, 0.02), contact, Gravity(0.0),
         initial=Initial(v=(0.0, -0.5, 0.0)), locked=("x", "theta"),
     )  # fmt: skip
-    # long enough to leave the wall, and too short to reach the opposite wall
+    # the run is long enough to leave the wall, and too short to reach the opposite wall
     return abs(simulate(scene, t_end=0.035, tol=1e-10).v[-1, 1]) / 0.5
 
 

@@ -245,7 +245,7 @@ def compare(
         found.distance,
         path_deviate(eye.paths(eye.q, _LAGS_S), features[:, 5:], paths, measured[5:]),
         law,
-        odds if near is None else -math.inf,  # the limit of the odds was tuned on hard contacts
+        odds if near is None else -math.inf,  # otherwise no odds: their limit was tuned on hard contacts
         *hidden_by_geometry(unknowns, poses, period, measured[:2]),
     )
 

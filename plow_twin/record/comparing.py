@@ -54,7 +54,7 @@ class Sent:
         slow_of = np.full(len(rows), -1)
         slow_of[slow["row"]] = np.arange(len(slow))
         numbers = [topic.numbers(topic.record_of(published)) for topic in REPLAYED]
-        #: kept alive, because compiled code reads them by address
+        #: these arrays are kept alive, because compiled code reads them by address
         self._numbers = [[_with_whole_rows(part) for part in parts] for parts in numbers]
         self._expected = (
             self.publication, slow_of, kinds, np.ascontiguousarray(rows["stamp_ns"]),

@@ -53,7 +53,7 @@ class Tail:
     def more(self, stream: IO[bytes], size: int) -> bool:
         """Wait until a file is longer than `size` [B]; False when its writer has ended."""
         while True:
-            # checked before the size, so that the last bytes of an ending writer are still read
+            # this is checked before the size, so that the last bytes of an ending writer are still read
             alive = is_claimed(stream.fileno())
             if os.fstat(stream.fileno()).st_size > size:
                 return True

@@ -193,7 +193,7 @@ def _at(content: Mapping[str, Any], path: str) -> Any | None:
 def _plain_number(value: Any) -> float | None:
     """Return a number of CSV or JSON, NaN for an empty cell, or None for any other value."""
     if isinstance(value, str):
-        value = value.strip()  # also removes space characters that `float` refuses
+        value = value.strip()  # this also removes space characters that `float` refuses
         if not value:
             return math.nan
         if not NUMBER.fullmatch(value):

@@ -168,7 +168,8 @@ class McapFile:
         self._schemas: dict[str, Any] = {}
         self._channels: dict[int, Any] = {}
         self._undeclared: list[Any] = []
-        # kept as bytes, because a live run has some thousand chunks an hour and objects would take ten times the memory
+        # the index is kept as bytes, because a live run has some thousand chunks an hour, and objects would take ten
+        # times the memory
         self._chunk_index = bytearray()
         self._chunk_count = 0
         self._metadata: list[Any] = []

@@ -52,7 +52,8 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(arguments: Sequence[str] | None, stop: StopSignals) -> int:
-    # imported after the handlers are set, because a stop during these imports must not end in a traceback
+    # these modules are imported after the handlers are set, because a stop during the imports must not end in a
+    # traceback
     import rclpy.utilities
 
     from plow_twin.live.parameters import ParameterError

@@ -73,7 +73,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
         for name in SERVICES:
             # the services are never destroyed: a waiting request to a destroyed service would end rclpy's executor
             self.create_service(Trigger, f"~/{name}", partial(self._answer, name))
-        # a steady clock, so that reports continue while /clock is paused
+        # timers use a steady clock, so that reports continue while /clock is paused
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(1.0, self._publish_diagnostics, clock=steady)
         self.create_timer(LOOK_S, self._look_for_publishers, clock=steady)

@@ -70,4 +70,4 @@ class Sender:
     def send(self) -> None:
         """Send the bytes as they are now."""
         if self._publish(*self._arguments):
-            self._publisher.publish(bytes(self._data))  # raises an error with the reason
+            self._publisher.publish(bytes(self._data))  # this raises an error with the reason

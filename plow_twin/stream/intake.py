@@ -245,7 +245,7 @@ class Intake:
             return Verdict.JUMP_FORWARD
         if ahead_ns > 0:
             return Verdict.IMPLAUSIBLE if self._too_fast(stamp_ns, values) else Verdict.ACCEPTED
-        # compared with the sender's own stamps, because the hold policy may be ahead of its clock
+        # the stamp is compared with the sender's own stamps, because the hold policy may be ahead of the sender's clock
         if newest_ns - stamp_ns > self.jump_back_s * NS_PER_S:
             return Verdict.JUMP_BACK
         if history is not None and history.oldest_ns is not None and stamp_ns > history.oldest_ns:

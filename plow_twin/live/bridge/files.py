@@ -39,7 +39,7 @@ class _Tail:
     """One file, read to its present end; a file that was cut or replaced is read again from its beginning."""
 
     path: Path
-    #: by default the name of the file without its ending
+    #: topic of the file's rows; by default the file's name without its ending
     topic: str = ""
     lines: Lines = field(default_factory=Lines)
     rows: Rows = field(default_factory=Rows)

@@ -16,7 +16,7 @@ def make_client(client_id: str, *, clean: bool) -> Any:
     """Return a client of MQTT 3.1.1 that connects again at growing intervals; `clean`: without a lasting session."""
     from paho.mqtt import client as paho
 
-    interface = getattr(paho, "CallbackAPIVersion", None)  # exists from paho 2.0 on
+    interface = getattr(paho, "CallbackAPIVersion", None)  # this exists from paho 2.0 on
     make: Any = paho.Client
     version = () if interface is None else (interface.VERSION2,)
     client = make(*version, client_id, clean_session=clean, protocol=paho.MQTTv311)

@@ -262,7 +262,7 @@ def _shift(lanes, guard, order, again, fraction) -> None:
             set_row(guard, j, after)
     first = zero
     if fraction is not None:
-        # a released pair may have parted a little outside the wall
+        # a RELEASED pair may have parted a little outside the wall
         first = choose(below(zero, exact_row(guard, 0)), exact_row(guard, 0), zero)
     set_row(guard, 0, choose(again, first, exact_row(guard, 0)))
 

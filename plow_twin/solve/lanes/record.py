@@ -109,7 +109,7 @@ LANES: Final = np.dtype(
         ("orders", "i8", _LANES_OF),  # order of each lane's series; the terms beyond have vanished
         ("before", "i8", _LANES_OF),  # number of steps up to the last sample
         ("carrying", "i8", _LANES_OF),  # a bit for each pair that is ON
-        # exponents other than 1 only
+        # the following fields are used only for exponents other than 1
         ("power", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # d^n of each slot's pairs
         ("base", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # d, or d / sigma^2 from a touch on; d^2 if n is an integer
         ("rate", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # d' of each slot's pairs
@@ -117,7 +117,7 @@ LANES: Final = np.dtype(
         ("exponent", "f8", _LANES_OF),
         ("threshold", "f8", (MOST_LACUNA, WIDTH)),  # admissible sizes of the last orders, as velocities
         ("stretch", "f8", _LANES_OF),  # log2 of the velocity's tolerance over that of the position and the order
-        # exponents that are not integers only
+        # the following fields are used only for exponents that are not integers
         ("rates", "f8", (4, _ROWS, WIDTH)),  # rates of cosine, sine, X and Y
         ("alpha", "f8", _LANES_OF),  # time since the step's start: alpha sigma + beta sigma^2 / 2
         ("beta", "f8", _LANES_OF),
