@@ -67,7 +67,7 @@ def located() -> str:
 
 
 def work() -> str:
-    """Return the table of work that one core can do."""
+    """Return the list of work that one core can do."""
     rows = solver_rows()
     (one,) = [row for row in rows if row.section == "sampled_load" and "256" not in row.scene]
     many = [row for row in rows if row.section == "sampled_load" and "256" in row.scene]
@@ -77,14 +77,14 @@ def work() -> str:
     assert pairs is not None and pairs.wall_ms is not None and None not in starts
     lines = [
         ["one live twin under samples at 1 kHz", f"{one.value:.0f} times as fast as real time"],
-        *([row.scene.partition(", ")[2], f"{row.value:.2f} of a core"] for row in many),
-        ["1,000 pairs of clearances, 20 s each, every one within 1e-4", f"{1e-3 * pairs.wall_ms:.2f} s"],
+        *([_many_twins(row.scene), f"{row.value:.2f} of a core"] for row in many),
+        ["20 s of 1,000 pairs of clearances, each within 1e-4", f"{1e-3 * pairs.wall_ms:.2f} s"],
         ["an hour of the bench scene", f"{1e-3 * (hours['kv'].wall_ms or 0.0):.1f} s"],
         *([f"an hour {name}", f"{row.wall_ms:.2g} ms"] for name, row in hours.items() if "rest" in name),
         ["first start of a live twin, with compiling", f"{1e-3 * (starts[0] or 0.0):.0f} s"],
         ["later starts", f"{1e-3 * (starts[1] or 0.0):.1f} s"],
     ]
-    return table(["work on one core", "time, share or speed"], lines)
+    return "\n".join(f"- {name}: {value}" for name, value in lines)
 
 
 def missed() -> str:
@@ -105,7 +105,7 @@ def random_scenes() -> str:
     """Return a sentence for each tolerance with the largest error of the random scenes that amplify little."""
     rows = [verdict for verdict in targets.verdicts(solver_rows()) if "random scenes" in verdict.work]
     asked = [re.search(r"tol=([\d.e-]+)", row.work) for row in rows]
-    texts = [row.measured.replace("failed", "scenes failed") for row in rows]
+    texts = [row.measured.replace("worst", "largest").replace(" 0 failed", " no scene failed") for row in rows]
     return "\n".join(f"- tolerance {tol[1]}: {text}" for tol, text in zip(asked, texts, strict=True) if tol)
 
 
@@ -126,6 +126,14 @@ def measured_sum() -> str:
     return table(["block", "error over one bounce", "over two", "inside the 90 % band after one"], rows)
 
 
+def replay() -> str:
+    """Return the list of a recording's sizes and of replay speeds."""
+    with (RESULTS / "replay.csv").open(newline="", encoding="utf-8") as file:
+        _, *rows = csv.reader(file)
+    unit = ", times real time"
+    return "\n".join(f"- {name.removesuffix(unit)}: {value}{unit[1:] * name.endswith(unit)}" for name, value, _ in rows)
+
+
 def life_table() -> str:
     """Return the table of forecasts of synthetic lives."""
     return lives.summary(_lines("lives.jsonl"))
@@ -143,7 +151,7 @@ def life_sum() -> str:
     shares = ", ".join(f"{share:g}" for share in lives.SHARES)
     return (
         f"At {shares} of the life, {right} of {len(rows)} forecasts of its end are within {100 * lives.ALPHA:.0f} %.\n"
-        f"The 80 % interval is right in {', '.join(held(own, 80) for own in parts)}, "
+        f"The 80 % interval contains this end in {', '.join(held(own, 80) for own in parts)} of the lives, "
         f"the 90 % interval in {', '.join(held(own, 90) for own in parts)}."
     )
 
@@ -165,7 +173,7 @@ def follow_table() -> str:
 def follow_sum() -> str:
     """Return the table of `follow_table` without clearances and cost."""
     _, *rows = estimate_pages.narrowed(follow_table(), range(6))
-    return table(["group", "truths", "forces, RMS", "largest force", "impulse", "coverage of the three"], rows)
+    return table(["group", "truths", "forces, RMS", "largest force", "impulse", "coverage of these three"], rows)
 
 
 def siconos() -> str:
@@ -198,12 +206,17 @@ FIGURES: dict[str, Callable[[], str]] = {
     "random_scenes": random_scenes, "siconos": siconos, "lives": life_table, "lives_sum": life_sum,
     "month": month_table, "follow": follow_table, "follow_sum": follow_sum,
     **estimate_pages.FIGURES, **measured_pages.FIGURES,
-    "measured_sum": measured_sum, "replay": stored("replay", 2), "tuning": tuning_sensitivity.table,
+    "measured_sum": measured_sum, "replay": replay, "tuning": tuning_sensitivity.table,
     **{
         name: stored(name)
         for name in ("live_node", "live_opcua", "estimate_forces", "estimate_scales", "estimate_live")
     },
 }  # fmt: skip
+
+
+def _many_twins(scene: str) -> str:
+    _, rate, twins, call = scene.split(", ")
+    return f"{twins} at {rate}, {call}"
 
 
 def _own_ms(rows: Sequence[Row], scene: str, output_s: float, level: float, solver: str) -> float:
@@ -214,7 +227,7 @@ def _own_ms(rows: Sequence[Row], scene: str, output_s: float, level: float, solv
 
 def _times(rows: Sequence[Row], scene: str, output_s: float, level: float, peer: str, own_ms: float) -> str:
     reached = fastest(rows, scene, output_s, level, PEERS[peer])
-    return "not reached" if reached is None else f"{reached.wall_ms / own_ms:.1f} x"
+    return "not reached" if reached is None else f"{reached.wall_ms / own_ms:.1f}x"
 
 
 def _short(verdict: targets.Verdict) -> str:

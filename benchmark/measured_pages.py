@@ -68,19 +68,18 @@ def measured_rigid() -> str:
 
 
 def measured_table() -> str:
-    """Return the table of errors of the estimated height of the drop table."""
+    """Return the list of errors of the estimated height of the drop table."""
     found = _part("table")
-    row = [
-        f"{found['estimated']} of {found['drops']}",
-        f"{found['median_mm']:.2f} mm",
-        f"{found['rms_mm']:.2f} mm",
-        f"{found['half_width_mm']:.2f} mm",
-        f"{found['coverage']:.2f}",
-        f"{found['within_half_mm']:.2f}",
-        f"{found['within_half_mm_or_rough']:.2f}",
-    ]
-    head = ["estimated", "error, median", "RMS", "half width of the 90 % interval", "coverage"]
-    return _lines([*head, "within 0.5 mm", "within, or rough"], [row])
+    rows = {
+        "estimated": f"{found['estimated']} of {found['drops']} drops",
+        "median error": f"{found['median_mm']:.2f} mm",
+        "RMS error": f"{found['rms_mm']:.2f} mm",
+        "half width of the 90 % interval": f"{found['half_width_mm']:.2f} mm",
+        "coverage": f"{found['coverage']:.2f}",
+        "share within 0.5 mm": f"{found['within_half_mm']:.2f}",
+        "share within 0.5 mm, or rough": f"{found['within_half_mm_or_rough']:.2f}",
+    }
+    return "\n".join(f"- {name}: {value}" for name, value in rows.items())
 
 
 FIGURES: dict[str, Callable[[], str]] = {

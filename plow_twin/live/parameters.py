@@ -276,7 +276,7 @@ class Settings:
     )
     limit_travel: float = _number(10.0, "m/s", 0.0, 1000.0, Effect.NOW, "largest plausible speed along the face")
     limit_travel_rate: float = _number(
-        0.0, "m/s^2", 0.0, 1e300, Effect.NOW, "largest plausible rate of that speed; 0: limit_travel in a millisecond"
+        0.0, "m/s^2", 0.0, 1e300, Effect.NOW, "largest plausible rate of this speed; 0: limit_travel in a millisecond"
     )
     limit_pose: float = _number(
         0.0,
@@ -303,13 +303,13 @@ class Settings:
     )
     mark: str = _plain("", Effect.NOW, "text that the service ~/mark puts into the journal")
     clearance_horizontal: float = _number(
-        -1.0, "m", -1.0, 10.0, Effect.NOW, "horizontal clearance of unworn pads; -1: the scene's"
+        -1.0, "m", -1.0, 10.0, Effect.NOW, "horizontal clearance of unworn pads; -1: as in the scene"
     )
     clearance_vertical: float = _number(
-        -1.0, "m", -1.0, 10.0, Effect.NOW, "vertical clearance of unworn pads; -1: the scene's"
+        -1.0, "m", -1.0, 10.0, Effect.NOW, "vertical clearance of unworn pads; -1: as in the scene"
     )
     stiffness: float = _number(
-        -1.0, "N/m^exponent", -1.0, 1e300, Effect.NOW, "stiffness of the contact law; -1: the scene's"
+        -1.0, "N/m^exponent", -1.0, 1e300, Effect.NOW, "stiffness of the contact law; -1: as in the scene"
     )
     damping: float = _number(
         -1.0,
@@ -317,12 +317,12 @@ class Settings:
         -1.0,
         1e300,
         Effect.NOW,
-        "damping of the contact law, if it has one; -1: the scene's",
+        "damping of the contact law, if it has one; -1: as in the scene",
     )
     restitution: float = _number(
-        -1.0, "1", -1.0, 1.0, Effect.NOW, "restitution of the contact law, if it has one; -1: the scene's"
+        -1.0, "1", -1.0, 1.0, Effect.NOW, "restitution of the contact law, if it has one; -1: as in the scene"
     )
-    wear_coefficient: float = _number(-1.0, "m^2/N", -1.0, 1.0, Effect.NOW, "wear coefficient; -1: the scene's")
+    wear_coefficient: float = _number(-1.0, "m^2/N", -1.0, 1.0, Effect.NOW, "wear coefficient; -1: as in the scene")
     max_evaluations: int = _number(
         0,
         "evaluations",

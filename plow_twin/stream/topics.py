@@ -111,7 +111,7 @@ TOPICS: Final = (
     Topic(
         "contact_peaks", JOINT_STATE, Cadence.EACH,
         "position = touches since configure, velocity = impulse [N s] and effort = largest force [N] since the last "
-        "message, or, after late samples, since the time that the model went back to",
+        "message, or, after late samples, since the time to which the model went back",
         names=PAIR_NAMES,
         columns={"position": (("makes", 8),), "velocity": (("impulse", 8),), "effort": (("peak", 8),)},
         cumulative=True,
@@ -133,7 +133,7 @@ TOPICS: Final = (
     ),
     Topic(
         "head_state", ODOMETRY, Cadence.EACH,
-        "pose in `frame_id`, twist in the head's own axes; covariances of zero mean: not known",
+        "pose in `frame_id`, twist in the head's own axes; zero covariances mean that they are not known",
         columns={"position": (("q", 2),), "orientation": (("orientation", 2),), "twist": (("twist", 3),)},
     ),
     Topic(
@@ -149,27 +149,27 @@ TOPICS: Final = (
     ),
     Topic(
         "quality", JOINT_STATE, Cadence.MARKED,
-        "position of `held` (the state at the stamp was computed without a sample) and `corrected` (late samples were "
-        "inserted), 1 or 0; also sent once after the last mark",
+        "position is 1 or 0 for `held` (the state at the stamp was computed without a sample) and `corrected` (late "
+        "samples were inserted); also sent once after the last mark",
         names=("held", "corrected"), columns={"position": (("held", 1), ("corrected", 1))}, latched=True,
     ),
     Topic(
         "estimate", JOINT_STATE, Cadence.ESTIMATE,
-        "with `estimate: true`: position of `horizontal`, `vertical` [m], `stiffness`, `damping`, `gain_fx`, "
+        "if `estimate` is true, position of `horizontal`, `vertical` [m], `stiffness`, `damping`, `gain_fx`, "
         "`gain_fy`, `gain_m` [1], `bias_x`, `bias_y` [m], `bias_theta` [rad], `delay` [s], each followed by its "
         "`<name>/p05`, `<name>/p95`",
         latched=True, depth=1,
     ),
     Topic(
         "window_forces", JOINT_STATE, Cadence.ESTIMATE,
-        "with `estimate_forces`: velocity = impulse [N s] and effort = largest force [N] in the last "
+        "if `estimate_forces` is set, velocity = impulse [N s] and effort = largest force [N] in the last "
         "`estimate_interval`, over twins drawn from the estimate: median `<pair>`, points `<pair>/p05`, `<pair>/p95`",
         latched=True, depth=1,
     ),
     Topic(
         "forecast", JOINT_STATE, Cadence.ESTIMATE,
-        "with `forecast_limits`: position of `seconds`, `metres`, `passes`, `shifts` of operation until a clearance "
-        "reaches its limit, each as `/p10`, `/p50`, `/p90` (left out beyond the horizon), then "
+        "if `forecast_limits` are set, position of `seconds`, `metres`, `passes`, `shifts` of operation until a "
+        "clearance reaches its limit, each as `/p10`, `/p50`, `/p90` (left out beyond the horizon), then "
         "`not_reached_in_horizon` and, with `forecast_stop`, `probability_before_stop` [1]",
         latched=True, depth=1,
     ),
