@@ -104,7 +104,7 @@ def test_sliding_in_the_plane_wears_by_the_way_of_the_corner() -> None:
     for pair, name in enumerate(PAIR_NAMES):
         x = half_w if "right" in name.rsplit("_", 1)[0] else -half_w
         y = half_h if "top" in name.rsplit("_", 1)[0] else -half_h
-        # speed along the wall of that point of the head which is at the corner
+        # this is the speed along the wall, at the point of the head that is at the corner
         vx = result.v[:, 0] - result.v[:, 2] * (y - result.q[:, 1])
         vy = result.v[:, 1] + result.v[:, 2] * (x - result.q[:, 0])
         along = c * vx + s * vy if name.endswith(("top", "bottom")) else c * vy - s * vx

@@ -61,7 +61,7 @@ def test_the_lowest_versions_are_those_that_setup_names(metadata: dict[str, Any]
         match = VERSION.fullmatch(line)
         assert match is not None, line
         stated[match[1]] = match[2]
-    stated["lz4"] = "4.3"  # 4.3 is the first with a wheel for Python 3.11; Ubuntu's 4.0.2 needs a compiler
+    stated["lz4"] = "4.3"  # this is the first version with a wheel for Python 3.11; Ubuntu's 4.0.2 needs a compiler
     lines = (ROOT / "requirements" / "lowest.txt").read_text().splitlines()
     lowest = dict(line.split("==") for line in lines if not line.startswith("#"))
     assert lowest.keys() == stated.keys()

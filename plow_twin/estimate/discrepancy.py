@@ -311,7 +311,7 @@ class _Linearised:
         known: dict[bytes, float] = {}
 
         def evidence(which: NDArray[np.bool_]) -> float:
-            key = which.tobytes()  # results are kept, as the sampler returns to most sets
+            key = which.tobytes()  # results are kept, because the sampler returns to most sets
             if key not in known:
                 use = np.append(np.arange(SIZE), SIZE + np.flatnonzero(which))
                 lower = np.linalg.cholesky(self._normal[np.ix_(use, use)])

@@ -91,7 +91,7 @@ class RunReader:
         self._place = Path(self.path)
         self._headers: dict[Path, RunHeader] = {}
         self._counted: Counter[str] = Counter()
-        self._noted: dict[int, Loss | Dropped] = {}  # kept by sequence number, because an entry may be in two chunks
+        self._noted: dict[int, Loss | Dropped] = {}  # by sequence number, because an entry may be in two chunks
         self._look_for_parts()
         self.path = self.parts[0]
         for part in self.parts:

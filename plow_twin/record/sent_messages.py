@@ -29,7 +29,8 @@ class SentMessages:
     @classmethod
     def of(cls, outputs: list[Outputs], topics: Mapping[str, str]) -> Self:
         """Collect messages; `topics` maps the topics that follow from the motion to base names."""
-        tables = {id(part.topics): _kinds(part.topics, topics) for part in outputs}  # few tables, as parts share topics
+        # there are few tables, because parts share topics
+        tables = {id(part.topics): _kinds(part.topics, topics) for part in outputs}
         sequence = _joined(part.sequence for part in outputs)
         kind = _joined(tables[id(part.topics)][part.messages.channel] for part in outputs)
         begins = np.cumsum([0, *map(len, outputs)])

@@ -44,7 +44,7 @@ def time_ns(value: Any, unit: str = "s") -> int | None:
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e19:
         return None
     scale = STAMP_UNITS[unit]
-    # integers keep their nanoseconds; a float resolves today's date to 0.2 us
+    # integers keep their nanoseconds, but a float resolves today's date only to 0.2 us
     stamp_ns = _within(value * scale if isinstance(value, int) else round(value * scale))
     return stamp_ns if stamp_ns is None or stamp_ns >= EPOCH_S * 1e9 else stamp_ns + START_NS
 

@@ -663,7 +663,8 @@ class Session:
         if not self._wears:
             self._speed = travel.speed_m_s
         elif self.stamp_ns is None:
-            self._use_speed(travel.speed_m_s)  # from the first sample on, before which the session never goes back
+            # the speed acts from the first sample on, because the session never goes back before this sample
+            self._use_speed(travel.speed_m_s)
         elif travel.stamp_ns > self.stamp_ns:
             insort(self._travels, travel, key=lambda item: item.stamp_ns)
         elif oldest_ns is not None and travel.stamp_ns <= oldest_ns:

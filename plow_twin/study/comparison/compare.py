@@ -206,7 +206,7 @@ def _overlapping(windows: Windows, others: Windows) -> np.ndarray[Any, Any]:
         return np.zeros(len(windows.start_ns), bool)
     order = np.argsort(others.start_ns)
     (begins, ends), (starts, stops) = (
-        # the span in which a window surely has messages
+        # begin and end of the span in which a window surely has messages
         ((part.start_ns + _MISSING * part.length_ns), (part.start_ns + FULL * part.length_ns))
         for part in (windows, others)
     )
