@@ -92,7 +92,7 @@ def draw(rng: np.random.Generator, powers: bool = False) -> Scene:
 
 
 #: Directions of the harmonics and terms of the law: viscous, hysteretic, integer, fraction. Each combination compiles
-#: its own kernels; these have every value once, without and with exponents other than 1.
+#: its own kernels, so only a few are used, which have every value once; the key says whether exponents differ from 1.
 SOME = {
     False: {(0, None, None, None, None), (0, 1, None, None, None), (1, 1, None, None, None), (2, None, 1, None, None)},
     True: {(0, None, None, None, 1), (1, None, 1, None, 1), (2, None, 1, 1, None)},

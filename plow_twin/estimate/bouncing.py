@@ -32,8 +32,8 @@ from plow_twin.model import geometry
 
 Array = NDArray[np.float64]
 
-#: Derived: biases of theta that are tried, in rad, up to eight prior deviations to both sides. A parabola refines the
-#: best bias; it covers three quarters of the spacing of the tried biases to both sides.
+#: Derived: biases of theta that are tried, in rad; they reach eight prior deviations to both sides. A parabola refines
+#: the best bias; it covers three quarters of the spacing of the tried biases to both sides.
 _TURNS: Final = np.linspace(-0.16, 0.16, 81)
 _FINEST_TURN: Final = 3e-3
 _NEAR_TURNS: Final = np.linspace(-_FINEST_TURN, _FINEST_TURN, 5)
@@ -46,8 +46,8 @@ _FEWEST_OF_PHASE = 9
 _LAGS_S: Final = np.linspace(-0.1, 0.1, 81)
 _OF_DRAWN_S: Final = np.linspace(-0.01, 0.01, 9)
 _NO_LAG = len(_OF_DRAWN_S) // 2
-#: Derived: distances in rows, powers of two, over which changes are computed: the changes of pose and reach in the
-#: whole motion, and the changes of the pose at each phase of the load.
+#: Derived: distances in rows, as powers of two, over which changes are computed. The first are for the changes of pose
+#: and reach in the whole motion, the second for the changes of the pose at each phase of the load.
 _CHANGES: Final = (1, 2, 4, 8, 16, 32)
 _CHANGES_BY_PHASE: Final = (1, 4)
 #: Definition: the paths by which a scene names the sides of the frame.

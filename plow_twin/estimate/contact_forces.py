@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 
 #: Guard: a number above this is not a force [N].
 _LARGEST = 1e12
-#: Bound: largest delay, and step of the delays, in s, at which measured forces and the motion's forces are compared.
+#: Bound: largest of the delays in s at which measured forces and the motion's forces are compared, and their step.
 #: Derived: the largest delay is three prior deviations of a sensor's delay.
 _LARGEST_DELAY, _DELAY_STEP = 0.15, 2e-3
 #: The law as a Python function, because Python cannot call the compiled function.

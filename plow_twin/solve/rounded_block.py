@@ -31,7 +31,7 @@ BLOCK = np.dtype(
 CORNERS = 4
 #: Number of steps in half a period of the stiffest contact.
 _STEPS = 70.0
-#: Least speed of a touch in m/s for its damping, least restitution, largest restitution.
+#: Least speed in m/s from which a touch gets its damping, and least and largest restitution.
 _SLOWEST, _LEAST, _LARGEST = 0.01, 0.05, 0.9
 #: Impact speed in m/s below which restitution and friction are constant.
 _SMALLEST_IMPACT = 0.05

@@ -335,8 +335,8 @@ ROW: Final = np.dtype(
         ("marked", "i8"),  # 1 if `held` or `corrected` is 1, here or in the publication before
         ("orientation", "f8", (2,)),  # z and w of the head's quaternion
         ("twist", "f8", (3,)),  # rates along the head's own axes [m/s], and about z [rad/s]
-        # written if the motion follows measurements: 5 % and 95 % quantiles over the drawn twins (of peak and impulse
-        # since the publication before), and the clearances [m] with their quantiles
+        # these fields are written if the motion follows measurements. They are 5 % and 95 % quantiles over the drawn
+        # twins (for peak and impulse since the publication before), and the clearances [m] with their quantiles
         ("followed", "i8"),  # `FOLLOWED`: clearances are filled; `WITH_INTERVALS`: all fields are filled
         *((f"{name}_{end}", "f8", (PAIR_COUNT,)) for name in ("force", "peak", "impulse") for end in ("low", "high")),
         ("known_clearance", "f8", (6,)),  # horizontal, then vertical clearance, each with its quantiles

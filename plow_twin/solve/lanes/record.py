@@ -116,7 +116,7 @@ LANES: Final = np.dtype(
         ("per_base", "f8", _PAIRS),  # 1 / base at the step's start
         ("exponent", "f8", _LANES_OF),
         ("threshold", "f8", (MOST_LACUNA, WIDTH)),  # admissible sizes of the last orders, as velocities
-        ("stretch", "f8", _LANES_OF),  # log2 of the velocity's tolerance over that of the position and the order
+        ("stretch", "f8", _LANES_OF),  # log2 of velocity tolerance / (position tolerance (order + 1))
         # the following fields are used only for exponents that are not integers
         ("rates", "f8", (4, _ROWS, WIDTH)),  # rates of cosine, sine, X and Y
         ("alpha", "f8", _LANES_OF),  # time since the step's start: alpha sigma + beta sigma^2 / 2
