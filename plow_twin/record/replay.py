@@ -161,14 +161,14 @@ class _Replay:
         self.topics = {header.topic(name): name for name in PUBLICATION_TOPICS if name not in absent}
         self.next_sequence = 0
         self.in_a_row = 0  # number of consecutive entries directly before the next entry
-        self.synced = False  # the session has the state of the live session
-        self.outputs_synced = False  # its windows between messages equal those of the live session, too
-        self.outputs_whole = True  # no message of the current batch may be missing without a note
-        self.resumed = False  # no advance yet since the state was taken from a snapshot
+        self.synced = False  # whether the session has the state of the live session
+        self.outputs_synced = False  # whether the windows between its messages are those of the live session, too
+        self.outputs_whole = True  # whether every missing message of the current batch has a note
+        self.resumed = False  # whether there was no advance since the state was taken from a snapshot
         self.messages: Mapping[str, Message] | None = None
         self.first_ns: int | None = None
         self.gaps = 0
-        self.lost_entries = 0  # the number that the notes in the journal state
+        self.lost_entries = 0  # number of lost entries that notes in the journal state
         self.inputs = InputCounts(header.excitation_source)
         self.alarms = AlarmCheck(header, self.all_outputs)
 

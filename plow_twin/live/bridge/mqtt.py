@@ -52,7 +52,7 @@ class Mqtt(SourceState):
         #: whether messages marked as retained are older than the subscription
         self._from_before = True
         self._queue: deque[tuple[str, bytes, int, bool]] = deque()
-        #: bytes of payloads that entered and left the queue; only one thread changes each count
+        #: bytes of payloads that entered and left the queue; each count is changed by one thread only
         self._came = self._left = 0
         self._arrived = threading.Event()
         self._answer = threading.Event()

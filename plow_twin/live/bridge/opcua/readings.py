@@ -76,7 +76,7 @@ def _stamp_ns(time: datetime | None, picoseconds: int | None) -> int | None:
         return None
     time = time if time.tzinfo else time.replace(tzinfo=UTC)
     stamp_ns = (time - _EPOCH) // _MICROSECOND * 1000 + (picoseconds or 0) // 100
-    return stamp_ns if 0 < stamp_ns < _FARTHEST_NS else None  # 1601 and 9999 mean that there is no time
+    return stamp_ns if 0 < stamp_ns < _FARTHEST_NS else None  # servers send 1601 or 9999 for no time
 
 
 def date_of(stamp_ns: int) -> datetime:
