@@ -188,7 +188,7 @@ def measure(answerer: list[str], rate_hz: float, seconds: float) -> dict[str, fl
             probe.spin(lambda: sender.poll() is not None, seconds + 30.0)
             share = (_cpu_s(process_id) - busy) / (time.monotonic() - begin)
         finally:
-            sender.kill()  # otherwise the publisher would go on and send to the subscriber of the next case
+            sender.kill()  # otherwise it would send to the subscriber of the next case
             sender.wait()
         figures.pop("samples_used", None)
         if "published" in figures:

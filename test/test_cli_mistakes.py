@@ -138,7 +138,7 @@ def test_a_load_that_looks_like_kilonewtons_is_named_before_it_is_estimated(
     desk: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(desk)
-    # the estimate corrects gains of the load, so such a load only causes a warning; it gives no clearance
+    # an estimate corrects gains of the load, so such a load only causes a warning, but here no clearance is found
     assert cli(["estimate", "kN", "--json"]) == 0
     shown = capsys.readouterr()
     assert "fx, fy: got 30, expected some 3.2e+04 N as in the scene; they look like kN: convert the file" in shown.err

@@ -59,7 +59,7 @@ LIBRARIES = {
     "model": {"scipy"},
     "solve": {"scipy"},
     "estimate": {"scipy"},
-    # imported for the type of `Result.plot` only; a test checks that it is not loaded at run time
+    # matplotlib is imported only for the type of `Result.plot`; a test checks that it is not loaded at run time
     "run": {"matplotlib"},
     "scene_file": {"yaml", "jsonschema", "pyarrow"},
     "record": {

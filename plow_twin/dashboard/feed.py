@@ -45,7 +45,7 @@ class Motion:
         self.penetration = np.full(PAIR_COUNT, np.nan)
         self.force = np.full(PAIR_COUNT, np.nan)
         self.clearance: Array | None = None
-        #: the newest estimate, until newer clearances are published, and the newest status
+        #: the newest estimate, which is emptied when newer clearances are published; the newest status
         self.estimate: Mapping[str, str] = {}
         self.status: Mapping[str, str] = {}
         self.load = _NO_LOAD

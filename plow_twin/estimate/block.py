@@ -195,7 +195,7 @@ def _solve(scene: Scene, met: list[Impact], known: Estimate, level: Array) -> tu
     prior = np.zeros(_SIZE)
     prior[_CLEARANCES] = known.horizontal.deviation, known.vertical.deviation
     prior[_BIAS] = np.array([quantity.deviation for quantity in QUANTITIES])[BIAS]
-    # the prior of the paper's machine, scaled to the machine's size
+    # this is the prior of the paper's machine, scaled to this machine's size
     prior[_LEVER] = UNSTATED["lever_x"] * geometry.half_diagonal(scene) / PAPER_LENGTH
     # the prior is for the logarithm of the stiffness, and the penetration is a power of the stiffness; the deviation of
     # the penetration is chosen so that the 95 % point stays the same

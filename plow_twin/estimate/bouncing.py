@@ -612,7 +612,8 @@ class MotionFeatures:
         vector[[GX, GY]], vector[DAMPING] = clearance, numbers[1]
         vector[GAIN] = np.clip(numbers[2:5], 0.7, 1.3)
         scene = unknowns.scene_of(vector)
-        # the contact may be harder than in a fit, because the decay of the bounces depends on the stiffness
+        # a fit limits how hard a contact is, but here it may be harder, because the decay of the bounces depends on the
+        # stiffness
         contact = replace(scene.contact, stiffness=unknowns.force / math.exp(numbers[0]) ** scene.contact.exponent)
         start = np.concatenate([self.q[0], np.zeros(3)])
         start += np.array([1e-3, 1e-3, 4e-3, 0.05, 0.05, 0.2]) * rng.standard_normal(6)

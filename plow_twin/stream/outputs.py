@@ -178,8 +178,8 @@ class Outputs:
         self._corrected_ns = 0
         #: the window before this correction, if it contained an advance
         self._before: Rows | None = None
-        #: shift by an estimate of the clearances and their quantiles, in the order of `CLEARANCE_NAMES`; None without
-        #: an estimate
+        #: amounts by which an estimate shifts the clearances and their quantiles, in the order of `CLEARANCE_NAMES`;
+        #: None without an estimate
         self._shift: Array | None = None
 
     def set_shift(self, shift: Sequence[float]) -> None:
