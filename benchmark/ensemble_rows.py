@@ -11,13 +11,14 @@ import numpy as np
 from bench_scenes import SPARSE, T_END, bench_scene, constants, error_scale
 from cases import Array, Row, Sample, pose_error, timed
 from lean import rk4
-from work_precision import HEYOKA, LEAN_RK4, OURS
+from work_precision import HEYOKA, LEAN_RK4, OURS, OURS_BARE, prepare_bare
 
 from plow_twin import Clearance, Initial, Scene
 from plow_twin.run.ensemble import simulate_many
 
 Notify = Callable[[str], None]
 SECTION = "ensemble"
+LANES_SECTION = "ensemble_hc"
 BATCH = f"{HEYOKA}, batch"
 COLUMNS, ROWS = 40, 25
 PAIRS = f"kv, {COLUMNS * ROWS} clearance pairs"
@@ -32,9 +33,9 @@ LISTED = 1e-4
 PERTURBATION = 1e-8
 
 
-def clearance_pairs(columns: int, rows: int) -> list[Scene]:
-    """Return KV scenes with horizontal and vertical clearances over 20..30 mm."""
-    scene = bench_scene("kv")
+def clearance_pairs(columns: int, rows: int, name: str = "kv") -> list[Scene]:
+    """Return bench scenes with horizontal and vertical clearances over 20..30 mm."""
+    scene = bench_scene(name)
     return [
         dataclasses.replace(scene, clearance=Clearance(float(gx), float(gy)))
         for gx in np.linspace(0.020, 0.030, columns)
@@ -70,6 +71,38 @@ def ensemble_rows(columns: int, rows: int, lean_steps: Sequence[float], repeats:
     growth = _amplification(scenes, exact)
     for index in sorted({*np.flatnonzero(error > LISTED), *np.argsort(-growth)[:10]}, key=lambda i: -growth[i]):
         yield _member_row(scenes[index], tol, float(error[index]), float(growth[index]))
+
+
+def lanes_rows(columns: int, rows: int, repeats: int, notify: Notify) -> Iterator[Row]:
+    """Yield rows of HC pairs on one core, in lanes and by the loop of a single scene in turns.
+
+    The tolerance is the first from 1e-4 on at which all pairs are accurate enough. The value is the ratio of the times.
+    """
+    scenes = clearance_pairs(columns, rows, "hc")
+    name = f"hc, {len(scenes)} clearance pairs"
+    notify(f"{name}, at {EXACT:g}")
+    exact = simulate_many(scenes, T_END, SPARSE, EXACT, 1).q
+    for tol in TOLERANCES[TOLERANCES.index(1e-4) :]:
+        in_lanes, error = _own_row(name, scenes, exact, tol, 1, 1)
+        if (error <= LISTED).all():
+            break
+    alone = [prepare_bare(scene, SPARSE, tol) for scene in scenes]
+    lanes, loop, last = list[float](), list[float](), list[Sample]()
+    for _ in range(repeats):
+        notify(f"{name}, tol={tol:g}")
+        lanes.append(timed(lambda: simulate_many(scenes, T_END, SPARSE, tol, 1))[0])
+        last = [run() for run in alone]
+        loop.append(sum(one.wall_s for one in last))
+    one_by_one = Row(LANES_SECTION, name, OURS_BARE, f"tol={tol:g}, threads=1", SPARSE, T_END)
+    poses = [one.q for one in last if one.q is not None]
+    one_by_one.error = float(_member_errors(scenes, np.array(poses), exact).max())
+    one_by_one.steps = sum(one.steps or 0 for one in last)
+    one_by_one.events = sum(one.events or 0 for one in last)
+    in_lanes.section = LANES_SECTION
+    for row, walls in ((in_lanes, lanes), (one_by_one, loop)):
+        row.wall_ms, row.wall_min_ms, row.runs = 1e3 * float(np.median(walls)), 1e3 * min(walls), len(walls)
+        row.value = row.wall_ms / (1e3 * float(np.median(lanes)))
+        yield row
 
 
 def core_row(rows: Sequence[Row]) -> Row | None:

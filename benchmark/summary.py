@@ -132,6 +132,7 @@ _TITLES = {
     "stiffness": ("Stiffness (tolerance 1e-6, error over the first 2 s against our own 1e-12)", ""),
     "machine_time": ("Machine time (tolerance 1e-6)", "steps per hour"),
     "contact_events": ("Cost against contact events (tolerance 1e-6, 20 s)", "steps per event"),
+    "ensemble_hc": ("Exponent 1.5 in lanes and one by one (one core, 20 s)", "times the lanes"),
     "sampled_load": ("Sampled load (tolerance 1e-6)", "value"),
     "start": ("Start: the live twin made ready by a process with an empty cache, and by the next", "kernels compiled"),
     "features": ("What features cost (KV, tolerance 1e-6, 20 s, output each 0.1 s)", "times the plain run"),
