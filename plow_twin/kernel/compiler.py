@@ -12,6 +12,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import FunctionType
 from typing import Any, Final, Literal
 
 import numba
@@ -98,6 +99,20 @@ def kernel(
         return compiled
 
     return decorate
+
+
+def for_kernels(entry: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a kernel with the code of an entry, for other kernels to call.
+
+    An entry that a kernel calls would itself be optimised and get machine code, which nobody runs.
+    """
+    function = getattr(entry, "py_func", None)
+    if function is None:
+        return entry  # NUMBA_DISABLE_JIT
+    copy = FunctionType(function.__code__, function.__globals__, function.__name__)
+    # the name in the cache
+    copy.__qualname__ = f"{function.__qualname__}_for_kernels"
+    return kernel()(copy)
 
 
 @contextmanager

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from plow_twin.kernel.compiler import kernel
-from plow_twin.solve.loop import integrate
+from plow_twin.kernel.compiler import for_kernels, kernel
+from plow_twin.solve import loop
 from plow_twin.solve.modes import settle_modes
 from plow_twin.solve.state import Status
 
 _OK, _LOG_FULL = int(Status.OK), int(Status.LOG_FULL)
+_integrate = for_kernels(loop.integrate)
 
 
 @kernel(entry=True)
@@ -29,7 +30,7 @@ def run_restarts(p, parts, states, w, totals, log, edges, budgets, t, q, v) -> i
         code = _LOG_FULL
         while code == _LOG_FULL:
             totals[m].logged = 0
-            code = integrate(
+            code = _integrate(
                 p, parts, states[m], w, totals[m], log, t[high - 1], budgets[m], first, t[low:high], q[low:high],
                 v[low:high], None, None, None, None,
             )  # fmt: skip
