@@ -75,7 +75,7 @@ def right_models() -> str:
             f"{one['h_range_rmse_mm']:.1f}, {one['v_range_rmse_mm']:.1f} | "
             f"{one['cpu_s']:.1f}, {one['cpu_s_most']:.1f} |"
         )
-    lines += ["", f"Of {total} truths with the right model {flagged} are flagged as suspect ({flagged / total:.1%})."]
+    lines += ["", f"Of {total} truths with the right model, {flagged} are flagged as suspect ({flagged / total:.1%})."]
     return "\n".join(lines)
 
 

@@ -175,9 +175,10 @@ TOPICS: Final = (
     ),
     Topic(
         "alarms", STATUS, Cadence.CHANGE,
-        "`<name>` (value), `<name>_level` and `<name>_latched` for `force` [N], `clearance` [m], `clearance_rate`, "
-        "`wear_rate` [m/s] and, with a threshold, `residual` [m]; for a latched alarm also `<name>_raised` (value), "
-        "`<name>_threshold`, `<name>_place` (pad or axis), `<name>_stamp_ns`; message = the same in words",
+        "for `force` [N], `clearance` [m], `clearance_rate` and `wear_rate` [m/s] and, with a threshold, `residual` "
+        "[m]: value (`<name>`), level (`<name>_level`) and latched level (`<name>_latched`); a latched alarm also has "
+        "`<name>_raised` (its value then), `<name>_threshold`, `<name>_place` (pad or axis) and `<name>_stamp_ns`; "
+        "message = the same in words",
         latched=True, depth=1,
     ),
     Topic("status", STATUS, Cadence.CHANGE, "what the node is doing", latched=True, depth=1),
