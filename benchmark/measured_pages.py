@@ -77,7 +77,7 @@ def measured_table() -> str:
         "half width of the 90 % interval": f"{found['half_width_mm']:.2f} mm",
         "coverage": f"{found['coverage']:.2f}",
         "share within 0.5 mm": f"{found['within_half_mm']:.2f}",
-        "share within 0.5 mm, or rough": f"{found['within_half_mm_or_rough']:.2f}",
+        "share within 0.5 mm or `rough`": f"{found['within_half_mm_or_rough']:.2f}",
     }
     return "\n".join(f"- {name}: {value}" for name, value in rows.items())
 
