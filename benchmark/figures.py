@@ -109,12 +109,12 @@ def random_scenes() -> str:
     return "\n".join(f"- tolerance {tol[1]}: {text}" for tol, text in zip(asked, texts, strict=True) if tol)
 
 
-def stored(name: str, columns: int | None = None) -> Callable[[], str]:
-    """Return a function that makes a Markdown table of the first columns (by default all) of a CSV file of results."""
+def stored(name: str) -> Callable[[], str]:
+    """Return a function that makes a Markdown table of a CSV file of results."""
 
     def shown() -> str:
         with (RESULTS / f"{name}.csv").open(newline="", encoding="utf-8") as file:
-            head, *lines = [row[:columns] for row in csv.reader(file)]
+            head, *lines = csv.reader(file)
         return table(head, lines)
 
     return shown
