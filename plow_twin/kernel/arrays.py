@@ -1,4 +1,4 @@
-"""Arrays inside kernels: without a reference count, and copied, searched and checked in few lines.
+"""Arrays and records inside kernels: without a reference count, and copied, searched and checked in few lines.
 
 These lines compile faster than numba's own code. Its assignment of a slice brings the formatting of an error message,
 which takes 2 s in each process that compiles a twin.
@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import Any, cast
 
 from llvmlite import ir
-from numba.core import types
+from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from plow_twin.kernel.compiler import kernel
@@ -36,6 +36,25 @@ def _unowned(typingctx: Any, array: Any) -> Any:
 
 
 unowned = cast("Callable[[Any], Any]", intrinsic(_unowned))
+
+
+def _copy_record(typingctx: Any, target: Any, source: Any) -> Any:
+    """Copy a record to a record of the same type.
+
+    Numba's assignment loads the record as an array of bytes, which LLVM takes apart byte by byte in 0.8 s.
+    """
+    if not isinstance(target, types.Record) or target != source:
+        return None
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        size = context.get_constant(types.intp, signature.args[0].size)
+        cgutils.raw_memcpy(builder, arguments[0], arguments[1], size, 1)  # type: ignore[no-untyped-call]
+        return context.get_dummy_value()
+
+    return types.void(target, source), codegen
+
+
+copy_record = cast("Callable[[Any, Any], None]", intrinsic(_copy_record))
 
 
 @kernel()

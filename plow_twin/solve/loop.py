@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from plow_twin.kernel.arrays import copy_into, unowned
+from plow_twin.kernel.arrays import copy_into, copy_record, unowned
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import row, set_row, splat
 from plow_twin.model.pairs import PAIR_COUNT
@@ -143,7 +143,7 @@ def _advance(p, parts, states, index, saved, w, totals, target, stop_time, budge
     """
     state = states[index]
     if pace.underway == 0:
-        saved[0] = state
+        copy_record(saved[0], state)
         _present(p, parts.harmonics, parts.terms.flight, parts.terms.support, state, w, w.saved[0])
         if parts.terms.support is not None:
             copy_into(w.frame_saved, w.frame_now)
@@ -164,7 +164,7 @@ def _advance(p, parts, states, index, saved, w, totals, target, stop_time, budge
         _present(p, parts.harmonics, parts.terms.flight, parts.terms.support, state, w, w.moved)
         read_range(p, state, w.moved, w.beyond)
     if code != _OK:
-        states[index] = saved[0]
+        copy_record(state, saved[0])
         _undo(parts.terms.support, state, w, target)
         _clear(totals)
     return code, steps
@@ -267,7 +267,7 @@ def advance_rows(
             _read_row(p, parts, state, w, sums, out)
         pace.row += 1
         while pace.mark < marks.size and marks[pace.mark] == pace.row:
-            snapshots[pace.mark] = states[m]
+            copy_record(snapshots[pace.mark], states[m])
             pace.mark += 1
     return True
 

@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.kernel.arrays import copy_into, unowned
+from plow_twin.kernel.arrays import copy_into, copy_record, unowned
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import below, choose, exact_row, exact_splat, fused, set_row
 from plow_twin.model.pairs import PAIR_COUNT
@@ -89,7 +89,7 @@ def _begin_sample(s, lanes, lane) -> None:
     member = lanes.member[lane]
     i, state = s.place[member], s.states[member]
     lanes.stop[lane], lanes.knot[lane], lanes.before[lane] = s.times[i], lanes.time[lane], state.steps
-    s.saved[lane] = state
+    copy_record(s.saved[lane], state)
     span = lanes.stop[lane] - lanes.knot[lane]
     per_span = 1.0 / span if span > _SHORTEST_SPAN else 0.0
     for j in range(3):
@@ -124,7 +124,7 @@ def _leave(s, lanes, lane) -> None:
     member = lanes.member[lane]
     _clear_sums(s, lanes, lane)
     save_lane(s.states[member], s.totals[lane], lanes, lane)
-    s.states[member] = s.saved[lane]
+    copy_record(s.states[member], s.saved[lane])
 
 
 @kernel()
