@@ -12,7 +12,7 @@ from plow_twin.model.geometry import half_diagonal
 from plow_twin.scene_file import load_scene
 
 ROOT = Path(__file__).resolve().parent.parent
-#: Folder of the reference on a 1 ms grid, which is not part of the project and is used if it exists.
+#: Folder of a reference on a 1 ms grid. The folder is not part of the project and is used only if it exists.
 FINE_REFERENCE = ROOT.parent / "shared" / "reference"
 NAMES = ("kv", "hc")
 T_END = 20.0

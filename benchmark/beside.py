@@ -20,7 +20,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "benchmark" / "results" / "beside.md"
-#: The program of a process. It repeats the runs of README, and uses only features that both commits have.
+#: Program that is run in its own process for each of the two commits. It repeats the runs of README, and uses only
+#: features that both commits have.
 _WORK = """
 import json, sys, time
 import numpy as np

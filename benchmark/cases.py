@@ -51,7 +51,8 @@ class Row:
     #: listed error, a multiple of real time, a share of a core, an error in tolerances, a ratio of times, or a number
     #: of compiled kernels
     value: float | None = None
-    #: growth of a small displacement at t = 0 (in the sections of random scenes and of the ensemble)
+    #: factor by which a small displacement at t = 0 grows; only the sections of random scenes and of the ensemble have
+    #: this figure
     amplification: float | None = None
     status: str = "ok"
 
@@ -66,11 +67,11 @@ class Case:
     samples: list[Sample] = field(default_factory=list)
 
 
-#: A case is no longer repeated once its runs have together taken this time.
+#: A case is repeated only while its runs have together taken less than this time.
 TIME_PER_CASE_S = 1.0
 #: A first run shorter than this is a warm-up and is discarded; in a longer run warm-up makes no difference.
 WARM_UP_BELOW_S = 0.05
-#: Cases with runs shorter than this are always repeated.
+#: Cases whose first run is shorter than this are repeated even if they were not chosen.
 SHORT_S = 0.02
 Choose = Callable[[Sequence[Row]], set[int]]
 

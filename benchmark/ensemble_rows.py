@@ -22,14 +22,15 @@ LANES_SECTION = "ensemble_hc"
 BATCH = f"{HEYOKA}, batch"
 COLUMNS, ROWS = 40, 25
 PAIRS = f"kv, {COLUMNS * ROWS} clearance pairs"
-#: Tolerances from loose to tight. The loosest at which every pair is within `LISTED` is timed repeatedly.
+#: Tolerances from loose to tight. The loosest tolerance at which the error of every pair is within `LISTED` is timed
+#: repeatedly.
 TOLERANCES = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5, 3e-6, 1e-6)
 _BATCH_TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
 EXACT = 1e-12
 #: Error, as a multiple of the clearance, beyond which a pair is listed.
 LISTED = 1e-4
-#: Displacement at t = 0, as a multiple of the clearance, by which amplification is measured; it is large compared with
-#: rounding.
+#: Size of the displacement at t = 0 by whose growth amplification is measured, as a multiple of the clearance. It is
+#: large compared with rounding.
 PERTURBATION = 1e-8
 
 

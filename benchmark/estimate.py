@@ -35,7 +35,7 @@ def run_one(name: str, seed: int, periods: float | None = None) -> dict[str, Any
     group = GROUPS[name]
     try:
         truth = draw(group if periods is None else type(group)(**{**vars(group), "periods": periods}), seed)
-    except SolverError as error:  # the head has passed through a wall, so no real machine is like this
+    except SolverError as error:  # the head has passed through a wall, which no real machine does
         return {"group": name, "seed": seed, "not_drawn": str(error)}
     begin = time.process_time()
     result = estimate(truth.nominal, truth.load, truth.poses, forces=truth.forces)

@@ -41,10 +41,11 @@ Array = NDArray[np.float64]
 _FINE = 1e-3
 #: Penetration in m at which contacts of different exponents have the same force.
 _COMMON_DEPTH = 8e-3
-#: Largest component of the pose (rad or m) of a head that has not passed through a wall.
+#: If a component of the pose (rad or m) exceeds this, the head has passed through a wall.
 _LARGEST_TURN = 0.6
-#: States in which the estimated clearance is published; its interval is useful if it is narrower than `USEFUL_M`.
+#: States in which an estimated clearance is published.
 PUBLISHED = {"estimated", "rough"}
+#: A published clearance is useful if its interval is narrower than this.
 USEFUL_M = 4e-3
 
 
@@ -60,19 +61,24 @@ class Kind:
     #: shape of the given load: paper, cutting (paper with a broad-band part), pressed, chatter, vertical
     shape: str = "paper"
     gain: float = 0.05
-    #: errors of the load as shares of each component's range: a correlated error, a third harmonic, a constant
+    #: correlated error of the load, as a share of each component's range
     correlated: float = 0.0
+    #: third harmonic that is an error of the load, as a share of each component's range
     harmonic: float = 0.0
+    #: constant error of the load, as a share of each component's range
     constant: float = 0.0
-    #: the given load consists of averages over `averaged_s` seconds, or of samples every `sampled_s` seconds
+    #: if positive, the given load consists of averages over this many seconds
     averaged_s: float = 0.0
+    #: if `averaged_s` is 0, the given load consists of samples at this interval in seconds
     sampled_s: float = 0.01
     friction: float = 0.0
     exponent: float = 1.0
     walls: float = 0.0
-    #: excess of the true over the assumed value: of mass and inertia as a share, of the frame size in m
+    #: excess of the true over the assumed mass, as a share
     mass: float = 0.0
+    #: excess of the true over the assumed inertia, as a share
     inertia: float = 0.0
+    #: excess of the true over the assumed frame size, in m
     frame_m: float = 0.0
     spring: float = 0.0
     radius_m: float = 0.0
@@ -83,13 +89,15 @@ class Kind:
     theta_missing: bool = False
     theta_scale: float = 0.0
     clock: float = 0.0
-    #: differences on which nothing was tuned: number of bursts without poses; largest pose that the sensor shows, as a
-    #: share of the motion's largest; error of gravity's arm; delay of the load; drift of the bias of x and y over the
-    #: window
+    #: nothing was tuned on this difference and those below; number of bursts without poses
     bursts: int = 0
+    #: largest pose that the sensor shows, as a share of the motion's largest pose
     saturated: float = 0.0
+    #: error of gravity's arm
     arm_m: float = 0.0
+    #: delay of the load
     late_s: float = 0.0
+    #: drift of the bias of x and y over the window
     drift_m: float = 0.0
 
 

@@ -17,7 +17,7 @@ from scipy.stats import beta
 
 from plow_twin.estimate.result import State
 
-#: Groups in the order of the page; each pair is a first seed and a number of truths.
+#: For each group, in the order of the page: pairs of a first seed and a number of truths.
 TRUTHS: dict[str, tuple[tuple[int, int], ...]] = {
     "plain": ((54000, 50),),
     "sensor": ((54000, 50),),
@@ -39,7 +39,7 @@ TRUTHS: dict[str, tuple[tuple[int, int], ...]] = {
     "hard_shape": ((50000, 6),),
     "hard_kelvin_voigt": ((50000, 23), (54000, 10), (60000, 30)),
 }
-#: Target of each group for the RMSE of the clearances [mm].
+#: RMSE of the clearances [mm] that is asked of each group.
 ASKED = {"plain": 0.05, "sensor": 0.06, "stochastic": 0.06, "middle": 0.05, "firm": 0.05, "hard": 0.1}
 _LEVEL = 0.95
 

@@ -28,7 +28,7 @@ ROOT = Path(__file__).resolve().parent.parent
 PERIOD = np.pi
 #: Interval of the samples of the true load in s.
 _FINE = 1e-3
-#: Time at which a shift, a jam or a fault of the sensor begins, as a share of the window.
+#: Share of the window after which a shift, a jam or a fault of the sensor begins.
 _FROM = 0.55
 
 
@@ -56,17 +56,21 @@ class Group:
     shift_m: float = 0.0
     stuck: bool = False
     noisier: float = 1.0
-    #: scales of the sensor: measured divided by true value of x, y, theta
+    #: scale factors of the sensor for x, y and theta: the measured value divided by the true value
     sensor_scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
     #: wear coefficient of the truth; the estimate assumes no wear
     wear_m2_n: float = 0.0
-    #: load cells at all pairs: sampling rate, noise, deviation of each gain, largest delay
+    #: sampling rate of the load cells, which measure at all pairs
     forces_hz: float = 0.0
+    #: noise of the load cells
     forces_noise_n: float = 1e3
+    #: standard deviation of each load cell's gain
     forces_gain: float = 0.05
+    #: largest delay of the load cells
     forces_delay_s: float = 0.05
-    #: expected verdicts on the model and on the sensor
+    #: expected verdict on the model
     model: str = "ok"
+    #: expected verdict on the sensor
     sensor: str = "ok"
 
 
@@ -189,7 +193,8 @@ def _contact(group: Group, rng: np.random.Generator) -> Contact:
     stiffness = float(np.exp(rng.uniform(low, high)))
     damping = 0.72 * float(np.exp(rng.normal(0.0, 0.4)))
     if group.law == "kelvin_voigt":
-        # hard contacts get the same damping ratio
+        # above 3e7 N/m the damping grows with the root of the stiffness, so that hard contacts have the same damping
+        # ratio
         damping = 10.0 ** rng.uniform(4.5, 5.3) * max(1.0, np.sqrt(stiffness / 3e7))
     return Contact(law=group.law, stiffness=stiffness, exponent=group.exponent, damping=damping)
 

@@ -22,7 +22,7 @@ from levels import OWN, PEERS, fastest
 from work_precision import OURS_BARE, OURS_CALL
 
 RESULTS = ROOT / "benchmark" / "results"
-#: File with the name of the machine of the newest complete run, whose figures the pages quote.
+#: File that names the machine of the newest complete run; the pages quote the figures of this run.
 NEWEST = RESULTS / "newest.txt"
 _PEERS = (
     "CVODE from C", "CVODE from C, rootfinding", "heyoka", "best of SciPy and scikit-sundae", "lean jitted RK4",

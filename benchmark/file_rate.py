@@ -19,7 +19,8 @@ import time
 from pathlib import Path
 from typing import Final
 
-#: Number of rows of the short file, by which the time of the start is measured.
+#: Number of rows of the short file. Its time is subtracted from that of the long file, so that the start does not
+#: count.
 FEW: Final = 1000
 
 

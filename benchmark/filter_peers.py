@@ -51,11 +51,12 @@ RESULTS = Path(__file__).resolve().parent / "results"
 
 TOLERANCE = 1e-4
 MEMBERS = 128
-#: Index in the filters' state of the first unknown of the estimate; pose and rate come before it.
+#: Index of the estimate's first unknown in the filters' state; pose and rates come before it.
 _FIRST = 6
-#: Process noise in each step: first that of x, y [m], theta [rad] and their rates, then that of the unknowns as a share
-#: of the prior's standard deviation. Both were set by hand, with trials on seeds 200 and 201 only.
+#: Process noise of x, y [m], theta [rad] and their rates in each step, set by hand with trials on seeds 200 and 201
+#: only.
 _STATE_NOISE = np.array([1e-5, 1e-5, 4e-5, 3e-3, 3e-3, 1e-2])
+#: Process noise of the unknowns in each step, as a share of the prior's standard deviation; set with the same trials.
 _UNKNOWN_NOISE = 3e-4
 
 
@@ -83,7 +84,7 @@ class Members:
         self._params = new_records(PARAMS, count)
         self._params[:] = compiled.params
         clearance = scene.clearance
-        # two other clearances give the slopes of the penetrations' rows, which are linear in the clearances
+        # the penetrations' rows are linear in the clearances, so two other clearances give the slopes of these rows
         self._rows = np.array(compiled.params["penetration_rows"])
         wider = (
             Clearance(clearance.horizontal_m + 1e-3, clearance.vertical_m),

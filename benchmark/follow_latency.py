@@ -27,7 +27,10 @@ from plow_twin.stream.journal import Estimated
 from plow_twin.stream.topics import TOPICS
 
 _T0 = 1_795_000_000_000_000_000
-#: Sampling interval, length of the run, length of the warm-up (which is not measured) and time of the estimate, in s.
+#: Sampling interval [s].
+#: End of the run [s].
+#: End of the warm-up, before which nothing is measured [s].
+#: Time of the estimate [s].
 _STEP, _END, _FIRST, _ESTIMATED = 1e-3, 6.0, 1.0, 0.5
 
 

@@ -21,7 +21,7 @@ from cases import Array, Sample, timed
 #: Time [s] after an event during which heyoka ignores the same event; with heyoka's default it would miss the next
 #: touch.
 _COOLDOWN = 1e-7
-#: Indices of the clearances in heyoka's parameters, after the modes of the pairs.
+#: Indices of the clearances in heyoka's parameters. The modes of the pairs come before the clearances.
 _GX, _GY = 8, 9
 
 
@@ -57,8 +57,8 @@ def _equations(p: Array, begin: float) -> tuple[list[tuple[Any, Any]], list[tupl
             force = hy.par[i] * law
         else:
             law = 1.0 + p[10] * rate
-            # the base is 1 if the pair does not act, since a negative number has no real power with a fractional
-            # exponent
+            # if the pair does not act, the base of the power is 1, because a negative penetration has no real power
+            # with a fractional exponent
             force = hy.par[i] * p[8] * (hy.par[i] * d + (1.0 - hy.par[i])) ** p[9] * law
             d = d - begin
         fx, fy, torque = fx + along_x * force, fy + along_y * force, torque + arm * force

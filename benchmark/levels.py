@@ -14,7 +14,7 @@ LEVELS = (1e-2, 1e-3, 1e-6, 1e-9)
 OUTPUTS = (0.1, 1e-3)
 Member = Callable[[str], bool]
 
-#: Groups of peers; at each level of error the fastest member of a group is compared.
+#: Groups of peers. At each level of error, only the fastest member of a group is compared.
 PEERS: dict[str, Member] = {
     "CVODE from C": lambda solver: solver.startswith("CVODE") and solver.endswith("(C)"),
     "CVODE from C, rootfinding": lambda solver: "rootfinding" in solver,
@@ -26,7 +26,7 @@ PEERS: dict[str, Member] = {
     "our RK4": lambda solver: solver == OURS_RK4,
 }
 OWN: dict[str, Member] = {name: name.__eq__ for name in (OURS_BARE, OURS, OURS_CALL)}
-#: A solver is not measured again if it is slower than the fastest solver of its group by more than this factor. The
+#: A solver that takes more than this many times as long as the fastest solver of its group is not measured again. The
 #: same holds for a setting compared with the fastest setting of its solver.
 _NEAR = 1.4
 

@@ -32,7 +32,7 @@ from typing import Any, NamedTuple
 ROOT = Path(__file__).resolve().parent.parent
 NS_PER_S = 1_000_000_000
 PERIOD_S = 10.0
-#: Time [s] after which the first window of an estimate has been formed.
+#: Time [s] after the first published message by which the first window of an estimate has been formed.
 FORMED_S = 34.0
 
 
@@ -129,8 +129,9 @@ class Probe:
         self.node = rclpy.create_node("probe", context=self.context)
         self._executor = EventsExecutor(context=self.context)
         self._executor.add_node(self.node)
-        #: age of each message [ms], and figures of the newest report
+        #: age of each message [ms]
         self.ages: list[float] = []
+        #: figures of the newest report
         self.figures: dict[str, str] = {}
         self.node.create_subscription(JointState, "/live_load/contact_forces", self._heard, 5000, raw=True)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._report, 10)

@@ -75,7 +75,8 @@ def _many_twins(scene: Scene, t: Array, wrench: Array, samples: int) -> float:
     return timed(run)[0]
 
 
-#: Program that prepares a live twin, and prints its times and the numbers of kernels that numba compiled or read.
+#: Program that prepares a live twin. It prints how long import and preparation take, how many kernels numba compiles,
+#: and how many it reads from its cache.
 _START = """
 import json, sys, time
 begin = time.perf_counter()

@@ -29,14 +29,16 @@ from plow_twin.model.scene import Harmonic
 
 Array = NDArray[np.float64]
 RESULTS = Path(__file__).resolve().parent / "results"
-#: 5 % and 95 % points [m^2/N] of the prior, from which the true coefficient is drawn.
+#: 5 % and 95 % points [m^2/N] of the prior. The true coefficient is drawn from this prior.
 PRIOR = (1e-15, 1e-14)
-#: Growth of a clearance that ends a life [m], noise of an estimate [m], number of visits in a life, and the shares of
-#: the life at which it is forecast.
+#: Growth of a clearance that ends a life [m].
+#: Standard deviation of the noise of an estimated clearance [m].
+#: Number of visits in a life.
+#: Shares of the life at which it is forecast.
 GROWTH, NOISE, VISITS, SHARES = 3e-3, 5e-5, 20, (0.3, 0.5, 0.7)
-#: Quantiles between which the inner 80 % and the inner 90 % lie.
+#: Quantiles that bound the inner 80 % and the inner 90 % of a distribution.
 _INNER, _INNER_90 = (0.1, 0.9), (0.05, 0.95)
-#: Largest relative error of a forecast that counts as right.
+#: A forecast counts as right if its relative error is at most this.
 ALPHA = 0.2
 
 

@@ -24,7 +24,7 @@ _A = np.ascontiguousarray(table.A)
 _B, _C = np.ascontiguousarray(table.B), np.ascontiguousarray(table.C)
 _E3, _E5, _D = np.ascontiguousarray(table.E3), np.ascontiguousarray(table.E5), np.ascontiguousarray(table.D)
 _ROWS = len(_C)
-#: Absolute tolerances divided by rtol, since poses are about 1e-2 and velocities about 1.
+#: Absolute tolerances divided by rtol. Each is a tenth of the usual size: poses are about 1e-2, velocities about 1.
 _ATOL = np.array([1e-3, 1e-3, 1e-3, 1e-1, 1e-1, 1e-1])
 _OFF, _ON, _CLIPPED = 0, 1, 2
 #: Number of equal parts of a step; guards are checked at the end of each part.

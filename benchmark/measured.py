@@ -186,7 +186,8 @@ def drumwright_shell(slip, rate, tt, nn, tn, e, mu):  # type: ignore[no-untyped-
     away, along = (tn * slip - tt * rate) / determinant, (tn * rate - nn * slip) / determinant
     slides = np.abs(along) > mu * away
     side = np.sign(along)
-    # the impulse along the edge of the friction cone, (side mu, 1), that leaves the least energy and no approach
+    # the impulse lies on the edge of the friction cone, along (side mu, 1): it leaves the least energy, or is the
+    # larger impulse that stops the approach
     least = -(side * mu * slip + rate) / (tt * mu**2 + 2.0 * side * mu * tn + nn)
     stopped = -rate / (nn + tn * mu * side)
     away = np.where(slides, np.maximum(least, stopped), away)
@@ -284,7 +285,7 @@ def without_drag() -> np.ndarray:
     return block
 
 
-#: Parameters of the block that are fitted together with the marker; stiffness and gravity are fixed.
+#: Parameters of the block that are fitted together with the marker's. Stiffness and gravity are not fitted.
 FITTED = (
     "half", "radius", "gyration", "table", "restitution", "restitution_fall", "friction", "friction_fall", "mass_power",
     "tangential", "tangential_damping", "drag", "spin_drag",
@@ -413,7 +414,7 @@ class Square:
         in x and of whole quarter turns.
         """
         gravity, height = float(SQUARE["gravity"]), 0.05
-        # time from the last row of the flight until the centre is at the height of 50 mm
+        # time that the centre needs after the flight's last row to fall to a height of 50 mm
         z, fall = self.flights[:, 1], self.flights[:, 4]
         shift = (fall + np.sqrt(np.maximum(fall**2 + 2.0 * gravity * (z - height), 0.0))) / gravity
         turned = self.flights[:, 2] + shift * self.flights[:, 5]
@@ -481,7 +482,7 @@ def of_drops(drops: Drops) -> dict[str, Any]:
             edges = [start, *lows[1:3]]
             for bounce, (first, last) in enumerate(pairwise(edges)):
                 off = rows[: last - start, :3] - pose[start:last]
-                # the distances are means over all bounces so far
+                # a distance is a mean from the end of the flight to this bounce, so it includes the earlier bounces
                 far[bounce].append((float(np.hypot(off[:, 0], off[:, 1]).mean()), float(np.abs(off[:, 2]).mean())))
                 inside[bounce].append(holds[first:last].mean(axis=0))
             if len(lows) > 3:

@@ -34,14 +34,15 @@ RESULTS = Path(__file__).resolve().parent / "results"
 #: Days on which the pose is measured.
 DAYS = np.linspace(0.0, 30.0, 7)
 SPEED_M_S, PAD_AREA_M2 = 2.0, 0.06
-#: 5 % and 95 % points of the prior, from which the truth is drawn [m^2/N].
+#: 5 % and 95 % points [m^2/N] of the prior. The true coefficient is drawn from this prior.
 PRIOR = (3e-16, 3e-15)
-#: The coefficient should be known within this factor.
+#: The estimated wear coefficient should be right within this factor.
 FACTOR = 1.3
 #: Sampling intervals of the true load, of the given load and of the pose [s].
 _FINE, _LOAD_STEP, _POSE_STEP = 1e-3, 2e-3, 1e-2
 _SPAN = 10.0 * PERIOD
-#: Standard deviation of the broad-band part of the load [N, N, N m], and of the sensor [m, m, rad].
+#: Standard deviation of the load's broad-band part [N, N, N m].
+#: Standard deviation of the sensor's noise [m, m, rad].
 _BROAD, _NOISE = np.array([8e3, 4e3, 1.1e4]), np.array([5e-4, 5e-4, 2e-3])
 
 

@@ -26,12 +26,13 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 NODES = ("Load.Fx", "Load.Fy", "Load.M")
 NAMESPACE = 2
-#: Publishing interval [ms] and queue length of the bare client, as the twin requests them.
+#: Publishing interval [ms] and queue length that the bare client requests. The twin requests the same.
 PUBLISHING_MS, QUEUE = 10.0, 10_000
-#: Time without a value after which the bare client ends [s].
+#: The bare client ends when it has received no value for this time [s].
 SILENCE_S = 3.0
 MAP = "excitation: {fx: {node: ns=2;s=Load.Fx}, fy: {node: ns=2;s=Load.Fy}, m: {node: ns=2;s=Load.M}}\n"
-#: Targets: largest 99th percentile of the age [ms], largest share of a core.
+#: Target: the 99th percentile of the age is at most this [ms].
+#: Target: at most this share of a core is used.
 MOST_AGE_MS, MOST_CORE = 15.0, 0.5
 
 

@@ -10,7 +10,7 @@ from bench_scenes import T_END
 from cases import Array, Sample, timed
 from lean import rhs_into
 
-#: Absolute tolerances divided by rtol, since poses are about 1e-2 and velocities about 1.
+#: Absolute tolerances divided by rtol. Each is a tenth of the usual size: poses are about 1e-2, velocities about 1.
 _ATOL = np.array([1e-3, 1e-3, 1e-3, 1e-1, 1e-1, 1e-1])
 
 

@@ -12,8 +12,8 @@ from work_precision import OURS_BARE, prepare_bare
 from plow_twin import Scene, SolverError
 
 TOLERANCES = (1e-3, 1e-6, 1e-9)
-#: Growth of a displacement at t = 0 above which no step control can keep a tolerance, so that the scene is listed
-#: separately.
+#: If a displacement at t = 0 grows by more than this factor, no step control can keep a tolerance, so the scene is
+#: listed separately.
 AMPLIFIES = 1e4
 QUICK_COUNT = 10
 

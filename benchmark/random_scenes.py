@@ -23,11 +23,10 @@ HERE = Path(__file__).resolve().parent
 DATA = HERE / "data" / "random_scenes.npz"
 COUNT, SEED = 200, 20150419
 T_END, OUTPUT_DT = 1.0, 0.02
-#: Settings (tolerance of a step, longest step in contact) of two reference runs in each arithmetic; both runs must
-#: agree.
+#: Tolerance of a step and longest step in contact, for two reference runs in each arithmetic. The two runs must agree.
 LONG_DOUBLE = (1e-16, 0.6), (1e-15, 1.0)
 QUAD = (1e-21, 0.6), (1e-19, 1.0)
-#: If the two runs differ by more than this, in clearances, both are run again in 113-bit arithmetic.
+#: If the two runs differ by more than this multiple of the clearance, both are run again in 113-bit arithmetic.
 AGREED = 1e-11
 PERTURBATION = 1e-12
 _KINDS = {"kelvin_voigt": 0, "hunt_crossley": 1, "exact_restitution": 2}

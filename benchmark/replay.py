@@ -38,7 +38,7 @@ _AMPLITUDE = np.array([32_000.0, -11_000.0, -45_495.0])
 _START_NS = 1_800_000_000_000_000_000
 _REPEATS = 5
 _BATCH = 8192
-#: Length of a recording so short that its replay takes hardly longer than the start of a replay [s].
+#: Length [s] of a recording so short that replaying it takes hardly longer than starting a replay.
 _SHORT_S = 0.1
 
 

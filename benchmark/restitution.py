@@ -23,14 +23,15 @@ PICTURE = ROOT / "docs" / "images" / "restitution.png"
 PAGE = ROOT / "benchmark" / "results" / "restitution.md"
 BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
 
-#: Nominal restitutions for which the CSV file has rows, and those that the page shows.
+#: Nominal restitutions for which the CSV file has rows.
 ASKED = tuple(round(0.01 * k, 2) for k in range(101))
+#: Nominal restitutions that the page shows.
 SHOWN = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0)
 #: Damping ratios C / (2 sqrt(K m)) of the Kelvin-Voigt table.
 RATIOS = (0.0, 0.01, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 2.0)
 #: Ramp lengths of the ramped law, as multiples of the depth v sqrt(m/K) of the undamped impact.
 RAMPS = (0.001, 0.01, 0.1, 0.3, 1.0, 3.0, 10.0)
-#: A law is valid where the delivered restitution is within this share of the nominal restitution.
+#: A law is valid where the delivered restitution differs from the nominal restitution by at most this share.
 VALID = 0.05
 
 MASS_KG, SPEED_M_S, STIFFNESS, EXPONENT = 2.0, 1.0, 1e9, 1.5
@@ -66,7 +67,8 @@ def free_impact(contact: Contact, mass: float = MASS_KG, speed: float = SPEED_M_
         locked=("x", "theta"),
         pairs=("top_left_top",),
     )
-    # the mass needs 5 ms to reach the wall; the slowest rebound (D at its largest value) takes some 50 ms
+    # at 1 m/s the mass needs 5 ms to reach the wall and, with D at its largest value, some 50 ms to rebound, so 0.2 s
+    # are enough
     result = simulate(scene, 0.2 / speed, output_dt=0.2 / speed, tol=1e-11)
     if result.penetration[-1, 0] > 0.0 or result.statistics["top_left_top"]["makes"] != 1:
         raise RuntimeError(f"{contact}: not one whole impact")

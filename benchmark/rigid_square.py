@@ -12,7 +12,7 @@ import numpy as np
 
 from plow_twin.study.measured.square import RATE_HZ
 
-#: Time step in s, in which a corner moves at most 0.5 mm.
+#: Time step in s. In one step a corner moves at most 0.5 mm.
 STEP = 2e-4
 #: Increment of the normal impulse per mass in Routh's integration, in m/s.
 BIT = 5e-3

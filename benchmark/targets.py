@@ -60,7 +60,7 @@ RATIOS = (
 )
 ENSEMBLE_S, WITHIN, REAL_TIME, CORE_SHARE = 0.5, 10.0, 1000.0, 0.25
 BATCH_TIMES = 5.0
-#: Largest cost of computing an hour almost without events, as a share of the cost of an hour of the driven scene.
+#: Computing an hour almost without events may cost at most this share of the cost of an hour of the driven scene.
 IDLE_SHARE = 0.01
 
 

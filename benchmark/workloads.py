@@ -63,7 +63,7 @@ def swaying_scene() -> Scene:
     scene = bench_scene("kv")
     load = _harmonic(scene)
     omega = 20.0
-    # these are the initial rates of x = -(F / (m omega^2)) sin(omega t), a motion without drift
+    # x = -(F / (m omega^2)) sin(omega t) is the motion without drift, and these are its initial rates
     force = (200.0, 50.0)
     mass, inertia = scene.head.mass_kg, scene.head.inertia_kg_m2
     v = (-force[0] / (mass * omega), -force[1] / (mass * omega), -10.0 / (inertia * omega))

@@ -10,7 +10,7 @@ from xml.sax.saxutils import escape
 
 OUT = Path(__file__).resolve().parent.parent / "docs" / "images" / "lanes.svg"
 WIDTH, HEIGHT, LEFT, ROW, CELL = 920, 330, 96, 34, 66
-#: Four of the eight lanes, each with its scene and the pairs that act (slots).
+#: Four of the eight lanes. Each has a scene and slots, which hold the pairs that act.
 LANES = (
     ("scene 17", ("a-top",)),
     ("scene 4", ("b-right", "d-left", "d-bottom")),
@@ -19,7 +19,8 @@ LANES = (
 )
 #: Guards that may end the steps: the first guard of each lane, then the second guard of lane 0 in the remaining place.
 ROUND = (("lane 0: b-right",), ("lane 1: d-left",), ("lane 2: a-left",), ("lane 0: c-bottom",))
-#: Ends of steps in each lane: the place as a share of the width, and what ends: "step", "event" or "next scene".
+#: Ends of steps in each lane. Each end has its place as a share of the width and its kind: "step", "event" or "next
+#: scene".
 STEPS = (
     ((0.18, "step"), (0.30, "event"), (0.55, "step"), (0.80, "step")),
     ((0.10, "event"), (0.22, "event"), (0.48, "step"), (0.66, "event")),

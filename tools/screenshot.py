@@ -94,7 +94,8 @@ def main() -> None:
             time.sleep(8.0)  # time for the plots to settle and the greeting to disappear
             client.save_screenshot(str(shot))
         finally:
-            os.killpg(viewer.pid, signal.SIGTERM)  # the program is a child of the script that starts it
+            # the program is a child of the script that starts it, so the signal goes to the whole process group
+            os.killpg(viewer.pid, signal.SIGTERM)
             viewer.wait()
         picture = Image.open(shot).convert("RGB").resize(SIZE, Image.Resampling.LANCZOS)
         # the menu is cut off, and 256 colours are used because the picture then has a third of the bytes

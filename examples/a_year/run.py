@@ -39,7 +39,7 @@ load = compile_loads(believed.loads).at(t)
 true_load = load * (1.0 + 0.04 * rng.standard_normal(3))
 path = wear_path(replace(believed, loads=(Table("true", t, true_load),)), limits, np.inf)
 grown = path.clearance_growth()
-# the wear coefficient with which the limit is reached at the end of the year
+# the wear coefficient with which a clearance reaches its limit at the end of the year
 reached = min(float(np.interp(GROWTH_M, column, path.exposure, right=np.inf)) for column in grown.T)
 k_s = reached * believed.wear.pad_area_m2 / (DAYS * DAY_M)
 

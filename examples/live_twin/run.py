@@ -28,7 +28,7 @@ for index in range(1, 5001):
 for name, largest, count in zip(PAIR_NAMES, peak, makes, strict=True):
     print(f"{name:20}  largest {largest / 1e3:6.1f} kN, {count:3d} makes")
 
-# another process could continue from here: the same samples give the same bits
+# another process could continue from this snapshot: with the same samples, its results have the same bits
 other = Twin(load_scene("bench_kv"), excitation="sampled", tol=1e-6)
 other.restore(saved)
 times = np.arange(4001, 5001) * 1e-3

@@ -35,7 +35,7 @@ def main() -> None:
     pose, given = drops.pose[DROP], int(drops.flight_rows[DROP])
     until = drops.until(DROP, 1) + 1
     found = bands(pose[:given], until)
-    # the preset's cavity has its centre 1 m above the table
+    # in the preset, the centre of the cavity is 1 m above the table
     x, z, theta, *rates = MARKER.state_of_block(fit_flight(pose[:given]).state)
     start = Initial(q=(x, z - 1.0, theta), v=(rates[0], rates[1], rates[2]))
     scene = replace(load_scene("measured_square"), initial=start)

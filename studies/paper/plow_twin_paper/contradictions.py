@@ -61,7 +61,8 @@ def _zero_load(runs: PaperRuns) -> Contradiction:
 def _doubled(runs: PaperRuns) -> Contradiction:
     pair = int(runs.case.penetration.max(axis=0).argmax())
     depth = float(runs.case.penetration[:, pair].max())
-    # distances from a point that is `depth` outside a strip to the strip's two sides
+    # for a point that is `depth` outside a strip, the sum of the distances to the strip's two sides exceeds the strip's
+    # width by `excess`
     width = runs.scene.frame.height_m + runs.scene.clearance.vertical_m
     excess = abs(-depth) + abs(width + depth) - width
     return Contradiction(

@@ -28,8 +28,9 @@ if TYPE_CHECKING:
     from plow_twin.record.writer import RunWriter
 
 Array = NDArray[np.float64]
-#: Interval of the samples [s], and number of samples per message. Messages include the peaks between them.
+#: Interval of the samples [s].
 SAMPLE_S: Final = 1e-3
+#: A message is written at every n-th sample. Its peaks cover all samples since the message before.
 MESSAGE_EVERY: Final = 4
 _CHUNK_B: Final = 256 * 1024
 _MIN_FREE_B: Final = 64 * 1024 * 1024

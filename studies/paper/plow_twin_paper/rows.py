@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Final
 
-#: How a row of the comparison relates to the fit of the scene's numbers.
+#: Whether the scene's numbers were fitted to a row of the comparison.
 FITTED: Final = "fitted to this"
 CHECK: Final = "not fitted to this"
 ASSUMED: Final = "not fitted to this; other clearance assumed 20 mm"

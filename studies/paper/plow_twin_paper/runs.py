@@ -32,13 +32,13 @@ from plow_twin_paper.values import (
 Array = NDArray[np.float64]
 OnProgress = Callable[[float], object]
 
-#: Length of the shortest run that contains a settled load period.
+#: Shortest permitted run [s]: two load periods, of which the second counts as settled.
 SHORTEST_S: Final = 2.0 * PERIOD_S
-#: Length of the longest run, in which the rows of all forms take about a gigabyte.
+#: Length of the longest run [s]; at this length the rows of the three forms of rotation take about a gigabyte.
 LONGEST_S: Final = 1000.0
-#: Interval of the rows in figures [s]; forces change over tens of milliseconds.
+#: Interval of the rows in figures [s]. Forces change over tens of milliseconds, so the rows show every change.
 OUTPUT_DT_S: Final = 1e-3
-#: Number of steps of a curve between two of the five places at which the paper's curves are read.
+#: The paper's curves are read at five places. Between two neighbouring places a curve is computed in this many steps.
 _FINE_STEPS: Final = 10
 
 

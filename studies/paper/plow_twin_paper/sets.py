@@ -13,7 +13,8 @@ from plow_twin.model.scene import Scene
 from plow_twin.run.simulate import Result
 from plow_twin_paper.values import SHORTEST_HOLD_S, Sense
 
-#: Mode of a pair that carries force; 0 is apart, 2 in contact with its force clipped at zero.
+#: Mode of a pair that carries force. In mode 0 the pair is apart; in mode 2 it is in contact but its force is clipped
+#: at zero.
 _CARRIES = 1
 
 

@@ -22,7 +22,7 @@ from plow_twin_paper.rows import FITTED, Row, Verdict
 from plow_twin_paper.runs import PaperRuns, run_all
 
 OnProgress = Callable[[float], object]
-#: Form of the head's rotation in words, by its place in `Rotation.scenes`.
+#: The three forms of the head's rotation in words, in the order of `Rotation.scenes`.
 FORMS = ("constant moment", "exact, I about the centre of mass", "exact, I about the cavity's centre")
 
 

@@ -21,8 +21,9 @@ CASE_M: Final = (0.025, 0.030)
 #: The fixed clearance of Figs 10 and 11, and the five values of the other clearance [m] (section 4).
 FIXED_M: Final = 0.020
 GRID_M: Final = (0.020, 0.0225, 0.025, 0.0275, 0.030)
-#: Figs 14 and 15, section 5: values of both clearances [m], and length of the simulation [s].
+#: Values of both clearances in Figs 14 and 15, section 5 [m].
 FACE_GRID_M: Final = (0.020, 0.025, 0.030)
+#: Length of the simulation for Figs 14 and 15 [s].
 FACE_T_END_S: Final = 20.0
 #: Angular frequency of the loads [rad/s] (section 3) and their period [s].
 OMEGA_RAD_S: Final = 2.0
@@ -79,12 +80,12 @@ class FaceMark:
 
 FACE_MARKS: Final = (FaceMark(1, "ccw", 1), FaceMark(2, "cw", 2), FaceMark(3, "cw", 3))
 
-#: A force agrees when it is within this share of the published force.
+#: A force agrees if it differs from the published force by at most this share.
 FORCE_TOLERANCE: Final = 0.05
-#: A contact set occurs when it lasts at least this long without a break [s].
+#: A contact set counts as occurring if it lasts at least this long [s] without a break.
 SHORTEST_HOLD_S: Final = 5e-3
-#: Smallest step against a trend that counts, as a share of the curve's largest value; a printed curve shows no smaller
-#: step.
+#: A step against a trend counts only if it is at least this share of the curve's largest value, because a printed curve
+#: shows no smaller step.
 TREND_SLACK: Final = 0.005
-#: "rare", for sets that the paper does not mention: at most this share of the contact time.
+#: A set that the paper does not mention counts as "rare" if it lasts for at most this share of the contact time.
 RARE_SHARE: Final = 0.10
