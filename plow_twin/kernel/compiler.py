@@ -87,7 +87,7 @@ def kernel(
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         dispatcher = kept(function, **options)
-        # absent with NUMBA_DISABLE_JIT
+        # with NUMBA_DISABLE_JIT the function stays plain Python and has no `_cache`
         cache_file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
         if cache_file is not None:
             cache_file._source_stamp = SOURCE_DIGEST
@@ -108,9 +108,9 @@ def for_kernels(entry: Callable[..., Any]) -> Callable[..., Any]:
     """
     function = getattr(entry, "py_func", None)
     if function is None:
-        return entry  # NUMBA_DISABLE_JIT
+        return entry  # NUMBA_DISABLE_JIT: the entry is a plain Python function
     copy = FunctionType(function.__code__, function.__globals__, function.__name__)
-    # the name in the cache
+    # numba names the files of the cache after `__qualname__`, so the copy needs a name of its own
     copy.__qualname__ = f"{function.__qualname__}_for_kernels"
     return kernel()(copy)
 
@@ -138,7 +138,7 @@ def kept(function: Callable[..., Any], **options: Any) -> Any:
     except RuntimeError:  # neither the package's folder nor the user's cache folder is writable
         with _read_only_cache():
             dispatcher = compiler(function)
-    if hasattr(dispatcher, "_cache"):  # absent with NUMBA_DISABLE_JIT
+    if hasattr(dispatcher, "_cache"):  # with NUMBA_DISABLE_JIT the function has no `_cache`
         share(dispatcher._cache._cache_file)
         _save_or_warn(dispatcher._cache)
     return dispatcher
@@ -165,7 +165,8 @@ def share(cache_file: Any) -> None:
         with cache_file._open_for_write(cache_file._data_path(name)) as file:
             file.write(code)
         overloads = cache_file._load_index()
-        if not overloads and Path(cache_file._index_path).exists():  # the index on the disk belongs to other sources
+        # an existing index that loads as empty belongs to other sources, so their compiled files are deleted
+        if not overloads and Path(cache_file._index_path).exists():
             for old in Path(cache_file._cache_path).glob(f"{glob.escape(stem)}*.nbc"):
                 if old.name != name:
                     old.unlink(missing_ok=True)
@@ -183,7 +184,8 @@ def _save_or_warn(cache: Any) -> None:
             save(signature, result)
         except OSError as error:
             place = Path(cache.cache_path).parent
-            if not _said:  # numba resets Python's registry of warnings, which would repeat the warning
+            # `_said` prevents a second warning, because numba resets the registry of warnings that Python has issued
+            if not _said:
                 _said.append(f"compiled kernels are not kept for the next start: {place}: {error.strerror or error}")
                 warnings.warn(_said[0], RuntimeWarning, stacklevel=1)
 
@@ -197,6 +199,6 @@ def for_arguments(function: Callable[..., Any], arguments: tuple[Any, ...]) -> C
     """
     compile_for = getattr(function, "compile", None)
     if compile_for is None:
-        return function  # NUMBA_DISABLE_JIT
+        return function  # NUMBA_DISABLE_JIT: the function is plain Python
     found: Callable[..., Any] = compile_for(tuple(map(numba.typeof, arguments)))
     return found

@@ -111,7 +111,7 @@ class _LowerForLinking(NativeLowering):
         state.flags.no_compile = True
         super().run_pass(state)
         state.library.finalize()
-        # numba looks the function up by this object when it compiles callers; it is never called
+        # numba looks the function up by this object when it compiles callers; the object is never called
         entry_point = object()
         state.targetctx.insert_user_function(entry_point, state.cr.fndesc, [state.library])
         state["cr"] = state.cr._replace(cfunc=entry_point)

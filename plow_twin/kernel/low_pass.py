@@ -8,7 +8,7 @@ import numpy as np
 
 from plow_twin.kernel.compiler import kernel
 
-#: Shortest time between two rows in s for which a cubic is formed from their poses and rates.
+#: Shortest interval in s between two rows; a shorter interval counts as this long, because slopes are divided by it.
 _SHORTEST: Final = 1e-6
 
 
@@ -29,7 +29,8 @@ def lagged(tau, edges, starts, places, rates, memory, t, q, v):
                 h = max(t[row] - before, _SHORTEST)
                 mean = (u1 - u0) / h
                 third = 6.0 * (v0 + v1 - 2.0 * mean) / (h * h)
-                # the particular solution u - tau u' + tau^2 u'' - tau^3 u''' at both ends
+                # the particular solution for the cubic u(t), u - tau u' + tau^2 u'' - tau^3 u''', at both ends of the
+                # interval
                 first = u0 - tau * (v0 - tau * ((6.0 * mean - 4.0 * v0 - 2.0 * v1) / h - tau * third))
                 last = u1 - tau * (v1 - tau * ((2.0 * v0 + 4.0 * v1 - 6.0 * mean) / h - tau * third))
                 y = last + (y - first) * np.exp(-h / tau)

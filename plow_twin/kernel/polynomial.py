@@ -77,7 +77,7 @@ def _crossing(g: Array, n: int, low: float, high: float, start: float) -> float:
         if not (low <= new <= high):
             new = 0.5 * (low + high)
         elif abs(change) <= 1e-6 * new and abs(bend * change) <= 1e-3 * abs(slope):
-            # Halley converges cubically: the next step would be of the order of this step's cube
+            # Halley's method converges cubically, so the next change would be of the order of this change's cube
             return new
         if abs(new - x) <= 2e-16 * high or high - low <= 2e-16 * high:
             return new
@@ -156,7 +156,7 @@ def maximum(g: Array, n: int, h: float, floor: float, w) -> float:
         power *= h
         steepest += k * abs(g[k]) * power
     if abs(g[1]) >= steepest:
-        # g is monotonic on [0, h]
+        # g is monotonic on [0, h], so its maximum is at an end
         return best
     for k in range(n):
         slope[k] = (k + 1) * g[k + 1]

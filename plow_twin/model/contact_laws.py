@@ -37,7 +37,7 @@ def exact_damping_number(restitution: float) -> float:
         return 1.5 * lost * (1.0 + lost)
 
     def residual(damping: float) -> float:
-        # the equation is divided by D, so that the trivial root D = 0 is no root of the residual
+        # the equation is divided by D; its trivial root D = 0 is therefore no root of the residual
         return (1.0 + restitution) - (math.log1p(damping) - math.log1p(-damping * restitution)) / damping
 
     # the positive root lies below 1/e, and is about 3 (1 - e) / 2 near e = 1

@@ -35,7 +35,7 @@ def load_laws(names: Iterable[str]) -> None:
         before = set(LAWS)
         try:
             _import_file(Path(key)) if name.endswith(".py") else importlib.import_module(name)
-        except Exception as error:  # the module's code can raise anything
+        except Exception as error:  # an imported module can raise any exception
             raise InputError([Problem("module", name, f"a module that can be imported ({error})")], "--laws") from error
         if set(LAWS) == before:
             raise InputError([Problem("module", name, "a module that calls plow_twin.add_law")], "--laws")

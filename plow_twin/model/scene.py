@@ -143,8 +143,8 @@ class Contact:
     """
 
     law: str = _choice("contact law", LAWS, "exact_restitution")
-    # must be given: its default is NaN, which is not admissible, and is here only because the preceding field has a
-    # default
+    # the stiffness must be given: its default, NaN, is not admissible. There is a default only because the field before
+    # has one
     stiffness: float = _quantity("N/m^exponent", "K in F = K d^n (...)", math.nan, gt=0.0)
     exponent: float = _quantity("1", "n in F = K d^n (...)", 1.0, ge=1.0, le=4.0)
     damping: float | None = _quantity(
@@ -172,7 +172,7 @@ class Contact:
     )
 
 
-#: Fields of `Contact` by which the restitution depends on the impact; all absent if it is constant.
+#: Fields of `Contact` that make the restitution depend on the impact; if the restitution is constant, all are absent.
 FALL_NAMES: Final = (
     "restitution_fall",
     "restitution_speed_m_s",
@@ -577,7 +577,8 @@ def _check_contact(contact: Contact) -> Iterator[Problem]:
     if law.exponent is not None and contact.exponent != law.exponent:
         yield Problem("contact.exponent", contact.exponent, f"{law.exponent:g} for {contact.law}")
     if not law.additive and contact.damping is not None and contact.damping > MOST_DAMPING_FACTOR:
-        # a larger factor stops a head within the depth sqrt(2 m / (K lambda)), which has few digits in double precision
+        # a larger factor would stop a head within sqrt(2 m / (K lambda)), a depth so small that few of its digits are
+        # left in double precision
         expected = f"at most {MOST_DAMPING_FACTOR:g} s/m for {contact.law}; a restitution gives at most 1e6"
         yield Problem("contact.damping", contact.damping, expected)
     if law.ramped != (contact.ramp_m is not None):

@@ -53,7 +53,7 @@ TOLERANCE_RANGE = (1e-13, 1e-1)
 STEP_SHARE = 3e-4
 #: Largest admissible error of a step relative to the length scale; it limits the error of a step at a loose tolerance.
 LARGEST_STEP_ERROR = 1e-6
-#: `STEP_SHARE` for exponents that are not integers; it is smaller because near a branch point series converge slowly.
+#: `STEP_SHARE` for exponents that are not integers; it is smaller, because series converge slowly near a branch point.
 STEP_SHARE_FRACTION = 1e-6
 #: Number of mode changes at one instant after which the solver steps beyond this instant.
 MAX_EVENTS_AT_ONCE = 64
@@ -172,7 +172,7 @@ class _Shared:
         key = (compute, *map(id, sources))
         known = self._known.get(key)
         if known is None:
-            # the sources are kept too, so that no other object can get the id of one of them
+            # the sources are kept too; otherwise another object could get the id of a source that no longer exists
             known = self._known[key] = sources, compute(*(sources if given is None else given))
             if len(self._known) > self._most:
                 self._known.popitem(last=False)
@@ -180,7 +180,8 @@ class _Shared:
         return found
 
 
-#: Parts of the last compiled scenes for reuse, since studies vary some parts of a scene and keep the others.
+#: Results computed from parts of the last scenes. Studies vary some parts of a scene and reuse the results of the
+#: others.
 _LATELY: Final = _Shared(64)
 
 
@@ -256,7 +257,8 @@ def _describe(scene: Scene, tol: float, sampled: bool, shared: _Shared) -> _Desc
     loads, acceleration, start_speed, harmonics, terms, unchanged = shared.of(
         _unchanged, scene.head, scene.frame, scene.contact, scene.gravity, scene.loads, scene.initial, scene.locked,
         scene.pairs, scene.wear, scene.friction, scene.support, sampled,
-        # the results depend on the clearance only if the head starts off centre, so that it may touch a wall
+        # only a head that starts off centre may touch a wall at the start, so only then do the results depend on the
+        # clearance
         scene.clearance if any(scene.initial.q) else None,
         given=(scene, sampled, shared),
     )  # fmt: skip
@@ -332,14 +334,15 @@ def _scene_terms(
     if scene.friction is not None and scene.friction.coefficient != 0.0:
         present["slip" if scene.friction.stick_stiffness_n_m is None else "stick"] = True
     present["support"] = scene.support is not None
-    # with an offset centre of mass the loads' moment depends on the angle, so that flight has no closed form
+    # with an offset centre of mass the moment of the loads depends on the angle; flight then has no closed form
     present["flight"] = present["harmonics"] and not present["offset"] and not present["support"]
-    # a tumbling block could turn by more than a quarter turn within a flight
+    # a head that carries corners may tumble by more than a quarter turn within a flight, so it has no flight in closed
+    # form
     present["flight"] &= scene.head.carries == "walls"
     creeps = present["wear"] or bool({"slip", "stick"} & present.keys())
     present["rest"] = not (creeps or present["support"])
     if present["harmonics"]:
-        # without damping a harmonic can swing the head up
+        # without damping a harmonic can swing the head up, so rest under harmonics is recognised only with damping
         damped = law.viscous is not None or law.hysteretic is not None
         present["rest"] &= damped and present["flight"] and _harmonics_are_small(scene, loads, shared.of(_swing, loads))
     return law._replace(**_flags(present))
@@ -440,7 +443,7 @@ def _harmonics(head: Head, loads: LoadSet) -> tuple[Array, Harmonics | None]:
     """
     if loads.omega.size == 0:
         return np.eye(2), None
-    # shape (h, 2, 3): sine and cosine amplitudes of Fx, Fy, M
+    # sine and cosine amplitudes of the accelerations Fx/m, Fy/m, M/I, shape (h, 2, 3)
     inertias = np.array([head.mass_kg, head.mass_kg, head.inertia_kg_m2])
     amplitudes = np.stack([loads.sine / inertias, loads.cosine / inertias], axis=1)
     acting = amplitudes.any(axis=(1, 2))
@@ -502,11 +505,12 @@ def _release(scene: Scene, tol: float, length: float, speed: float) -> float:
     release = float((impulse * (exponent + 1.0) * speed / scene.contact.stiffness) ** (1.0 / (exponent + 1.0)))
     friction = scene.friction
     if friction is not None and friction.stick_stiffness_n_m is not None and friction.coefficient > 0.0:
-        # a pair's release also ends the spring of its sticking corner, so the jump of the spring's force must be
-        # negligible too
+        # when a pair becomes RELEASED, the spring of its sticking corner ends too; the jump of the spring's force must
+        # therefore also be negligible
         stretch = max(1e-3 * tol * length, 1e-15 * geometry.half_diagonal(scene))
         held = stretch * friction.stick_stiffness_n_m / friction.coefficient
-        # if a corner crossed this depth in less than 1e-11 s, its series would have non-finite terms
+        # the depth is at least the way of a corner in 1e-11 s; if a corner crossed it faster, its series would have
+        # non-finite terms
         depth = max(float((held / scene.contact.stiffness) ** (1.0 / exponent)), 1e-11 * speed)
         release = min(release, depth)
     return release
@@ -530,7 +534,7 @@ def _implicit(scene: Scene, terms: Terms, values: dict[str, Any]) -> Implicit | 
     if terms.slip is not None:
         damping += values["friction"] * largest_force / values["slip_speed"]
     overdamped = damping * mobility > OVERDAMPED_RATIO * math.sqrt(spring * mobility)
-    # the damping of a support can outweigh its springs too
+    # a support can be overdamped like a contact
     if scene.support is not None:
         overdamped |= bool((values["frame_damping"] > OVERDAMPED_RATIO * np.sqrt(values["frame_stiffness"])).any())
     return new_implicit(scene.support is not None) if overdamped else None

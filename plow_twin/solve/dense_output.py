@@ -26,7 +26,8 @@ def sigma_at(state, used):
     """Return sigma at `used` seconds into the step."""
     if used >= state.step_size:
         return state.sigma_end
-    if state.beta == 0.0 or used == 0.0:  # at used = 0 the formula is 0 / 0 if a step begins at a touch (alpha = 0)
+    # in a step that begins at a touch (alpha = 0) the formula gives 0 / 0 at used = 0
+    if state.beta == 0.0 or used == 0.0:
         return used
     # the root of alpha sigma + beta sigma^2 / 2 = used, in the form without cancellation
     return 2.0 * used / (state.alpha + math.sqrt(max(state.alpha**2 + 2.0 * state.beta * used, 0.0)))
@@ -58,7 +59,8 @@ def wear_depth_at(state, w, sigma, out) -> None:
     """Write each pad's wear depth at sigma of the step to `out`, shape (8,)."""
     wear_depth = row(state.wear_depth, 0)
     if any_penetrates(state):
-        # row 0 is left out, so that the sum is the growth over the step; pairs without force do not wear
+        # without a penetrating pair no pad wears. The sum leaves out row 0, so that it is the growth since the step's
+        # start
         order = state.order
         growth = row(w.wear, order)
         for k in range(order - 1, 0, -1):

@@ -23,11 +23,11 @@ from plow_twin.solve.loads import load_at
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, X, Y, new_record
 from plow_twin.solve.support import to_ground
 
-#: Number of nodes of the quadrature, which is exact to degree 15. More nodes would not reduce the imbalance, because
-#: the higher terms of a step's series are as small as the series' error.
+#: Number of nodes of the quadrature; with 8 nodes it is exact up to degree 15. More nodes would not reduce the
+#: imbalance, because the higher terms of a step's series are as small as the series' error.
 _NODES = 8
-#: Largest phase [rad] of the fastest harmonic over a panel of a flight or rest; products of two harmonics are then
-#: integrated to 1e-13.
+#: Largest phase [rad] of the fastest harmonic over a panel of a flight or rest; up to this phase products of two
+#: harmonics are integrated to 1e-13.
 _PANEL_PHASE = 2.0
 # indices into the powers [W] and forces [N, N m] at one instant
 LOADS, NORMAL, FRICTION, SUPPORT, LOAD_X, LOAD_Y, LOAD_M, CONTACT_X, CONTACT_Y, CONTACT_M, SIZE = range(11)
@@ -45,13 +45,14 @@ SUMS = np.dtype(
 )
 
 
-#: Quadrature, work space and sums; `None` instead of this record leaves the balance out of the compiled code.
+#: Record of the energy balance: its quadrature, work space and sums. If kernels get `None` instead, they are compiled
+#: without the balance.
 BALANCE = np.dtype(
     [
         ("nodes", "f8", (_NODES,)),
         ("weights", "f8", (_NODES,)),
         ("now", "f8", (SIZE,)),  # powers and forces at one instant
-        ("before", "f8", (SIZE,)),  # powers and forces at the end of the fixed step before
+        ("before", "f8", (SIZE,)),  # powers and forces at the end of the previous fixed step
         ("body", "f8", (STATE_SIZE,)),  # body coordinates at a node
         ("ground", "f8", (STATE_SIZE,)),  # body coordinates relative to the ground, with a support
         ("wear_depth", "f8", (PAIR_COUNT,)),  # wear depth at a node

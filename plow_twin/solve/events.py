@@ -18,7 +18,8 @@ _AT_ONCE = 1e-12
 #: Penetration at which a pair changes from ON to RELEASED, as a share of `Params.release`. The pair is ON again at
 #: `Params.release` itself.
 LET_GO = 0.25
-#: Allowances for rounding where all guards are proved at once: a factor on the sums, and an error of 1 + lambda d'.
+#: Allowances for rounding in the proof that no guard turns negative: a factor on the sums of terms, and an error of 1 +
+#: lambda d'.
 _ROUNDED, _ROUNDING = 1.0 + 1e-9, 1e-9
 _ALL_PAIRS = 2**PAIR_COUNT - 1
 #: Penetration below which a RELEASED pair counts as resting on its wall, as a share of `Params.release`.
@@ -52,7 +53,8 @@ def _guards(p, state, w, order, penetrating, viscous, ramp) -> None:
             # a pair becomes RELEASED at a quarter of the depth at which it is ON again, so that it cannot alternate
             first -= min(LET_GO * p.release, 0.5 * first)
         elif state.mode[pair] == RELEASED and first <= ON_THE_WALL * p.release:
-            # the guard of a pair that rests on its wall turns negative a little outside the wall
+            # a RELEASED pair that rests on its wall parts a little outside the wall, at the depth -LET_GO * release;
+            # its guard is raised by this distance
             first = max(guard[0, pair] + LET_GO * p.release, 0.0)
         guard[0, pair] = first if p.enabled[pair] == 1 else 1.0
 

@@ -87,7 +87,7 @@ def end_coarsely(p, parts, state, totals, target, bound) -> int:
     dt = (target - start) / bound.steps
     _to_world(p, parts.terms.support, state, z)
     for pair in range(PAIR_COUNT):
-        # a CLIPPED or RELEASED pair counts as ON, because it is inside its wall too
+        # a CLIPPED or RELEASED pair is inside its wall too, so it counts as ON
         state.mode[pair] = OFF if state.mode[pair] == OFF else ON
     pair_outputs(p, state, state.wear_depth, y, pen, rate, now)
     state.bounded += 1
@@ -150,7 +150,7 @@ def integrate_fixed(
         if not within_range(p, state, y):
             return _RANGE
         if n % stride == 0 or n == steps:
-            # the last row may follow after fewer than `stride` steps
+            # the last row may follow the previous row by fewer than `stride` steps, so its index is rounded up
             row = (n + stride - 1) // stride
             pose_of(p, y, parts.terms.offset, q[row], v[row])
             if frame is not None:

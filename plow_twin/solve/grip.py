@@ -35,11 +35,11 @@ from plow_twin.solve.state import (
     Y,
 )
 
-#: A guard's first value counts as rounding error if it is at most the first number times its terms at the step's start
-#: plus the second number times its largest term over the step.
+#: A guard's first value counts as rounding error up to the sum of two bounds: `_ROUNDING` times its terms at the step's
+#: start, and `_ROUNDING_OVER_STEP` times its largest term over the step.
 _ROUNDING, _ROUNDING_OVER_STEP = 1e-10, 1e-13
-#: Rounding error of a corner's place along its wall, relative to `Params.leverage`, and of its slip rate, relative to
-#: `Params.threshold[0]`.
+#: Rounding error of a corner's place along its wall, as a share of `Params.leverage`, and of its slip rate, as a share
+#: of `Params.threshold[0]`.
 _FINEST = 4e-15
 
 
@@ -95,7 +95,7 @@ def grasp(p, state, pair, old) -> None:
     normal = 0.0 if old == CLIPPED else _normal_force(p, state, pair, depth)
     state.anchor[pair], state.grip[pair] = place, 0
     held = p.stick_damping * rate
-    # without a normal force every corner that slides counts as slipping, as it does for the guard of a slipping corner
+    # without a normal force every sliding corner slips; the guard of a slipping corner gives the same decision
     if abs(held) > p.static_friction * normal or (normal <= 0.0 and rate != 0.0):
         state.grip[pair] = 1 if rate > 0.0 else -1
 
@@ -105,7 +105,8 @@ def switch_grip(p, state, pair, new) -> None:
     """Change a corner's grip to stick or slip, as `new` says."""
     if new == STICKS:
         place, rate = _along(p, pair, state.y)
-        # at a touch Kelvin-Voigt's force acts at once, even if the rounded depth is not positive
+        # a Kelvin-Voigt force acts from the touch on, so it is computed even if rounding has made the depth zero or
+        # negative
         normal = _normal_force(p, state, pair, penetration_of(p, state, pair, state.y))
         _anchor(p, state, pair, state.grip[pair] * p.friction * normal, place, rate)
         state.grip[pair] = 0
@@ -173,7 +174,8 @@ def grip_guard(p, state, w, order, pair, side) -> int:
         # touch has an error
         g[0] = p.static_friction * max(force[0, pair], 0.0) - sign * drag[0, pair]
         size, noise = p.static_friction * abs(force[0, pair]) + abs(drag[0, pair]), 0.0
-        # the guard is raised by the rounding error of T, because otherwise a corner could slip as soon as it sticks
+        # the guard is raised by the rounding error of the tangential force T; otherwise a corner could slip as soon as
+        # it sticks
         late = _FINEST * (p.stick_stiffness * p.leverage + p.stick_damping * p.threshold[0])
     else:
         for k in range(order - 1):
@@ -188,7 +190,8 @@ def grip_guard(p, state, w, order, pair, side) -> int:
         for k in range(1, order):
             power *= state.sigma_end
             noise = max(noise, _ROUNDING_OVER_STEP * abs(g[k]) * power)
-    # a negative first value within rounding error is set to 0, so that the higher orders decide
+    # a negative first value within rounding error is set to 0; the higher orders then decide whether the guard turns
+    # negative
     if abs(g[0]) <= _ROUNDING * size + noise:
         g[0] = max(g[0], 0.0)
     g[0] += late

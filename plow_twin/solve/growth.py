@@ -8,10 +8,12 @@ from typing import Final
 from plow_twin.kernel.arrays import copy_into
 from plow_twin.kernel.compiler import kernel
 
-#: Largest number of earlier times from which growth is followed; when it is reached, every second time is dropped.
+#: Largest number of earlier times from which growth is followed; when the number is reached, every second time is
+#: dropped.
 MOST_KEPT: Final = 256
-#: Largest number of squarings of a matrix (singular values closer than 1e-6 are not distinguished). The iteration ends
-#: earlier if the square of the matrix, scaled to trace 1, has a trace above `_RANK_ONE`, which means rank one.
+#: Largest number of squarings of a matrix; with it, singular values closer than 1e-6 are not distinguished. The
+#: iteration ends earlier if the square of the matrix, scaled to trace 1, has a trace above `_RANK_ONE`: the matrix then
+#: has rank one.
 _SQUARINGS, _RANK_ONE = 18, 1.0 - 1e-9
 
 
@@ -113,8 +115,8 @@ def _stretch_basis(matrix, basis, moved, logs) -> None:
     _multiply(matrix, basis, moved)
     for j in range(size):
         for i in range(2 * j):
-            # each vector is made orthogonal to the vectors before it twice, because doing so once leaves rounding
-            # errors
+            # each vector is made orthogonal to the vectors before it; one pass would leave rounding errors, so there
+            # are two
             before, share = i % j, 0.0
             for k in range(size):
                 share += basis[k, before] * moved[k, j]
@@ -161,7 +163,7 @@ def follow_growth(matrices, changes, ends, since, kept, whole, basis, scratch, t
         matrix, count = matrices[index], kept[0]
         grown, size = since[1], len(matrix)
         _multiply_all(matrix, since[0], count, grown)
-        # index `count` holds the product since the beginning of this stretch
+        # entry `count` of `grown` is the growth since the beginning of this stretch, which is `matrix` itself
         for k in range(size):
             copy_into(grown[k, count], matrix[k])
         ended = ends[index] == 1

@@ -93,8 +93,8 @@ def _impact_speed(number, rate, energy) -> float:
     if number <= 0.0 or (energy <= 0.0 and rate == 0.0):
         return 0.0
     full = number - math.log1p(number)
-    # `low` is the speed of an impact that has this energy at its turning point, where the rate is 0; with a rate the
-    # impact was faster
+    # `low` is the speed of an impact whose turning point, where the rate is 0, has this energy; if the rate is not 0,
+    # the impact was faster than `low`
     low = math.sqrt(number * number * energy / full)
     high = max(low, abs(rate)) * (1.0 + number)
     low = max(low, rate, -number * rate)

@@ -32,7 +32,7 @@ def _strike(point, damping, normal_arm, tangential_arm, inertia, speed, slip, ou
     normal = 1.0 + normal_arm * normal_arm / inertia
     along = 1.0 + tangential_arm * tangential_arm / inertia
     coupling = -normal_arm * tangential_arm / inertia
-    # the largest depth without damping gives the duration up to a factor near 1
+    # the largest depth of the undamped impact gives the impact's duration up to a factor near 1
     power = point.exponent + 1.0
     deepest = (power * speed * speed / (2.0 * point.stiffness * normal)) ** (1.0 / power)
     h = math.pi * deepest / (speed * _STEPS)

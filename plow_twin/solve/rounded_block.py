@@ -31,12 +31,12 @@ BLOCK = np.dtype(
 CORNERS = 4
 #: Number of steps in half a period of the stiffest contact.
 _STEPS = 70.0
-#: Least speed in m/s from which a touch gets its damping, and least and largest restitution.
+#: Least speed in m/s from which the damping of a touch is computed; least and largest restitution.
 _SLOWEST, _LEAST, _LARGEST = 0.01, 0.05, 0.9
 #: Impact speed in m/s below which restitution and friction are constant.
 _SMALLEST_IMPACT = 0.05
-#: Mobility of a corner (times the mass) to which the moving mass of an impact is related: that of a uniform square that
-#: lands on the end of an edge.
+#: Mobility of a corner (times the mass) with which an impact's moving mass is compared: the mobility of a uniform
+#: square that lands on the end of an edge.
 _USUAL_MOBILITY = 1.5
 
 

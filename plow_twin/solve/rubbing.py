@@ -16,7 +16,8 @@ from plow_twin.kernel.compiler import kernel
 from plow_twin.solve.kinematics import slip_rate
 from plow_twin.solve.state import COS, OMEGA, SIN, VX, VY, X, Y
 
-#: Least speed along the face in m/s in the factor of in-plane sliding; below it this wear falls in proportion to v.
+#: Least value in m/s of the speed v by which the factor of in-plane sliding divides; below it this wear falls in
+#: proportion to v.
 SLOWEST_TRAVEL: Final = 0.01
 
 

@@ -87,8 +87,8 @@ _STATUS_TEXT: Final = {
 }
 
 
-# These are records rather than tuples of arrays, because a kernel then gets one pointer, shapes are constants, and
-# nothing is reference counted.
+# The types below are records rather than tuples of arrays, because a kernel then gets one pointer, shapes are
+# constants, and nothing is reference counted.
 
 _ROWS: Final = MAX_ORDER + 1
 _WIDE: Final = (_ROWS, PAIR_COUNT)
@@ -120,7 +120,8 @@ _PARAM_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("penetration_rows", "f8", (5, PAIR_COUNT)),  # factors of c, s, X, Y and 1 in the penetrations
     ("arm_rows", "f8", (4, PAIR_COUNT)),  # factors of c, s, X and Y in the arms
     ("slip_rows", "f8", (4, PAIR_COUNT)),  # factors of c, s, X and Y in the corners' places along their walls
-    ("slip_arm_rows", "f8", (4, PAIR_COUNT)),  # factors of c, s, X and Y in the arms about G of forces along the walls
+    # factors of c, s, X and Y in the arms, about G, of the forces along the walls
+    ("slip_arm_rows", "f8", (4, PAIR_COUNT)),
     ("wear_per_impulse", "f8", (PAIR_COUNT,)),  # depth of each pad per impulse, k_s v / A
     ("speed_per_wear", "f8"),  # A / k_s = v / `wear_per_impulse`; 0 if sliding in the plane does not wear
     ("running_in", "f8"),  # share by which a new pad wears faster than a worn one
@@ -170,7 +171,7 @@ _OPTION_FIELDS: Final[dict[str, list[tuple[Any, ...]]]] = {
         ("damping_numbers", "f8", (RESTITUTIONS + 1,)),  # e D(e) on a grid from 0 to 1
         ("restitution", "f8"),  # restitution of impacts up to `fall_speed`
         ("fall", "f8"),  # power with which the restitution falls with the impact
-        ("fall_speed", "f8"),  # in m/s
+        ("fall_speed", "f8"),  # impact speed in m/s up to which the restitution is constant
         ("fall_mass", "f8"),  # power of the effective mass in the impact
         ("fall_along", "f8"),  # loss of restitution per speed along the wall, in s/m
     ],
@@ -202,7 +203,7 @@ _STATE_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("beyond_ramp", "i8", (PAIR_COUNT,)),  # 1 if the penetration is beyond the ramp
     ("step_start", "f8"),
     ("elapsed", "f8"),  # time since the start of the current step
-    ("step_size", "f8"),  # size of the current step, negative without a step
+    ("step_size", "f8"),  # size of the current step; negative if there is no current step
     ("sigma_end", "f8"),  # the series' variable at the step's end
     ("alpha", "f8"),  # time since the step's start: alpha sigma + beta sigma^2 / 2
     ("beta", "f8"),
@@ -211,14 +212,15 @@ _STATE_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("touch_time", "f8"),  # time of the last touch
     ("time", "f8"),  # the present time, bit for bit as the caller gave it
     ("implicit_size", "f8"),  # size of the next implicit step
-    ("decay_times", "f8"),  # number of decay times in overdamped contact since a contact changed
-    # these two fields have their values from before the current step was laid out
+    ("decay_times", "f8"),  # time in overdamped contact since a contact changed, as a number of decay times
+    # values of `implicit_size` and `decay_times` before the current step was laid out
     ("implicit_size_before", "f8"),
     ("decay_times_before", "f8"),
     ("order", "i8"),  # order of the series of the current step
     ("event_pair", "i8"),  # the pair whose event ends the step, or -1
     ("event_mode", "i8"),  # the mode of this pair after the event
-    ("touching", "i8"),  # bits of pairs that touch at the step's start, whose series need the square root of time
+    # a bit for each pair that touches at the step's start; the series of these pairs need the square root of time
+    ("touching", "i8"),
     ("events_at_once", "i8"),  # number of events at the present instant so far
     ("piece", "i8"),  # index of the sampled load's present piece
     ("ends_at_stop", "i8"),  # 1 if the step ends at `stop_time`
@@ -226,7 +228,7 @@ _STATE_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("refused_before", "i8"),  # `refused` before the current step was laid out
     ("in_flight", "i8"),  # 1 if the current step is a step of free flight
     ("at_rest", "i8"),  # 1 if the current step is a step of rest
-    # counted since the start
+    # the following numbers count from the start of the motion
     ("steps", "i8"),
     ("evaluations", "i8"),  # number of evaluations of the equations of motion, one for each order of a series
     ("events", "i8"),
@@ -241,7 +243,8 @@ _GRIP_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("anchor", "f8", (PAIR_COUNT,)),  # place along the wall in m where a sticking corner's spring is slack
     ("grip", "i8", (PAIR_COUNT,)),  # 0 sticks, 1 slips forward, -1 backward
 ]
-#: A frame on springs: its displacement x, y, theta from equilibrium and their rates; `y` is relative to the frame.
+#: A frame on springs: its displacement x, y, theta from equilibrium and their rates. With this field, `State.y` is
+#: relative to the frame.
 _FRAME_FIELDS: Final[list[tuple[Any, ...]]] = [("frame", "f8", (6,))]
 
 #: Scratch space, mainly the series of one step. Rows are orders; the eight columns (SIMD lanes) are state components or
@@ -252,7 +255,7 @@ WORK: Final = np.dtype(
         ("left", "f8", _WIDE),  # first factors of the Cauchy products
         ("right", "f8", _WIDE),
         ("penetration", "f8", _WIDE),  # penetration
-        ("rate", "f8", _WIDE),  # rate of the penetration in time
+        ("rate", "f8", _WIDE),  # time derivative of the penetration
         ("arm", "f8", _WIDE),
         ("damped", "f8", _WIDE),  # ramped damping only: the ramp times the rate
         ("force", "f8", _WIDE),
@@ -272,7 +275,7 @@ WORK: Final = np.dtype(
         ("moved", "f8", (STATE_SIZE,)),
         ("saved", "f8", (2, PAIR_COUNT)),  # body coordinates and wear depth at the start of an advance
         ("read", "f8", (3, PAIR_COUNT)),  # body coordinates, rate and wear depth at a time of output
-        ("frame_now", "f8", (6,)),  # state of the frame at the last reading of the motion
+        ("frame_now", "f8", (6,)),  # state of the frame when the motion was last read
         ("frame_saved", "f8", (6,)),  # state of the frame at the start of an advance
         ("load", "f8", (3, _ROWS)),  # S1, S2, M
         ("world", "f8", (4, _ROWS)),  # forces per mass in head and world axes
@@ -296,7 +299,7 @@ WORK: Final = np.dtype(
     ]
 )
 
-#: Sums over the motion since the last clearing.
+#: Sums over the motion since they were last cleared.
 TOTALS: Final = np.dtype(
     [
         ("peak", "f8", (PAIR_COUNT,)),
@@ -312,7 +315,7 @@ TOTALS: Final = np.dtype(
 FOLLOWED: Final = 1
 WITH_INTERVALS: Final = 2
 
-#: The motion at a time and the sums since the row before, as passed from the solver to the messages.
+#: The motion at a time and the sums since the previous row; the solver passes these rows on to the messages.
 ROW: Final = np.dtype(
     [
         ("t", "f8"),
@@ -326,18 +329,19 @@ ROW: Final = np.dtype(
         ("status", "i8"),
         ("error_estimate", "f8"),
         # in a published row (`solve.totals.publish`) `makes` counts touches since the beginning; impulse and peak cover
-        # the time since the publication before
+        # the time since the previous publication
         ("stamp_ns", "i8"),
-        ("samples", "i8"),  # number of advances that ended at a sample since the publication before
+        ("samples", "i8"),  # number of advances that ended at a sample since the previous publication
         ("measured_peak", "f8", (PAIR_COUNT,)),  # largest force in these advances
         ("held", "i8"),  # 1 if the motion at the stamp was computed with held loads, without a sample
-        ("corrected", "i8"),  # 1 if late samples have changed the motion since the publication before
-        ("marked", "i8"),  # 1 if `held` or `corrected` is 1, here or in the publication before
+        ("corrected", "i8"),  # 1 if late samples have changed the motion since the previous publication
+        ("marked", "i8"),  # 1 if `held` or `corrected` is 1, in this or in the previous publication
         ("orientation", "f8", (2,)),  # z and w of the head's quaternion
         ("twist", "f8", (3,)),  # rates along the head's own axes [m/s], and about z [rad/s]
-        # these fields are written if the motion follows measurements. They are 5 % and 95 % quantiles over the drawn
-        # twins (for peak and impulse since the publication before), and the clearances [m] with their quantiles
-        ("followed", "i8"),  # `FOLLOWED`: clearances are filled; `WITH_INTERVALS`: all fields are filled
+        # the following fields are written if the motion follows measurements. They are the 5 % and 95 % quantiles over
+        # the drawn twins, and the clearances [m] with their quantiles. Quantiles of peak and impulse cover the time
+        # since the previous publication
+        ("followed", "i8"),  # `FOLLOWED` if only the clearances are filled, `WITH_INTERVALS` if all fields are filled
         *((f"{name}_{end}", "f8", (PAIR_COUNT,)) for name in ("force", "peak", "impulse") for end in ("low", "high")),
         ("known_clearance", "f8", (6,)),  # horizontal, then vertical clearance, each with its quantiles
     ]
@@ -350,7 +354,8 @@ Totals: TypeAlias = np.record
 Implicit: TypeAlias = np.record
 
 
-#: A harmonic load per mass and inertia: sine and cosine amplitudes of forces S1 and S2 along `direction`, of moment M.
+#: A harmonic load per mass and inertia: sine and cosine amplitudes of the forces S1 and S2 along `Params.direction`,
+#: and of the moment M.
 HARMONIC: Final = np.dtype([("omega", "f8"), ("first", "f8", (2,)), ("second", "f8", (2,)), ("moment", "f8", (2,))])
 
 #: A linear piece of a load per mass and inertia: its value at the knot and its slope from there on.
@@ -403,19 +408,19 @@ BOUND: Final = np.dtype(
         ("error", "f8"),  # estimated error of the advance in m, 0 if the limit was not reached
         ("z", "f8", (6, 12)),  # state, trial state and four stages, of the head and of a frame on springs
         ("load", "f8", (3,)),
-        ("pairs", "f8", (4, PAIR_COUNT)),  # penetration, rate, force, and force at the step before
+        ("pairs", "f8", (4, PAIR_COUNT)),  # penetration, rate, force, and force at the previous step
     ]
 )
 
 #: One change of contact: time in s, pair, modes before and after, rate of penetration in m/s.
 EVENT: Final = np.dtype([("time", "f8"), ("pair", "i8"), ("mode_from", "i8"), ("mode_to", "i8"), ("rate", "f8")])
 
-#: Progress of a call for many advances, which returns after each slice of work.
+#: Progress of a call that makes many advances; the call returns after each slice of work.
 PACE: Final = np.dtype(
     [
-        ("slice", "i8"),  # steps of a slice
-        ("left", "i8"),  # steps left of the slice
-        ("row", "i8"),  # index of the next advance, counted through one member after another
+        ("slice", "i8"),  # number of steps in a slice
+        ("left", "i8"),  # number of steps left in the slice
+        ("row", "i8"),  # index of the next advance; all advances of one member come before those of the next member
         ("underway", "i8"),  # 1 if this advance has begun
         ("mark", "i8"),  # index of the next mark
         ("failed", "i8"),  # number of failed advances

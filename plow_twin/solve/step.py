@@ -32,7 +32,7 @@ METHODS: Final[tuple[Method, ...]] = (flight, rest, implicit, taylor)
 LONGEST_STEP = 100.0
 #: Step in sigma beyond an instant at which modes would change back and forth without end.
 PAST_AN_INSTANT = 1e-9
-#: Largest relative difference of two times that are taken as the same instant; it covers some rounding errors.
+#: Two times are the same instant if their relative difference is at most this, which covers some rounding errors.
 ONE_INSTANT = 1e-15
 
 

@@ -48,7 +48,8 @@ _OF_PAIRS: Final = (PAIR_COUNT, _ROWS, WIDTH)
 COLUMNS: Final = np.dtype(
     [
         ("series", "f8", (6, _ROWS, WIDTH)),
-        ("depth", "f8", _OF_PAIRS),  # pairs that act: changes of penetration, of its rate, of force
+        # for pairs that act: change of penetration; `rate` and `force` hold the changes of its rate and of the force
+        ("depth", "f8", _OF_PAIRS),
         ("rate", "f8", _OF_PAIRS),
         ("force", "f8", _OF_PAIRS),
         ("load", "f8", (3, _ROWS, WIDTH)),  # change of the load per mass and inertia, in world axes
@@ -79,7 +80,7 @@ ALONG: Final = np.dtype(
         ("damped", "f8", (_ROWS, PAIR_COUNT)),  # d^n d'
         ("push", "f8", (4, _ROWS)),  # fx, fy, derivative of the moment with respect to the angle, -fy
         ("mode", "i8", (PAIR_COUNT,)),  # modes before the step's event
-        ("waiting", "i8"),  # number of ends in a row at which no stretch began
+        ("waiting", "i8"),  # number of consecutive ends of stretches at which no new stretch began
     ]
 )
 Along: TypeAlias = np.record

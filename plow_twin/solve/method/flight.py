@@ -15,7 +15,7 @@ from plow_twin.kernel.compiler import kernel
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.kinematics import penetration_of, to_body, to_world
 
-#: Least phase of the fastest harmonic [rad] over a flight; a step of a series covers a phase of about 2 rad.
+#: A flight must cover at least this phase [rad] of the fastest harmonic; a step of a series covers about 2 rad.
 _LEAST_PHASE = 8.0
 #: Largest distance that the head may move in a flight, as a share of the smallest gap.
 _SAFE = 0.9
@@ -106,7 +106,8 @@ def safe_time(p, harmonics, state, w, span) -> float:
     z = w.flight[0]
     to_world(p, state.y, z)
     _bounds(p, harmonics, state.step_start, z, w)
-    # the walls turn with the head about its centre of mass, so the leverage includes the head's place
+    # the walls turn with the head about its centre of mass, so the leverage includes the head's distance from the
+    # centre
     leverage = p.leverage + math.hypot(z[0], z[1]) + max(gap, 0.0)
     time = span
     while time >= least:

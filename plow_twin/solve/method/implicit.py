@@ -56,7 +56,7 @@ OVERDAMPED_RATIO = 20.0
 #: Cost of an implicit step, as a number of explicit steps; an implicit step must be longer than this number of stable
 #: explicit steps.
 _WORTH = 30.0
-#: Factor on the admissible error of an implicit step compared with an explicit step, since it replaces many of them.
+#: An implicit step may have this many times the error of an explicit step, because it replaces many explicit steps.
 _GAIN = 100.0
 #: Rounding error of a velocity, as a share of the largest velocity; smaller errors are always admissible.
 _NOISE = 1e-12
@@ -391,7 +391,8 @@ def _solve(p, acts, support, state, t, h, implicit, wear, sliding, running_in) -
                 * p.velocity_tolerance
                 / p.position_tolerance
             )
-        # convergence is quadratic, so the iteration ends with the first iterate that does not improve
+        # convergence is quadratic: once an iterate no longer improves, the iteration has reached rounding error and
+        # ends
         if change < 1e-14 * p.threshold[0] or (change < 0.1 * p.velocity_tolerance and change > 0.1 * before):
             _places(implicit, h)
             return True
@@ -602,7 +603,8 @@ def note_step(implicit, state, w, step_size, has_event) -> None:
     if implicit is not None:
         note_decay(state, w.decay[0], step_size)
         if has_event:
-            # the polynomial of a long step can show a false event if a pair only comes close to its wall
+            # if a pair only comes close to its wall, the polynomial of a long step can show a false event; the next
+            # step is therefore at most four times as long as this step
             state.implicit_size = min(state.implicit_size, 4.0 * step_size)
 
 
@@ -634,7 +636,7 @@ def _collocate(p, parts, support, state, w, span, decay, implicit, ramp, wear, s
             size = _write_series(p, support, state, h, w, implicit, ramp, wear, stick)
             better = 0.9 * (admissible / max(size, 1e-6 * admissible)) ** (1.0 / (STAGES - 1))
             if size <= admissible:
-                # if a sample has cut the step short, the previous size is still a good guess
+                # a sample may have cut the step short; the previous size is then still a good guess
                 longer = h * min(better, 4.0)
                 state.implicit_size = max(longer, state.implicit_size) if h == span else longer
                 state.implicit_steps += 1

@@ -20,11 +20,11 @@ from plow_twin.solve.method.equilibrium import held, stiffer_than, stiffness_at,
 from plow_twin.solve.method.small_harmonics import EVALUATIONS, stays_at_rest, without_harmonics
 from plow_twin.solve.state import OMEGA, ON, VX, VY
 
-#: Largest omitted motion, as a share of the tolerances.
+#: Largest motion that a step of rest may omit, as a share of the tolerances.
 _SHARE = 1e-3
 #: Least penetration or gap of every pair, as a multiple of the largest omitted motion.
 _MARGIN = 10.0
-#: Least penetration or gap in m, for the difference quotients of the stiffness.
+#: Least penetration or gap in m of every pair, so that difference quotients for the stiffness can be computed.
 _DEEP = 1e-7
 #: Largest number of evaluations of the equations of motion in the check.
 AT_REST = 5 + EVALUATIONS
@@ -63,7 +63,7 @@ def _still(p, acts, harmonics, state, w) -> bool:
     without_harmonics(p, harmonics, state.step_start, rate, w.rest[3, 3:])
     if not stiffer_than(w.hessian, 0.0):
         return False
-    # the energy bounds the speed, and with the least stiffness the distance from equilibrium
+    # the energy bounds the speed; together with the least stiffness it also bounds the distance from equilibrium
     energy = speed * speed + to_equilibrium(w.hessian, rate, z, gyration)
     if not (2.0 * energy < fast * fast and stiffer_than(w.hessian, 2.0 * energy / (way * way))):
         return False

@@ -591,7 +591,7 @@ def expand(
         here = rates * steady + before * bent
         before = rates
         if k > 0 and load_terms[2] is None:
-            # the size comes last, because the next order does not wait for it
+            # the size of this order is computed last, because the next order does not depend on it
             size = _size(p, w, k, penetrating, sigma_limit, wear, support, *rub_terms)
             w.term_size[k] = size
             reach *= sigma_limit

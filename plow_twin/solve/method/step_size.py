@@ -14,17 +14,17 @@ from plow_twin.solve.method.series import expand, expand_harmonics, one_by_one
 from plow_twin.solve.modes import penetration_and_rate
 from plow_twin.solve.state import CLIPPED, ON
 
-#: The parting of a pair is searched for within this many steps of the last size, with a series of this order.
+#: The search for a pair's parting reaches over this many steps of the last size, and uses a series of this order.
 PARTING_REACH, PARTING_ORDER = 1.3, 6
-#: The same reach under friction with stick, whose guards make steps shorter.
+#: This reach under friction with stick, whose guards make steps shorter.
 _PARTING_REACH_STICK = 8.0
-#: Largest number of Newton steps to the parting, and the relative change at which they end; the next step corrects the
-#: error.
+#: Largest number of Newton steps to the parting, and the relative change at which they end. The next step corrects the
+#: remaining error.
 _NEWTON_STEPS, _ROOT_FOUND = 6, 1e-9
 #: Largest usable term; products of larger terms would not be finite.
 _FINITE = 1e300
-#: Largest number of times that a step is shortened (its largest term shrinks too), and the factor above which
-#: shortening ends.
+#: Largest number of times that a step is shortened; it is repeated, because the largest term of the shorter step is
+#: smaller too. Shortening ends when a step would keep at least the share `_SHORT_ENOUGH` of its size.
 _SHORTER, _SHORT_ENOUGH = 20, 0.9
 
 
@@ -43,7 +43,8 @@ def accurate_step(p, w, order, sigma_limit):
         if size > 0.0:
             least = min(least, math.log(p.threshold[k] / size) / k)
     sigma = min(sigma_limit, math.exp(least))
-    # over a long step an error of velocity becomes an error of position
+    # over a long step an admissible error of velocity becomes too large an error of position; the step is then
+    # shortened
     stretch = sigma * p.velocity_tolerance / (p.position_tolerance * (order + 1))
     if stretch > 1.0 and sigma < sigma_limit:
         sigma *= math.exp(-math.log(stretch) / order)

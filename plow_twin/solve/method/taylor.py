@@ -62,14 +62,14 @@ def _choose_map(p, parts, fraction, stick, state, w, span, penetrating):
     if fraction is None:
         return span, True
     if state.touching != 0:
-        # a force that starts like d^1.5 is analytic in the square root of time
+        # from a touch on, a force like d^1.5 is analytic in the square root of the time since the touch
         state.alpha, state.beta = 0.0, 2.0
         return math.sqrt(span), True
     if not penetrating or p.exponent != 1.5:
         return span, True
     parting = time_to_separation(p, parts, state, w, span, parts.harmonics, stick)
     if parting > 0.0:
-        # a force that ends like d^1.5 is analytic in the square root of the time left
+        # up to the parting, a force like d^1.5 is analytic in the square root of the time left
         root = math.sqrt(parting)
         state.alpha, state.beta = 2.0 * root, -2.0
         return (root if parting <= span else root - math.sqrt(parting - span)), parting > span
