@@ -29,7 +29,7 @@ class Compiles(event.Listener):
 
     def on_end(self, event: Any) -> None:
         took = time.thread_time() - self._begun.pop()
-        if not self._begun:  # the time of a kernel that is compiled for another kernel is part of the other's time
+        if not self._begun:  # a kernel compiled during the compilation of another is part of the other's time
             function = event.data["dispatcher"].py_func
             self._test.append((PROPERTY, (took, f"{function.__module__}.{function.__qualname__}")))
 
@@ -38,7 +38,7 @@ class Compiles(event.Listener):
         self._test = item.user_properties
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        if report.when == "teardown":  # earlier reports of a test hold only part of its kernels
+        if report.when == "teardown":  # only this report, the test's last, holds all kernels of the test
             for name, value in report.user_properties:
                 if name == PROPERTY:
                     self._found.append((*value, report.nodeid))  # type: ignore[misc]

@@ -27,17 +27,18 @@ def _prepare_environment() -> None:
     """Set the environment that child processes inherit, before rclpy and numpy are imported."""
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.environ.pop("ROS_LOCALHOST_ONLY", None)
-    # domains 1..101 avoid the ephemeral ports; each process of each run has its own domain
+    # ROS domains 1 to 101 use no ephemeral ports; each process of each run has its own domain
     worker = os.environ.get("PYTEST_XDIST_WORKER", "")
     number = 8 * (os.getppid() if worker else os.getpid()) + int(worker.removeprefix("gw") or 0)
     os.environ["ROS_DOMAIN_ID"] = str(1 + number % 101)
-    # the processes of a suite use all cores, so more threads of linear algebra would only load the cores while they
-    # wait for each other
+    # the processes of a suite use all cores already; further threads of linear algebra would only wait for each other,
+    # and load the cores meanwhile
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
     logs = tempfile.mkdtemp(prefix="plow_twin-ros-log-")
     atexit.register(shutil.rmtree, logs, ignore_errors=True)
     os.environ["ROS_LOG_DIR"] = logs
-    # a suite that a shell has started in the background ignores Ctrl-C, even in the tests that send it
+    # if a shell has started the suite in the background, SIGINT is ignored; the tests that send SIGINT need Python's
+    # handler
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 

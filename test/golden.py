@@ -27,7 +27,7 @@ from plow_twin.model.loads import compile_loads
 
 Figures = dict[str, Any]
 
-#: Damping of the laws that take one, for the head of a bench scene.
+#: Damping for the laws that have this parameter, with the head of a bench scene.
 _DAMPING = {"kelvin_voigt": 6e4, "ramped_damping": 6e4}
 
 

@@ -147,8 +147,8 @@ MADE: dict[str, Callable[[Path], object]] = {
     "channels.mcap": lambda path: path.write_bytes(
         run(more=b"".join(channel(n % 65536, 1, f"/t{n}") for n in range(100_000)))
     ),
-    # two files of 170 kB that unpack to 5 GB: in the first each chunk is too large, in the second only the sum
-    # of the chunks
+    # two files of 170 kB that unpack to 5 GB: in the first each chunk is too large; in the second only the sum of the
+    # chunks is too large
     "large_chunks.mcap": lambda path: path.write_bytes(run(more=20 * chunk(bytes(250 * 2**20)))),
     "many_chunks.mcap": lambda path: path.write_bytes(run(more=100 * chunk(bytes(50 * 2**20)))),
     "lying_zstd.mcap": lambda path: path.write_bytes(

@@ -25,7 +25,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from plow_twin.ros.messages import set_stamp
 
 with warnings.catch_warnings():
-    # the wheels' parser of message definitions uses a deprecated module of the standard library
+    # in the ROS wheels, the parser of message definitions uses a deprecated module, so importing it gives a warning
     warnings.simplefilter("ignore", DeprecationWarning)
     import rosidl_generator_py  # noqa: F401
 
@@ -34,7 +34,8 @@ ROOT = Path(__file__).resolve().parent.parent
 START_S = 200.0
 #: Time [s] that is long enough for discovery on a machine that does other work.
 WAIT_S = 60.0
-#: Twice the longest time that a stop took while three processes shared two cores [s].
+#: Time within which a process must stop [s]. It is twice the longest time measured while three processes shared two
+#: cores.
 STOP_S = 10.0
 _numbers = itertools.count()
 
@@ -187,7 +188,8 @@ class Probe:
             self._executor.spin_once(timeout_sec=0.02)
 
     def call(self, kind: type, service: str, request: Any) -> Any:
-        # one client makes all calls, because the answer to a client that the server has not yet discovered is lost
+        # the answer to a client that the server has not yet discovered is lost, so each service has one client, which
+        # makes all calls
         if service not in self._clients:
             self._clients[service] = self.node.create_client(kind, service)
         client = self._clients[service]

@@ -67,7 +67,8 @@ def test_a_feed_without_a_reader_does_not_wait_and_keeps_the_peaks() -> None:
             updates.append(update)
         feed.turn()
         updates.append(far.receive() or {})
-        # the first update has the facts; the first update after a refusal has the largest force of the refused updates
+        # the first update contains the facts; the first update after a refusal contains the largest force of the
+        # refused updates
         assert updates[0]["facts"]["can_ask"] is False and len(updates) == feed.taken
         assert max(update["motion"]["peak"][0] for update in updates) == 7e5
         assert updates[-1]["not_taken"] == feed.not_taken and updates[-1]["motion"]["t"] == pytest.approx(2.999)

@@ -11,7 +11,7 @@ import griffe
 import pytest
 from scenes import ROOT
 
-#: Pattern of a field whose declaration in the source has its unit and meaning; the site shows both.
+#: Pattern of a field's declaration that gives the unit and the meaning of the field; the site shows both.
 DECLARED = re.compile(r"_(quantity|choice)\(")
 DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 ARRAYS = re.compile(r"NDArray|ArrayLike|\bArray\b")

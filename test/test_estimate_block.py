@@ -19,7 +19,8 @@ from plow_twin.study.measured.drops import Drops
 
 DATA = Path(__file__).resolve().parent.parent / "benchmark" / "data" / "measured" / "square_drops.npz"
 SQUARE = load_scene("measured_square")
-#: Prior deviation of the clearance in m. The height of the table is half of the clearance, so it is known to 5 mm.
+#: Standard deviation of the clearance's prior in m. The table's height is half of the clearance, so the prior knows the
+#: height to 5 mm.
 DEVIATION = 0.01
 
 

@@ -212,7 +212,7 @@ def test_what_a_hard_motion_hides_widens_the_clearances_and_not_the_twins() -> N
     assert back.apparent == result.apparent
     scenes, _ = draw_scenes(truth.nominal, back, 50, np.random.default_rng(0))
     assert np.std([scene.clearance.horizontal_m for scene in scenes]) < 7e-5
-    # nothing is added for round corners, because a deviation of the sides that the scene states covers the corners
+    # the scene states a deviation of the sides; this also covers the corners, so nothing is added for round corners
     exact = Provenance(Mark.MEASURED, deviation=0.0)
     marks = {**truth.nominal.marks, "frame.width_m": exact, "frame.height_m": exact}
     stated = replace(unknowns, scene=replace(truth.nominal, marks=marks))
@@ -260,6 +260,6 @@ def test_the_regression_gives_the_value_at_the_measured_features() -> None:
     found = regress_near(features, targets, np.array([0.5, 0.2, 0.0]))
     assert found.value[0] == pytest.approx(2.3, abs=0.1)
     assert 0.05 < found.deviation[0] < 0.2
-    # the deviation includes the part of the relation that is not linear
+    # the relation is partly nonlinear, and the deviation includes what a line leaves over
     assert found.deviation[1] > 0.2
     assert found.distance < 1.5 < regress_near(features, targets, np.full(3, 6.0)).distance

@@ -49,7 +49,7 @@ def test_a_thinned_load_gives_the_same_forces(noise: float) -> None:
     load = Load(t, wrench)
     few = followed(load, truth.load.period())
     assert len(few.t) < 0.3 * len(t)
-    # with both loads the forces begin 3.1 s after the first sample, however dense the samples are
+    # one load has fewer samples than the other, but with both the forces begin 3.1 s after the first sample
     each = [forces_of(truth.nominal, result, one, 60, 3.1, over_time=False) for one in (load, few)]
     assert each[0].start == each[1].start == pytest.approx(3.1)
     for one, other in ((each[0].peak, each[1].peak), (each[0].impulse, each[1].impulse)):
@@ -64,7 +64,7 @@ def test_members_are_drawn_with_the_estimate_s_correlation() -> None:
     scenes, gains = draw_scenes(truth.nominal, drawn, 2000, np.random.default_rng(1))
     clearance = np.array([scene.clearance.horizontal_m for scene in scenes])
     stiffness = np.log([scene.contact.stiffness for scene in scenes])
-    # a smaller clearance comes with a softer contact
+    # clearance and stiffness are correlated: a member with a smaller clearance has a softer contact
     assert np.corrcoef(clearance, stiffness)[0, 1] == pytest.approx(0.8, abs=0.04)
     ends = drawn.horizontal.p05, drawn.horizontal.p95
     assert np.quantile(clearance, [0.05, 0.95]) == pytest.approx(ends, abs=0.05 * (ends[1] - ends[0]))

@@ -107,7 +107,7 @@ def test_intervals_hold_from_the_first_row_on_and_narrow(truth: Truth, followed:
     for axis, true in enumerate(truth.clearance):
         value, low, high = clearance[:, axis].T
         assert ((low <= true) & (true <= high)).mean() > 0.85
-        assert 0.02 < high[0] - low[0] < 0.04  # the width of the prior's interval
+        assert 0.02 < high[0] - low[0] < 0.04  # at the start the interval is as wide as the prior's
         assert (low <= value).all() and (value <= high).all()
         assert high[-1] - low[-1] < 1e-3
 
@@ -261,7 +261,7 @@ def test_a_machine_without_gravity_is_steered_too(truth: Truth, monkeypatch: pyt
     monkeypatch.setattr(TwinBatch, "move", counted)
     nominal = replace(truth.nominal, gravity=replace(truth.nominal.gravity, acceleration_m_s2=0.0))
     _run(Follower(nominal, MEMBERS), truth, 1.0)
-    # if the limit of a wall's force were a share of the weight, which is zero here, hardly any member would be moved
+    # hardly any member would be moved if a wall's force were limited to a share of the weight, which is zero here
     assert np.mean(moved) > MEMBERS / 3
 
 
@@ -292,7 +292,7 @@ def test_stiffness_and_gains_of_a_hard_contact_are_learned_from_the_poses() -> N
     follower.span()
     _run(follower, truth, 5.0, 4.0)
     peak = simulate(truth.scene, 5.0, 1e-4, 1e-6).force[40_000:].max()
-    # with the estimate's stiffness the peak would be less than half as large
+    # twins with the estimate's stiffness would have a peak less than half as large
     assert follower.span().peak[0].max() == pytest.approx(peak, rel=0.25)
     # a twin that follows by its parameters alone keeps the learned parameters
     follower.follow_parameters()

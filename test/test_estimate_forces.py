@@ -120,7 +120,7 @@ def test_a_folder_without_forces_runs_no_code_of_forces(
 ) -> None:
     short = replace(truth, load=truth.load.between(0.0, 4.0), poses=truth.poses.between(0.0, 4.0), forces=None)
     short.write(tmp_path)
-    # files that `--out` writes are not measurements
+    # `--out` writes a file of this name with computed forces, so this file is not read as a measurement
     (tmp_path / "forces.csv").write_text("t,force_top_left_top/p05\n0,1\n")
     for name in ("contact_forces", "force_fit"):
         monkeypatch.setitem(sys.modules, f"plow_twin.estimate.{name}", None)  # an import of this module now fails

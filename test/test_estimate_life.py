@@ -53,7 +53,7 @@ def test_the_jump_agrees_with_the_direct_run_with_sliding_in_the_plane_and_runni
     assert path.depth[-1] == pytest.approx(direct, rel=0.03, abs=1e-5)
     travel_only = wear_path(replace(preset("paper"), wear=replace(slow, sliding="travel")), (1.0, 1.0), exposure)
     assert direct.max() > 1.5 * travel_only.depth[-1].max() > 1e-4
-    # the same path is valid for a quarter of the coefficient, with which running-in is not yet complete
+    # with a quarter of the coefficient running-in is not yet complete, but the same path is valid
     quarter = simulate(replace(scene, wear=replace(scene.wear, coefficient_m2_n=7.5e-10)), span, span, 1e-6).wear_depth
     early = [np.interp(0.25 * exposure, path.exposure, pad) for pad in path.depth.T]
     assert early == pytest.approx(quarter, rel=0.05, abs=1e-5)
@@ -79,7 +79,7 @@ def test_quantiles_scale_with_the_coefficient_and_the_horizon_cuts(tmp_path: Pat
     life = forecast(scene, plan)
     p10, p50, p90 = (life.quantile(share) for share in (0.1, 0.5, 0.9))
     assert p10 is not None and p50 is not None and p90 is not None and p10 < p50 < p90
-    # the prior is log-normal, which determines the ratio of the 10 % and 90 % points of 1/k_s
+    # the prior of k_s is log-normal, which determines the ratio of the 10 % and 90 % points of 1/k_s
     assert np.log(p90 / p10) == pytest.approx(np.log(4.0) * 1.2816 / 1.6449, rel=0.1)
     doubled = replace(scene, wear=replace(slow, prior_m2_n=(1e-14, 4e-14)))
     assert forecast(doubled, plan).quantile(0.5) == pytest.approx(0.5 * p50, rel=0.02)
@@ -101,7 +101,7 @@ def test_quantiles_scale_with_the_coefficient_and_the_horizon_cuts(tmp_path: Pat
     assert other["p50"]["hours"] < 0.55 * facts["p50"]["hours"]
     assert other["probability_before_stop"] >= facts["probability_before_stop"]
     assert picture.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
-    # just before the median time at which a limit is reached, a clearance is at its limit
+    # just before the median time at which a limit is reached, one clearance has nearly reached its limit
     now = life.clearances(np.zeros(1))[1, 0]
     assert now == pytest.approx([0.025, 0.030], abs=1e-9)
     late = life.clearances(np.array([0.99 * p50]))[1, 0]
@@ -116,7 +116,7 @@ def test_scenarios_are_forecasts_of_their_own_from_the_same_draws() -> None:
     alone = forecast(scene, replace(plan, scenarios=()))
     assert np.array_equal(found.hours, alone.hours)
     assert found.scenarios["dry"].hours == pytest.approx(2.0 * found.hours, rel=1e-2)
-    # the force grows with the load, by a share that depends on the contact
+    # a heavier load makes larger forces and a shorter life; how much shorter depends on the contact
     middle, sooner = found.quantile(0.5), found.scenarios["heavy"].quantile(0.5)
     assert middle is not None and sooner is not None and 0.6 * middle < sooner < 0.95 * middle
     for text in ("no numbers:load", "a:speed=2", "b:load=0", ":load=2", "c:load=nan"):
@@ -164,7 +164,8 @@ def test_of_a_run_the_pads_as_it_left_them_count_and_no_estimate_of_others(tmp_p
     scene, newest = left_by(RunReader(tmp_path / "set"))
     assert newest is None and scene.clearance.vertical_m == 0.031
     assert scene.wear is not None and scene.wear.initial_depth_m == pytest.approx(depth, abs=1e-12)
-    # the first snapshot of a run contains its initial wear, which comes from the folder of the wear
+    # the first snapshot of a run contains the wear at the run's start, which may come from wear_state_path instead of
+    # the scene
     session = Session(Twin(scene, excitation="sampled"), wear_depth=depth)
     record_run(tmp_path / "kept", [session.snapshot(), paper_sample(0), of_old_pads], wear=Wear(1e-14, 0.015, 2.0))
     scene, newest = left_by(RunReader(tmp_path / "kept"))
@@ -200,11 +201,11 @@ def test_a_history_of_clearances_determines_the_coefficient(tmp_path: Path, caps
     known = coefficient(scene, history)
     found = known.interval()
     assert found.p05 < true_k < found.p95 and found.p95 / found.p05 < 1.3**2
-    # even clearances without noise do not make the path certain
+    # clearances without noise would leave a single value, but the path itself is uncertain, so the interval stays wide
     sure = replace(known, weight=np.eye(len(known.value))[len(known.value) // 2]).interval()
     assert sure.p95 / sure.p05 > math.exp(3.2 * tuning.PATH_DEVIATION)
     assert np.abs(known.clearance - [0.025, 0.030] - grown[-1]).max() < 4.0 * noise
-    # the forecast continues along the path with its unequally worn pads
+    # the forecast continues along the path with the present depths of the pads, which have worn unequally
     assert known.depth == pytest.approx(depth[-1], rel=0.1, abs=5e-5)
     ahead = with_clearances(scene, *map(float, known.clearance), known.depth)
     assert ahead.wear is not None and ahead.wear.initial_depth_m == pytest.approx(known.depth)
@@ -301,7 +302,7 @@ def test_unusable_input_of_a_forecast_is_refused_and_not_left_out(
     scene = replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0, prior_m2_n=(5e-15, 2e-14)))
     file, found, history = (tmp_path / name for name in ("scene.yaml", "estimate.json", "history.csv"))
     file.write_text(dump_scene(scene))
-    # a spreadsheet program writes the history like this
+    # a spreadsheet program may write the history with a byte order mark, semicolons and decimal commas
     sheet = "\ufeffkm;horizontal_mm;horizontal_sd_mm;vertical_mm;vertical_sd_mm\n0,0;25;1;30;1\n9;25;1;30;1\n"
     history.write_text(sheet)
     limits = ["--limit-horizontal", "28", "--limit-vertical", "34"]

@@ -48,7 +48,7 @@ from estimate_truths import GROUPS, Truth, draw
 #: Stamp of the first sample [ns].
 START_NS = 1_700_000_000_000_000_000
 WINDOW_S, INTERVAL_S, WAIT_S = 10.0, 4.0, 2.0
-#: Settings with which a busy machine loses no sample and no pose: with missing rows a window would differ.
+#: Settings with which a busy machine loses no sample and no pose. If rows were missing, a window would differ.
 RELIABLE = {
     f"qos_overrides.{{ns}}/{topic}.subscription.reliability": "reliable"
     for topic in ("excitation", "head_pose", "gaps")
@@ -195,7 +195,7 @@ def test_the_live_estimate_is_published_and_given_again_by_the_journal(tmp_path:
     facts = json.loads(done.stdout)
     assert facts["live"]["repeated"] is True and facts["live"]["estimates"] >= 1
     assert facts["horizontal"]["mean_m"] == found["horizontal"]
-    # gaps were measured too, and give the clearances of the groups of pads
+    # gaps were measured too, so there are also clearances of the groups of pads
     group = facts["groups"]["horizontal_top"]
     assert group["mean_m"] == pytest.approx(truth.clearance[0], abs=3e-4) and group["p95_m"] - group["p05_m"] > 4e-4
     # forecast and forces depend on the estimate, and are the same too
@@ -236,7 +236,7 @@ def test_an_estimate_stays_until_it_is_withdrawn_or_the_pads_are_changed() -> No
     assert [now[f"horizontal{point}"] for point in ("", "/p05", "/p95")] == pytest.approx(
         [0.02, 0.019, 0.021], abs=1e-6
     )
-    # a late sample takes the model back to a time before the estimate; the estimate remains
+    # a late sample takes the model back to a time before the estimate, but the estimate stays in force
     clearance(0.6)
     session.apply(Sample(START_NS + 100_000_000, (4e4, -1e4, 0.0)))
     later = clearance(1.8)
@@ -283,7 +283,7 @@ def test_other_pads_and_other_model_numbers_discard_earlier_estimates(
         return estimation.poll(session)
 
     assert told()["forecast"].name == ("seconds/p50",)
-    # an estimate of the previous machine is being computed
+    # while the model is changed, an estimate of the previous machine is still being computed
     estimation.worker.found.append(_found(State.ESTIMATED, State.ESTIMATED))
     session.apply(SetModel(START_NS, json.dumps({"clearance.horizontal_m": 0.026})))
     # the clearance is that of the model again, because an estimate is not kept if the other clearance is not observable
@@ -402,7 +402,7 @@ def test_of_a_file_that_ends_the_last_window_is_estimated_or_too_few_data_are_na
         )
         assert found == []
         return
-    last_s = truth.load.t[-1] + 1.0  # stamps that begin at 0 are moved by a second
+    last_s = truth.load.t[-1] + 1.0  # stamps that begin at 0 are moved by a second, so the data end a second later
     window = found[-1].window
     assert window is not None and window.end_ns == pytest.approx(last_s * 1e9 + 1, abs=1.0)
     assert "Estimate of the window" in shown.out and "horizontal clearance" in shown.out.lower()

@@ -51,7 +51,7 @@ def test_spikes_and_repetitions_of_a_sensor_are_left_out() -> None:
     )
     q[::4] += 5.0
     assert Poses(poses.t, q).without_spikes(level)[1] == 0, "a bad sensor is not made a good one"
-    # each value is repeated in five rows, as by a sensor of 20 Hz that is sent at 100 Hz
+    # a sensor of 20 Hz whose values are sent at 100 Hz repeats each value in five rows
     slow = Poses(poses.t, poses.q[np.arange(len(poses.t)) // 5 * 5])
     assert np.array_equal(slow.fresh().q, poses.q[::5]) and np.array_equal(slow.fresh().t, poses.t[::5])
     slow.q[700:] = slow.q[700]
@@ -76,7 +76,7 @@ def test_an_averaged_load_keeps_its_mean_and_bridges_gaps() -> None:
     fine = np.linspace(0.0, t[-1], 200_001)
     for column, whole in zip(few.wrench.T, load.wrench.T, strict=True):
         left_over = np.interp(fine, few.t, column) - np.interp(fine, t, whole)
-        # the impulse of the difference since the beginning does not drift
+        # the impulse of the difference, summed from the beginning, does not drift
         assert np.abs(np.cumsum(left_over) * (fine[1] - fine[0])).max() < 0.02
         assert np.abs(np.interp(4.4, few.t, column) - np.interp(4.4, t, whole)) < 0.1
 
@@ -107,6 +107,6 @@ def test_samples_too_rare_for_a_rough_load_leave_its_oscillation_and_the_density
     assert ((share > 0.4) & (share < 1.3)).all(), "samples hardly tell how short the correlation is"
     known = load.believable()
     left = np.stack([np.interp(known.t, fine, column) for column in slow.T], axis=1) - known.wrench
-    # the samples themselves have errors with standard deviations of 1, 2 and 3
+    # the samples have errors with standard deviations of 1, 2 and 3; the errors that are left are smaller
     assert (left.std(axis=0) < [0.4, 0.8, 1.2]).all()
     assert (np.array(known.unknown) < (impulse**2).mean(axis=0)).all()

@@ -160,7 +160,7 @@ def test_a_motion_that_can_hardly_be_predicted_is_no_evidence_of_a_clearance(mon
     assert (result.model, result.sensor) == ("ok", "ok") and before.horizontal_state is State.ESTIMATED
     assert all("is predicted, expected 110% or more" in reason for reason in result.reasons)
     assert [reason.split()[0] for reason in result.reasons] == ["horizontal", "vertical"]
-    # no group's clearance is known better than the whole clearance
+    # each group has the value of the whole clearance, because no group is known better
     assert {value for value, _ in result.groups.values()} == {result.horizontal, result.vertical}
     assert result.horizontal.deviation > 10.0 * before.horizontal.deviation
 
@@ -284,7 +284,8 @@ def test_a_machine_at_rest_does_not_make_the_model_suspect() -> None:
         result = estimate(truth.nominal, Load.of(t, load)[0], Poses.of(t, rests)[0])
         assert result.horizontal_state is result.vertical_state is State.NOT_OBSERVABLE
         assert (result.model, result.sensor) == ("ok", "ok") and "the head rests" in result.reasons[0]
-    # the poses of a head that has just come to rest scatter as little as at a hard wall, but show no other sign of one
+    # if a head has just come to rest, its poses scatter as little as at a hard wall, but show no other sign of a hard
+    # wall
     rests[:200] += np.linspace(1e-2, 0.0, 200)[:, None]
     result = estimate(truth.nominal, Load.of(t, idle)[0], Poses.of(t, rests)[0])
     assert (result.horizontal_state, result.model) == (State.NOT_OBSERVABLE, "ok")

@@ -58,7 +58,8 @@ def test_walls_worn_askew_are_estimated_and_the_model_is_not_suspect(monkeypatch
     assert result.vertical.mean == pytest.approx(0.5 * (true["vertical_left"] + true["vertical_right"]), abs=3e-4)
     for name, (value, state) in result.groups.items():
         assert state is State.ESTIMATED and abs(value.mean - true[name]) < 1.5 * (value.p95 - value.p05)
-    # clearances that differ by 2 mm, because walls are askew, are distinguished
+    # the walls are askew, so the clearances at the top and at the bottom differ by 2 mm; the estimate distinguishes
+    # them
     assert result.groups["horizontal_top"][0].p05 > result.groups["horizontal_bottom"][0].p95
 
 
@@ -84,7 +85,7 @@ def test_pads_that_are_not_touched_leave_a_clearance_between_askew_walls_open() 
     noise = np.random.default_rng(1).standard_normal(run.q.shape) * [5e-4, 5e-4, 2e-3]
     result = estimate(truth.nominal, truth.load, Poses.of(run.t, run.q + noise)[0])
     assert run.statistics["bottom_left_left"]["time_in_contact"] == 0.0
-    # an overconfident fit would be 1.1 mm off, with a deviation of 0.03 mm
+    # an overconfident fit would be 1.1 mm off and state a deviation of 0.03 mm
     assert abs(result.horizontal.mean - 0.0354) < 3.0 * result.horizontal.deviation
     assert abs(result.vertical.mean - 0.0205) < 3.0 * result.vertical.deviation < 4e-4
     assert result.groups["horizontal_bottom"][1] is State.NOT_OBSERVABLE

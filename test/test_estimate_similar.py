@@ -38,7 +38,7 @@ def test_a_machine_of_another_size_is_estimated_as_one_of_the_paper_s_size() -> 
 def test_a_scene_in_other_units_moves_alike(friction: Friction) -> None:
     thrown = Initial((1e-3, 0.0, 1e-3), (0.4, 0.3, 0.5))
     units, scene = Units(8.0, 1024.0, 4.0), replace(preset("bench_kv"), friction=friction, initial=thrown)
-    # the load moves nothing; it and the energy balance are here so that the kernels of other tests are used again
+    # the load moves nothing; load and energy balance are here only because the kernels of other tests have them
     nothing, balance = (Harmonic("nothing to speak of", (1e-9, 0.0), 2.0),), friction.stick_stiffness_n_m is not None
     run, other = (
         simulate(replace(one, loads=nothing), span, span / 40.0, 1e-9, energy_balance=balance)

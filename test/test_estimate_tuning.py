@@ -13,7 +13,7 @@ from scenes import ROOT
 from plow_twin.estimate import tuning
 
 FOLDER = ROOT / "plow_twin" / "estimate"
-#: Permitted origins of a number outside the table.
+#: Origins that a number may have if it is not in the tuning table.
 ORIGIN = re.compile(r"\b(Definition|Derived|Bound|Guard|Step|Prior): ")
 
 

@@ -17,7 +17,7 @@ from golden import CASES, build_name
 
 FOLDER = Path(__file__).resolve().parent / "data" / "golden"
 PROGRAM = Path(__file__).resolve().parent / "golden.py"
-#: Largest relative change of a count that rounding may cause on another build.
+#: On another build, rounding may change a count by at most this share.
 OTHER_BUILD = 0.02
 
 # the limit is high, because compiling all kernels takes long

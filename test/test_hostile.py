@@ -76,9 +76,9 @@ FILES: dict[str, Callable[[], str]] = {
     "an alias to itself": lambda: "a: &a {b: *a}",
     "a scalar of 20 MB": lambda: "a: " + "x" * 20_000_000,
 }
-#: Readable files without the expected content.
+#: Files that can be read but lack the expected content.
 WITHIN = {"unknown keys", "a scalar of 20 MB"}
-#: Every reader of YAML files given by a user, as arguments of `plow-twin`.
+#: For each reader of YAML files that a user gives: the arguments of `plow-twin`.
 READERS = {
     "scene": ["simulate", "FILE", "--t-end", "1"],
     "mapping": ["live", "load.csv", "--map", "FILE"],
@@ -179,12 +179,13 @@ COMMANDS = {
     ],
 }
 FOREIGN = {"array", "texts", "nothing", "itself", "tree", "chain", "empty_lines", "topics"}
-#: Files above a limit, and files whose usable part is used.
+#: Files above a limit.
 ABOVE = {"channels", "many_chunks", "topics", "columns", "line", "row", "unpacked"}
+#: Files of which the usable part is used.
 WITH_LOSS = {"large_chunks", "lying_zstd", "lying_lz4", "lying_length"}
-#: Largest memory of a command [MB], of which compiled code and libraries take 200.
+#: Largest memory that a command may take [MB]. Compiled code and libraries take 200 MB of it.
 MOST_MB = 700
-#: Program that runs each command in its own process, with at most 20 s of processor time and 6 GB of addresses.
+#: Program that runs each command in its own process, with at most 20 s of processor time and 6 GB of address space.
 RUNNER = """
 import json, os, resource, sys
 from plow_twin.cli.app import run
@@ -236,7 +237,7 @@ def test_absurd_recordings_end_with_one_line(kind: str, tmp_path: Path) -> None:
                     ],
                 )
             )
-    if kind == "run":  # the processor time is measured without compiling
+    if kind == "run":  # this run compiles the kernels, so that compiling does not count as processor time below
         (tmp_path / "plain.mcap").write_bytes(recorded())
         subprocess.run(
             [sys.executable, "-m", "plow_twin", "replay", "plain.mcap", "-q"],
@@ -284,7 +285,7 @@ def _on_a_terminal(*arguments: str, folder: Path) -> str:
     try:
         while data := os.read(ours, 1 << 16):
             written += data
-    except OSError:  # the terminal has ended
+    except OSError:  # the program has closed its side of the terminal
         pass
     os.close(ours)
     process.wait()

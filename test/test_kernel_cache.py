@@ -17,7 +17,8 @@ from plow_twin.kernel.compiler import KERNEL_FOLDERS, kernel, share
 from plow_twin.model import contact
 
 ROOT = Path(__file__).resolve().parent.parent
-#: Program that prints the number of machine-code functions of a kernel that only `settle_modes` calls.
+#: Program that prints how many machine-code functions the kernel `mode_inside` has. Only `settle_modes` calls this
+#: kernel.
 LINKED = (
     "from plow_twin import load_scene; from plow_twin.solve import compiled_scene, modes; "
     "compiled_scene.compile_scene(load_scene('paper'), 1e-6).initial_state(); "

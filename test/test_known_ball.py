@@ -37,7 +37,7 @@ def test_bouncing_ball_comes_to_rest(e: float) -> None:
     """Infinitely many bounces end at sqrt(2 h / g) (1 + e) / (1 - e); at K = 1e11 N/m the error is 5e-4."""
     errors = [abs(rest_time_error(e, stiffness)) for stiffness in (1e7, 1e9, 1e11)]
     assert errors[0] > errors[1] > errors[2] and errors[2] < 5e-4
-    # a nonlinear contact lasts longer at small speeds and converges only with K^-0.4
+    # at small speeds a nonlinear contact lasts longer, so the error falls only with K^-0.4
     pairs = ("top_left_top", "top_right_top")
     limit = math.sqrt(0.02 / GRAVITY) * (1.0 + e) / (1.0 - e)
     for stiffness, bound in ((1e9, 0.05), (1e11, 0.015)):
@@ -84,10 +84,10 @@ def test_a_ball_on_a_vibrating_table_has_its_period(gamma: float, period: int) -
 @pytest.mark.parametrize("gamma", [1.01, 1.03])
 def test_below_the_threshold_the_ball_sticks_each_period(gamma: float) -> None:
     result, touches = on_the_table(gamma, 0.5, 1e8, 60)
-    # without a period-one orbit there are several bounces in every period, then the ball rides on the table
+    # there is no period-one orbit: in every period the ball bounces several times and then rides on the table
     assert np.count_nonzero(touches > 40.0) > 2 * 19
     assert np.diff(touches)[touches[1:] > 40.0].max() < 0.999
-    # a ball with one bounce a period would be in contact for 0.3 % of the time
+    # with one bounce a period, the ball would be in contact for only 0.3 % of the time
     assert result.statistics["top_left_top"]["time_in_contact"] > 0.5 * 60 * PERIOD
 
 

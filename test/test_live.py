@@ -112,7 +112,7 @@ def test_a_file_is_fed_recorded_and_replayed_and_every_row_is_counted(
     report = replay(tmp_path / "run")
     assert (report.samples, report.exit_code, report.first_divergence) == (1000, 0, None)
     assert report.compared["contact_forces"] == 1000
-    # the file agrees with the counters of unused messages, and contains these messages
+    # the recording contains the unused messages, and its counts of them agree with the twin's counters
     told = {key.removeprefix("dropped_"): int(count) for key, count in dropped.items()}
     assert report.inputs == examine(tmp_path / "run").inputs == {"excitation": {"used": 1000, **told}}
     unused = {found["reason"]: found for found in unused_messages(tmp_path / "run")}
@@ -190,7 +190,7 @@ def test_bounded_work_is_reported_with_its_error_and_repeated_by_the_journal(tmp
     given = {"scene": "bench_kv", "max_evaluations": 16, "record_path": str(tmp_path / "run")}
     reports: list[Part] = []
     parts = _run(_csv(tmp_path / "load.csv", 1500), reports=reports, **given)
-    # each report covers the time since the previous report
+    # each report covers only the time from the previous report on, so the largest error is sought in all reports
     largest = max(float(values["error_estimate_m"]) for _, _, values in (*reports, parts["state"]))
     assert int(parts["state"][2]["coarse_advances"]) > 0 and 0.0 < largest < 1e-3
     report = replay(tmp_path / "run")
@@ -221,7 +221,7 @@ def test_the_alarms_of_a_run_are_computed_again_and_compared(tmp_path: Path) -> 
         return False
 
     assert front.run(acknowledge) == [] and acknowledged
-    # alarms are reported once a second, in addition to the recorded changes of a level
+    # changes of a level are recorded; in addition, all alarms are reported once a second
     alarms = [part[2] for name, part in said if name == "alarms"]
     assert any(values["residual_latched"] == "warn" for values in alarms)
     recorded = [
@@ -239,7 +239,8 @@ def test_the_alarms_of_a_run_are_computed_again_and_compared(tmp_path: Path) -> 
     file = next((tmp_path / "run").glob("*.mcap"))
     report = replay(rewrite(file, tmp_path / "other.mcap", metadata=other_thresholds))
     assert report.exit_code == 1 and report.first_divergence is not None
-    # the alarm of the residual was raised and then released
+    # in the recording the residual's alarm was raised and then released; the replay raises none, so there are two
+    # divergences
     found = report.first_divergence
     assert (report.divergences, found.topic, found.recorded, found.computed) == (2, "alarms", "a message", "none")
 
@@ -250,7 +251,7 @@ def test_the_alarms_of_a_run_are_computed_again_and_compared(tmp_path: Path) -> 
     assert report.first_divergence is not None
     found = report.first_divergence
     assert (found.topic, found.recorded, found.computed) == ("alarms", "none", "warn") and "_l" in found.field
-    # without outputs, alarms are not compared
+    # without recorded outputs, alarms cannot be compared
     few = given | {"record_path": str(tmp_path / "few"), "record_outputs": "none"}
     _run(path, mapping, **few)
     report = replay(tmp_path / "few")
@@ -270,13 +271,13 @@ def test_the_senders_own_numbers_show_loss_repetition_and_a_new_start(tmp_path: 
     lines = [
         json.dumps({"time": 1000 + index, "load": {"f": [index, 2, 3]}, "n": n}) for index, n in enumerate(numbers)
     ]
-    # messages of other senders come in between; they have no number, and neither they nor two damaged messages use up a
+    # messages of other senders come in between and have no number; neither these nor the two damaged messages use up a
     # number
     lines[150], lines[151] = '{"n": 152, "load"', '{"n"'
     for place, other in ((60, '{"hello": 1}'), (40, "garbage"), (20, '{"n": "x", "status": 3}')):
         lines.insert(place, other)
     path = tmp_path / "plough.csv"
-    # an unreadable message before the first number is not taken for number 1
+    # an unreadable message before the first number does not count as number 1
     path.write_text("\n".join(["{}", "nothing", *lines, '{"n": 60, "load"']) + "\n", encoding="utf-8")
     mapping = tmp_path / "map.yaml"
     mapping.write_text(
@@ -293,8 +294,8 @@ def test_the_senders_own_numbers_show_loss_repetition_and_a_new_start(tmp_path: 
     ("numbers", "lost"),
     [
         *((["1", "2", *map(str, range(3, 150)), stray, *map(str, range(151, 301))], 0) for stray in STRAY),
-        # the numbers go on after a jump back to the start of a new count, after a jump ahead, and after a jump so large
-        # that it cannot be a loss
+        # after each of these jumps the numbers continue: a jump back to a new count, a jump ahead, and a jump too large
+        # to be a loss
         ([*map(str, range(2000, 2150)), *map(str, range(2, 150))], 1),
         ([*map(str, range(1, 150)), *map(str, range(5000, 5150))], 4850),
         ([*map(str, range(1, 150)), *map(str, range(10**15, 10**15 + 150))], 0),
@@ -333,7 +334,7 @@ def test_a_mapping_takes_units_offsets_clocks_and_names_its_faults(tmp_path: Pat
     # a time with an arbitrary start is moved by 1 s, because 0 stands for a missing stamp
     assert time_ns(0.5) == 1_500_000_000
     assert time_ns("yesterday") is None and time_ns(float("inf")) is None and time_ns(1e300) is None
-    # the date that stands for `empty` in many databases, and dates that no stamp can represent
+    # many databases write the first date for `empty`; no stamp can represent the other two dates
     assert time_ns("9999-12-31") is None and time_ns("2300-01-01T00:00:00") is None and time_ns("0001-01-01") is None
     assert time_ns(10**400) is None and time_ns("20260102") == (20_260_102 + 1) * 10**9
     for text, said in (
@@ -358,7 +359,7 @@ def test_a_mapping_takes_units_offsets_clocks_and_names_its_faults(tmp_path: Pat
         with pytest.raises(RecordingError, match="head_pose") as caught:
             read_map(path, None)
         assert said in str(caught.value)
-    # a time that was requested by name but is absent is not replaced by the time of receipt
+    # if a message lacks the time that was requested by name, the time of receipt is not used instead
     assert read("head_pose: {topic: p, stamp: at}", x=1, y=2, theta=3) is None
     for key, name in (("stamp", "at"), ("sequence", "n")):
         path.write_text(f"head_pose: {{topic: p, {key}: {name}}}")
@@ -412,7 +413,7 @@ def test_a_reader_of_the_lines_that_hangs_stops_nothing_and_what_it_does_not_get
         outlet.put(str(number))
     assert lost_at == [1] and 99 <= outlet.lost <= 100
     hangs.set()
-    # the newest lines follow in order after the line that was being written
+    # after the line that was being written, the outlet writes the newest lines in their order
     assert outlet.close() and len(taken) + outlet.lost == MOST_WAITING + 100
     assert taken[-MOST_WAITING:] == list(map(str, range(100, MOST_WAITING + 100)))
 
@@ -423,7 +424,8 @@ def test_a_live_twin_whose_standard_output_nobody_reads_goes_on_and_ends_when_it
     with _live(str(path), "--follow", "--scene", "paper", *more) as live:
         pipe = live.process.stdout
         assert pipe is not None
-        fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, 4096)  # the pipe holds less than the lines of a second
+        # the pipe holds less than the lines of a second, so it soon is full
+        fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, 4096)
         live.until_count("samples_used", 100)
         give_up = time.monotonic() + START_S
         for count in range(1000, 4000, 1000):  # from here on nobody reads the pipe
@@ -494,7 +496,7 @@ def test_a_file_is_followed_while_it_grows_and_when_it_is_replaced(tmp_path: Pat
     path, run = tmp_path / "load.csv", tmp_path / "run"
     _csv(path, 100)
     arguments = (str(path), "--follow", "--record", str(run), "--set", "excitation_timeout=3600")
-    # the twin gets the default handler of SIGHUP, not that of a `nohup` around the tests
+    # a `nohup` around the tests would make the twin ignore SIGHUP, so it gets the default handler
     with _live(*arguments, preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL)) as live:
         live.until_count("samples_used", 100)
         text = "".join(",".join(map(repr, _row(index))) + "\n" for index in range(100, 200))
@@ -526,7 +528,8 @@ def test_an_alarm_is_reported_once_with_value_pad_threshold_and_time_and_acknowl
     arguments = (str(path), "--follow", "--control", str(control), "--set", "excitation_timeout=3600", *thresholds)
     with _live(*arguments, "--record", str(tmp_path / "run")) as live:
         live.until_count("samples_used", 5000)
-        (said,) = live.alarms  # within five seconds the force passes the threshold repeatedly
+        # within five seconds the force passes the threshold repeatedly, but the alarm is reported once
+        (said,) = live.alarms
         values = said["values"]
         assert values["force_raised"] > values["force_threshold"] == 20e3 and values["force_place"] in PAIR_NAMES
         assert said["stamp_ns"] >= values["force_stamp_ns"] > 1_000_000_000
@@ -644,7 +647,7 @@ def test_lines_on_standard_input_are_taken_and_silence_is_held(tmp_path: Path) -
         assert (values["samples_used"], values["dropped_malformed"]) == ("100", "2")
         live.process.stdin = None
         live.process.communicate(timeout=60.0)
-        assert live.process.returncode == 3  # the exit code means a loss, because two lines were not used
+        assert live.process.returncode == 3  # two lines were not used, so the exit code is that of a loss
     report = replay(tmp_path / "run")
     assert (report.samples, report.exit_code) == (100, 0)
 
@@ -682,7 +685,8 @@ class Endless:
             row["speed"] = 1.0 if self._index % 100 == 0 else ""
             found.append(Arrived("load", time.time_ns(), row))
             self._index += 1
-        return found[::-1] if self._index % 1000 == 0 else found  # some are late
+        # every 50th batch comes in reverse order, so some rows are late
+        return found[::-1] if self._index % 1000 == 0 else found
 
     def close(self) -> None:
         pass
@@ -716,10 +720,10 @@ def test_nothing_lives_longer_than_the_time_remembered_but_the_index_of_the_reco
     finally:
         tracemalloc.stop()
     (_, _, _), (objects, size, before), (more, larger, after) = found
-    # between these points 8,000 samples and 25,000 messages pass; the number of objects for the last seconds varies by
-    # some hundreds
+    # between the two measurements 8,000 samples and 25,000 messages pass, so a leak would show; the number of objects
+    # kept for the last seconds varies by some hundreds
     assert more - objects < 800 and larger - size < 100_000, found
-    # until the part ends, the index takes about 140 B for each chunk, which is 2 MB an hour
+    # until a part ends, its index grows by about 140 B for each chunk, which is 2 MB an hour
     assert 0 < after - before < 20_000
     figures = front.parts()["input"][2]
     assert int(figures["samples_used"]) == int(figures["samples_in"]) and int(figures["rolled_back"]) > 0
@@ -844,7 +848,7 @@ def test_poses_gaps_and_speeds_that_cannot_be_are_not_used() -> None:
     assert [pose[0] for pose in used[:2]] == [0.01, 0.04] and used[2][1] == 0.001 and len(used) == 3
     assert inputs.head_pose.counts[Verdict.IMPLAUSIBLE] == 2
     used.clear()
-    # the second message lacks pair 3, whose change is taken from the first
+    # the second message lacks pair 3, so the third message's change of pair 3 is taken from the first message
     for at, gaps in enumerate([{1: 0.01, 3: 0.01}, {1: 0.02}, {3: 0.09, 1: 0.02}, {1: 0.11}, {3: 0.05, 1: 0.03}]):
         used += [gaps] if inputs.uses_gaps(second + at * 20_000_000, gaps) else []
     assert used == [{1: 0.01, 3: 0.01}, {1: 0.02}, {3: 0.05, 1: 0.03}]
@@ -923,7 +927,8 @@ def test_a_file_that_ends_is_read_at_the_pace_of_the_twins_that_follow_and_this_
 ) -> None:
     path = _csv(tmp_path / "load.csv", 50)
     options = ["--set", "estimate=true", "--set", given, "--set", "follow_members=20"]
-    assert run_cli(["live", str(path), "--scene", "paper", *options]) == 3  # the data are not enough for an estimate
+    # exit code 3: the data are not enough for an estimate
+    assert run_cli(["live", str(path), "--scene", "paper", *options]) == 3
     assert ("20 twins follow the machine" in capsys.readouterr().err) == said
     if not said:
         assert run_cli(["live", str(path), "--scene", "paper", *options, "--follow", "--seconds", "0.5"]) == 0
@@ -1057,7 +1062,8 @@ def test_a_file_gives_the_same_journal_outputs_and_counts_in_batches_as_row_by_r
         prepared = Preparation(settings).result(lambda: False)
         front = BridgeFront(Files([path], follow=False), None, settings, prepared, lambda *_: None, pytest.fail)
         if name == "single":
-            front.attach(_Onlooker())  # an observer sees each sample, so the samples are used one by one
+            # an observer sees each sample, so with an observer the samples are used one by one
+            front.attach(_Onlooker())
         front.run(lambda: False)
         figures = front.parts()
         counts = {key: figures["input"][2][key] for key in figures["input"][2] if not key.endswith(("_s", "_ms"))}

@@ -21,7 +21,8 @@ def test_the_plough_runs_to_the_end_turns_and_comes_back_without_a_jump() -> Non
     assert position.max() > 199.99 and position[number == 1].min() < 0.01
     np.testing.assert_allclose(np.diff(position), 0.5 * (speed[1:] + speed[:-1]) * 1e-3, rtol=0.0, atol=1e-8)
     assert (speed[(number % 2 == 1)] <= 0.0).all() and np.abs(speed).max() == 2.0
-    assert np.abs(np.diff(speed)).max() <= 1.0001e-3  # the speed changes by 2 m/s within 2 s, half of the 4 s of a turn
+    # the speed changes by 2 m/s within 2 s, which is half of a turn of 4 s
+    assert np.abs(np.diff(speed)).max() <= 1.0001e-3
 
 
 def test_the_load_has_mean_variation_correlation_and_skewness_asked_for() -> None:
@@ -32,7 +33,8 @@ def test_the_load_has_mean_variation_correlation_and_skewness_asked_for() -> Non
     assert fx.std() / fx.mean() == pytest.approx(0.5, rel=0.04)
     assert fx.min() > 0.0
     skewness = ((fx - fx.mean()) ** 3).mean() / fx.std() ** 3
-    assert skewness == pytest.approx(2.0 * 0.5, rel=0.15)  # the skewness of a Gamma distribution is twice its variation
+    # a Gamma distribution's skewness is twice its coefficient of variation
+    assert skewness == pytest.approx(2.0 * 0.5, rel=0.15)
     assert abs(fy.mean()) < 400.0 and fy.std() == pytest.approx(5e3, rel=0.04)
     np.testing.assert_allclose(moment, 0.1 * fy - 0.7 * fx)
     one = fy[: len(t)]

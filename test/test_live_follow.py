@@ -166,10 +166,11 @@ def test_an_estimate_that_stands_is_taken_over_and_undone_when_it_is_withdrawn(t
     assert known[:, 0] == pytest.approx(truth.clearance, abs=1e-6) and (np.ptp(known, axis=1) < 2e-4).all()
     fine = simulate(truth.scene, 6.0, 1e-3, 1e-6).force
     assert _error(nominal, fine[:3000:10][: len(nominal)]) > (0.3 if how == "parameters" else 0.1)
-    # a single twin forgets its wrong pose only within some load periods, but steered twins had the machine's pose
+    # a single twin starts with a wrong pose and forgets it only within some load periods; steered twins already had the
+    # machine's pose
     first, most, above = (150, 0.2, 1.3) if how == "parameters" else (50, 0.03, 1.1)
     assert _error(live.column("force")[first:], fine[3000::10][first : len(live.column("force"))]) < most
-    # the adoption of the estimate does not look like an impact
+    # the peaks show no impact when the estimate is adopted
     assert (live.column("peak").max(axis=0) < above * fine[2900:].max(axis=0) + 2e3).all()
     assert (live.column("followed") == WITH_INTERVALS).all() == (how == "full")
     live.take([_known(truth, State.WITHDRAWN), *_in_turn(truth, 6.0, 6.3)])
@@ -230,7 +231,7 @@ def test_wear_continues_from_its_depth_and_widens_the_estimate(truth: Truth) -> 
     live.take(_in_turn(truth, 2.011, 4.0))
     grown = live.session.wear_depth - before
     assert (grown >= 0.0).all() and grown.max() > 1e-6
-    # the last message is 0.1 s old, so it lacks the newest wear
+    # the last message is 0.1 s old, so it lacks the wear of the last 0.1 s
     assert live.clearance()[0, 0] - at_first[0, 0] == pytest.approx(0.5 * grown[[1, 3, 5, 7]].sum(), rel=0.2)
 
 
@@ -326,7 +327,7 @@ def test_a_snapshot_holds_all_that_a_later_run_needs(truth: Truth) -> None:
     for name in ROW.names or ():
         assert np.array_equal(live.column(name), other.column(name)), name
     assert live.twin.digest() == other.twin.digest()
-    # the earlier motion is restored with the present wear
+    # restoring a snapshot restores the earlier motion, but keeps the present wear
     live.take([Restore(_stamp(1.1), snapshot.data), *_in_turn(truth, 0.8, 0.9)])
     # the next sample continues from the restored time
     assert live.twin.time == pytest.approx(0.88) and np.isfinite(live.column("force")).all()
@@ -478,7 +479,7 @@ def test_waiting_poses_are_bounded_dropped_ones_counted_and_no_estimate_is_dropp
     live.take([Pose(_stamp(t), (0.0, 0.0, 0.0)) for t in (3601.0, 7200.0)])
     assert live.session.poses_dropped == 2
     before, more = live.twin.added, 10_050
-    # while the load is silent these poses are kept, because a late sample would need all of them again
+    # a late sample would need all of these poses again, so they are kept while the load is silent
     live.take([Pose(_stamp(0.51) + 100_000 * index, (0.0, 0.0, 0.0)) for index in range(more)])
     assert live.session.poses_dropped == 2 + before + more - 10_000
     assert live.twin.poses_dropped == more - 10_000

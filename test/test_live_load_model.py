@@ -46,7 +46,7 @@ def test_absurd_telemetry_goes_through_to_where_it_is_counted_and_is_no_certaint
     for drive in ({"power": 1e200, "speed": 2.0}, {"chain_force": 1e308}, {"depth": -1e308}):
         found = MODEL.wrench(drive)
         assert found is not None and not max(map(abs, (*found[0], *found[1]))) < 1e100
-    # a negative depth, from a slightly biased sensor, is no better evidence than the same positive depth
+    # a slightly biased sensor may give a negative depth; this is no better evidence than the same positive depth
     (below, wide), (_, same) = (MODEL.cutting_force({"depth": depth}) for depth in (-0.08, 0.08))  # type: ignore[misc]
     assert (below, wide) == (0.0, same)
     (tmp_path / "map.yaml").write_text(MAP)

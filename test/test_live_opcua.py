@@ -174,15 +174,16 @@ def test_values_of_a_stamp_are_a_sample_and_unchanged_fields_stay() -> None:
     assert samples.take(0.5) == [(20, {"a": 3.0, "b": 2.0}), (30, {"a": 5.0, "b": 4.0})]
     samples.add("b", 40, NOT_MEASURED, 0.6)
     assert samples.take(0.7) == [] and samples.take(1.7) == [(40, {"a": 5.0, "b": NOT_MEASURED})]
-    samples.add("a", 35, 6.0, 2.0)  # this value is late: the value of b at its time is no longer known
+    # this value is late: at its time, the value of b is no longer known, so it gives no sample
+    samples.add("a", 35, 6.0, 2.0)
     samples.add("b", 25, 7.0, 2.0)
     samples.add("a", 25, 8.0, 2.0)
     assert samples.take(2.1) == [(25, {"a": 8.0, "b": 7.0})]
     assert samples.take(9.0) == []
     assert samples.take_incomplete() == 1
-    samples.add("b", 40, 9.0, 9.0)  # b at 40 is a value that is sent again
+    samples.add("b", 40, 9.0, 9.0)  # the value of b at 40 came before, and is sent again
     assert samples.take(99.0) == []
-    # an impossible stamp changes nothing
+    # a value with an impossible stamp changes nothing
     samples.add_stray("a", 10**18, 1.0, 9.0)
     samples.add("b", 50, 3.0, 9.0)
     samples.add("a", 50, 2.0, 9.0)

@@ -35,7 +35,7 @@ from plow_twin.stream.journal import Digest
 from plow_twin.telemetry.mqtt import Broker, Message
 from plow_twin.telemetry.sparkplug import Payload
 
-#: Version of the broker; a version before 0.12 closes a connection that it refuses.
+#: Version of the broker. If the broker is older than 0.12, it closes a connection that it refuses.
 AMQTT = tuple(map(int, version("amqtt").split(".")[:2]))
 STALE = ("--set", "excitation_timeout=3600")
 

@@ -46,7 +46,8 @@ SUBPACKAGES = {
     "__init__": CORE | {"scene_file", "record"},
     "__main__": {"cli"},
 }
-#: Parts of scipy that are imported only where they are used; numba imports the package scipy itself.
+#: Parts of scipy that may be imported only where they are used. numba itself imports the package scipy, so only its
+#: parts count.
 SCIPY = ("scipy.linalg", "scipy.optimize", "scipy.special")
 MESSAGES = {
     f"{name}_msgs"
@@ -95,7 +96,8 @@ LIBRARIES = {
 }
 
 
-#: The study of the paper imports the library; only the verb's placeholder in the library refers to the study.
+#: The study of the paper imports the library. In the library, only the placeholder of the study's verb refers to the
+#: study.
 PAPER_STUDY = PACKAGE.parent / "studies" / "paper" / "plow_twin_paper"
 PAPER_MAY_IMPORT = CORE | {"build", "scene_file", "stream", "record", "view", "study", "cli"}
 
@@ -246,7 +248,7 @@ def test_every_public_name_is_found_and_imported_on_first_use() -> None:
     assert {name for name in dir(plow_twin) if not name.startswith("_")} >= names
     for name in names:
         assert getattr(plow_twin, name) is not None
-    # these two names need libraries of an extra
+    # these two names need libraries of an extra, so `__all__` lacks them
     assert set(plow_twin.__all__) == names - {"Recording", "read_recording"}
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
         plow_twin.nonsense  # noqa: B018
