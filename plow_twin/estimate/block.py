@@ -39,12 +39,12 @@ WALLS: Final = {
     "top": (GY, np.array([0.0, 1.0])),
     "bottom": (GY, np.array([0.0, -1.0])),
 }
-#: Derived: smallest number of rows of a flight, one more than the three coefficients of a parabola. Bound: largest
-#: number of rows of a flight that are fitted.
+#: Derived: smallest number of rows of a flight, one more than the three coefficients of a parabola.
+#: Bound: largest number of rows of a flight that are fitted.
 _FLIGHT_ROWS: Final = (4, 9)
 #: Derived: degrees of freedom of the Student-t likelihood, the value that Lange et al. recommend.
 _FREEDOM: Final = 4.0
-#: Bound: number of scales on the grid of the likelihood, and of reweighting rounds for each scale.
+#: Bound: number of scales on the grid of the likelihood, and number of reweighting rounds for each scale.
 _SCALES, _ROUNDS = 40, 30
 #: Definition: the unknowns of the linear problem are the clearances, the bias of x, y and theta, the lever arm, and the
 #: relative change of the penetration from its value with the scene's stiffness.

@@ -32,8 +32,8 @@ from plow_twin.model import geometry
 
 Array = NDArray[np.float64]
 
-#: Derived: biases of theta that are tried, in rad; they reach eight prior deviations to both sides. A parabola refines
-#: the best bias; it covers three quarters of the spacing of the tried biases to both sides.
+#: Derived: biases of theta that are tried, in rad; they reach eight prior deviations to both sides. The best bias is
+#: refined by a parabola over three quarters of the spacing of the tried biases to both sides.
 _TURNS: Final = np.linspace(-0.16, 0.16, 81)
 _FINEST_TURN: Final = 3e-3
 _NEAR_TURNS: Final = np.linspace(-_FINEST_TURN, _FINEST_TURN, 5)
@@ -58,7 +58,7 @@ _NO_SCATTER = 1e-14
 _LONGER = 2.0
 #: Guard: smallest and largest penetration in m that is drawn for a hard and for a firm contact.
 _HARD_BOUNDS, _FIRM_BOUNDS = (8e-7, 6e-4), (2e-6, 2e-2)
-#: Bound: number of corrections of a draw's noise.
+#: Bound: number of rounds in which the noise of a draw is corrected.
 _NOISE_ROUNDS = 3
 #: Derived: smallest number of draws for a regression with twenty features, and of poses for a 99 % quantile.
 _FEWEST, _FEWEST_WHOLE = 30, 100
@@ -206,7 +206,7 @@ def compare(
         features = np.array(drawn.features)
         if found is None:
             delay = path_delay(eye, features[:, 5:], drawn.q, measured[5:])
-            # the first round was drawn without a delay, so the phase of its paths is shifted
+            # the first round was drawn without a delay, so its paths are shifted by the delay that has now been found
             paths = [eye.paths(q, _OF_DRAWN_S - delay) for q in drawn.q]
             drawn.by_phase = [eye.changes_by_phase(q, -delay) for q in drawn.q]
         else:
@@ -219,7 +219,8 @@ def compare(
         found = regress_near(like, targets, seen)
         moved = measured[:2] + found.value[:2] - centre
         centre = centre + moved
-        # the last move is added to the deviation, because a clearance that still moves has not converged
+        # the change of a clearance in the last round is added to its deviation, because a clearance that still changes
+        # has not converged
         deviation = np.hypot(found.deviation[:2], moved)
         if near is None and len(features) <= tuning.DRAWS[0] and found.distance > tuning.NOT_HARD:
             return None
@@ -229,7 +230,7 @@ def compare(
             if len(rounds) == 3 and count == tuning.DRAWS[2] and not followed:
                 rounds.append((tuning.DRAWS[3], tuning.DRAWN_CLEARANCE[3]))
     assert found is not None
-    # a large last move shows that a clearance has not converged
+    # a large change in the last round shows that a clearance has not converged, so its deviation is increased
     deviation = np.where(np.abs(moved) > tuning.ASTRAY, np.hypot(deviation, tuning.UNEXPLAINED_HARD), deviation)
     law, odds = 0.0, -math.inf
     if found.value[5] < math.log(tuning.FITTED):
@@ -245,7 +246,8 @@ def compare(
         found.distance,
         path_deviate(eye.paths(eye.q, _LAGS_S), features[:, 5:], paths, measured[5:]),
         law,
-        odds if near is None else -math.inf,  # otherwise no odds: their limit was tuned on hard contacts
+        # only hard contacts get odds, because the limit of the odds was tuned on them
+        odds if near is None else -math.inf,
         *hidden_by_geometry(unknowns, poses, period, measured[:2]),
     )
 
@@ -588,7 +590,7 @@ class MotionFeatures:
         self.q = filled(poses)
         self.noise = noise_level(self.q)
         self._period, self._parts = period, tuning.PATH_PHASES // 2
-        #: which poses are at least one period after the first pose; earlier poses still depend on the start
+        #: mask of the poses that are at least one period after the first pose; earlier poses still depend on the start
         self._settled = poses.t - poses.t[0] >= period
         self._whole = self._there.all(axis=1)
         if self._whole.sum() <= _FEWEST_WHOLE:
@@ -596,7 +598,8 @@ class MotionFeatures:
         self._smooth = max(min(smooth_width(poses, tuning.AVERAGED), int(self._whole.sum()) // 8), 1)
         self._reach_phase = ((poses.t[self._whole] - poses.t[0]) / period % 1.0 * tuning.PATH_PHASES).astype(int)
         phase = np.minimum(((poses.t - poses.t[0]) / period % 1.0 * self._parts).astype(int), self._parts - 1)
-        #: for each component, the rows of each part of a period that have it; parts with few rows are left out
+        #: for each component and each part of a period, the rows that have the component; parts with few rows are left
+        #: out
         self._parts_of = [
             [rows for k in range(self._parts) if len(rows := np.flatnonzero((phase == k) & there)) > 8]
             for there in self._there.T
@@ -612,8 +615,8 @@ class MotionFeatures:
         vector[[GX, GY]], vector[DAMPING] = clearance, numbers[1]
         vector[GAIN] = np.clip(numbers[2:5], 0.7, 1.3)
         scene = unknowns.scene_of(vector)
-        # a fit limits how hard a contact is, but here it may be harder, because the decay of the bounces depends on the
-        # stiffness
+        # a fit has a hardest contact, but a drawn contact may be harder, because the decay of the bounces depends on
+        # the stiffness
         contact = replace(scene.contact, stiffness=unknowns.force / math.exp(numbers[0]) ** scene.contact.exponent)
         start = np.concatenate([self.q[0], np.zeros(3)])
         start += np.array([1e-3, 1e-3, 4e-3, 0.05, 0.05, 0.2]) * rng.standard_normal(6)

@@ -27,8 +27,8 @@ Array = NDArray[np.float64]
 
 #: Guard: a number above this is not a force [N].
 _LARGEST = 1e12
-#: Bound: largest of the delays in s at which measured forces and the motion's forces are compared, and their step.
-#: Derived: the largest delay is three prior deviations of a sensor's delay.
+#: Bound: largest delay in s for which measured forces are compared with the motion's forces, and step between the
+#: delays. Derived: the largest delay is three prior deviations of a sensor's delay.
 _LARGEST_DELAY, _DELAY_STEP = 0.15, 2e-3
 #: The law as a Python function, because Python cannot call the compiled function.
 _LAW = getattr(free_force, "py_func", free_force)
@@ -167,7 +167,7 @@ def cells_of(feeling: Feeling, found: Fit, forces: ContactForces) -> tuple[Cells
     measured = forces.force - offset
     found_out, pairs = [], []
     largest = float(np.nanmax(felt.force))
-    # a cell that reads exactly 0 in flight has a resolution too, which is at least this
+    # a cell that reads exactly 0 in flight has a limited resolution too, so its noise is set to at least this
     noise = np.maximum(noise, 1e-4 * largest)
     for i, name in enumerate(PAIR_NAMES):
         there = np.isfinite(measured[:, i]) & (felt.swing >= 0)

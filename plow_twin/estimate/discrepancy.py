@@ -222,7 +222,8 @@ class _Linearised:
         self._found, self._swing = found, found.point.swing
         further = np.stack([one.derivative for one in every], axis=2)
         self._precision = np.concatenate([problem.deviation, [one.deviation for one in every]]) ** -2.0
-        #: (k,) values of the further quantities in the fit, and whether the fit includes these quantities
+        #: `_value`: values of the further quantities in the fit, shape (k,)
+        #: `_held`: whether the fit includes each of these quantities, shape (k,)
         self._value = np.array([one.value or 0.0 for one in every])
         self._held = np.array([one.value is not None for one in every])
         self._pull = np.concatenate([problem.mean - found.shared, -self._value]) * self._precision
@@ -311,7 +312,7 @@ class _Linearised:
         known: dict[bytes, float] = {}
 
         def evidence(which: NDArray[np.bool_]) -> float:
-            key = which.tobytes()  # results are kept, because the sampler returns to most sets
+            key = which.tobytes()  # results are kept, because the sampler visits most sets several times
             if key not in known:
                 use = np.append(np.arange(SIZE), SIZE + np.flatnonzero(which))
                 lower = np.linalg.cholesky(self._normal[np.ix_(use, use)])

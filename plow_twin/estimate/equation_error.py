@@ -42,7 +42,7 @@ _SHORTEST, _FEWEST = 5e-3, 3
 _UNIT = 1e7
 #: Derived: deviate beyond which Huber's function is linear; ratio of standard deviation to median absolute deviation.
 _HUBER, _MAD = 2.0, 1.4826
-#: Bound: starting values of a search, clearances as shares of the range of motion and penetrations in m.
+#: Bound: starting values of a search: clearances as shares of the range of motion, and penetrations in m.
 _SHARES, _DEPTHS = (0.25, 0.5, 0.75, 0.95), (3e-3, 6e-3, 12e-3, 20e-3)
 #: Guard: penetrations in m of the hardest and of the softest contact that is tried.
 DEPTHS: Final = (2e-4, 3e-2)

@@ -214,7 +214,8 @@ def _from_motion(
     if guess:
         numbers = np.array(guess)
         shared, noise, differences = np.split(numbers, [SIZE, SIZE + 3])
-        # a guess is close to the optimum if it comes from a fit, but contacts harder than `FITTED` are not fitted
+        # a guess from a fit is close to the optimum; contacts harder than `FITTED` are not fitted, so their guess is
+        # uncertain
         certain = unknowns.penetration_of(float(shared[SOFTNESS])) > tuning.FITTED
         near = refine(forward, unknowns, poses, period, unknowns.within(shared), noise, drift, differences, certain)
         verdict = judge(*near, period) if near else None
@@ -622,7 +623,8 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
     clearances, states = [], []
     untested: dict[int, Interval] = {}
     for index, sides in ((GX, ("left", "right")), (GY, ("top", "bottom"))):
-        # only predicted moments test a clearance; hard contacts are exempt, as bounces cannot be predicted for long
+        # only instants at which the motion is predicted test a clearance; hard contacts are exempt, because their
+        # bounces cannot be predicted for long
         tested = share[index] > tuning.PREDICTED or unknowns.penetration_of(float(shared[SOFTNESS])) < tuning.HARD
         if not tested and finished and not suspect:
             reasons.append(
@@ -849,7 +851,7 @@ def _lacking(poses: Poses) -> tuple[str, ...]:
     )
     if lacking:
         return lacking
-    # a flight in a long gap is not seen, however dense the values around it are
+    # the longest gap counts too, because a flight within it is not seen, however dense the values around it are
     apart = max(poses.interval(), poses.gap())
     if apart > tuning.SPARSEST:
         lacking = (f"poses: got {1.0 / apart:.1f} a second, expected at least {1.0 / tuning.SPARSEST:.1f}",)

@@ -391,7 +391,7 @@ class Problem:
             change = moved[index] - point.shared[index]
             other = self.evaluate(moved, point.states) if abs(change) > 0.5 * step else None
             if other is not None:
-                # residuals decrease as the prediction increases
+                # a residual decreases as the prediction increases, so this difference is the change of the prediction
                 return np.nan_to_num((point.residual - other.residual) / change), (point.defect - other.defect) / change
         return np.zeros_like(point.residual), np.zeros_like(point.defect)
 
@@ -411,7 +411,7 @@ def _by_state(point: Point, other: Point, index: int, moved: float) -> tuple[Arr
     In `other` this component is larger by `moved`.
     """
     ends = point.defect - other.defect
-    ends[:, index] += moved  # the start of the next swing has moved too
+    ends[:, index] += moved  # in `other` the start of the next swing has moved too, which is no change of the end
     return np.nan_to_num((point.residual - other.residual) / moved), ends / moved
 
 

@@ -57,8 +57,8 @@ _CALL: Final = 20
 _KNOWN_HZ: Final = 10.0
 #: Bound: largest number of poses that wait for the model to reach their stamps; a session keeps as many for going back.
 _MOST_DUE: Final = MOST_MEASURED
-#: Definition: masks of one row with intervals and of one row without; an empty array of digests; the change of constant
-#: clearances.
+#: Definition: masks of one row that gets intervals (`_YES`) and of one row that gets none (`_NO`); an empty array of
+#: digests; the change of clearances that are constant.
 _YES: Final = np.ones(1, bool)
 _NO: Final = np.zeros(1, bool)
 _NO_DIGESTS: Final = np.zeros(0, np.int64)
@@ -154,17 +154,20 @@ class Follower:
         self._ends, self._begins = _NO_DIGESTS, False
         self._span_start = start
         self._wrench = np.zeros(3)
-        #: numbers of poses that moved the members, that were outliers, and that were dropped because too many were
-        #: waiting
+        #: `poses_used`: number of poses that moved the members
+        #: `poses_outlying`: number of poses that were outliers
+        #: `poses_dropped`: number of poses that were dropped because too many were waiting
         self.poses_used = self.poses_outlying = self.poses_dropped = 0
-        #: how often members were drawn anew; time in s since which the estimate is followed
+        #: `drawn`: number of times that members were drawn anew
+        #: `_since`: time in s from which on the present estimate is followed
         self.drawn, self._since = 0, start
         self._draw("", start, self._unworn())
         self._forget()
 
     def _forget(self) -> None:
         """Forget all poses."""
-        #: poses and estimates that wait, in order of time: time in s, number, and the pose or the text of the estimate
+        #: poses and estimates that wait, in order of time: time in s, sequence number, and the pose or the text of the
+        #: estimate
         self._due: list[tuple[float, int, list[float] | str]] = []
         #: times of recently used poses
         self._used: deque[float] = deque()

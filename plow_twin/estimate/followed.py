@@ -126,7 +126,7 @@ class _Steps:
         deviation = 0.0 if gaps is None else gaps.deviation
         self._windows = Windows(WINDOW_S, INTERVAL_S, 0.0, poses.deviation, load.deviation, deviation, early=True)
         self._guess: Guess = ()
-        #: numbers of rows on a grid, of added poses and of added gaps
+        #: counts of rows on a grid, of added poses and of added gaps
         self._count = self._poses_added = self._gaps_added = 0
         self._span = span
         self.taken_over: list[TakenOver] = []

@@ -24,8 +24,8 @@ Array = NDArray[np.float64]
 
 #: Bound: largest number of rows, about 200 a second for a window of ten load periods.
 _MOST_ROWS = 6000
-#: Bound: largest number of steps; number of first steps in which predictability is probed; number of draws of a probe;
-#: reduction of the cost, within noise, below which the steps end.
+#: Bound: a fit takes at most `_ROUNDS` steps. In the first `_DRAWN_ROUNDS` steps predictability is probed with
+#: `_PROBES` draws. The steps end when the cost falls by less than `_ENOUGH`, which is within noise.
 _ROUNDS, _DRAWN_ROUNDS, _PROBES, _ENOUGH = 8, 3, 3, 0.5
 #: Step: for the two-sided difference quotients with respect to the delay in s and to a starting state. With the longer
 #: one-sided steps of the fit of the poses, clearances were wrong by 4 of their deviations.
@@ -151,7 +151,8 @@ class _Joint:
             return not_used("the model cannot be run")
         linear, jacobian = self._linearised(at)
         for index in range(_ROUNDS):
-            if index < _DRAWN_ROUNDS:  # in the first round only the poses limit the draws
+            # in the first round only the poses limit the draws; the forces limit them from the second round on
+            if index < _DRAWN_ROUNDS:
                 self._weigh(at.force)
                 known = self._blocks(at, linear, jacobian if index else 0.0 * jacobian)
                 self._jitter = self._unpredicted(at, jacobian, known)

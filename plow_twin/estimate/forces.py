@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 MEMBERS: Final = 256
 #: Definition: quantiles of an interval.
 POINTS: Final = (0.05, 0.5, 0.95)
-#: Derived: smallest number of members that has a 5 % point.
+#: Derived: smallest number of members of which one member is 5 %; fewer members have no 5 % point.
 FEWEST: Final = 20
 #: Guard: smallest drawn clearance, as a share of the estimated clearance.
 _LEAST_SHARE = 0.02
@@ -145,7 +145,7 @@ def quantiles(values: Array) -> Array:
     """Return the nearest-rank quantiles over the first axis, in the order of `POINTS`; no value is below zero."""
     places = [min(int(share * len(values)), len(values) - 1) for share in POINTS]
     out = np.zeros((len(POINTS), *values.shape[1:]))
-    # most pairs are apart in all members and need no sorting
+    # most pairs are apart in all members; their quantiles are 0 and need no sorting
     there = values.any(axis=0)
     out[:, there] = np.partition(np.ascontiguousarray(values[:, there].T), places, axis=1)[:, places].T
     return out

@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 
 #: Definition: seconds of an hour.
 HOUR_S = 3600.0
-#: Guard: a drawn clearance is smaller than the present clearance by at most this share of it.
+#: Guard: a drawn clearance is smaller than the present clearance by at most this share of the present clearance.
 _LEAST_SHARE = 0.9
 
 

@@ -20,7 +20,8 @@ from plow_twin.solve.state import EVENT, SEGMENT, TOTALS, Parts, Status, new_rec
 
 Array = NDArray[np.float64]
 
-#: Bound: largest number of steps of a run for each second of motion, and further steps; number of rows in a run's log.
+#: Bound: a run takes at most `_STEPS_PER_SECOND` steps for each second of motion and `_STEPS` more; its log has
+#: `_LOG_SIZE` rows.
 _STEPS_PER_SECOND, _STEPS = 20_000, 2_000
 _LOG_SIZE = 4096
 #: Bound: number of series steps that cost as much as one implicit step.

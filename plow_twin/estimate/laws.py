@@ -20,11 +20,12 @@ Array = NDArray[np.float64]
 
 #: Guard: least variance of a feature.
 _LEAST = 1e-9
-#: Definition: parameters with terms up to the third degree (penetration, damping), and parameters whose effect depends
-#: on these (clearances).
+#: Definition: indices of the parameters with terms up to the third degree (penetration, damping), and of the
+#: clearances, whose effect depends on these parameters.
 _CURVED, _CHANGING = (0, 1), (5, 6)
-#: Bound: number of Levenberg-Marquardt steps to the likeliest parameters, damping of the first step, gain that ends the
-#: steps. Step: for the difference quotients with respect to the parameters.
+#: Bound: number of Levenberg-Marquardt steps to the likeliest parameters; damping of the first step; gain at which the
+#: steps end.
+#: Step: for the difference quotients with respect to the parameters.
 _STEPS, _DAMPED, _ENOUGH, _SMALL = 30, 1e-2, 1e-2, 1e-4
 
 

@@ -150,7 +150,7 @@ def wear_path(scene: Scene, limit: tuple[float, float], most_exposure: float) ->
     """
     if scene.wear is None:
         raise LifeError("wear: got no wear, expected a section `wear`")
-    # depths without running-in, so that all pads have the same coefficient
+    # the depths are converted to depths without running-in, for which all pads have the same coefficient
     steady = without_running_in(scene.wear, np.array(scene.wear.initial_depth_m, dtype=np.float64))
     depth = with_running_in(scene.wear, steady)
     smallest = max(min(_clearances(scene, depth)), _LEAST_CLEARANCE)
@@ -163,7 +163,7 @@ def wear_path(scene: Scene, limit: tuple[float, float], most_exposure: float) ->
         euler = steady + step * force
         ahead, ahead_deviation = mean_forces(scene, with_running_in(scene.wear, euler))
         change = 0.5 * step * (ahead - force)
-        # noise of the mean forces is not an error of the step
+        # the noise of the mean forces is subtracted, because it is not an error of the step
         noise = 0.5 * step * np.hypot(deviation, ahead_deviation)
         off = float(np.maximum(np.abs(change) - 2.0 * noise, 0.0).max()) / smallest
         if off > tuning.JUMP[1] and step * float(force.max()) > 1e-3 * smallest:

@@ -20,10 +20,10 @@ Array = NDArray[np.float64]
 Deviation = tuple[float, ...]
 #: Definition: deviations that are not stated.
 UNSTATED: Deviation = (0.0, 0.0, 0.0)
-#: Derived: a standard deviation from n values has the relative error 1 / sqrt(2 n): 22 % for a cell in contact, 16 %
-#: for poses and gaps, 10 % for a scatter in a comparison.
+#: Derived: smallest numbers of values for a standard deviation. From n values it has the relative error 1 / sqrt(2 n):
+#: 22 % for a cell in contact, 16 % for poses and gaps, 10 % for a scatter in a comparison.
 FEWEST_IN_CONTACT, FEWEST_POSES, FEWEST_FOR_SCATTER = 10, 20, 50
-#: Guard: longest interval in s between poses or samples in which the motion in a soft contact is nearly cubic.
+#: Guard: longest interval in s between poses or samples; over it the motion in a soft contact is nearly cubic.
 RESOLVING: Final = 0.02
 #: Bound: smallest number of points between two knots over which a load is averaged.
 _FINER = 8

@@ -73,11 +73,13 @@ class Ensemble:
     ) -> None:  # fmt: skip
         scenes, gain = draw_scenes(scene, known, members, rng) if members > 1 else ([scene], np.ones((1, 3)))
         scenes[0], gain[0] = middle_of(scene, known)
-        #: whether poses move the first member, as after an estimate; otherwise they move its copy, the second member
+        #: whether poses move the first member, as they do once there is an estimate; while the prior is followed, they
+        #: move the second member, which is a copy of the first
         self._steers_first = known.horizontal_state is not State.PRIOR
         if not self._steers_first and members > 1:
             scenes[1], gain[1] = scenes[0], gain[0]
-        #: wear of the pads at the beginning, and the part of the estimated clearances that is due to it, (2, 1)
+        #: `worn_before`: wear of the pads at the beginning
+        #: `moved_before`: part of the estimated clearances that is due to this wear, shape (2, 1)
         self.worn_before, self.moved_before = worn, np.zeros((2, 1))
         if scene.wear is not None:
             states = (known.horizontal_state, known.vertical_state)
@@ -88,12 +90,14 @@ class Ensemble:
         self.others = TwinBatch(scenes[1:], tol=tol, start=start) if members > 1 else None
         self._scene, self._gain, self._rng, self._speed = scene, gain, rng, 0.0
         self._numbers = numbers_of(scenes, gain, draw_biases(known, members, rng))
-        #: learner of the parameters that an estimate hardly determines; the next member to adopt learned parameters;
-        #: the number of members that are due to adopt them
+        #: `_learner`: learner of the parameters that an estimate hardly determines
+        #: `_turn`: the next member to adopt learned parameters
+        #: `_waiting`: number of members that are due to adopt them
         learns = learns and self._steers_first and members > 1
         self._learner = Learner.of(self._numbers.copy(), start) if learns else None
         self._turn, self._waiting = 0, 0.0
-        #: error of each member's load in N and N m, and time in s up to which the errors have drifted
+        #: `_load_off`: error of each member's load in N and N m
+        #: `_drifted`: time in s up to which these errors have drifted
         self._load_off, self._drifted = np.zeros((members, 3)), start
         self._walls = np.stack([penetration_rows(one) for one in scenes])
         self._clearance = np.array([[one.clearance.horizontal_m, one.clearance.vertical_m] for one in scenes])
@@ -106,10 +110,12 @@ class Ensemble:
         self._peak, self._impulse = self._sums[:, 1], self._sums[:, 2]
         #: sum of the squares of each member's normalised innovations
         self.square = np.zeros(members)
-        #: whether each degree of freedom is free, and number of outlying poses in a row
+        #: `_free`: whether each degree of freedom is free
+        #: `outlying`: number of outlying poses in a row
         self._free = np.array([name not in scene.locked for name in DOF_NAMES])
         self.outlying = 0
-        #: recent times and poses (m, 3), oldest first; present rates (m, 3), wear and penetration (m, 8)
+        #: `_path`: recent times and poses (m, 3), oldest first
+        #: `_v`, `worn`, `_depth`: present rates (m, 3), wear (m, 8) and penetrations (m, 8)
         self._path: deque[tuple[float, Array]] = deque([(start, np.tile(np.array(scene.initial.q), (members, 1)))])
         self._v, self.worn = np.tile(np.array(scene.initial.v), (members, 1)), np.tile(worn, (members, 1))
         self._depth = self._penetration(self._path[-1][1])
@@ -263,7 +269,7 @@ class Ensemble:
             self._learner.take_over(before._learner)
             self._take_numbers(np.arange(len(self.good)))
         elif self.others is None and before._learner is not None:
-            # the estimate is the same, but from here on a single twin follows it
+            # the estimate is the same, but from here on a single twin follows it, with the numbers of the first member
             self._set_numbers(np.zeros(1, np.int64), before._numbers[:1])
 
     def stand_about(self, q: Array, v: Array) -> None:

@@ -22,8 +22,8 @@ from plow_twin.estimate.unknowns import GX, GY, SIZE
 
 Array = NDArray[np.float64]
 
-#: Definition: for each group of pads the clearance to which it belongs, and the shares with which the turns of the
-#: left, right, top and bottom wall change its own clearance.
+#: Definition: for each group of pads the index of its clearance, and the shares with which the turns of the left,
+#: right, top and bottom wall change the group's own clearance.
 _MADE_OF: Final = {
     "horizontal_top": (GX, np.array([0.5, 0.5, 0.0, 0.0])),
     "horizontal_bottom": (GX, np.array([-0.5, -0.5, 0.0, 0.0])),

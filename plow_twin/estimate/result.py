@@ -31,8 +31,8 @@ class State(Enum):
     ESTIMATED = "estimated"
     ROUGH = "rough"  #: the machine differs from the model, or the interval is wide
     NOT_OBSERVABLE = "not_observable"  #: the prior's value, because the motion does not determine the quantity
-    PRIOR = "prior"  #: not measured
-    WITHDRAWN = "withdrawn"  #: the sensor is broken, or the data contradict themselves or every motion of the model
+    PRIOR = "prior"  #: the prior's value, because the quantity was not measured
+    WITHDRAWN = "withdrawn"  #: the sensor is broken, or the data contradict each other or every motion of the model
 
     @property
     def known(self) -> bool:
@@ -77,7 +77,7 @@ def _tail(least: float) -> tuple[float, float, float]:
 
     scipy's `truncnorm` is not used, because its import takes half a second.
     """
-    if least > _FAR:  # beyond this the tail is exponential
+    if least > _FAR:  # beyond `_FAR` the tail is nearly exponential
         return least + 1.0 / least, least - math.log(0.95) / least, least - math.log(0.05) / least
     share = 0.5 * math.erfc(least / math.sqrt(2.0))
     mean = math.exp(-0.5 * least * least) / (math.sqrt(2.0 * math.pi) * share)

@@ -33,7 +33,7 @@ class Stage:
 _FEWEST_ROWS = (8, 12)
 #: Prior: the differences of a machine whose sensor has a slow low pass and which has no other difference.
 LOW_PASS: Final = np.array([0.0] * LAG + [UNSTATED["filter"]])
-#: Bound: the rounds of the search, after each of which fewer candidates are kept.
+#: Bound: the rounds of the search; each round keeps fewer candidates than the round before.
 STAGES: Final = (Stage(0.1, 4, 5), Stage(0.2, 3, 2))
 #: Bound: largest number of swings, because the cost of a fit grows with their number.
 _MOST_SWINGS = 350
@@ -108,7 +108,7 @@ def refine(
     shortest = tuning.SHORTEST[0 if hard else 1 if drift is None else 2]
     horizon = tuning.HARD_HORIZON if hard else np.inf
     if drift is not None and not hard:
-        # within a swing, the unknown part of the load moves the head by less than the sensor's noise
+        # a swing is so short that during it the unknown part of the load moves the head by less than the sensor's noise
         shortest = min(max(shortest, float(np.cbrt(3.0 * noise**2 / drift).min()) / period), tuning.SHORTEST[1])
     shortest = max(shortest * period, rows[1], float(poses.t[-1] - poses.t[0]) / _MOST_SWINGS)
     horizon = max(horizon * period, rows[0])

@@ -125,7 +125,8 @@ def compare_under_uncertain_load(
     assert found is not None
     share, least = tuning.CORRECTED
     unexplained = np.hypot(share * value[:2], least) if angle else np.zeros(2)
-    # the last move is added to the deviation, because a clearance that still moves has not converged
+    # the change of a clearance in the last round is added to its deviation, because a clearance that still changes has
+    # not converged
     moved = spread.centre - before
     return Compared(
         spread.centre,
@@ -220,7 +221,8 @@ def _with_error(load: Load, share: float, rng: np.random.Generator) -> Load:
         error[index] += keep * error[index - 1]
     amplitude = 0.5 * share * np.ptp(load.wrench, axis=0)
     within = np.arange(load.t[0], load.t[-1], _KNOT)
-    # the density is an upper bound, because samples hardly show how short the correlation of the missed part is
+    # the spectral density is drawn up to an upper bound, because samples hardly show how short the correlation of the
+    # missed part is
     missed = rng.standard_normal((len(within), 3)) * np.sqrt(rng.random() * np.array(load.unknown) / _KNOT)
     t = np.unique(np.concatenate([load.t, grid, within]))
     parts = ((load.t, load.wrench), (grid, amplitude * error), (within, missed))

@@ -103,10 +103,10 @@ _HARDEST, _SOFTEST = 3e-5, 0.12
 _LEAST_CLEARANCE = 5e-4
 
 
-#: The alternative law of a linear contact.
+#: For the law of a linear contact, the alternative law that an estimate tries.
 OTHER_LAW: Final = {"hunt_crossley": "kelvin_voigt"}
 
-#: Guard: smallest prior deviation; a number stated as exact keeps its value.
+#: Guard: smallest prior deviation; it is so small that a number stated as exact keeps its value.
 _HELD = 1e-6
 #: Guard: largest prior deviation of a load's gain.
 _MOST_GAIN = 1.0

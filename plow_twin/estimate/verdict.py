@@ -218,7 +218,7 @@ def _stuck(problem: Problem, fit: Fit, verdict: Verdict) -> None:
 
 
 def _noise_change(fit: Fit, verdict: Verdict) -> None:
-    if not fit.finished:  # the residuals still contain motion, more in one part than in another
+    if not fit.finished:  # the residuals of an unfinished fit still contain motion, more in one part than in another
         return
     for i, name in enumerate(COMPONENTS):
         residual, swing = fit.point.residual[:, i], fit.point.swing
@@ -312,7 +312,7 @@ def swing_blocks(problem: Problem, fit: Fit) -> list[Block]:
     """Return information and score of each swing that has measurements, as if it were not linked."""
     out = []
     for measured, *_ in pieces(problem, fit.point, fit.linear, fit.variance):
-        if len(measured.residual) < 12:  # four poses
+        if len(measured.residual) < 12:  # fewer than four poses
             continue
         normal, score = measured.weighted.T @ measured.rows, measured.weighted.T @ measured.residual
         own = normal[SIZE:, SIZE:] + np.diag(1e-6 + 1e-9 * np.diag(normal[SIZE:, SIZE:]))

@@ -151,7 +151,7 @@ class Worker:
         if self.error or self.ended is not None:
             return None
         if len(self._waiting) > _MOST_WAITING:
-            # the sending thread may be blocked until the far side reads
+            # the sending thread may be blocked, because the far side does not read; the far side is therefore killed
             self._process.kill()
             self._fail(f"the estimator did not read for {_MOST_WAITING} samples")
             return None
@@ -194,7 +194,7 @@ class Worker:
             if waiting:
                 try:
                     self._connection.send(waiting)
-                except OSError:  # `poll` finds the cause
+                except OSError:  # `poll` finds the cause and reports it
                     return
 
 
@@ -202,7 +202,7 @@ def serve(connection: Connection) -> None:
     """Estimate until the other side closes the connection."""
     scene, windows, asked = connection.recv()
     warm_up(scene)
-    connection.send(None)  # ready
+    connection.send(None)  # the far side has compiled its kernels
     guess: Guess = ()
     ended: str | None = None
     skipped = restarts = 0
@@ -256,7 +256,7 @@ def _request_short_slices() -> None:
 
 def main() -> None:
     """Run the far side; the arguments are the descriptor of its end of the pipe, and modules of contact laws."""
-    # Ctrl-C reaches the whole process group, but the near side ends this process
+    # Ctrl-C reaches the whole process group; this process ignores it, because the near side ends this process
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(_NICE)
     _request_short_slices()

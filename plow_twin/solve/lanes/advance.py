@@ -62,16 +62,17 @@ class Samples(NamedTuple):
 
     params: NDArray[np.void]  #: parameters of all twins, shape (m,)
     states: NDArray[np.void]
-    saved: NDArray[np.void]  #: states at the sample before, by lane, shape (8,)
-    totals: NDArray[np.void]  #: counts of touches since the sample before, by lane, shape (8,)
+    saved: NDArray[np.void]  #: states at the previous sample, by lane, shape (8,)
+    totals: NDArray[np.void]  #: counts of touches since the previous sample, by lane, shape (8,)
     times: NDArray[np.float64]  #: times of the samples in s, shape (n,)
-    #: load per mass and inertia, beginning with the last sample before, shape (m, n + 1, 3)
+    #: load per mass and inertia at the previous sample and at the samples, shape (m, n + 1, 3)
     wrench: NDArray[np.float64]
     rows: NDArray[np.void]  #: rows to fill, shape (m, n)
     place: NDArray[np.int64]  #: number of samples that each twin has passed, shape (m,)
-    queue: NDArray[np.int64]  #: numbers of the twins that wait for a lane
-    progress: NDArray[np.int64]  #: number of twins taken from the queue; number of twins that left for another method
-    other: NDArray[np.int64]  #: numbers of the twins that left for another method, shape (m,)
+    queue: NDArray[np.int64]  #: indices of the twins that wait for a lane
+    #: first the number of twins taken from the queue, then the number of twins that left for another method
+    progress: NDArray[np.int64]
+    other: NDArray[np.int64]  #: indices of the twins that left for another method, shape (m,)
 
 
 @kernel(inline="source")

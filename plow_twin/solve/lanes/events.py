@@ -28,15 +28,15 @@ from plow_twin.solve.state import CLIPPED, COS, OFF, ON, RELEASED, SIN, X, Y
 
 #: Two events are simultaneous if the time between them is less than this share of the step before them.
 _AT_ONCE = 1e-12
-#: The search for a root ends when its relative change is below `_FOUND` and the curvature's part in it is below
-#: `_STRAIGHT`, because then the next change would be of the order of this change's cube. It also ends when the relative
-#: change is a rounding error, below `_ROUNDED`.
+#: The search for a root ends if the root's relative change is below `_FOUND` and the curvature's part in the change is
+#: below `_STRAIGHT`; the next change would be of the order of this change's cube. It also ends if the relative change
+#: is below `_ROUNDED`, a rounding error.
 _FOUND, _STRAIGHT, _ROUNDED = 1e-6, 1e-3, 2e-16
 _MOST_CHANGES = 80
 #: A root found over a longer step is surely beyond the present step, in spite of rounding, if it exceeds this multiple
 #: of the step.
 _SURELY_LATER = 1.0 + 1e-9
-#: Rows of `lanes.chosen` after the rows of a penetration.
+#: Indices in `lanes.chosen` after the five rows of a penetration: factor of d, factor of d', further constant.
 _DEPTH, _RATE, _CONSTANT = 5, 6, 7
 
 
@@ -168,7 +168,8 @@ def _write_guard(lanes, places, rows, of_depth, of_rate, constant, guard, order,
             term = fused(of_rate * (k + 1.0), deeper, of_depth * depth)
             deeper = depth
         else:
-            # the rate needs a series of its own, because the variable of the series may be a root of time
+            # the variable of the series may be a root of time, so the rate is no derivative of this series and has one
+            # of its own
             term = of_depth * depth
             if damped != 0 and k < order:
                 deeper = linear_at(
@@ -189,7 +190,7 @@ def _write_guard(lanes, places, rows, of_depth, of_rate, constant, guard, order,
     first = fused(of_rate, deeper, of_depth * depth) + constant
     kept = below(zero, first)
     if fraction is not None:
-        # a pair that parts within the step is inside its wall at the step's start
+        # a pair that parts within the step is inside its wall at the step's start, so its guard keeps its first value
         kept |= below(zero, exact_row(lanes.begin, 0))
     first = choose(kept, first, zero)
     set_row(guard, 0, first)
@@ -262,7 +263,7 @@ def _shift(lanes, guard, order, again, fraction) -> None:
             set_row(guard, j, after)
     first = zero
     if fraction is not None:
-        # a RELEASED pair may have parted a little outside the wall
+        # a pair that was RELEASED may part a little outside its wall (`LET_GO`); its guard -d then begins above 0
         first = choose(below(zero, exact_row(guard, 0)), exact_row(guard, 0), zero)
     set_row(guard, 0, choose(again, first, exact_row(guard, 0)))
 

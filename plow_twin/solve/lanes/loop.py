@@ -41,7 +41,7 @@ class Members(NamedTuple):
     states: NDArray[np.void]
     totals: NDArray[np.void]
     harmonics: NDArray[np.void]  #: harmonics of all scenes, one scene after the other
-    extent: NDArray[np.int64]  #: index of each scene's first harmonic, number of its harmonics
+    extent: NDArray[np.int64]  #: for each scene, the index of its first harmonic and the number of its harmonics
     status: NDArray[np.int64]
     first: NDArray[np.int64]  #: number of rows written
     q: NDArray[np.float64]
@@ -50,8 +50,9 @@ class Members(NamedTuple):
 
 _OK, _RANGE, _NON_FINITE = int(Status.OK), int(Status.OUT_OF_RANGE), int(Status.NON_FINITE)
 _BUDGET, _PAUSED = int(Status.BUDGET), int(Status.PAUSED)
-#: Internal results of a lane: another method must take the next step; the scene has reached the end.
+#: Internal result of a lane whose next step must be taken by another method.
 OTHER_METHOD: Final = 6
+#: Internal result of a lane whose scene has reached its end.
 _DONE: Final = 7
 
 

@@ -41,7 +41,7 @@ LANES: Final = np.dtype(
         # penetrations of the pairs in each slot, unless F is linear in d and d'
         ("depth", "f8", (PAIR_COUNT, _ROWS, WIDTH)),
         ("push", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # F / K of the pairs in each slot
-        ("guard", "f8", (GUARDS, _ROWS, WIDTH)),  # for each round eight guards, which may belong to any lanes
+        ("guard", "f8", (GUARDS, _ROWS, WIDTH)),  # the eight guards of each round, which may belong to any lanes
         ("bernstein", "f8", (_ROWS, WIDTH)),
         ("bulge", "f8", (_ROWS, WIDTH)),  # forces whose maximum must still be found, because it may exceed the peak
         ("bulge_step", "f8", _LANES_OF),  # step sizes that belong to the forces in `bulge`
@@ -49,17 +49,17 @@ LANES: Final = np.dtype(
         ("arms", "f8", (PAIR_COUNT, 2, WIDTH)),  # arm: factors of cosine and sine
         ("ratio", "f8", _PAIRS),  # C / K of pairs that are ON
         ("factor", "f8", _PAIRS),  # lambda
-        ("gear", "f8", (PAIR_COUNT, 8, WIDTH)),  # factors of each slot's pairs: rows, arms, lambda
+        ("gear", "f8", (PAIR_COUNT, 8, WIDTH)),  # for the pairs in each slot: `rows`, `arms` and `factor`
         # guards of a round: the penetration's rows, factors of d and d', a further constant
         ("chosen", "f8", (8, WIDTH)),
         ("along", "f8", (2, 6, WIDTH)),  # factors of c, s, X or Y and of their rates in the forces along X and Y
         # moment = c Gc + s Gs - X fy + Y fx: factors of c, s, X, Y and of their rates in Gc and Gs
         ("turn", "f8", (2, 8, WIDTH)),
         ("constant", "f8", (3, WIDTH)),
-        ("slope", "f8", (3, WIDTH)),  # sampled loads: slope from the last sample to the next sample
-        ("sample", "f8", (3, WIDTH)),  # sampled loads: value of the last sample
+        ("slope", "f8", (3, WIDTH)),  # sampled loads: slope from the previous sample to the next sample
+        ("sample", "f8", (3, WIDTH)),  # sampled loads: value at the previous sample
         ("held", "f8", (3, WIDTH)),  # load at the step's start, including the constant loads
-        ("knot", "f8", _LANES_OF),  # sampled loads: time of the last sample
+        ("knot", "f8", _LANES_OF),  # sampled loads: time of the previous sample
         ("small", "f8", _LANES_OF),  # size below which a term over the longest wanted step counts as vanished
         ("direction", "f8", (4, WIDTH)),
         ("inverse_mass", "f8", _LANES_OF),
@@ -71,10 +71,10 @@ LANES: Final = np.dtype(
         ("half_cavity", "f8", _LANES_OF),
         ("y", "f8", (COMPONENTS, WIDTH)),  # state at the step's start
         ("change", "f8", (COMPONENTS, WIDTH)),  # change of the state over the step
-        ("gained", "f8", (2, WIDTH)),  # one slot: impulse over the step, peak
+        ("gained", "f8", (2, WIDTH)),  # scratch for one slot: impulse over the step, and peak
         ("sum", "f8", (4, WIDTH)),  # integrals over the step of the changes of cosine, sine, X, Y
         ("harmonic", "f8", (10, WIDTH)),  # one load: frequency, sine, cosine, amplitudes of S1, S2, M; phase
-        ("size", "f8", (MOST_LACUNA, WIDTH)),  # the terms of the last orders, as velocities
+        ("size", "f8", (MOST_LACUNA, WIDTH)),  # sizes of the terms of the last orders, as velocities
         ("step", "f8", _LANES_OF),  # step size in s
         ("accurate", "f8", _LANES_OF),  # step size without events
         ("stop", "f8", _LANES_OF),  # time at which a step must end
@@ -101,17 +101,18 @@ LANES: Final = np.dtype(
         ("event", "i8", _LANES_OF),  # the guard that ends the step, or -1
         ("ends_at_stop", "i8", _LANES_OF),
         ("todo", "i8", _LANES_OF),  # a bit for each guard that remains to be searched
-        ("guarded", "i8", (GUARDS, WIDTH)),  # numbers of the guards of each round, or -1
+        ("guarded", "i8", (GUARDS, WIDTH)),  # the guards of each round, by their numbers from 0 to `GUARDS` - 1, or -1
         ("owner", "i8", (GUARDS, WIDTH)),  # lanes of these guards
         ("row_place", "i8", _LANES_OF),  # index in `rows` of each guard of a round
         ("bulge_pair", "i8", _LANES_OF),
         ("bulge_lane", "i8", _LANES_OF),
         ("orders", "i8", _LANES_OF),  # order of each lane's series; the terms beyond have vanished
-        ("before", "i8", _LANES_OF),  # number of steps up to the last sample
+        ("before", "i8", _LANES_OF),  # number of steps up to the previous sample
         ("carrying", "i8", _LANES_OF),  # a bit for each pair that is ON
         # the following fields are used only for exponents other than 1
         ("power", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # d^n of each slot's pairs
-        ("base", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # d, or d / sigma^2 from a touch on; d^2 if n is an integer
+        # d; for a pair that touches at the step's start, d / sigma^2; d^2 if n is an integer
+        ("base", "f8", (PAIR_COUNT, _ROWS, WIDTH)),
         ("rate", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # d' of each slot's pairs
         ("per_base", "f8", _PAIRS),  # 1 / base at the step's start
         ("exponent", "f8", _LANES_OF),
@@ -122,7 +123,7 @@ LANES: Final = np.dtype(
         ("alpha", "f8", _LANES_OF),  # time since the step's start: alpha sigma + beta sigma^2 / 2
         ("beta", "f8", _LANES_OF),
         ("duration", "f8", _LANES_OF),  # step size in s, where `step` and `whole` are values of sigma
-        ("before_it", "f8", _LANES_OF),  # size of the step before in s
+        ("before_it", "f8", _LANES_OF),  # size of the previous step in s
         ("touch_time", "f8", _LANES_OF),  # time of the last touch
         ("release", "f8", _LANES_OF),  # penetration below which the force is negligible
         ("may_stop", "i8", _LANES_OF),  # 1 if a step that is `whole` ends at `stop`

@@ -556,7 +556,8 @@ def accurate_steps(params, lanes, order) -> int:
             elif size > 0.0:
                 least = min(least, math.log(p.threshold[k] / size) / k)
         step = min(whole, math.exp(least))
-        # over a long step an error of velocity becomes an error of position
+        # over a long step an admissible error of velocity becomes too large an error of position; the step is then
+        # shortened
         stretch = step * p.velocity_tolerance / (p.position_tolerance * (order + 1))
         if stretch > 1.0 and step < whole:
             step *= math.exp(-math.log(stretch) / order)
@@ -578,7 +579,8 @@ def accurate_steps_by_power(lanes, w, order, fraction) -> int:
         here = coarse_log2(exact_row(lanes.threshold, i) / size) * w.inverse[order - i]
         least = choose(below(here, least), here, least)
     shorter = below(coarse_exp2(least), whole)
-    # over a long step an error of velocity becomes an error of position
+    # over a long step an admissible error of velocity becomes too large an error of position; the step is then
+    # shortened
     stretch = least + exact_row(lanes.stretch, 0)
     stretch = choose(below(zero, stretch), stretch, zero)
     step = choose(shorter, coarse_exp2(fused(stretch, exact_splat(-w.inverse[order]), least)), whole)

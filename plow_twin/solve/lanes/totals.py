@@ -12,8 +12,8 @@ from plow_twin.solve.lanes.record import COMPONENTS, WIDTH, linear_at, penetrati
 from plow_twin.solve.state import COS, SIN, X, Y
 from plow_twin.solve.totals import add_set_times
 
-#: Allowances for rounding: a factor on the upper bound of a force, and the largest ratio of a maximum to a peak that
-#: counts as equal to it.
+#: Allowances for rounding: the factor by which the upper bound of a force is raised, and the ratio of a maximum to a
+#: peak up to which the two count as equal.
 _ROUNDED, _SAME = 1.0 + 1e-9, 1.0 + 1e-12
 
 
@@ -100,7 +100,7 @@ def _impulses(lanes, gear, viscous, hysteretic):
         if viscous is not None:
             impulse = fused(exact_row(lanes.viscous, 0), way, impulse)
         else:
-            # the dampers add lambda / 2 times the change of d^2
+            # the dampers add lambda / 2 times the change of d^2 to the impulse per stiffness
             damped = exact_row(gear, 7) * (way * fused(way, exact_splat(0.5), depth))
             impulse = fused(exact_row(lanes.stiffness, 0), damped, impulse)
     return impulse

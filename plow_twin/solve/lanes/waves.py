@@ -20,7 +20,7 @@ from plow_twin.kernel.simd import (
 
 #: Largest angle for which the product of the number of quarter turns and the first part of pi / 2 is exact.
 _LARGEST = 1e5
-#: Adding and then subtracting this number rounds to an integer.
+#: Adding this number to a double and then subtracting it rounds the double to an integer.
 _ROUNDS = 6755399441055744.0
 #: pi / 2 in three parts, the first two of 33 bits (fdlibm, e_rem_pio2.c).
 _QUARTERS = (0.6366197723675814, 1.57079632673412561417, 6.07710050630396597660e-11, 2.02226624879595063154e-21)
@@ -77,7 +77,7 @@ def turn_lanes(angle, cosine, sine) -> None:
         c = fused(c, square, exact_splat(_COSINE[i]))
     s = fused(s * square, r, r)
     c = fused(c * square, square, fused(square, exact_splat(-0.5), exact_splat(1.0)))
-    # 0 to 3 quarter turns remain after the whole turns
+    # `quarter`, from 0 to 3, is the number of quarter turns that remain after the whole turns
     whole = (turns * 0.25 - 0.375 + _ROUNDS) - _ROUNDS
     quarter = turns - whole * 4.0
     first, half, last = (
