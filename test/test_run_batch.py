@@ -9,7 +9,7 @@ import pytest
 from scenes import preset
 from test_solve_rest import fallen
 
-from plow_twin import Friction, Head, Scene, Twin, TwinBatch, Wear
+from plow_twin import Clearance, Friction, Head, Scene, Twin, TwinBatch, Wear
 from plow_twin.model.loads import compile_loads
 
 TIMES = np.arange(1, 401) * 1e-3
@@ -82,6 +82,19 @@ def test_a_member_in_lanes_has_its_own_bits_and_the_motion_of_a_twin(law: str) -
             found, expected = getattr(together[index], name), getattr(twin, name)
             assert np.abs(found - expected).max() < 1e-7 * max(np.abs(expected).max(), 1e-3), (index, name)
     assert together.makes.sum() > 0 and together.steps.sum() > 1.05 * together.steps.size
+
+
+def test_a_sample_soon_after_a_touch_leaves_no_false_peak() -> None:
+    """0.12 us after a touch with exponent 1.5 a step of 1 ms is beyond what the series of the force can give."""
+    scene = dataclasses.replace(preset("bench_hc"), clearance=Clearance(0.02177825783567106, 0.026269479985725534))
+    times = np.arange(1, 852) * 1e-3
+    wrench = compile_loads(scene.loads).at(times)
+    alone = Twin(scene, tol=1e-6, excitation="sampled").advance_samples(times, wrench)
+    lanes = TwinBatch([scene], tol=1e-6).advance_samples(times, wrench)[0]
+    assert 0.0 < alone.force[849, 4] < 1e-3 and alone.force[850, 4] > 200.0
+    for rows in (alone, lanes):
+        assert rows.peak[850, 4] == pytest.approx(rows.force[850, 4], rel=1e-9)
+        assert rows.impulse[850, 4] == pytest.approx(alone.impulse[850, 4], rel=1e-9)
 
 
 def test_a_twin_at_rest_costs_next_to_nothing() -> None:

@@ -17,6 +17,7 @@ from plow_twin.kernel.simd import below, choose, exact_row, exact_splat, fused, 
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.lanes.record import DC, DS, DX, DY, MOST_LACUNA, WIDTH, linear_at, penetration_at
 from plow_twin.solve.lanes.waves import coarse_exp2, coarse_log2, turn_lanes
+from plow_twin.solve.method.taylor import FURTHEST
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, X, Y
 
 #: Largest usable term; products of larger terms would not be finite.
@@ -567,6 +568,18 @@ def accurate_steps(params, lanes, order) -> int:
 
 
 @kernel()
+def _not_too_far(lanes, step):
+    """Shorten the steps in the root of time since a touch (`method.taylor`)."""
+    zero, alpha, beta = exact_splat(0.0), exact_row(lanes.alpha, 0), exact_row(lanes.beta, 0)
+    furthest = alpha / beta * FURTHEST
+    far = below(zero, alpha) & below(zero, beta) & below(furthest, step)
+    if far != 0:
+        for lane in range(WIDTH):
+            lanes.ends_at_stop[lane] &= 1 - (far >> lane & 1)
+    return choose(far, furthest, step)
+
+
+@kernel()
 def accurate_steps_by_power(lanes, w, order, fraction) -> int:
     """Do what `accurate_steps` does, for exponents other than 1, from the last `MOST_LACUNA` orders.
 
@@ -594,6 +607,8 @@ def accurate_steps_by_power(lanes, w, order, fraction) -> int:
         if fraction is not None:
             lanes.ends_at_stop[lane] &= lanes.may_stop[lane]
     step = choose(live, step, whole)
+    if fraction is not None:
+        step = _not_too_far(lanes, step)
     set_row(lanes.step, 0, step)
     set_row(lanes.accurate, 0, step)
     return infinite & live

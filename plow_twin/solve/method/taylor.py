@@ -18,6 +18,10 @@ from plow_twin.solve.method.step_size import (
 #: After a touch the square root of the time since the touch is the series' variable for this many steps of the last
 #: size.
 TOUCH_REACH = 2.5
+#: Longest step in the square root of time since the touch, over its value at the step's start. The series of the force
+#: has a rounding error like that of 1 / sqrt(t), which grows by this factor with each order, and with the 30th reaches
+#: 1e18 times its size. The motion is free of it, because there the factor dt / d sigma cancels it.
+FURTHEST = 4.0
 
 
 @kernel(inline="source")
@@ -43,6 +47,8 @@ def _lay_out(p, parts, slip, ramp, fraction, stick, implicit, state, w, span, pe
     sigma = limit if order < p.order else accurate_step(p, w, order, limit)
     if not math.isfinite(sigma):
         return False
+    if fraction is not None and state.alpha > 0.0 and state.beta > 0.0:
+        sigma = min(sigma, FURTHEST * state.alpha / state.beta)
     if slip is not None:
         sigma = before_sticking(p, state, w, order, sigma)
     if ramp is not None and penetrating:
