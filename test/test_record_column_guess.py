@@ -132,7 +132,7 @@ def _in_terminal(folder: Path, *said: bytes) -> tuple[int, str]:
     screen, answers, seen = b"", list(said), 0
     with suppress(OSError):  # reading fails once the program has closed its side of the terminal
         while True:
-            # readline misses a signal just before it waits, so the key is pressed again
+            # readline may miss a signal that comes just before it waits, so the key is pressed again
             while said[-1] == CTRL_C and not answers and not select.select([near], [], [], 5.0)[0]:
                 os.write(near, CTRL_C)
             found = os.read(near, 4096)

@@ -79,7 +79,7 @@ def test_an_export_is_the_recording_and_overwrites_nothing(
     recording = plow_twin.read_recording(run.folder)
     for name in recording.names:
         stamps, values = recording[name].numpy()
-        if not len(stamps):  # there are no intervals, because the run did not follow its machine
+        if not len(stamps):  # this run did not follow its machine, so these tables are empty
             assert name in ("force_intervals", "peak_intervals") and not (out / f"{name}.{kind}").exists()
             continue
         if kind == "npz":
@@ -115,7 +115,8 @@ def test_an_export_of_a_cut_recording_says_so_and_of_a_place_that_takes_nothing_
     monkeypatch.setattr(Table, "arrow_batch", full)
     assert cli(["export", str(run.folder), "--to", "parquet", "--out", str(tmp_path / "none"), "--quiet"]) == 1
     assert "cannot be written: No space left" in capsys.readouterr().err
-    assert not list((tmp_path / "none").iterdir())  # no file is left that looks like a whole table
+    # no incomplete file is left, because it would look like a whole table
+    assert not list((tmp_path / "none").iterdir())
     monkeypatch.undo()
     (tmp_path / "file").write_text("")
     assert cli(["export", str(run.folder), "--to", "csv", "--out", str(tmp_path / "file" / "x"), "--quiet"]) == 1

@@ -50,7 +50,7 @@ from plow_twin.stream.journal import (
 )
 
 JOURNAL = {Sample: "samples", Digest: "digests"}
-# integers have 64 bits, as a journal stores them
+# a journal stores integers with 64 bits
 whole = st.integers(-(2**63), 2**63 - 1)
 counts = st.integers(1, 2**63 - 1)
 stamps = st.integers(-(2**31) * 10**9, (2**31 - 1) * 10**9)
@@ -179,7 +179,7 @@ def test_a_file_cut_anywhere_gives_its_content_before_the_cut(run: Run, tmp_path
         cut_file.write_bytes(data[:cut])
         reader = RunReader(cut_file)
         records = list(reader)
-        # journal and outputs are in separate chunks, so the first records of each are left
+        # journal and outputs are in separate chunks, so a cut leaves the first records of each
         for kind in (EntryRecord, OutputRecord):
             found = [record for record in records if isinstance(record, kind)]
             assert found == [record for record in whole if isinstance(record, kind)][: len(found)]
@@ -317,8 +317,9 @@ def test_the_extra_brings_every_library_that_is_imported(monkeypatch: pytest.Mon
     runpy.run_path("setup.py")
     wanted = [*declared["install_requires"], *declared["extras_require"]["record"]]
     names = {re.split("[^A-Za-z0-9_-]", requirement.replace("PyYAML", "yaml"))[0] for requirement in wanted}
-    names.add("llvmlite")  # numba requires llvmlite at a fixed version
-    names |= {"pandas", "pyarrow"}  # libraries for tables of a recording, which are used only if installed
+    names.add("llvmlite")  # llvmlite need not be declared, because numba requires it at a fixed version
+    # these libraries for tables need not be declared, because they are used only if installed
+    names |= {"pandas", "pyarrow"}
     assert imported - names - sys.stdlib_module_names - {"plow_twin"} == set()
 
 

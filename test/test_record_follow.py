@@ -22,7 +22,8 @@ COUNT = 3000
 
 def test_a_follower_sees_every_sample_of_every_part_and_ends_with_the_run(tmp_path: Path) -> None:
     before = record_run(tmp_path / "before", map(paper_sample, range(10)))
-    assert sum(len(batch.entries) for batch in RunReader(before.folder, Tail()).batches())  # compiles the reader
+    # this first reading compiles the reader
+    assert sum(len(batch.entries) for batch in RunReader(before.folder, Tail()).batches())
     options = {"part_bytes": 100_000, "flush_period_s": 0.05}
     writer = threading.Thread(
         target=record_run, args=(tmp_path / "run", map(paper_sample, range(COUNT))), kwargs=options

@@ -32,7 +32,7 @@ def order(*streams: Iterator[Arrived]) -> list[tuple[str, float | None]]:
         ((1, 3, 2.9, 5), (2, 4), "abaaba"),  # a late message
         ((10, 12, 1, 13, 15), (11, 14), "abaaaba"),  # a wrong stamp in the past
         ((10, 12, 99, 13, 15), (11, 14), "abaaaba"),  # a wrong stamp in the future
-        ((10, 12, 2, 4), (11, 3), "abaaba"),  # both files have a step of the clock
+        ((10, 12, 2, 4), (11, 3), "abaaba"),  # in both files the clock steps back
         ((-4, -3, 5), (-3.5, 0), "ababa"),
     ],
 )

@@ -87,7 +87,8 @@ class Mixed:
         bound = self.settings.max_evaluations or None
         twin = Twin(SCENE, tol=self.settings.tolerance, excitation="sampled", max_evaluations=bound)
         session = Session(twin, on_entry=self.recording.recorder.journal, rollback_span_s=self.settings.rollback_span)
-        intake = Intake(jump_back_s=60.0)  # the input has no limits, so an advance may fail
+        # the input has no limits, so an absurd load reaches the model and its advance may fail
+        intake = Intake(jump_back_s=60.0)
         every_sample = self.settings.publish_mode == "on_sample"
         self.driver = Driver(session, intake, policy(self.settings), every_sample=every_sample)
         session.start()
@@ -267,7 +268,7 @@ def _drive(live: Mixed, random: Random, calls: int) -> None:
                 skipped += range(index, index + gap)
                 index += gap
             case "late" if skipped:
-                # these samples have stamps at the edge of the twin's memory
+                # the stamps of these samples are at the edge of the time that the twin remembers
                 near = [ms for ms in skipped if abs(index - ms - span_ms) < 20]
                 chosen = near or random.sample(skipped, min(len(skipped), random.choice([1, 1, 4])))
                 skipped = [ms for ms in skipped if ms not in chosen]

@@ -40,7 +40,7 @@ from plow_twin.stream.session import Session
 from plow_twin.study.analysis.analyse import analyse
 
 COUNT = 3000
-#: Options that split such a run into several parts.
+#: Options that split a run of `COUNT` samples into several parts.
 SMALL: dict[str, Any] = {"part_bytes": 200_000, "flush_period_s": 0.01, "chunk_size": 50_000}
 
 
@@ -158,7 +158,7 @@ def test_a_repair_keeps_every_old_file_and_lists_every_part(tmp_path: Path) -> N
     old = [parts[1].read_bytes()[:-1000]]
     for _ in range(2):  # the file is cut, repaired and cut again
         parts[1].write_bytes(old[-1])
-        assert repair(parts[1]) == [parts[1]]  # this file is one part of several
+        assert repair(parts[1]) == [parts[1]]  # one of several parts can be repaired alone
         assert listed_parts(run.folder) == [part.name for part in parts]
         old.append(parts[1].read_bytes()[:-2000])
     kept = [parts[1].with_name(f"{parts[1].name}.damaged{ending}") for ending in ("", "_2")]
@@ -182,7 +182,7 @@ def test_topics_recorded_beside_a_run_are_examined_and_repaired(tmp_path: Path) 
     with writer.path.open("rb") as stream:
         summary = make_reader(stream).get_summary()
     assert summary is not None and summary.statistics is not None and summary.statistics.message_count > 5
-    # the type belongs to another package, so its hash is unknown
+    # the type belongs to another package, so its hash is unknown and is written as zeros
     assert summary.channels[1].metadata["topic_type_hash"] == "RIHS01_" + 64 * "0"
     assert "own/msg/Level" in (writer.folder / "metadata.yaml").read_text()
 
@@ -239,7 +239,8 @@ def test_a_stretch_that_stands_there_twice_is_counted_and_used_once(tmp_path: Pa
     whole, spans = run.file.read_bytes(), chunk_spans(run.file)
     before = replay(run.folder)
     head = 9 + 3 * 8 + 2 * 4 + len("zstd") + 8  # number of bytes of a chunk's record before its data
-    begin, end = spans[2][0] - head, spans[8][0] - head  # from a chunk of the journal to one of outputs
+    # the repeated bytes begin with a journal chunk and end before an outputs chunk
+    begin, end = spans[2][0] - head, spans[8][0] - head
     run.file.write_bytes(whole[:end] + whole[begin:end] + whole[end:])
     after, found = replay(run.folder), examine(run.folder)
     assert after.divergences == 0 and after.samples == before.samples and after.repeated == found.repeated > 0
@@ -264,7 +265,7 @@ def test_a_full_disk_is_named_and_a_repair_leaves_nothing_half_done(tmp_path: Pa
 def test_a_full_disk_ends_the_writing_of_a_replay_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = record_run(tmp_path / "run", map(paper_sample, range(COUNT)), frame_every=10**9, pause_every=0)
     before, full = run.file.read_bytes(), tmp_path / "full"
-    # this run puts the kernels into the cache
+    # this run puts the kernels into the cache before the size of files is limited
     assert cli(["replay", str(run.folder), "--write", str(tmp_path / "whole"), "-q"]) == 0
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, limits[1]))
@@ -331,7 +332,7 @@ def test_a_part_that_is_not_there_is_counted_and_no_load_drawn_over_its_hole(whi
     whole = analyse(run.folder)
     assert not whole.lossy and not read_recording(run.folder)[1]
     RunReader(run.folder).parts[which].unlink()
-    for listing in (True, False):  # the parts' numbers show a missing part in the middle
+    for listing in (True, False):  # without a listing, the parts' numbers show only a missing part in the middle
         report, found, (facts, lossy) = replay(run.folder), analyse(run.folder), read_recording(run.folder)
         problems = examine(run.folder).problems
         if listing or which == 1:
@@ -343,7 +344,7 @@ def test_a_part_that_is_not_there_is_counted_and_no_load_drawn_over_its_hole(whi
         (run.folder / "metadata.yaml").unlink(missing_ok=True)
     assert found.input["samples_used"] == report.samples < COUNT
     times = np.diff(found.predictions[0].series()[0])
-    assert times.max() == 1_000_000  # no rows are missing in between
+    assert times.max() == 1_000_000  # none is missing among the rows that are left
     assert found.predictions[0].loads.duration_s < whole.predictions[0].loads.duration_s
 
 
@@ -351,16 +352,17 @@ def test_parts_that_are_removed_while_others_are_read_are_passed_over(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """If the oldest parts are removed (`record_keep_mb`), a reader may be slower than the recorder."""
-    monkeypatch.setattr("plow_twin.record.reader._LEAST", 1)  # with small batches the parts are read one by one
+    # batches are so small that the reader takes the parts one by one
+    monkeypatch.setattr("plow_twin.record.reader._LEAST", 1)
     run = record_run(tmp_path / "run", map(paper_sample, range(COUNT)), **SMALL)
-    (run.folder / "metadata.yaml").unlink()  # a run that still goes on has no metadata.yaml
+    (run.folder / "metadata.yaml").unlink()  # without metadata.yaml the run looks as if it still went on
     parts = RunReader(run.folder).parts
     assert len(parts) >= 4
     reader = RunReader(run.folder)
     parts[0].unlink()
     records = iter(reader)
     first = next(records)
-    parts[1].unlink()  # the reader has opened this part and reads it to its end
+    parts[1].unlink()  # the reader has this part open already, so it still reads the part to its end
     parts[2].unlink()
     assert isinstance(first.entry, Snapshot)  # type: ignore[union-attr]
     assert len(list(records)) < sum(reader.counts.values()) < COUNT * 4

@@ -95,7 +95,8 @@ def joint_state(index: int) -> JointState:
     return JointState(BASE_NS + index * STEP_NS, "slide_frame", PAIR_NAMES, values, values, values)
 
 
-#: A program that forks a writer for each line `folder flush_period` that it reads, and prints its number and its end.
+#: A program that reads lines `folder flush_period`. For each line it forks a writer, and prints the writer's process id
+#: and its end.
 FORKS = """
     import json, os, sys
     import plow_twin.record.writer, mcap.writer, rosbags.typesys, lz4.frame, zstandard
@@ -220,7 +221,7 @@ def test_a_full_disk_stops_the_recording_and_nothing_else(tmp_path: Path) -> Non
     output, _ = process.communicate(timeout=60)
     assert process.returncode == 0
     report = json.loads(output.splitlines()[-1])
-    assert len(output.splitlines()) == 3001  # the caller has continued to its last sample
+    assert len(output.splitlines()) == 3001  # the full disk did not stop the caller, which continued to its last sample
     assert report["errors"] == [report["error"]] and "File too large" in report["error"]
     assert not report["closed"] and report["refused"] > 0 and report["counted"] == report["lost"]
     reader = RunReader(tmp_path / "run")
@@ -350,7 +351,7 @@ def test_a_ring_keeps_the_last_seconds_and_writes_them_at_a_mark(
     dump = RingWriter.dump
 
     def dump_after_another(ring: RingWriter, folder: Path, loss: Mapping[str, int]) -> None:
-        if folder.name == "ring_2":  # another process makes this folder before the ring does
+        if folder.name == "ring_2":  # another process makes this folder just before the ring makes it
             Recorder(folder, HEADER).close()
         dump(ring, folder, loss)
 
@@ -385,8 +386,8 @@ def test_a_ring_keeps_the_last_seconds_and_writes_them_at_a_mark(
     for path in written:
         report = replay(path)
         assert (report.exit_code, report.divergences) == (0, 0) and report.messages_compared
-        assert 0.02 < report.span_s < 0.7 * index * 1e-3  # on a busy machine 0.4 s have few samples
-    # items between the two recordings are in one of them or in neither
+        assert 0.02 < report.span_s < 0.7 * index * 1e-3  # on a busy machine few samples arrive within the ring's 0.4 s
+    # no sample is in both recordings
     stamps = [
         {int(stamp) for batch in RunReader(path).batches() for stamp in batch.entries.stamp_ns[batch.entries.sample]}
         for path in written
@@ -443,7 +444,7 @@ def test_closing_waits_while_items_are_written_and_then_says_what_is_missing(
     write, stuck = RunWriter.write_samples, threading.Event()
 
     def slowly(writer: RunWriter, *given: Any) -> None:
-        if len(given[0]) == 1:  # this sample comes last
+        if len(given[0]) == 1:  # only the last sample comes alone; writing it hangs
             stuck.wait(60.0)
         time.sleep(0.3)
         write(writer, *given)
@@ -454,7 +455,8 @@ def test_closing_waits_while_items_are_written_and_then_says_what_is_missing(
         recorder = Recorder(tmp_path / f"run{count}", HEADER)
         for index in range(count):
             assert recorder.journal(paper_sample(index))
-        report = recorder.close(timeout_s=0.6)  # one burst takes 0.3 s, five take 1.5 s
+        # writing one burst takes 0.3 s, which is in time; five bursts take 1.5 s, which is too long
+        report = recorder.close(timeout_s=0.6)
         assert report.complete == (count == 50)
     sentence = report.sentence(tmp_path / "run51")
     stuck.set()
@@ -538,7 +540,7 @@ def test_with_sync_flushed_data_survive_a_loss_of_power(tmp_path: Path) -> None:
                 before = index if flushes == 3 else before
             if flushes == 5:
                 process.kill()
-    # a loss of power may leave only the synced files
+    # a loss of power may leave only what was synced, so the file is cut to that size
     assert {str(folder), str(tmp_path)} <= {path for path, _ in synced}
     os.truncate(file, max(size for path, size in synced if path == str(file)))
     reader = RunReader(folder)

@@ -198,7 +198,8 @@ def test_after_a_damaged_chunk_nothing_is_claimed(run: Run, tmp_path: Path) -> N
     for start, length in spans:  # these are the chunks of the journal, and of the sent messages
         data = bytearray(run.file.read_bytes())
         middle = start + length // 2
-        # one flipped bit in the compressed data may refer to other bytes that are equal, so several bytes are changed
+        # in compressed data, one flipped bit may make a reference point to equal bytes and change nothing, so several
+        # bytes are changed
         data[middle : middle + 8] = bytes(byte ^ 0xFF for byte in data[middle : middle + 8])
         damaged = tmp_path / "damaged.mcap"
         damaged.write_bytes(data)
@@ -272,7 +273,7 @@ def test_a_journal_alone_gives_the_full_recording_again(tmp_path: Path) -> None:
 def test_digests_alone_are_compared_without_opening_the_outputs(run: Run, tmp_path: Path) -> None:
     data = bytearray(run.file.read_bytes())
     for start, length in chunk_spans(run.file, journal=False):
-        data[start + length // 2] ^= 0xFF  # the damaged chunks are of outputs, which are not read
+        data[start + length // 2] ^= 0xFF  # only chunks of outputs are damaged, and outputs are not read here
     file = tmp_path / "damaged.mcap"
     file.write_bytes(data)
     report = replay(file, digests_only=True)
@@ -292,8 +293,8 @@ def test_digests_do_not_break_a_run_of_samples(run: Run, monkeypatch: pytest.Mon
 
     monkeypatch.setattr(Session, "advance", counted)
     assert replay(run.folder).exit_code == 0
-    # a digest follows every hundred samples, yet each call after the first, which warms up, processes thousands of
-    # samples
+    # a digest follows every hundred samples, but does not split the calls: after the first call, which warms up, each
+    # call processes thousands of samples
     assert sum(calls) == COUNT + 2 and len(calls) <= 4
 
 

@@ -88,7 +88,7 @@ def test_two_twins_do_not_keep_their_wear_in_one_folder(tmp_path: Path) -> None:
     first.close(np.array(DEPTH))
     second = WearKeeper(tmp_path / "wear", "head 7", SCENE)
     assert second.load() == DEPTH
-    second.release()  # a failed configure releases the folder too
+    second.release()  # a configuration that fails also releases the folder
     WearKeeper(tmp_path / "wear", "head 7", SCENE).release()
     assert os.listdir(tmp_path / "wear") == [FILE_NAME]
 
@@ -163,7 +163,7 @@ def test_wear_that_could_not_be_saved_goes_on_unless_the_file_is_another_one(
 
         def fail(descriptor: int) -> None:
             calls.append(descriptor)
-            # the write of the file fails, or the write of the folder, when the new file already exists
+            # either the sync of the file fails, or the sync of the folder, when the new file already exists
             if len(calls) == 1 + waited:
                 raise OSError(28, "No space left on device")
 

@@ -133,7 +133,7 @@ def test_forces_are_compared_with_the_machine_s_and_the_time_of_each_estimate_is
     beside = compare_forces(record_run(tmp_path / "run", entries).folder, 1.5e-3)
     assert beside is not None
     assert beside.estimates_s == pytest.approx([1.499])
-    # this run does not follow the machine, so its forces are nominal
+    # this run does not follow the machine, so its forces are those of the nominal model
     assert beside.error["followed"] == pytest.approx(beside.error["nominal"], rel=1e-3)
     assert beside.error["nominal"] > 0.02
 

@@ -89,7 +89,7 @@ def test_late_samples_of_a_publisher_that_was_stopped_are_used(tmp_path: Path) -
         running.probe.pause(2.0)
         publisher.send_signal(signal.SIGCONT)
         figures = _until_accounted(running, _sent(publisher))
-        # samples sent at once may overrun the publisher's own queue
+        # the publisher's own queue may lose some of the samples that it sends at once, so losses are counted too
         assert int(figures["samples_used"]) + int(figures["samples_lost"]) == 4000
         assert int(figures["rolled_back"]) > 0
 
@@ -121,13 +121,13 @@ def test_a_paused_node_counts_the_overrun_of_its_queue_and_continues(tmp_path: P
 
 
 def test_outputs_come_in_time_while_samples_come_ten_times_as_fast(tmp_path: Path) -> None:
-    # the reader is reliable, because a best-effort reader's loss at the very end would never show
+    # with a best-effort reader a loss at the very end would never show, so the reader is reliable
     settings = {"publish_mode": "fixed_rate", "publish_rate": 100.0, "input_depth": 20000}
     with bench(tmp_path, **settings, **RELIABLE_INPUT) as running:
         publisher = running.publisher("--rate", "10000", "--seconds", "5")
         _until_accounted(running, _sent(publisher))
-        # an executor that checks its timers only when nothing waits would send 23 of 500 due messages; at this rate
-        # such a loop sometimes finds an empty queue, so test_ros_runtime keeps the queue full
+        # an executor that checks its timers only when no message waits would send 23 of 500 due messages; at this rate
+        # even such an executor sometimes finds an empty queue, so test_ros_runtime keeps the queue full
         figures = running.probe.figures("output")
         assert int(figures["published"]) - int(figures["held"]) > 60
 
@@ -161,7 +161,8 @@ def test_a_disk_that_takes_no_more_stops_the_recording_and_not_the_twin(tmp_path
         # a write beyond this size fails, as on a full disk
         resource.prlimit(running.twin._process.pid, resource.RLIMIT_FSIZE, (200_000, 200_000))
         publisher = running.publisher("--rate", "1000", "--seconds", "120")
-        # losses on a busy machine are errors too, and may be reported earlier
+        # on a busy machine other losses, which are errors too, may be reported earlier, so the recorder's error is
+        # awaited
         running.probe.until(lambda: running.probe.figures("recorder")["error"], "the full disk")
         running.probe.until(lambda: value(running.probe.status[-1], "recorder") == "trouble", "the full disk in status")
         assert running.probe.status[-1].level == b"\x02"
@@ -230,7 +231,7 @@ def test_damaged_bytes_on_every_input_are_counted_to_the_last_one(tmp_path: Path
         assert running.twin.stop() == 0
     report = replay(tmp_path / "run")
     assert report.exit_code == 0 and report.samples > 2900
-    # the file accounts for every message
+    # the counts in the file add up to the number of messages sent
     assert sum(report.inputs["tool_forces"].values()) == 3000
 
 
@@ -293,10 +294,10 @@ def test_the_scene_s_loads_follow_a_clock_that_is_paused_looped_and_fast(tmp_pat
         reach(T0)
         reach(T0 + 20 * MS)
         count = len(forces)
-        for _ in range(3):  # while paused, three reports show no motion
+        for _ in range(3):  # while the clock is paused, three reports come and none shows motion
             probe.figures("output")
         assert len(forces) == count and probe.figures("state")["resets"] == "0"
-        # the clock advances by a second with each message, which is sent once the message before is answered
+        # each message advances the clock by a second; the next is sent once this one is answered
         for second in range(1, 8):
             reach(T0 + second * 1000 * MS)
         assert probe.figures("state")["resets"] == "0"
@@ -401,7 +402,8 @@ def test_steps_of_the_node_s_own_clock_stop_reset_and_lose_nothing(
                 probe.pace(sent)
             figures = _until_accounted(running, sent)
             age_s = float(figures["newest_sample_age_s"]) - (time.time_ns() - T0 - sent * MS) * 1e-9
-            # the report has the node's time, which shows the step; on a busy machine it may be read late
+            # the report's age is by the node's clock and therefore shows the step; on a busy machine the report may be
+            # read late
             assert abs(age_s - off_s) < 5.0
             assert (figures["samples_used"], figures["holds"]) == (str(sent), "0")
         found = probe.figures("state")
@@ -525,7 +527,8 @@ def test_two_twins_in_one_process_do_not_disturb_each_other() -> None:
 
 def test_two_minutes_with_the_recorder_account_for_every_message_and_grow_by_nothing() -> None:
     command = [sys.executable, str(ROOT / "benchmark" / "live_load.py"), "--minutes", "2", "--rate", "500"]
-    environment = os.environ | {"ROS_DOMAIN_ID": "97"}  # other nodes publish reports too
+    # a ROS domain of its own, because other nodes publish reports too
+    environment = os.environ | {"ROS_DOMAIN_ID": "97"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=400.0)
     rows = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]

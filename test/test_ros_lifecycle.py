@@ -87,7 +87,7 @@ def test_a_recording_that_cannot_be_made_refuses_configuration_and_leaves_nothin
 
 
 def test_a_folder_that_takes_no_wear_refuses_configuration_and_is_named(managed: Bench) -> None:
-    # in /proc no user can make files
+    # no user can create files in /proc
     assert _set(managed, "wear_state_path", "/proc/self/wear").successful
     assert not _change(managed, Transition.TRANSITION_CONFIGURE)
     expected = "wear_state_path: got '/proc/self/wear', expected a folder that can be written to: "
@@ -212,7 +212,7 @@ def test_arguments_that_ros_cannot_read_are_reported_without_a_traceback(tmp_pat
 def test_a_parameter_file_with_integers_for_doubles_and_a_typing_error(tmp_path: Path) -> None:
     path = tmp_path / "twin.yaml"
     path.write_text(yaml.safe_dump({"/**": {"ros__parameters": {"excitation_timeout": 2, "hold_polcy": "zero"}}}))
-    # the tolerance comes as a text, because YAML 1.1 reads 1e-8 as one
+    # YAML 1.1 reads 1e-8 as a text, so the tolerance comes as a text
     with bench(tmp_path, arguments=("--params-file", str(path)), tolerance="1e-8") as running:
         request = GetParameters.Request(names=["excitation_timeout", "tolerance"])
         service = f"{running.namespace}/plow_twin/get_parameters"
@@ -296,7 +296,7 @@ def test_the_model_changes_a_motion_comes_back_and_the_journal_gives_it_all_agai
         assert ask("snapshot").success
         first = feed(100)
         assert ask("restore").success
-        # the first sample gets the snapshot's time
+        # the first sample after the restore gets the snapshot's time
         assert feed(101)[1:] == first
         answer = _set(running, "damping", 0.0)
         assert not answer.successful and "configure the node again" in answer.reason

@@ -150,7 +150,7 @@ def test_at_a_fixed_rate_the_latency_includes_the_wait_for_the_publication(tmp_p
     ("mode", "rate"), [pytest.param("on_sample", 3000, marks=pytest.mark.stress), ("fixed_rate", 10000)]
 )
 def test_every_sample_sent_is_used_dropped_or_counted_as_lost(tmp_path: Path, mode: str, rate: int) -> None:
-    # the publisher overruns any queue, so some or all samples are read
+    # the publisher may overrun any queue, so samples may be lost, but each of them is counted
     with bench(tmp_path, publish_mode=mode, input_depth=200, excitation_timeout=60.0) as running:
         probe = running.probe
         publisher = running.publisher("--rate", str(rate), "--seconds", "2")
@@ -163,7 +163,7 @@ def test_every_sample_sent_is_used_dropped_or_counted_as_lost(tmp_path: Path, mo
             if counted == sent:
                 break
     assert sent == 2 * rate
-    # only the next sample would reveal a loss at the very end
+    # a loss at the very end would show only with the next sample, so it is not yet counted
     assert 0 <= sent - counted <= 0.01 * sent
     assert int(figures["samples_missing"]) == 0  # no sample counts as missing, because no rate is expected
 
@@ -320,20 +320,20 @@ def test_an_alarm_stays_until_it_is_acknowledged_and_writes_the_time_before_it(t
         found["topic_metadata"]["name"].rpartition("/")[2]: found["topic_metadata"]["offered_qos_profiles"][0]
         for found in stated["topics_with_message_count"]
     }
-    # the recording states the durability that each publisher has in the graph
+    # for each topic, the recording states the durability that the topic's publisher has in the graph
     recorded = {name: profiles[name]["durability"] for name in profiles.keys() & offered.keys()}
     assert recorded == {name: offered[name] for name in recorded}
     assert {*recorded.values()} == {"volatile", "transient_local"}
     assert (profiles["alarms"]["depth"], profiles["contact_forces"]["depth"]) == (1, 1000)
     before, after = replay(tmp_path / "run"), replay(tmp_path / "run_2")
     assert (before.exit_code, after.exit_code) == (0, 0)
-    # the first ring ends at the alarm, not at the end of the run; the time after it is in the second ring
+    # the first ring ends at the alarm; the time from the alarm to the run's end is in the second ring
     assert 0 < before.samples < 600 and before.samples + after.samples == 601
-    # the first ring begins with the run and raises the alarm again; the second ring does not contain the cause of its
-    # alarm
+    # the first ring begins with the run, so its replay raises the alarm again; the second ring lacks the alarm's cause,
+    # so its replay raises none
     assert (before.compared["alarms"], after.compared["alarms"]) == (1, 0) and after.not_compared["alarms"] > 0
     kinds = [type(record.entry).__name__ for record in RunReader(tmp_path / "run_2") if hasattr(record, "entry")]
-    # entries of the acknowledgement, the mark's text, and the mark
+    # the acknowledgement and the mark's text are entries of the kind Parameter; the mark itself is a Mark
     assert (kinds.count("Parameter"), kinds.count("Mark")) == (2, 1)
 
 
@@ -382,7 +382,7 @@ def test_a_delay_that_rises_for_good_is_worked_in_marked_and_replayed_exactly(tm
     report = replay(record)
     assert (report.exit_code, report.divergences) == (0, 0), report
     assert report.compared["contact_peaks"] >= len(forces) and not report.not_compared
-    # a subscriber received the same messages that the file has
+    # the messages in the file are those that a subscriber received
     topic = f"{running.namespace}/contact_forces"
     recorded = [item.message() for item in RunReader(record) if getattr(item, "topic", "") == topic]
     assert len(recorded) >= len(forces)
@@ -481,7 +481,7 @@ def test_bad_samples_are_dropped_counted_and_never_published(tmp_path: Path) -> 
         "tool_forces": {"not_selected": 1},
         **{topic: {"malformed": 1} for topic in ("travel", "head_pose", "gaps")},
     }
-    assert b"\x02" in levels  # an unstamped sample is an error
+    assert b"\x02" in levels  # a sample without a stamp is reported as an error
     assert [stamp_ns(message.header) - T0 for message in forces] == [0, 3 * MS, 3 * MS, 4 * MS]
     for quantity in ("position", "velocity", "effort"):
         assert np.isfinite(_column(forces, quantity)).all()
@@ -525,7 +525,7 @@ def test_a_stop_under_load_is_clean_and_closes_the_recording(tmp_path: Path, num
         forces = running.probe.listen(JointState, "contact_forces")
         publisher = running.publisher("--seconds", "60")
         running.probe.until(lambda: len(forces) > 500, "a flow of messages", 60.0)
-        # several signals arrive, as when a terminal and a launch each send one
+        # several signals arrive, for example one from a terminal and one from a launch
         assert running.twin.stop_again_and_again(number) == 0
         assert "Traceback" not in running.twin.output()
         assert publisher.running
@@ -540,7 +540,8 @@ def test_a_stop_under_load_is_clean_and_closes_the_recording(tmp_path: Path, num
 
 
 def test_a_twin_ends_cleanly_when_its_launch_has_gone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # `launch` ends at once at SIGTERM without passing the signal on; the tests check only the launch file's requests
+    # `launch` ends at once at SIGTERM without passing the signal on, so mocks replace it; the tests check only what the
+    # launch file requests
     asked = {name: MagicMock() for name in ("launch", "launch_ros")}
     for package, names in (("launch", "actions conditions substitutions"), ("launch_ros", "actions substitutions")):
         for name in ("", *names.split(), *(("parameter_descriptions",) if package == "launch_ros" else ())):
@@ -573,7 +574,7 @@ def test_a_stop_while_the_solver_is_compiled_is_clean(tmp_path: Path, monkeypatc
         running.probe.until(lambda: "preparing the solver" in running.twin.output(), "the start of compiling")
         running.probe.pause(1.0)
         assert "solver ready" not in running.twin.output()
-        # the node still answers meanwhile
+        # the node still answers while the solver compiles
         count = len(running.probe.reports)
         service = f"{running.namespace}/plow_twin/get_state"
         assert running.probe.call(GetState, service, GetState.Request()).current_state.label == "unconfigured"
@@ -590,7 +591,7 @@ def test_best_effort_and_reliable_publishers_connect(tmp_path: Path, reliability
         forces = running.probe.listen(JointState, "contact_forces")
         send, stamps = running.probe.excitation(reliability), itertools.count(T0, MS)
         send(next(stamps), (1.0, 2.0, 3.0))
-        # a best-effort message is lost if the reader has not discovered its writer yet
+        # a best-effort message is lost if the reader has not discovered its writer yet, so it is sent again
         again = reliability is ReliabilityPolicy.BEST_EFFORT
         running.probe.until(lambda: forces or (again and send(next(stamps), (1.0, 2.0, 3.0))), "an answer")
         assert running.probe.figures("input")["refused_publishers"] == "0"
@@ -612,7 +613,7 @@ def test_silence_is_held_and_reported(tmp_path: Path) -> None:
         assert states == ["waiting", "running", "stale", "running", "stale"]
         assert [status.level for status in probe.status[-3:]] == [b"\x01", b"\x00", b"\x01"]
         assert value(probe.status[-1], "stale_inputs") == "excitation"
-        # the stamps follow the clock, but there is no newer sample
+        # the stamps of held messages follow the clock, although no newer sample has come
         probe.until(lambda: stamp_ns(forces[-1].header) > T0 + 9_200 * MS, "held frames")
         sent_ns = T0 + 9_000 * MS
         assert float(probe.figures("input")["newest_sample_age_s"]) <= (time.time_ns() - sent_ns) * 1e-9
@@ -765,7 +766,7 @@ def test_the_scenes_own_loads_run_by_the_nodes_clock(tmp_path: Path) -> None:
         for step in range(5):
             message = Clock()
             message.clock.sec, message.clock.nanosec = divmod(T0 + step * 300 * MS, 1_000_000_000)
-            # the clock is published repeatedly, because the twin may see the connection later than this process
+            # the twin may see the connection later than this process does, so the clock is published repeatedly
             probe.until(lambda: clock.publish(message) or _at(heads, T0 + step * 300 * MS), "its answer")  # noqa: B023
     twin = Twin(PAPER)
     for index, head in enumerate(heads):
