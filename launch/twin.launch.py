@@ -46,14 +46,14 @@ def generate_launch_description() -> LaunchDescription:
         name="plow_twin",
         namespace=given["namespace"],
         parameters=[given["params_file"], overrides],
-        # time for the node to close its recording, which takes up to 5 s
+        # the node may take up to 5 s to close its recording
         sigterm_timeout="6",
         sigkill_timeout="6",
         prefix=STOP_WITH_LAUNCH,
         exec_name="twin",
         output="screen",
     )
-    # the viewer runs without the variables that a sourced ROS 2 adds, because it has an environment of its own
+    # the viewer has a Python environment of its own, so the variables that a sourced ROS 2 adds are removed
     apart = [
         "env",
         *(f"--unset={name}" for name in ("PYTHONPATH", "LD_LIBRARY_PATH", "_ROS_WHEELS_BOOTSTRAP_COMPLETE")),

@@ -10,7 +10,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Final
 
-#: Subpackages whose code determines the bits of a run's results; `estimate` does so if the twin follows its machine.
+#: Subpackages whose code determines the bits of a run's results. `estimate` is among them because a twin that follows
+#: its machine uses it.
 NUMERIC_SUBPACKAGES: Final = ("kernel", "model", "solve", "run", "estimate", "stream", "record")
 
 

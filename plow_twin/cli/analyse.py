@@ -152,7 +152,7 @@ def _watch(task: Any, every: float, as_json: bool, quiet: bool) -> dict[str, Any
             sys.stdout.flush()
         else:
             _show([facts], False, False, quiet)
-        # the pause is so long that summing up a long run takes at most a tenth of the time
+        # this pause is at least nine times as long as the summing up, which therefore takes at most a tenth of the time
         due = time.monotonic() + max(every, 9.0 * (time.monotonic() - begin))
 
     with interruptible() as stopped:

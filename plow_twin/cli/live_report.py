@@ -43,7 +43,7 @@ class Report:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is not None:  # after an orderly end the caller closes both outputs
+        if kind is not None:  # the caller closes both outputs itself, unless an error has ended the run
             with suppress(BrokenPipeError):
                 self.close_lines()
             self.close()

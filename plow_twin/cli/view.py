@@ -208,8 +208,8 @@ def _serve(file: Path, port: int) -> int:
     command = [program, str(file), "--serve-web", "--bind", LOOPBACK, "--port", str(data_port)]
     click.echo(f"serving until interrupted: {page_address(port, data_port)}")
     sys.stdout.flush()
-    # this replaces the process, so that signals reach the server; only errors are logged, because the program would
-    # print the address of the light theme, in which labels cannot be read
+    # the program replaces this process, so that signals reach the server; it logs only errors, because otherwise it
+    # would print the address of the light theme, in which labels cannot be read
     os.execve(program, [*command, "--web-viewer-port", str(port)], {"RUST_LOG": "error", **os.environ})
 
 

@@ -26,7 +26,7 @@ class Board:
         self._history = History()
         self._not_taken = 0
         self._updated_s = time.monotonic()
-        #: event that each update sets, and then replaces by a new event
+        #: each update sets this event, and then replaces it by a new event
         self.news = asyncio.Event()
         self.pages = 0
 

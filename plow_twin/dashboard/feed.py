@@ -45,8 +45,9 @@ class Motion:
         self.penetration = np.full(PAIR_COUNT, np.nan)
         self.force = np.full(PAIR_COUNT, np.nan)
         self.clearance: Array | None = None
-        #: the newest estimate, which is emptied when newer clearances are published; the newest status
+        #: the newest estimate; it is emptied when newer clearances are published
         self.estimate: Mapping[str, str] = {}
+        #: the newest status
         self.status: Mapping[str, str] = {}
         self.load = _NO_LOAD
         self.held = False
@@ -176,7 +177,8 @@ class Feed:
         self.motion = Motion()
         #: stamp of the newest publication in whole seconds
         self._second = 0
-        #: number of updates that the server took, and number of updates for which it had no room
+        #: number of updates that the server took
+        #: number of updates for which it had no room
         self.taken = self.not_taken = 0
 
     def publication(self, published: Published) -> None:
@@ -194,8 +196,9 @@ class Feed:
     def part(self, name: str, part: Part) -> None:
         """Add a status, which replaces the previous status of that name."""
         level, message, values = part
-        if name == "estimate" and "estimates" not in values:  # the part of the diagnostics has this key
-            self._sum_up()  # the publications before the estimate come first
+        # only the part of the diagnostics with this name has this key
+        if name == "estimate" and "estimates" not in values:
+            self._sum_up()  # the publications that came before the estimate are summed up first
             self.motion.estimate = values
         elif name == "status":
             self.motion.status = values

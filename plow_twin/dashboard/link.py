@@ -8,8 +8,9 @@ import socket
 from contextlib import suppress
 from typing import Any, Final
 
-#: Largest message [B], and room for messages that the other side has not yet received [B].
+#: Largest message [B].
 LONGEST: Final = 1 << 16
+#: Room for messages that the other side has not yet received [B].
 _ROOM: Final = 1 << 18
 
 

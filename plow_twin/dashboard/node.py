@@ -45,7 +45,8 @@ _SHOWN: Final = (
 )  # fmt: skip
 #: How long a service may take to answer [s].
 _PATIENCE_S: Final = 5.0
-#: Queue depth of topics of which only the newest message is needed, and of topics of which all messages are needed.
+#: Queue depth of topics of which only the newest message is needed.
+#: Queue depth of topics of which all messages are needed.
 _NEWEST, _ALL = 1, 1000
 
 

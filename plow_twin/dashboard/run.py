@@ -28,7 +28,7 @@ from plow_twin.stream.topics import Cadence, names_of
 
 #: The topics whose messages are decoded one by one.
 _SLOW: Final = names_of(Cadence.ESTIMATE, Cadence.CHANGE)
-#: How long the feed waits for room [s]; unlike a live run, a file may wait.
+#: Longest wait of the feed for room [s]; a file may wait, unlike a live run.
 _WAIT_S: Final = 2e-3
 
 

@@ -34,7 +34,8 @@ PAGE: Final = Path(__file__).with_name("page")
 MOST_PAGES: Final = 50
 #: Time [s] after which a page is closed if it has not received an update or has not sent its token.
 _PATIENCE_S: Final = 20.0
-#: Longest time without a message to a page, and shortest time between two requests of a page [s].
+#: Longest time without a message to a page [s].
+#: Shortest time between two requests of a page [s].
 _WORD_S, _WISH_S = 1.0, 0.2
 #: Longest request of a page [B].
 _WISH: Final = 4096

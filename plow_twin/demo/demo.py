@@ -29,13 +29,15 @@ from plow_twin.model.scene import Mark, Provenance, Wear
 from plow_twin.scene_file import dump_scene, load_scene
 
 DONE, FAILED, DONE_WITH_LOSS = 0, 1, 3
-#: Longest wait for the estimate, or for a start that compiles the solver, on a busy machine [s].
+#: Longest wait [s] for the estimate, and for a start that compiles the solver on a busy machine.
 _START_TIMEOUT_S: Final = 300.0
 _STOP_TIMEOUT_S: Final = 10.0
 _RATE_HZ: Final = 1000.0
-#: Excess clearance of the synthetic machine over the scene [mm].
+#: How much larger the clearance of the synthetic machine is than that of the scene [mm].
 _SENSOR_MM: Final = 1.5
-#: Shortest demo with an estimate, and the estimate's window and interval [s].
+#: Shortest length of a demo with an estimate [s].
+#: Length of the estimate's window [s].
+#: Time between the ends of two windows [s].
 _ESTIMATED_S, _WINDOW_S, _INTERVAL_S = 15.0, 14.0, 3.0
 #: Time without progress after which the run counts as failed [s].
 _STUCK_S: Final = 30.0
@@ -111,7 +113,7 @@ def run_demo(speed: str, seconds: float, out: Path, quiet: bool, screen: list[st
 def _set_environment(folder: Path) -> None:
     """Confine the demo's processes to this machine and to a domain of their own."""
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    # domains above 101 share their ports with outgoing connections
+    # domains above 101 share their ports with outgoing connections, so the domain is between 1 and 100
     os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
     os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)
     os.environ.setdefault("ROS_LOG_DIR", str((folder / "log").resolve()))
@@ -140,7 +142,7 @@ def _run(
         # publisher and reader keep every sample of the run, so that no sample is lost when the machine is busy
         *("-p", "qos_overrides./excitation.subscription.reliability:=reliable"),
         *("-p", f"input_depth:={QUEUE}"),
-        # after the last sample the run stops before the hold policy acts
+        # the timeout is long, so that the run stops after its last sample before the hold policy acts
         *("-p", "excitation_timeout:=60.0", "-p", f"use_sim_time:={str(speed == 'fast').lower()}"),
     ]
     publisher = ["plow_twin.demo.excitation_publisher", "--speed", speed, "--seconds", repr(seconds)]
@@ -200,7 +202,7 @@ def _follow(source: Child, twin: Child, watch: Watch, spin: Any, bar: Progress, 
         now = watch.number("state", "model_time_s")
         if now > reached:
             moved, reached = time.monotonic(), now
-        # until the first sample the publisher is starting, which is slow on a busy machine
+        # before the first sample more patience is needed: the publisher is starting, which is slow on a busy machine
         elif time.monotonic() - moved > (patience := _STUCK_S if reached else _START_TIMEOUT_S):
             raise DemoError(f"no progress for {patience:g} s at model time {reached:g} s\n{twin.output()}")
         bar.update(task, completed=reached)

@@ -47,7 +47,7 @@ from plow_twin.stream.intake import NS_PER_S
 
 #: Stamp of the first sample under /clock [ns]: zero would count as unstamped.
 FIRST_STAMP_NS: Final = NS_PER_S
-#: Largest number of unanswered samples at the speed `fast`.
+#: At the speed `fast`, largest number of samples that may wait for their answers.
 WINDOW: Final = 200
 #: Number of samples by which a reliable reader may be late before samples are lost: 100 s at 1 kHz.
 QUEUE: Final = 100_000
@@ -55,8 +55,9 @@ QUEUE: Final = 100_000
 _CLOCK_EVERY: Final = 10
 #: Time between two messages on travel [s].
 _TRAVEL_S: Final = 0.1
-#: Rate of the synthetic sensor, and its noise [m, m, rad].
+#: Rate of the synthetic sensor [Hz].
 _POSE_HZ: Final = 100.0
+#: Noise of the synthetic sensor [m, m, rad].
 _POSE_NOISE: Final = np.array([5e-4, 5e-4, 2e-3])
 #: Time without an answer after which unanswered samples count as lost [s].
 _STALL_S: Final = 2.0
@@ -99,7 +100,7 @@ class ExcitationPublisher(WithoutEvents):
         self._twin_reads = False
         self._answered_ns = FIRST_STAMP_NS
         self.sent = 0
-        #: longest delay of a sample behind its time on the grid [s]
+        #: largest delay with which a sample was sent after its time on the grid [s]
         self.latest_s = 0.0
         #: how often the twin did not answer within the time allowed
         self.stalls = 0
@@ -184,7 +185,7 @@ class ExcitationPublisher(WithoutEvents):
 
     def _on_status(self, message: DiagnosticStatus) -> None:
         values = {value.key: value.value for value in message.values}
-        # the twin may see the connection later than this process
+        # this process may see the connection before the twin does, so the status of the twin decides
         self._twin_reads = values.get("lifecycle") == "active" and values.get("publishers_excitation", "0") != "0"
 
     def _on_answer(self, data: bytes) -> None:

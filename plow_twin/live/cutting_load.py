@@ -63,7 +63,8 @@ class Face:
 
         In a turn the speed falls linearly to zero and rises in the other direction; each pass has one half of the turn.
         """
-        # the head turns within the face and reaches the end of the face in the middle of the turn
+        # when a turn begins, the head is still within the face; it reaches the end of the face in the middle of the
+        # turn
         steady = (self.length_m - 0.5 * self.speed_m_s * self.turn_s) / self.speed_m_s
         period = steady + self.turn_s
         number = np.floor(t / period).astype(np.int64)

@@ -53,17 +53,20 @@ class Estimation:
         self._topics = [topic for topic, wanted in sent.items() if wanted]
         #: time at which other pads were set [ns], until empty messages have withdrawn the estimate; otherwise None
         self._set_ns: int | None = None
-        #: origin of the clearances, and trust in model and sensor, according to the newest estimate
+        #: origin of each clearance according to the newest estimate
         self.states = {"horizontal": State.PRIOR, "vertical": State.PRIOR}
+        #: trust in model and sensor according to the newest estimate
         self.trust = {"model": "", "sensor": ""}
         self.reasons: tuple[str, ...] = ()
-        #: number of estimates, number of windows skipped because a newer window came, and the time that the newest
-        #: estimate took [s]
+        #: number of estimates
+        #: number of windows skipped because a newer window came
         self.count = self.skipped = 0
+        #: time that the newest estimate took [s]
         self.wall_s = 0.0
         self.end_ns: int | None = None
-        #: the newest forecast, or the reason why there is no forecast
+        #: the newest forecast
         self.forecast: dict[str, Any] | None = None
+        #: reason why there is no forecast
         self.forecast_error = "nothing has been estimated yet"
         #: the newest estimate, for a new journal
         self.entry: Estimated | None = None

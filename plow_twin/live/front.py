@@ -276,7 +276,7 @@ class BridgeFront:
 
     def _report(self) -> None:
         self.changed()
-        # the twin itself sends alarms only when a level changes, so reports send their present values
+        # the twin itself sends alarms only when a level changes, so each report sends their present values
         self.send(ALARMS, alarms_message(self.runtime.alarms, self.name, self._settings.hardware_id))
         for name, part in self.parts().items():
             self._tell(name, part)

@@ -70,7 +70,7 @@ class Inputs:
         #: senders of the optional inputs
         self.optional = {topic: OneSender() for topic in OPTIONAL}
         self._queue_peak = (0, 0.0)
-        #: longest wait of a sample in the queue [s]; a report resets it
+        #: longest wait of a sample in the queue since the last report [s]
         self.wait_s = 0.0
         self._heard_ns: dict[str, int] = {}
         self._other_heard_ns: dict[str, int] = {}

@@ -21,7 +21,7 @@ import numpy as np
 
 from plow_twin.record.map_file import LOAD_MODEL, map_error, read_map_file
 
-#: Smallest speed [m/s] at which the power determines the force of the chain.
+#: Smallest speed [m/s] at which the force of the chain is computed from the power.
 SLOWEST_M_S: Final = 0.1
 
 Number = tuple[float, float]
@@ -71,8 +71,8 @@ class LoadModel:
         if not opinions:
             return None
         deviations = [max(deviation, 1.0) for _, deviation in opinions]
-        # weights are relative to the smallest deviation, so that huge numbers do not overflow; a later check refuses
-        # them
+        # weights are relative to the smallest deviation, so that huge numbers, which a later check refuses, do not
+        # overflow here
         smallest = min(deviations)
         shares = [smallest / deviation for deviation in deviations]
         total = sum(share * share for share in shares)

@@ -20,8 +20,9 @@ if TYPE_CHECKING:
 
 #: Characters that a metric's name cannot have.
 _OTHER: Final = re.compile(r"[^a-zA-Z0-9_]")
-#: Largest number of readers at once, and longest wait for a reader [s].
+#: Largest number of readers at once.
 _READERS: Final = 16
+#: Longest wait for a silent reader [s].
 _PATIENCE_S: Final = 10.0
 
 

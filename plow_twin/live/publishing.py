@@ -21,7 +21,7 @@ from plow_twin.stream.session import Series
 if TYPE_CHECKING:
     from plow_twin.live.recording import Recording
 
-#: Base name of the topic, and the message: bytes if it is made from the record of a publication.
+#: Base name of the topic, and the message; a message made from the record of a publication is bytes.
 Outgoing = tuple[str, memoryview | Message]
 
 
@@ -108,14 +108,15 @@ class Publishing:
             self._messages = Messages(*frames, intervals=settings.follows == "full")
         self.latency = DurationHistogram()
         self.age = DurationHistogram()
-        #: number of publications, and of publications withheld because a number was not finite
+        #: number of publications
+        #: number of publications withheld because a number was not finite
         self.published = self.withheld = 0
-        #: number of publications computed without a sample, and of publications that correct earlier ones because of
-        #: late samples
+        #: number of publications computed without a sample
+        #: number of publications that correct earlier publications because of late samples
         self.held_frames = self.corrected_frames = 0
         #: steady time at which the samples of the next publication were received [ns]; 0 means that it has no samples
         self.received_ns = 0
-        #: while alarms of a series are reported: stamp of the sample that caused them [ns]
+        #: stamp of the sample that changed the alarms of a series [ns], while these alarms are reported; otherwise None
         self.series_ns: int | None = None
         self._newest: Rows | None = None
         self._catch_up = catch_up

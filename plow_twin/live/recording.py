@@ -78,7 +78,7 @@ class Recording:
             now_ns=clock or time.time_ns,
             on_error=on_error,
         )
-        #: for each sample of the newest series, the number of the journal entry before its publication
+        #: for each sample of the newest series, the sequence number of the journal entry that precedes its publication
         self._series = np.zeros(0, np.int64)
         self.recorder = in_free_folder(Path(settings.record_path), make)
 

@@ -46,8 +46,8 @@ _CATCH_UP_S: Final = 0.002
 _LOOK_FOR_CLOCK_HZ: Final = 20.0
 #: Rate at which unused messages are journalled [Hz].
 _UNUSED_HZ: Final = 5.0
-#: The twins that follow measurements are too slow if samples wait this long [s] in each of this many successive
-#: seconds.
+#: The twins that follow measurements are too slow if samples wait longer than `_LONGEST_WAIT_S` in each of
+#: `_WAITING_SECONDS` successive seconds.
 _LONGEST_WAIT_S, _WAITING_SECONDS = 0.5, 5
 
 
@@ -83,7 +83,7 @@ class Runtime:
         self._front = front
         self.settings = settings
         self.scene = prepared.scene
-        #: seconds that compiling or loading the solver took
+        #: time that compiling or loading the solver took [s]
         self.compile_s = prepared.compile_s
         #: periods of the loop that publishes at a fixed rate or follows the clock; None if samples set the pace
         self.periods = _periods(settings)
@@ -95,12 +95,12 @@ class Runtime:
         self.reduced = False
         self._waiting_seconds = 0
         self._clock_before_ns = 0
-        #: whether the journal still waits for a clock, so that services are refused
+        #: whether services are refused because the journal still waits for a clock
         self.waits_for_clock = True
         self._early: list[Arrival] = []
         self._seen: tuple[Any, ...] = ()
         self.wear_keeper: WearKeeper | None = None
-        #: identity of the scene, the key of the kept wear
+        #: identity of the scene, under which its wear is kept
         self.identity = scene_identity(self.scene)
         kept = kept_wear.get(self.identity)
         depth = kept.depth_m if kept else None
@@ -108,7 +108,7 @@ class Runtime:
         if misplaced:
             raise ParameterError(misplaced)
         self.alarms = alarms_of(asdict(settings))
-        # a change of the model that cannot be made is refused here, not while samples come
+        # a change of the model that is impossible is refused here, before samples come
         changed_twin(prepared.twin, prepared.scene, model_changes(settings))
         with ExitStack() as made:
             if settings.wear_state_path:
@@ -351,8 +351,8 @@ class Runtime:
     def step_series(self, stamps: NDArray[np.int64], wrench: NDArray[np.float64]) -> Iterator[Outgoing]:
         """Use many samples of a source with its own time, like `step`; stamps [ns], shape (n,), wrenches (n, 3)."""
         if self.waits_for_clock or self.publishing.watch is not None or self.settings.record_ring:
-            # samples are used one by one, so that an observer gets each of them, and a ring gets the state after the
-            # sample that raised its alarm
+            # samples are used one by one, because an observer gets each of them, and a ring needs the state right after
+            # the sample that raised its alarm
             yield from self.step(list(zip(stamps.tolist(), map(tuple, wrench.tolist()), strict=True)))
             return
         self.publishing.received_ns = now_ns = time.monotonic_ns()
@@ -501,7 +501,8 @@ class Runtime:
         if self.recording and self.recording.recorder.snapshot_wanted:
             self._renew_recording()
         if self._front.follows_samples:
-            # there is no deadline, so a pause, bounded by the number of samples, lets recorder and estimate catch up
+            # a source with its own time has no deadline, so a pause, bounded by the number of samples, lets recorder
+            # and estimate catch up
             while count and self._behind:
                 time.sleep(_CATCH_UP_S)
                 count -= 1
@@ -519,8 +520,7 @@ class Runtime:
         assert self.recording is not None
         renewed = self.recording.renew(self.driver.session)
         if renewed and self.estimation and self.estimation.entry and self.driver.session.following is None:
-            # the estimate is journalled again, because the snapshot of a twin lacks it; the snapshot of a follower has
-            # it
+            # the snapshot of a follower has the estimate; that of a twin lacks it, so the estimate is journalled again
             self.recording.recorder.journal(self.estimation.entry)
 
 

@@ -104,7 +104,7 @@ def _prepare(settings: Settings, warm_up: Callable[[], None]) -> Prepared:
 
 def leave(code: int, *, at_once: bool = False) -> int:
     """Return the exit code; end the process here with `at_once`, or if an abandoned compiler would delay its end."""
-    if at_once:  # a stream without a reader can no longer be flushed
+    if at_once:  # a stream without a reader can no longer be flushed, so the process ends without a flush
         os._exit(code)
     if all(future.done() for future in _started):
         return code

@@ -117,8 +117,8 @@ class WearKeeper:
     def _save(self, values: tuple[float, ...]) -> None:
         try:
             if not self._is_claimed():
-                # the folder was moved, removed or hidden by a mount; another twin may have claimed the folder that has
-                # its name now
+                # the folder was moved, removed or hidden by a mount, so another twin may have claimed the folder that
+                # now has its name
                 self.release()
                 self._claim = claim_folder(self.folder)
             found = read_wear(self.folder)

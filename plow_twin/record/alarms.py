@@ -99,7 +99,8 @@ class AlarmCheck:
         self._recorded: deque[OutputRecord] = deque()
         #: whether every publication so far is present
         self.possible = possible
-        #: number of recorded messages that were compared, and of those that could not be compared
+        #: number of recorded messages that were compared
+        #: number of recorded messages that could not be compared
         self.compared = self.not_compared = 0
 
     def give_up(self) -> None:
@@ -147,7 +148,7 @@ class AlarmCheck:
 
     def _take(self, sequence: NDArray[np.int64], step: NDArray[np.int64], published: Published) -> None:
         if len(published.rows) == 1 and not published.finite:
-            return  # such a message is not sent
+            return  # a publication that is not finite is not sent
         for index in self._alarms.feed(published):
             self._say(int(sequence[index]), int(step[index]))
 

@@ -77,7 +77,7 @@ class BagWriter:
             if short is not None:
                 raise OSError(short)
             self._file.chunk(self._chunk)
-        except OSError as error:  # these messages are lost, and the next flush tries again
+        except OSError as error:  # the waiting messages are lost; the next flush tries to write again
             self._chunk.clear()
             self.lost.update(waiting)
             self.error = f"{self.path}: {error.strerror or error}"
@@ -123,7 +123,8 @@ def readable_beside(run: Path, lost: Counter[str]) -> list[Path]:
     for folder in beside_folders(run):
         lost.update(recorded_losses(folder))
         parts = [*folder.glob("*.mcap")]
-        if any(is_begun(part) and is_mcap(part) for part in parts):  # this folder's reader counts its unreadable files
+        # the reader of this folder counts its unreadable files
+        if any(is_begun(part) and is_mcap(part) for part in parts):
             found.append(folder)
         else:
             lost.update("damaged_files" if is_begun(part) else "truncated_files" for part in parts)

@@ -46,7 +46,7 @@ _MOST_DECLARED: Final = 10_000
 _CHANNEL_BITS: Final = 63
 #: Number of record heads that are read at once.
 _AHEAD: Final = 64
-#: pread for the compiled code that reads record heads, since a recording has many more of them than opened chunks.
+#: `pread` for the compiled code that reads record heads: a recording has many more record heads than opened chunks.
 _pread: Final[Any] = types.ExternalFunction("pread", types.intp(types.int32, types.uintp, types.uintp, types.int64))
 _CHUNK_HEAD: Final = struct.Struct("<QQQII")
 #: Bytes of a message record before its data: opcode, length, channel, sequence, log time, publish time.
@@ -55,7 +55,7 @@ _MESSAGE_FIELDS: Final = MESSAGE_HEAD - _HEAD_SIZE
 _COLUMNS: Final = 6
 #: Chunks below this size [B] are scanned together.
 _SMALL: Final = 2**18
-#: The same limit for a reader that may skip the large chunks between the small ones.
+#: The same limit for a reader with `wanted`, which may skip the large chunks between the small ones.
 _SMALL_ALONE: Final = 2**20
 
 
@@ -130,7 +130,7 @@ class ChunkReader:
     #: number of damaged chunks that a repair has left out
     left_out: int = 0
     position: int = 0
-    #: answers of `wanted` by channel mask
+    #: for each channel mask, the answer of `wanted`
     _answers: dict[int, bool] = field(default_factory=dict, init=False)
     #: number of rows of the next table of messages
     _room: int = field(default=256, init=False)
@@ -155,7 +155,8 @@ class ChunkReader:
                 begin = place + _HEAD_SIZE
                 if length > RECORD_LIMIT and opcode != _ATTACHMENT:
                     break
-                behind = len(MAGIC) if opcode == _FOOTER else 0  # a writer may not have written the magic yet
+                # a footer is read only together with the magic after it, which the writer may not have written yet
+                behind = len(MAGIC) if opcode == _FOOTER else 0
                 if begin + length + behind > size:
                     if self.more is None:
                         break
@@ -188,7 +189,7 @@ class ChunkReader:
                 elif opcode == _METADATA:
                     yield from self._scan(
                         waiting.pop_all(), schemas
-                    )  # a note of damage keeps its place among the messages
+                    )  # the messages before a note of damage are passed on first, so that the note keeps its place
                     self._metadata(os.pread(descriptor, length, begin))
                 elif opcode == _FOOTER:
                     self.finished = os.pread(descriptor, len(MAGIC), place) == MAGIC
@@ -300,7 +301,7 @@ class ChunkReader:
         try:
             with self.path.open("rb") as stream:
                 summary = make_reader(stream).get_summary()
-        except Exception:  # without an index these channels stay unknown
+        except Exception:  # without a readable index these channels stay unknown
             return
         if summary is None:
             return
@@ -411,7 +412,8 @@ class _Heads:
             count = look_ahead(self._descriptor, self._size, place, self._table)
             self._rows, self._next = self._table[:count].tolist(), 0
             if not self._rows:
-                os.pread(self._descriptor, 1, place)  # if the file cannot be read, this call raises the error
+                # no record was found; if the file cannot be read, this call raises the error
+                os.pread(self._descriptor, 1, place)
                 return 0, 0
         _, opcode, length, *self._index = self._rows[self._next]
         self._next += 1

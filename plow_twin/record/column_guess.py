@@ -39,9 +39,9 @@ _UNIT: Final = re.compile(
 )
 #: Times above these limits count from 1970 in the named unit; each limit is a date in 2001.
 _DATES: Final = (("ns", 1e18), ("us", 1e15), ("ms", 1e12), ("s", 1e9))
-#: Largest number of cells that are examined, so that fewer rows of a wide file are examined.
+#: Largest number of cells that are examined: the wider a file, the fewer of its rows are examined.
 _MOST_CELLS: Final = 2_000_000
-#: Numbers that a load needs.
+#: Role and name of each number that a load needs.
 _NEEDED: Final = tuple(("excitation", name) for name in ROLES["excitation"])
 
 

@@ -41,10 +41,11 @@ class Sent:
         self.counts = np.zeros(_KINDS, np.int64)
         numbers = np.full(advances, -1)
         find_advances(sequence, kind, done, first, self.after, self.counts, numbers)
-        #: advances after which messages were sent, and the sequence number of the first message after each
+        #: advances after which messages were sent
         self.taken = np.flatnonzero(numbers >= 0)
+        #: sequence number of the first message after each of these advances
         self.first_sequence = numbers[self.taken]
-        #: index of the publication of each advance
+        #: for each advance in `taken`, the index of its publication
         self.publication = np.empty(advances, np.int64)
         self.publication[self.taken] = np.arange(len(self.taken))
 

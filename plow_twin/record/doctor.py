@@ -50,7 +50,7 @@ class PartReport:
     finished: bool
     damaged_chunks: int
     messages: dict[str, int]
-    #: number of bytes after the last MCAP record, because of which other readers refuse the file
+    #: number of bytes after the last MCAP record; because of them other readers refuse the file
     trailing_bytes: int = 0
     #: number of chunks that an earlier repair left out
     left_out: int = 0
@@ -128,7 +128,7 @@ def examine(path: Path) -> RunReport:
     report.parts = [_part(part) for part in reader.parts]
     expected: int | None = None if reader.header.part else 0
     run_time = RunTime(reader.header.parameters)
-    in_a_row = 0  # number of consecutive entries directly before the expected entry
+    in_a_row = 0  # length of the unbroken series of entries directly before the expected entry
     inputs = InputCounts(reader.header.excitation_source)
     for batch in reader.batches(outputs=False):
         entries = batch.entries
@@ -316,7 +316,7 @@ def _rewrite(part: Path, *, last: bool) -> None:
     def on_metadata(name: str, record: dict[str, str]) -> None:
         if name == LOSS_RECORD:
             loss.update(record)
-        elif name != DAMAGE_RECORD:  # notes of damage are written anew below
+        elif name != DAMAGE_RECORD:  # the old notes of damage are not copied, because they are written anew below
             file.metadata(name, record)
 
     reader = ChunkReader(part, on_metadata)

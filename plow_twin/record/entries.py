@@ -192,7 +192,7 @@ class Holes:
     """Search for missing journal entries by sequence number, batch after batch."""
 
     def __init__(self) -> None:
-        self._next: int | None = None  # number of the next entry
+        self._next: int | None = None  # sequence number that the next entry should have
 
     def find(self, entries: Entries) -> dict[int, int]:
         """Return the number of entries that are missing before an index, for each index after a gap, in order."""
@@ -221,7 +221,8 @@ def in_order(batch: Batch) -> Iterator[Record]:
     sequences = [part.sequence for part in batch.outputs]
     owners = np.concatenate([np.full(len(part), number) for number, part in enumerate(sequences)] or [np.zeros(0, int)])
     places = np.concatenate([np.arange(len(part)) for part in sequences] or [np.zeros(0, int)])
-    # outputs come before the first entry with a higher number; the running maximum keeps the order of unordered files
+    # a message is placed before the first entry with a higher sequence number; entries may be out of order, so the
+    # highest number so far counts
     bounds = np.maximum.accumulate(batch.entries.sequence) if len(batch.entries) else batch.entries.sequence
     slots = np.searchsorted(bounds, np.concatenate(sequences or [np.zeros(0, np.int64)]), side="right")
     order = np.argsort(slots, kind="stable")

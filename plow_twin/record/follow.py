@@ -53,7 +53,8 @@ class Tail:
     def more(self, stream: IO[bytes], size: int) -> bool:
         """Wait until a file is longer than `size` [B]; False when its writer has ended."""
         while True:
-            # this is checked before the size, so that the last bytes of an ending writer are still read
+            # the claim is checked before the size: otherwise the bytes that a writer adds between both checks, just
+            # before it ends, would not be read
             alive = is_claimed(stream.fileno())
             if os.fstat(stream.fileno()).st_size > size:
                 return True

@@ -32,9 +32,9 @@ class Feed:
     roles: dict[str, Role]
     measured: Callable[[str, int, dict[str, float]], object]
     intake: Intake = field(default_factory=Intake)
-    #: numbers of unused messages by reason; the intake counts those of the load as well
+    #: number of unused messages by reason; the intake also counts those of the load
     unfit: Counter[str] = field(default_factory=Counter)
-    #: whether the measured poses, which do not affect the motion, go into the first walker's journal
+    #: whether the measured poses go into the first walker's journal; they do not affect the motion
     with_poses: bool = False
     #: stretches without samples, in which the load is interpolated linearly
     silences: Silences = field(default_factory=lambda: Silences(Policy.excitation_timeout_s))

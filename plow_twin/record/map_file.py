@@ -24,7 +24,7 @@ ROLES: Final[dict[str, tuple[str, ...]]] = {
 }
 #: Type of a topic whose fields are nodes of an OPC UA server.
 OPCUA: Final = "opcua"
-#: The stamp of a node's value that becomes the sample's stamp: that of the sensor or that of the server.
+#: Which of the two stamps of a node's value becomes the stamp of the sample: the sensor's or the server's.
 SOURCE_STAMP: Final = "source"
 SERVER_STAMP: Final = "server"
 #: Keys that a node may have besides its identifier.
@@ -66,7 +66,7 @@ _LIMITS: Final[Schema] = {
     ],
     "description": "a number, or the smallest and the largest",
 }
-#: Largest offset between two clocks [s].
+#: Largest offset between two clocks that a mapping may state [s].
 _MOST_OFFSET_S: Final = 1e9
 
 
@@ -129,7 +129,8 @@ def _nodes_as_fields(role: Any, entry: Any) -> Any:
         if own:
             given = rest.get(key)
             rest[key] = {**(given if isinstance(given, dict) else {}), **own}
-        elif isinstance(rest.get(key), dict):  # a value for all names was repeated, also for names without a node
+        elif isinstance(rest.get(key), dict):
+            # a value for all names was repeated for each name; it is dropped for names without a node
             rest[key] = {name: value for name, value in rest[key].items() if name in fields or name not in ROLES[role]}
     return {"stamp": SOURCE_STAMP, "stamp_unit": "ns", **rest, "topic": role, "type": OPCUA, "fields": fields}
 

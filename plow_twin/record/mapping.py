@@ -168,7 +168,7 @@ class Role:
             if self.stamp == "header":
                 name = next((name for name in TIMES if name in content), None)
                 return received_ns if name is None else time_ns(content[name], self.stamp_unit)
-            # a missing time is not replaced by the time of receipt
+            # where the mapping names the stamp, a missing stamp is not replaced by the receive time
             return time_ns(_at(content, self.stamp), self.stamp_unit)
         stamp = getattr(getattr(content, "header", None), "stamp", None)
         # types without a header have only their receive time
@@ -438,7 +438,7 @@ def _guess(role: str, topics: Mapping[str, TopicType]) -> Role | None:
         if enough and "/journal/" not in topic:
             fitting[topic] = fields
     ending = [topic for name in _NAMES[role] for topic in fitting if topic.rpartition("/")[2] == name]
-    # forces and gaps are found by name only, because many topics have their type
+    # many topics have the same types as forces and gaps, so these two roles are found by name only
     lonely = list(fitting) if len(fitting) == 1 and role in ("excitation", "head_pose", "travel") else []
     lonely = [topic for topic in lonely if topic.rpartition("/")[2] not in ("head_state", "contact_forces")]
     for topic in (*ending, *lonely):

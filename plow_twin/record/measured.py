@@ -196,7 +196,7 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
             folder = path if path.is_dir() else path.parent
             places = [folder, *readable_beside(folder, lost)]
             rows, _, unread, why = _collect(places, mapping, ("head_pose", "forces"), own.header.node)
-            unread.pop("missing_parts", 0)  # the run has already counted them
+            unread.pop("missing_parts", 0)  # the run has already counted its missing parts
             lost.update(unread)
         lost.update(own.lost, damaged_chunks=own.damaged_chunks, **own.lost_parts)
     poses = rows["head_pose"]

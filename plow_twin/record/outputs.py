@@ -14,10 +14,10 @@ from plow_twin.stream.topics import JOINT_STATE, Cadence, Topic, names_of, topic
 
 Array = NDArray[np.float64]
 
-#: Topics whose messages a replay computes from the journal: some topics have a message in each publication, the others
-#: in each publication that has intervals or a slow part.
+#: Topics whose messages a replay computes from the journal. Some have a message in each publication, the others in each
+#: publication that has intervals or a slow part.
 REPLAYED: Final = topics_of(Cadence.EACH, Cadence.FOLLOWED, Cadence.SLOW)
-#: Base names of these topics.
+#: Base names of the topics in `REPLAYED`.
 PUBLICATION_TOPICS: Final = tuple(topic.name for topic in REPLAYED)
 #: Topics that only a twin with `follow: full` has.
 FOLLOWED_TOPICS: Final = names_of(Cadence.FOLLOWED)

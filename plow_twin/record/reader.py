@@ -33,9 +33,9 @@ from plow_twin.stream.journal import Entry, Loss, Sample
 
 #: Largest number of journal entries that wait for the messages sent after them, so that memory is bounded.
 _PENDING: Final = 65_536
-#: Smallest number of entries in a batch. A batch may have fewer if the outputs of a sixteenth as many chunks wait.
+#: Smallest number of entries in a batch; a batch may be smaller once `_LEAST // 16` parts of outputs wait.
 _LEAST: Final = 8192
-#: The same number if outputs, which take most of the memory, are not read.
+#: Smallest number of entries in a batch without outputs, which take most of the memory.
 _LEAST_ALONE: Final = 32_768
 #: Growth of a recording of all outputs at 1 kHz [B/s].
 _BYTES_PER_S: Final = 400_000
@@ -91,7 +91,7 @@ class RunReader:
         self._place = Path(self.path)
         self._headers: dict[Path, RunHeader] = {}
         self._counted: Counter[str] = Counter()
-        self._noted: dict[int, Loss | Dropped] = {}  # by sequence number, because an entry may be in two chunks
+        self._noted: dict[int, Loss | Dropped] = {}  # keyed by sequence number, because an entry may be in two chunks
         self._look_for_parts()
         self.path = self.parts[0]
         for part in self.parts:
@@ -238,7 +238,7 @@ class RunReader:
             done.append(left[0])
             if left[0].exists():
                 yield left[0]
-            elif len(self.parts) > 1:  # the recorder has removed it
+            elif len(self.parts) > 1:  # the recorder has removed this part
                 self.parts.remove(left[0])
             if self.tail is not None and not self.tail.stopped:
                 self._look_for_parts()
@@ -449,7 +449,7 @@ def read_header(path: Path) -> RunHeader | None:
 
     for _ in ChunkReader(path, on_metadata):
         break
-    if not found:  # programs that rewrite a file put the header's record last
+    if not found:  # programs that rewrite a file put the header's record last, so the whole file is searched
         for name, record in metadata_records(path):
             on_metadata(name, record)
     return found[0] if found else None

@@ -41,8 +41,8 @@ JOURNAL: Final = "journal"
 _POLL_S: Final = 0.05
 #: Errors of a full disk, which may have room again later.
 _FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
-#: Number of items written between two sleeps, which takes some 0.2 ms of Python. The sleep gives callers the
-#: interpreter; without it the thread would get the interpreter back at once.
+#: Number of items that the thread writes between two sleeps (some 0.2 ms of Python). Callers get the interpreter during
+#: a sleep; without the sleep the thread would take it back at once.
 _BURST: Final = 128
 
 
@@ -172,7 +172,7 @@ class Recorder:
         self._split_due = False
         self._part_since = time.monotonic()
         self._queue: deque[_Item] = deque()
-        #: number of waiting entries and publications minus number of items in the queue
+        #: number of waiting entries and publications minus number of items in the queue, since an item may hold several
         self._more = 0
         self._queue_size = queue_size
         self._flush_period_s = flush_period_s
@@ -187,7 +187,7 @@ class Recorder:
         self._unflushed: Counter[str] = Counter()  # counts of items that are written, but not yet flushed
         self._written = 0
         self._error: str | None = None
-        self._paused: str | None = None  # reason why items are refused at present
+        self._paused: str | None = None  # reason why new items are refused; None while they are accepted
         self._closed = False
         self._accepting = True
         self._stopping = threading.Event()
@@ -474,7 +474,9 @@ class Recorder:
                 self._dump(self._ring, self._mark, lost)
             except (OSError, RecordingError) as failed:  # the ring stays in memory
                 error = f"{self._mark}: the last {self._ring_s:g} s not written: {failed}"
-            with self._lock:  # with the lock, a caller that reads the new count may mark again at once
+            # `_mark` and the count change under one lock, because a caller that reads the new count may mark again at
+            # once
+            with self._lock:
                 self._mark = None
                 if error is None:
                     self._marks += 1
@@ -587,7 +589,7 @@ def _numbers(items: Sequence[_EntryItem | _PublicationItem]) -> tuple[NDArray[np
     return np.array(sequence, np.int64), np.array(log_time_ns, np.int64)
 
 
-# a named tuple is made in a quarter of the time of a frozen dataclass, and four thousand are made each second
+# four thousand of these are made each second; a named tuple takes a quarter of the time of a frozen dataclass
 class _EntryItem(NamedTuple):
     """A journal entry on its way to the file."""
 

@@ -151,8 +151,8 @@ class _Replay:
         if excitation == "sampled":
             _warm_up(scene, header.tol, self.templates, rows=not digests_only)
         self.sink: RunWriter | None = None
-        self.rows = np.zeros(0, ROW)  # rows of the last run of samples
-        # publications of the last run of samples; messages of its last row may follow
+        self.rows = np.zeros(0, ROW)  # buffer for the rows of the newest run of samples
+        # publications of the newest run of samples; messages of the last publication may still follow
         self.published: Published | None = None
         self.session = Session(
             twin, header.origin_ns, rollback_span_s=float(header.parameters.get("rollback_span", 0.0))
@@ -160,15 +160,15 @@ class _Replay:
         absent = FOLLOWED_TOPICS if header.follow != "full" else ()
         self.topics = {header.topic(name): name for name in PUBLICATION_TOPICS if name not in absent}
         self.next_sequence = 0
-        self.in_a_row = 0  # number of consecutive entries directly before the next entry
-        self.synced = False  # whether the session has the state of the live session
-        self.outputs_synced = False  # whether the windows between its messages are those of the live session, too
-        self.outputs_whole = True  # whether every missing message of the current batch has a note
-        self.resumed = False  # whether there was no advance since the state was taken from a snapshot
+        self.in_a_row = 0  # length of the unbroken series of entries directly before the next entry
+        self.synced = False  # whether the state of the session equals that of the live session
+        self.outputs_synced = False  # whether the windows between its messages also equal those of the live session
+        self.outputs_whole = True  # whether the current batch has a note for every missing message
+        self.resumed = False  # whether the session took its state from a snapshot and has made no advance since then
         self.messages: Mapping[str, Message] | None = None
         self.first_ns: int | None = None
         self.gaps = 0
-        self.lost_entries = 0  # number of lost entries that notes in the journal state
+        self.lost_entries = 0  # number of lost entries according to notes in the journal
         self.inputs = InputCounts(header.excitation_source)
         self.alarms = AlarmCheck(header, self.all_outputs)
 
@@ -235,7 +235,8 @@ class _Replay:
             self._note(Divergence(*difference))
 
     def _messages(self, sent: SentMessages, begin: int, end: int) -> None:
-        chosen = (sent.kind[begin:end] >= 0) == (self.sink is None)  # with a sink, only other topics are used
+        # without a sink the topics computed from the journal are compared, with a sink the other topics are copied
+        chosen = (sent.kind[begin:end] >= 0) == (self.sink is None)
         for index in (begin + np.flatnonzero(chosen)).tolist():
             self.output(sent.record(index))
 
@@ -315,7 +316,8 @@ class _Replay:
         assert self.sink is not None
         entry = record.entry
         if isinstance(entry, Snapshot) and self.synced:
-            entry = self.session.snapshot()  # the windows of this snapshot fit the publications written here
+            # this session's own snapshot is written, because its windows fit the publications written here
+            entry = self.session.snapshot()
         self.sink.write_entry(record.sequence, record.log_time_ns, entry)
         published = self.session.outputs.pop() if self.synced and isinstance(entry, Sample | Hold | Unload) else NOTHING
         if len(published.rows) and published.finite:
@@ -365,7 +367,7 @@ class _Replay:
     def entry(self, record: EntryRecord) -> None:
         """Apply or compare one entry of the journal."""
         if not self.report.entries and self.header.part:
-            self.next_sequence = record.sequence  # the earlier parts of the recording are missing
+            self.next_sequence = record.sequence  # the recording lacks its earlier parts, so counting starts here
             self.alarms.give_up()
         missing = (record.sequence - self.next_sequence) & _SEQUENCE_MASK
         if 0 < (-missing & _SEQUENCE_MASK) <= self.in_a_row:  # a repeated entry
@@ -378,11 +380,11 @@ class _Replay:
             self.alarms.give_up()
             self.synced = self.outputs_synced = False
         elif record.sequence == 0 and not isinstance(record.entry, Snapshot):
-            # the run begins with the scene's own initial state
+            # the entry with sequence number 0 is the first of the run, which begins with the scene's own initial state
             self.synced, self.outputs_synced = True, self.all_outputs and self.outputs_whole
         self.next_sequence = (record.sequence + 1) & _SEQUENCE_MASK
         self.in_a_row += 1
-        if not isinstance(record.entry, Dropped):  # a note may come between messages of one publication
+        if not isinstance(record.entry, Dropped):  # a note of a loss may stand between messages of one publication
             self.messages = self.published = None
         self.report.entries += 1
         match record.entry:
@@ -417,13 +419,14 @@ class _Replay:
             self.first_ns = entry.stamp_ns if self.first_ns is None else self.first_ns
         try:
             self.session.apply(entry)
-        except ValueError:  # the live session refused the entry too, or the next comparison fails
+        except ValueError:
+            # the refusal is right if the live session refused the entry too; otherwise the next comparison fails
             self.report.refused += 1
 
     def _snapshot(self, snapshot: Snapshot) -> None:
         if self.synced and self.outputs_synced:
             self.report.snapshots_compared += 1
-            # the live session also forgot earlier times when it journalled the snapshot
+            # the live session also dropped its past when it journalled the snapshot
             computed = self.session.renew().data
             self._compare("snapshot", snapshot.stamp_ns, "state", _hash(snapshot.data), _hash(computed))
             return
@@ -432,7 +435,8 @@ class _Replay:
             self.session.apply(snapshot)
         except (ValueError, struct.error) as error:
             raise RecordingError(f"{self.report.path}: snapshot at {snapshot.stamp_ns} ns: {error}") from error
-        if before is not None:  # only messages were lost, so the motion must be the same as before
+        # no entry was lost, but messages were, so only the motion can be compared with the snapshot
+        if before is not None:
             self._compare("snapshot", snapshot.stamp_ns, "state", self.session.twin.digest(), before)
         self.synced = self.resumed = True
         # the windows of the outputs are known only if every publication was recorded
@@ -440,7 +444,7 @@ class _Replay:
 
     def output(self, record: OutputRecord) -> None:
         """Compare a recorded message with the model's message at that place."""
-        if self.sink is not None:  # other topics are copied unchanged
+        if self.sink is not None:  # messages of other topics are copied unchanged
             place = (record.topic, record.sequence, record.log_time_ns, record.publish_time_ns)
             self.sink.write_output(*place, record.message())
             return

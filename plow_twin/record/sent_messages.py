@@ -29,7 +29,7 @@ class SentMessages:
     @classmethod
     def of(cls, outputs: list[Outputs], topics: Mapping[str, str]) -> Self:
         """Collect messages; `topics` maps the topics that follow from the motion to base names."""
-        # there are few tables, because parts share topics
+        # few tables are made, because parts share their topics
         tables = {id(part.topics): _kinds(part.topics, topics) for part in outputs}
         sequence = _joined(part.sequence for part in outputs)
         kind = _joined(tables[id(part.topics)][part.messages.channel] for part in outputs)

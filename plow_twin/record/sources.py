@@ -34,8 +34,8 @@ _ROWS: Final = 1000
 _ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
 #: Largest message that is unpacked [B].
 _LARGEST_MESSAGE: Final = 2**26
-#: Query that has a row if `topics` or `messages` is a view or a virtual table or has computed columns, because reading
-#: these may never end.
+#: Query that returns a row if `topics` or `messages` is a view, is a virtual table or has computed columns: reading
+#: such a table may never end.
 _COMPUTED: Final = """
     SELECT 1 FROM sqlite_master
     WHERE name COLLATE NOCASE IN ('topics', 'messages') AND (type != 'table' OR rootpage = 0)
@@ -78,7 +78,7 @@ class Arrived:
     #: receive time [ns], or `NO_TIME` if it is unknown
     log_time_ns: int
     content: Any
-    #: whether the broker had retained the message since before the subscription
+    #: whether the broker had retained the message from before the subscription
     retained: bool = False
     #: whether messages before this message are missing, because a part is absent or damaged
     after_hole: bool = False

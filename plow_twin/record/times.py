@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-#: Names of the column or key with the time, unless the mapping gives another name.
+#: Names of the column or key that has the time, if the mapping does not name it.
 TIMES: Final = ("t", "time")
 #: Length of each unit of time [ns].
 STAMP_UNITS: Final = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
@@ -19,8 +19,8 @@ NO_TIME: Final = -1
 NUMBER: Final = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|inf|nan)", re.IGNORECASE)
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 _NANOSECONDS: Final = re.compile(r"[.,]\d{6}(\d{1,3})")
-#: Times below this [s] count from an unknown start, not from 1970. They are moved away from 0, because a stamp of 0
-#: means a missing stamp.
+#: A time below this [s] counts from an unknown start, not from 1970. `START_NS` is added to it, because a stamp of 0
+#: would mean a missing stamp.
 EPOCH_S: Final = 1e9
 #: Stamp that a time of 0 receives [ns].
 START_NS: Final = 1_000_000_000

@@ -25,15 +25,17 @@ _START_S: Final = START_NS * 1e-9
 
 #: Number of messages that are checked: 20 s at 1 kHz, which contain several periods of a load.
 CHECKED: Final = 20_000
-#: An idling machine has forces above a hundredth of the scene's largest force. Forces between a ten-thousandth and a
-#: hundredth look like kN, and forces a thousand times smaller like MN; others may be the noise of an idle sensor.
+#: An idling machine has forces above this share of the scene's largest force.
 _IDLE_SHARE: Final = 1e-2
+#: Forces between this share and `_IDLE_SHARE` of the scene's largest force look like kN.
 _BROKEN_SHARE: Final = 1e-4
+#: Units of forces that are too small, each with a factor for both shares: forces a thousand times smaller than those in
+#: kN look like MN. Other small forces may be the noise of an idle sensor.
 _SMALLER: Final = {"kN": 1.0, "MN": 1e-3}
 #: Largest angle of the model [rad], 45 degrees.
 _LARGEST_ANGLE_RAD: Final = 0.25 * np.pi
-#: A swing that exceeds the angle allowed by the clearance this many times is in degrees, since wear and pressed
-#: contacts allow less.
+#: A swing larger than this multiple of the angle that the clearance allows is in degrees: wear and pressed contacts
+#: alone do not let a head turn so far.
 _BEYOND_CLEARANCE: Final = 3.0
 #: A swing up to this [rad] is accepted, because soft pads let a head turn farther than a narrow clearance does.
 _BELIEVED_SWING_RAD: Final = 0.1
@@ -43,7 +45,8 @@ _SLOW_S: Final = 0.5
 _SMOOTH: Final = 0.05
 #: Ploughs travel at 3.6 m/s at most (Caterpillar GH1600); a speed above this [m/s] is in another unit.
 _FASTEST_M_S: Final = 5.0
-#: Share of falling stamps above which the column is not a time, and share above which the rows are in reverse order.
+#: Share of falling stamps above which the column is not a time.
+#: Share of falling stamps above which the rows are in reverse order.
 _FALLING, _REVERSED = 0.2, 0.9
 #: Length [s] of each unit other than the second that a time may have.
 _TIMES: Final = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
@@ -54,7 +57,7 @@ _FEW: Final = 20
 _SORT: Final = "sort the rows by time"
 _NAME_TIME: Final = "name the column of the time in a mapping (stamp: NAME)"
 _WRITE_SECONDS: Final = "write seconds, or dates such as 2026-01-02T03:04:05.678Z"
-#: Load cells send at most at 10 kHz; stamps that are closer together than this [s] are in another unit.
+#: Load cells send at 10 kHz at most; if stamps are closer together than this [s], they are in another unit.
 _SHORTEST_SPACING_S: Final = 1e-4
 #: Stamps above this [s] are dates: 1e9 s is in the year 2001.
 _DATES_S: Final = 1e9
@@ -220,7 +223,7 @@ def _load(magnitudes: Mapping[tuple[str, str], float], scene: Scene) -> list[Uni
             largest *= UNITS["force"][unit]
     if largest < _IDLE_SHARE * usual:
         return doubts
-    # the expected moment is reduced with the forces, because small forces come with a small moment
+    # small forces come with a small moment, so the expected moment is reduced in proportion to the forces
     beside = float(compile_loads(scene.loads).largest()[2]) * min(1.0, largest / usual) if usual else 0.0
     moment = magnitudes.get(("excitation", "m"), 0.0)
     if _BROKEN_SHARE * beside < moment < _IDLE_SHARE * beside:
@@ -234,7 +237,7 @@ def _angle(theta: Array, scene: Scene) -> list[UnitDoubt]:
     largest = _usual_magnitude(theta)
     if scene.head.carries == "corners" or not 0.0 < largest < np.degrees(_LARGEST_ANGLE_RAD):
         return []
-    # the zero of a sensor may differ from the head's zero
+    # the zero of a sensor may differ from the head's zero, so the swing, half the range, is judged as well
     low, high = np.percentile(theta[np.isfinite(theta)], (0.5, 99.5))
     swing = 0.5 * float(high - low)
     allowed = max(_BELIEVED_SWING_RAD, _BEYOND_CLEARANCE * largest_angle(scene))
@@ -288,7 +291,7 @@ def _spacing(stamps_s: Array, load: Array) -> list[UnitDoubt]:
     if stamps_s.max() > _DATES_S:
         return []
     spacing = float(np.median(np.abs(steps)))
-    # `time_ns` has added a second to times that count from an unknown start
+    # `time_ns` has added a second to times that count from an unknown start, so the limits get a second too
     low, high = (days + _START_S for days in _SHEET_DAYS)
     if low <= stamps_s[0] <= high and np.ptp(stamps_s) < 1.0 and spacing < _SHORTEST_SPACING_S:
         found = f"{stamps_s[0] - _START_S:.6g} and stamps {spacing:.2g} s apart"

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 #: Number of samples in one advance of the session.
 BATCH: Final = 4096
-#: Entries at which a walk stops. Across all other entries, late samples are sorted in.
+#: A walk stops at these entries. Across all other entries, late samples are sorted in.
 _ACTING: Final = (Travel, Reset, Loss, Restore, Snapshot, SetModel, SetWear)
 #: Further entries at which a walk stops if the motion follows measurements.
 _FOLLOWED: Final = (Pose, PartOfPose, Estimated, Parameter)

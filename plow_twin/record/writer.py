@@ -41,7 +41,7 @@ class _Part:
 
     path: Path
     file: McapFile
-    #: number, message type and QoS text of each channel by topic
+    #: for each topic, number, message type and QoS text of its channel
     channels: dict[str, tuple[int, str, str]] = field(default_factory=dict)
     #: channel number of each publication topic by base name
     sent: dict[str, int] = field(default_factory=dict)
@@ -200,7 +200,7 @@ class RunWriter:
     def _write(
         self, chunk: ChunkBuilder, topic: str, sequence: int, log_time_ns: int, stamp_ns: int, message: Message
     ) -> None:
-        # a negative time becomes 0, because MCAP times are unsigned; the message has its exact stamp
+        # MCAP times are unsigned, so a negative time becomes 0; the message itself keeps the exact stamp
         log_time_ns, stamp_ns = max(0, log_time_ns), max(0, stamp_ns)
         channel = self._channel(topic, message.TYPE)
         chunk.add(channel, sequence & _SEQUENCE_MASK, log_time_ns, stamp_ns, encode(message))
@@ -226,7 +226,7 @@ class RunWriter:
             self._part.file.chunk(self._journal)
             self._part.file.chunk(self._outputs)
         except OSError:
-            self._outputs.clear()  # outputs are useless without the journal before them
+            self._outputs.clear()  # outputs are useless without the journal before them, so they are dropped
             raise
 
     def flush(self) -> None:

@@ -75,9 +75,9 @@ class InputLoop:
 
     def __init__(self, turns: Turns, on_error: Callable[[Exception], None]) -> None:
         self._turns, self._on_error = turns, on_error
-        #: queue, receiver and topic by file descriptor
+        #: queue, receiver and topic for each file descriptor
         self._queues: dict[int, tuple[Queue, Receiver, str]] = {}
-        #: the first timer always runs
+        #: the first timer, which looks at all queues, always runs
         self._timers = [Timer(_LOOK_S, self._look_at_all)]
         self._active = self._stopped = False
         #: time at which the next timer is due

@@ -44,8 +44,8 @@ class _Info(ctypes.Structure):
     ]
 
 
-#: Layout of `_Info` (times of sending and reception, sequence number, publisher), and of the address and the length in
-#: `SerializedMessage`.
+#: Layout of `_Info`: times of sending and reception, sequence number, publisher.
+#: Layout of the address and the length in `SerializedMessage`.
 _INFO, _PLACE = struct.Struct("=qqQ16x16s"), struct.Struct("=QQ")
 #: Return code of rcl for an empty queue.
 _NOTHING_TAKEN: Final = 401
@@ -107,7 +107,7 @@ class InputQueue:
         """
         try:
             signs = os.eventfd_read(self.fd)
-        except BlockingIOError:  # the queue is polled without a notification
+        except BlockingIOError:  # no notification has come, but the queue is polled
             signs = 0
         self._signs += signs
         wanted = most if all_there_are else min(most, self._signs)

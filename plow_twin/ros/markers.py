@@ -24,9 +24,9 @@ _GREY: Final = (0.6, 0.6, 0.6)
 _BLUE: Final = (0.3, 0.55, 0.9)
 _ORANGE: Final = (0.9, 0.6, 0.1)
 _RED: Final = (0.9, 0.2, 0.2)
-#: Width of lines and arrows, and length of the arrow for a force as large as the head's weight, as shares of the
-#: frame's height.
+#: Width of lines and arrows, as a share of the frame's height.
 _LINE: Final = 0.015
+#: Length of the arrow for a force as large as the head's weight, as a share of the frame's height.
 _ARROW: Final = 0.5
 
 

@@ -13,7 +13,8 @@ from std_msgs.msg import Header
 from plow_twin.record import messages as plain
 from plow_twin.stream.intake import NS_PER_S
 
-#: Stamp [ns] and numbers of a message, whether they are a load, and whether it has a non-zero out-of-plane component.
+#: Stamp [ns] and numbers of a message, whether the numbers are a load, and whether the message has a non-zero
+#: out-of-plane component.
 Read = tuple[int, tuple[float, ...], bool, bool]
 #: A message that cannot be read.
 UNREADABLE: Final[Read] = (0, (), False, False)
@@ -51,7 +52,7 @@ def read_wrench(data: bytes) -> Read:
     try:
         start, numbers = _WRENCH_LAYOUTS[data[1] & 1]
         seconds, nanoseconds, length = start.unpack_from(data, 4)
-        # numbers of 8 bytes are aligned to 8, counted from the end of the 4 bytes of encapsulation
+        # numbers of 8 bytes begin at multiples of 8 bytes, counted from the end of the 4 bytes of encapsulation
         fx, fy, fz, mx, my, mz = numbers.unpack_from(data, 4 + (start.size + length + 7) // 8 * 8)
     except (struct.error, IndexError):
         return UNREADABLE

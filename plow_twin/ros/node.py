@@ -122,7 +122,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
             self._front = RosFront(self, settings, self._publish_status, prepared, self._kept_wear)
         except (PlowTwinError, OSError, ModuleNotFoundError) as error:
             self.reason = f"scene {settings.scene!r}, record_path {settings.record_path!r}: {error}"
-        except Exception:  # rclpy would swallow any other error
+        except Exception:  # rclpy would hide any other error, so its traceback becomes the reason
             self.reason = traceback.format_exc()
         else:
             self.get_logger().info(f"scene {settings.scene}: solver ready in {prepared.compile_s:.2f} s")
@@ -164,7 +164,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
 
     def release(self) -> None:
         """Release everything and close the recording; can be called at any time."""
-        # a frozen runtime is part of reference cycles and would never be freed
+        # the runtime is part of reference cycles, so it would never be freed while its objects are frozen
         gc.unfreeze()
         front, self._front = self._front, None
         if front is None:

@@ -70,11 +70,11 @@ class Subscriptions:
         self._tool_forces = ToolForces(runtime.scene)
         self._source, depth = runtime.settings.excitation_source, self._inputs.depth
         self._names: dict[tuple[str, bytes], str] = {}
-        #: number of the next message, by topic and publisher
+        #: sequence number expected next, by topic and publisher
         self._following: dict[tuple[str, bytes], int] = {}
         self._since_ns = time.time_ns()  # time at which the excitation was subscribed to
-        #: for each publisher of the excitation that was unknown at that time: its first message, and the losses counted
-        #: before this message
+        #: for each publisher of the excitation that was unknown when the subscription began: its first message, and the
+        #: losses counted before this message
         self._appeared: dict[bytes, tuple[Taken, int]] = {}
         self._before: frozenset[bytes] = frozenset()
         with_covariance = runtime.settings.head_pose_type == "pose_with_covariance"
@@ -99,7 +99,7 @@ class Subscriptions:
             for topic in present:
                 self.look_for_senders(
                     topic
-                )  # the look-up is repeated, because messages may have been taken in the meantime
+                )  # the look-up is repeated, because messages may have been taken since the publishers were counted
         self._front.changed()
 
     def look_for_senders(self, topic: str) -> None:
@@ -217,7 +217,7 @@ class Subscriptions:
             stamp, values, fits, out_of_plane = self._read(topic, message.data)
             wanted = inputs.wanted(message.sender, message.number, stamp, values, fits)
             if inputs.senders.followed != followed:
-                # earlier messages came from another publisher
+                # the followed sender has changed, and the samples collected so far came from another publisher
                 self._step(arrived)
                 arrived, followed = [], inputs.senders.followed
             if wanted:
@@ -268,7 +268,8 @@ class Subscriptions:
             with_covariance = self._pose is PoseWithCovarianceStamped
             pose = message.pose.pose if with_covariance else message.pose
             turn, stamp = pose.orientation, stamp_ns(message.header)
-            if turn.z == turn.w == 0.0:  # without a turn about z the field was never filled, or the head is upside down
+            # z and w are both zero if the sender never filled the field, or if the head is upside down
+            if turn.z == turn.w == 0.0:
                 self._inputs.head_pose.refuse(Verdict.MALFORMED, stamp, (pose.position.x, pose.position.y))
                 continue
             theta = 2.0 * math.atan2(turn.z, turn.w)

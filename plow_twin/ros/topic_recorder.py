@@ -76,7 +76,7 @@ class TopicRecorder:
         self._loop = InputLoop(self._turns, lambda error: None)
         #: reason for each topic that is not recorded
         self.skipped: dict[str, str] = {}
-        #: number of messages sent but never received, from the publishers' sequence numbers
+        #: number of messages that were sent but never received, from the publishers' sequence numbers
         self.missed: dict[str, int] = {}
         self._newest: dict[tuple[str, bytes], int] = {}
         self._loop.every(_FLUSH_S, writer.flush)
@@ -149,7 +149,8 @@ class TopicRecorder:
         """Write messages of a subscription, each message once."""
         for message in taken:
             key = (name, message.sender)
-            # a weaker subscription of the topic gets the messages of a stronger publisher as well
+            # the topic's weaker subscription also gets the messages of a stronger publisher, which must be recorded
+            # only once
             if self._taken_as.setdefault(key, quality) != quality:
                 continue
             before = self._newest.get(key, message.number - 1)

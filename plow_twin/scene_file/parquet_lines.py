@@ -16,15 +16,16 @@ if TYPE_CHECKING:
 SUFFIX: Final = ".parquet"
 #: Largest number of rows that are converted at once.
 _ROWS: Final = 4096
-#: Largest number of rows per byte of a file, since a few bytes can encode any number of rows; and number of rows that a
-#: file of any size may have.
+#: Largest number of rows per byte of a file, since a few bytes can encode any number of rows.
 _MOST_PER_BYTE: Final = 100
+#: Number of rows that a file of any size may have.
 _ALWAYS: Final = 1_000_000
 #: Largest unpacked column of a row group [B], since a whole column is held in memory. Writers make row groups of 128
 #: MB.
 _LARGEST_COLUMN: Final = 2**29
-#: Largest number of columns, and longest text in the file's metadata [B].
+#: Largest number of columns.
 _MOST_COLUMNS: Final = 10_000
+#: Longest text in the file's metadata [B].
 _LONGEST_TEXT: Final = 2**24
 
 

@@ -63,7 +63,8 @@ MOST_PROBLEMS: Final = 50
 def validate(raw: Any, schema: Schema, name: str) -> list[Problem]:
     """Return the problems of plain data in the order of the schema; messages call the whole data `name`."""
     problems = (problem for error in _validator(schema).iter_errors(raw) for problem in _explain(error, name))
-    unique: dict[str, Problem] = {}  # jsonschema repeats a mapping for each missing key
+    # jsonschema reports a mapping once for each missing key, and `_explain` lists all its missing keys each time
+    unique: dict[str, Problem] = {}
     for problem in islice(map(_brief, problems), 2 * MOST_PROBLEMS):
         unique[str(problem)] = problem
     return list(unique.values())[:MOST_PROBLEMS]

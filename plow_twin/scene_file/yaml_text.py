@@ -24,9 +24,9 @@ except ImportError:
     from yaml import SafeDumper as _Dumper  # type: ignore[assignment]
     from yaml import SafeLoader as _Loader  # type: ignore[assignment]
 
-#: Largest file [B] and largest number of values in it, enough for a table of 200,000 rows, which takes ten seconds to
-#: read; longer tables belong in CSV.
+#: Largest file [B]. A table of 200,000 rows fits, which takes ten seconds to read; longer tables belong in CSV.
 LARGEST_FILE: Final = 64 * 2**20
+#: Largest number of values in a file, for the same reason.
 MOST_VALUES: Final = 1_000_000
 #: Deepest nesting of collections; a scene has six levels.
 DEEPEST: Final = 20
@@ -121,7 +121,7 @@ def _excess(text: str, most_values: float) -> Problem | None:
     values = repeated = 0
     sizes: dict[str, _Size | None] = {}  # size by anchor; None while the node has not ended
     outer, is_mapping, anchor = _Size(), False, None
-    stack: list[tuple[_Size, bool, str | None]] = []  # size, kind and anchor of the collections around it
+    stack: list[tuple[_Size, bool, str | None]] = []  # size, kind and anchor of the collections around the event
     event: Any
     for event in yaml.parse(text, SceneLoader):
         kind = type(event)
@@ -161,7 +161,7 @@ def _excess(text: str, most_values: float) -> Problem | None:
         if is_mapping:
             outer.keys += 1
         outer.keys += node.keys
-        if outer.keys > 2 * MOST_KEYS:  # both the key and the value of each item have been counted
+        if outer.keys > 2 * MOST_KEYS:  # `keys` counts both the key and the value of each item, so the limit is doubled
             return _above(event, (outer.keys + 1) // 2, MOST_KEYS, "keys")
         if outer.depth <= node.depth:
             outer.depth = node.depth + 1
@@ -187,7 +187,7 @@ def dump_yaml(data: Any, *, flow: bool = True) -> str:
 
 def _repeated_keys(node: yaml.Node, path: str) -> Iterator[Problem]:
     if isinstance(node, yaml.SequenceNode):
-        # a row of a long table is read quickly, because its scalars have no keys and are skipped
+        # scalars have no keys and are skipped, so that a row of a long table is read quickly
         for index, item in enumerate(node.value):
             if not isinstance(item, yaml.ScalarNode):
                 yield from _repeated_keys(item, f"{path}[{index}]")

@@ -136,7 +136,7 @@ class _Model:
     def add(self, stamp_ns: int, x: float, y: float) -> list[tuple[int, float]]:
         """Add a pose of the model; return stamps and residuals [m] of the measured poses that waited for it."""
         place = bisect_left(self._stamps_ns, stamp_ns)
-        # the motion after a late sample is computed again, so the old poses are dropped
+        # after a late sample the motion is computed again, so the poses from its stamp on are dropped
         del self._stamps_ns[place:], self._q[place:]
         self._stamps_ns.append(stamp_ns)
         self._q.append((x, y))
@@ -252,7 +252,7 @@ class Alarms:
                 for found in zip(stamps_ns, earlier, strict=False):
                     self._growth(*found)
             rate = self._growth(stamps_ns[-1], clearance)
-        # only the newest values are kept, as no level changes
+        # no level changes, so it is enough to keep the newest values
         newest = {name: float(found[-1].max()) for name, found in values.items() if len(found)}
         for name, value in (newest | ({"clearance_rate": rate} if stamps_ns else {})).items():
             if name in self.alarms:

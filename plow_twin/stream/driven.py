@@ -58,7 +58,7 @@ class Following(Driven, Protocol):
 
     #: number of poses and estimates so far
     added: int
-    #: whether intervals and measurements wait for `catch_up` when a row is published by itself
+    #: whether the intervals and measurements of a row that is published by itself wait for `catch_up`
     defers: bool
 
     def catch_up(self) -> None:

@@ -106,8 +106,9 @@ class Driver:
         self.rolled_back = 0
         #: number of speeds along the face that could not act at their stamps
         self.travel_misplaced = 0
-        #: steady times of the latest resets, and of the latest refused reset [ns]
+        #: steady times of the latest resets by jumps of the clock [ns]
         self._resets_ns: deque[int] = deque()
+        #: steady time of the latest refused reset [ns]
         self._unsteady_ns: int | None = None
         self._steps = Steps(intake)
         self.clock = Intake(jump_back_s=intake.jump_back_s, jump_forward_s=intake.jump_forward_s)
@@ -212,7 +213,8 @@ class Driver:
     ) -> Iterator[Published]:
         """Judge a sample and add it to `run`, the samples to apply together; `run` is applied first where needed."""
         late = bool(run) and self._is_late(run[0])
-        # a stamp that does not rise may be late or a jump back: `judge` can decide once the run is applied
+        # a stamp that does not rise is either late or a jump back; `judge` can decide which only after `run` has been
+        # applied
         if run and not late and stamp_ns <= run[-1].stamp_ns:
             yield from self._use(run, now_ns)
             late = False
@@ -427,7 +429,7 @@ class Driver:
             if len(published.rows):
                 yield published
         if self._newest_ns is None:
-            # silence must also be noticed after a reset between two samples
+            # a silence between a reset and the next sample must also be noticed, so it counts from the stamp reached
             self._newest_ns = self.session.stamp_ns
 
     def _apply(self, samples: Sequence[Sample], now_ns: int) -> Published:

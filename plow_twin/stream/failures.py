@@ -18,7 +18,8 @@ class Failures:
 
     def __init__(self, emit: Callable[[Failed], object]) -> None:
         self._emit = emit
-        #: number of failed advances, and number of stretches of failed advances
+        #: number of failed advances
+        #: number of stretches of failed advances
         self.count = self.stretches = 0
         #: reason of the newest failure; empty without a failure
         self.reason = ""
@@ -27,8 +28,9 @@ class Failures:
         #: whether the motion restarted after the newest stretch
         self.restarts = False
         self._in_a_row = 0
-        #: length of the stretch before the newest restart, and stamp of that restart [ns]
+        #: length of the stretch of failed advances before the newest restart [ns]
         self._before_ns = 0
+        #: stamp of the newest restart [ns]
         self._restarted_ns: int | None = None
 
     @property

@@ -33,10 +33,10 @@ class History:
         self._span_ns = span_ns
         self._spacing_ns = max(1, span_ns // SNAPSHOTS)
         self._snapshots: list[tuple[int, bytes]] = []
-        #: stamps of the first sample in each span, where calls with single samples have a snapshot
+        #: for each span, the stamp of its first sample; a session that takes samples one by one has a snapshot there
         self._kept_ns: list[int] = []
-        #: largest of these stamps so far; while the session has gone back and computes up to it again, no kept stamp is
-        #: dropped
+        #: largest of these stamps so far. After going back, no kept stamp is dropped until the session has computed up
+        #: to this stamp again.
         self._newest_kept_ns: int | None = None
         self._samples: list[Sample] = []
         self._stamps_ns: list[int] = []

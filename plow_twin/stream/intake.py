@@ -111,11 +111,14 @@ class Intake:
         self._newest_values: Sequence[float] = ()
         #: newest stamp before the last jump [ns]
         self._before_jump_ns: int | None = None
-        #: whether the last judged sample returned to the stamps before a jump, so that the stamps in between were wrong
+        #: whether the last judged sample continued the stamps from before a jump, so that the stamps since the jump
+        #: were wrong
         self.returned = False
-        #: number of samples missing up to the last jump; first stamp and number of used samples since then
+        #: number of samples missing up to the last jump
         self._missing_before = 0
+        #: first stamp since the last jump [ns]
         self._first_ns = 0
+        #: number of samples used since the last jump
         self._since_first = 0
 
     @property
@@ -170,7 +173,7 @@ class Intake:
             return verdict
         if self._newest_ns is None or verdict.resets:
             self._missing_before, self._first_ns, self._since_first = self.missing, stamp_ns, 0
-            # after a return, a later sample cannot return to the wrong stamps
+            # after a return, the newest stamp is one of the wrong stamps, to which no later sample may return
             self._before_jump_ns = None if self.returned else self._newest_ns
         self._since_first += 1
         if self._newest_ns is None or verdict.resets or stamp_ns > self._newest_ns:

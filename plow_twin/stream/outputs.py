@@ -39,13 +39,14 @@ _STATE_SIZE: Final = 4 * PAIR_COUNT
 SLOW: Final = np.dtype(
     [
         ("stamp_ns", "i8"),
-        ("row", "i8"),  # index of the publication's row to which this slow part belongs
+        ("row", "i8"),  # index, among the publication's rows, of the row to which this slow part belongs
         ("clearance", "f8", (len(CLEARANCE_NAMES),)),
         ("wear_rate", "f8", (PAIR_COUNT,)),
     ]
 )
-#: Indices of the rows to publish: the only row, or no row.
+#: Indices of the rows to publish: the only row.
 THE_ONE: Final = np.zeros(1, np.int64)
+#: Indices of the rows to publish: no row.
 NONE: Final = np.zeros(0, np.int64)
 _NO_ROWS: Final = np.zeros(0, ROW)
 _NO_SLOW: Final = np.zeros(0, SLOW)
@@ -167,7 +168,8 @@ class Outputs:
 
     def __init__(self, scene: Scene) -> None:
         self._scene, self._publish = scene, _publish()
-        #: sums since the previous publication, and the newest advance if it still waits to be published (`_waits`)
+        #: sums since the previous publication; while `_waits` is 1, also the newest advance, which still waits to be
+        #: published
         self._window = np.zeros(1, ROW)
         self._waits = 0
         self._stock = Stock()
@@ -176,7 +178,7 @@ class Outputs:
         self._slow_wear_depth = np.zeros(PAIR_COUNT)
         #: stamp from which the published motion was computed again [ns]; valid while the window is marked as corrected
         self._corrected_ns = 0
-        #: the window before this correction, if it contained an advance
+        #: the window from before this correction if it contained an advance, otherwise None
         self._before: Rows | None = None
         #: amounts by which an estimate shifts the clearances and their quantiles, in the order of `CLEARANCE_NAMES`;
         #: None without an estimate
@@ -354,7 +356,7 @@ class Outputs:
         self._clear()
         self._window["makes"] = parts[0].view(np.int64)
         self._window["impulse"], self._window["peak"] = parts[1:3]
-        # a state has no peak of the samples alone, so the peak of all advances takes its place
+        # a state has no `measured_peak`, the peak of the samples alone, so the peak of all advances takes its place
         self._window["measured_peak"] = parts[2]
         self._slow_wear_depth = parts[3].copy()
         slow_ns = int(np.frombuffer(data, np.int64, 1, offset=8 * _STATE_SIZE)[0])

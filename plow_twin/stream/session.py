@@ -164,7 +164,8 @@ class Session:
         self._use(twin)
         #: poses and estimates since the earliest state that is kept
         self._measured: deque[_Measured] = deque()
-        #: number of dropped poses: too far ahead of the load, or removed from `_measured` because it was full
+        #: number of dropped poses: those too far ahead of the load, and those removed from `_measured` because it was
+        #: full
         self.poses_dropped = 0
         self._scene = twin.scene
         #: changed numbers of the scene, by their keys
@@ -177,7 +178,7 @@ class Session:
         #: row of the latest advance, kept until the wear at its end is read
         self._row: Rows | None = None
         scene, self._sampled = twin.scene, twin.excitation == "sampled"
-        #: past states and samples, for late samples
+        #: past states and samples, from which the session starts again to insert late samples
         self.history = History(round(rollback_span_s * 1e9) if self._sampled else 0)
         self.wear_depth = np.zeros(PAIR_COUNT)
         if scene.wear is not None:
@@ -267,7 +268,7 @@ class Session:
                 self.following.follow_parameters()
                 self._forget()
             case Parameter() | Gaps() | Mark() | Failed() | Spread() | Unused():
-                # the entry acts through later entries, or has no effect here
+                # these entries act through later entries, or have no effect here
                 self._on_entry(entry)
             case Snapshot(_, data):
                 self._on_entry(entry)
@@ -434,7 +435,9 @@ class Session:
                 continue
             if travel is not None:
                 end = int(np.searchsorted(stamps, travel.stamp_ns, side="right"))
-            if resumed:  # the session never goes back to the motion without samples before the first sample
+            # the first sample after a motion without samples advances alone, and the state after it is kept, because
+            # the session never goes back to the motion before it
+            if resumed:
                 end = begin + 1
             here = slice(begin, end)
             chosen = taken[(taken >= begin) & (taken < end)] - begin
@@ -481,7 +484,7 @@ class Session:
         )
         travels = b"".join(_TRAVEL.pack(travel.stamp_ns, travel.speed_m_s) for travel in self._travels)
         stamp_ns = self.stamp_ns if self.stamp_ns is not None else self.origin_ns or 0
-        # the changes of the model come last, because most runs have no changes
+        # the changes of the model come last, so that they can be absent: most runs have no changes
         changes = json.dumps(self.changes).encode() if self.changes else b""
         data = header + travels + self.wear_depth.tobytes() + self.outputs.state() + self.twin.snapshot() + changes
         return Snapshot(stamp_ns, data)
@@ -598,15 +601,16 @@ class Session:
         self._restore(data)
         self._advances, self.outputs.slow_before = advances, slow
         if self.following is not None:
-            # each measurement acts from the time when it was known, because publications decide how far the session
-            # goes back, and they must not change the motion
+            # each measurement acts from the time at which it was known: publications decide how far the session goes
+            # back, and a publication must not change the motion
             measured, self._measured = self._measured, deque()
             for one in measured:
                 if one.number > self.following.added:
                     self._follow(one.stamp_ns, one.entry, one.known)
                 else:
                     self._measured.append(one)
-        # a speed at the time of the snapshot may or may not have been applied
+        # a speed with the snapshot's stamp may be in the snapshot and among the later speeds, so each stamp is used
+        # once
         known = {travel.stamp_ns: travel for travel in (*self._travels, *travels, *pending, *more)}
         self._travels = sorted(known.values(), key=lambda travel: travel.stamp_ns)
         return samples

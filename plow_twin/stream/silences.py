@@ -30,9 +30,9 @@ class Silences:
     def __init__(self, timeout_s: float) -> None:
         self.timeout_s = timeout_s
         self.count = 0
-        #: length of all stretches [ns]
+        #: total length of all silences [ns]
         self.total_ns = 0
-        #: begin and end of the longest stretch [ns]
+        #: begin and end of the longest silence [ns]
         self.longest_ns = (0, 0)
         self._first_ns: int | None = None
         self._newest_ns: int | None = None

@@ -21,9 +21,11 @@ from plow_twin.telemetry.way import State
 _WAITING: Final = 2000
 #: Largest number of points in one request.
 _AT_ONCE: Final = 500
-#: Longest wait for an answer [ms]; first and longest wait before another attempt [s].
+#: Longest wait for an answer [ms].
 _ANSWER_MS: Final = 5000
+#: First wait before another attempt [s].
 _FIRST_WAIT_S: Final = 1.0
+#: Longest wait before another attempt [s].
 _LONGEST_WAIT_S: Final = 30.0
 
 

@@ -78,8 +78,9 @@ class Sparkplug:
 
     def __init__(self, group: str, node: str, **options: Any) -> None:
         self._topic = f"spBv1.0/{group}/{{}}/{node}"
-        #: number of the next message, and number of the connection, which birth and death messages contain
+        #: sequence number of the next message
         self._number = 0
+        #: number of the connection, which birth and death messages contain
         self._connection = -1
         self._rebirth = False
         self._newest = Newest()

@@ -52,7 +52,7 @@ class Curves:
         self.span_ns = span_ns
         self.entities = tuple(entities)
         self._parts: list[tuple[Indexes, Indexes, Array]] = []
-        self._ends: list[NDArray[np.bool_]] = []  # for each row of each part, whether the lines end there
+        self._ends: list[NDArray[np.bool_]] = []  # for each part, whether the lines end at each of its rows
         self._last: tuple[Indexes, Indexes] | None = None
         self._waiting = self.rows = self.sent = 0
 

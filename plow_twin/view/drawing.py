@@ -123,7 +123,8 @@ class Drawing:
         self.pad_names = Batches(stream, axis, "exaggerated/pads/wear", rr.Points2D, ("positions", "labels"))
         self.events = Events(stream, axis)
         self.section_rows = 0
-        #: number of the last advance, and its stamp [ns]
+        #: number of the newest advance
+        #: stamp of the newest advance [ns]
         self.step, self.stamp_ns = -1, 0
         self._shown: int | None = None
         self._sample_ns: int | None = None
@@ -255,7 +256,8 @@ class Drawing:
         for index in sorted(entries.others):
             self._back(samples[: np.searchsorted(samples, index)], stamps, steps)
             entry, stamp_ns = entries.others[index], int(stamps[index])
-            if not hasattr(entry, "stamp_ns"):  # an entry without a stamp is drawn at the stamp reached
+            # an entry without a stamp is drawn at the stamp that the model had reached
+            if not hasattr(entry, "stamp_ns"):
                 reached = np.flatnonzero(advance[:index])
                 stamp_ns = int(stamps[reached[-1]]) if reached.size else self.stamp_ns
             self.events.entry(stamp_ns, max(int(steps[index]), 0), entry, self.header.excitation_source)

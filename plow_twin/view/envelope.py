@@ -29,7 +29,8 @@ class Envelope:
         self._segment = 0
         #: width of a bin [s]; 0 while every row is kept
         self._bin_s = 0.0
-        # segment (n,); bin number (n,), or time [s] while every row is kept; least and largest values (n, width)
+        # segment of each row (n,); its bin number (n,), or its time [s] while every row is kept; its least and its
+        # largest values (n, width)
         self._kept = _Rows(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, width)), np.zeros((0, width)))
         self._added: list[_Rows] = []
         self._added_rows = 0

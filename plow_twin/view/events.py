@@ -49,7 +49,8 @@ class Events:
                     self.add(stamp_ns, step, f"excitation silent: {subject}", "WARN")
                     self.silent = True
             case Travel(_, speed):
-                if speed != self._speed_m_s:  # sensors repeat an unchanged speed many times a second
+                # sensors repeat an unchanged speed many times a second, so only changes become events
+                if speed != self._speed_m_s:
                     self.add(stamp_ns, step, f"travel along the face at {speed:g} m/s")
                 self._speed_m_s = speed
             case Reset(_, reason):

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from plow_twin.stream.journal import Travel
 from plow_twin.view.columns import Array, Batches, Indexes, TimeAxis
 
-#: Size of the chart in the units of its view.
+#: Width of the chart in the units of its view.
 WIDTH: Final = 300.0
+#: Height of the chart in the same units.
 HEIGHT: Final = 90.0
 #: First length of a piece of the face [m]; it doubles when there are more than `_MOST_PIECES` pieces.
 _PIECE_M: Final = 0.1

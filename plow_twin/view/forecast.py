@@ -33,7 +33,7 @@ def draw_forecast(found: Forecast, path: FilePath, title: str) -> None:
     growing = 1e3 * found.clearances(hours)
     limits = (plan.limit_horizontal_m, plan.limit_vertical_m)
     for axis, (name, limit, colour) in enumerate(zip(("horizontal", "vertical"), limits, _COLOURS, strict=True)):
-        # the clearance is infinite if its limit has already been reached
+        # a clearance is infinite if its limit has already been reached; then its median is not drawn
         low, middle, high = np.minimum(growing[:, :, axis], 1e3 * limit)
         middle[~np.isfinite(growing[1, :, axis])] = np.nan
         left.fill_between(hours, low, high, color=colour, alpha=0.2, linewidth=0.0)
@@ -54,7 +54,7 @@ def draw_forecast(found: Forecast, path: FilePath, title: str) -> None:
                 xytext=(offset, -10.0),
                 textcoords="offset points",
                 ha=side,
-                # the box covers the line of another point
+                # the white box of this label covers the line of the other points
                 bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0},
             )
     if plan.stop_h is not None and plan.stop_h <= end:

@@ -116,7 +116,8 @@ def blueprint(
             _plot("wear", "Wear [mm]", rrb.Corner2D.LeftTop, _WITHOUT_BOUNDS),
             active_tab=0,
         ),
-        row_shares=[4.7, 2.2, 2.7, 3.4],  # with these shares the lane of the sets fits even in a window of 600 pixels
+        # with these shares the lane of the contact sets fits even in a window 600 pixels high
+        row_shares=[4.7, 2.2, 2.7, 3.4],
     )
     return rrb.Blueprint(
         rrb.Horizontal(

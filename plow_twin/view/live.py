@@ -18,8 +18,9 @@ from plow_twin.view.rrd import ViewSummary
 
 #: Rate of the spans in which a curve keeps two values [Hz]; an hour of all curves then takes some 200 MB in the viewer.
 CURVE_HZ: Final = 25.0
-#: Rates of the cross-section [Hz]: live, and for the part that was recorded before the view started.
+#: Rate of the cross-section in a live view [Hz].
 SECTION_HZ: Final = 20.0
+#: Rate of the cross-section for the part that was recorded before the view started [Hz].
 _SECTION_HZ_BEFORE: Final = 1.0
 
 

@@ -152,7 +152,7 @@ def _draw_section(axis: Any, section: Section, instant: Instant, curves: RunCurv
             sideways = abs(vector[0]) > abs(vector[1])
             side = "center" if not sideways else "left" if vector[0] > 0.0 else "right"
             axis.annotate(text, origin + 1.1 * vector, color=color, ha=side, va="center", fontsize=8)
-        # annotations do not widen the limits of the axes, so these points do
+        # annotations do not widen the limits of the axes, so points on both sides of each label are added to the limits
         axis.update_datalim(
             np.concatenate([origins + 1.1 * vectors + side for side in (-_LABEL_ROOM_MM, _LABEL_ROOM_MM)])
         )

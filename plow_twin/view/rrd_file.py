@@ -13,7 +13,7 @@ import rerun.blueprint as rrb
 
 from plow_twin.errors import RecordingError
 
-#: Largest number of bytes that are copied at once. A pipe holds fewer, so each copy takes all that is waiting.
+#: Largest number of bytes that are copied at once. A pipe holds fewer bytes, so each copy takes all that are waiting.
 _CHUNK: Final = 1 << 20
 
 

@@ -72,7 +72,7 @@ class RunCurves:
     _estimated: bool = False
     _held_since_ns: int | None = None
     _newest_ns: int | None = None
-    #: number of the newest estimate's entry, and its result
+    #: sequence number and result of the newest `Estimated` entry
     _estimate: tuple[int, str] | None = None
     _clearance: Array | None = None
 
@@ -134,7 +134,7 @@ class RunCurves:
                     self._newest_ns = stamp_ns
                 case Estimated(end_ns=end_ns, result=result):
                     if not self._estimated:
-                        # the estimate holds from its arrival on
+                        # the estimate holds from its arrival on, so the samples before it are added first
                         self._samples(batch.entries.stamp_ns[samples[(samples >= done) & (samples < index)]])
                         done = index
                         self._change(end_ns if self._newest_ns is None else self._newest_ns, "first estimate")

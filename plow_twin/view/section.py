@@ -24,8 +24,9 @@ FAINT_N: Final = 500.0
 #: Distance of the body's drawn outline from the cavity [mm]; a scene states no outline.
 BODY_MARGIN_MM: Final = 60.0
 
-#: Drawn depth of a pad [mm] per wear depth [mm], and its length [mm].
+#: Drawn depth of a pad per depth of its wear [mm/mm].
 PAD_MM_PER_MM: Final = 200.0
+#: Drawn length of a pad [mm].
 _PAD_MM: Final = 60.0
 #: Distance of a label below its place [mm].
 LABEL_MM: Final = 16.0
@@ -85,7 +86,7 @@ class Section:
 
         A block's corners are named by their place, so beyond 45 degrees each corner has another name.
         """
-        # distance along each axis from the corner of the sides to the middle of its arc
+        # distance along each axis from the point where the sides would meet to the middle of the corner's arc
         within = self.radius * (1.0 - math.sqrt(0.5))
         corners = ((0.5 * self.frame - within) * _SIGNS)[::2]
         if not self.is_block:
@@ -124,8 +125,8 @@ class Section:
         along = _SIGNS - _OUTWARDS
         depth = np.minimum(PAD_MM_PER_MM * wear_depth_mm, 0.25 * self.frame.min())[:, None]
         middles = (corners - 0.5 * depth * _OUTWARDS - (0.5 * _PAD_MM + 12.0) * along) * _FLIP
-        # labels are inside the frame, away from the walls, in two rows at a corner; the vertical wall's row is nearer
-        # the centre
+        # labels are inside the frame, away from the walls; of the two labels at a corner, that of the vertical wall is
+        # nearer the centre
         inwards = np.stack((np.full(PAIR_COUNT, 0.5), np.where(np.abs(_OUTWARDS[:, 0]) > 0.5, 0.26, 0.64)), axis=1)
         labels = corners * inwards * _FLIP - [0.0, LABEL_MM]
         return middles, 0.5 * (depth * np.abs(_OUTWARDS) + _PAD_MM * np.abs(along)), labels

@@ -22,13 +22,13 @@ from plow_twin.record.sources import Arrived
 from plow_twin.stream.driver import Arrival
 from plow_twin.stream.intake import Intake, Verdict
 
-#: A larger jump of the message numbers means that the sender has restarted, if the next number follows the new one.
+#: The sender has restarted if a message number jumps by more than this and the next message number follows it.
 _RESTART = 1000
 #: Largest number of samples lost between two messages: a day at 10 kHz.
 _MOST_LOST = 10**9
 #: After at least this many messages, a message with the number 0 or 1 means a restart; after fewer messages it is late.
 _FIRST = 10
-#: Smallest relative change of a deviation of the load that is journalled.
+#: A change of the load's deviation is journalled if it exceeds this share of the larger deviation.
 _NOTABLE = 0.02
 
 
@@ -60,23 +60,23 @@ class Feeder:
         self._by_topic: dict[str, list[tuple[str, Role]]] = {}
         for name, role in roles.items():
             self._by_topic.setdefault(role.topic, []).append((name, role))
-        #: time of a source that has its own time [ns]: its newest stamp, unless that is a single stamp far ahead
+        #: newest stamp of a source that has its own time [ns]; a single stamp far ahead does not count
         self.newest_ns = 0
         self._far_ahead_ns: int | None = None
         #: reason why the first unreadable load was refused; empty if every load could be read
         self.unfit = ""
         self._number = 0
-        #: number of unnumbered messages since the last numbered message, each assumed to have the next number; and
-        #: number of all such assumptions that were wrong
+        #: count of messages without a number since the last message with one; each is assumed to have the next number
+        #: count of these assumptions that proved wrong, since the numbers of this sender began
         self._assumed = self._unnumbered = 0
-        #: number of the newest message if it does not continue the earlier numbers
+        #: number of the newest message if this number does not continue the earlier numbers
         self._odd: int | None = None
         #: whether the sender numbers its messages
         self._counts = False
         self._sender = 0
         self._source = next((role.topic for name, role in roles.items() if name in ("excitation", "drive")), "")
         inputs = runtime.inputs
-        #: whether samples can be published together, because the source has its own time
+        #: whether the source has its own time, so that samples can be published together
         self._at_once = runtime.reads_at_once
         self._optional: dict[str, Intake] = {
             "travel": inputs.travel,
@@ -104,7 +104,7 @@ class Feeder:
             roles = self._by_topic.get(arrived.topic, ())
             for name, role in roles:
                 if len(roles) > 1 and role.empty(arrived):
-                    continue  # the row has values of other roles only
+                    continue  # this row has values only of other roles
                 if name in ("excitation", "drive"):
                     samples += self._sample(role, arrived)
                 elif name in self._optional:
@@ -199,7 +199,7 @@ class Feeder:
         wrench, deviation = load
         absurd = intake.limits is not None and intake.limits.exceeded(wrench)
         if absurd or not all(map(math.isfinite, (*wrench, *deviation))):
-            return [(stamp_ns, wrench)]  # the sample will be refused, so its deviation is not used either
+            return [(stamp_ns, wrench)]  # the sample will be refused, so its deviation must not be used either
         if any(abs(new - old) > _NOTABLE * max(new, old) for new, old in zip(deviation, self._deviation, strict=True)):
             self._deviation = deviation
             self._runtime.driver.spread(stamp_ns, deviation)
@@ -209,7 +209,8 @@ class Feeder:
         """Return sender, message number (counted here if the message has none), and whether it is a repetition."""
         number = role.number(arrived) if role.sequence else None
         if number is None:
-            # a message without a readable number is assumed to have the next number, until a message has that number
+            # a message without a readable number is assumed to have the next number; the next message with a number
+            # shows whether this was right
             self._assumed += 1
             self._number += 1
             return self._name, self._number + self._unnumbered, False
@@ -226,7 +227,7 @@ class Feeder:
             return self._name, number, True
         elif self._goes_on(number):
             self._odd = None
-        else:  # assume the next number until the next message shows which number is right
+        else:  # assume the next number for now; the message after this one shows which of both numbers is right
             self._odd, number = number, self._number + 1
         again, self._number = number == self._number, number
         return self._name, number + self._unnumbered, again
@@ -256,7 +257,8 @@ class Feeder:
         inputs.arriving = (name, arrived.topic.encode())
         if found is None:
             intake.refuse(Verdict.MALFORMED)
-        elif arrived.retained and name != "travel":  # a speed applies until the next speed
+        elif arrived.retained and name != "travel":
+            # of the retained values only a speed is used, because a speed applies until the next speed
             intake.refuse(Verdict.INACTIVE, found[0], tuple(found[1].values()))
         elif not role.plausible(found[1]):
             intake.refuse(Verdict.IMPLAUSIBLE, found[0], tuple(found[1].values()))

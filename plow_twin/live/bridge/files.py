@@ -90,7 +90,7 @@ class _Tail:
             self.close()
             self._file, self._newest = file, b""
             self.rows = self.rows.of_another_file()
-            # an incomplete line is left out, because a number in it may have been cut
+            # the incomplete last line of the previous file is not used, because a number in it may have been cut
             self.left += self.lines.begun
             self.lines = Lines()
         return self._read()
@@ -113,7 +113,7 @@ class _Tail:
         try:
             found = self.path.stat()
         except FileNotFoundError:
-            return False  # a file that was moved away may still grow until its successor exists
+            return False  # a file that was moved away may still grow until a new file has its path
         ours = os.fstat(self._file.fileno())
         return (found.st_dev, found.st_ino) != (ours.st_dev, ours.st_ino) or self._is_anew()
 
@@ -246,7 +246,8 @@ class Files(SourceState):
         self._merged: Iterator[Arrived] | None = None
         #: the messages of a single topic
         self._tables: Iterator[Messages] | None = None
-        #: total size of the files that are read once [B], and how many of these bytes have been read
+        #: total size of the files that are read once [B]
+        #: how much of this total has been read [B]
         self._size = self._done = 0
 
     def topics(self) -> dict[str, TopicType]:

@@ -21,8 +21,9 @@ from plow_twin.live.bridge.source import LONGEST, BridgeError, SourceState, read
 from plow_twin.record.merging import StampOf
 from plow_twin.record.sources import Arrived
 
-#: Largest number of messages that wait to be read, and of their bytes; further messages are counted as lost.
+#: Largest number of messages that wait to be read; further messages are counted as lost.
 _QUEUE: Final = 100_000
+#: Largest total size of the waiting messages [B]; further messages are counted as lost.
 _QUEUED_BYTES: Final = 2**26
 _PORTS: Final = {"mqtt": 1883, "mqtts": 8883}
 
@@ -52,7 +53,8 @@ class Mqtt(SourceState):
         #: whether messages marked as retained are older than the subscription
         self._from_before = True
         self._queue: deque[tuple[str, bytes, int, bool]] = deque()
-        #: bytes of payloads that entered and left the queue; each count is changed by one thread only
+        #: total size of the payloads that have entered the queue [B]; only the thread that adds them changes this
+        #: total size of the payloads that have left the queue [B]; only the thread that takes them changes this
         self._came = self._left = 0
         self._arrived = threading.Event()
         self._answer = threading.Event()

@@ -98,7 +98,7 @@ class Model:
             if name in UNITS and "/" not in key:
                 await instantiate(folder, interval, node_id, browse_name, instantiate_optional=False)
                 node = self._server.get_node(node_id)
-                for point in _POINTS:  # otherwise only the type would have the points
+                for point in _POINTS:  # without a modelling rule, only the type would have the points
                     await self._server.get_node(self.node_id(f"{begin}.{key}.{point}")).set_modelling_rule(True)
                 await self._set_unit(node, UNITS[name])
             elif name in UNITS:

@@ -30,8 +30,9 @@ _POLICIES: Final = [
     ua.SecurityPolicyType.Aes128Sha256RsaOaep_SignAndEncrypt,
     ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt,
 ]
-#: Status of an unknown number, and of a number computed without samples.
+#: Status of an unknown number.
 _UNKNOWN: Final = ua.StatusCode(StatusCodes.BadWaitingForInitialData)
+#: Status of a number computed without samples.
 _HELD: Final = ua.StatusCode(StatusCodes.UncertainLastUsableValue)
 _GOOD: Final = ua.StatusCode()
 

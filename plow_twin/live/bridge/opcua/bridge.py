@@ -31,8 +31,8 @@ from plow_twin.record.sources import Arrived, TopicType
 #: Largest number of samples that wait to be read; further samples are counted as lost, except samples of the history.
 _QUEUE: Final = 100_000
 _PORTS: Final = {"opc.tcp": 4840}
-#: Time [s] to wait for all values of a stamp, which come in one message or two successive messages; it has a margin for
-#: a busy machine.
+#: Longest wait [s] for all values of a stamp. They come in one message or in two successive messages; the wait has a
+#: margin for a busy machine.
 _WAIT_S: Final = 5e-3 * PUBLISHING_MS
 #: The history is read in pieces of this length [ns].
 _PIECE_NS: Final = 10_000_000_000
@@ -44,8 +44,9 @@ _AHEAD_NS: Final = 86_400_000_000_000
 _HISTORY_LAG_S: Final = 5.0
 #: Longest wait for the first values of a subscription [s], which a server sends at once.
 _FIRST_VALUES_S: Final = 10.0
-#: First and longest wait before another attempt to connect [s].
+#: First wait before another attempt to connect [s].
 _FIRST_WAIT_S: Final = 1.0
+#: Longest wait before another attempt to connect [s].
 _LONGEST_WAIT_S: Final = 30.0
 
 
@@ -278,7 +279,8 @@ class OpcUa(SourceState):
                 samples, node = self._samples[topic], self._nodes[number]
                 if found[0] > time.time_ns() + _AHEAD_NS:
                     samples.add_stray(node, *found, now_s)
-                elif samples.newest_ns[node] or topic == "travel":  # a speed applies until the next speed
+                elif samples.newest_ns[node] or topic == "travel":
+                    # a first speed is used at once, because a speed applies until the next speed
                     samples.add(node, *found, now_s)
                 else:
                     samples.begin(node, *found)

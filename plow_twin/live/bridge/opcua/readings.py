@@ -36,7 +36,7 @@ class Counts:
     values_filled: int = 0
     #: values of the history from times that were not requested
     history_strays: int = 0
-    #: time covered by neither a message nor the history
+    #: time for which neither the messages nor the history had values [s]
     unfilled_s: float = 0.0
 
 
@@ -76,7 +76,7 @@ def _stamp_ns(time: datetime | None, picoseconds: int | None) -> int | None:
         return None
     time = time if time.tzinfo else time.replace(tzinfo=UTC)
     stamp_ns = (time - _EPOCH) // _MICROSECOND * 1000 + (picoseconds or 0) // 100
-    return stamp_ns if 0 < stamp_ns < _FARTHEST_NS else None  # servers send 1601 or 9999 for no time
+    return stamp_ns if 0 < stamp_ns < _FARTHEST_NS else None  # servers without a time send a date in 1601 or 9999
 
 
 def date_of(stamp_ns: int) -> datetime:

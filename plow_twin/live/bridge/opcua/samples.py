@@ -6,7 +6,7 @@ from bisect import insort
 from collections.abc import Sequence
 from typing import Final
 
-#: Stands for a value that is not used and counts as not measured.
+#: Marks a value that the twin does not use; it counts as not measured.
 NOT_MEASURED: Final = ""
 Value = float | str
 #: Largest number of stamps that wait for values.
@@ -35,19 +35,19 @@ class Samples:
         #: stamp of the newest value of each node [ns]
         self.newest_ns = dict.fromkeys(nodes, 0)
         self._held: dict[str, Value] = {}
-        #: nodes that have only a value from before the first sample
+        #: nodes whose only value so far is from before the first sample
         self._begun: set[str] = set()
         self._released_ns = 0
         #: samples with impossible stamps
         self._strays: dict[int, tuple[float, dict[str, Value]]] = {}
-        #: late stamps that were dropped because the other values of that time had been used
+        #: number of late stamps that were dropped because values were missing
         self._incomplete = 0
 
     def add(self, node: str, stamp_ns: int, value: Value, now_s: float) -> None:
         """Add a value; the same stamp of a node again is ignored."""
         if stamp_ns == self.newest_ns[node]:
             return
-        # a starting server may stamp the first value by another clock; later values may then have older stamps
+        # a starting server may stamp the first value by another clock, so later values may have older stamps
         self.newest_ns[node] = stamp_ns if node in self._begun else max(stamp_ns, self.newest_ns[node])
         self._begun.discard(node)
         if stamp_ns not in self._waiting:
