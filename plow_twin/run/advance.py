@@ -129,7 +129,8 @@ class AdvanceSeries(_Rows):
     t = _Column[np.float64]()
 
     def __getitem__(self, index: int) -> Advance:
-        return Advance(self.rows[index].copy())  # the row is copied, so that not all rows are kept in memory
+        # the row is copied; without a copy the advance would keep all rows in memory
+        return Advance(self.rows[index].copy())
 
 
 class AdvanceBatch(_Rows):

@@ -30,7 +30,8 @@ __all__ = ["TwinBatch"]
 
 _Array = NDArray[np.float64]
 _NO_MARKS = np.zeros(0, np.int64)
-#: Terms that have no effect if their parameters are zero.
+#: Terms that have no effect if their parameters are zero. A scene without such a term can therefore run with compiled
+#: code that has it.
 _OPTIONAL = ("hysteretic", "wear", "sliding", "running_in", "offset", "free", "slip")
 
 

@@ -136,10 +136,10 @@ def simulate_many(
     return ensemble
 
 
-#: Smallest number of members that a thread takes at a time; with fewer, too many lanes would stay empty while the last
-#: members of a share end.
+#: Smallest number of members that a thread takes at a time. With fewer members, lanes would be empty for too large a
+#: part of the time, because they stay empty while the last members of a share end.
 _LEAST_SHARE = 64
-#: Number of shares for each thread; it is above 1 so that all threads end at about the same time.
+#: Number of shares for each thread; with several small shares all threads end at about the same time.
 _SHARES = 4
 
 

@@ -21,7 +21,8 @@ Array = NDArray[np.float64]
 _FIRST_LOG: Final = 4096
 #: Default number of steps after which a run ends with an error.
 BUDGET: Final = 10**8
-#: Computing time between two looks at the clock in s, and number of steps (explicit, implicit) before the first look.
+#: Computing time in s between two looks at the clock; number of steps before the first look, for explicit and for
+#: implicit steps.
 _SLICE_S: Final = 0.02
 _FIRST_SLICE, _FIRST_SLICE_IMPLICIT = 2048, 64
 
@@ -42,7 +43,7 @@ class Motion:
     sums: BalanceSums | None = None
     #: number of rows written
     first: NDArray[np.int64] = field(default_factory=lambda: np.zeros(1, np.int64))
-    #: time reached by fixed steps [s], which do not change the state's own time
+    #: time in s that fixed steps have reached; they leave `time` in the state unchanged
     fixed_time: float | None = None
 
     @property
@@ -115,7 +116,7 @@ def run_fixed(
     done, size = np.zeros(1, np.int64), _FIRST_SLICE
     while True:
         begin = _time.perf_counter()
-        # a slice writes a last row at its end; unless this row is due, the next slice overwrites it
+        # a slice writes a row at its end; if this row is not due, the next slice overwrites it
         allowed = min(steps, budget, steps if look is None else int(done[0]) + size)
         code = int(fixed_step.integrate_fixed(
             compiled.params, compiled.parts, motion.state, motion.totals, motion.log, z, done, allowed, dt, euler,

@@ -11,9 +11,10 @@ import numpy as np
 from plow_twin.errors import ArgumentError
 from plow_twin.solve.state import PACE, first_of, new_records
 
-#: Default time [s] after which a call ends with an error.
+#: Default time in s after which a call ends with an error.
 MOST_SECONDS: Final = 3600.0
-#: Number of steps in a slice: explicit steps, which take microseconds; implicit steps, which take up to a millisecond.
+#: Number of steps in a slice, for explicit steps, which take microseconds, and for implicit steps, which take up to a
+#: millisecond.
 _SLICE, _SLICE_IMPLICIT = 2048, 64
 
 
@@ -66,7 +67,7 @@ class Pace:
 
 def check_limits(max_steps: int, max_wall_s: float) -> None:
     """Raise `ArgumentError` for invalid limits."""
-    # a float must be refused, because numba would compile further kernels for it
+    # a float is refused, because numba would compile the kernels again for it
     if isinstance(max_steps, bool) or not isinstance(max_steps, (int, np.integer)) or not max_steps >= 1:
         raise ArgumentError(f"max_steps: got {max_steps!r}, expected an integer >= 1")
     if not max_wall_s > 0.0:

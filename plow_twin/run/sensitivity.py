@@ -29,24 +29,25 @@ from plow_twin.solve.tangents import ALONG, STATE_COLUMNS, follow_columns
 
 Array = NDArray[np.float64]
 
-#: Displacement of a shadow as a share of the clearance, smallest displacement near a wall, and tolerance of a shadow.
+#: Displacement of a shadow as a share of the clearance; smallest displacement near a wall, as such a share; tolerance
+#: of a shadow.
 DISPLACEMENT: Final = 1e-7
 _LEAST_DISPLACEMENT: Final = 1e-10
 SHADOW_TOLERANCE: Final = 1e-12
 _STRETCHES: Final = 200
 #: Change of a parameter that is not a length, as a share of the parameter's value.
 _RELATIVE_CHANGE: Final = 1e-6
-#: Smallest distance from walls at the beginning of a stretch, in displacements. If this leaves too small a
-#: displacement, the previous stretch is continued, at most `_MOST_MERGED` times in a row.
+#: At the beginning of a stretch the walls must be at least this many displacements away; the displacement is reduced
+#: for this. If it would become too small, the previous stretch is continued, at most `_MOST_MERGED` times in a row.
 _CLEAR_OF_WALLS: Final = 100.0
 _MOST_MERGED: Final = 20
 #: Largest number of steps of a shadow in a stretch.
 _SHADOW_BUDGET: Final = 10**7
-#: Tolerance of the motion along which the equations are linearised. The error of the derivatives is some 1e-6 times the
-#: growth of errors; if it exceeds `_LARGEST_ERROR`, the tolerance of the run is used.
+#: Tolerance of the motion along which the equations are linearised. The derivatives then have an error of some 1e-6
+#: times the growth of errors; if this error exceeds `_LARGEST_ERROR`, the tolerance of the run is used instead.
 _EQUATIONS_TOLERANCE, _LARGEST_ERROR = 1e-6, 1e-2
-#: Number of steps before the first check of the time limit, and largest number of explicit steps in a scene that can
-#: need implicit steps.
+#: `_FIRST_SLICE`: number of steps before the first check of the time limit
+#: `_MOST_WITHOUT_IMPLICIT`: largest number of explicit steps in a scene that can need implicit steps
 _FIRST_SLICE, _MOST_WITHOUT_IMPLICIT = 2048, 200_000
 #: Growth above which an error is no longer within ten tolerances (`docs/solver.md`).
 TRUSTED_GROWTH: Final = 1e4
@@ -265,11 +266,12 @@ def sensitivity_of(scene: Scene, t_end: float, tol: float, parameters: Sequence[
         stretches = _by_shadows(scene, t_end, tol, parameters)
     totals, rows, growth, logs = follow(stretches)
     if tol < _EQUATIONS_TOLERANCE and _EQUATIONS_TOLERANCE * growth.max() > _LARGEST_ERROR:
-        # the linearisation needs a more accurate motion
+        # at the coarse tolerance the derivatives are too inaccurate, so the motion is linearised again at the run's
+        # tolerance
         stretches = _by_equations(scene, t_end, tol, parameters) or stretches
         totals, rows, growth, logs = follow(stretches)
     times, ends = _ends(t_end), stretches.ends
-    # the exponent is computed from stretches that begin in the second half
+    # the exponent is computed only from stretches that begin in the second half
     edges = np.concatenate([[0.0], times[ends]])
     first = int(np.searchsorted(edges, 0.5 * t_end))
     stretched = logs[ends][first:].sum(axis=0)
@@ -321,7 +323,7 @@ def _by_equations(scene: Scene, t_end: float, tol: float, parameters: Sequence[s
 
 def _by_shadows(scene: Scene, t_end: float, tol: float, parameters: Sequence[str]) -> _Stretches:
     """Follow the motion and displaced motions."""
-    # `SHADOW_TOLERANCE` is 1e-5 of a displacement
+    # `SHADOW_TOLERANCE` is 1e-5 of a displacement; the run's tolerance is used if it is tighter
     fine = min(max(SHADOW_TOLERANCE, TOLERANCE_RANGE[0]), tol)
     compiled = compile_scene(scene, fine)
     changed = [ChangedScene.of(scene, path, fine) for path in parameters]

@@ -288,8 +288,8 @@ def output_times(t_end: float, output_dt: float | None) -> Array:
     return times if t_end - times[-1] <= 1e-9 * output_dt else np.append(times, t_end)
 
 
-#: Scratch space of the last run, for reuse; a simultaneous run (in another thread, or started from `on_progress`) makes
-#: its own.
+#: Scratch space of the last run, kept for the next run. A run that is simultaneous with another (in another thread, or
+#: started from `on_progress`) finds none and makes its own.
 _spare: Final[deque[Work]] = deque(maxlen=1)
 #: Kinds of run whose kernels this process has compiled or loaded.
 _ready: set[tuple[object, ...]] = set()
@@ -398,7 +398,7 @@ def contact_sets_of(scene: Scene, totals: Totals) -> dict[str, dict[str, float]]
     labels = [letters.get(corner, corner) for corner in CORNER_NAMES]
     joint = "" if letters else "+"
     senses = {}
-    # the force of a pair turns a block the other way than a cavity, so the two senses are exchanged
+    # the force of a pair turns a block in the opposite sense to a cavity, so the two senses are exchanged
     order = ("ccw", "cw") if scene.head.carries == "walls" else ("cw", "ccw")
     for sense, times in sorted(zip(order, totals.set_time, strict=True), key=lambda item: item[0]):
         total = times.sum()

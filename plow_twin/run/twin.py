@@ -45,12 +45,12 @@ __all__ = ["Advance", "AdvanceSeries", "Status", "Twin"]
 
 #: Default number of steps after which an advance fails.
 DEFAULT_BUDGET = 50_000_000
-#: The compiled kernels, by a key that determines the types of their arguments. They are kept because numba's dispatch
+#: The compiled kernels; the types of a kernel's arguments follow from its key. They are kept because numba's dispatch
 #: takes milliseconds.
 _entries: dict[tuple[Any, ...], Callable[..., bool]] = {}
 _NO_DIGESTS = np.zeros(0, np.int64)
 _THE_ONE = np.zeros(1, np.int64)
-#: Smallest bound for the evaluations of an advance: four Runge-Kutta steps.
+#: Smallest bound for the number of evaluations of an advance: the evaluations of four Runge-Kutta steps.
 LEAST_EVALUATIONS = 16
 
 
@@ -119,12 +119,13 @@ class Twin:
         self._work, self._totals = first_of(self._works), first_of(self._all_totals)
         self._states[0] = compiled.initial_state(start)
         self._inertias = inertias(scene)
-        #: the kernel that writes rows (True) and the kernel that does not (False)
+        #: True: the kernel that writes rows; False: the kernel that does not
         self._kernels: dict[bool, Callable[..., bool]] = {}
         #: model time, as a view of the state
         self._time = self._states["time"]
         self._wrench = np.zeros(3)
-        #: work space for the load of one sample, per mass and inertia, and an empty array of snapshots
+        #: `_one_load`: work space for the load of one sample, per mass and inertia
+        #: `_no_snapshots`: an empty array of snapshots
         self._one_load, self._no_snapshots = np.empty((1, 2, 3)), self._states[:0]
         self._travel_speed = scene.wear.travel_speed_m_s if scene.wear is not None else 0.0
 
@@ -416,8 +417,8 @@ class Twin:
             return None
         if state.step_size < 0.0:
             return np.array(state.frame)
-        # under the scene's own loads the present time may lie within a step; the frame is then read from the step's
-        # series, at the sigma of `dense_output.sigma_at`
+        # under the scene's own loads the present time may lie within a step; the frame's state is then computed from
+        # the step's series, at the sigma of `dense_output.sigma_at`
         used, beta = float(state.elapsed), float(state.beta)
         sigma = 2.0 * used / (state.alpha + math.sqrt(max(state.alpha**2 + 2.0 * beta * used, 0.0)))
         return frame_at(work.frame, int(state.order), sigma)

@@ -27,9 +27,10 @@ from plow_twin.solve.state import Status
 
 Array = NDArray[np.float64]
 
-#: Length of a stretch in s, and distance between shadow and twin (in displacements) at which a stretch ends earlier.
+#: `_STRETCH_S`: length of a stretch in s
+#: `_FAR`: distance between shadow and twin, in displacements, at which a stretch ends earlier
 _STRETCH_S, _FAR = 0.1, 100.0
-#: Longest stretch in s while a contact prevents the start of the next stretch.
+#: Longest stretch in s; a stretch becomes longer than `_STRETCH_S` if a contact prevents the start of the next stretch.
 _LONGEST_S = 0.5
 
 

@@ -13,9 +13,9 @@ if TYPE_CHECKING:
 
 #: Time to wait for a scheduler [s].
 CONNECT_TIMEOUT_S = 20.0
-#: Longest time that a cluster may be without a worker [s], at the start or after its workers have left.
+#: Longest time that a cluster may be without a worker [s], at the start or later, after all its workers have left.
 WORKER_TIMEOUT_S = 300.0
-#: Time between two checks for a worker while no result arrives [s].
+#: Interval [s] at which a cluster is checked for a worker while no result arrives.
 _LOOK_S: Final = 2.0
 
 

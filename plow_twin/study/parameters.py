@@ -26,7 +26,7 @@ from plow_twin.errors import PlowTwinError, Problem, SceneError
 from plow_twin.model.contact_laws import LAWS
 from plow_twin.model.scene import Friction, Head, Scene, Table
 
-#: Value of a parameter: a word for the paths in `WORDS`, a number for all others.
+#: Value of a parameter: for the paths in `WORDS` a word, for all other paths a number.
 Value = float | str
 
 #: Paths whose values are words.
@@ -34,7 +34,7 @@ WORDS: Final = ("contact.law", "head.rotation", "frame.labels")
 _CORNERS_CCW: Final = ("bottom_right", "top_right", "top_left", "bottom_left")
 _PARTS: Final = ("head", "frame", "clearance", "contact", "gravity", "initial", "wear", "friction", "support")
 _DERIVED: Final = ("sign", "arm_sign", "scale")
-#: Friction without effect, from which a study of a scene without friction starts.
+#: Friction with a coefficient of 0. A study that varies friction starts from it if the scene has no friction.
 _NO_FRICTION: Final = Friction(0.0)
 _INDEX: Final = re.compile(r"(.+)\[(\d+)\]")
 
@@ -130,7 +130,7 @@ def with_parameters(scene: Scene, values: Mapping[str, Value]) -> Scene:
             raise StudyError(f"{path}: got {value!r}, expected a {'word' if words else 'number'}")
     parts: dict[str, Any] = {name: getattr(scene, name) for name in _PARTS}
     loads = {load.name: load for load in scene.loads}
-    # fields come first, because sign and scale act on the new values
+    # fields are set first, because sign and scale act on the new values of the fields
     for path, value in sorted(values.items(), key=lambda item: item[0].rsplit(".", 1)[1] in _DERIVED):
         owner, field_name = path.rsplit(".", 1)
         if path == "frame.labels":
@@ -225,13 +225,13 @@ def _vector(load: Any, field_name: str) -> tuple[float, ...]:
     if field_name == "arm_sign":
         return tuple(load.at_m)
     if isinstance(load, Table):
-        # the sign of a sampled load is the sign of its largest force component
+        # a sampled load has the sign of its force component with the largest magnitude
         return (float(load.wrench[:, :2].flat[abs(load.wrench[:, :2]).argmax()]),)
     return tuple(load.force_n)
 
 
 def _times(vector: tuple[float, ...], factor: float) -> tuple[float, ...]:
-    # 0 stays +0, so that equal scenes have equal texts
+    # 0 becomes +0 and never -0, so that equal scenes have equal texts
     return tuple(factor * x if x != 0.0 else 0.0 for x in vector)
 
 

@@ -108,7 +108,7 @@ def statistic(scene: Scene, path: str) -> Statistic:
         There is no such statistic; the error has the nearest paths and the existing kinds.
     """
     known = statistics_of_scene(scene)
-    # the letters of a set may be in any order
+    # in a path the letters of a set may be in any order
     head, _, last = path.rpartition(".")
     key = path if path in known else f"{head}.{''.join(sorted(last))}"
     if key not in known:

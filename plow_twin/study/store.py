@@ -25,7 +25,7 @@ from plow_twin.study.sweep.table import Sweep, Table, chunks_of
 Array = NDArray[np.float64]
 
 FORMAT: Final = 1
-#: Name of a chunk, or of an incomplete chunk whose process was killed.
+#: Name of a chunk, or of an incomplete chunk that a killed process has left.
 _CHUNK_NAME: Final = re.compile(r"\d{5,}\.npz|\.\d{5,}\.npz\.\d+")
 
 

@@ -8,7 +8,8 @@ from typing import Final
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.study.statistics import unit_of
 
-#: Unit in pictures, and factor from SI to it, by the ending of a parameter's name; the first ending that fits is used.
+#: Unit in pictures, and factor from the SI unit to this unit. The key is the ending of a parameter's name; the first
+#: ending that fits is used.
 _ENDS: Final = {
     "_kg_m2": ("kg m²", 1.0),
     "_kg": ("kg", 1.0),

@@ -391,8 +391,8 @@ def _solve(p, acts, support, state, t, h, implicit, wear, sliding, running_in) -
                 * p.velocity_tolerance
                 / p.position_tolerance
             )
-        # convergence is quadratic: once an iterate no longer improves, the iteration has reached rounding error and
-        # ends
+        # convergence is quadratic, so the iteration ends with the first iterate whose change is not much smaller than
+        # the change before
         if change < 1e-14 * p.threshold[0] or (change < 0.1 * p.velocity_tolerance and change > 0.1 * before):
             _places(implicit, h)
             return True

@@ -16,15 +16,15 @@ from plow_twin.solve.state import CLIPPED, ON
 
 #: The search for a pair's parting reaches over this many steps of the last size, and uses a series of this order.
 PARTING_REACH, PARTING_ORDER = 1.3, 6
-#: This reach under friction with stick, whose guards make steps shorter.
+#: Value of `PARTING_REACH` under friction with stick, whose guards make steps shorter.
 _PARTING_REACH_STICK = 8.0
 #: Largest number of Newton steps to the parting, and the relative change at which they end. The next step corrects the
 #: remaining error.
 _NEWTON_STEPS, _ROOT_FOUND = 6, 1e-9
 #: Largest usable term; products of larger terms would not be finite.
 _FINITE = 1e300
-#: Largest number of times that a step is shortened; it is repeated, because the largest term of the shorter step is
-#: smaller too. Shortening ends when a step would keep at least the share `_SHORT_ENOUGH` of its size.
+#: Shortening a step also reduces its largest term, so shortening is repeated: at most `_SHORTER` times, and
+#: only while the new step is below the share `_SHORT_ENOUGH` of the step before.
 _SHORTER, _SHORT_ENOUGH = 20, 0.9
 
 

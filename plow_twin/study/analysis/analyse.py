@@ -49,13 +49,14 @@ _COLUMNS: Final = (
     *(f"force_{name}" for name in PAIR_NAMES),
     *(f"gap_{name}" for name in PAIR_NAMES),
 )
-#: Tolerance of the run that the analysis computes from a recording of another program.
+#: Tolerance of the motion that an analysis computes if the recording is another program's.
 _TOLERANCE: Final = 1e-9
-#: If a measured stamp is older than the newest stamp by more than this [ns], its clock has stepped.
+#: If a measured stamp is older than the newest stamp by more than this time [ns], the clock of the measurement has
+#: stepped.
 _STEP_NS: Final = 1_000_000_000
-#: Largest measured value, in any unit, because squares of larger values may overflow.
+#: Largest measured value, in any unit; larger values are left out, because their squares may overflow.
 _LARGEST: Final = 1e15
-#: Name in results of the scene that a run's header contains.
+#: Name that results give to the scene in a run's header.
 _OF_THE_RUN: Final = "of the run"
 _MAP: Final = "map_"
 #: Parameter that marks each run made by an analysis.
@@ -73,12 +74,12 @@ class Prediction:
     loads: LoadTotals
     longest: Thinned = field(default_factory=lambda: Thinned(len(_COLUMNS)))
     present: Thinned = field(default_factory=lambda: Thinned(len(_COLUMNS)))
-    #: number of resets of the motion so far, also the index of the present stretch
+    #: number of resets of the motion so far, which is also the index of the present stretch
     resets: int = 0
     #: first and last stamp [ns] of each stretch with rows, by index
     spans: dict[int, tuple[int, int]] = field(default_factory=dict)
     _longest_number: int = 0
-    #: clearances of all stretches, in the order of `CLEARANCE_NAMES`
+    #: clearances of all stretches; columns as in `CLEARANCE_NAMES`
     clearance: Thinned = field(default_factory=lambda: Thinned(len(CLEARANCE_NAMES)))
 
     def walked(self, part: Walked) -> None:
@@ -152,7 +153,7 @@ class Measured:
     """Measured values by signal, in order of arrival; of very many values only every second, fourth, ... is kept."""
 
     signals: dict[str, ThinnedSignal] = field(default_factory=dict)
-    #: stretch and stamp [ns] of the latest message of each role
+    #: for each role, the stretch and the stamp [ns] of the latest message
     _latest: dict[str, tuple[int, int]] = field(default_factory=dict)
     #: number of values that are impossible in any unit
     implausible: int = 0
@@ -161,7 +162,8 @@ class Measured:
         """Add the numbers of one message in a stretch; a number that is not finite means that nothing was measured."""
         before, newest = self._latest.get(role, (0, stamp_ns))
         back = newest - stamp_ns > _STEP_NS
-        # the measurement's clock may step back before the load's clock does
+        # the measurement's clock may step back before the load's clock does; the measurement then begins a new stretch
+        # first
         stretch = max(stretch, before + back)
         self._latest[role] = stretch, stamp_ns if back else max(newest, stamp_ns)
         prefix = {"forces": "force_", "gaps": "gap_"}.get(role, "")
@@ -183,10 +185,10 @@ class Analysis:
     input: dict[str, int]
     losses: dict[str, int]
     unknown_types: dict[str, str]
-    #: stretches without samples, in which the load is interpolated linearly
+    #: times without samples, during which the load is interpolated linearly
     silences: Silences
     wall_s: float = 0.0
-    #: other folders in the recording's folder, empty or with recordings of their own
+    #: other folders in the recording's folder; they are empty or have recordings of their own
     left_out: tuple[Path, ...] = ()
 
     @property
@@ -422,7 +424,7 @@ def _measured_beside(path: Path, mapping: Path | None, node: str) -> tuple[Measu
         for name, count in source.losses.counts.items():
             if count and (
                 name == "undecodable" or number >= len(places)
-            ):  # the other losses are counted with the run itself
+            ):  # all other losses are counted together with the run itself
                 unused[name] += count
     return measured, unknown, unused
 
@@ -533,10 +535,11 @@ def expand(paths: Sequence[Path], results: Sequence[Path] = ()) -> list[Path]:
         inside = [
             item
             for item in sorted(path.iterdir())
-            # a recording with missing parts is analysed too; its analysis names them
+            # a recording with missing parts is analysed too; its analysis names the missing parts
             if item.suffix in (".mcap", ".db3") or _holds(item) or (item / "metadata.yaml").is_file()
         ]
-        if not inside and any(path.glob(f"*{SUFFIX}")):  # a table beside recordings is the result of an analysis
+        # tables count only if there are no recordings, because a table beside recordings is the result of an analysis
+        if not inside and any(path.glob(f"*{SUFFIX}")):
             inside = [path]
         if not inside:
             raise RecordingError(f"{path}: got a folder without recordings, expected some{packed(path)}")

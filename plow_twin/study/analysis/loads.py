@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 CYCLE_BINS: Final = 16
 #: Length of a piece of the face [m].
 FACE_BIN_M: Final = 1.0
-#: Memory for the reversals of a pair [B], enough for 131,072 reversals. A longer series is kept on the disk and read
+#: Memory for the reversals of a pair [B], enough for 131,072 reversals. A longer series is kept on the disk; it is read
 #: back in blocks of this size.
 _IN_MEMORY: Final = 2**20
 
@@ -80,14 +80,15 @@ class LoadTotals:
     contact_loss_j: float = 0.0
     sets: Counter[int] = field(default_factory=Counter)
     passes: list[Pass] = field(default_factory=list)
-    #: largest force in each piece of the face, by pass and piece
+    #: largest force in each piece of the face; the key is the pass and the piece
     face: dict[tuple[int, int], float] = field(default_factory=dict)
     #: wear depth that the pads have gained [m], by direction of travel (0 forward, 1 backward)
     pad_wear: Array = field(default_factory=lambda: np.zeros((2, PAIR_COUNT)))
-    #: wear depth of the slide at each pair [m], by direction (0 forward, 1 backward) and piece of the face
+    #: wear depth of the slide at each pair [m]; the key is the direction (0 forward, 1 backward) and the piece of the
+    #: face
     slide_wear: dict[tuple[int, int], Array] = field(default_factory=dict)
     _first_ns: int | None = None
-    #: stamp [ns], load, pose, rates and penetrations of the last row
+    #: stamp [ns], load, pose, rates and penetrations of the previous row
     _last: tuple[int, Array, Array, Array, Array] | None = None
     #: wear depth of the pads after the last advance [m]
     _worn: Array | None = None
@@ -118,7 +119,7 @@ class LoadTotals:
             self.sets[int(mask)] += int(count)
         for pair, kept in enumerate(self._reversals):
             turning = reversals(rows.peak[:, pair])
-            if turning.any() or kept.last != 0.0:  # one zero stands for a long time without contact
+            if turning.any() or kept.last != 0.0:  # during a long time without contact only one zero is kept
                 kept.add(turning)
         loss = self._contact_loss(walked, steps)
         self.contact_loss_j += float(loss.sum())

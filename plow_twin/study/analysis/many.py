@@ -55,7 +55,7 @@ def run_many(
 def _here(tasks: Sequence[RunTask], waiting: list[int], workers: int, done: _OnDone) -> None:
     while waiting:
         left = _round(tasks, waiting, workers, done)
-        if len(left) == len(waiting):  # to find the task that has killed its worker, the first tasks are run one by one
+        if len(left) == len(waiting):  # some task has killed its worker; to find it, the first tasks are run one by one
             left, first = left[workers:], left[:workers]
             for number in first:
                 if _round(tasks, [number], 1, done):
@@ -75,7 +75,7 @@ def _round(tasks: Sequence[RunTask], waiting: list[int], workers: int, done: _On
                 done(futures[future], future.result())
             except BrokenProcessPool:
                 left.append(futures[future])
-    except BaseException:  # after an interrupt the next call repeats unfinished analyses
+    except BaseException:  # an interrupt ends the workers; unfinished analyses are repeated by the next call
         for worker in set(active_children()).difference(others):
             worker.kill()
         raise

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-#: Largest lag in the search [s]; a longer lag cannot be distinguished from a period of the load.
+#: Largest lag that is searched [s]; a longer lag cannot be distinguished from a period of the load.
 LARGEST_LAG_S: Final = 1.0
 #: Smallest number of measured values for a comparison.
 _FEWEST: Final = 8
@@ -82,7 +82,7 @@ def _correlation(one: Array, other: Array) -> float | None:
         return None
     one, other = one - one.mean(), other - other.mean()
     size = math.sqrt(float(one @ one) * float(other @ other))
-    # the value is limited, because rounding could give more than 1
+    # the correlation is limited to 1 in magnitude, because rounding could give more
     return min(1.0, max(-1.0, float(one @ other) / size)) if size > 1e-300 else None
 
 
@@ -126,7 +126,7 @@ def _correlations(longer: Array, shorter: Array) -> Array:
     square_one = sums(one**2, low + begin, high + begin) - count * mean_one**2
     square_other = sums(other**2, low, high) - count * mean_other**2
     product = correlate(one, other, mode="valid", method="fft") - count * mean_one * mean_other
-    # a constant piece has no correlation, because its deviation from the mean is only rounding
+    # in a constant piece the deviations from the mean are only rounding errors, so it has no correlation
     enough = (high - low >= _FEWEST) & (square_one > 1e-12 * (one @ one)) & (square_other > 1e-12 * (other @ other))
     size = np.sqrt(np.where(enough, square_one * square_other, 1.0))
     return np.where(enough, product / size, -1.0)

@@ -23,10 +23,10 @@ from plow_twin.scene_file.presets import scene_path
 from plow_twin.study.analysis.analyse import MAPPED_LOAD, analyse
 from plow_twin.study.analysis.report import write_report
 
-#: File with the inputs of an analysis, written last.
+#: File with the inputs of an analysis. It is written last, so that only a complete analysis has it.
 _ASKED: Final = "asked.json"
 _FILES: Final = (_ASKED, "analysis.json", "report.html", "measured.parquet")
-#: Names of the tables; each scene has its own tables.
+#: Names of the tables of an analysis; each scene has its own tables, whose names may end in a number.
 _TABLE: Final = re.compile(r"(predicted|clearance|face|slide_wear)(_\d+)?\.parquet")
 
 
@@ -69,9 +69,9 @@ class Task:
     mapping: Path | None
     others: tuple[Path, ...]
     out: Path | None
-    #: other contents of the recording's folder, which the results name
+    #: other contents of the recording's folder, whose names the results contain
     left_out: tuple[Path, ...] = ()
-    #: units of measured numbers by name, which replace the units of the mapping
+    #: units of measured numbers by name; they take precedence over the units of the mapping
     units: Mapping[str, str] = field(default_factory=dict)
 
     def stored(self) -> dict[str, Any] | None:
@@ -156,7 +156,7 @@ class Task:
         beside = folder / "scene.yaml" if self.scene is None else None
         return {
             "run": _state(self.path, self.out),
-            # measurements may also be in other parts, and in folders beside a single part
+            # measurements may also be in the recording's other parts, and in folders beside a single part
             "parts": [] if self.path.is_dir() else [_state(path, self.out) for path in _measured_near(folder)],
             "scene": _scene_state(self.scene),
             "scene_beside": _scene_state(beside) if beside is not None and beside.is_file() else None,

@@ -33,9 +33,9 @@ class Search:
     population: int = 30
     generations: int = 40
     simplex: int = 0
-    #: spread of the population's objectives, relative to their mean, at which the evolution ends
+    #: the evolution ends when the spread of the population's objectives, relative to their mean, is at most this
     spread: float = 1e-3
-    #: step of the Jacobian in the unit cube
+    #: step of the difference quotients of the Jacobian, in the unit cube
     step: float = 1e-6
 
 
@@ -107,7 +107,7 @@ def calibrate(
         points, values = _evolve(space, objective, rng, search, known, report)
         point, best = polish(space, objective, points[np.argmin(values)], search)
         populations.append((points, values))
-        # if polishing has not improved the best point of the population, that point is kept
+        # the best point of the population is kept if polishing has not improved it
         if values.min() < best:
             point, best = points[np.argmin(values)], float(values.min())
         point = space.settled(point)

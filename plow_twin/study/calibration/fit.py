@@ -104,7 +104,7 @@ class Fit:
     source: str
     identifiability: Identifiability
     clusters: list[Cluster]
-    #: objective of the given scene; None if the scene is outside the ranges of the unknowns
+    #: objective of the scene as given; None if this scene is outside the ranges of the unknowns
     before: float | None
     targets: list[TargetRow]
 

@@ -46,7 +46,8 @@ class TargetObjective:
     runs: int = 0
 
     def __post_init__(self) -> None:
-        # marks are never read here, and a candidate without marks is made in a third of the time
+        # marks are removed, because they are never read here and a candidate without marks is made in a third of the
+        # time
         self.scene = replace(self.scene, marks={})
 
     def residuals(self, candidates: Sequence[Values], cut: float = np.inf) -> Array:

@@ -34,7 +34,7 @@ class PoseRecording:
     t: Array
     q: Array
     source: str = ""
-    #: the recorded load, which replaces the loads of the scene
+    #: the recorded load; it replaces the loads of the scene
     load: Table | None = None
 
     @property
@@ -86,7 +86,7 @@ def load_poses(path: Path) -> PoseRecording:
         raise StudyError(str(error)) from None
     except OSError as error:
         raise StudyError(f"{path}: {error.strerror or error}") from None
-    except (ValueError, AttributeError, MemoryError, BadZipFile, EOFError) as error:  # EOFError: np.load
+    except (ValueError, AttributeError, MemoryError, BadZipFile, EOFError) as error:  # `np.load` can raise EOFError
         raise StudyError(f"{path}: {error}") from None
     if t.ndim != 1 or q.shape != (len(t), 3) or len(t) < 2:
         raise StudyError(f"{path}: got t {t.shape} and q {q.shape}, expected (n,) and (n, 3) with n >= 2")

@@ -112,7 +112,7 @@ class TargetSet:
         unique: list[Mapping[str, Value]] = []
         for target in self.targets:
             unique += [setting for setting in target.settings if setting not in unique]
-        # the most used setting comes first, because a candidate that fails at this setting needs no further runs
+        # the setting that most targets use comes first; a candidate that fails at this setting needs no further runs
         uses = [sum(setting in target.settings for target in self.targets) for setting in unique]
         order = sorted(range(len(unique)), key=lambda index: -uses[index])
         object.__setattr__(self, "settings", tuple(unique[index] for index in order))
@@ -142,7 +142,7 @@ _TEXTS: Final[Schema] = {
     "anyOf": [TEXT, {"type": "array", "items": TEXT, "minItems": 1, "description": "one or more texts"}],
     "description": "a text, or a list of texts",
 }
-#: The kinds of targets, of which each target has one.
+#: The kinds of targets; each target is of one kind.
 _KINDS: Final[dict[str, Schema]] = {
     "value": {**NUMBER, "not": {"const": 0}, "description": "a number but 0, because the tolerance is relative"},
     "at_least": NUMBER,

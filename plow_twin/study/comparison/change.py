@@ -16,19 +16,21 @@ Array = NDArray[np.float64]
 _DRAWS: Final = 1000
 #: Smallest number of windows that can distinguish a change from chance.
 FEWEST: Final = 8
-#: Smallest variation of the load within groups, relative to the mean load, that shows how a quantity depends on it.
+#: Smallest variation of the load within groups, relative to the mean load; a smaller variation does not show how a
+#: quantity depends on the load.
 _LEAST_VARIATION: Final = 0.01
-#: Loads of two groups that differ by less than this share are treated as equal.
+#: If the loads of two groups differ by less than this share, they are treated as equal.
 _EQUAL_LOAD: Final = 0.01
-#: Percentiles [%] between which the loads of two groups must overlap, because a slope is valid only near its loads.
+#: The loads of two groups must overlap between these percentiles [%], because a slope is valid only near the loads from
+#: which it was computed.
 _USUAL: Final = (5.0, 95.0)
 #: Probability below which a change is statistically significant.
 _LEVEL: Final = 0.05
 #: Number of windows drawn at once, which bounds the memory.
 _AT_ONCE: Final = 2**21
-#: Relative difference that rounding can cause between means of equal numbers.
+#: Relative difference that rounding alone can cause between the means of equal numbers.
 _ROUNDING: Final = 1e-12
-#: Largest distance between the starts of two neighbouring windows, in window lengths.
+#: Largest distance between the starts of two windows that count as neighbours, in window lengths.
 _NEXT: Final = 1.5
 
 

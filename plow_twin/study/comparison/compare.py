@@ -17,7 +17,7 @@ from plow_twin.record.recording import read_recording
 from plow_twin.study.comparison.change import Change, Drawn, changes, points, with_neighbours
 from plow_twin.study.comparison.windows import FULL, QUANTITIES, Windows, windows_of
 
-#: Stamps before this [ns] are not dates: 1e18 ns is in the year 2001.
+#: Smallest stamp [ns] that counts as a date: 1e18 ns is in the year 2001.
 _DATES_NS: Final = 10**18
 #: Share of a window that may be without messages.
 _MISSING: Final = 1.0 - FULL
@@ -127,7 +127,7 @@ def by_time(kind: str, shifts: Sequence[time] = SHIFTS, zone: tzinfo = UTC) -> L
         if kind == "day":
             return at.strftime("%Y-%m-%d")
         before = [begin for begin in begins if begin <= at.time()]
-        if not before:  # the time belongs to the last shift of the previous day
+        if not before:  # a time before the first shift of a day belongs to the last shift of the previous day
             return f"{(at - timedelta(days=1)).strftime('%Y-%m-%d')} {begins[-1].strftime('%H:%M')}"
         return f"{at.strftime('%Y-%m-%d')} {before[-1].strftime('%H:%M')}"
 
@@ -206,12 +206,12 @@ def _overlapping(windows: Windows, others: Windows) -> np.ndarray[Any, Any]:
         return np.zeros(len(windows.start_ns), bool)
     order = np.argsort(others.start_ns)
     (begins, ends), (starts, stops) = (
-        # begin and end of the span in which a window surely has messages
+        # begin and end of the part of a window in which there surely are messages
         ((part.start_ns + _MISSING * part.length_ns), (part.start_ns + FULL * part.length_ns))
         for part in (windows, others)
     )
     starts, stops = starts[order], stops[order]
-    before = np.searchsorted(starts, ends) - 1  # the last other window that begins before a window's end
+    before = np.searchsorted(starts, ends) - 1  # the last of the other windows that begin before a window's end
     return np.asarray((before >= 0) & (stops[before] > begins))
 
 

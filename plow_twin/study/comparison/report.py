@@ -20,8 +20,9 @@ from plow_twin.view.section import PAIR_COLORS
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: Largest number of groups that are drawn as boxes, of names on the axis, and of letters in a line of a name that is
-#: not slanted.
+#: `_MOST_BOXES`: largest number of groups that are drawn as boxes
+#: `_MOST_LABELS`: largest number of names on the axis
+#: `_WIDEST`: if a line of a name has more letters, all names are drawn slanted
 _MOST_BOXES: Final = 6
 _MOST_LABELS: Final = 12
 _WIDEST: Final = 10
@@ -85,7 +86,8 @@ def _lines(axis: Any, found: Comparison) -> None:
         axis.plot(places, median[:, pair], color=color, label=name)
         axis.plot(places, high[:, pair], color=color, ls=":", lw=1.0)
     shown = places[:: 1 + len(places) // _MOST_LABELS]
-    names = [list(found.groups)[place].replace(" ", "\n") for place in shown]  # a shift has date and time, on two lines
+    # date and time of a shift are on two lines
+    names = [list(found.groups)[place].replace(" ", "\n") for place in shown]
     slanted = max(len(line) for name in names for line in name.split("\n")) > _WIDEST
     axis.set_xticks(shown, names, rotation=30 if slanted else 0, ha="right" if slanted else "center", fontsize=8)
     axis.set_ylim(bottom=0.0)

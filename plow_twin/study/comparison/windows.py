@@ -19,7 +19,7 @@ from plow_twin.stream.outputs import CLEARANCE_NAMES, PAD_NAMES
 Array = NDArray[np.float64]
 Indexes = NDArray[np.int64]
 
-#: Quantities of each pair in a window, with their units.
+#: The quantities that each window has for each pair, with their units.
 QUANTITIES: Final[Mapping[str, str]] = {
     "peak": "N",
     "impacts": "1/min",
@@ -28,12 +28,12 @@ QUANTITIES: Final[Mapping[str, str]] = {
     "dissipation": "W",
     "wear": "m/h",
 }
-#: Span of the load in which a period is searched [s].
+#: Length [s] of the load in which a period is searched.
 _PERIOD_SPAN_S: Final = 60.0
 #: Length of a window if the load has no period [s].
 _NO_PERIOD_S: Final = 10.0
-#: Smallest number of messages in a window, as a share of those in a full window. Windows that an end or a gap has cut
-#: to fewer messages are left out. Sample rates of runs may differ by the same share without a note.
+#: Smallest number of messages in a window, as a share of the number in a full window. A window with fewer messages, cut
+#: by an end or a gap, is left out. The sample rates of runs may differ by the same share without a note.
 FULL: Final = 0.9
 _PADS: Final = np.array([CLEARANCE_NAMES.index(name) for name in PAD_NAMES])
 _TOTALS: Final = np.array([CLEARANCE_NAMES.index(name) for name in ("horizontal", "vertical")])
@@ -178,7 +178,7 @@ def windows_of(recording: Recording, window_s: float | None = None) -> Windows:
                 f"{recording.path}: got no {name}, expected a run with outputs: plow-twin replay --write"
             )
     full = FULL * float(np.median([row[0] for row in messages.rows.values()]))
-    # messages at the end of a silence cover the whole silence, so all its windows are left out
+    # messages at the end of a silence cover the whole silence; therefore all windows of the silence are left out
     known, silent = np.array(sorted(messages.rows)), set[int]()
     for begin, end in silent_ns:
         first, last = np.searchsorted(known, begin // window_ns), np.searchsorted(known, end // window_ns, side="right")

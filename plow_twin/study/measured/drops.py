@@ -15,8 +15,10 @@ Array = NDArray[np.float64]
 
 #: Half the side of the square in m.
 _HALF: Final = 0.03
-#: Criteria of an impact: free-fall acceleration [m/s^2], smallest deviation of the vertical acceleration from it
-#: [m/s^2], smallest angular acceleration [rad/s^2], and largest gap [m].
+#: Criteria of an impact. `_FALL`: free-fall acceleration [m/s^2]
+#: `_JERK`: smallest deviation of the vertical acceleration from `_FALL` [m/s^2]
+#: `_TWIST`: smallest angular acceleration [rad/s^2]
+#: `_NEAR`: largest gap [m]
 _FALL, _JERK, _TWIST, _NEAR = 9.0, 9.0, 300.0, 0.03
 #: Smallest rise in m between two separate bounces.
 _RISE: Final = 0.003

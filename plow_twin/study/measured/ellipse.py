@@ -26,9 +26,9 @@ _STIFFNESS: Final = 1e9
 #: Speed of approach in m/s to which given restitutions refer: the middle of the measured speeds.
 USUAL_SPEED: Final = 2.5
 _LEAST, _LARGEST = 0.05, 0.98
-#: Upper bound for rates in m/s or rad/s, which no measured body reaches.
+#: Upper bound for rates in m/s or rad/s; no measured body is as fast.
 _FASTEST: Final = 1e4
-#: Gap in m at which a simulated impact starts, and time in s after which the impact is over: 13 half periods of the
+#: Gap in m at which a simulated impact starts; time in s after which the impact is surely over, 13 half periods of the
 #: contact's oscillation.
 _GAP, _WHOLE = 1e-9, 40.0 / _STIFFNESS**0.5
 
@@ -206,7 +206,7 @@ def simulated_impact(before: ArrayLike) -> Array:
         scene = impact_scene(state)
         motion = simulate(scene, t_end=_WHOLE, output_dt=_WHOLE)
         (vx, vy, omega), theta = motion.v[-1], motion.q[-1, 2]
-        # the centre of mass is half a metre from the origin, so the turn during the impact matters
+        # the centre of mass is half a metre from the origin, so even the small turn during the impact moves it
         x, y = scene.head.com_offset_m
         c, s = np.cos(theta), np.sin(theta)
         state[3:5] = _to_surface(vx - omega * (s * x + c * y), vy + omega * (c * x - s * y), ELLIPSE.tilt)

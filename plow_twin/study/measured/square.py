@@ -20,14 +20,14 @@ RATE_HZ: Final = 250.0
 _DT: Final = 1.0 / RATE_HZ
 #: Number of steps in the table of damping numbers.
 _NUMBERS: Final = 1000
-#: Number of touches of a motion for which scatter is drawn.
+#: Number of touches of one motion for which scatter is drawn; later touches have the scatter of the last of them.
 _TOUCHES: Final = 64
-#: Difference in rad between a row's angle and the extrapolated angle above which there was an impact.
+#: If a row's angle differs from the extrapolated angle by more than this [rad], there was an impact.
 _TURN_IN_A_ROW: Final = 0.1
-#: Smallest number of rows of a first flight, from which its speeds are fitted.
+#: Smallest number of rows of a first flight; the speeds of the drop are fitted to them.
 LEAST_ROWS: Final = 4
-#: Largest number of rows of the bands, which is 4 s (a block comes to rest within 1 s). A speed in m/s that no drop
-#: reaches.
+#: `_MOST_ROWS`: largest number of rows of the bands, which is 4 s (a block comes to rest within 1 s)
+#: `_FASTEST`: a speed in m/s that no drop reaches
 _MOST_ROWS, _FASTEST = 1000, 100.0
 
 #: Parameters of the block, fitted to the odd-numbered drops.

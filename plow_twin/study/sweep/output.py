@@ -81,7 +81,7 @@ def _curve(axes: Axes, table: Table, index: int) -> None:
 
     (axis,) = table.sweep.axes
     numbers, places = _scaled(table, index), _places(axis)
-    # points of words are not joined by lines, because there are no values between words
+    # points whose values are words are not joined by lines, because there are no values between two words
     style = "none" if isinstance(axis.values[0], str) else "-"
     axes.plot(places, numbers, marker="o", markersize=3 if style == "-" else 6, linestyle=style)
     for member in table.failed:

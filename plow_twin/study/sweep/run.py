@@ -60,7 +60,7 @@ def run_on_cluster(store: Store, address: str, on_progress: OnProgress | None = 
             try:
                 table, build = future.result()
             except Exception as error:
-                # after any error of a worker, stored chunks are kept, and the call can be repeated
+                # whatever the error of a worker is, stored chunks are kept, so the call can be repeated
                 raise StudyError(f"dask: chunk {index}: {type(error).__name__}: {error}") from error
             store.write(index, table, build)
             done += len(chunks[index])

@@ -21,9 +21,10 @@ from plow_twin.study.statistics import statistic, statistics_of
 
 Array = NDArray[np.float64]
 
-#: Status of a member whose values are impossible in a scene.
+#: Status of a member whose values no scene can have.
 UNUSABLE: Final = -1
-#: Largest number of members of a sweep, because its table and its list of chunks are kept in memory.
+#: Largest number of members of a sweep; the number is limited, because the table and the list of chunks are kept in
+#: memory.
 _MOST_MEMBERS: Final = 1_000_000
 
 
@@ -63,7 +64,7 @@ def parse_axis(text: str, scene: Scene) -> Axis:
                 raise ValueError
             if int(count) > _MOST_MEMBERS:
                 raise StudyError(f"axis: got {int(count)} values of {path}, expected at most {_MOST_MEMBERS}")
-            # both functions include the bounds exactly
+            # both functions return exactly `low` and `high` as the first and the last value
             spaced = (np.geomspace if log else np.linspace)(float(low), float(high), int(count))
             values = tuple(map(float, spaced))
     except StudyError:
