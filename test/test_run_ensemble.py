@@ -80,7 +80,7 @@ def test_scenes_one_after_the_other_share_what_their_equal_parts_need(monkeypatc
     for gap in (0.020, 0.025, 0.030):
         simulate(dataclasses.replace(scene, clearance=Clearance(gap, gap)), 1e-3)
     assert len(summed) == 1
-    for _ in range(2):  # a table is not cached
+    for _ in range(2):  # loads given as a table are not cached, so each run computes them again
         simulate(dataclasses.replace(scene, loads=(table,)), 1e-3)
     assert len(summed) == 3
 

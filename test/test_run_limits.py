@@ -112,7 +112,7 @@ def test_a_twin_stops_at_its_limits_where_its_last_advance_ended() -> None:
     samples = np.stack([4e4 * np.sin(2.0 * times), 1e4 * np.cos(2.0 * times), 3e4 * np.sin(2.0 * times)], axis=1)
     free = Twin(BENCH, excitation="sampled")
     whole = free.advance_samples(times, samples)
-    # a limit of steps belongs to the motion, so an advance that needs more steps is undone and gets a status
+    # the limit of steps belongs to the motion, so an advance that needs more steps is undone and gets the status BUDGET
     tied = Twin(BENCH, excitation="sampled", max_steps=1)
     assert {tied.advance(t, load).status.name for t, load in zip(times[:50], samples, strict=False)} == {"OK", "BUDGET"}
     for name in ("sampled", "scene"):
@@ -179,7 +179,7 @@ def test_no_scene_works_without_bound(scene: Scene, tol: float) -> None:
         assert "at t = " in str(error)
 
 
-#: A program that prints its number of steps twice: when the signal arrives, from another thread, and when the call has
+#: A program that prints its number of steps twice: from another thread when the signal arrives, and after the call has
 #: returned.
 INTERRUPTED = """
 import json, os, signal, threading, time
@@ -230,7 +230,7 @@ def test_a_process_that_gets_sigint_returns_within_a_slice_of_work() -> None:
         told = json.loads(process.communicate(timeout=60)[0])
     slices = told["slices"]
     largest = max(after - before for before, after in itertools.pairwise(slices))
-    # the slice during which the signal came is the last one; it may be four times as large as the slice before
+    # the run ends after the slice in which the signal came; this slice may be four times as large as the slice before
     assert 0 <= told["returned"] - told["signalled"] <= 4 * largest
     assert told["rows"] >= 1
 

@@ -100,7 +100,8 @@ def _law(name: str) -> Scene:
     scene = replace(preset("paper"), initial=Initial((0.001, 0.002, 0.003), (0.4, 0.1, 0.8)))
     stiffness = scene.contact.stiffness
     contact = {
-        # with this floor, as in the presets, no implicit step is possible, so the presets' kernels are used again
+        # with this floor, which the presets have too, no implicit step is possible, so the presets' kernels are used
+        # again
         "restitution": Contact("exact_restitution", stiffness, restitution=0.7, impact_speed_floor_m_s=0.05),
         "Hertz with restitution": Contact(
             "exact_restitution", 30.0 * stiffness, 1.5, restitution=0.7, impact_speed_floor_m_s=0.05
@@ -235,7 +236,7 @@ def test_a_live_twin_has_the_derivative_by_restitution_also_where_nothing_damps(
         assert rows.makes.sum() > 2
         return np.concatenate([rows.q[-1], rows.v[-1]])
 
-    # two one-sided differences, the second with half the step
+    # the expected derivative is the one-sided difference of second order, from three points
     ends = [end(with_parameters(scene, {"contact.restitution": e - d})) for d in (0.0, 1e-5, 2e-5)]
     expected = (1.5 * ends[0] - 2.0 * ends[1] + 0.5 * ends[2]) / 1e-5
     found = followed.by_parameter["contact.restitution"]

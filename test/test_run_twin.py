@@ -83,7 +83,7 @@ def test_asking_in_between_does_not_change_the_motion(times: list[float]) -> Non
     assert np.max([row.peak for row in [*rows, last]], axis=0) == pytest.approx(expected.peak, rel=1e-10)
 
 
-#: A scene with all effects on wear, whose kernels `test_solve_wear` uses too.
+#: A scene with all effects on wear. `test_solve_wear` uses the same kernels.
 RUBBED = dataclasses.replace(
     preset("paper"),
     wear=Wear(1e-12, 0.015, 2.0, sliding="total", running_in_ratio=4.0, running_in_depth_m=2e-5),
@@ -157,7 +157,7 @@ def test_a_failed_advance_leaves_no_trace_in_later_ones(depth: float) -> None:
     twins[1].advance(t, idle)
     assert twins[1].advance(t + 0.1, (0.0, -1e6, 0.0)).status is Status.OUT_OF_RANGE
     assert twins[1].advance(t + 0.1, idle).status is Status.OK
-    # the two are equal only up to rounding, because a step ends where the failure was
+    # a step ends where the failure was, so the two motions are equal only up to rounding
     expected, after = twins[0].advance(t + 0.01, idle), twins[1].advance(t + 0.11, idle)
     assert after.q == pytest.approx(expected.q, abs=1e-13) and after.v == pytest.approx(expected.v, rel=1e-9)
 
@@ -222,7 +222,7 @@ def test_a_bound_on_evaluations_is_kept_and_the_error_estimated() -> None:
         assert most <= bound
         series = Twin(scene, excitation="sampled", max_evaluations=bound).advance_samples(t, wrench)
         error, estimate = np.abs(series.q - exact.q).max(), series.error_estimate_m.sum()
-        # without the code of the error bound another kernel runs, whose result is equal up to rounding
+        # `exact` comes from a kernel without the error bound, so even an unbounded motion equals it only up to rounding
         assert (twin.bounded == 0) == (estimate == 0.0) == (error < 1e-14)
         assert error <= 10.0 * estimate and error < 1e-4
     assert twin.bounded == 0

@@ -49,7 +49,7 @@ contact: {law: hunt_crossley, stiffness: 9.6975e6, damping: 0.72154}
 
 def test_numbers_are_read_as_people_write_them() -> None:
     scene = loads_scene(MINIMAL)
-    assert scene.contact.stiffness == 9.6975e6  # YAML 1.1 reads this number as a text
+    assert scene.contact.stiffness == 9.6975e6  # as this number is written, YAML 1.1 reads it as a text
     assert type(scene.head.mass_kg) is float
     assert scene.pairs == PAIR_NAMES
     assert scene.wear is None

@@ -100,7 +100,7 @@ def test_the_error_falls_with_the_tolerance(name: str) -> None:
     errors = [run(scene, 10.0**-k, exact)[1] for k in exponents.tolist()]
     slope, offset = np.polyfit(-exponents, np.log10(errors), 1)
     assert slope == pytest.approx(1.0, abs=0.12)
-    # no error is off the line by more than 0.6 decades
+    # no error differs from the fitted line by more than 0.6 decades
     assert np.log10(errors) == pytest.approx(offset - slope * exponents, abs=0.6)
 
 

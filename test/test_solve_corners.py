@@ -93,16 +93,17 @@ def test_corners_pass_their_contact_on_at_45_degrees() -> None:
     push = Constant("push", force_n=(0.0, -90.0), moment_n_m=-3.3)
     lying = Initial(q=(0.0, -WALL + 0.5 * SIDE, 0.0), v=(0.0, 0.0, -0.3))
     scene = block(initial=lying, loads=(push,), friction=Friction(1.0, 0.02))
-    result = simulate(scene, t_end=0.25, output_dt=1e-3, energy_balance=True)  # this call uses the kernels of `falls`
+    # this call uses the kernels of the fixture `falls`
+    result = simulate(scene, t_end=0.25, output_dt=1e-3, energy_balance=True)
     turned = np.flatnonzero(result.q[:, 2] < -0.25 * math.pi)
     assert turned.size > 0
     at = result.t[turned[0]]
     passed = [event for event in result.events if abs(event["time"] - at) < 1.1e-3]
-    # one event changes two pairs at the same time, without a touch
+    # one event, which is no touch, passes the contact from one pair to another: both pairs change at the same time
     assert {(int(e["pair"]), int(e["mode_from"]), int(e["mode_to"])) for e in passed} == {(4, 1, 0), (6, 0, 1)}
     assert passed[0]["time"] == passed[1]["time"]
     force = result.force[:, [4, 6]].sum(axis=1)
-    # the force continues smoothly: its steps before, across and after the event grow alike
+    # the force continues smoothly, so its steps before, across and after the event grow alike
     steps = np.abs(np.diff(force[turned[0] - 3 : turned[0] + 2]))
     assert force[turned[0]] > 0.0
     assert np.abs(np.diff(steps)).max() < steps.max()
@@ -132,7 +133,7 @@ def mirrored(scene: Scene) -> Scene:
 
 
 STICK = Friction(0.2, stick_stiffness_n_m=1e6, stick_damping_n_s_m=20.0)
-#: A block with so much inertia that it does not turn; a locked angle would need its own kernels.
+#: A block with so much inertia that it does not turn. A locked angle would need kernels of its own.
 GUIDED = block(
     head=Head(MASS, 1e12, carries="corners"),
     frame=Frame(0.3, 0.2),
@@ -168,7 +169,7 @@ def test_corners_that_turn_little_are_nearly_a_mirrored_head_with_walls() -> Non
         scene = replace(
             GUIDED,
             head=block().head,
-            # friction and load are negligible instead of absent, so that the kernels of the test above are used
+            # friction and load are negligible instead of absent, because the kernels of the test above have both
             friction=replace(STICK, coefficient=1e-12),
             loads=(Harmonic("push", force_n=(1e-9, 0.0), omega_rad_s=9.0),),
             initial=Initial(q=(0.0, 0.0, angle), v=(0.4, -0.3, 0.0)),
@@ -176,7 +177,8 @@ def test_corners_that_turn_little_are_nearly_a_mirrored_head_with_walls() -> Non
         ends = [simulate(one, t_end=0.03, output_dt=1e-3, tol=1e-10).q for one in (scene, mirrored(scene))]
         return float(np.abs(ends[0] + ends[1]).max())
 
-    # block and head differ in the arms of their contacts, by the ratio of clearance to size and by a turn of this size
+    # the contacts of block and head have different arms; the arms differ by the ratio of clearance to size, and by the
+    # angle
     assert difference(1e-3) < 0.1 * 0.03
 
 
@@ -246,7 +248,7 @@ def test_strongly_damped_block_sinks_in_as_deep_as_its_weight_presses() -> None:
     damped = Contact("kelvin_voigt", stiffness=stiffness, damping=4e4)
     scene = block(contact=damped, initial=Initial((0.0, start, 0.0), (0.0, 0.0, 0.0)), friction=None)
     found = simulate(scene, t_end=60.0, output_dt=1.0)
-    # for each corner C x' = m g / 2 - K x, except during the first m / (2 C) = 13 us
+    # each corner moves by C x' = m g / 2 - K x, except during the first m / (2 C) = 13 us
     depth = 0.5 * MASS * 9.81 / stiffness * (1.0 - np.exp(-found.t * stiffness / 4e4))
     np.testing.assert_allclose(start - found.q[:, 1], depth, atol=2e-7)
     assert found.solver["steps"] < 2000

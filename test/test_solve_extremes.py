@@ -27,7 +27,7 @@ from plow_twin import (
     simulate,
 )
 
-#: A load that moves nothing, with which the presets' kernels are used, instead of new kernels without loads.
+#: A load that moves nothing. With this load a scene uses the presets' kernels; without loads it would need new kernels.
 PRESETS_TERMS = (Harmonic("nothing to speak of", (1e-9, 0.0), 2.0),)
 
 

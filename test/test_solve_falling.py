@@ -41,8 +41,8 @@ LAW = Contact(
     "exact_restitution", 1e8, restitution=E, restitution_fall=FALL, restitution_speed_m_s=SPEED,
     impact_speed_floor_m_s=0.01,
 )  # fmt: skip
-#: A block that no impact turns. It is heavy instead of locked; with negligible friction and the energy balance, all of
-#: these scenes use the same kernels.
+#: A block that no impact turns. Its angle is not locked, but its inertia is huge; with negligible friction and the
+#: energy balance, all of these scenes use the same kernels.
 HEAVY = Head(MASS, 1e12, carries="corners")
 SMOOTH = Friction(1e-12, 0.05)
 
@@ -104,7 +104,7 @@ def test_restitution_falls_with_the_speed_along_the_wall(along: float) -> None:
     contact = Contact("exact_restitution", 1e8, restitution=E, restitution_fall_along_s_m=0.2)
     scene = impact(contact, (along, -1.0, 0.0), head=HEAVY, pairs=("bottom_left_bottom",))
     assert returned(scene) == pytest.approx(E - 0.2 * 1.5, abs=2e-5)
-    # the restitution cannot become negative
+    # by the law's formula the restitution would be negative here, so it is limited to zero
     fast = replace(scene, initial=replace(scene.initial, v=(10.0 * along, -1.0, 0.0)))
     assert 0.0 <= returned(fast) < 2e-3
 
@@ -118,7 +118,7 @@ def test_head_with_walls_reads_the_same_restitution() -> None:
     result = simulate(scene, t_end=2.5e-3, output_dt=5e-4)
     by_wall = [float(rate) for rate in result.v[-1, :2]]
     before = (0.5, 0.8)
-    # the lower wall is met first, so the head slides along the left wall with the remaining speed
+    # the head meets the lower wall first; at the left wall, the speed along the wall is what the first impact has left
     for axis, along in ((1, before[0]), (0, by_wall[1])):
         expected = E * (before[axis] / SPEED) ** -FALL - 0.1 * abs(along)
         assert -by_wall[axis] / before[axis] == pytest.approx(expected, abs=2e-5)
@@ -136,7 +136,7 @@ def test_no_impact_gains_energy(fall, along, omega, angle, e, power, least, mass
     contact = Contact(
         "exact_restitution", 1e8, restitution=e, restitution_fall=power, restitution_speed_m_s=least,
         restitution_mass_power=mass, restitution_fall_along_s_m=sideways,
-        impact_speed_floor_m_s=0.2,  # a lower floor would compile implicit steps
+        impact_speed_floor_m_s=0.2,  # with a lower floor, implicit steps would be compiled
     )  # fmt: skip
     scene = impact(contact, (along, -fall, omega), angle, friction=Friction(0.3, 0.05))
     result = simulate(scene, t_end=0.02, output_dt=1e-3, energy_balance=True)
@@ -175,14 +175,15 @@ def test_block_with_a_falling_restitution_agrees_with_an_independent_integration
     found = simulate(only, t_end=0.006, output_dt=1e-3, tol=1e-9, energy_balance=True)
     z0 = [*scene.initial.q, *scene.initial.v]
     reference = solve_ivp(rate, (0.0, 0.006), z0, "DOP853", rtol=1e-10, atol=1e-12, max_step=1e-6)
-    # the approach in flight lasts a microsecond, in which weight and turning change the speed of the touch a little
+    # the touch comes after a flight of a microsecond, in which weight and turning change the speed a little
     assert (np.abs(found.v[-1] - reference.y[3:, -1]) < [1e-3, 1e-3, 0.05]).all()
 
 
 def test_live_twin_and_batch_have_the_motion_of_the_run() -> None:
     scene = impact(LAW, (0.2, -1.0, 3.0), 0.1, friction=Friction(0.2, 0.05), gravity=Gravity())
     run = simulate(scene, t_end=0.05, output_dt=0.01, energy_balance=True)
-    twin = Twin(scene, excitation="sampled")  # a zero load is sampled, because the batch uses the same kernel
+    # the twin samples a zero load, because its kernel is then that of the batch
+    twin = Twin(scene, excitation="sampled")
     np.testing.assert_allclose([twin.advance(float(t)).q for t in run.t[1:]], run.q[1:], atol=1e-9)
     rows = TwinBatch([scene, scene]).advance(0.05)
     np.testing.assert_allclose(rows.q[:, 0], [run.q[-1]] * 2, atol=1e-9)

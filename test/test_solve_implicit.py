@@ -42,7 +42,7 @@ def test_implicit_and_explicit_steps_agree(
     damping: float, friction: Friction | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene = replace(damped(damping), friction=friction)
-    # with friction, the kernels of the test below are used
+    # with friction there is no energy balance, so that the kernels of the test below are used
     implicit = simulate(scene, 0.5, output_dt=0.01, energy_balance=friction is None)
     monkeypatch.setattr(compiled_scene, "_implicit", lambda *arguments: None)
     explicit = simulate(scene, 0.5, output_dt=0.01)
@@ -61,7 +61,7 @@ def test_the_work_hardly_grows_with_the_damping() -> None:
         twin.advance(0.3)
         steps[damping] = twin.steps
         assert twin._state.implicit_steps > 0
-    # explicit steps would be a hundred times as many
+    # with explicit steps, the number of steps would grow by a factor of a hundred
     assert steps[1e11] < 10 * steps[1e9]
 
 
@@ -103,7 +103,7 @@ def assert_within_the_gate(scene: Scene, tolerances: tuple[float, ...]) -> None:
     for tol in tolerances:
         result = simulate(scene, 2.0, output_dt=0.01, tol=tol)
         assert result.solver["steps"] <= (15_000 if tol >= 1e-8 else 30_000), tol
-        # if displacements grow, the tolerance has no meaning
+        # where displacements grow by more than this, the tolerance has no meaning
         if growth < 1e3:
             assert pose_error(shown, result.q, exact.q) <= 10.0 * tol, (tol, growth)
 

@@ -45,7 +45,7 @@ def test_depth_and_time_of_an_impact(n: float, duration: float) -> None:
 @pytest.mark.parametrize(
     ("n", "law"),
     [
-        # the quick run has this exponent in one of the cases below, and this law in another
+        # in the quick run, one of the cases below has this exponent, and the other has this law
         pytest.param(1.0, "exact_restitution", marks=pytest.mark.stress),
         (1.5, "exact_restitution"),
         (1.0, "kelvin_voigt"),

@@ -66,7 +66,8 @@ def draw(rng: np.random.Generator, powers: bool = False) -> Scene:
     ][rng.choice(4, p=[0.2, 0.4, 0.2, 0.2])]
     if powers:
         exponent = float(rng.choice([1.5, 2.0, 2.2, 3.0, 4.0], p=[0.5, 0.15, 0.1, 0.15, 0.1]))
-        stiffness *= 1e3 ** (exponent - 1.0)  # at about 1 mm this is as stiff as exponent 1
+        # with this factor, the contact is as stiff at about 1 mm as with exponent 1
+        stiffness *= 1e3 ** (exponent - 1.0)
         contact = [
             Contact("hertz", stiffness, exponent),
             Contact("hunt_crossley", stiffness, exponent, damping=10 ** rng.uniform(-1.0, 1.0)),
@@ -91,8 +92,9 @@ def draw(rng: np.random.Generator, powers: bool = False) -> Scene:
     )
 
 
-#: Directions of the harmonics and terms of the law: viscous, hysteretic, integer, fraction. Each combination compiles
-#: its own kernels, so only a few are used, which have every value once; the key says whether exponents differ from 1.
+#: Combinations of the harmonics' directions and the law's terms (viscous, hysteretic, integer, fraction). Each
+#: combination compiles its own kernels, so only a few are used, in which each value occurs at least once. The key says
+#: whether exponents differ from 1.
 SOME = {
     False: {(0, None, None, None, None), (0, 1, None, None, None), (1, 1, None, None, None), (2, None, 1, None, None)},
     True: {(0, None, None, None, 1), (1, None, 1, None, 1), (2, None, 1, 1, None)},
@@ -147,7 +149,7 @@ def _check_beside_the_loop(seed: int, count: int, some: bool, powers: bool) -> N
         alone = simulate(scene, 0.7, 0.02, tol=1e-12)
         error = pose_error(scene, many.q[index], alone.q)
         if error > 1e-9:
-            # the scene amplifies rounding errors, which makes two runs of the single loop differ too
+            # the scene amplifies rounding errors, so even two runs of the single loop differ
             assert error < 300.0 * pose_error(scene, simulate(scene, 0.7, 0.02, tol=1e-11).q, alone.q), index
             continue
         close += 1

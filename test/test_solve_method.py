@@ -21,9 +21,10 @@ from plow_twin.solve.modes import weigh_pairs
 from plow_twin.solve.state import new_work
 from plow_twin.solve.step import METHODS
 
-#: Fields of the state that every method may write; below them, the fields of single methods.
+#: Fields of the state that every method may write.
 OUTPUT = {"alpha", "beta", "sigma_end", "order", "ends_at_stop", "evaluations"}
 DECAY = {"implicit_size", "decay_times", "refused"}
+#: Further fields of the state that a single method may write.
 OWN = {
     flight: {"in_flight"},
     rest: {"at_rest", "y"},

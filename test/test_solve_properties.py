@@ -24,9 +24,9 @@ from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.run.advance import Advance
 from plow_twin.solve.compiled_scene import compile_scene
 
-#: Largest number of steps of a request; a longer request ends with a status.
+#: Largest number of steps of a request. A request that needs more steps ends with a status.
 BUDGET = 20_000
-#: Number of steps after which a run ends.
+#: A run ends after this number of steps.
 ENOUGH = 100_000
 
 
@@ -260,7 +260,8 @@ def search(structure: str, examples: int) -> None:
 
     every_scene_is_solved_or_named()
     assert ended[Status.OK] >= 0.5 * ended.total(), ended
-    # an overdamped or very stiff contact under explicit steps uses up its steps and ends with a status
+    # with explicit steps, an overdamped or very stiff contact needs more steps than it may take, so the request ends
+    # with a status
     assert ended[Status.BUDGET] < 0.2 * ended.total(), ended
     assert ended[Status.NON_FINITE] == 0, ended
 

@@ -51,7 +51,7 @@ def test_a_short_ramp_is_kelvin_voigt_and_a_long_one_elastic() -> None:
 def test_both_solvers_agree(stiffness: float, exponent: float) -> None:
     contact = Contact("ramped_damping", stiffness, exponent, damping=6e4, ramp_m=1e-3)
     scene = replace(preset("paper"), contact=contact)
-    # other exponents are run without the balance, with the kernels of the pinned motions
+    # other exponents run without the balance, because the pinned motions have compiled these kernels
     events = simulate(scene, 2.0, output_dt=0.1, energy_balance=exponent == 1.0)
     steps = simulate(scene, 2.0, output_dt=0.1, method="rk4", dt=1e-5)
     assert pose_error(scene, steps.q, events.q) < 1e-6
@@ -117,7 +117,7 @@ def test_a_clipped_pair_does_not_push_before_its_time() -> None:
         (Harmonic("swing", (136407.79207032567, 78091.2651934814), 2.13280634928262, 6.183084803690521, -11577.53909),),
         Initial((0.0, 0.0, 0.0), (0.08018584619312634, 0.08016477931228669, -0.04463423756155122)),
     )  # fmt: skip
-    # with the balance, the kernels of `test_both_solvers_agree` are used
+    # with the balance, this run uses the kernels of `test_both_solvers_agree`
     exact = simulate(scene, 1.0, output_dt=0.005, tol=1e-12, energy_balance=True)
     for tol in (1e-4, 1e-6, 1e-8, 1e-10):
         found = simulate(scene, 1.0, output_dt=0.005, tol=tol, energy_balance=True)

@@ -93,7 +93,7 @@ def test_an_exponent_that_is_no_integer_keeps_to_the_tolerance_when_separations_
 @pytest.mark.parametrize(
     ("offset", "loads", "contact"),
     [
-        # a table acts like samples, so other tests compile its kernels
+        # a table acts like samples, so this case uses kernels that other tests compile
         pytest.param((0.0, 0.0), VARIANTS["table"], (6e6, 1.0), id="centred, table"),
         pytest.param((0.05, -0.08), VARIANTS["two directions"], (2e9, 2.0), id="offset, two directions"),
         pytest.param(

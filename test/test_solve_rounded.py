@@ -136,7 +136,7 @@ def test_rounded_corners_move_the_same_by_fixed_steps_a_live_twin_and_a_batch(ca
     scene = in_guide(carries, friction=friction)
     run = simulate(scene, t_end=0.1, output_dt=0.01, energy_balance=True)
     fixed = simulate(scene, t_end=0.1, output_dt=0.01, method="rk4", dt=1e-5)
-    # fixed steps notice a touch and a slip only at their ends
+    # fixed steps notice a touch or a slip only at the end of a step, so the bound is wide
     np.testing.assert_allclose(fixed.q, run.q, atol=1e-3)
     twin = Twin(scene)
     np.testing.assert_allclose([twin.advance(float(t)).q for t in run.t[1:]], run.q[1:], atol=1e-9)

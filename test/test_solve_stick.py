@@ -34,8 +34,9 @@ from plow_twin.solve import compiled_scene
 from plow_twin.solve.state import STATE
 
 GRIP = 1e9
-#: Tangential damping [N s/m] and friction of each of the two corners from which the block hangs.
+#: The block hangs from two corners. Tangential damping of each corner [N s/m].
 HELD_DAMPING = 2e5
+#: Friction of each of these corners.
 HELD = Friction(MU, stick_stiffness_n_m=GRIP, stick_damping_n_s_m=HELD_DAMPING)
 
 
@@ -131,8 +132,8 @@ def belt(speed: float) -> tuple[Scene, Slider]:
     """
     stiffness, deep, wide, static, kinetic, omega = 1e6, 1e-3, 0.02, 0.5, 0.3, 0.05
     friction = Friction(kinetic, stick_stiffness_n_m=1e7, static_coefficient=static)
-    # the four side pairs are the spring: both walls stay penetrated, with 4 K x in total; their friction acts along y,
-    # which is locked
+    # the four side pairs are the spring: both walls stay penetrated, which gives a force of 4 K x; the friction of
+    # these pairs acts along y, which is locked
     pull = 4.0 * stiffness * speed
     scene = Scene(
         Head(MASS, 100.0), Frame(0.3, 0.3), Clearance(-2.0 * wide, -2.0 * deep),

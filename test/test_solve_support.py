@@ -36,7 +36,7 @@ from plow_twin.solve import compiled_scene
 from plow_twin.solve.state import STATE
 
 SUPPORT = Support(800.0, 60.0, 3e7, 5e7, 4e6, 2e4, 3e4, 5e3)
-#: Head and law of the tests that share their compiled code.
+#: Head and contact law that several tests have in common, so that they share compiled code.
 HEAD, LAW = Head(2430.0, 1265.0), Contact("kelvin_voigt", 2e7, damping=6e4)
 
 
@@ -53,8 +53,8 @@ def test_two_masses_pressed_together_move_as_their_eigenmodes() -> None:
     omega, amplitude = 40.0, 4e3
     scene = pressed(Harmonic("up and down", (0.0, amplitude), omega_rad_s=omega))
     result = simulate(scene, 1.0, output_dt=0.01, tol=1e-10)
-    # the state has y of the head and v of the frame (both from the place where contact begins), their rates, the
-    # weight, and sine and cosine of the load
+    # the state has y of the head and v of the frame, both measured from the place where contact begins; then the rates
+    # of the two, the weight, and sine and cosine of the load
     k, c, mass = 2.0 * LAW.stiffness, 2.0 * (LAW.damping or 0.0), HEAD.mass_kg
     matrix = np.zeros((7, 7))
     matrix[0, 2] = matrix[1, 3] = 1.0
@@ -202,12 +202,12 @@ def test_free_bodies_part_with_the_restitution_asked_for_and_keep_their_momentum
 @pytest.mark.parametrize("friction", [None, Friction(0.2), Friction(0.3, stick_stiffness_n_m=5e7)], ids=str)
 @pytest.mark.parametrize("name", ["paper", "bench_kv", "bench_hc"])
 def test_fixed_steps_come_to_the_same_motion_and_energy_is_kept(name: str, friction: Friction | None) -> None:
-    # fixed steps integrate wear with first order
+    # with fixed steps, wear is accurate to first order only
     wear = Wear(1e-11, 0.015, 2.0)
     scene = replace(preset(name), support=SUPPORT, friction=friction, wear=wear)
     events = simulate(scene, 1.0, output_dt=0.1, energy_balance=True)
     assert events.energy_balance is not None and events.energy_balance.relative_imbalance < 1e-10
-    # the force of Kelvin-Voigt jumps at a touch, so fixed steps have first order there
+    # the Kelvin-Voigt force jumps at a touch, so fixed steps are accurate to first order only there
     steps = simulate(scene, 1.0, output_dt=0.1, method="rk4", dt=2e-6)
     assert pose_error(scene, steps.q, events.q) < (1e-4 if name == "bench_kv" else 1e-6)
     bounded = Twin(scene, max_evaluations=20_000)

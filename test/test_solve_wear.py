@@ -104,14 +104,14 @@ def test_sliding_in_the_plane_wears_by_the_way_of_the_corner() -> None:
     for pair, name in enumerate(PAIR_NAMES):
         x = half_w if "right" in name.rsplit("_", 1)[0] else -half_w
         y = half_h if "top" in name.rsplit("_", 1)[0] else -half_h
-        # this is the speed along the wall, at the point of the head that is at the corner
+        # the point of the head that is at the corner has this speed along the wall
         vx = result.v[:, 0] - result.v[:, 2] * (y - result.q[:, 1])
         vy = result.v[:, 1] + result.v[:, 2] * (x - result.q[:, 0])
         along = c * vx + s * vy if name.endswith(("top", "bottom")) else c * vy - s * vx
         corners.append(np.trapezoid(result.force[:, pair] * np.hypot(0.05, along), result.t))
     expected = [worn_by(wear.coefficient_m2_n / wear.pad_area_m2 * float(way)) for way in corners]
     impulse = np.array([row["impulse"] for row in result.statistics.values()])
-    # the pads wear far more than by the travel alone
+    # the pads wear far more than they would by the travel alone
     assert result.wear_depth.max() > 1.5 * worn_by(wear.coefficient_m2_n / wear.pad_area_m2 * 0.05 * impulse.max())
     assert result.wear_depth == pytest.approx(expected, rel=1e-3, abs=1e-12)
     assert fixed.wear_depth == pytest.approx(result.wear_depth, rel=0.02, abs=1e-11)

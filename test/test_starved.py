@@ -77,8 +77,8 @@ def test_a_run_works_and_is_repeated_where_little_is_there(lacking: dict[str, ob
     assert (report.exit_code, report.samples) == (0, 1500)
 
 
-#: Shell script that runs a command with read-only package, cache, home and /dev/shm, as for a user of another user's
-#: installation.
+#: Shell script that runs a command with read-only package, cache, home and /dev/shm, as for a user who runs another
+#: user's installation.
 NOTHING_WRITABLE = """
 for place in "$PACKAGE" "$CACHE" "$HOME"; do
     mount --bind "$place" "$place"

@@ -59,7 +59,7 @@ def test_an_alarm_comes_after_its_duration_goes_below_its_hysteresis_and_stays_l
     _changes(alarms, _publication(30, 150.0))
     assert alarms.acknowledge() == ["force"] and _levels(alarms) == (Level.WARN, Level.WARN)
     raised = alarms.alarms["force"].raised
-    # value and threshold belong to the higher level, which the alarm has left
+    # value and threshold are still those of the higher level, which the alarm has left
     assert raised is not None and (raised.value, raised.threshold) == (300.0, 100.0)
 
 
@@ -83,7 +83,7 @@ def test_a_residual_is_that_at_the_stamp_of_the_pose_early_and_late_alike() -> N
     # a pose between two publications is compared with the model's pose at its time, not with the present pose
     assert not alarms.feed_pose(35 * MS, (0.036, 0.0, 0.0))
     assert abs(alarms.alarms["residual"].value - 0.001) < 1e-12
-    # a pose ahead of the model waits for it
+    # a pose ahead of the model waits until the model reaches its time
     assert not alarms.feed_pose(105 * MS, (0.110, 0.0, 0.0))
     assert not _changes(alarms, moved(100))
     assert _changes(alarms, moved(110))

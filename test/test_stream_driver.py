@@ -283,7 +283,7 @@ def test_wrong_stamps_one_after_another_reset_no_more_than_five_times_and_keep_n
         bench.sample(T0 + index * MS + ahead_ns, LOAD, now_ns=index * MS)
     bench.driver.pause()
     counted = counters(bench.driver)
-    # within ten seconds there may be five steps of the clock, each with its return
+    # within ten seconds there may be five steps of the clock, each with its return, so there are at most ten resets
     assert counted["resets"] <= 10
     assert counted["samples_used"] >= 1900
     assert counted["samples_used"] + counted["dropped_unsteady"] + counted["dropped_stray"] == 2000

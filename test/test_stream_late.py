@@ -196,7 +196,7 @@ def test_speeds_of_another_clock_act_from_the_time_reached_on_and_are_counted_an
         right = live.wear if right is None else right
         assert (live.wear == right).all()
     live = Live()
-    # without a sample, speeds wait if they are within a step of the clock
+    # while no sample comes, speeds wait to act if their stamps are within a step of the clock
     live.send(*(_arrival(index) for index in range(10)))
     for index in range(0, 30_000, 10):
         live.driver.travel(T0 + index * MS, 2.0 + 1e-6 * index)

@@ -123,7 +123,7 @@ def test_a_changed_model_goes_on_from_pose_rates_and_wear_and_a_snapshot_of_it_h
     bench.session.close()
     assert sum(isinstance(entry, SetModel) for entry in bench.journal) == 2
     assert _again(WORN, bench.journal) == bench.journal
-    # this part of the recording begins with the snapshot
+    # a later part of a recording has only the entries from the snapshot on
     index = max(number for number, entry in enumerate(bench.journal) if isinstance(entry, Snapshot))
     assert _again(WORN, bench.journal[index:]) == bench.journal[index:]
 

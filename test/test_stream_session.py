@@ -67,7 +67,7 @@ class Run:
         return self
 
 
-#: Published numbers of a row, except its stamp.
+#: Fields of a published row that are numbers, except the stamp.
 NUMBERS = ("penetration", "rate", "force", "makes", "impulse", "peak", "q", "v")
 
 
@@ -164,7 +164,7 @@ def test_nothing_is_lost_however_rarely_frames_are_taken(cuts: set[int]) -> None
 def test_a_snapshot_goes_on_with_the_same_bits(reference: Run, at: int) -> None:
     before = Run().apply(_entries()[:at])
     after = Run().apply([Loss(at), before.session.snapshot(), *_entries()[at:]])
-    # an entry that makes no advance makes no publication
+    # an entry that advances nothing publishes nothing
     publications = reference.publications[len(before.publications) :]
     assert [_bits(publication) for publication in after.publications] == [
         _bits(publication) for publication in publications

@@ -150,7 +150,8 @@ def test_a_run_is_predicted_with_all_that_was_done_to_the_model_while_it_ran(tmp
     again = Restore(samples[999].stamp_ns, session.snapshot().data)
     poses = [Pose(sample.stamp_ns, (0.0, 0.0, 0.0)) for sample in samples]
     entries = [entry for both in zip(samples, poses, strict=True) for entry in both]
-    speeds = [Travel(BASE_NS, 1.0), Travel(BASE_NS + 300 * STEP_NS, -1.0)]  # the second speed comes ahead of its time
+    # the second speed is given ahead of the time at which it acts
+    speeds = [Travel(BASE_NS, 1.0), Travel(BASE_NS + 300 * STEP_NS, -1.0)]
     entries = [*entries[:2], *speeds, *entries[2:1200], changes, *entries[1200:2000], again, *entries[2000:]]
     run = record_run(tmp_path / "run", entries, frame_every=1)
     peaks = [message for topic, message in run.outputs if topic.endswith("contact_peaks")]
@@ -265,14 +266,15 @@ def test_travel_makes_passes_of_the_face(tmp_path: Path) -> None:
     assert replay(tmp_path / "out" / "run").exit_code == 0
     again = analyse(tmp_path / "out" / "run").predictions[0].loads
     np.testing.assert_array_equal(again.impacts, loads.impacts)
-    # the journal has the direction, so passes and wear are the same
+    # the journal contains the direction of travel, so passes and wear are the same
     assert len(again.passes) == 2
     assert again.pad_wear == pytest.approx(loads.pad_wear, rel=1e-12)
     facts = loads.wear_facts()
     assert facts is not None and loads.pad_wear[0].max() > 0.0 < loads.pad_wear[1].max()
     # the pads' wear in both directions adds up to the model's wear
     assert loads.pad_wear.sum(axis=0) == pytest.approx(prediction.clearance.series()[1][-1][2:10], rel=0.03)
-    # the whole slide wears by the ratio of pad length to distance, each place by the pads that pass it
+    # the slide's wear in total is the pads' wear times the ratio of pad length to distance; each place is worn by the
+    # pads that pass it
     whole = np.array(list(facts["slide_mean_m"].values())) * facts["slide_pieces"]
     assert whole == pytest.approx(0.3 * loads.pad_wear.sum(axis=0), rel=1e-12)
     assert {backward for backward, _ in loads.slide_wear} == {0, 1}
@@ -322,7 +324,7 @@ def test_duty_is_a_share_of_time_however_coarsely_the_load_is_sampled(tmp_path: 
     coarse, fine = (np.array(list(found[name].facts()["duty"].values())) for name in ("coarse", "fine"))
     assert 0.05 < fine.max() < 1.0
     assert coarse == pytest.approx(fine, abs=2e-3)
-    # duty is a share of time, not of the intervals with an impulse
+    # duty is the share of time in contact, not the share of the intervals that have an impulse
     twin = Twin(load_scene(PAPER), excitation="sampled", tol=1e-9)
     force = twin.advance_samples(
         grid := np.arange(0.0, 2.0, 2e-5), np.column_stack([np.interp(grid, knots, column) for column in wrench.T])
@@ -518,7 +520,7 @@ def test_cycles_are_those_of_the_whole_series_for_any_length(monkeypatch: pytest
     for part in np.array_split(forces, 7):
         series.add(reversals(part))
     expected = rainflow.count_cycles(forces, nbins=loads.CYCLE_BINS)
-    for _ in range(2):  # a run that is still being written is polled
+    for _ in range(2):  # a run that is still being written is counted again at each poll
         counted = rainflow.count_cycles(series, binsize=(series.high - series.low) / loads.CYCLE_BINS)
         np.testing.assert_allclose(counted, expected, rtol=1e-12)
 

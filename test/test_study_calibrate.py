@@ -40,7 +40,7 @@ RANGES = (
     "clearance.horizontal_m=0.015:0.035",
     "loads.fx2.sign",
 )
-#: Relative error with which each start recovers each parameter.
+#: Each start recovers each parameter within this relative error.
 RECOVERED = 1e-6
 
 
@@ -53,7 +53,7 @@ def space() -> Space:
     return Space(tuple(parse_unknown(text, preset("paper")) for text in RANGES))
 
 
-#: Effort of a start that recovers the truth.
+#: Effort of a search that recovers the truth from each start.
 SEARCH = Search(screen=150, population=24, generations=24)
 
 
@@ -93,7 +93,7 @@ def test_the_same_seed_gives_the_same_bits_on_any_number_of_threads() -> None:
 
 def test_an_unseen_parameter_is_reported_as_such() -> None:
     scene = with_parameters(preset("paper"), {"contact.impact_speed_floor_m_s": 2e-3})
-    # a constant damping does not use the floor of the speed, so the recording does not determine this floor
+    # a constant damping does not use the floor of the speed, so the recording does not determine the floor
     unknowns = Space(
         tuple(parse_unknown(text, scene) for text in (RANGES[0], "contact.impact_speed_floor_m_s=1e-4:1e-2"))
     )

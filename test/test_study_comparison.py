@@ -96,7 +96,7 @@ def test_windows_with_a_stretch_without_samples_are_left_out_and_named(runs: tup
 
 def test_the_window_is_the_period_of_the_load(runs: tuple[Run, Run]) -> None:
     starts = windows_of(read_recording(runs[0].folder)).start_ns
-    # the load has 2 rad/s, and the data cover two and a half periods
+    # the load's angular frequency is 2 rad/s, so its period is pi s; the data cover two and a half periods
     assert np.diff(starts)[0] * 1e-9 == pytest.approx(np.pi, rel=0.3)
 
 
@@ -156,7 +156,7 @@ def test_a_lasting_change_of_a_load_that_windows_cut_through_is_the_load_s() -> 
     np.testing.assert_array_equal(
         with_neighbours(np.array([1.0, 2.0, 3.0]), np.array([0, 10, 90])), [[1, 1, 2], [2, 1, 2], [3, 3, 3]]
     )
-    # a slope is not valid far from its loads
+    # a slope is not valid at loads far from those to which it was fitted
     load = random.normal(1.0, 0.02, 40)
     apart = change((1e5 * load**2, load), (1.4e5 * load**2, 1.4 * load), random, draws=100)
     assert apart is not None and apart.verdict == "load or machine"

@@ -48,7 +48,7 @@ def sqlite_bag(folder: Path) -> Path:
         live.execute("INSERT INTO messages (topic_id, timestamp, data) VALUES (1, ?, ?)", (time_ns, data))
     live.commit()
     killed.mkdir()
-    for item in folder.glob("*.db3*"):  # the files are copied as they are on the disk, without a clean end
+    for item in folder.glob("*.db3*"):  # the files are copied while the database is open, so the copy has no clean end
         if not item.name.endswith("-shm"):
             shutil.copy(item, killed)
     live.close()

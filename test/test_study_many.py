@@ -210,7 +210,8 @@ def test_no_recording_of_a_folder_is_left_out_unsaid(tmp_path: Path, capsys: pyt
     table = parquet.read_table(out / "runs.parquet")
     assert table.column("lost").to_pylist() == [None, 0, None]
     assert table.column("error").to_pylist()[1:] == [None, "left out: no recording"]
-    assert cli(["analyse", str(tmp_path), "--json", "--quiet"]) == 1  # one recording lacks its parts
+    # one recording has none of its parts, so the exit code is 1
+    assert cli(["analyse", str(tmp_path), "--json", "--quiet"]) == 1
     assert json.loads(capsys.readouterr().out)["left_out"] == [str(tmp_path / "empty")]
     shutil.copytree(tmp_path / "good", inner := tmp_path / "good" / "inner")
     assert left_out(tmp_path) == [tmp_path / "empty", inner]
@@ -265,7 +266,7 @@ def test_an_interrupted_analysis_goes_on_and_a_run_that_a_twin_recorded_stays(ru
     half = tmp_path / "out" / "run" / "run_0.mcap"
     half.write_bytes(half.read_bytes()[:-4000])
     other = Task(runs / "r1", PAPER, None, (), tmp_path / "out")
-    other.clear()  # a task that is interrupted later also begins with this call
+    other.clear()  # a task begins with this call, also if it is interrupted later
     assert task.stored() is None and not half.exists()
     assert task.run()["loads"] == first["loads"]
     recorded = record_run(tmp_path / "mine" / "run", map(paper_sample, range(10))).file
@@ -292,7 +293,7 @@ def test_no_input_is_removed_and_results_of_two_recordings_never_stand_side_by_s
     with pytest.raises(RecordingError):
         Task(broken, PAPER, None, (), out).run()
     assert not [path.name for path in out.iterdir() if path.is_file()]
-    # a scene in another role, or another scene, makes another task
+    # another scene, or the same scene in another role, makes another task
     Task(runs / "r0", PAPER, None, (narrow,), out).run()
     assert Task(runs / "r0", PAPER, None, (narrow,), out).stored() is not None
     assert Task(runs / "r0", PAPER, narrow, (), out).stored() is None

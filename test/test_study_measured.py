@@ -54,7 +54,7 @@ def test_measured_impacts_are_met_better_than_by_a_rigid_impact(impacts) -> None
 def test_preset_computes_measured_impacts_whole_as_the_function_does(impacts) -> None:
     before, after = impacts
     found = simulated_impact(before)
-    # the ellipse turns a little during an impact of finite time
+    # an impact of finite time turns the ellipse a little, so the two results differ
     assert misses(found, impact(before)).max() < 0.015
     missed = misses(found, after)
     assert np.sqrt((missed**2).mean()) < 0.245
@@ -67,7 +67,7 @@ def test_impact_is_an_impulse_at_the_lowest_point_that_gains_no_energy(impacts) 
     after = impact(before, contact)
     change = after - before
     along, up = contact_arms(before[:, 2])
-    # the plus stands here because the data's x has the opposite sign of an x that is right-handed with theta
+    # the data's x has the opposite sign of an x that is right-handed with theta, hence the plus
     moment = along * change[:, 4] + up * change[:, 3]
     np.testing.assert_allclose(change[:, 5], moment / GYRATION**2, atol=1e-9)
     assert (energy(after) < energy(before)).all()
@@ -114,7 +114,7 @@ def test_tossed_block_moves_as_the_preset_computed_by_the_solver(drops) -> None:
     # impacts enlarge the difference between fixed steps and exact events
     assert (np.max(apart, axis=0) < [2e-3, 2e-3, 0.1]).all()
     assert (np.median(apart, axis=0) < [4e-4, 3e-4, 0.03]).all()
-    # rigid impacts have an error of 10 mm
+    # a model with rigid impacts has an error of 10 mm
     assert np.median(far) < 9e-3, far
 
 

@@ -37,7 +37,7 @@ def test_a_process_beside_a_node_sends_its_results_and_ends_with_them(tmp_path: 
             peaks = max(max(filter(None, found["values"].values()), default=0.0) for found in heard.all("face/peaks"))
             assert peaks > 1e4 and heard.newest("face/clearance")["values"]["horizontal"] == pytest.approx(0.025)
             assert "influx" in beside.output() or "http" in beside.output()  # the message names the absent receiver
-            # points for an absent database are lost, which the exit code shows
+            # points for an absent database are lost, so the exit code is that of a loss
             assert beside.stop() == 3
             probe.until(lambda: heard.newest("face/online") is False, "the end")
         finally:

@@ -95,8 +95,9 @@ def test_a_test_that_hangs_is_named_and_ends_the_run(tmp_path: Path) -> None:
     assert "in test_that_hangs" in done.stderr  # the output names the place where the test hangs
 
 
-#: A kernel, and a test of it that waits until another process has reached the same place.
+#: Source of a kernel.
 DOUBLE = "from plow_twin.kernel.compiler import kernel\n@kernel(entry=True)\ndef double(x):\n    return 2.0 * x\n"
+#: Source of a test of this kernel that waits until another process has reached the same place.
 MEETING = """
 import time
 from pathlib import Path
@@ -135,7 +136,7 @@ def test_ci_is_bounded_and_runs_every_check() -> None:
     steps = re.findall(r'^step "([^"]+)" (\d+) (?:env \S+ )?make (.+)', program, re.MULTILINE)
     assert sum(int(limit) for _, limit, _ in steps) <= 4200
     targets = {word for _, _, given in steps for word in given.split()}
-    # coverage has no required minimum, because it is a figure and not a check
+    # coverage is a figure and not a check, so it has no required minimum
     assert targets >= {"test", "lint", "docs", "demo", "lowest"}
     assert "test_stream_session.py" in dry_run("coverage") and "--cov" not in dry_run("test")
     lowest = dry_run("lowest")

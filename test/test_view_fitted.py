@@ -43,7 +43,8 @@ def test_each_value_stands_with_its_interval_in_that_of_the_prior(picture: Fitte
     horizontal = values["horizontal clearance [mm]"]
     assert horizontal.prior is not None and horizontal.note == "estimated"
     middle, low, high = horizontal.places()
-    assert -1.0 < low < middle < high < 1.0 and high - low < 0.1  # the motion determines far more than the prior
+    # the motion determines the value far better than the prior does
+    assert -1.0 < low < middle < high < 1.0 and high - low < 0.1
     assert FittedValue("", (2.0, 1.0, 3.0), (2.0, 1.0, 3.0)).places() == pytest.approx([0.0, -1.0, 1.0])
     assert FittedValue("", (-1.5, -2.0, -1.0), None, ".1f").text == "−1.5 (−2.0 to −1.0)"
 

@@ -78,7 +78,7 @@ def test_an_estimate_and_a_changed_parameter_are_marked_and_are_no_wear(tmp_path
     # the change of the model ends the estimate
     np.testing.assert_allclose(np.unique(horizontal.round(6)), [25.0, 26.0, 31.0])
     marks = {text.get_text(): text.xy[0] for text in clearance.texts if isinstance(text, Annotation)}
-    # the estimate of a window that ended earlier is valid from its arrival on
+    # the window of the estimate ended earlier, but the estimate is valid only from its arrival on
     assert marks == {"first estimate": pytest.approx(0.399), "parameters set": pytest.approx(0.5)}
 
 
@@ -118,7 +118,7 @@ def test_a_stretch_without_samples_is_shaded_and_crossed_by_no_line(tmp_path: Pa
 def test_every_force_of_the_instant_shown_has_its_arrow_and_its_value_inside_the_axes(
     tmp_path: Path, figures: list[Figure]
 ) -> None:
-    load = map(paper_sample, range(0, 3000, 50))  # the peaks are between the stamps
+    load = map(paper_sample, range(0, 3000, 50))  # the samples are so far apart that the peaks lie between the stamps
     run = record_run(tmp_path / "run", load)
     to_png(run.folder, tmp_path / "run.png")
     check_figure(figures[0])

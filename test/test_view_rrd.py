@@ -138,7 +138,7 @@ def test_the_growth_of_the_clearance_is_drawn_in_micrometres(tmp_path: Path) -> 
         index = sent[0].name.index(name)
         np.testing.assert_allclose(best, [1e6 * (m.position[index] - new_m) for m in sent], rtol=0, atol=1e-9)
         assert 0.0 < low[-1] < 0.2 * best[-1] < best[-1] < 0.2 * high[-1]
-        # the legend shows the colour of the first stroke, so the first stroke of a band is not faint
+        # the legend shows the colour of a band's first stroke, so this stroke is not faint
         colors = tables[f"/growth/band/{name} colors"]["SeriesLines:colors"].to_pylist()
         assert [color[0] & 0xFF for color in colors] == [255, layout._BAND_ALPHA]
 
@@ -184,7 +184,7 @@ def test_forces_along_the_face_measured_poses_and_other_scenes_are_drawn(tmp_pat
     twin, offset = Twin(scene, excitation="sampled"), np.array([1e-3, -5e-4, 2e-3])
     for index in range(COUNT):
         sample = paper_sample(index)
-        if index in (0, 700):  # the second speed comes ahead of its time
+        if index in (0, 700):  # the second speed is given ahead of the time at which it acts
             entries.append(Travel(BASE_NS + (index and 999) * STEP_NS, -2.0 if index else 2.0))
         entries.append(sample)
         pose = twin.advance(index * 1e-3, sample.wrench).q + offset
@@ -415,7 +415,7 @@ def test_the_lane_of_contact_sets_has_room_in_a_low_window() -> None:
     curves = blueprint.root_container.contents[1]
     names = [getattr(part, "name", None) for part in curves.contents]
     share = curves.row_shares[names.index("Corners that carry force")] / sum(curves.row_shares)
-    # as drawn in a window of 1000 x 620, the curves have 555 of the 620 pixels, and the lane needs 87 with title, axis
+    # in a window of 1000 x 620 pixels the curves have 555 of the 620, and the lane needs 87 for itself, its title, axis
     # and name
     assert share * 555.0 > 87.0
 
@@ -431,8 +431,8 @@ def test_the_legends_of_the_clearance_are_not_cut_in_a_low_window(
             for entity, name in curve_names(view[0].path).items()
             if entity.startswith(f"/{group}/") and not entity.endswith(("/p05", "/p95"))
         }
-        # each line of a legend takes 23 pixels, and equal names share a line; when a legend needed 94 pixels of a plot
-        # 112 pixels high, its last line was cut off
+        # each line of a legend takes 23 pixels, and equal names share a line; in a plot 112 pixels high, a legend of 94
+        # pixels lost its last line
         assert names >= {"horizontal", "vertical"} and 23 * len(names) + 2 < 0.77 * height
 
 
@@ -443,10 +443,11 @@ def test_no_line_is_drawn_over_a_part_that_is_not_there(
     entries = [*first, Reset(BASE_NS + 99 * STEP_NS, "asked for"), *second]
     run = record_run(tmp_path / "run", entries, part_bytes=200_000, flush_period_s=0.01, chunk_size=50_000)
     whole = read(to_rrd(run.folder, tmp_path / "whole.rrd").path)
-    assert [scalar for scalar in whole["/load/fx"]["Scalars:scalars"].to_pylist() if not scalar] == [[]]  # the reset
+    # the only empty value is that of the reset
+    assert [scalar for scalar in whole["/load/fx"]["Scalars:scalars"].to_pylist() if not scalar] == [[]]
     RunReader(run.folder).parts[1].unlink()
     before, after = (sample.stamp_ns for sample in journal_around_the_hole(run.folder))
-    for most_rows in (10**6, 300):  # thinned, too
+    for most_rows in (10**6, 300):  # once with all rows, and once thinned
         summary = to_rrd(run.folder, tmp_path / "run.rrd", most_rows=most_rows)
         tables = read(summary.path)
         assert summary.lost == {"missing_parts": 1}
@@ -454,7 +455,7 @@ def test_no_line_is_drawn_over_a_part_that_is_not_there(
             table = tables[name]
             stamps = np.array(table["ros_time"].cast(pa.int64()).to_pylist())
             ends = stamps[[not scalar for scalar in table["Scalars:scalars"].to_pylist()]]
-            # clearances come at 10 Hz, so they end up to 0.1 s earlier
+            # clearances are published at 10 Hz, so their curves end up to 0.1 s earlier
             behind = ends - np.array([entries[99].stamp_ns, before])
             assert (behind > -(10**8)).all() and (behind <= 1).all() and after - before > 10**8
         assert [state for state in tables["/contact_set"]["StateChange:state"].to_pylist() if not state] == [[], []]
@@ -466,5 +467,5 @@ def test_no_line_is_drawn_over_a_part_that_is_not_there(
     for axis in figures[0].axes[2:]:
         for times in (np.asarray(line.get_xdata(), float) for line in axis.lines):
             if times.min() == times.max():
-                continue  # marks an instant
+                continue  # this line marks an instant
             assert np.isnan(times).sum() == 2 and np.nanmax(np.diff(times)) < 0.11
