@@ -75,7 +75,7 @@ def test_scenes_one_after_the_other_share_what_their_equal_parts_need(monkeypatc
         return compile_loads(loads)
 
     monkeypatch.setattr(compiled_scene, "compile_loads", counted)
-    scene = preset("bench_hc")
+    scene = preset("paper")
     table = Table("ramp", np.array([0.0, 1.0]), np.array([[0.0, 0.0, 0.0], [4e4, -1e4, 2e3]]))
     for gap in (0.020, 0.025, 0.030):
         simulate(dataclasses.replace(scene, clearance=Clearance(gap, gap)), 1e-3)
