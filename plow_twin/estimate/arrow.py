@@ -16,7 +16,7 @@ from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_bande
 
 Array = NDArray[np.float64]
 
-#: Definition: number of unknowns of one swing, the pose and its rate at the start.
+#: Definition: number of unknowns of one swing: the pose and its rate at the start, three numbers each.
 OWN = 6
 
 

@@ -32,7 +32,7 @@ from plow_twin.solve.compiled_scene import inertias
 
 Array = NDArray[np.float64]
 
-#: Definition: walls by name, the axis that they bound and their outward normal.
+#: Definition: for each wall, by name, the axis that it bounds and its outward normal.
 WALLS: Final = {
     "right": (GX, np.array([1.0, 0.0])),
     "left": (GX, np.array([-1.0, 0.0])),

@@ -46,8 +46,8 @@ _FEWEST_OF_PHASE = 9
 _LAGS_S: Final = np.linspace(-0.1, 0.1, 81)
 _OF_DRAWN_S: Final = np.linspace(-0.01, 0.01, 9)
 _NO_LAG = len(_OF_DRAWN_S) // 2
-#: Derived: distances in rows, as powers of two, over which changes are computed. The first are for the changes of pose
-#: and reach in the whole motion, the second for the changes of the pose at each phase of the load.
+#: Derived: distances in rows, as powers of two, over which changes are computed: `_CHANGES` for the changes of pose and
+#: reach in the whole motion, `_CHANGES_BY_PHASE` for the changes of the pose at each phase of the load.
 _CHANGES: Final = (1, 2, 4, 8, 16, 32)
 _CHANGES_BY_PHASE: Final = (1, 4)
 #: Definition: the paths by which a scene names the sides of the frame.

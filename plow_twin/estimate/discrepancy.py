@@ -50,7 +50,7 @@ STATED: Final = {
 _WALL_STEP, _PUSH_STEP = 0.02, 5e-3
 #: Guard: smallest error of the load in units of half the load's range.
 _LEAST_PUSH = 1e-5
-#: Bound: numbers of rounds of expectation-maximisation; the noise is tempered after each series of rounds.
+#: Bound: lengths of the three series of rounds of expectation-maximisation; the noise is tempered after each series.
 _ROUNDS = (8, 5, 3)
 #: Bound: number of the sampler's sweeps, and number of the first sweeps that are discarded.
 _SWEEPS, _BURNT = 50, 10

@@ -38,7 +38,7 @@ _WALL: Final = np.argmax(np.stack(WALLS), axis=0)
 _STEPS, _SMALL, _LONGEST = 8, 2e-5, 3e-3
 #: Guard: shortest interval between rows in s, and smallest number of rows in half of a test function.
 _SHORTEST, _FEWEST = 5e-3, 3
-#: Derived: unit of the stiffness in N/m in which its column is as large as the other columns.
+#: Derived: unit of the stiffness in N/m; in this unit the column of the stiffness is as large as the other columns.
 _UNIT = 1e7
 #: Derived: deviate beyond which Huber's function is linear; ratio of standard deviation to median absolute deviation.
 _HUBER, _MAD = 2.0, 1.4826

@@ -53,7 +53,7 @@ Guess = tuple[float, ...]
 #: Bound: a window has at most this many load periods or this many seconds, whichever is longer. Of longer data the
 #: newest part is used.
 MOST_PERIODS, MOST_SPAN_S = 20.0, 60.0
-#: Bound: length in s of the data in which the load's period is searched, as long as the longest window of a node.
+#: Bound: the load's period is searched in data of at most this length in s, the longest window of a node.
 _LONGEST_S = 600.0
 #: Derived: normal deviate that a correct model exceeds in one of a hundred cases, to two digits.
 MOST_OTHER_LAW = round(float(ndtri(0.99)), 2)

@@ -42,9 +42,9 @@ _DISPLACED = np.array([2e-4, 2e-4, 1e-3, 5e-3, 5e-3, 3e-2])
 _LEAST_DRIFT = 1e-8
 #: Definition: the two pads of each wall: left and right with the top pad first, top and bottom with the left pad first.
 WALLS: Final = ((1, 7), (3, 5), (0, 2), (6, 4))
-#: Definition: differences of machine and sensor, which a fit uses beside the shared unknowns. They are the distances in
-#: m by which the first pad of each wall in `WALLS` lies farther out than the second, the sensor's lever arm in m along
-#: x and y, and the squared time constant of its low pass in s2.
+#: Definition: differences of machine and sensor from the model, which a fit uses beside the shared unknowns. They are
+#: the distances in m by which the first pad of each wall in `WALLS` lies farther out than the second, the sensor's
+#: lever arm in m along x and y, and the squared time constant of the sensor's low pass in s2.
 TURNS, LEVER, LAG = slice(0, 4), slice(4, 6), 6
 DIFFERENCES: Final = ("turn_left", "turn_right", "turn_top", "turn_bottom", "lever_x", "lever_y", "filter")
 #: Step: for the difference quotients with respect to these differences.
@@ -295,7 +295,7 @@ class Problem:
             # times rise, so the rows of a swing are consecutive
             inner = np.searchsorted(swing[inside], np.arange(window.swings + 1)).astype(np.int64)
             asked, ends, edges = times[inside], np.zeros(0, np.int64), inner
-            if len(self.link):  # each swing but the last runs to the start of the next
+            if len(self.link):  # each swing but the last is computed up to the start of the next swing
                 ends = edges[1:-1] + np.arange(len(self.link))
                 asked = np.insert(asked, edges[1:-1], window.starts[1:-1])
                 edges = edges + np.minimum(np.arange(window.swings + 1), len(self.link))
@@ -342,7 +342,7 @@ class Problem:
     def linearise(self, point: Point) -> Linear:
         """Return the Jacobians of the prediction and of the ends of the swings."""
         rows, ends = np.zeros((len(point.residual), 3, SIZE + OWN)), np.zeros((len(point.defect), 6, SIZE + OWN))
-        # the derivatives with respect to states and gains come first, because they use the point's scene
+        # the derivatives with respect to states and gains come first, because they need the scene of the point itself
         together = self._evaluate(point.shared, point.states + np.diag(_DISPLACED)[:, None])
         for j in range(6):
             if together is not None:

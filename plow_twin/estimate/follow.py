@@ -47,7 +47,7 @@ Rows = NDArray[np.void]
 
 #: Definition: default number of members.
 MEMBERS: Final = 128
-#: Bound: shortest time in s between used poses. A pose that follows sooner adds little and costs as much.
+#: Bound: shortest time in s between used poses. A pose that comes sooner after another adds little and costs as much.
 APART_S: Final = 4e-3
 #: Bound: smallest and largest number of poses from whose quick changes the noise is computed.
 _NOISE_ROWS: Final = (20, 400)

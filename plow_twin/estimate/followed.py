@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 
 #: Definition: length in s of the estimates' windows, and interval in s of the windows' ends; the defaults of a node.
 WINDOW_S, INTERVAL_S = 32.0, 10.0
-#: Definition: nanoseconds of a second.
+#: Definition: number of nanoseconds in a second.
 _NS: Final = 1e9
 #: Bound: the load is used in parts of this many seconds, so that the rows of all members fit into the processor's
 #: cache.

@@ -25,7 +25,7 @@ from plow_twin.model.scene import Clearance, Scene, Table, Wear
 
 Array = NDArray[np.float64]
 
-#: Definition: seconds of an hour.
+#: Definition: number of seconds in an hour.
 HOUR_S = 3600.0
 #: Guard: a drawn clearance is smaller than the present clearance by at most this share of the present clearance.
 _LEAST_SHARE = 0.9

@@ -273,7 +273,7 @@ class Load:
             chord = rows[right] - rows[left]
             error = np.abs(rows[place] - rows[left][line] - along[:, None] * chord[line]).max(axis=1)
             largest = np.maximum.reduceat(error, first[:-1])
-            # the first sample with the largest error of each line
+            # for each line, the first sample that has the line's largest error
             at = np.flatnonzero(error == largest[line])
             middle = place[at[np.unique(line[at], return_index=True)[1]]]
             least = np.minimum(least, largest)

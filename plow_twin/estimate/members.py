@@ -36,7 +36,7 @@ from plow_twin.stream.outputs import clearances
 Array = NDArray[np.float64]
 Rows = NDArray[np.void]
 
-#: Bound: seconds of motion that are kept for late poses, including the sensor's delay.
+#: Bound: so many seconds of motion are kept for late poses; the sensor's delay is included.
 LATEST_S: Final = 0.25
 #: Bound: smallest interval in s between kept states of the motion.
 _PATH_S: Final = 2e-3

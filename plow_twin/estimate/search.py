@@ -115,7 +115,7 @@ def refine(
     window = cut(unknowns.scene, poses, period, shortest)
     near = Problem(forward, unknowns, window, horizon=min(max(0.2 * period, rows[0]), horizon), differences=differences)
     starts = [shared]
-    if unknowns.is_hard(shared):  # this start is good for hard contacts only
+    if unknowns.is_hard(shared):  # only for hard contacts is this second start useful
         starts.append(range_of_hard(unknowns, poses, shared))
     fits = []
     for start in starts:

@@ -90,7 +90,7 @@ class Windows:
         self._loads: list[Row] = []
         self._poses: deque[tuple[int, tuple[float, ...], tuple[float, ...]]] = deque(maxlen=MOST_KEPT)
         self._gaps: deque[tuple[int, tuple[int, ...], tuple[float, ...]]] = deque(maxlen=MOST_KEPT)
-        #: length [s] of the newest window that was checked, and its number of poses or gaps
+        #: of the newest window that was checked: its length [s], and its number of poses or gaps
         self._left = (0.0, 0)
         self._newest_ns: int | None = None
         self._end_ns: int | None = None

@@ -40,7 +40,7 @@ _MOST_WAITING: Final = 1_000_000
 _NICE: Final = 10
 #: Definition: shortest time slice in ns that Linux gives, and number of the system call that requests it.
 _SLICE_NS, _SCHED_SETATTR = 100_000, 314
-#: Bound: time in s in which the far side must end.
+#: Bound: the far side must end within this time in s.
 _STOP_S: Final = 5.0
 _ESTIMATE_ALONE: Final = Asked()
 

@@ -208,7 +208,7 @@ class _Unchanged(NamedTuple):
 
     loads: LoadSet
     acceleration: float  #: largest acceleration in m/s^2
-    start_speed: float  #: in m/s
+    start_speed: float  #: upper bound of the head's speed at the start in m/s
     harmonics: Harmonics | None
     terms: Terms
     values: dict[str, Any]
@@ -509,8 +509,8 @@ def _release(scene: Scene, tol: float, length: float, speed: float) -> float:
         # therefore also be negligible
         stretch = max(1e-3 * tol * length, 1e-15 * geometry.half_diagonal(scene))
         held = stretch * friction.stick_stiffness_n_m / friction.coefficient
-        # the depth is at least the way of a corner in 1e-11 s; if a corner crossed it faster, its series would have
-        # non-finite terms
+        # the depth is at least the distance that a corner covers in 1e-11 s; if a corner crossed it faster, its series
+        # would have non-finite terms
         depth = max(float((held / scene.contact.stiffness) ** (1.0 / exponent)), 1e-11 * speed)
         release = min(release, depth)
     return release

@@ -13,7 +13,7 @@ from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.grip import grip_guard
 from plow_twin.solve.state import CLIPPED, CROSSING, OFF, ON, RATIO, RELEASED, SIGN
 
-#: Two events are simultaneous if the time between them is less than this share of the step before them.
+#: Two events are simultaneous if the time between them is less than this share of the step that ends with them.
 _AT_ONCE = 1e-12
 #: Penetration at which a pair changes from ON to RELEASED, as a share of `Params.release`. The pair is ON again at
 #: `Params.release` itself.
@@ -50,7 +50,8 @@ def _guards(p, state, w, order, penetrating, viscous, ramp) -> None:
     for pair in range(PAIR_COUNT):
         first = max(guard[0, pair], 0.0)
         if state.mode[pair] == ON:
-            # a pair becomes RELEASED at a quarter of the depth at which it is ON again, so that it cannot alternate
+            # a pair becomes RELEASED at a quarter of the depth at which it is ON again; it therefore cannot alternate
+            # between the modes
             first -= min(LET_GO * p.release, 0.5 * first)
         elif state.mode[pair] == RELEASED and first <= ON_THE_WALL * p.release:
             # a RELEASED pair that rests on its wall parts a little outside the wall, at the depth -LET_GO * release;

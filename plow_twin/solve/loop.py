@@ -297,7 +297,7 @@ def lay_out_again(p, parts, state, w) -> None:
         return
     used, implicit = state.elapsed, parts.implicit
     if implicit is not None:
-        # restore the fields that the first layout of the step has changed
+        # the step is laid out a second time, so the fields that the first layout changed are restored
         state.implicit_size, state.decay_times = state.implicit_size_before, state.decay_times_before
         state.refused = state.refused_before
     steps, evaluations, guard_roots = state.steps, state.evaluations, state.guard_roots

@@ -36,7 +36,7 @@ from plow_twin.solve.state import (
 #: A penetration below this share of the release penetration, or a speed below this share of the speed needed to reach
 #: it, counts as zero.
 SHALLOW = 1e-3
-#: Number of iterations for the damping and speed of an impact under way, which depend on each other.
+#: Number of iterations that find the damping and the speed of an impact under way, which depend on each other.
 _ROUNDS = 8
 #: Number of halvings of a bracket, enough for the last bit of a double.
 _BISECTIONS = 60
@@ -118,7 +118,7 @@ def _start_inside(p, state, pair, energy) -> None:
     if p.damping_number >= 0.0:
         y = state.y
         arm = row_value(p.arm_rows, pair, y[COS], y[SIN], y[X], y[Y])
-        # a frame on springs adds its mobility, with the arm about its own centre
+        # a frame on springs adds a mobility of its own, with the arm about the frame's centre
         arm_of_frame = row_value(p.arm_rows, pair, y[COS], y[SIN], 0.0, 0.0)
         mobility = p.inverse_mass + p.free[2] * arm * arm * p.inverse_inertia
         mobility += p.frame_mobility[0] + arm_of_frame * arm_of_frame * p.frame_mobility[2]
@@ -219,7 +219,8 @@ def weigh_pairs(p, state, w, viscous, fraction, ramp, stick) -> bool:
             if penetration > SHALLOW * p.release:
                 per_pair[BASE, pair] = 0.5 / math.sqrt(penetration) if p.exponent == 1.5 else 1.0 / penetration
             else:
-                # the step after the touch was interrupted at a depth that is too shallow for a series of d^n
+                # the step after the touch was cut short at a depth that is too shallow for a series of d^n, so the pair
+                # is RELEASED
                 mode[pair] = RELEASED
         acts = mode[pair] == ON
         per_pair[ACTS, pair] = p.stiffness if acts else 0.0

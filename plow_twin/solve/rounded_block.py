@@ -14,11 +14,15 @@ import numpy as np
 from plow_twin.kernel.compiler import kernel
 from plow_twin.model.contact import normal_force
 
-#: Parameters of a block, per mass: half the distance between the centres of its corners' arcs [m], their radius [m],
-#: radius of gyration [m], height of the table [m], stiffness K [1/s^2], tangential stiffness relative to K [1],
-#: tangential damping relative to critical damping [1], restitution at an impact speed of 1 m/s and the power with which
-#: it falls, friction at 1 m/s and the power with which it falls, the power of the moving mass in the impact, gravity
-#: [m/s^2], drag of place and of angle [1/s].
+#: Parameters of a block, per mass.
+#: `half`: half the distance between the centres of its corners' arcs [m]; `radius`: radius of these arcs [m]
+#: `gyration`: radius of gyration [m]; `table`: height of the table [m]
+#: `stiffness`: K [1/s^2]; `tangential`: tangential stiffness relative to K [1]
+#: `tangential_damping`: tangential damping relative to critical damping [1]
+#: `restitution`, `friction`: their values at an impact speed of 1 m/s [1]
+#: `restitution_fall`, `friction_fall`: the powers of the speed with which they fall [1]
+#: `mass_power`: power of the moving mass in the impact [1]; `gravity`: gravity [m/s^2]
+#: `drag`, `spin_drag`: drag of place and of angle [1/s]
 BLOCK = np.dtype(
     [
         (name, "f8")

@@ -32,7 +32,7 @@ CLIPPED: Final = 2
 #: Mode for exponents that are not integers: the pair penetrates by less than `Params.release`, so its force is
 #: negligible.
 RELEASED: Final = 3
-#: Outcome of an event that does not change the mode: a pair crosses the end of its damping's ramp.
+#: Outcome of an event that does not change the mode: a pair's penetration crosses the end of the damping's ramp.
 CROSSING: Final = 4
 #: Further outcomes that do not change the mode: the corner begins to slip along the wall, forward or backward, or to
 #: stick.
@@ -207,7 +207,8 @@ _STATE_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("sigma_end", "f8"),  # the series' variable at the step's end
     ("alpha", "f8"),  # time since the step's start: alpha sigma + beta sigma^2 / 2
     ("beta", "f8"),
-    ("stop_time", "f8"),  # time at which a step must end for a sample, a knot of the load, or the end of the run
+    # time at which a step must end, because of a sample, a knot of the load, or the end of the run
+    ("stop_time", "f8"),
     ("last_step_size", "f8"),
     ("touch_time", "f8"),  # time of the last touch
     ("time", "f8"),  # the present time, bit for bit as the caller gave it
@@ -262,7 +263,7 @@ WORK: Final = np.dtype(
         ("wear", "f8", _WIDE),  # growth of the wear depth
         ("guard", "f8", _WIDE),
         ("bernstein", "f8", _WIDE),
-        ("power", "f8", (4, *_WIDE)),  # powers of the penetration
+        ("power", "f8", (4, *_WIDE)),  # powers of the penetration d
         ("ramp", "f8", (3, *_WIDE)),  # ramped damping only: square and cube of the penetration, acting share of C
         ("slip", "f8", (6, *_WIDE)),  # friction: slip rate r / v_s, k r_k, tanh r, 1 - tanh^2 r, force, arm
         ("frame", "f8", _WIDE),  # a frame on springs (`solve.support`)
@@ -343,7 +344,7 @@ ROW: Final = np.dtype(
         # since the previous publication
         ("followed", "i8"),  # `FOLLOWED` if only the clearances are filled, `WITH_INTERVALS` if all fields are filled
         *((f"{name}_{end}", "f8", (PAIR_COUNT,)) for name in ("force", "peak", "impulse") for end in ("low", "high")),
-        ("known_clearance", "f8", (6,)),  # horizontal, then vertical clearance, each with its quantiles
+        ("known_clearance", "f8", (6,)),  # horizontal, then vertical clearance, each followed by its quantiles
     ]
 )
 
@@ -438,7 +439,8 @@ def state_type(terms: Terms) -> np.dtype[np.void]:
 
 @cache
 def _state_type(stick: bool, support: bool) -> np.dtype[np.void]:
-    # further fields come first, because numba takes a record with further fields at its end for the record without them
+    # further fields come first: numba would take a record with further fields at its end for the record without these
+    # fields
     more = (_FRAME_FIELDS if support else []) + (_GRIP_FIELDS if stick else [])
     return _in_lines([*more, *_STATE_FIELDS]) if more else STATE
 

@@ -30,7 +30,8 @@ from plow_twin.solve.tumbling import turn_at, turn_corners
 METHODS: Final[tuple[Method, ...]] = (flight, rest, implicit, taylor)
 #: Longest step in s, so that every power of a step is finite.
 LONGEST_STEP = 100.0
-#: Step in sigma beyond an instant at which modes would change back and forth without end.
+#: If modes would change back and forth at one instant without end, a step of this size in sigma leads beyond this
+#: instant.
 PAST_AN_INSTANT = 1e-9
 #: Two times are the same instant if their relative difference is at most this, which covers some rounding errors.
 ONE_INSTANT = 1e-15

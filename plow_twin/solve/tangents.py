@@ -44,7 +44,7 @@ _ROWS: Final = MAX_ORDER + 1
 _EIGHT: Final = (PAIR_COUNT, WIDTH)
 _OF_PAIRS: Final = (PAIR_COUNT, _ROWS, WIDTH)
 
-#: Eight columns: how they depend on parameters, and their series over a step.
+#: Eight columns of derivatives: how they depend on parameters, and their series over a step.
 COLUMNS: Final = np.dtype(
     [
         ("series", "f8", (6, _ROWS, WIDTH)),

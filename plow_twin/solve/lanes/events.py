@@ -26,15 +26,15 @@ from plow_twin.solve.lanes.record import (
 )
 from plow_twin.solve.state import CLIPPED, COS, OFF, ON, RELEASED, SIN, X, Y
 
-#: Two events are simultaneous if the time between them is less than this share of the step before them.
+#: Two events are simultaneous if the time between them is less than this share of the step that ends with them.
 _AT_ONCE = 1e-12
 #: The search for a root ends if the root's relative change is below `_FOUND` and the curvature's part in the change is
 #: below `_STRAIGHT`; the next change would be of the order of this change's cube. It also ends if the relative change
 #: is below `_ROUNDED`, a rounding error.
 _FOUND, _STRAIGHT, _ROUNDED = 1e-6, 1e-3, 2e-16
 _MOST_CHANGES = 80
-#: A root found over a longer step is surely beyond the present step, in spite of rounding, if it exceeds this multiple
-#: of the step.
+#: A root found over a longer step lies beyond the present step, whatever the rounding, if it exceeds the step by this
+#: factor.
 _SURELY_LATER = 1.0 + 1e-9
 #: Indices in `lanes.chosen` after the five rows of a penetration: factor of d, factor of d', further constant.
 _DEPTH, _RATE, _CONSTANT = 5, 6, 7
@@ -119,7 +119,7 @@ def _list_off(lanes, order) -> None:
     """
     h, series, cosine, sine = exact_row(lanes.step, 0), lanes.series, lanes.series[COS], lanes.series[SIN]
     x, y = series[X], series[Y]
-    # these are the sums of abs(term k) h^k for k > 1
+    # bounds of the terms after the second: the sums of abs(term k) h^k for k > 1
     later_c = later_s = later_x = later_y = exact_splat(0.0)
     for k in range(order, 1, -1):
         later_c = fused(later_c, h, magnitude(exact_row(cosine, k)))
@@ -471,7 +471,8 @@ def note_switches(lanes, order, viscous, fraction) -> None:
             guard, lane = lanes.guarded[at, i], lanes.owner[at, i]
             if lanes.event[lane] >= 0 and 0 <= guard < AGAIN:
                 pair = guard % PAIR_COUNT
-                # a first guard takes precedence over a second guard
+                # if both guards of a pair end here, the first guard decides: the second is left out for a pair that has
+                # a new mode
                 if lanes.switch[pair, lane] < 0 and lanes.parted[pair, lane] >= lanes.step[lane]:
                     _note_switch(lanes, lane, guard, viscous, fraction)
     for lane in range(WIDTH):

@@ -77,7 +77,7 @@ LANES: Final = np.dtype(
         ("size", "f8", (MOST_LACUNA, WIDTH)),  # sizes of the terms of the last orders, as velocities
         ("step", "f8", _LANES_OF),  # step size in s
         ("accurate", "f8", _LANES_OF),  # step size without events
-        ("stop", "f8", _LANES_OF),  # time at which a step must end
+        ("stop", "f8", _LANES_OF),  # time at which the present step must end at the latest
         ("whole", "f8", _LANES_OF),  # longest wanted step in s
         ("reach", "f8", _LANES_OF),  # guards of a round: end of the interval that is searched
         ("root", "f8", _LANES_OF),  # guards of a round: first root
@@ -134,7 +134,7 @@ LANES: Final = np.dtype(
         ("rounds", "i8", (1,)),
         ("bulges", "i8", (1,)),  # number of forces in `bulge`
         ("vanished", "i8", (1,)),  # a bit for each lane whose series ends early
-        ("stale", "i8", (1,)),  # 1 if modes or scenes have changed since the maps were summed
+        ("stale", "i8", (1,)),  # 1 if modes or scenes have changed since the last `weigh_lanes`
     ]
 )
 
@@ -163,7 +163,7 @@ def new_lanes() -> NDArray[np.void]:
     """Return empty lanes, shape (1,)."""
     lanes = new_records(LANES, 1)
     lanes["member"] = -1
-    # the numbers in an empty lane are those of a scene at rest, so that they stay finite
+    # an empty lane has the numbers of a scene at rest, so that its results stay finite
     lanes["y"][:, COS] = lanes["half_cavity"] = lanes["whole"] = 1.0
     return lanes
 

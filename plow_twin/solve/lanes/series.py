@@ -22,7 +22,7 @@ from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, X, Y
 
 #: Largest usable term; products of larger terms would not be finite.
 _FINITE = 1e300
-#: Least order of a series that ends because its terms vanish.
+#: A series whose terms vanish ends early, but not below this order.
 _FEWEST_ORDERS = 4
 _ALL = 2**WIDTH - 1
 

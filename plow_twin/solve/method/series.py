@@ -39,8 +39,8 @@ from plow_twin.solve.support import (
 
 #: A term has vanished if it is below this share of the admissible size of the last order.
 _VANISHED = 0.4
-#: Permutations of the state's lanes for its rates: the components that are multiplied by omega (lanes 4 and 7 hold S1),
-#: and the components that are rates of other components.
+#: Permutations of the state's lanes, for its rates. `_turned` gives the components that are multiplied by omega (in
+#: lanes 4 and 7 by S1 instead), `_rates_of` the components that are rates of other components.
 _turned = permutation(Y, X, VY, VX, COS, SIN, COS, SIN)
 _rates_of = permutation(VX, VY, VX, VY, OMEGA, COS, SIN, OMEGA)
 
@@ -526,8 +526,8 @@ def expand(
                 penetration = penetration - row(w.wear, k)
         set_row(w.penetration, k, penetration)
         if k > 0 and load_terms[2] is not None:
-            # under samples most series end early, and an order computed in vain would cost more than waiting for the
-            # size of the order before it
+            # under samples most series end early; it is faster to wait for the size of an order than to compute the
+            # next order in vain
             reach *= sigma_limit
             size = _size(p, w, k, penetrating, sigma_limit, wear, support, *rub_terms)
             w.term_size[k] = size

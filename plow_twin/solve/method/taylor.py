@@ -18,9 +18,9 @@ from plow_twin.solve.method.step_size import (
 #: After a touch the square root of the time since the touch is the series' variable for this many steps of the last
 #: size.
 TOUCH_REACH = 2.5
-#: Longest step in the square root of time since the touch, over its value at the step's start. The series of the force
-#: has a rounding error like that of 1 / sqrt(t), which grows by this factor with each order, and with the 30th reaches
-#: 1e18 times its size. The motion is free of it, because there the factor dt / d sigma cancels it.
+#: Longest step in the square root of the time since the touch, as a multiple of this root at the step's start. The
+#: series of the force has a rounding error like that of 1 / sqrt(t): it grows by this factor with each order, and at
+#: order 30 reaches 1e18 times its size. The motion is free of this error, because the factor dt / d sigma cancels it.
 FURTHEST = 4.0
 
 
@@ -81,7 +81,7 @@ def _choose_map(p, parts, fraction, stick, state, w, span, penetrating):
         return (root if parting <= span else root - math.sqrt(parting - span)), parting > span
     since = state.step_start - state.touch_time
     if 0.0 < since < TOUCH_REACH * state.last_step_size:
-        # for some steps after a touch the square root of the time since the touch is the better variable
+        # for some steps after a touch the square root of the time since the touch is a better variable than time
         root = math.sqrt(since)
         state.alpha, state.beta = 2.0 * root, 2.0
         return math.sqrt(since + span) - root, True

@@ -85,7 +85,7 @@ class TargetObjective:
                 try:
                     scenes.append(with_parameters(self.scene, {**self.targets.settings[column], **candidates[row]}))
                 except SceneError:
-                    continue  # impossible candidates get the residuals of a failure
+                    continue  # impossible candidates get the residuals of a failed run
                 places.append((row, column))
         if not scenes:
             return

@@ -26,7 +26,7 @@ _EQUAL_LOAD: Final = 0.01
 _USUAL: Final = (5.0, 95.0)
 #: Probability below which a change is statistically significant.
 _LEVEL: Final = 0.05
-#: Number of windows drawn at once, which bounds the memory.
+#: Number of windows that are drawn at once; it limits the memory that is used.
 _AT_ONCE: Final = 2**21
 #: Relative difference that rounding alone can cause between the means of equal numbers.
 _ROUNDING: Final = 1e-12
