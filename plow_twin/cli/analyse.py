@@ -91,7 +91,7 @@ def found_recordings(recordings: Sequence[Path], out: Path | None = None) -> tup
     for path in recordings:
         if not path.exists():
             raise click.BadParameter(f"{path}: does not exist", param_hint="RUN...")
-    # results of an earlier analysis are not reported
+    # folders with results of an earlier analysis are not reported as left out
     results_before = () if out is None else (out.resolve(), (out / "run").resolve())
     left = {item: path for path in recordings for item in left_out(path, results_before)}
     left = {item: path for item, path in left.items() if item.resolve() not in results_before}

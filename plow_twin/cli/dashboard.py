@@ -98,7 +98,8 @@ def dashboard(
     access = access_of(options)
     with interruptible() as stopped:
         if run is None:
-            os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)  # ROS from wheels
+            # the folder of the message definitions if ROS was installed from wheels
+            os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)
             from plow_twin.dashboard.node import show_node
 
             show_node(namespace, name, scene, access, wait, stopped, lambda screen: say_where(screen, access))

@@ -27,7 +27,8 @@ def interruptible(on_overdue: Callable[[], object] = lambda: None) -> Iterator[C
     os.set_blocking(send, False)
 
     def watch() -> None:
-        os.read(receive, 1)  # the signal handler writes this byte, independently of the main thread
+        # the signal handler writes a byte, which this thread reads independently of the main thread
+        os.read(receive, 1)
         asked.set()
         if not done.wait(PATIENCE_S):
             on_overdue()

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 #: Time between two updates of the progress bar [s].
 _PROGRESS_S = 0.2
-#: Pattern of the names of the counters of unused input.
+#: Pattern that the names of counters of unused input match.
 _LOST = re.compile(r"dropped_.*|.*_dropped|.*_lost")
 
 

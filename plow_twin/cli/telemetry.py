@@ -88,7 +88,8 @@ def telemetry(namespace: str, name: str, scene: str | None, wait: float, **optio
     from plow_twin.live.stop import StopRequested, StopSignals
 
     with StopSignals() as stop:
-        os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)  # ROS from wheels
+        # the folder of the message definitions if ROS was installed from wheels
+        os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)
         from plow_twin.telemetry.node import send_node
 
         def on_error(text: str) -> None:

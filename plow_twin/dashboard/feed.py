@@ -177,8 +177,8 @@ class Feed:
         self.motion = Motion()
         #: stamp of the newest publication in whole seconds
         self._second = 0
-        #: number of updates that the server took
-        #: number of updates for which it had no room
+        #: `taken`: number of updates that the server took
+        #: `not_taken`: number of updates for which it had no room
         self.taken = self.not_taken = 0
 
     def publication(self, published: Published) -> None:

@@ -110,7 +110,7 @@ def call(path: Path, service: str, text: str | None = None) -> tuple[bool, str]:
         kind = "a folder" if path.is_dir() else "a file" if path.exists() else "nothing there"
         raise ControlError(f"{path}: got {kind}, expected the socket that plow-twin live --control has opened")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as client:
-        client.bind("")  # the client gets a name outside the file system
+        client.bind("")  # the client's name is chosen by the system and is outside the file system
         client.settimeout(_PATIENCE_S)
         try:
             client.connect(str(path))

@@ -34,7 +34,7 @@ from plow_twin.stream.session import Series, Session
 
 #: Published topics, by base name.
 ESTIMATE, WINDOW_FORCES, FORECAST = ESTIMATES
-#: Names of a forecast's numbers in SI units, by their names in the units of the forecast.
+#: For each name of a forecast's number that is not in SI units, the name of the same number in SI units.
 _SI: Final = {"hours": "seconds", "km": "metres"}
 #: Rate of checks for a finished estimate [Hz].
 RATE_HZ: Final = 10.0
@@ -58,8 +58,8 @@ class Estimation:
         #: trust in model and sensor according to the newest estimate
         self.trust = {"model": "", "sensor": ""}
         self.reasons: tuple[str, ...] = ()
-        #: number of estimates
-        #: number of windows skipped because a newer window came
+        #: `count`: number of estimates
+        #: `skipped`: number of windows skipped because a newer window came
         self.count = self.skipped = 0
         #: time that the newest estimate took [s]
         self.wall_s = 0.0

@@ -108,11 +108,11 @@ class Publishing:
             self._messages = Messages(*frames, intervals=settings.follows == "full")
         self.latency = DurationHistogram()
         self.age = DurationHistogram()
-        #: number of publications
-        #: number of publications withheld because a number was not finite
+        #: `published`: number of publications
+        #: `withheld`: number of publications withheld because a number was not finite
         self.published = self.withheld = 0
-        #: number of publications computed without a sample
-        #: number of publications that correct earlier publications because of late samples
+        #: `held_frames`: number of publications computed without a sample
+        #: `corrected_frames`: number of publications that correct earlier publications because of late samples
         self.held_frames = self.corrected_frames = 0
         #: steady time at which the samples of the next publication were received [ns]; 0 means that it has no samples
         self.received_ns = 0

@@ -312,7 +312,7 @@ class Runtime:
         for intake in (self.driver.intake, self.driver.clock):
             intake.jump_back_s, intake.jump_forward_s = settings.jump_back, settings.jump_forward
         if self.waits_for_clock:
-            return  # `start` opens the journal with the settings of that time
+            return  # `start` will open the journal with the settings that hold then
         if name in MODEL:
             self.driver.set_model(self.stamp_ns, model_changes(settings))
             self._front.changed()

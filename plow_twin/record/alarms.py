@@ -99,8 +99,8 @@ class AlarmCheck:
         self._recorded: deque[OutputRecord] = deque()
         #: whether every publication so far is present
         self.possible = possible
-        #: number of recorded messages that were compared
-        #: number of recorded messages that could not be compared
+        #: `compared`: number of recorded messages that were compared
+        #: `not_compared`: number of recorded messages that could not be compared
         self.compared = self.not_compared = 0
 
     def give_up(self) -> None:

@@ -38,7 +38,8 @@ _HEAD: Final = struct.Struct("<BQ")
 _HEAD_SIZE: Final = _HEAD.size
 #: Size of a record's head and of the channel number at the start of an index record [B].
 _INDEX_HEAD: Final = _HEAD.size + 2
-#: Largest ratio of the unpacked size of a file's chunks to the size of the file; chunks may have `RECORD_LIMIT` more.
+#: Largest ratio of the unpacked size of a file's chunks to the size of the file; the chunks may exceed this by
+#: `RECORD_LIMIT`.
 UNPACKED_RATIO: Final = 200
 #: Largest number of schemas and channels in a file.
 _MOST_DECLARED: Final = 10_000
@@ -389,7 +390,7 @@ def _metadata_by_heads(descriptor: int) -> list[tuple[str, dict[str, str]]]:
         if opcode == _METADATA and length <= RECORD_LIMIT:
             try:
                 record = Metadata.read(ReadDataStream(BytesIO(os.pread(descriptor, length, place))))
-            except Exception:  # damage
+            except Exception:  # the record is damaged
                 break
             found.append((record.name, dict(record.metadata)))
         place += length
@@ -404,7 +405,7 @@ class _Heads:
         self._table = np.empty((_AHEAD, 5), np.int64)
         self._rows: list[tuple[int, int, int, int, int]] = []
         self._next = 0
-        self._index = [0, 0]  # end of the newest record with its index, and its channel mask
+        self._index = [0, 0]  # end of the newest record together with its index, and the channel mask of this index
 
     def at(self, place: int) -> tuple[int, int]:
         """Return opcode and length of the record at a place; zeros at the end."""

@@ -23,7 +23,7 @@ from plow_twin.scene_file.csv_rows import csv_rows, delimiter_of, open_csv
 
 Array = NDArray[np.float64]
 
-#: Patterns of column names, without spaces and signs, by role and number.
+#: For each role and number, a pattern that fits the column's name without spaces and signs.
 _NAMES: Final = {
     ("excitation", "fx"): r"fx|(force|load|kraft|last)x|x(force|load|kraft)|fhor(izontal)?|horizontalforce",
     ("excitation", "fy"): r"fy|(force|load|kraft|last)y|y(force|load|kraft)|fver(tical)?|verticalforce",

@@ -198,7 +198,7 @@ _READERS: Final[dict[str, Callable[[Any], Any]]] = {
     "tuple[tuple[float, ...], ...]": _rows,
     "ParameterValue": _exactly(bool, int, float, str),
 }
-#: Name and reader of each field by kind.
+#: For each kind of entry, the name and the reader of each of its fields.
 _FIELDS: Final = {
     name: [(spec.name, _READERS[str(spec.type)]) for spec in fields(kind)] for name, kind in _KINDS.items()
 }

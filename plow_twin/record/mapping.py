@@ -32,7 +32,7 @@ from plow_twin.record.times import NO_TIME, NUMBER, STAMP_UNITS, TIMES, likely_u
 from plow_twin.scene_file.parquet_lines import SUFFIX
 
 Number = TypeVar("Number", float, NDArray[np.float64])
-#: Prefix of the reasons in the counts of messages that do not fit their role.
+#: Prefix of each reason why messages do not fit their role, in the counts of these messages.
 UNFIT: Final = "unfit, "
 _WRENCH: Final = {"fx": "wrench.force.x", "fy": "wrench.force.y", "m": "wrench.torque.z"}
 _POSE: Final = {"x": "pose.position.x", "y": "pose.position.y", "theta": "pose.orientation"}

@@ -270,7 +270,7 @@ class RunReader:
             try:
                 with part.open("rb") as stream:
                     summary = make_reader(stream).get_summary()
-            except Exception:  # cut off
+            except Exception:  # a part that was cut off has no summary
                 continue
             if summary is not None and summary.statistics is not None and summary.statistics.message_count:
                 first.append(summary.statistics.message_start_time)

@@ -243,7 +243,7 @@ class Recorder:
                 if self._journal_gap:
                     self._push_entry(now, Loss(self._journal_gap))
                     self._journal_gap = 0
-                if snapshot:  # notes of losses come before it, so that all messages after it can be compared
+                if snapshot:  # notes of losses come before the snapshot, so that all messages after it can be compared
                     self._push_notes(now)
                 self._push_entry(now, entry)
                 self._snapshot_due = self._snapshot_due and not snapshot

@@ -64,7 +64,7 @@ if TYPE_CHECKING:
 
 #: Topics that depend on the previous publication: after a lost message they cannot be compared until the next snapshot.
 _CUMULATIVE: Final = frozenset(topic.name for topic in TOPICS if topic.cumulative)
-#: Whether each topic of `PUBLICATION_TOPICS` is cumulative.
+#: For each topic of `PUBLICATION_TOPICS`, whether it depends on the previous publication.
 _IS_CUMULATIVE: Final = np.array([name in _CUMULATIVE for name in PUBLICATION_TOPICS])
 _SEQUENCE_MASK: Final = 0xFFFFFFFF
 

@@ -43,7 +43,7 @@ class RingWriter(RunWriter):
         sync_dumps: bool = False,
     ) -> None:
         self._ring_s, self._sync_dumps = ring_s, sync_dumps
-        self._kept: list[tuple[float, PartFacts, bytes]] = []  # start and content of each part
+        self._kept: list[tuple[float, PartFacts, bytes]] = []  # start [s], facts and content of each part
         self._begun = time.monotonic()
         super().__init__(folder, header, chunk_size, min_free_bytes)
         self.path = folder

@@ -180,7 +180,7 @@ class Decoder:
             try:
                 types = parsed_types(schema, message_type)
                 self._store.register({name: type_ for name, type_ in types.items() if name not in self._store.types})
-            except Exception:  # the schema is in another language, damaged or endless
+            except Exception:  # the schema is in another language, damaged or endless: its topic cannot be read
                 self._losses.unknown_types[topic] = message_type
         if message_type in self._store.types:
             return True
@@ -288,7 +288,8 @@ class SqliteSource:
         if kept:
             try:
                 connection.execute("SELECT 1 FROM sqlite_master")
-            except sqlite3.OperationalError:  # in a read-only folder the log cannot be opened
+            except sqlite3.OperationalError:
+                # in a read-only folder the database's log cannot be opened, so it is left unread
                 connection.close()
                 connection = sqlite3.connect(f"file:{place}?mode=ro&immutable=1", uri=True)
                 self._unread.add(path)

@@ -26,7 +26,7 @@ EPOCH_S: Final = 1e9
 START_NS: Final = 1_000_000_000
 #: Characters of plain decimal numbers.
 OF_NUMBERS: Final = b"0123456789+-.eE "
-#: Dates after this [ns] are placeholders: many databases write 9999-12-31 for no date.
+#: Dates after this [ns] are placeholders: many databases write 9999-12-31 where there is no date.
 _FARTHEST_NS: Final = 4_000_000_000_000_000_000
 
 

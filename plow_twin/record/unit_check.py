@@ -50,7 +50,7 @@ _FASTEST_M_S: Final = 5.0
 _FALLING, _REVERSED = 0.2, 0.9
 #: Length [s] of each unit other than the second that a time may have.
 _TIMES: Final = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-#: Spreadsheets count days since 1900; the dates of this century are between these numbers.
+#: Spreadsheets count days since 1900; dates of this century lie between these two day numbers.
 _SHEET_DAYS: Final = (36_525.0, 73_050.0)
 #: Smallest number of samples whose spacing can be judged.
 _FEW: Final = 20

@@ -251,7 +251,8 @@ class JournalWalk:
     def _speed(self, speed_m_s: float) -> None:
         for walker in self._all:
             walker.speed_m_s = speed_m_s
-            walker.apply(Travel(max(0, self._reached_ns), speed_m_s))  # acts at once
+            # the stamp is the time reached, so that the speed acts at once
+            walker.apply(Travel(max(0, self._reached_ns), speed_m_s))
 
     def _begin_anew(self) -> None:
         """Forget the time reached, so that any stamp may come next; waiting speeds act from now on."""

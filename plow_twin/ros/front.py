@@ -78,7 +78,7 @@ class RosFront:
         made.callback(lambda: self._lost.extend(runtime.close()))
         wanted = (settings.estimate, settings.estimate_forces, any(settings.forecast_limits))
         without = [topic for topic, one in zip(ESTIMATES, wanted, strict=True) if not (settings.estimate and one)]
-        # the node publishes its status whether it is configured or not
+        # `status` is left out, because the node publishes it whether it is configured or not
         if settings.follows != "full":
             without += FOLLOWED_TOPICS
         self._publishers = OutputPublishers(node, ["status", *without], runtime.publishing.memory)

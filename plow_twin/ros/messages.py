@@ -19,7 +19,8 @@ Read = tuple[int, tuple[float, ...], bool, bool]
 #: A message that cannot be read.
 UNREADABLE: Final[Read] = (0, (), False, False)
 
-#: Layouts in big endian and in little endian: stamp and length of the frame's name; force and torque.
+#: Layouts in big endian and in little endian. Each pair has a layout of the stamp and of the length of the frame's
+#: name, and a layout of force and torque.
 _WRENCH_LAYOUTS: Final = tuple((struct.Struct(f"{order}iII"), struct.Struct(f"{order}6d")) for order in "><")
 
 

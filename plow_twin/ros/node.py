@@ -248,7 +248,8 @@ class TwinNode(WithoutEvents, LifecycleNode):
             self._connections.look_for_subscribers(self.publishers)
             self._front.look_for_others()
         elif self.lifecycle == "unconfigured" and not self.reason:
-            # a manager that configures later, perhaps with another scene, need not wait for the compiler
+            # the solver is prepared now, so that a manager that configures later, perhaps with another scene, need not
+            # wait for the compiler
             self.prepare()
         runtime = self.runtime
         if runtime is not None and runtime.without_clock and self._reports % _SAY_AGAIN == 0:

@@ -79,7 +79,7 @@ class Alarm:
     #: cause of the latched level; None if no level is latched
     raised: Raised | None = None
     _since_ns: int | None = None
-    #: value below which the alarm has no level
+    #: smallest threshold; an alarm without a level has none as long as its value is below this
     lowest: float = field(init=False)
 
     def __post_init__(self) -> None:
@@ -120,7 +120,7 @@ class Alarm:
 
     def stays(self, values: NDArray[np.float64]) -> bool:
         """Return whether the level stays the same for all these values."""
-        if self.level or self.lowest == math.inf:  # an infinite value means that the alarm has no threshold
+        if self.level or self.lowest == math.inf:  # `lowest` is infinite if the alarm has no threshold
             return not self.level
         return float(values.max(initial=-math.inf)) < self.lowest
 

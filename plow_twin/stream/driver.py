@@ -38,7 +38,7 @@ from plow_twin.stream.session import Series, Session
 from plow_twin.stream.silences import Silences
 from plow_twin.stream.steps import Steps
 
-#: Stamp [ns] and wrench (Fx, Fy [N], M [N m]) of a sample that has arrived.
+#: Stamp [ns] and wrench (Fx, Fy [N], M [N m]) of an arrived sample.
 Arrival = tuple[int, tuple[float, float, float]]
 
 #: Largest model time that one call may catch up when the excitation is silent [ns], so that a call's work is bounded.

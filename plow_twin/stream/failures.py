@@ -18,8 +18,8 @@ class Failures:
 
     def __init__(self, emit: Callable[[Failed], object]) -> None:
         self._emit = emit
-        #: number of failed advances
-        #: number of stretches of failed advances
+        #: `count`: number of failed advances
+        #: `stretches`: number of stretches of failed advances
         self.count = self.stretches = 0
         #: reason of the newest failure; empty without a failure
         self.reason = ""

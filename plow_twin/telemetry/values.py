@@ -20,7 +20,7 @@ _LIFE: Final = (
     *(f"{name}/{point}" for name in ("seconds", "metres", "passes", "shifts") for point in ("p10", "p50", "p90")),
     "not_reached_in_horizon", "probability_before_stop",
 )  # fmt: skip
-#: Units of the groups of numbers.
+#: Unit of the numbers in each group.
 UNITS: Final = {"clearance": "m", "wear": "m", "peaks": "N"}
 
 

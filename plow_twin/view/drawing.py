@@ -123,8 +123,8 @@ class Drawing:
         self.pad_names = Batches(stream, axis, "exaggerated/pads/wear", rr.Points2D, ("positions", "labels"))
         self.events = Events(stream, axis)
         self.section_rows = 0
-        #: number of the newest advance
-        #: stamp of the newest advance [ns]
+        #: `step`: number of the newest advance
+        #: `stamp_ns`: stamp of the newest advance [ns]
         self.step, self.stamp_ns = -1, 0
         self._shown: int | None = None
         self._sample_ns: int | None = None

@@ -20,12 +20,13 @@ class Events:
     """Write the log; `count` is the number of its lines."""
 
     def __init__(self, stream: rr.RecordingStream, axis: TimeAxis) -> None:
-        #: number of lines, and number of failed advances
+        #: `count`: number of lines
+        #: `failed`: number of failed advances
         self.count = self.failed = 0
         self._lines = Batches(stream, axis, "events", rr.TextLog, ("text", "level"))
         self._makes_before: NDArray[np.float64] | None = None
         self._status: dict[str, tuple[int, str]] = {}
-        #: whether the load is held without samples
+        #: whether the load is held because no samples come
         self.silent = False
         self._speed_m_s: float | None = None
 

@@ -23,7 +23,7 @@ from plow_twin.view.envelope import Envelope
 
 Array = NDArray[np.float64]
 
-#: Columns of the clearances: horizontal and its 5 % and 95 % points, then vertical.
+#: Columns of the horizontal clearance and of its 5 % and 95 % points, then of the same for the vertical clearance.
 _CLEARANCE_COLUMNS: Final = np.array(
     [CLEARANCE_NAMES.index(f"{axis}{point}") for axis in ("horizontal", "vertical") for point in ("", "/p05", "/p95")]
 )
@@ -59,7 +59,7 @@ class RunCurves:
     load: Envelope = field(default_factory=lambda: Envelope(3))
     clearance: Envelope = field(default_factory=lambda: Envelope(len(_CLEARANCE_COLUMNS)))
     instant: Instant | None = None
-    #: largest peak of all pairs, also between the stamps [kN]; 0 without peaks
+    #: largest peak of all pairs, at the stamps and between them [kN]; 0 without peaks
     peak: float = 0.0
     held_s: list[tuple[float, float]] = field(default_factory=list)
     failed_s: list[tuple[float, float]] = field(default_factory=list)

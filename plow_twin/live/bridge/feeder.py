@@ -66,8 +66,9 @@ class Feeder:
         #: reason why the first unreadable load was refused; empty if every load could be read
         self.unfit = ""
         self._number = 0
-        #: count of messages without a number since the last message with one; each is assumed to have the next number
-        #: count of these assumptions that proved wrong, since the numbers of this sender began
+        #: `_assumed`: count of messages without a number since the last message with one; each is assumed to have the
+        #: next number
+        #: `_unnumbered`: count of these assumptions that proved wrong, since the numbers of this sender began
         self._assumed = self._unnumbered = 0
         #: number of the newest message if this number does not continue the earlier numbers
         self._odd: int | None = None

@@ -44,7 +44,7 @@ class _Tail:
     lines: Lines = field(default_factory=Lines)
     rows: Rows = field(default_factory=Rows)
     _file: Any = None
-    #: the last bytes that were read, which differ in a rewritten file
+    #: the last bytes that were read; a rewritten file has other bytes at their place
     _newest: bytes = b""
     #: number of lines that were never completed because the file was cut or replaced
     left: int = 0
@@ -197,7 +197,7 @@ class _Dated:
 def _changed_ns(path: Path) -> tuple[int, Any]:
     try:
         return path.stat().st_mtime_ns, _numbered(path)
-    except FileNotFoundError:  # the file has gone in the meantime
+    except FileNotFoundError:  # the file was removed after it had been found
         return 0, _numbered(path)
 
 
@@ -246,8 +246,8 @@ class Files(SourceState):
         self._merged: Iterator[Arrived] | None = None
         #: the messages of a single topic
         self._tables: Iterator[Messages] | None = None
-        #: total size of the files that are read once [B]
-        #: how much of this total has been read [B]
+        #: `_size`: total size of the files that are read once [B]
+        #: `_done`: how much of this total has been read [B]
         self._size = self._done = 0
 
     def topics(self) -> dict[str, TopicType]:

@@ -53,8 +53,8 @@ class Mqtt(SourceState):
         #: whether messages marked as retained are older than the subscription
         self._from_before = True
         self._queue: deque[tuple[str, bytes, int, bool]] = deque()
-        #: total size of the payloads that have entered the queue [B]; only the thread that adds them changes this
-        #: total size of the payloads that have left the queue [B]; only the thread that takes them changes this
+        #: `_came`: total size of the payloads that entered the queue [B]; only the thread that adds them changes it
+        #: `_left`: total size of the payloads that left the queue [B]; only the thread that takes them changes it
         self._came = self._left = 0
         self._arrived = threading.Event()
         self._answer = threading.Event()

@@ -92,7 +92,8 @@ class Conditions:
             before = condition.level, condition.acknowledged
             condition.level = str(values[f"{name}_level"] or "none")
             raised = values[f"{name}_time"]
-            if raised != condition.raised:  # None means that no alarm is latched
+            # the new time is None if no alarm is latched; then there is nothing to acknowledge
+            if raised != condition.raised:
                 condition.raised, condition.acknowledged = raised, raised is None
             if (condition.level, condition.acknowledged) != before:
                 await self._send(name, condition)

@@ -133,7 +133,7 @@ class Link:
         """Disconnect."""
         try:
             await asyncio.wait_for(self._client.disconnect(), _CLOSE_S)
-        except Exception:  # any error can occur, because the connection may be in any state
+        except Exception:  # the connection may be in any state, so any error can occur here
             self._client.disconnect_socket()
 
     def _placed(self, node: ua.NodeId, uris: Sequence[str]) -> ua.NodeId:
@@ -265,7 +265,7 @@ class Link:
     def _missing(self, number: int) -> range:
         """Return the sequence numbers that should have come before this one."""
         expected = self._next_number
-        if expected is not None and number == expected - 1:  # the newest message was repeated
+        if expected is not None and number == expected - 1:  # the server has sent the newest message again
             return range(0)
         self._next_number = number % _LAST_NUMBER + 1
         return range(0) if expected is None or number < expected else range(expected, number)
