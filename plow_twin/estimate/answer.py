@@ -109,7 +109,7 @@ def under_load(scene: Scene, result: Estimate, load: Load) -> Scene:
     If the window is too short for a period, the scene is returned unchanged.
     """
     gains = [1.0 if gain is None else gain.mean for gain in (result.gain_fx, result.gain_fy, result.gain_m)]
-    felt = load.thinned()
+    felt = load.thinned() if result.load_harmonics is None else result.load_harmonics.added(load.thinned())
     seen = replace(scene, loads=(Table("window", felt.t - felt.t[0], felt.wrench * gains),))
     try:
         period_of(seen)

@@ -26,6 +26,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from plow_twin.estimate import tuning
 from plow_twin.estimate.fit import DIFFERENCES, FEWEST_OF_SWING, WALLS, Fit, Point, Problem, freed, huber_weight
+from plow_twin.estimate.harmonics import Harmonics
 from plow_twin.estimate.measurements import FEWEST_FOR_SCATTER
 from plow_twin.estimate.pads import deviations
 from plow_twin.estimate.priors import ROUNDING, UNSTATED, deviation_of
@@ -75,6 +76,8 @@ class Graded:
         Factor by which the variance of x, y, theta exceeds the fit's noise.
     surprise : float
         Mean square of the differences in units of their prior deviations, at least 1.
+    harmonics : Harmonics, optional
+        The harmonics that were added to the load, if any.
     """
 
     shared: Array
@@ -83,6 +86,7 @@ class Graded:
     load: Array
     inflation: Array
     surprise: float
+    harmonics: Harmonics | None = None
 
 
 def graded(problem: Problem, found: Fit, doubtful: bool = False, seed: int = 0) -> Graded:
@@ -114,14 +118,15 @@ def graded(problem: Problem, found: Fit, doubtful: bool = False, seed: int = 0) 
         # if the machine differs, every quantity may differ
         mean, covariance = linear.free()
         surprise = max(surprise, linear.surprise(mean, np.ones(len(often))))
-    step = mean[:SIZE]
-    covariance = covariance[:SIZE, :SIZE] * max(1.0, linear.scatter()) * surprise
+    covariance = covariance * max(1.0, linear.scatter()) * surprise
+    harmonics = problem.harmonics and problem.harmonics.moved(mean[linear.waves], np.diag(covariance)[linear.waves])
+    step, covariance = mean[:SIZE], covariance[:SIZE, :SIZE]
     covariance += np.diag((tuning.BENT * step) ** 2)
     share, exponent, _ = named.get("contact.exponent", (0.0, 0.0, 0.0))
     bent = tuning.BENT_BY_EXPONENT * share * exponent**2
     unexplained = tuning.UNEXPLAINED * math.sqrt(float(linear.inflation.mean()) - 1.0)
     covariance[[GX, GY], [GX, GY]] += bent**2 + unexplained**2
-    return Graded(found.shared + step, covariance, named, linear.load, linear.inflation, surprise)
+    return Graded(found.shared + step, covariance, named, linear.load, linear.inflation, surprise, harmonics)
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,6 +177,10 @@ def _columns(problem: Problem, found: Fit) -> tuple[dict[str, _Column], Array]:
         else:
             out[name] = _Column(UNSTATED[name], columns[:, :, index])
     out |= {name: _Column(UNSTATED[name], np.nan_to_num(column)) for name, column in _of_sensor(problem, point)}
+    if problem.harmonics is not None:
+        columns, values = problem.by_harmonics(point, problem.harmonics), problem.harmonics.amplitude.ravel()
+        for index, name in enumerate(problem.harmonics.names):
+            out[name] = _Column(tuning.LACKING, columns[:, :, index], float(values[index]))
     size = np.ptp(problem.forward.load.wrench, axis=0) / 2.0
     pushes = [by(_PUSH_STEP, push=_PUSH_STEP * push) for push in np.diag(np.maximum(size, 1e-3 * size.max()))]
     return out, np.stack([np.zeros_like(point.rate) if push is None else push for push in pushes], axis=2)
@@ -218,7 +227,10 @@ class _Linearised:
     """
 
     def __init__(self, problem: Problem, found: Fit, columns: dict[str, _Column], pushes: Array) -> None:
-        self.names, every = list(columns), columns.values()
+        every, waves = columns.values(), 0 if problem.harmonics is None else problem.harmonics.amplitude.size
+        #: names of the quantities without the harmonics, which come last, and slice of these in the border
+        self.names = list(columns)[: len(columns) - waves]
+        self.waves = slice(SIZE + len(self.names), SIZE + len(columns))
         self._found, self._swing = found, found.point.swing
         further = np.stack([one.derivative for one in every], axis=2)
         self._precision = np.concatenate([problem.deviation, [one.deviation for one in every]]) ** -2.0
@@ -306,7 +318,7 @@ class _Linearised:
 
         The scene may be exact if it is exact in any draw. A quantity that the fit includes always differs.
         """
-        count, size = len(self.names), len(self._precision)
+        count, size = len(self._held), len(self._precision)
         differs, log_precision = self._held.copy(), np.log(self._precision)
 
         known: dict[bytes, float] = {}
@@ -360,7 +372,8 @@ class _Linearised:
 
         If it is above 1, the linearisation is inaccurate.
         """
-        z = (self._value + mean[SIZE:]) * np.sqrt(self._precision[SIZE:])
+        own = len(self.names)
+        z, often = ((self._value + mean[SIZE:]) * np.sqrt(self._precision[SIZE:]))[:own], often[:own]
         # the mean over the quantities is weighted by how often each quantity differs
         return max(1.0, float((z**2 / np.maximum(often, 0.1)).sum() / max(often.sum(), 1.0)))
 
@@ -369,7 +382,7 @@ class _Linearised:
         deviation = np.sqrt(1.0 / np.diag(self._normal)[SIZE:])
         return {
             name: (float(share), float(value / max(share, 1e-9)), float(spread))
-            for name, share, value, spread in zip(self.names, often, self._value + mean[SIZE:], deviation, strict=True)
+            for name, share, value, spread in zip(self.names, often, self._value + mean[SIZE:], deviation, strict=False)
         }
 
 

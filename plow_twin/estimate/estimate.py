@@ -17,6 +17,7 @@ from plow_twin.estimate.discrepancy import Graded, graded, variants
 from plow_twin.estimate.fit import Fit, Problem, freed
 from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.gaps import Gaps, GapsFit, fit_gaps
+from plow_twin.estimate.lacking import named, with_harmonics
 from plow_twin.estimate.measurements import FEWEST_POSES, Load, Poses, filled, useless_deviation
 from plow_twin.estimate.pads import by_group, of_differences, shown, with_differences
 from plow_twin.estimate.result import NORMAL_P95, Estimate, ForcesUsed, Interval, Motion, State
@@ -266,17 +267,20 @@ def _searched(
         return summarise_bounced(unknowns, poses, bounced, lost, spent + forward.work), ()
     if found is None:
         return under_uncertain_load(_without_fit(unknowns, poses, lost), unknowns, forward.load, poses, period), ()
-    verdict = judge(*found, period)
+    verdict, plain = judge(*found, period), found
     behind = behind_low_pass(*searched) if searched and _fails(found[1], verdict) and not verdict.broken else None
     if behind is not None:
         again = refine(forward.renewed(), unknowns, poses, period, behind.shared, behind.noise, drift, LOW_PASS)
         if again and again[1].loss < found[1].loss:
             found, verdict = again, judge(*again, period)
     found, verdict = _with_differences(found, verdict, period)
+    if bounced is None and _fails(found[1], verdict) and not verdict.sensor:
+        # a low pass, or a change of the machine, can imitate harmonics
+        found, verdict = _with_harmonics(plain, forward.load, period) or (found, verdict)
     result = summarise(*found, verdict, lost, forces if bounced is None else None)
     if bounced is None and _fails(found[1], verdict) and not verdict.broken:
         result = under_uncertain_load(result, unknowns, forward.load, poses, period, found)
-    following = () if verdict.model or verdict.sensor else _next_guess(*found)
+    following = () if verdict.model or verdict.sensor or verdict.lacking else _next_guess(*found)
     return result if bounced is None else with_bounced(result, bounced, spent), following
 
 
@@ -380,6 +384,18 @@ def _with_differences(
     if again and other and not _fails(again[1], other):
         return again, other
     return found, verdict
+
+
+def _with_harmonics(
+    found: tuple[Problem, Fit], felt: Load, period: float
+) -> tuple[tuple[Problem, Fit], Verdict] | None:
+    """Repeat a fit with harmonics that the measured load lacks; None if it then still fails a check."""
+    again = with_harmonics(*found, felt, period)
+    if again is None:
+        return None
+    verdict = judge(*again[:2], period)
+    verdict.lacking = named(again[2])
+    return None if _fails(again[1], verdict) else (again[:2], verdict)
 
 
 def _moved_back(result: Estimate, bias: Array) -> Estimate:
@@ -610,9 +626,9 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
         shared = unknowns.within(beside.shared)
         covariance = beside.covariance
         covariance[[GX, GY], [GX, GY]] += _between_optima(unknowns, shared) ** 2
-    rough = beside is not None and (suspect or not finished)
+    rough = beside is not None and (suspect or not finished or bool(verdict.lacking))
     deviation = np.sqrt(np.diag(covariance))
-    reasons = verdict.model + verdict.sensor
+    reasons = verdict.model + verdict.sensor + ([verdict.lacking] if verdict.lacking else [])
     if not finished and not suspect:
         gain = f"the cost would still fall by {fit.gain_left:.0f}, expected at most {tuning.OUTLYING**2:g}"
         reasons = [f"the fit has not reached an optimum: {gain}"]
@@ -651,10 +667,11 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
         vertical_state=states[1],
         **_numbers(unknowns, normal),
         noise=(float(fit.noise[0]), float(fit.noise[1]), float(fit.noise[2])),
-        model="suspect" if verdict.model else "ok",
+        model="suspect" if verdict.model or verdict.lacking else "ok",
         sensor="suspect" if verdict.sensor else "ok",
         reasons=tuple(reasons),
         lost=lost,
+        load_harmonics=None if beside is None else beside.harmonics,
         groups=_groups(
             problem, fit, float(np.sqrt(alone[GX, GX] / plain[GX, GX])), states, untested, shared, covariance - alone
         ),

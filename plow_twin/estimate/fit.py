@@ -14,7 +14,7 @@ Optimization, ch. 10; Huber, Robust Statistics, ch. 7; Tremolet, Q. J. R. Meteor
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain, pairwise
 from typing import Final
 
@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 from plow_twin.estimate import tuning
 from plow_twin.estimate.arrow import OWN, Arrow, Factor
 from plow_twin.estimate.forward import Forward
-from plow_twin.estimate.measurements import RESOLVING, Poses
+from plow_twin.estimate.harmonics import Harmonics
+from plow_twin.estimate.measurements import RESOLVING, Load, Poses
 from plow_twin.estimate.sensor import Memory, moved_by_lever
 from plow_twin.estimate.unknowns import BIAS, DAMPING, DELAY, GAIN, MOVING, OF_SCENE, PROBES, QUANTITIES, SIZE, Unknowns
 from plow_twin.kernel.low_pass import lagged
@@ -49,6 +50,8 @@ TURNS, LEVER, LAG = slice(0, 4), slice(4, 6), 6
 DIFFERENCES: Final = ("turn_left", "turn_right", "turn_top", "turn_bottom", "lever_x", "lever_y", "filter")
 #: Step: for the difference quotients with respect to these differences.
 DIFFERENCE_STEPS: Final = np.array([2e-4, 2e-4, 2e-4, 2e-4, 1e-3, 1e-3, 4e-6])
+#: Step: for the difference quotients with respect to the amplitude of a harmonic, in units of half the load's range.
+_HARMONIC_STEP = 5e-3
 #: Derived: smallest number of rows of a swing. Two rows of three numbers only determine the six numbers of the swing's
 #: start.
 FEWEST_OF_SWING = 4
@@ -224,26 +227,28 @@ class Problem:
 
     `horizon` is the longest simulated part of a swing in s; `differences`, shape (7,), are in the order of
     `DIFFERENCES`. `drift`, shape (3,), is the spectral density of an unknown acceleration in m2/s3 and rad2/s3; it
-    links the swings.
+    links the swings. `harmonics` are those that were added to the measured load.
     """
 
     def __init__(
         self, forward: Forward, unknowns: Unknowns, window: Window, prior: tuple[Array, Array] | None = None,
         horizon: float = np.inf, differences: Array | None = None, drift: Array | None = None,
+        harmonics: Harmonics | None = None,
     ) -> None:  # fmt: skip
         self.forward, self.unknowns, self.window, self.horizon = forward, unknowns, window, horizon
         self.mean, self.deviation = prior or (unknowns.nominal(), unknowns.deviations())
         self.differences = np.zeros(len(DIFFERENCES)) if differences is None else differences
-        self.drift = drift
+        self.drift, self.harmonics = drift, harmonics
         self.link = np.zeros((0, 6, 6)) if drift is None else link_weights(np.diff(window.starts)[:-1], drift)
         self._memory: Memory | None = None
         self._columns: tuple[Point | None, Array] = None, np.zeros(0)
+        self._waves: tuple[Point | None, Array] = None, np.zeros(0)
         self._scene: tuple[bytes, Scene] = b"", unknowns.scene
         self._at: _Rows | None = None
 
     def evaluate(
         self, shared: Array, states: Array, differences: Array | None = None, push: Array | None = None,
-        share: Array | None = None, change: Callable[[Scene], Scene] | None = None,
+        share: Array | None = None, change: Callable[[Scene], Scene] | None = None, load: Load | None = None,
     ) -> Point | None:  # fmt: skip
         """Run the model; None where it leaves the model's range.
 
@@ -257,13 +262,15 @@ class Problem:
             As in `Forward.run`.
         change : callable, optional
             Function that returns a changed scene, perhaps with other compiled terms.
+        load : Load, optional
+            Load to use instead of the forward model's.
         """
-        found = self._evaluate(shared, states[None], differences, push, share, change)
+        found = self._evaluate(shared, states[None], differences, push, share, change, load)
         return None if found is None else found[0]
 
     def _evaluate(
         self, shared: Array, several: Array, differences: Array | None = None, push: Array | None = None,
-        share: Array | None = None, change: Callable[[Scene], Scene] | None = None,
+        share: Array | None = None, change: Callable[[Scene], Scene] | None = None, load: Load | None = None,
     ) -> list[Point] | None:  # fmt: skip
         """Run the model in one call from `several` sets of starting states, shape (k, s, 6); None as in `evaluate`."""
         window, differences = self.window, self.differences if differences is None else differences
@@ -271,6 +278,8 @@ class Problem:
         scene, forward = self._scene_of(shared), self.forward
         if change is not None:
             scene, forward = change(scene), forward.of(change(self.unknowns.scene))
+        if load is not None:
+            forward = forward.under(load)
         count, size = len(several), len(rows.asked)
         edges = (size * np.arange(count)[:, None] + rows.edges[:-1]).ravel()
         motions = forward.run(
@@ -380,6 +389,24 @@ class Problem:
                     out[:, :, index] = np.nan_to_num((other.predicted - point.predicted) / step)
             self._columns = point, out
         return self._columns[1]
+
+    def by_harmonics(self, point: Point, harmonics: Harmonics) -> Array:
+        """Return the derivatives of the prediction with respect to the amplitudes of harmonics, shape (n, 3, 3 k).
+
+        They are zero if the model cannot be run.
+        """
+        if self._waves[0] is not point:
+            load, size = harmonics.moved(-harmonics.amplitude).added(self.forward.load), harmonics.amplitude.size
+            out = np.zeros((*point.residual.shape, size))
+            here = self.evaluate(point.shared, point.states, load=load)
+            for index, one in enumerate(np.eye(size).reshape(size, *harmonics.amplitude.shape)):
+                wave = replace(harmonics, amplitude=_HARMONIC_STEP * one).at(load.t)
+                moved = replace(load, wrench=load.wrench + wave)
+                other = self.evaluate(point.shared, point.states, load=moved)
+                if here is not None and other is not None:
+                    out[:, :, index] = np.nan_to_num((other.predicted - here.predicted) / _HARMONIC_STEP)
+            self._waves = point, out
+        return self._waves[1]
 
     def _quotient(self, point: Point, index: int) -> tuple[Array, Array]:
         step = QUANTITIES[index].step
@@ -507,11 +534,19 @@ def freed(swings: int, unknowns: int) -> float:
 
 
 def joint_step(problem: Problem, found: Fit, columns: Array, precision: Array, pull: Array) -> tuple[Array, Array]:
-    """Return the linearised step of the shared and the further unknowns together, and its covariance.
+    """Return the step of `whole_step` without the starting states, and its covariance."""
+    step, covariance, _ = whole_step(problem, found, columns, precision, pull)
+    return step, covariance
+
+
+def whole_step(
+    problem: Problem, found: Fit, columns: Array, precision: Array, pull: Array
+) -> tuple[Array, Array, Array]:
+    """Return the linearised step of the shared and the further unknowns together, its covariance, and the states' step.
 
     `columns`, shape (n, 3, k), are the derivatives of the prediction with respect to the further unknowns. `precision`
     and `pull`, shape (k,), are the prior's terms in their normal equations. The starting state of each swing is
-    eliminated.
+    eliminated; its step, shape (s, 6), is 0 in swings with few poses.
     """
     size = SIZE + len(precision)
     normal = np.diag(np.concatenate([1.0 / problem.deviation**2, precision]))
@@ -519,6 +554,7 @@ def joint_step(problem: Problem, found: Fit, columns: Array, precision: Array, p
     z = np.abs(np.nan_to_num(found.point.residual)) / np.sqrt(found.variance)
     weight = np.isfinite(found.point.residual) * huber_weight(z) / found.variance
     residual = np.nan_to_num(found.point.residual)
+    alone, gains = np.zeros((problem.window.swings, OWN)), np.zeros((problem.window.swings, size, OWN))
     for swing in range(problem.window.swings):
         inside = found.point.swing == swing
         if inside.sum() < FEWEST_OF_SWING:
@@ -533,8 +569,10 @@ def joint_step(problem: Problem, found: Fit, columns: Array, precision: Array, p
         left = (weights * residual[inside].reshape(-1, 1)).ravel()
         normal += (weights * shared).T @ shared - gain @ cross.T
         gradient += shared.T @ left - gain @ (own.T @ left)
+        alone[swing], gains[swing] = np.linalg.solve(held, own.T @ left), gain
     covariance: Array = np.linalg.inv(normal)
-    return covariance @ gradient, covariance
+    step = covariance @ gradient
+    return step, covariance, alone - step @ gains
 
 
 def _descend(

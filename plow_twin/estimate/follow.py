@@ -67,6 +67,8 @@ _UNMOVED: Final = np.zeros(6)
 _NO_LOAD: Final = Load(np.array([0.0, 1.0]), np.zeros((2, 3)))
 _NO_POSES: Final = Poses(np.zeros(0), np.zeros((0, 3)))
 _LENGTH: Final = struct.Struct("<q")
+#: Definition: key of the harmonics of the load in an estimate.
+_HARMONICS: Final = "load_harmonics"
 
 
 @dataclass(frozen=True, eq=False)
@@ -455,14 +457,16 @@ class Follower:
         """
         self._add(max(t, known), [t, *np.asarray(q, dtype=np.float64).tolist()])
 
-    def add_estimate(self, text: str, t: float) -> None:
+    def add_estimate(self, text: str, t: float, start: float = 0.0) -> None:
         """Add an estimate that is known from time `t` in s on, as JSON of `Estimate.as_dict`.
+
+        Its window begins at the time `start` in s.
 
         An estimate with both clearances is followed. One clearance is enough while no estimate is followed. Of two
         estimates of nearly the same motion, the first is followed if the second has more rough clearances. After a
         withdrawn estimate the twin follows the prior again.
         """
-        self._add(t, text)
+        self._add(t, _with_harmonics(text, start))
 
     def _add(self, t: float, measured: list[float] | str) -> None:
         self.added += 1
@@ -502,7 +506,8 @@ class Follower:
         return self._text
 
     def follow_estimate(self, known: str) -> None:
-        """Follow the estimate in another follower's `known`."""
+        """Follow the estimate in another follower's `known`; its time may have another origin, so no phase is known."""
+        known = _with_harmonics(known, None)
         if known != self._text:
             self.catch_up()
             self._begin_anew(known)
@@ -585,6 +590,18 @@ class Follower:
 def follower(scene: Scene, follow: str, members: int, tol: float) -> Follower:
     """Return a twin of a scene; `follow` is `full`, with `members` twins, or `parameters`, without poses."""
     return Follower(scene, members) if follow == "full" else Follower(scene, 1, tol=tol)
+
+
+def _with_harmonics(text: str, start: float | None) -> str:
+    """Return an estimate (JSON) whose harmonics of the load count from the time `start` in s; None leaves them out."""
+    if _HARMONICS not in text:
+        return text
+    found = json.loads(text)
+    if start is None:
+        del found[_HARMONICS]
+    else:
+        found[_HARMONICS]["begin_s"] = start
+    return json.dumps(found)
 
 
 def _load_share(text: str) -> Array:

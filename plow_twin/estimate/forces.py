@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from plow_twin.errors import PlowTwinError
 from plow_twin.estimate import tuning
+from plow_twin.estimate.harmonics import Harmonics
 from plow_twin.estimate.measurements import Load
 from plow_twin.estimate.result import NORMAL_P95, Estimate, Interval, State
 from plow_twin.estimate.unknowns import CORRELATED, DAMPING, GAIN, SOFTNESS, contact_with
@@ -106,7 +107,9 @@ class ForceEnsemble:
             raise ForcesError(f"estimate: got a withdrawn estimate ({'; '.join(found.reasons)}), expected a valid one")
         if members < FEWEST:
             raise ForcesError(f"members: got {members}, expected at least {FEWEST}")
-        scenes, self._gain = draw_scenes(scene, found, members, np.random.default_rng(seed))
+        rng = np.random.default_rng(seed)
+        scenes, self._gain = draw_scenes(scene, found, members, rng)
+        self._lacking = found.load_harmonics, amplitudes_of(found, members, rng)
         self._twins = TwinBatch(scenes, tol=tuning.TOLERANCE, start=start)
         self._good = np.ones(members, dtype=bool)
 
@@ -127,7 +130,7 @@ class ForceEnsemble:
         peak, impulse = np.zeros((len(self), PAIR_COUNT)), np.zeros((len(self), PAIR_COUNT))
         for first in range(0, len(t), _CALL):
             part = slice(first, first + _CALL)
-            batch = self._twins.advance_samples(t[part], wrench[part] * self._gain[:, None, :])
+            batch = self._twins.advance_samples(t[part], loads_of(t[part], wrench[part], self._gain, *self._lacking))
             self._good &= (batch.status == 0).all(axis=1)
             if self._good.sum() < FEWEST:
                 raise ForcesError(
@@ -202,6 +205,20 @@ def draw_biases(found: Estimate, members: int, rng: np.random.Generator) -> Arra
             drawn[:, index] = value.mean
             drawn[1:, index] = _normal(value, rng.standard_normal(members - 1))
     return drawn
+
+
+def amplitudes_of(found: Estimate, members: int, rng: np.random.Generator) -> Array:
+    """Return amplitudes of the load's harmonics drawn from an estimate, shape (m, k, 3), and without error first."""
+    harmonics = found.load_harmonics
+    return np.zeros((members, 0, 3)) if harmonics is None else harmonics.drawn(members, rng)
+
+
+def loads_of(t: Array, wrench: Array, gain: Array, harmonics: Harmonics | None, amplitude: Array) -> Array:
+    """Return the loads of members, (m, n, 3), from samples (n,), (n, 3), gains (m, 3) and amplitudes (m, k, 3)."""
+    if harmonics is not None:
+        wrench = wrench + harmonics.basis(t) @ amplitude
+    found: Array = wrench * gain[:, None, :]
+    return found
 
 
 def _normal(value: Interval, white: Array) -> Array:

@@ -82,6 +82,10 @@ class Forward:
         """Return a model of another nominal scene under the same load, with a work of zero."""
         return Forward(scene, self.load)
 
+    def under(self, load: Load) -> Forward:
+        """Return a model of the same nominal scene under another load, with a work of zero."""
+        return Forward(self._scene, load)
+
     def run(
         self, scene: Scene, gain: Array, starts: Array, states: Array, edges: NDArray[np.int64], times: Array,
         depth: Array | None = None, push: Array | None = None, share: Array | None = None,

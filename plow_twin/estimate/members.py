@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.estimate import tuning
-from plow_twin.estimate.forces import FEWEST, draw_biases, draw_scenes, quantiles
+from plow_twin.estimate.forces import FEWEST, amplitudes_of, draw_biases, draw_scenes, loads_of, quantiles
 from plow_twin.estimate.learned import Learner, biases_of, numbers_of, with_numbers
 from plow_twin.estimate.result import Estimate, Interval, State
 from plow_twin.estimate.unknowns import QUANTITIES
@@ -96,6 +96,10 @@ class Ensemble:
         learns = learns and self._steers_first and members > 1
         self._learner = Learner.of(self._numbers.copy(), start) if learns else None
         self._turn, self._waiting = 0, 0.0
+        #: `_harmonics`: harmonics that the measured load lacks
+        #: `_amplitude`: their amplitudes for each member, (m, k, 3), in N, N, N m
+        self._harmonics = known.load_harmonics
+        self._amplitude = amplitudes_of(known, members, rng)
         #: `_load_off`: error of each member's load in N and N m
         #: `_drifted`: time in s up to which these errors have drifted
         self._load_off, self._drifted = np.zeros((members, 3)), start
@@ -140,9 +144,15 @@ class Ensemble:
         if self.others is not None:
             self.others.set_travel_speed(speeds[1:])
 
+    def _loads(self, t: Array, wrench: Array, which: slice) -> Array:
+        """Return the loads of some members, (m, n, 3), at the times and values of samples, (n,) and (n, 3)."""
+        loads = loads_of(t, wrench, self._gain[which], self._harmonics, self._amplitude[which])
+        found: Array = loads + self._load_off[which, None, :]
+        return found
+
     def advance_first(self, t: Array, wrench: Array, rows: Rows) -> int:
         """Advance the first member and write its rows, shape (n,); return how many advances failed."""
-        failed, _ = self.first.advance_rows(t, wrench * self._gain[0] + self._load_off[0], rows)
+        failed, _ = self.first.advance_rows(t, self._loads(t, wrench, slice(1))[0], rows)
         rows["followed"] = FOLLOWED
         return failed
 
@@ -155,8 +165,7 @@ class Ensemble:
         """
         parts = [_bytes(rows[None])]
         if self.others is not None:
-            loads = wrench * self._gain[1:, None, :] + self._load_off[1:, None, :]
-            parts.append(_bytes(self.others.advance_samples(t, loads).rows))
+            parts.append(_bytes(self.others.advance_samples(t, self._loads(t, wrench, slice(1, None))).rows))
         whole = np.concatenate(parts).view(ROW)
         good = whole["status"] == 0
         if len(self.good) == 1:
@@ -258,7 +267,7 @@ class Ensemble:
             from_[1:2] = 0
         share = self._shares(before._room()[from_])
         self._load_off = before._load_off[from_]
-        loads = wrench * self._gain + self._load_off
+        loads = self._loads(np.array([self.first.time]), wrench[None], _ALL)[:, 0]
         self.first.advance(self.first.time, loads[0])
         if self.others is not None:
             self.others.set_wrench(loads[1:])

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from plow_twin.estimate.harmonics import Harmonics
 from plow_twin.estimate.unknowns import CORRELATED, QUANTITIES
 
 Array = NDArray[np.float64]
@@ -203,6 +204,8 @@ class Estimate:
     apparent : tuple of (Interval, Interval), optional
         Clearances in m with which a machine that has exactly the scene's frame would move like the measured machine.
         They are given if they are known better than the true clearances; twins are then drawn from them.
+    load_harmonics : Harmonics, optional
+        Harmonics that the measured load lacks, if the motion shows them; their times are those of the window.
     motion : Motion, optional
         The fitted motion; None if the motion is not known moment by moment. It is not part of `as_dict`.
     """
@@ -233,6 +236,7 @@ class Estimate:
     forces_measured: ForcesUsed | None = None
     differs: dict[str, tuple[float, float, float]] = field(default_factory=dict)
     apparent: tuple[Interval, Interval] | None = None
+    load_harmonics: Harmonics | None = None
     motion: Motion | None = field(default=None, compare=False, repr=False)
 
     @classmethod
@@ -249,9 +253,11 @@ class Estimate:
             for quantity in QUANTITIES
             if quantity.name in data and quantity.name not in ("horizontal", "vertical")
         }
-        correlation, apparent = data["correlation"], data.get("apparent")
+        correlation, apparent, harmonics = data["correlation"], data.get("apparent"), data.get("load_harmonics")
         if apparent is not None:
             others["apparent"] = tuple(Interval(**apparent[name]) for name in ("horizontal", "vertical"))
+        if harmonics is not None:
+            others["load_harmonics"] = Harmonics.from_dict(harmonics)
         return cls(
             data["t_start"], data["t_end"], horizontal, vertical, horizontal_state, vertical_state,
             noise=None if data["noise"] is None else tuple(data["noise"]), model=data["model"], sensor=data["sensor"],
@@ -310,5 +316,6 @@ class Estimate:
                 if self.apparent is None
                 else {"apparent": dict(zip(("horizontal", "vertical"), map(asdict, self.apparent), strict=True))}
             ),
+            **({} if self.load_harmonics is None else {"load_harmonics": self.load_harmonics.as_dict()}),
             **({} if self.forces_measured is None else {"forces_measured": self.forces_measured.as_dict()}),
         }

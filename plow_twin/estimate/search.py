@@ -113,7 +113,9 @@ def refine(
     shortest = max(shortest * period, rows[1], float(poses.t[-1] - poses.t[0]) / _MOST_SWINGS)
     horizon = max(horizon * period, rows[0])
     window = cut(unknowns.scene, poses, period, shortest)
-    near = Problem(forward, unknowns, window, horizon=min(max(0.2 * period, rows[0]), horizon), differences=differences)
+    near = Problem(
+        forward, unknowns, window, horizon=min(near_horizon(poses, period), horizon), differences=differences
+    )
     starts = [shared]
     if unknowns.is_hard(shared):  # only for hard contacts is this second start useful
         starts.append(range_of_hard(unknowns, poses, shared))
@@ -128,6 +130,11 @@ def refine(
     states = better_states(whole, found.shared, found.point.states)
     found = fit(whole, found.shared, states, found.noise, 20 if not hard and drift is None else 12)
     return None if found is None else (whole, found)
+
+
+def near_horizon(poses: Poses, period: float) -> float:
+    """Return the horizon in s of a fit to the beginnings of swings."""
+    return max(0.2 * period, _FEWEST_ROWS[0] * poses.interval())
 
 
 def range_of_hard(unknowns: Unknowns, poses: Poses, shared: Array) -> Array:

@@ -154,6 +154,7 @@ class Units:
             if found.forces_measured is None
             else found.forces_measured.in_units(self.force, self.time),
             reasons=found.reasons + scale if found.reasons else (),
+            load_harmonics=found.load_harmonics and found.load_harmonics.in_units(self.force, length, time),
             apparent=None
             if found.apparent is None
             else (found.apparent[0].times(length), found.apparent[1].times(length)),

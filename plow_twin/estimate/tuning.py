@@ -334,6 +334,23 @@ UNEXPLAINED: Annotated[
     ),
 ] = 1e-4
 TURN: Annotated[float, Tuned("m", "prior deviation of the turn of a wall in a fit")] = 4e-3
+MULTIPLES: Annotated[
+    tuple[int, ...],
+    Tuned(
+        "1",
+        "multiples of a load's frequency at which the measured load may lack a harmonic",
+        "`shape` 72000, 74000, 74001, `harmonic_1`, `harmonic_5`, `constant_1` 99001: all 12 intervals hold, RMSE "
+        "0.06 mm; with 2 and 3 alone two do not; with 1 too 0.08 mm",
+    ),
+] = (2, 3, 4, 5)
+LACKING: Annotated[
+    float,
+    Tuned(
+        "half range",
+        "prior deviation of the amplitude of a harmonic that a load lacks",
+        "harmonics of 1 to 15 % are fitted",
+    ),
+] = 0.1
 SETTLED: Annotated[
     float,
     Tuned(

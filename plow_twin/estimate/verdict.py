@@ -37,6 +37,7 @@ class Verdict:
     figures : statistics of the tests
     by_scale : whether the scales are the sensor's only fault
     broken : whether the sensor fails or the data contradict themselves, so that no estimate is possible
+    lacking : the clearest harmonic that the measured load lacks and the fit includes
     """
 
     model: list[str] = field(default_factory=list)
@@ -44,6 +45,7 @@ class Verdict:
     figures: dict[str, float] = field(default_factory=dict)
     by_scale: bool = False
     broken: bool = False
+    lacking: str = ""
 
 
 def judge(problem: Problem, fit: Fit, period: float) -> Verdict:

@@ -70,8 +70,8 @@ class Following(Driven, Protocol):
         The pose has an effect from model time `known` in s on.
         """
 
-    def add_estimate(self, text: str, t: float) -> None:
-        """Add an estimate (JSON) that has an effect from model time `t` in s on."""
+    def add_estimate(self, text: str, t: float, start: float = ...) -> None:
+        """Add an estimate (JSON) that has an effect from model time `t` in s on; its window begins at `start` in s."""
 
     @property
     def known(self) -> str:

@@ -542,7 +542,7 @@ class Session:
             return
         time = (stamp_ns - self.origin_ns) * 1e-9
         if isinstance(entry, Estimated):
-            self.following.add_estimate(entry.result, time)
+            self.following.add_estimate(entry.result, time, (entry.start_ns - self.origin_ns) * 1e-9)
         else:
             self.following.add_pose(time, entry.pose if isinstance(entry, Pose) else whole_pose(entry), known)
         measured, earliest_ns, reached_ns = self._measured, self.history.earliest_ns, self.stamp_ns or 0

@@ -1,0 +1,140 @@
+"""Harmonics that a measured load lacks: Fourier terms at low multiples of its own frequency.
+
+A working load is periodic, so what its measurement lacks is mostly periodic too, with the same period.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.estimate import tuning
+from plow_twin.estimate.measurements import Load
+
+Array = NDArray[np.float64]
+
+#: Definition: names of the components of a load.
+COMPONENTS: Final = ("fx", "fy", "m")
+#: Bound: number of corrections of a load's frequency; each correction leaves the square of the error.
+_CORRECTIONS = 6
+#: Derived: knots in the shortest period of a harmonic, between which straight lines are 0.9 % off.
+_KNOTS = 24
+
+
+@dataclass(frozen=True, eq=False)
+class Harmonics:
+    """Fourier terms of a load, in the order constant, sine and cosine of each multiple.
+
+    omega : angular frequency of the load in rad/s
+    multiples : multiples of this frequency
+    size : (3,) unit of the amplitudes in N, N, N m; in a fit half the range of the measured load
+    amplitude, variance : (k, 3) of each term, in units of `size` and of its square
+    begin : time in s from which the phases count
+    """
+
+    omega: float
+    multiples: tuple[int, ...]
+    size: Array
+    amplitude: Array
+    variance: Array
+    begin: float = 0.0
+
+    @staticmethod
+    def of(load: Load) -> Harmonics | None:
+        """Return harmonics without amplitude of a load's frequency; None for a load without two periods."""
+        omega = frequency(load)
+        if omega is None:
+            return None
+        size, none = np.ptp(load.wrench, axis=0) / 2.0, np.zeros((1 + 2 * len(tuning.MULTIPLES), 3))
+        return Harmonics(omega, tuning.MULTIPLES, np.maximum(size, 1e-3 * size.max()), none, none)
+
+    @staticmethod
+    def from_dict(data: Mapping[str, Any]) -> Harmonics:
+        """Return the harmonics that `as_dict` returned."""
+        mean, deviation = np.array(data["mean"]), np.array(data["deviation"])
+        return Harmonics(
+            data["omega_rad_s"], tuple(data["multiples"]), np.ones(3), mean, deviation**2, data.get("begin_s", 0.0)
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the harmonics for JSON, in N, N, N m."""
+        return {
+            "omega_rad_s": self.omega,
+            "multiples": list(self.multiples),
+            "mean": (self.amplitude * self.size).tolist(),
+            "deviation": (np.sqrt(self.variance) * self.size).tolist(),
+        }
+
+    def in_units(self, force: float, length: float, time: float) -> Harmonics:
+        """Return the harmonics converted from these units of force, length and time to SI."""
+        size = self.size * [force, force, force * length]
+        return replace(self, omega=self.omega / time, size=size, begin=self.begin * time)
+
+    def basis(self, t: Array) -> Array:
+        """Return each term at the times `t`, shape (n, k)."""
+        turns = self.omega * np.outer(t - self.begin, self.multiples)
+        waves = np.stack([np.sin(turns), np.cos(turns)], axis=2).reshape(len(t), -1)
+        return np.concatenate([np.ones((len(t), 1)), waves], axis=1)
+
+    def at(self, t: Array) -> Array:
+        """Return the sum of the terms at the times `t`, shape (n, 3), in N, N, N m."""
+        found: Array = self.basis(t) @ self.amplitude * self.size
+        return found
+
+    def added(self, load: Load) -> Load:
+        """Return a load with these harmonics added, and with knots that resolve them."""
+        step = 2.0 * math.pi / (self.omega * max(self.multiples) * _KNOTS)
+        t = np.union1d(load.t, np.arange(load.t[0], load.t[-1], step))
+        wrench = np.stack([np.interp(t, load.t, column) for column in load.wrench.T], axis=1)
+        return replace(load, t=t, wrench=wrench + self.at(t))
+
+    def moved(self, by: Array, variance: Array | None = None) -> Harmonics:
+        """Return harmonics with the amplitudes changed by `by`, and with other variances, (3 k,) each."""
+        shape = self.amplitude.shape
+        known = self.variance if variance is None else variance.reshape(shape)
+        return replace(self, amplitude=self.amplitude + by.reshape(shape), variance=known)
+
+    def drawn(self, members: int, rng: np.random.Generator) -> Array:
+        """Return amplitudes in N, N, N m, shape (members, k, 3), those of the first member without error."""
+        white = rng.standard_normal((members, *self.amplitude.shape))
+        white[0] = 0.0
+        found: Array = (self.amplitude + np.sqrt(self.variance) * white) * self.size
+        return found
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the amplitudes in the order of `amplitude.ravel()`."""
+        terms = ["constant", *(f"{wave}_{multiple}" for multiple in self.multiples for wave in ("sin", "cos"))]
+        return [f"load_{component}_{term}" for term in terms for component in COMPONENTS]
+
+
+def frequency(load: Load) -> float | None:
+    """Return the angular frequency in rad/s of the strongest oscillation of a load; None without two periods of it.
+
+    The change of its phase from the first to the second half corrects the frequency.
+    """
+    period, span = load.oscillation(), float(load.t[-1] - load.t[0])
+    if period is None:
+        return None
+    omega = 2.0 * math.pi / period
+    t = np.linspace(load.t[0], load.t[-1], 2 * len(load.t))
+    wrench = np.stack([np.interp(t, load.t, column) for column in load.wrench.T], axis=1)
+    wrench = wrench / np.maximum(wrench.std(axis=0), 1e-12 * np.abs(wrench).max())
+    halves = slice(len(t) // 2), slice(len(t) // 2, None)
+    for _ in range(_CORRECTIONS):
+        first, second = (_phasor(omega, t[half], wrench[half]) for half in halves)
+        omega += float(np.angle((second * first.conj()).sum())) / (0.5 * span)
+    return omega if span * omega >= 4.0 * math.pi else None
+
+
+def _phasor(omega: float, t: Array, wrench: Array) -> NDArray[np.complex128]:
+    """Return the complex amplitude of exp(i omega t) in each component, shape (3,)."""
+    turns = omega * t
+    basis = np.stack([np.cos(turns), np.sin(turns), np.ones(len(t))], axis=1)
+    found = np.linalg.lstsq(basis, wrench, rcond=None)[0]
+    return np.asarray(found[0] - 1j * found[1])

@@ -1,0 +1,88 @@
+"""Fits with harmonics that the measured load lacks.
+
+A linearised step of all unknowns, amplitudes included, alternates with a short fit of all unknowns but the amplitudes,
+first for the beginnings of the swings, which have few false optima, then for whole swings.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.estimate import tuning
+from plow_twin.estimate.fit import Fit, Problem, fit, whole_step
+from plow_twin.estimate.harmonics import COMPONENTS, Harmonics
+from plow_twin.estimate.measurements import Load
+from plow_twin.estimate.search import better_states, near_horizon, refine
+from plow_twin.estimate.unknowns import SIZE
+
+Array = NDArray[np.float64]
+
+#: Bound: number of fits with harmonics, iterations of each fit, and fits in a row that are no better than all before.
+_ROUNDS, _ITERATIONS, _IN_VAIN = 12, 6, 4
+
+
+def with_harmonics(problem: Problem, found: Fit, felt: Load, period: float) -> tuple[Problem, Fit, Harmonics] | None:
+    """Repeat a fit with harmonics of the measured load `felt`.
+
+    Returns None if the load is not periodic, swings are linked, or the model cannot be run.
+    """
+    harmonics, poses = Harmonics.of(felt), problem.window.poses
+    if harmonics is None or len(problem.link):
+        return None
+    near = Problem(problem.forward, problem.unknowns, problem.window, horizon=near_horizon(poses, period))
+    begun = fit(near, found.shared, found.point.states, found.noise, _ITERATIONS)
+    first = None if begun is None else _alternated(near, begun, felt, harmonics)
+    if first is None:
+        return None
+    near, begun, harmonics = first
+    whole = refine(near.forward, near.unknowns, poses, period, begun.shared, begun.noise, None)
+    return None if whole is None else _alternated(*whole, felt, harmonics)
+
+
+def _alternated(
+    problem: Problem, found: Fit, felt: Load, harmonics: Harmonics
+) -> tuple[Problem, Fit, Harmonics] | None:
+    """Alternate steps of the amplitudes, which begin at `harmonics`, with fits of the other unknowns."""
+    best, in_vain = found.loss, 0
+    for index in range(_ROUNDS):
+        value = harmonics.amplitude.ravel()
+        precision = np.full(len(value), tuning.LACKING**-2.0)
+        columns = problem.by_harmonics(found.point, harmonics)
+        step, covariance, states = whole_step(problem, found, columns, precision, -value * precision)
+        (shared, change), covariance = np.split(step, [SIZE]), covariance[SIZE:, SIZE:]
+        size = float(change @ np.linalg.solve(covariance, change))
+        # a change within the noise follows linearly in the grades of a fit
+        if in_vain == _IN_VAIN or (index and size < tuning.SETTLED * len(COMPONENTS)):
+            break
+        harmonics = harmonics.moved(np.clip(change, -tuning.LACKING, tuning.LACKING), np.diag(covariance))
+        problem = Problem(
+            problem.forward.under(harmonics.added(felt)), problem.unknowns, problem.window, horizon=problem.horizon,
+            differences=problem.differences, harmonics=harmonics,
+        )  # fmt: skip
+        most = problem.deviation, tuning.START_SPREAD
+        shared, states = (np.clip(one, -bound, bound) for one, bound in zip((shared, states), most, strict=True))
+        shared = problem.unknowns.within(found.shared + shared)
+        states = better_states(problem, shared, found.point.states + states)
+        again = fit(problem, shared, states, found.noise, _ITERATIONS)
+        if again is None:
+            return None
+        found = again
+        in_vain = 0 if found.loss < best else in_vain + 1
+        best = min(best, found.loss)
+    return problem, found, harmonics
+
+
+def named(harmonics: Harmonics) -> str:
+    """Return the clearest harmonic as a reason."""
+    clear = harmonics.amplitude**2 / harmonics.variance
+    clear[1::2] += clear[2::2]
+    clear[2::2] = 0.0
+    term, component = divmod(int(clear.argmax()), len(COMPONENTS))
+    size = (
+        float(np.hypot(*harmonics.amplitude[term : term + 2, component]))
+        if term
+        else abs(harmonics.amplitude[0, component])
+    )
+    what = f"at {harmonics.multiples[term // 2]} times its frequency" if term else "at rest"
+    return f"load: {COMPONENTS[component]} lacks {size:.1%} of its amplitude {what}"
