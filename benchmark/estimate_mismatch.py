@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-os.environ |= dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")  # as `Worker` does
+os.environ |= dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")  # one thread, as in `Worker`
 
 import click
 import numpy as np
@@ -303,7 +303,7 @@ def _telemetry(kind: Kind, fine: Array, believed: Array) -> tuple[Array, Array]:
         return knots + kind.late_s, np.stack([np.interp(knots, fine, column) for column in believed.T], axis=1)
     rows = round(kind.averaged_s / _FINE)
     count = len(fine) // rows
-    # an average has the stamp of the middle of its interval
+    # the stamp of an average is the middle of its interval
     middle = fine[: count * rows].reshape(count, rows).mean(axis=1)
     return middle, believed[: count * rows].reshape(count, rows, 3).mean(axis=1)
 

@@ -50,7 +50,7 @@ def run_one(name: str, seed: int, members: int) -> dict[str, Any]:
     """Follow one truth, and return the errors as a row."""
     try:
         truth = draw(GROUPS[name], seed)
-    except SolverError as error:  # the head has passed through a wall, so no real machine is like this
+    except SolverError as error:  # the head has passed through a wall, which no real machine does
         return {"group": name, "seed": seed, "not_drawn": str(error)}
     true, nominal = (Motion(scene, truth) for scene in (truth.scene, truth.nominal))
     begin = time.process_time()

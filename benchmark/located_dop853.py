@@ -27,7 +27,7 @@ _ROWS = len(_C)
 #: Absolute tolerances divided by rtol. Each is a tenth of the usual size: poses are about 1e-2, velocities about 1.
 _ATOL = np.array([1e-3, 1e-3, 1e-3, 1e-1, 1e-1, 1e-1])
 _OFF, _ON, _CLIPPED = 0, 1, 2
-#: Number of equal parts of a step; guards are checked at the end of each part.
+#: A step is divided into this number of equal parts, and guards are checked at the end of each part.
 _LOOKS = 4
 _AT_ONE_INSTANT = 64
 

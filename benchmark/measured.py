@@ -51,7 +51,7 @@ FOLDER = Path(__file__).resolve().parent
 DATA = FOLDER / "data" / "measured"
 RESULTS = FOLDER / "results" / "measured.json"
 IMAGES = FOLDER.parent / "docs" / "images"
-#: First step of each unknown in a fit.
+#: Step by which a fit first changes each unknown.
 STEPS = {"tilt": 0.004, "fall": 0.1, "fall_along": 0.05, "slip_speed": 0.05, "restitution": 0.05, "friction": 0.03}
 PLAIN = replace(ELLIPSE, fall=0.0, fall_along=0.0, tilt=0.0, restitution=0.54)
 FRICTIONS: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {

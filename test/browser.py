@@ -65,7 +65,7 @@ class Page:
             self.errors.append(str(message["params"]["exceptionDetails"]))
         elif message.get("method") == "Log.entryAdded":
             entry = message["params"]["entry"]
-            if entry["level"] == "error" and entry["source"] != "network":  # network errors are in `requests`
+            if entry["level"] == "error" and entry["source"] != "network":  # `requests` has the network errors
                 self.errors.append(str(entry))
 
     def evaluate(self, expression: str) -> Any:

@@ -64,7 +64,7 @@ def test_the_ensemble_ends_at_the_tolerance_that_every_pair_needs(rows: list[dic
     pairs = [row for row in rows if row["section"] == "ensemble" and not row["wall_ms"]]
     assert float(timed[-1]["error"]) <= 1e-4 and float(timed[-1]["value"]) == 0.0
     assert len(pairs) == 6 and all(float(row["amplification"]) > 0.1 for row in pairs)
-    # every pair is run again by itself, and its error is computed in another way
+    # the expected errors come from running every pair by itself and computing its error in another way
     code = (
         "import numpy as np, ensemble_rows as e; from plow_twin import simulate, simulate_many\n"
         "for scene in e.clearance_pairs(3, 2):\n"

@@ -138,7 +138,8 @@ def test_a_load_that_looks_like_kilonewtons_is_named_before_it_is_estimated(
     desk: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(desk)
-    # an estimate corrects gains of the load, so such a load only causes a warning, but here no clearance is found
+    # an estimate fits the gains of the load, so a load in kN only causes a warning; but no clearance is found from it
+    # here
     assert cli(["estimate", "kN", "--json"]) == 0
     shown = capsys.readouterr()
     assert "fx, fy: got 30, expected some 3.2e+04 N as in the scene; they look like kN: convert the file" in shown.err

@@ -146,7 +146,7 @@ def test_the_clearances_of_an_estimate_after_the_last_publication_are_shown_with
         assert shown() == shown() == (0.0265, 0.0)
         publish(2.0, 0.0264)
         assert shown() == (0.0264, 0.0)
-        feed.part("estimate", (0, "", {}))  # withdrawn
+        feed.part("estimate", (0, "", {}))  # the estimate is withdrawn
         feed.part("status", (0, "", {"horizontal": "withdrawn", "vertical": "withdrawn"}))
         assert shown() == (0.0264, 0.0)
     link.close()
@@ -395,7 +395,7 @@ def test_a_killed_server_is_reported_once_and_the_twin_continues(tmp_path: Path)
         assert process.stdin is not None
         process.stdin.close()
         process.stdin = None
-        out, err = process.communicate(timeout=60)  # the server no longer waits for a page
+        out, err = process.communicate(timeout=60)  # the killed server does not hold up the end
     assert process.returncode == 0 and json.loads(out)["input"]["samples_used"] == str(COUNT)
     assert "server of the screen" not in err
 

@@ -38,7 +38,7 @@ def test_a_hard_contact_is_estimated_by_its_bounces() -> None:
     result = estimate(truth.nominal, truth.load, truth.poses)
     assert "distance" in result.figures, "the bounces were compared"
     assert (result.model, result.sensor) == ("ok", "ok"), result.reasons
-    # the other law is so unlikely that half of its draws are enough
+    # the other law is so unlikely that half of the draws planned for it are enough
     assert result.figures["law_odds"] < tuning.CLEAR_ODDS[0]
     assert result.figures["work"] < tuning.MOST_WORK[1] + 0.5 * tuning.MOST_WORK[2]
     for value, true in zip((result.horizontal, result.vertical), truth.clearance, strict=True):

@@ -23,7 +23,7 @@ from plow_twin.stream.journal import Entry, Pose, SetWear
 def test_the_command_keeps_the_contract(tmp_path: Path) -> None:
     truth = draw(replace(GROUPS["sensor"], periods=6.0), 1)
     truth.write(tmp_path)
-    # a row that is not a number is counted and not replaced by a guess
+    # a row with a value that is no number is counted, and not replaced by a guess
     with (tmp_path / "pose.csv").open("a") as file:
         file.write("99,what,0,0\n")
     command = [sys.executable, "-m", "plow_twin", "estimate", str(tmp_path), "--json", "--out", str(tmp_path / "out")]

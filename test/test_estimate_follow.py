@@ -310,7 +310,7 @@ def test_a_wrong_bias_of_the_sensor_is_learned_with_a_hard_contact() -> None:
     _take(follower, replace(_known(truth), bias_x=x, bias_y=y, bias_theta=theta))
     _run(follower, truth, 4.0)
     biases = biases_of(follower._ensemble.learned()[0])
-    # the bias of the median twin, then the mean of all twins
+    # first the bias of the median twin, then the mean bias of all twins
     assert (np.abs(biases[0]) < 0.6 * np.abs(wrong)).all()
     assert (np.abs(biases.mean(axis=0)) < 0.6 * np.abs(wrong)).all()
 

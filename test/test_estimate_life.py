@@ -57,7 +57,7 @@ def test_the_jump_agrees_with_the_direct_run_with_sliding_in_the_plane_and_runni
     quarter = simulate(replace(scene, wear=replace(scene.wear, coefficient_m2_n=7.5e-10)), span, span, 1e-6).wear_depth
     early = [np.interp(0.25 * exposure, path.exposure, pad) for pad in path.depth.T]
     assert early == pytest.approx(quarter, rel=0.05, abs=1e-5)
-    # the pads of a head whose clearances have grown have run in
+    # if a head's clearances have grown, its pads have worn and therefore run in
     grown = with_clearances(scene, scene.clearance.horizontal_m + 2e-3, scene.clearance.vertical_m)
     assert grown.wear is not None and grown.clearance == scene.clearance
     assert grown.wear.initial_depth_m == pytest.approx(1e-3 * np.abs(NORMAL_X))

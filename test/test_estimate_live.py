@@ -198,7 +198,7 @@ def test_the_live_estimate_is_published_and_given_again_by_the_journal(tmp_path:
     # gaps were measured too, so there are also clearances of the groups of pads
     group = facts["groups"]["horizontal_top"]
     assert group["mean_m"] == pytest.approx(truth.clearance[0], abs=3e-4) and group["p95_m"] - group["p05_m"] > 4e-4
-    # forecast and forces depend on the estimate, and are the same too
+    # forecast and forces are computed from the estimate, so they are the same too
     assert facts["forecast"] == json.loads(answer.message)
     told = dict(zip(forecasts[-1].name, forecasts[-1].position, strict=True))
     assert told["seconds/p50"] == pytest.approx(3600.0 * facts["forecast"]["p50"]["hours"])
@@ -293,7 +293,7 @@ def test_other_pads_and_other_model_numbers_discard_earlier_estimates(
     session.apply(SetWear(START_NS + 1, (0.0,) * 8, "new pads"))
     assert (estimation.forecast, estimation.reasons, estimation.end_ns) == (None, (), None)
     assert estimation.forecast_error and set(estimation.trust.values()) == {""}
-    # the empty messages also release latched alarms
+    # empty messages replace the latched estimate and the latched forecast
     messages = estimation.poll(session)
     assert {topic: (message.stamp_ns, message.name) for topic, message in messages.items()} == dict.fromkeys(
         ("estimate", "forecast"), (START_NS + 1, ())
@@ -325,7 +325,7 @@ def test_a_frozen_worker_is_reported_and_costs_no_further_memory(monkeypatch: py
         for _ in range(1000):
             worker.add_load(START_NS, (0.0, 0.0, 0.0))
         assert worker.poll() is None
-        # the pause acts like a slow worker: the source waits for it even with less data
+        # the pause is that of a source that waits for a slow worker
         time.sleep(0.1)
     assert worker.error == "the estimator did not read for 20000 samples"
     assert not worker.ready

@@ -320,7 +320,7 @@ def test_a_rough_load_costs_little_accuracy() -> None:
     found = estimate(truth.nominal, truth.load, truth.poses)
     assert (found.model, found.sensor) == ("ok", "ok")
     for value, true in zip((found.horizontal, found.vertical), truth.clearance, strict=True):
-        # without links, the interval would be twice as wide, and the clearance 0.2 mm off
+        # if the swings were not linked, the interval would be twice as wide, and the clearance 0.2 mm off
         assert value.p95 - value.p05 < 2.5e-4 and abs(value.mean - true) < 1.5e-4
 
 

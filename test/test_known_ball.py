@@ -16,7 +16,7 @@ from scipy.optimize import brentq
 from plow_twin import Clearance, Contact, Frame, Gravity, Harmonic, Head, Initial, Result, Scene, simulate
 
 GRAVITY = 9.81
-#: Angular frequency of the table in rad/s, 10 Hz.
+#: Angular frequency of the table in rad/s, for a frequency of 10 Hz.
 OMEGA = 2.0 * math.pi * 10.0
 PERIOD = 2.0 * math.pi / OMEGA
 

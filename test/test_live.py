@@ -75,7 +75,7 @@ def _csv(path: Path, count: int, more: str = "", times: float = 1.0) -> Path:
     return path
 
 
-#: Damaged message numbers, as texts.
+#: Damaged sequence numbers, as texts.
 STRAY = ("5000000", "1e30", "0", "-7", "nan")
 
 
@@ -271,13 +271,13 @@ def test_the_senders_own_numbers_show_loss_repetition_and_a_new_start(tmp_path: 
     lines = [
         json.dumps({"time": 1000 + index, "load": {"f": [index, 2, 3]}, "n": n}) for index, n in enumerate(numbers)
     ]
-    # messages of other senders come in between and have no number; neither these nor the two damaged messages use up a
-    # number
+    # messages of other senders come in between and have no sequence number; neither these nor the two damaged messages
+    # use up a number
     lines[150], lines[151] = '{"n": 152, "load"', '{"n"'
     for place, other in ((60, '{"hello": 1}'), (40, "garbage"), (20, '{"n": "x", "status": 3}')):
         lines.insert(place, other)
     path = tmp_path / "plough.csv"
-    # an unreadable message before the first number does not count as number 1
+    # an unreadable message before the first sequence number does not count as number 1
     path.write_text("\n".join(["{}", "nothing", *lines, '{"n": 60, "load"']) + "\n", encoding="utf-8")
     mapping = tmp_path / "map.yaml"
     mapping.write_text(
@@ -424,7 +424,7 @@ def test_a_live_twin_whose_standard_output_nobody_reads_goes_on_and_ends_when_it
     with _live(str(path), "--follow", "--scene", "paper", *more) as live:
         pipe = live.process.stdout
         assert pipe is not None
-        # the pipe holds less than the lines of a second, so it soon is full
+        # the pipe holds fewer lines than come in a second, so it is soon full
         fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, 4096)
         live.until_count("samples_used", 100)
         give_up = time.monotonic() + START_S

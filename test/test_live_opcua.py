@@ -321,7 +321,7 @@ def test_a_history_that_lies_is_not_believed(kind: str, roles: Any) -> None:
             plant.do("rows", _rows(start_ns, 0, 5))
             _until(bridge, lambda found: start_ns + 4 * MS in _stamps(found))
             plant.do("lie", kind)
-            plant.do("number", -1)  # a repeated number is not a loss
+            plant.do("number", -1)  # a repeated sequence number is not a loss
             plant.do("rows", _rows(start_ns, 5, 6))
             _until(bridge, lambda found: start_ns + 5 * MS in _stamps(found))
             assert bridge.part()[2]["notifications_lost"] == "0"

@@ -161,7 +161,7 @@ def test_a_broker_keeps_messages_for_an_absent_twin_and_garbage_is_counted(broke
     )
     sender = Sender(broker)
     old = {"t": 3.0, "force": {"x": 1.0, "y": 1.0}, "moment": 1.0, "n": 9000}
-    # this message was sent before the twin began, so its number starts no count
+    # this message was sent before the twin began, so its sequence number starts no count
     sender.raw(json.dumps(old).encode(), retain=True)
     with _live(*arguments) as live:
         live.until_count("dropped_inactive", 1)

@@ -55,8 +55,9 @@ def test_colcon_build_gives_the_layout_of_ros2_run(options: list[str], tmp_path:
     assert "expected_rate" in start("twin --ros-args -p expected_rate:=-1.0", code=2)
 
 
-#: Files that use ROS, and ament's linters with our line width and docstring style.
+#: Files that use ROS.
 OF_ROS = ("launch", "plow_twin/ros", "plow_twin/demo", "setup.py")
+#: ament's linters, with our line width and docstring style.
 LINTERS = (
     ("ament_xmllint", "package.xml", "config"),
     ("ament_flake8", "--linelength", "120", *OF_ROS),

@@ -156,7 +156,7 @@ def _module_imports(path: Path, modules: set[str]) -> set[str]:
         if isinstance(node, ast.Import):
             names = [[alias.name] for alias in node.names]
         else:
-            # the statement is `from folder import module` or `from module import name`
+            # the statement is either `from folder import module` or `from module import name`
             names = [[f"{node.module}.{alias.name}", node.module or ""] for alias in node.names]
         found |= {
             next(name for name in candidates if name in modules) for candidates in names if {*candidates} & modules

@@ -189,7 +189,7 @@ def test_an_analysis_reads_a_folder_of_parquet_files(tmp_path: Path, capsys: pyt
     assert cli(["analyse", str(tmp_path / "plant"), *words]) == 0
     whole = json.loads(capsys.readouterr().out)
     assert whole["signals"] and whole["input"]["samples_used"] == 2000 and not whole["lossy"]
-    # poses without a number count as a loss, so the exit code is 3
+    # every tenth pose has no value, which counts as a loss, so the exit code is 3
     assert cli(["live", str(tmp_path / "plant"), *words]) == 3
     assert json.loads(capsys.readouterr().out)["input"]["samples_used"] == "2000"
 

@@ -97,7 +97,7 @@ def test_a_recording_that_was_cut_off_is_repaired(share: float, tmp_path: Path) 
     assert repair(run.folder) == [run.file]
     after = examine(run.folder)
     assert after.problems == [] and after.status == FileStatus.COMPLETE.value
-    # the repaired file has everything that could be read before, but entries at equal places may have another order
+    # the repaired file has every record that could be read before, but not always in the same order
     assert {repr(record) for record in RunReader(run.folder)} == {repr(record) for record in found}
     assert replay(run.folder).exit_code == 0
     with AnyReader([run.folder]) as reader:

@@ -227,7 +227,8 @@ def test_a_full_disk_stops_the_recording_and_nothing_else(tmp_path: Path) -> Non
     reader = RunReader(tmp_path / "run")
     entries = [record for record in reader if isinstance(record, EntryRecord)]
     assert reader.status is FileStatus.TRUNCATED and len(entries) > 100
-    # every item is in the file or counted; an item being written when the disk became full may be both
+    # every item is in the file or counted as lost; the item that was being written when the disk became full may be
+    # both
     assert len(entries) + report["lost"][JOURNAL] >= 3000
 
 
@@ -536,7 +537,7 @@ def test_with_sync_flushed_data_survive_a_loss_of_power(tmp_path: Path) -> None:
             else:
                 synced.append((rest[1], int(rest[0])))
                 flushes += index >= 0
-                # at the latest, the next flush waits until these entries are on the disk
+                # these entries are on the disk when the next flush begins, at the latest
                 before = index if flushes == 3 else before
             if flushes == 5:
                 process.kill()

@@ -355,7 +355,7 @@ def test_loss_is_counted_by_the_publishers_numbers() -> None:
         assert node.start()
         assert node._front is not None and node.runtime is not None
         subscriptions = node._front.subscriptions
-        for numbers in ((7, 8), (11,), (10,), (12,)):  # number 9 never comes, and 10 comes late
+        for numbers in ((7, 8), (11,), (10,), (12,)):  # sequence number 9 never comes, and 10 comes late
             batch = [Taken(b"one", number, 0, serialize_message(TwistStamped())) for number in numbers]
             subscriptions.receive("travel", batch)
         assert node.runtime.inputs.lost == 1
@@ -370,7 +370,7 @@ def test_messages_from_before_the_subscription_are_no_loss_whenever_their_publis
         subscriptions = node._front.subscriptions
         begun_ns = subscriptions._since_ns + round(after_s * 1e9) - numbers[0] * period_ns
         for number in numbers:
-            # the sender has another clock
+            # the sender's stamps are not by the receiver's clock
             received_ns, sent_ns = begun_ns + number * period_ns, number * period_ns
             batch = [Taken(sender, number, received_ns, serialize_message(WrenchStamped()), sent_ns)]
             subscriptions.receive("excitation", batch)

@@ -219,7 +219,7 @@ def check_energy(
     gain = kinetic + potential + elastic - work
     gain -= gain[0]
     scale = kinetic.max() + elastic.max() + np.ptp(potential) + np.ptp(work)
-    # hundreds of steps and impacts add up their errors and amplify them
+    # the errors of hundreds of steps and impacts add up and are amplified
     slack = (1e3 * case.tol + 1e-9) * scale + work_error
     # for speeds below a thousandth of the clearance per second the tolerance is absolute
     slack += case.tol * length_scale(case.scene) * np.sqrt(2.0 * case.scene.head.mass_kg * kinetic.max())

@@ -248,7 +248,7 @@ def test_painleves_case_is_an_impact_without_collision() -> None:
         rate, t = math.sqrt(abs(p) * stiffness), result.t[1:40]
         expected = stiffness * 1e-3 / rate * (np.sinh(rate * t) if jams else np.sin(rate * t))
         assert result.force[1:40, pair] == pytest.approx(expected, rel=0.02)
-        # if it jams, the corner is thrown back far faster than it came; otherwise it just turns back
+        # if the corner jams, it is thrown back far faster than it came; otherwise it just turns back
         assert (result.v[-1, 1] > 0.1) == jams and (result.statistics["top_right_top"]["max"] > 1e3) == jams
         assert result.force[-1, pair] == 0.0
 

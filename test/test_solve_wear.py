@@ -49,7 +49,8 @@ def test_linear_feedback_of_wear_on_force() -> None:
 
 
 def test_depth_is_the_wear_law_of_the_impulse_and_widens_the_clearance() -> None:
-    scene = dataclasses.replace(preset("bench_kv"), wear=Wear(1e-10, 0.015, 2.5))  # a pinned motion uses its kernels
+    # a pinned motion compiles the same kernels
+    scene = dataclasses.replace(preset("bench_kv"), wear=Wear(1e-10, 0.015, 2.5))
     result = simulate(scene, 20.0)
     impulse = np.array([row["impulse"] for row in result.statistics.values()])
     assert result.wear_depth == pytest.approx(1e-10 * 2.5 / 0.015 * impulse, rel=1e-8)
@@ -70,7 +71,7 @@ def worn_by(exposure: float) -> float:
     return h0 * math.log(ratio * math.exp(exposure / h0) - ratio + 1.0)
 
 
-# explicit steps use the kernels of the other tests
+# explicit steps use kernels that other tests cover, so only the full run has them
 @pytest.mark.parametrize(
     "damping", [pytest.param(1e3, id="explicit", marks=pytest.mark.stress), pytest.param(1e8, id="implicit")]
 )
@@ -90,7 +91,7 @@ def test_sliding_in_the_plane_and_running_in_under_a_constant_load(damping: floa
     exposure = RUBBED.coefficient_m2_n / RUBBED.pad_area_m2 * 0.5 * weight * math.hypot(2.0, along) * t
     assert worn[[0, 2]] == pytest.approx([worn_by(exposure)] * 2, rel=1e-5)
     assert (twin._state.implicit_steps > 0) == (damping > 1e7)
-    # running-in has a visible effect: at its end, h0 ln r of the depth is due to it
+    # running-in has a visible effect: when it is over, it has added h0 ln r to the depth
     assert worn[0] > exposure + 1.5e-5
 
 

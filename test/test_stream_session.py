@@ -258,7 +258,7 @@ def test_a_speed_at_which_the_damping_lets_no_contact_last_is_refused_by_name() 
     ):
         with pytest.raises(ArgumentError, match=r"got -?4.1, expected at most 4 m/s, .* contact.damping 200000.0 N"):
             refuse()
-    # while a speed waits to act, the damping cannot be raised either
+    # while a speed waits to act, a damping that does not allow this speed is refused as well
     with pytest.raises(ArgumentError, match=r"speed_m_s: got -3.9, expected at most 3.2 m/s"):
         session.check_model({"contact.damping": 1.25 * damping})
     session.check_model({"contact.damping": damping})

@@ -96,7 +96,7 @@ def test_values_of_another_clock_and_impossible_ones_are_counted(tmp_path: Path)
     pose.write_text("t,x,y,theta\n" + "".join(f"{t},{x},{y},{theta}\n" for t, x, y, theta in late))
     found = analyse(tmp_path, scene=PAPER, out=tmp_path / "out")
     assert found.facts()["outside"] == {"x": 10, "y": 11} and found.facts()["signals"]["x"]["n"] == 18
-    # y has no value within the load's time
+    # no value of y lies within the time of the load
     assert found.lost == {"measured_implausible": 1, "measured_outside_the_load": 11}
     write_report(found, tmp_path / "out")
     assert "outside the time of the load" in (tmp_path / "out" / "report.html").read_text()
@@ -162,7 +162,8 @@ def test_a_run_is_predicted_with_all_that_was_done_to_the_model_while_it_ran(tmp
     assert mine.loads.impulse == pytest.approx(sum(message.velocity for message in peaks), rel=1e-9)
     np.testing.assert_array_equal(mine.loads.largest, force.max(axis=0))
     assert other.loads.impulse != pytest.approx(mine.loads.impulse, rel=0.01)
-    for name, counted in mine.loads.cycles().items():  # a row may stand alone between other entries
+    # a sample may stand alone between other entries, but the cycles are those of the whole series
+    for name, counted in mine.loads.cycles().items():
         whole = rainflow.count_cycles(force[:, PAIR_NAMES.index(name)], nbins=loads.CYCLE_BINS)
         assert [one["count"] for one in counted] == [count for _, count in whole]
     assert [item.start_s for item in mine.loads.passes] == pytest.approx([0.0, 0.301], abs=1e-9)

@@ -145,7 +145,7 @@ def test_a_lasting_change_of_a_load_that_windows_cut_through_is_the_load_s() -> 
         for scale in (1.0, 1.15):
             true = scale * random.normal(
                 1.0, 0.15, 62
-            )  # a window covers halves of two periods, and only one of them has its peak
+            )  # a window covers half of each of two periods, and contains the peak of only one of them
             start_ns = 10**9 * np.arange(61)
             seen = with_neighbours(0.5 * (true[1:] + true[:-1]), start_ns)
             groups.append((1e5 * true[1:] * random.normal(1.0, 0.02, 61), seen))

@@ -66,7 +66,7 @@ def test_the_lowest_versions_are_those_that_setup_names(metadata: dict[str, Any]
     lowest = dict(line.split("==") for line in lines if not line.startswith("#"))
     assert lowest.keys() == stated.keys()
     for name, version in stated.items():
-        # `6` is the first release of 6, `1.26` the last patch of 1.26
+        # `6` stands for the first release of version 6, and `1.26` for the last patch of 1.26
         assert lowest[name].removesuffix(".*").split(".")[: len(version.split("."))] == version.split("."), name
     assert "1.26" in lowest["numpy"]
 

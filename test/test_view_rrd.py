@@ -424,7 +424,7 @@ def test_the_legends_of_the_clearance_are_not_cut_in_a_low_window(
     view: tuple[ViewSummary, dict[str, pa.Table]],
 ) -> None:
     curves = layout.blueprint(Section.of(load_scene(scene_path("paper"))), 3.0).root_container.contents[1]
-    height = curves.row_shares[-1] / sum(curves.row_shares) * 555.0 - 46.0  # title and axis take 46 pixels
+    height = curves.row_shares[-1] / sum(curves.row_shares) * 555.0 - 46.0  # the plot's title and axis take 46 pixels
     for group in ("growth", "clearance"):
         names = {
             name

@@ -17,7 +17,8 @@ LANES = (
     ("scene 22", ()),
     ("scene 9", ("c-bottom", "d-bottom")),
 )
-#: Guards that may end the steps: the first guard of each lane, then the second guard of lane 0 in the remaining place.
+#: Guards that may end the steps. The first guard of each lane comes first; the remaining place has the second guard of
+#: lane 0.
 ROUND = (("lane 0: b-right",), ("lane 1: d-left",), ("lane 2: a-left",), ("lane 0: c-bottom",))
 #: Ends of steps in each lane. Each end has its place as a share of the width and its kind: "step", "event" or "next
 #: scene".

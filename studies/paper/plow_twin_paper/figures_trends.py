@@ -16,7 +16,7 @@ from plow_twin_paper.values import CORNERS, FACE_MARKS, FACES, FIXED_M, GRID_M, 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: Colour and line of each form of the head's rotation.
+#: Colour and line style of each of the three forms of the head's rotation.
 _FORMS: Final = (
     ("constant moment (paper)", "#333333", "-"),
     ("exact, I about the centre of mass", "#D55E00", "--"),
