@@ -52,8 +52,8 @@ DIFFERENCES: Final = ("turn_left", "turn_right", "turn_top", "turn_bottom", "lev
 DIFFERENCE_STEPS: Final = np.array([2e-4, 2e-4, 2e-4, 2e-4, 1e-3, 1e-3, 4e-6])
 #: Step: for the difference quotients with respect to the amplitude of a harmonic, in units of half the load's range.
 _HARMONIC_STEP = 5e-3
-#: Derived: smallest number of rows of a swing. Two rows of three numbers only determine the six numbers of the swing's
-#: start.
+#: Derived: smallest number of rows of a swing; two rows of three numbers would just determine the six numbers of the
+#: swing's start.
 FEWEST_OF_SWING = 4
 
 

@@ -24,7 +24,8 @@ from plow_twin.stream.session import Session
 
 Array = NDArray[np.float64]
 
-#: Definition: length in s of the estimates' windows, and interval in s of the windows' ends; the defaults of a node.
+#: Definition: length in s of the estimates' windows, and time in s between the ends of two windows; both are the
+#: defaults of a node.
 WINDOW_S, INTERVAL_S = 32.0, 10.0
 #: Definition: number of nanoseconds in a second.
 _NS: Final = 1e9

@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 
 #: Derived: default number of members, with which a 5 % point has a standard error of 1.4 %.
 MEMBERS: Final = 256
-#: Definition: quantiles of an interval.
+#: Definition: quantiles at which an interval has its ends and its middle.
 POINTS: Final = (0.05, 0.5, 0.95)
 #: Derived: smallest number of members of which one member is 5 %; fewer members have no 5 % point.
 FEWEST: Final = 20

@@ -126,7 +126,7 @@ def _fit_one_set(
     rows: Array, t: Array, gap: Array, pairs: NDArray[np.int64], theta: Array, error: float, scene: Scene
 ) -> GapsFit | None:
     """Fit the messages of one set of sensors; `gap`, shape (n, k), holds the gaps of the pairs `pairs`, shape (k,)."""
-    # gap = half the clearances minus the reach of a corner
+    # the gap of a pair is half the clearances minus the reach of the pair's corner
     half = 0.5 * np.abs(np.stack([NORMAL_X, NORMAL_Y], axis=1))[pairs]
     fixed = np.concatenate([-rows[2:4, pairs].T, half], axis=1)
     with_turn = np.concatenate([fixed, -rows[1, pairs][:, None]], axis=1)
@@ -151,7 +151,7 @@ def _fit_one_set(
         unknown[:, : equations.shape[1]] += left @ inverse.T
     x, y = _displacement(unknown, scene)
     clearance = np.median(unknown[:, 2:4], axis=0)
-    # the errors of the sensors are constant, so only the noise averages out
+    # the error of each sensor is constant, so only the noise becomes smaller by averaging
     spread = error * np.sqrt((inverse[2:4] ** 2).sum(axis=1))
     noise = unknown[:, 2:4].std(axis=0) / np.sqrt(len(t))
     q = np.stack([x, y, unknown[:, 4]], axis=1)

@@ -18,7 +18,7 @@ from plow_twin.estimate.regression import ridge, shrunk_root
 
 Array = NDArray[np.float64]
 
-#: Guard: least variance of a feature.
+#: Guard: smallest variance that a feature can have.
 _LEAST = 1e-9
 #: Definition: indices of the parameters with terms up to the third degree (penetration, damping), and of the
 #: clearances, whose effect depends on these parameters.

@@ -149,7 +149,7 @@ class Learner:
         before = np.sqrt(np.diag(self.covariance))
         self.covariance = (turned / (1.0 + value.clip(0.0))) @ turned.T
         step = tuning.LEARNING * (self.covariance @ self._score)
-        # the linearisation is good within one deviation
+        # the linearisation is good within one deviation, so a step is at most this long
         step /= max(1.0, float(np.abs(step / before).max()))
         self.mean = np.clip(self.mean + step, self._least, self._most)
         # the machine changes, so deviations grow with time; they stay between one unit and the estimate's deviation

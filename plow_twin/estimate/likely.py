@@ -70,7 +70,7 @@ def _likeliest(drawn: Array, gain: float, motions: Seen, asked: Seen) -> Array:
     error = (motions.like - terms @ surface) / np.sqrt(free)[:, None]
     whiten = np.linalg.inv(shrunk_root(error.T @ error / len(error), _LEAST)).T
     seen, late, surface = asked.like @ whiten, asked.late @ whiten, surface @ whiten
-    # first the four parameters without a prior, then the gains and the delay
+    # the first four parameters have no prior; the gains and the delay follow
     mean = np.concatenate([np.zeros(4), (1.0 - middle[4:]) / scale[4:], np.zeros(1)])
     weight = np.concatenate([np.full(4, _FREE), gain / scale[4:], np.full(1, tuning.LATE)]) ** -2.0
     point = np.zeros((len(seen), len(mean)))

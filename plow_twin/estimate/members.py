@@ -45,7 +45,7 @@ _PATH_S: Final = 2e-3
 _MOST_OUTLYING: Final = 5
 #: Bound: smallest number of members that get other parameters at once, because a call costs as much as three members.
 _AT_ONCE: Final = 8
-#: Definition: all members.
+#: Definition: slice that selects all members.
 _ALL: Final = slice(None)
 _THETA: Final = DOF_NAMES.index("theta")
 #: Derived: indices of c, s, X, Y in the solver's state.

@@ -30,7 +30,7 @@ _MADE_OF: Final = {
     "vertical_left": (GY, np.array([0.0, 0.0, 0.5, 0.5])),
     "vertical_right": (GY, np.array([0.0, 0.0, -0.5, -0.5])),
 }
-#: Bound: number of fits with differences, and iterations of each fit.
+#: Bound: number of fits with differences, and number of iterations of each fit.
 _ROUNDS, _ITERATIONS = 6, 15
 assert list(_MADE_OF) == list(GROUPS)
 

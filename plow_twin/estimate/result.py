@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 #: Derived: quantile of the normal distribution at which a 90 % interval ends.
 NORMAL_P95: Final = float(ndtri(0.95))
-#: Guard: standard deviations beyond which the tail of the normal distribution is nearly exponential.
+#: Guard: number of standard deviations beyond which the tail of the normal distribution is nearly exponential.
 _FAR = 30.0
 _STANDARD: Final = NormalDist()
 

@@ -69,7 +69,7 @@ def cut(scene: Scene, poses: Poses, period: float, shortest: float) -> Window:
     raw, t = filled(poses), poses.t
     width = smooth_width(poses, 0.04)
     reach = reaches(scene, smoothed(raw, width))
-    # the head's distance from contact with the nearest wall
+    # distance of the head from contact with the nearest wall
     room = -(reach - np.quantile(reach, 0.99, axis=0)).max(axis=1)
     noise = np.maximum(noise_level(raw), 1e-7)
     clear = tuning.OUTLYING * np.hypot(*(noise[[0, 2]] * [1.0, geometry.half_diagonal(scene)])) / np.sqrt(width)

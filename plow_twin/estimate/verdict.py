@@ -260,7 +260,7 @@ def _change_within(problem: Problem, fit: Fit, verdict: Verdict) -> None:
         verdict.sensor.append(f"shifted within the window by {shift[0]:.2g} m, {shift[1]:.2g} m, {shift[2]:.2g} rad")
     elif clearance > bias and np.abs(growth).max() > 0.5 * tuning.OBSERVED:
         verdict.model.append(f"machine changed within the window: clearances by {growth[0]:.2g} m, {growth[1]:.2g} m")
-    # residuals of a wrong load or law also resemble a change, but a change explains little of them
+    # residuals of a wrong load or law also resemble a change, but only a real change explains a large share of them
     verdict.broken |= (
         len(verdict.sensor) + len(verdict.model) > found and share > tuning.CHANGE_SHARE and _felt(problem, fit)
     )

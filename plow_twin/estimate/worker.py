@@ -36,7 +36,7 @@ from plow_twin.model.scene import Scene
 _SEND_S: Final = 0.05
 #: Bound: largest number of queued items; this many items wait only if the far side has stopped reading.
 _MOST_WAITING: Final = 1_000_000
-#: Bound: `nice` of the far side.
+#: Bound: `nice` value of the far side.
 _NICE: Final = 10
 #: Definition: shortest time slice in ns that Linux gives, and number of the system call that requests it.
 _SLICE_NS, _SCHED_SETATTR = 100_000, 314

@@ -31,7 +31,7 @@ def _operation(function: Callable[..., Any]) -> Callable[..., Any]:
 class Lanes(types.Type):
     """Numba's type of eight float64."""
 
-    #: changes that LLVM may make to sums
+    #: LLVM's names of the changes that it may make to sums
     flags: tuple[str, ...] = _FLAGS
 
     def __init__(self, name: str = "Lanes") -> None:

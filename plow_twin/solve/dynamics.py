@@ -144,7 +144,7 @@ def _accelerate_head(p, offset, free, c, s, load, along_x, along_y, torque, firs
 def _accelerate_both(p, offset, free, slip, stick, frozen, state, z, load, out) -> None:
     """Write the rate of head and frame (`support.to_world_both`)."""
     c, s, om, spin = math.cos(z[2]), math.sin(z[2]), z[8], z[11]
-    # pose and rates of the head relative to the frame
+    # the pose and the rates of the head relative to the frame
     angle = z[2] - z[5]
     x, y = to_body_axes(c, s, z[0] - z[3], z[1] - z[4])
     vx, vy = to_body_axes(c, s, z[6] - z[9], z[7] - z[10])

@@ -115,8 +115,8 @@ def _stretch_basis(matrix, basis, moved, logs) -> None:
     _multiply(matrix, basis, moved)
     for j in range(size):
         for i in range(2 * j):
-            # each vector is made orthogonal to the vectors before it; one pass would leave rounding errors, so there
-            # are two
+            # each vector is made orthogonal to the vectors before it in two passes, because a single pass would leave
+            # rounding errors
             before, share = i % j, 0.0
             for k in range(size):
                 share += basis[k, before] * moved[k, j]

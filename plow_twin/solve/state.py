@@ -283,7 +283,7 @@ WORK: Final = np.dtype(
         ("column", "f8", (2, _ROWS)),  # a polynomial, for example one guard
         ("halves", "f8", (MAX_HALVINGS + 2, _ROWS)),
         ("bounds", "f8", (MAX_HALVINGS + 2, 2)),
-        ("wrench", "f8", (2, 3)),  # linear load: value and slope at the step's start
+        ("wrench", "f8", (2, 3)),  # linear load: its value at the step's start and its slope
         ("flight", "f8", (6, 6)),  # start of a flight, its bounds, scratch (`solve.method.flight`)
         ("rest", "f8", (4, 6)),  # place, rates and load at rest (`solve.method.rest`)
         ("hessian", "f8", (3, 3)),
@@ -291,7 +291,7 @@ WORK: Final = np.dtype(
         ("decay", "f8", (1,)),  # decay rate of the damping in 1/s, 0 if it does not limit steps
         ("switch", "i8", (PAIR_COUNT,)),  # modes that pairs take at the step's end, -1 for no change
         ("inverse", "f8", (_ROWS + 2,)),  # 1/k
-        # rest under harmonics: minus the derivatives of the accelerations with respect to the rates
+        # rest under harmonics: derivatives of the accelerations with respect to the rates, with the opposite sign
         ("damping", "f8", (3, 3)),
         ("rub", "f8", (6, *_WIDE)),  # wear: s' / v, sliding distance per travel, force times this distance; running-in
         ("binomial", "f8", (_ROWS, _ROWS)),  # 1 / C(order, k)

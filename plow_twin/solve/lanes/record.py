@@ -45,8 +45,8 @@ LANES: Final = np.dtype(
         ("bernstein", "f8", (_ROWS, WIDTH)),
         ("bulge", "f8", (_ROWS, WIDTH)),  # forces whose maximum must still be found, because it may exceed the peak
         ("bulge_step", "f8", _LANES_OF),  # step sizes that belong to the forces in `bulge`
-        ("rows", "f8", (PAIR_COUNT, 5, WIDTH)),  # penetration: factors of cosine, sine, X, Y, constant
-        ("arms", "f8", (PAIR_COUNT, 2, WIDTH)),  # arm: factors of cosine and sine
+        ("rows", "f8", (PAIR_COUNT, 5, WIDTH)),  # factors of cosine, sine, X and Y in the penetration, and its constant
+        ("arms", "f8", (PAIR_COUNT, 2, WIDTH)),  # factors of cosine and sine in the arm
         ("ratio", "f8", _PAIRS),  # C / K of pairs that are ON
         ("factor", "f8", _PAIRS),  # lambda
         ("gear", "f8", (PAIR_COUNT, 8, WIDTH)),  # for the pairs in each slot: `rows`, `arms` and `factor`
@@ -73,7 +73,8 @@ LANES: Final = np.dtype(
         ("change", "f8", (COMPONENTS, WIDTH)),  # change of the state over the step
         ("gained", "f8", (2, WIDTH)),  # scratch for one slot: impulse over the step, and peak
         ("sum", "f8", (4, WIDTH)),  # integrals over the step of the changes of cosine, sine, X, Y
-        ("harmonic", "f8", (10, WIDTH)),  # one load: frequency, sine, cosine, amplitudes of S1, S2, M; phase
+        # one harmonic load: frequency, sine, cosine, amplitudes of S1, S2 and M, phase
+        ("harmonic", "f8", (10, WIDTH)),
         ("size", "f8", (MOST_LACUNA, WIDTH)),  # sizes of the terms of the last orders, as velocities
         ("step", "f8", _LANES_OF),  # step size in s
         ("accurate", "f8", _LANES_OF),  # step size without events

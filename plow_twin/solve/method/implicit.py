@@ -111,7 +111,7 @@ def _implicit_type(size: int) -> np.dtype[np.void]:
             ("from_values", "f8", (STAGES + 1, STAGES + 1)),  # coefficients from values at the start and at the nodes
             ("from_stages", "f8", (STAGES, STAGES)),  # coefficients from values at the nodes alone
             ("z", "f8", (STAGES + 1, 2 * size)),  # state at the start and at the nodes
-            ("rate", "f8", (2, 2 * size)),  # rates for a difference quotient
+            ("rate", "f8", (2, 2 * size)),  # rates at a state and at a displaced state, for a difference quotient
             ("accelerations", "f8", (STAGES, size)),
             # derivatives of the accelerations with respect to place and to velocity
             ("jacobians", "f8", (STAGES, 2, size, size)),
