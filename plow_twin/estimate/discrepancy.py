@@ -228,7 +228,8 @@ class _Linearised:
 
     def __init__(self, problem: Problem, found: Fit, columns: dict[str, _Column], pushes: Array) -> None:
         every, waves = columns.values(), 0 if problem.harmonics is None else problem.harmonics.amplitude.size
-        #: names of the quantities without the harmonics, which come last, and slice of these in the border
+        #: `names`: names of the quantities other than the harmonics, which come last
+        #: `waves`: slice of the harmonics in the border
         self.names = list(columns)[: len(columns) - waves]
         self.waves = slice(SIZE + len(self.names), SIZE + len(columns))
         self._found, self._swing = found, found.point.swing

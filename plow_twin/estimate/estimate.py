@@ -275,7 +275,8 @@ def _searched(
             found, verdict = again, judge(*again, period)
     found, verdict = _with_differences(found, verdict, period)
     if bounced is None and _fails(found[1], verdict) and not verdict.sensor:
-        # a low pass, or a change of the machine, can imitate harmonics
+        # a low pass or a change of the machine can look like harmonics, so harmonics are tried only after the
+        # differences
         found, verdict = _with_harmonics(plain, forward.load, period) or (found, verdict)
     result = summarise(*found, verdict, lost, forces if bounced is None else None)
     if bounced is None and _fails(found[1], verdict) and not verdict.broken:

@@ -67,7 +67,7 @@ _UNMOVED: Final = np.zeros(6)
 _NO_LOAD: Final = Load(np.array([0.0, 1.0]), np.zeros((2, 3)))
 _NO_POSES: Final = Poses(np.zeros(0), np.zeros((0, 3)))
 _LENGTH: Final = struct.Struct("<q")
-#: Definition: key of the harmonics of the load in an estimate.
+#: Definition: key under which an estimate has the harmonics of the load.
 _HARMONICS: Final = "load_harmonics"
 
 

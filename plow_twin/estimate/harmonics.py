@@ -20,9 +20,10 @@ Array = NDArray[np.float64]
 
 #: Definition: names of the components of a load.
 COMPONENTS: Final = ("fx", "fy", "m")
-#: Bound: number of corrections of a load's frequency; each correction leaves the square of the error.
+#: Bound: number of corrections of a load's frequency; convergence is quadratic: a correction leaves about the square of
+#: the error.
 _CORRECTIONS = 6
-#: Derived: knots in the shortest period of a harmonic, between which straight lines are 0.9 % off.
+#: Derived: number of knots in the shortest period of a harmonic; straight lines between the knots are 0.9 % off.
 _KNOTS = 24
 
 

@@ -18,7 +18,8 @@ from plow_twin.estimate.unknowns import SIZE
 
 Array = NDArray[np.float64]
 
-#: Bound: number of fits with harmonics, iterations of each fit, and fits in a row that are no better than all before.
+#: Bound: number of fits with harmonics; number of iterations of each fit; number of consecutive fits, none of them
+#: better than all before, after which no more are made.
 _ROUNDS, _ITERATIONS, _IN_VAIN = 12, 6, 4
 
 
@@ -52,7 +53,7 @@ def _alternated(
         step, covariance, states = whole_step(problem, found, columns, precision, -value * precision)
         (shared, change), covariance = np.split(step, [SIZE]), covariance[SIZE:, SIZE:]
         size = float(change @ np.linalg.solve(covariance, change))
-        # a change within the noise follows linearly in the grades of a fit
+        # a change within the noise needs no further fit, because grading a fit allows for it by a linear step
         if in_vain == _IN_VAIN or (index and size < tuning.SETTLED * len(COMPONENTS)):
             break
         harmonics = harmonics.moved(np.clip(change, -tuning.LACKING, tuning.LACKING), np.diag(covariance))

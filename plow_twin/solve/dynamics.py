@@ -84,7 +84,7 @@ def about_mass(p, c, s, load):
 def accelerate(p, acts, frozen, state, t, z, load, out) -> None:
     """Write the rate of z = (x, y, theta, vx, vy, omega), or with a support of the z of `support.to_world_both`.
 
-    `acts` is an `Acting`. If `frozen`, the pairs that are on act by their law even where it would pull; otherwise the
+    `acts` is an `Acting`. If `frozen`, the pairs that are ON act by their law even where it would pull; otherwise the
     pairs that penetrate act and never pull.
     """
     load_at(p, acts.harmonics, acts.segments, t, load)

@@ -30,7 +30,7 @@ ON_THE_WALL = 1e-6
 def _guards(p, state, w, order, penetrating, viscous, ramp) -> None:
     """Write each pair's first guard to `w.guard`.
 
-    The guard of a pair that is off is -d. The guard of a pair that is on is F / K = d + (C / K) d' for Kelvin-Voigt;
+    The guard of a pair that is OFF is -d. The guard of a pair that is ON is F / K = d + (C / K) d' for Kelvin-Voigt;
     for other laws it is d, less a small penetration if the exponent is not an integer. All other guards are d.
     """
     guard, weights = w.guard, w.per_pair
@@ -64,8 +64,8 @@ def _guards(p, state, w, order, penetrating, viscous, ramp) -> None:
 def _second_guard(p, state, w, order, pair, viscous, hysteretic, integer, fraction, ramp) -> bool:
     """Write the second guard of a penetrating pair to `w.column[0]`; return whether it has one.
 
-    The guard of a pair that is on is 1 + lambda d', or F with a ramp. A clipped pair's guard is positive as long as its
-    force would pull. A released pair's guard is p.release - d.
+    The guard of a pair that is ON is 1 + lambda d', or F with a ramp. A CLIPPED pair's guard is positive as long as its
+    force would pull. A RELEASED pair's guard is p.release - d.
     """
     g, mode = w.column[0], state.mode[pair]
     g[order] = 0.0
@@ -103,7 +103,7 @@ def elastic_term(p, w, k, pair, integer, fraction):
 
 @kernel()
 def _pull(p, w, order, pair, mode, integer, fraction) -> None:
-    """Write the force of a ramped law to `w.column[0]`, with the opposite sign for a clipped pair."""
+    """Write the force of a ramped law to `w.column[0]`, with the opposite sign for a CLIPPED pair."""
     g, sign = w.column[0], 1.0 if mode == ON else -1.0
     for k in range(order):
         elastic = elastic_term(p, w, k, pair, integer, fraction)

@@ -88,7 +88,7 @@ def grasp(p, state, pair, old) -> None:
     """Let the corner of a pair that begins to push stick with a slack spring, or slip if T would exceed mu_s N.
 
     N follows from the previous mode `old`; if N followed from the depth, rounding would decide between stick and slip.
-    At a touch N is the force at depth 0, that of Kelvin-Voigt's damper; for a clipped pair that pushes again N is 0.
+    At a touch N is the force at depth 0, that of Kelvin-Voigt's damper; for a CLIPPED pair that pushes again N is 0.
     """
     place, rate = _along(p, pair, state.y)
     depth = 0.0 if old == OFF else penetration_of(p, state, pair, state.y)

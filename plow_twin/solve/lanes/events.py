@@ -1,7 +1,7 @@
 """The first event of each lane's step.
 
 Few guards can turn negative within a step. Each lane lists these guards, and each round searches eight of them, of any
-lanes. If a clipped or released pair parts, the step does not end, because no force changes; the rest of the step is
+lanes. If a CLIPPED or RELEASED pair parts, the step does not end, because no force changes; the rest of the step is
 then searched for the pair's next touch.
 """
 
@@ -44,9 +44,9 @@ _DEPTH, _RATE, _CONSTANT = 5, 6, 7
 def _list_guards(lanes, order, hysteretic, power, fraction) -> None:
     """Write to `lanes.todo` a bit for each guard of a lane that may turn negative.
 
-    The guard of a pair that is off is -d. A pair that is on has the guard F / K = d + (C / K) d', or with lambda d' the
-    two guards d and 1 + lambda d'. The guards of a clipped pair are d and the force with the opposite sign, those of a
-    released pair (`modes`) d and the distance to the release penetration.
+    The guard of a pair that is OFF is -d. A pair that is ON has the guard F / K = d + (C / K) d', or with lambda d' the
+    two guards d and 1 + lambda d'. The guards of a CLIPPED pair are d and the force with the opposite sign, those of a
+    RELEASED pair (`modes`) d and the distance to the release penetration.
     """
     for lane in range(WIDTH):
         lanes.todo[lane] = lanes.watched[lane]
@@ -72,7 +72,7 @@ def _list_guards(lanes, order, hysteretic, power, fraction) -> None:
 
 @kernel()
 def _list_powers(lanes, order, hysteretic, fraction) -> None:
-    """List the guards of pairs that are on, for exponents other than 1."""
+    """List the guards of pairs that are ON, for exponents other than 1."""
     one, none, h = exact_splat(1.0), exact_splat(0.0), exact_row(lanes.step, 0)
     for slot in range(PAIR_COUNT):
         taken = lanes.taken[slot]
@@ -113,9 +113,9 @@ def _note(lanes, slot, kind, bits) -> None:
 
 @kernel()
 def _list_off(lanes, order) -> None:
-    """List the guards of pairs that are off.
+    """List the guards of pairs that are OFF.
 
-    A guard is left out if its first terms, with bounds of the later terms, prove that the pair stays off.
+    A guard is left out if its first terms, with bounds of the later terms, prove that the pair stays OFF.
     """
     h, series, cosine, sine = exact_row(lanes.step, 0), lanes.series, lanes.series[COS], lanes.series[SIN]
     x, y = series[X], series[Y]
@@ -334,7 +334,7 @@ def _leaves(guard, i, order, h) -> bool:
 
 @kernel()
 def _note_root(lanes, lane, at, i, order) -> None:
-    """Use the root of a guard to end the step, or to record the parting of a clipped or released pair."""
+    """Use the root of a guard to end the step, or to record the parting of a CLIPPED or RELEASED pair."""
     guard, root = lanes.guarded[at, i], lanes.root[i] + lanes.begin[i]
     pair = guard % PAIR_COUNT
     if guard < SECOND and lanes.mode[pair, lane] > ON:

@@ -152,7 +152,7 @@ def turn(out, first, second) -> None:
 
 @kernel()
 def _part(state, sums, lanes, lane) -> None:
-    """Set the clipped and released pairs that leave their wall within a lane's step to off."""
+    """Set the CLIPPED and RELEASED pairs that leave their wall within a lane's step to OFF."""
     for pair in range(PAIR_COUNT):
         if lanes.parted[pair, lane] < lanes.step[lane]:
             lanes.mode[pair, lane] = OFF
@@ -178,7 +178,7 @@ def _touch(p, lanes, pair, lane) -> None:
 
 @kernel()
 def _touch_or_release(p, lanes, pair, lane) -> None:
-    """Begin the contact of a pair whose force is d^n; a slow touch begins with a released pair (`step`)."""
+    """Begin the contact of a pair whose force is d^n; a slow touch begins with a RELEASED pair (`step`)."""
     lanes.touched[lane] &= ~(1 << pair)
     if lanes.mode[pair, lane] == ON:
         if _rate(p, lanes, pair, lane) > slow_touch(p):

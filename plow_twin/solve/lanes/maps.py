@@ -52,7 +52,7 @@ def sigma_of(lanes, lane, used, fraction) -> float:
 def choose_maps(params, harmonics, extent, waves, second, hysteretic, fraction, segments, lanes, w) -> None:
     """Choose each lane's variable, and convert `lanes.whole` to a value of it.
 
-    A pair that is on, but too shallow for a series of its power, is released.
+    A pair that is ON, but too shallow for a series of its power, is RELEASED.
     """
     shallow, near = _look_at_pairs(lanes)
     if shallow != 0:

@@ -243,7 +243,7 @@ def clear_lane(lanes, lane) -> None:
 
 @kernel()
 def note_modes(p, lanes, lane) -> None:
-    """Derive the guards of a lane from the modes of its pairs, and put the pairs that are on into slots."""
+    """Derive the guards of a lane from the modes of its pairs, and put the pairs that are ON into slots."""
     bit, inside, carrying, taken, watched = 1 << lane, 0, 0, 0, 0
     for pair in range(PAIR_COUNT):
         mode, rest = lanes.mode[pair, lane], ~bit
@@ -265,7 +265,7 @@ def note_modes(p, lanes, lane) -> None:
 
 @kernel()
 def _take_slot(lanes, lane, pair, slot) -> None:
-    """Put a pair that is on into a slot of its lane."""
+    """Put a pair that is ON into a slot of its lane."""
     gear = lanes.gear[slot]
     for i in range(5):
         gear[i, lane] = lanes.rows[pair, i, lane]

@@ -13,7 +13,7 @@ from plow_twin.solve.state import OFF, ON
 
 @kernel()
 def held(p, state, y, least) -> bool:
-    """Return whether every pair is on or off and its penetration or gap is larger than `least`."""
+    """Return whether every pair is ON or OFF and its penetration or gap is larger than `least`."""
     for pair in range(PAIR_COUNT):
         if p.enabled[pair] == 1:
             penetration = penetration_of(p, state, pair, y)

@@ -541,7 +541,7 @@ def _write_ramp(p, h, w, implicit) -> float:
     """Write the law's force as K times an elastic part plus C times a remainder, and return the last term's size.
 
     The elastic part is d for the exponent 1, otherwise 0. The size is a velocity per h^(STAGES - 1). The series of a
-    clipped pair does not act on the head, but gives the time at which the pair pushes again.
+    CLIPPED pair does not act on the head, but gives the time at which the pair pushes again.
     """
     s, largest = implicit.nodes.size, 0.0
     _interpolate(implicit.pairs[1], implicit.from_stages, h, w.damped)

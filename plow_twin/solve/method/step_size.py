@@ -76,7 +76,7 @@ def before_sticking(p, state, w, order, sigma) -> float:
 
 @kernel()
 def before_pushing_again(p, state, w, order, sigma, integer, fraction) -> float:
-    """Return `sigma`, or the smaller value up to which the series of clipped pairs' ramped force is accurate.
+    """Return `sigma`, or the smaller value up to which the series of CLIPPED pairs' ramped force is accurate.
 
     This force does not act yet, and only a guard depends on it, so no other check limits its error. The motion's root
     test is applied to the velocity that the force would give. This is needed because the acting share of C is a cubic,
