@@ -234,7 +234,7 @@ def _balance_table(balance: EnergyBalance) -> Table:
         ("- stored in contacts, end minus start", -stored),
         ("= kinetic energy gained", kinetic),
     ):
-        rows.add_row(name, f"{value + 0.0:.6g}")  # no -0
+        rows.add_row(name, f"{value + 0.0:.6g}")  # adding 0.0 turns -0 into 0
     rows.add_row("largest imbalance at any step", f"{balance.imbalance_j:.3g}")
     rows.add_row("largest imbalance over turnover", f"{balance.relative_imbalance:.1e}")
     rows.add_row(

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
 #: Largest number of rows of a table on the terminal; longer tables are cut or thinned out, and files have all rows.
 MOST_ROWS: Final = 24
-#: Width of a column of numbers, and of the first column with its frame [characters].
+#: Width of a column of numbers [characters].
+#: Width of the first column with its frame [characters].
 _COLUMN, _FIRST_COLUMN = 12, 8
 
 

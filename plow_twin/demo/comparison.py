@@ -17,7 +17,7 @@ from plow_twin.stream.journal import Estimated
 
 Array = NDArray[np.float64]
 
-#: Length of the compared end of a run [s]: a load period of the paper.
+#: The last stretch of a run is compared; its length [s] is a load period of the paper.
 COMPARED_S: Final = 3.2
 
 

@@ -17,7 +17,7 @@ from plow_twin.record.estimated import left_by
 from plow_twin.record.reader import RunReader
 from plow_twin.record.recording import read_recording
 
-#: Mask of the pairs that belong to each sense of swing.
+#: For each sense of swing, the mask of the pairs that belong to it.
 SENSES: Final = {"ccw": STOPS_COUNTER_CLOCKWISE, "cw": ~STOPS_COUNTER_CLOCKWISE}
 
 

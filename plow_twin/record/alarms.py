@@ -21,9 +21,9 @@ from plow_twin.stream.outputs import Published
 
 #: Base name of the alarms' topic.
 ALARMS: Final = "alarms"
-#: Parameter name of an acknowledgement in the journal.
+#: Name under which the journal notes an acknowledgement, as if it were a parameter.
 ACKNOWLEDGED: Final = "alarms_acknowledged"
-#: Factor from SI and unit of each quantity in an alarm's text.
+#: For each quantity, the factor from SI and the unit in an alarm's text.
 _UNITS: Final = {
     "force": (1e-3, "kN"),
     "clearance": (1e3, "mm"),

@@ -35,7 +35,7 @@ class Sent:
 
     def __init__(self, sequence: Indexes, kind: Indexes, done: Indexes, first: int, advances: int) -> None:
         self.kind = kind
-        #: index of the advance after which each message was sent
+        #: for each message, the index of the advance after which it was sent
         self.after = np.empty(len(kind), np.int64)
         #: number of messages of each kind
         self.counts = np.zeros(_KINDS, np.int64)

@@ -23,7 +23,7 @@ def parsed_types(text: str, message_type: str) -> dict[str, Any]:
     """
     from rosbags.typesys import get_types_from_msg
 
-    # the parser's time grows with the square of the number of consecutive empty lines
+    # empty lines are left out: the parser's time grows with the square of the number of consecutive empty lines
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     if sum(map(len, lines)) > _LONGEST:
         raise RecordingError(f"{message_type}: got a longer text, expected at most {_LONGEST} characters")
@@ -39,7 +39,8 @@ def _count(name: str, types: dict[str, Any], counts: dict[str, int]) -> int:
     if name not in types:
         return 1
     if name not in counts:
-        counts[name] = _MOST_PARTS + 1  # a type that contains itself has no end
+        # a type counts as too large while its parts are counted, so that a type that contains itself is refused
+        counts[name] = _MOST_PARTS + 1
         counts[name] = max(1, sum(_parts(field, types, counts) for _, field in types[name][1]))
     if counts[name] > _MOST_PARTS:
         raise RecordingError(f"{name}: got more parts, expected at most {_MOST_PARTS}")

@@ -92,7 +92,7 @@ class Feed:
                 self.flush()
                 for walker in self.walkers:
                     walker.speed_m_s = speed
-                    # the speed acts from this sample on
+                    # the speed acts from the newest sample on
                     walker.apply(Travel(self._reached_ns or 0, speed), max(0, log_time_ns))
         elif name == "excitation":
             wrench = (values["fx"], values["fy"], values["m"])

@@ -31,7 +31,7 @@ SERVER_STAMP: Final = "server"
 _NODE_KEYS: Final = ("scale", "offset", "unit", "limits")
 #: Key of the model that computes the load from the drive's signals.
 LOAD_MODEL: Final = "load_model"
-#: Factor from each unit to SI, by quantity.
+#: For each quantity, the factor from each of its units to SI.
 UNITS: Final[dict[str, dict[str, float]]] = {
     "force": {"N": 1.0, "kN": 1e3, "MN": 1e6},
     "moment": {"N m": 1.0, "Nm": 1.0, "kN m": 1e3, "kNm": 1e3},

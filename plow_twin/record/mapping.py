@@ -47,7 +47,7 @@ _FIELDS: Final[dict[tuple[str, str], dict[str, str]]] = {
     ("forces", "sensor_msgs/msg/JointState"): {name: f"effort[{name}]" for name in PAIR_NAMES},
     ("gaps", "sensor_msgs/msg/JointState"): {name: f"position[{name}]" for name in PAIR_NAMES},
 }
-#: Names of topics by which a role is found without a mapping.
+#: Without a mapping, a role is found by these names of topics.
 _NAMES: Final = {
     "excitation": ("excitation", "load", "wrench"),
     "head_pose": ("head_pose", "pose"),

@@ -44,10 +44,10 @@ FORCES_FILE = "contact_forces.csv"
 _LOAD_COLUMNS: Final = ("t", "fx", "fy", "m")
 _POSE_COLUMNS: Final = ("t", "x", "y", "theta")
 _NOT_STATED: Final = (math.nan,) * 3
-#: Largest number of rows of a table that are kept; they are the newest rows. For a load they take 320 MB, and last
-#: nearly three hours at 1 kHz.
+#: Largest number of rows of a table that are kept; the newest rows are kept. This many rows of a load take 320 MB and
+#: cover nearly three hours at 1 kHz.
 MOST_ROWS: Final = 10_000_000
-#: Key of the losses for rows older than the kept rows.
+#: Key under which the losses count rows that are older than the kept rows.
 OLDER_ROWS: Final = "older_rows"
 
 

@@ -35,11 +35,11 @@ if TYPE_CHECKING:
     from plow_twin.record.ring import RingWriter
     from plow_twin.record.writer import RunWriter
 
-#: Key of the journal in the loss counters.
+#: Key under which the loss counters count lost journal entries.
 JOURNAL: Final = "journal"
 #: Interval at which the thread empties the queue [s].
 _POLL_S: Final = 0.05
-#: Errors of a full disk, which may have room again later.
+#: Errors that mean a full disk; there may be room again later.
 _FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
 #: Number of items that the thread writes between two sleeps (some 0.2 ms of Python). Callers get the interpreter during
 #: a sleep; without the sleep the thread would take it back at once.
@@ -184,7 +184,7 @@ class Recorder:
         self._snapshot_due = False
         self._output_gaps: Counter[str] = Counter()
         self._lost: Counter[str] = Counter()
-        self._unflushed: Counter[str] = Counter()  # counts of items that are written, but not yet flushed
+        self._unflushed: Counter[str] = Counter()  # counts of items that are written but not yet flushed
         self._written = 0
         self._error: str | None = None
         self._paused: str | None = None  # reason why new items are refused; None while they are accepted

@@ -35,7 +35,7 @@ class Messages:
             for cadence in (Cadence.EACH, Cadence.SLOW, Cadence.MARKED, Cadence.FOLLOWED)
         ]
         self._followed = followed if intervals else None
-        #: the memory that receives each message, by base name of its topic
+        #: for each topic (base name), the memory that receives its message
         self.memory = dict(part for group in groups[: 3 + intervals] for part in group.parts)
 
     def write(self, published: Published) -> tuple[tuple[str, memoryview], ...]:

@@ -81,7 +81,7 @@ def _fits(buffer: Bytes, start: int, length: int, data: Bytes, fixed: Bytes) -> 
     """Return whether the bytes from `start` on are a message of a template, with any numbers."""
     if length != data.size or start < 0 or start + length > buffer.size:
         return False
-    last = length - 8  # the last word may overlap the previous word
+    last = length - 8  # the last word ends with the message, so it may overlap the word before it
     wrong = (word(buffer, start + last) ^ word(data, last)) & word(fixed, last)
     for k in range(length >> 3):
         wrong |= (word(buffer, start + 8 * k) ^ word(data, 8 * k)) & word(fixed, 8 * k)

@@ -48,7 +48,7 @@ _FASTEST_M_S: Final = 5.0
 #: Share of falling stamps above which the column is not a time.
 #: Share of falling stamps above which the rows are in reverse order.
 _FALLING, _REVERSED = 0.2, 0.9
-#: Length [s] of each unit other than the second that a time may have.
+#: Length [s] of each unit of time except the second.
 _TIMES: Final = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 #: Spreadsheets count days since 1900; dates of this century lie between these two day numbers.
 _SHEET_DAYS: Final = (36_525.0, 73_050.0)

@@ -114,7 +114,7 @@ def claim_folder(folder: Path) -> int:
     except BlockingIOError:
         os.close(descriptor)
         raise WearStateError(f"{folder}: another twin keeps its wear there, expected a folder for each") from None
-    except OSError:  # the file system has no locks
+    except OSError:  # without locks the file system cannot show whether another twin uses the folder
         pass
     beside = folder / f".{FILE_NAME}.{os.getpid()}"
     try:

@@ -43,7 +43,7 @@ class _Part:
     file: McapFile
     #: for each topic, number, message type and QoS text of its channel
     channels: dict[str, tuple[int, str, str]] = field(default_factory=dict)
-    #: channel number of each publication topic by base name
+    #: for each publication topic (base name), the number of its channel
     sent: dict[str, int] = field(default_factory=dict)
 
     def facts(self) -> PartFacts:

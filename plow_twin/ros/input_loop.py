@@ -134,7 +134,7 @@ class InputLoop:
 
     def _run(self) -> None:
         try:
-            left: list[int] = []  # queues that may not be empty
+            left: list[int] = []  # queues in which messages may still wait
             while not self._stopped:
                 pause_s = 0.0 if left else max(0.0, self._due - time.monotonic())
                 ready = select.select(self._signs, (), (), pause_s)[0]

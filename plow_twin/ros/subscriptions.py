@@ -27,7 +27,8 @@ from plow_twin.stream.intake import Intake, Verdict
 
 #: Depth of the optional inputs' queues.
 _SLOW_DEPTH: Final = 200
-#: Number of publishers whose sequence numbers are remembered; the oldest is forgotten.
+#: Largest number of publishers whose sequence numbers are remembered; when there are more, the oldest publisher is
+#: forgotten.
 _MOST_PUBLISHERS: Final = 256
 #: Number of samples from which a publisher's rate is estimated.
 _RATE_KNOWN: Final = 20

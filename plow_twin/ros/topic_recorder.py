@@ -68,13 +68,13 @@ class TopicRecorder:
 
     def __init__(self, node: Node, writer: BagWriter, wanted: Callable[[str], bool]) -> None:
         self._node, self._writer, self._wanted = node, writer, wanted
-        #: type, number in the file, and subscribed qualities of service, by topic
+        #: for each topic: its type, its number in the file, and the subscribed qualities of service
         self._topics: dict[str, tuple[str, int, set[_Quality]]] = {}
         #: for each known publisher, the quality of service of the subscription that takes its messages
         self._taken_as: dict[tuple[str, bytes], _Quality] = {}
         self._turns = Turns()
         self._loop = InputLoop(self._turns, lambda error: None)
-        #: reason for each topic that is not recorded
+        #: for each topic that is not recorded, the reason
         self.skipped: dict[str, str] = {}
         #: number of messages that were sent but never received, from the publishers' sequence numbers
         self.missed: dict[str, int] = {}

@@ -13,8 +13,9 @@ from typing import IO, Final
 from plow_twin.errors import ExcessError
 from plow_twin.scene_file.parquet_lines import SUFFIX, ParquetLines, is_parquet
 
-#: Longest row [characters] and largest number of columns; the export of a plant historian has some hundred columns.
+#: Longest row [characters].
 LONGEST_ROW: Final = 2**20
+#: Largest number of columns; the export of a plant historian has some hundred columns.
 MOST_COLUMNS: Final = 10_000
 
 
@@ -45,7 +46,7 @@ def tables(folder: Path) -> list[Path]:
     return [found[name] for name in sorted(found)]
 
 
-#: Kinds of file that may be mistaken for CSV, by their first bytes.
+#: First bytes of each kind of file that may be mistaken for CSV.
 _OTHERS: Final = {
     b"\xff\xfe": "UTF-16 text",
     b"\xfe\xff": "UTF-16 text",

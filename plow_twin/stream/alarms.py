@@ -24,8 +24,8 @@ from plow_twin.stream.outputs import CLEARANCE_NAMES, Published, Rows
 
 #: An alarm leaves a level when its value falls below this share of the level's threshold.
 HYSTERESIS: Final = 0.95
-#: Time [ns] over which the growth rate of the clearance is computed, because the clearance grows too little from one
-#: slow part to the next (0.1 s).
+#: Time [ns] over which the growth rate of the clearance is computed. Over the 0.1 s between two slow parts the
+#: clearance grows too little.
 RATE_SPAN_NS: Final = 10 * NS_PER_S
 #: Time for which poses of the model are kept for late measured poses [ns].
 _KEPT_NS: Final = 2 * NS_PER_S

@@ -25,7 +25,7 @@ class Failures:
         self.reason = ""
         #: stamps of the first and the last advance of the newest stretch [ns]
         self.since_ns = self.until_ns = 0
-        #: whether the motion restarted after the newest stretch
+        #: whether the motion has restarted since the newest stretch began
         self.restarts = False
         self._in_a_row = 0
         #: length of the stretch of failed advances before the newest restart [ns]

@@ -46,8 +46,8 @@ class Verdict(Enum):
     IMPLAUSIBLE = "implausible"
     #: the stamps jump repeatedly, so that this jump does not reset the model
     UNSTEADY = "unsteady"
-    #: the stamp jumped, but the next stamp continued the stamps before the jump: this stamp was wrong, and the sender's
-    #: clock did not step
+    #: the stamp jumped, but the next stamp continued the stamps from before the jump, so this stamp was wrong and the
+    #: sender's clock did not step
     STRAY = "stray"
     #: names or lengths of the message do not fit the scene
     MALFORMED = "malformed"
@@ -58,7 +58,8 @@ class Verdict(Enum):
     #: arrived before the first message on /clock
     NO_CLOCK = "without_clock"
 
-    # verdicts are looked up several times for each sample, and the hash of an enumeration is slow
+    # verdicts are looked up several times for each sample, so they are hashed by identity: the hash of an enumeration
+    # is slow
     __hash__ = object.__hash__
 
     def __init__(self, name: str) -> None:

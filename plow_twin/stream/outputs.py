@@ -50,13 +50,13 @@ THE_ONE: Final = np.zeros(1, np.int64)
 NONE: Final = np.zeros(0, np.int64)
 _NO_ROWS: Final = np.zeros(0, ROW)
 _NO_SLOW: Final = np.zeros(0, SLOW)
-#: Additional fields of a row if the motion follows measurements.
+#: Fields that a row has in addition if the motion follows measurements.
 FOLLOWED_FIELDS: Final = (
     "followed", "known_clearance", "force_low", "force_high", "peak_low", "peak_high", "impulse_low", "impulse_high",
 )  # fmt: skip
 #: Fields that describe the motion at the row's time.
 _MOTION: Final = ("t", "stamp_ns", "held", "q", "v", "penetration", "rate", "force", "wear_depth", *FOLLOWED_FIELDS)
-#: Fields whose numbers `summary` checks for being finite by summing them up.
+#: Fields that `summary` sums up, to find numbers that are not finite.
 _SUMMED: Final = ("q", "v", "penetration", "rate", "force", "impulse", "peak")
 #: Index in `clearance` of each of the six numbers of `known_clearance`, and of an estimate's six shifts.
 _KNOWN: Final = np.array([0, len(_CLEARANCES), len(_CLEARANCES) + 1, 1, len(_CLEARANCES) + 2, len(_CLEARANCES) + 3])

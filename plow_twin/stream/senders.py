@@ -10,7 +10,7 @@ from collections.abc import Collection
 
 #: Silence of the followed sender [ns] after which `OneSender` follows another sender.
 _SILENT_NS = 10_000_000_000
-#: Largest number of senders whose message numbers are kept; the oldest is forgotten.
+#: Largest number of senders whose message numbers are kept; when there are more, the oldest sender is forgotten.
 _MOST_SENDERS = 64
 
 

@@ -46,7 +46,7 @@ from plow_twin.stream.journal import (
 from plow_twin.stream.model_changes import changed_scene, changed_twin, read_changes
 from plow_twin.stream.outputs import NONE, NOTHING, THE_ONE, Outputs, Published, Rows, Stock
 
-#: Number of advances between digests.
+#: Number of advances from one digest to the next.
 DIGEST_INTERVAL: Final = 100
 #: Header of a snapshot: whether a stamp is known, origin, stamp reached, number of advances, whether the load is held,
 #: speed along the face, number of waiting speeds.

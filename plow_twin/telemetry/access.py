@@ -33,7 +33,7 @@ class AccessError(InputError):
         super().__init__([Problem(key, got, expected)], "telemetry")
 
 
-#: Characters that a topic for sending cannot have.
+#: Characters that the name of a topic for sending cannot have.
 _NO_TOPIC: Final = re.compile(r"[+#\x00-\x1f]|^\$")
 
 

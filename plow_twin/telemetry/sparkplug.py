@@ -84,7 +84,7 @@ class Sparkplug:
         self._connection = -1
         self._rebirth = False
         self._newest = Newest()
-        #: newest value of each metric that was sent
+        #: for each metric, the newest value that was sent
         self._sent: dict[tuple[str, str], Value] = {}
         # messages that a break has delayed are dropped, because the next birth message has all newest values
         self._broker = Broker(will=self._next_death, on_connected=self._born, keeps=False, **options)

@@ -14,7 +14,8 @@ from plow_twin.view.columns import Array, Batches, Indexes, TimeAxis
 ENTITY: Final = "contact_set"
 FREE: Final = "free"
 Color = tuple[int, int, int]
-#: Colours for no contact, a stopped counter-clockwise rotation, a stopped clockwise rotation, and both.
+#: Colours of four states: no contact; contacts that stop counter-clockwise rotation; contacts that stop clockwise
+#: rotation; both kinds of contact.
 _COLORS: Final[tuple[Color, ...]] = ((235, 235, 235), (86, 180, 233), (240, 160, 60), (204, 121, 167))
 _CCW_BITS: Final = int((STOPS_COUNTER_CLOCKWISE.astype(np.int64) << np.arange(PAIR_COUNT)).sum())
 

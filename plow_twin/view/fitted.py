@@ -23,7 +23,7 @@ _SCALE: Final = 1e3
 _COMPONENTS: Final = (("x", "mm"), ("y", "mm"), ("θ", "mrad"))
 #: Largest number of characters in a line of the title.
 _LINE: Final = 150
-#: Smallest time between two rows that counts as a gap, as a multiple of the usual time.
+#: There is a gap between two rows if the time between them exceeds this multiple of the median time.
 _GAP: Final = 10.0
 #: Largest drawn distance from the prior's middle, in half widths of the prior; values farther away are drawn at this
 #: distance.

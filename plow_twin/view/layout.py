@@ -159,7 +159,8 @@ def style_curves(stream: rr.RecordingStream) -> None:
         _style(stream, entity, name, color, AggregationPolicy.MinMax)
     for entity in BAND:
         _style(stream, entity, "90 % interval", None, AggregationPolicy.MinMax, _BAND_WIDTH)
-    for entity in (*TOTAL, *GROWTH, *WEAR):  # the lines of bounds are thinner than the line of the value between them
+    # the lines of a value's bounds are thinner than the line of the value itself
+    for entity in (*TOTAL, *GROWTH, *WEAR):
         base, _, bound = entity.partition("/")[2].partition("/")
         base = base.removeprefix("pad_")
         color = _CLEARANCE_COLORS.get(base) or PAIR_COLORS[PAIR_NAMES.index(base)]

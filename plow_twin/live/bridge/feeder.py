@@ -26,7 +26,8 @@ from plow_twin.stream.intake import Intake, Verdict
 _RESTART = 1000
 #: Largest number of samples lost between two messages: a day at 10 kHz.
 _MOST_LOST = 10**9
-#: After at least this many messages, a message with the number 0 or 1 means a restart; after fewer messages it is late.
+#: After at least this many messages, the number 0 or 1 means that the sender has restarted; before, it belongs to a
+#: late message.
 _FIRST = 10
 #: A change of the load's deviation is journalled if it exceeds this share of the larger deviation.
 _NOTABLE = 0.02

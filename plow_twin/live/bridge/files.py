@@ -25,7 +25,7 @@ from plow_twin.scene_file.parquet_lines import ParquetLines, is_parquet
 
 #: Largest number of bytes that are read from a source at once.
 _BLOCK: Final = 1 << 18
-#: Number of bytes by which a file is recognised.
+#: Number of newest bytes that are remembered, to recognise whether a file was rewritten.
 _REMEMBERED: Final = 256
 #: Interval at which a followed file is read [s].
 _LOOK_S: Final = 0.02
@@ -108,7 +108,7 @@ class _Tail:
 
     def _is_another(self) -> bool:
         """Return whether the file was rewritten, or another file is at its path."""
-        if isinstance(self._file, ParquetLines):  # such a file is read once
+        if isinstance(self._file, ParquetLines):  # a Parquet file is read once, so it is not looked at again
             return False
         try:
             found = self.path.stat()
@@ -244,7 +244,7 @@ class Files(SourceState):
             if not tail.path.parent.is_dir():
                 raise BridgeError(f"{tail.path.parent}: no such folder")
         self._merged: Iterator[Arrived] | None = None
-        #: the messages of a single topic
+        #: the messages of the source if it has a single topic
         self._tables: Iterator[Messages] | None = None
         #: `_size`: total size of the files that are read once [B]
         #: `_done`: how much of this total has been read [B]

@@ -130,7 +130,7 @@ class Rows:
         self._json = False
         #: the delimiter that the header shows
         self.delimiter = ","
-        #: columns of the previous file, which this file replaces
+        #: columns of the previous file, whose place this file has taken
         self._before: list[str] | None = None
 
     @property

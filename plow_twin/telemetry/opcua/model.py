@@ -40,7 +40,7 @@ class Model:
         self._server = server
         self._index = 0
         self._di = 0
-        #: node of each value by `<group>/<name>`
+        #: node of each value; the key is `<group>/<name>`
         self.nodes: dict[str, ua.NodeId] = {}
         self.device: Node
 

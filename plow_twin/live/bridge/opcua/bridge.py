@@ -42,7 +42,7 @@ _OVERLAP_NS: Final = 1_000_000_000
 _AHEAD_NS: Final = 86_400_000_000_000
 #: Longest delay [s] after which a value that was sent is also in the server's history.
 _HISTORY_LAG_S: Final = 5.0
-#: Longest wait for the first values of a subscription [s], which a server sends at once.
+#: Longest wait for the first values of a subscription [s]; a server sends these values at once.
 _FIRST_VALUES_S: Final = 10.0
 #: First wait before another attempt to connect [s].
 _FIRST_WAIT_S: Final = 1.0
@@ -183,7 +183,7 @@ class OpcUa(SourceState):
             link = Link(self._access, self.host, self._ids, self._uris, self._sampling_ms, self._take, self._counts)
             try:
                 await self._follow(link)
-            except Exception as error:  # a malformed answer can raise any error of the library
+            except Exception as error:  # the library can raise any error for a malformed answer
                 self.trouble = self._words(error)
             finally:
                 wait_s = _FIRST_WAIT_S if self.connected else wait_s
