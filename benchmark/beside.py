@@ -1,4 +1,4 @@
-"""Measure this checkout and an earlier commit in one run, by two processes that do the same work in turn.
+"""Compare this checkout with an earlier commit: two processes, one for each, do the same work in turn.
 
     python benchmark/beside.py COMMIT [--rounds 5]
 

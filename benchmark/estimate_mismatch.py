@@ -51,7 +51,7 @@ USEFUL_M = 4e-3
 
 @dataclass(frozen=True)
 class Kind:
-    """The difference of a machine from the model; a share or size that gets a random sign is a standard deviation."""
+    """Differences of a machine from the model. A share or size that gets a random sign is a standard deviation."""
 
     title: str
     stiffness: tuple[float, float] = (5e6, 3e7)

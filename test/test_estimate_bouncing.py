@@ -89,7 +89,7 @@ def test_a_method_that_disagrees_widens_the_interval() -> None:
 
 @pytest.mark.parametrize("turn", [0.0, -0.1])
 def test_the_bias_of_a_sensor_behind_a_hard_contact_is_found(turn: float) -> None:
-    """A missed half degree would withdraw the estimate; missed 9 mm along y would make a clearance 1 mm too large."""
+    """Half a degree that is missed would withdraw the estimate; 9 mm along y would make a clearance 1 mm too large."""
     truth = draw(replace(GROUPS["hard"], periods=4.0), 3)
     bias = np.array([1e-3, -9e-3, turn])
     found = bias_of_hard(Unknowns(truth.nominal), truth.poses.moved(bias))
@@ -192,7 +192,7 @@ def test_a_motion_like_those_of_another_law_is_suspect_unless_that_law_is_unlike
 
 
 def test_what_a_hard_motion_hides_widens_the_clearances_and_not_the_twins() -> None:
-    """Corners rounded by 5 mm make clearances 0.7 mm too large, by ten of their deviations."""
+    """Corners rounded by 5 mm make clearances 0.7 mm too large, which is ten of their deviations."""
     truth = draw(replace(GROUPS["hard"], periods=4.0), 3)
     unknowns, period = Unknowns(truth.nominal), truth.load.period()
     eye = MotionFeatures(unknowns, truth.poses, period)

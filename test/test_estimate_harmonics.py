@@ -93,7 +93,7 @@ def _error(force: np.ndarray, true: np.ndarray) -> float:
 
 
 def test_twins_follow_with_the_harmonics_of_their_window(truth: Truth, found: Estimate) -> None:
-    """The stamps of the window begin 1.5 s before the first sample of the session, whose state goes on bit for bit."""
+    """The window begins 1.5 s before the session's first sample; the session's state continues bit for bit."""
     text, begin, end = json.dumps(found.as_dict()), 150, 700
     run = simulate(truth.scene, end * 0.01, 0.01, 1e-6)
     errors = {}

@@ -64,7 +64,7 @@ def test_the_jump_agrees_with_the_direct_run_with_sliding_in_the_plane_and_runni
 
 
 def test_constant_force_wears_as_archard_says() -> None:
-    """If wear does not change the force, h = F E."""
+    """If wear does not change the force F, the depth is h = F E, where E is the exposure."""
     scene = replace(preset("paper"), wear=FAST)
     force, deviation = mean_forces(scene, np.zeros(8))
     path = wear_path(scene, (1.0, 1.0), 1e-10)

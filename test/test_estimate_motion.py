@@ -104,7 +104,7 @@ def test_the_vertical_clearance_of_a_head_that_never_moves_sideways_is_estimated
 
 @pytest.mark.parametrize("seed", [pytest.param(43202, marks=pytest.mark.stress), 43210])
 def test_intervals_hold_between_soft_and_hard_contacts(seed: int) -> None:
-    """The first contact is estimated like a hard one, with an interval for errors of the frame, which is exact here."""
+    """The first machine is treated as if its contact were hard: errors of the frame, here zero, widen its intervals."""
     truth = draw(GROUPS["middle"], seed)
     result = estimate(truth.nominal, truth.load, truth.poses)
     values = result.horizontal, result.vertical
@@ -215,7 +215,7 @@ def test_without_measurements_the_prior_is_returned() -> None:
 
 
 def test_poses_too_sparse_for_a_fit_are_refused() -> None:
-    """With 5 Hz, 1.5 % of 200 Hz or 10 % of 100 Hz, swings would begin anywhere; a fit would be wrong and narrow."""
+    """At 5 Hz, or with 1.5 % or 10 % of the poses, swings would begin anywhere, and a wrong fit would look certain."""
     nominal = preset("paper")
     load, _ = Load.of([0.0, 20.0], np.ones((2, 3)))
     rng = np.random.default_rng(1)

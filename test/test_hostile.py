@@ -88,7 +88,7 @@ READERS = {
 
 @pytest.mark.parametrize("reader", READERS)
 def test_files_that_stand_for_too_much_are_refused_in_a_line(reader: str, tmp_path: Path) -> None:
-    """Each ends with exit code 2 and one line, without a signal; all of them take at most 60 s of processor time."""
+    """Each command ends with exit code 2, one line and no signal; all of them take at most 60 s of processor time."""
     for name, make in FILES.items():
         (tmp_path / f"{name}.yaml").write_text(make())
     (tmp_path / "load.csv").write_text("t,fx,fy,m\n0,0,0,0\n1,0,0,0\n")

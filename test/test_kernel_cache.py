@@ -85,7 +85,7 @@ def test_code_of_other_sources_is_removed(tmp_path: Path) -> None:
 
 
 def test_a_kernel_that_only_kernels_call_stands_as_a_copy_in_each_entry_and_has_no_machine_code(tmp_path: Path) -> None:
-    """Compiling it in addition to each caller would take a third of the time.
+    """Compiling such a kernel by itself, in addition to its callers, would take a third of the time.
 
     Without copies, bits would depend on which entry a process loads first, and on whether it compiles or loads entries.
     """
@@ -114,7 +114,7 @@ def test_a_disk_that_takes_no_cache_is_one_warning_and_the_run_goes_on(tmp_path:
 
 
 def test_no_kernel_assigns_an_array_to_a_slice() -> None:
-    """Numba would compile the formatting of an error message with it, 2 s in each process; `copy_into` has none."""
+    """Numba would also compile how its error message is formatted, 2 s in each process; `copy_into` has no message."""
     found = []
     for folder in KERNEL_FOLDERS:
         for source in sorted((ROOT / "plow_twin" / folder).rglob("*.py")):

@@ -254,7 +254,7 @@ def test_the_server_s_grants_are_compared_with_the_requests() -> None:
 def test_a_minute_without_a_connection_is_filled_and_ends_in_the_digest_of_the_uninterrupted_run(
     server: Plant, tmp_path: Path
 ) -> None:
-    """Meanwhile the model follows the hold policy; then it goes back to the end of the samples."""
+    """During the break the model follows the hold policy; after the break it goes back to the end of the samples."""
     (tmp_path / "map.yaml").write_text(MAP)
     run, step_ns = tmp_path / "run", 10 * MS
     start_ns = time.time_ns() // MS * MS - 63_000 * MS

@@ -122,7 +122,7 @@ def _law(name: str) -> Scene:
     ],
 )
 def test_the_linearised_equations_agree_with_displaced_motions(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The laws are those that the differences of runs above do not cover.
+    """These laws are not covered by the tests above, which compare differences of runs.
 
     The linearised equations are used, not shadow runs.
     """

@@ -147,7 +147,7 @@ def test_every_law_keeps_to_the_tolerance_and_to_bounded_work(start: Scene, law:
 
 @pytest.mark.parametrize("damping", [10.0**k for k in range(10, 14)])
 def test_damping_beyond_double_precision_or_the_model_is_refused(damping: float) -> None:
-    """Refused are a factor beyond its limit, and a damper so strong that a pad wears faster than the head moves."""
+    """A factor beyond its limit is refused, and so is a damper with which a pad wears faster than the head moves."""
     with pytest.raises(SceneError, match=r"contact.damping: got \S+, expected at most 1e\+09 s/m for hunt_crossley"):
         replace(BENCH, contact=overdamped("hunt_crossley", damping))
     wear = Wear(1e-12, 0.015, 2.0)
@@ -161,7 +161,10 @@ def test_damping_beyond_double_precision_or_the_model_is_refused(damping: float)
 
 
 def test_a_start_inside_a_wall_leaves_as_from_the_middle_of_an_impact() -> None:
-    """From depth d it leaves with e v0 of an impact at v0 that turns back at d; v0 = d sqrt(2 K / m) at e = 1."""
+    """The head starts at depth d and leaves with e v0, as after an impact at v0 that turns back at d.
+
+    At e = 1, v0 = d sqrt(2 K / m).
+    """
     depth, stiffness, mass = 1e-3, 1e9, 2430.0
     for e in (1.0, 0.4):
         contact = Contact("exact_restitution", stiffness, restitution=e)

@@ -49,7 +49,7 @@ Draw = Callable[[st.SearchStrategy], float]
 
 
 def a_contact(draw: Draw, law: str, exponent: float, weight: float, size: float, mass: float) -> Contact:
-    """Draw a contact; at 1e-8 to 1e-2 of the size its wall bears the weight, which gives about 1e3 to 1e13 N/m."""
+    """Draw a contact that bears the weight at a depth of 1e-8 to 1e-2 of the size: about 1e3 to 1e13 N/m."""
     depth = size * draw(decades(1e-8, 1e-2))
     stiffness = min(weight / depth**exponent, 1e13)
     if law == "kelvin_voigt":

@@ -148,7 +148,7 @@ def test_a_spring_that_nothing_damps_goes_on_ringing() -> None:
 def test_a_harmonic_that_cannot_be_seen_lets_the_head_rest(
     force: float, omega: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It moves the head by less than a thousandth of the tolerance, as is proved before and seen without rest."""
+    """The harmonic moves the head by less than a thousandth of the tolerance; a run without rest confirms this."""
     tol, scene = 1e-6, fallen_under_a_harmonic(force, omega)
     rested = simulate(scene, 400.0, 0.317, tol=tol)
     assert rested.solver["steps"] == simulate(scene, 200.0, tol=tol).solver["steps"] + 2

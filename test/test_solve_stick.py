@@ -195,7 +195,7 @@ def test_strong_dampers_keep_to_the_tolerance(damping: float) -> None:
 
 
 def test_whether_a_corner_holds_from_its_touch_on_is_not_decided_by_rounding() -> None:
-    """The force of Kelvin-Voigt is present at once, so a slack grip holds."""
+    """The Kelvin-Voigt force is present from the touch on, so a slack grip holds."""
     scene = replace(preset("bench_kv"), friction=Friction(0.3, stick_stiffness_n_m=5e7))
     loose, tight = (simulate(scene, 1.0, output_dt=0.1, tol=tol, energy_balance=True) for tol in (1e-6, 1e-10))
     assert pose_error(scene, loose.q, tight.q) < 1e-8
@@ -215,7 +215,7 @@ def test_whether_a_clipped_corner_that_pushes_again_holds_is_not_decided_by_roun
 
 @pytest.mark.parametrize("damping", [1e5, 1e6])
 def test_a_corner_grips_at_its_touch_as_with_fixed_steps(damping: float) -> None:
-    """Kelvin-Voigt's force is present at once.
+    """The Kelvin-Voigt force is present from the touch on.
 
     The corner sticks from the touch on, or slips if its damper is too strong.
     """

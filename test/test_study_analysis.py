@@ -287,7 +287,7 @@ def test_travel_makes_passes_of_the_face(tmp_path: Path) -> None:
 @pytest.mark.parametrize("lag_s", [0.0, 0.0203, -0.4])
 @pytest.mark.parametrize(("rate_hz", "times_each"), [(1000, 1), (1000, 2), (200, 1), (37, 1)])
 def test_the_lag_is_found_at_any_rate_of_the_sensor(rate_hz: int, times_each: int, lag_s: float) -> None:
-    """The lag is also found for a signal that is slow compared with the recorded time, and with repeated rows."""
+    """The lag is found even if the signal is slow compared with the recorded time, and if rows are repeated."""
     t = np.arange(0.0, 3.0, 1e-3)
 
     def signal(at: np.ndarray) -> np.ndarray:
@@ -335,7 +335,7 @@ def test_duty_is_a_share_of_time_however_coarsely_the_load_is_sampled(tmp_path: 
 
 @pytest.mark.parametrize("clock_s", [2.0, 3600.0])
 def test_measured_values_are_compared_with_the_stretch_they_belong_to(clock_s: float, tmp_path: Path) -> None:
-    """The clock steps back, or an hour ahead; both stretches are predicted as they were measured."""
+    """The clock steps back or an hour ahead; the stretches before and after the step are predicted as measured."""
     times, wrench, q = motion()
     short = 3000
     weak = 0.3 * wrench[:short]
@@ -355,7 +355,7 @@ def test_measured_values_are_compared_with_the_stretch_they_belong_to(clock_s: f
 # each rotation compiles its own kernel
 @pytest.mark.parametrize("rotation", ["paper", pytest.param("consistent", marks=pytest.mark.stress)])
 def test_contacts_under_gravity_alone_take_the_energy_of_the_height_lost(rotation: str, tmp_path: Path) -> None:
-    """In flight they take nothing; until the head rests, m g times the drop of its centre less the stored energy."""
+    """In flight they take none; up to rest they take m g times the drop of the centre, less the stored energy."""
     scene = load_scene(PAPER)
     arm, height = scene.gravity.arm_m, 0.1
     assert arm > 0.1

@@ -258,7 +258,7 @@ def test_a_touch_that_is_over_is_not_drawn_on_in_a_thinned_run(tmp_path: Path) -
 
 
 def test_finished_pieces_are_not_redrawn(tmp_path: Path) -> None:
-    """The pieces are a load that has fallen to zero, a held load, and the wear of replaced pads."""
+    """The pieces shown are a load that has fallen to zero, a held load, and the wear of replaced pads."""
     wear = Wear(1e-14, pad_area_m2=0.015, travel_speed_m_s=2.0)
     end = BASE_NS + 1000 * STEP_NS
     silent: list[Entry] = [Hold(end), *(Unload(end + index * 10 * STEP_NS) for index in range(1, 30))]

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure on disk with its heading, and what the paper's figure (by the paper's text) and this figure show."""
+    """A figure on disk, its heading, what it shows, and what the paper's figure shows by the paper's text."""
 
     path: Path
     heading: str
@@ -105,7 +105,7 @@ def _falls(runs: PaperRuns) -> str:
 
 
 def draw_rotation(runs: PaperRuns, scene: str, folder: Path) -> Picture | None:
-    """Draw the comparison of the head's rotation; None when gravity has no arm."""
+    """Draw the comparison of the three forms of rotation; return None if gravity has no arm."""
     from plow_twin_paper.figures_trends import rotation_figure
     from plow_twin_paper.style import save
 

@@ -1,6 +1,6 @@
-"""The same scene with gravity's moment held constant, as the paper has it, and with the exact rigid body.
+"""The same scene with a constant moment of gravity, as in the paper, and as an exact rigid body.
 
-A centre of mass off the cavity's centre couples translation and rotation in the mass matrix; the paper leaves that out
+A centre of mass off the cavity's centre couples translation and rotation in the mass matrix; the paper omits this
 and keeps a constant moment -m g arm (its section 2). The equivalent offset is `com_offset_m = (arm, 0)`. The paper does
 not state the reference point of its inertia, so both readings are run.
 """
@@ -32,7 +32,7 @@ class Rotation:
 
     @property
     def parted_s(self) -> float:
-        """Time in s from which the first two runs are more than `PARTED_M` apart; NaN when they never are."""
+        """Time in s from which the first two runs are more than `PARTED_M` apart, or NaN if they never are."""
         first, second = self.results[:2]
         apart = np.hypot(*(first.q - second.q)[:, :2].T) > PARTED_M
         return float(first.t[np.argmax(apart)]) if apart.any() else float("nan")
@@ -49,12 +49,12 @@ class RotationRow:
     consistent_centre: float
 
     def change(self, value: float) -> float | None:
-        """Return the relative difference of a value from that of the constant moment; None if that is zero."""
+        """Return the relative difference of a value from the constant moment's value, or None if the latter is zero."""
         return (value - self.constant) / abs(self.constant) if self.constant else None
 
 
 def rotation_scenes(scene: Scene, t_end: float, output_dt: float) -> Rotation | None:
-    """Run the scene in its three forms; None when its gravity has no arm."""
+    """Run the scene with the three forms of rotation; return None if gravity has no arm or the inertia is too small."""
     head, gravity = scene.head, scene.gravity
     offset = gravity.arm_m if head.rotation == "paper" else head.com_offset_m[0]
     about_centre = head.inertia_kg_m2 - head.mass_kg * offset**2

@@ -14,7 +14,7 @@ UNKNOWN: Final = "the scene does not say"
 
 
 class Verdict(Enum):
-    """Whether a row agrees by its criterion; `NOT_COMPUTED` when the run behind it failed."""
+    """Whether a row agrees by its criterion, or `NOT_COMPUTED` if the row's run failed."""
 
     AGREES = "yes"
     DISAGREES = "no"
@@ -58,7 +58,7 @@ class Row:
 
     @property
     def difference(self) -> float | None:
-        """Computed minus published as a share of the published value; None without numbers."""
+        """Computed minus published value as a share of the published value, or None without numbers."""
         if self.published_value is None or self.value is None:
             return None
         return (self.value - self.published_value) / abs(self.published_value)

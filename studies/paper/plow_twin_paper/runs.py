@@ -190,7 +190,7 @@ def _face_run(scene: Scene, clearance_m: float, t_end: float) -> FaceRun:
 
 
 def _rotation(scene: Scene, t_end: float) -> tuple[Rotation | None, int]:
-    """Return the forms of the head's rotation and the number of failed runs, which leave nothing to compare."""
+    """Return the runs of the three forms of rotation and the number of failures; one failure leaves no comparison."""
     try:
         return rotation_scenes(scene, t_end, OUTPUT_DT_S), 0
     except SolverError:

@@ -75,7 +75,7 @@ def _name(letters: Sequence[str], carries: NDArray[np.bool_]) -> str:
 
 
 def figures(timeline: Sequence[Hold]) -> dict[str, SetFigures]:
-    """Return the figures of every set that occurs at all, largest share first."""
+    """Return the figures of every set that occurs, however briefly, in order of decreasing share."""
     total = sum(hold.duration_s for hold in timeline if hold.corners)
     table = {}
     for name in {hold.corners for hold in timeline} - {""}:

@@ -28,7 +28,7 @@ FORMS = ("constant moment", "exact, I about the centre of mass", "exact, I about
 
 @dataclass(frozen=True)
 class Change:
-    """A statement whose verdict another form of the head's rotation changes."""
+    """A statement that has another verdict with another form of the head's rotation."""
 
     form: str
     row: Row

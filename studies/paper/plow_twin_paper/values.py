@@ -32,7 +32,7 @@ PERIOD_S: Final = 2.0 * math.pi / OMEGA_RAD_S
 
 @dataclass(frozen=True)
 class Force:
-    """A published force: the largest of its kind over the four points, so it names the point too."""
+    """A published force. It is the largest of its kind over the four points, so it also states at which point."""
 
     sense: Sense
     statistic: Literal["max", "mean_in_contact"]
