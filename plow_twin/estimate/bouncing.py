@@ -155,7 +155,7 @@ def _near_bias(unknowns: Unknowns, q: Array) -> Array:
 
 
 def _few(q: Array, most: int) -> Array:
-    """Return every n-th row, at most `most` rows."""
+    """Return every n-th row, with n so large that at most `most` rows are left."""
     return q[:: len(q) // most + 1]
 
 

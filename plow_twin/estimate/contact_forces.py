@@ -65,7 +65,7 @@ class ContactForces:
         return ContactForces(self.t[inside], self.force[inside])
 
     def thinned(self, most: int) -> ContactForces:
-        """Return every n-th row, at most `most` rows."""
+        """Return every n-th row, with n so large that at most `most` rows are left."""
         apart = max(1, -(-len(self.t) // most))
         return ContactForces(self.t[::apart], self.force[::apart])
 

@@ -111,7 +111,7 @@ class Point:
 
 @dataclass(frozen=True, eq=False)
 class Linear:
-    """Jacobians by the shared unknowns and by the starting state of the row's swing.
+    """Jacobians with respect to the shared unknowns and to the starting state of the row's swing.
 
     rows : (n, 3, SIZE + 6) of the predicted measurements
     ends : (s - 1, 6, SIZE + 6) of the ends of linked swings

@@ -198,8 +198,9 @@ class _Joint:
         return self._problem.cost(at.point, self._variance) + float(np.nansum(loss) + np.isnan(loss).sum()) + prior
 
     def _linearised(self, at: _At) -> tuple[Linear, Array]:
-        """Return the Jacobians of the poses, and of the forces by the border and the swing's starting state, (m, b +
-        6).
+        """Return the Jacobians of the poses and of the forces.
+
+        The Jacobian of the forces, (m, b + 6), is with respect to the border and the swing's starting state.
         """
         place, border = at.place, self._border
         out = np.zeros((len(self._row), border + 6))

@@ -33,7 +33,7 @@ class Stage:
 _FEWEST_ROWS = (8, 12)
 #: Prior: the differences of a machine whose sensor has a slow low pass and which has no other difference.
 LOW_PASS: Final = np.array([0.0] * LAG + [UNSTATED["filter"]])
-#: Bound: the rounds of the search; each round keeps fewer candidates than the round before.
+#: Bound: the rounds of the search; each round keeps fewer candidates than the previous round.
 STAGES: Final = (Stage(0.1, 4, 5), Stage(0.2, 3, 2))
 #: Bound: largest number of swings, because the cost of a fit grows with their number.
 _MOST_SWINGS = 350

@@ -222,7 +222,7 @@ def advance_rows(
     times : ndarray, shape (n,)
         Times in s, not decreasing.
     wrench : ndarray, shape (m, n + 1, 3), or None
-        Samples of the load per mass and inertia, joined by straight lines: the sample before, then a sample at each
+        Samples of the load per mass and inertia, joined by straight lines: the previous sample, then a sample at each
         time, which ends a step. None for the scene's own loads.
     rows : ndarray of `ROW`, shape (m, n), or None
         Receives the motion and the totals at each time; None without totals.

@@ -11,7 +11,7 @@ from plow_twin.kernel.compiler import kernel
 def lay_out(before, samples, inertias, per) -> bool:
     """Divide the wrenches of samples by mass and inertia, and write them to `per`, shape (n + 1, 3).
 
-    `samples` are the new samples, shape (n, 3); `before` is the sample before them, shape (3,). Returns whether all new
+    `samples` are the new samples, shape (n, 3); `before` is the previous sample, shape (3,). Returns whether all new
     samples are finite.
     """
     finite = True

@@ -1,4 +1,4 @@
-"""Derivatives of a motion by its state and parameters, from the linearised equations along each step's series.
+"""Derivatives of a motion with respect to state and parameters, from equations linearised along each step's series.
 
 Each column holds one derivative: xi and eta of the position and velocity of the centre of mass (in head axes), phi and
 psi of the angle and its rate. With the contacts' force f = (fx, fy) in head axes, a column obeys

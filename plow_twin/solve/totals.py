@@ -33,7 +33,7 @@ def _seal(row_of, window) -> None:
 
 @kernel(entry=True)
 def publish(rows, stamps, held, taken, windows, waits) -> int:
-    """Sum up advances; the rows taken for publication get the sums since the publication before.
+    """Sum up advances; the rows taken for publication get the sums since the previous publication.
 
     If the advance of a published row failed, the row gets motion and sums of the good rows before it, or the stamp 0 if
     there are no good rows.
@@ -49,7 +49,7 @@ def publish(rows, stamps, held, taken, windows, waits) -> int:
     taken : ndarray of int64, shape (m,)
         Indices of the rows to publish, increasing.
     windows : ndarray of `ROW`, shape (1,)
-        Sums since the publication before, and the motion of the newest good advance not yet published.
+        Sums since the previous publication, and the motion of the newest good advance not yet published.
     waits : int
         1 if an advance waits to be published.
 

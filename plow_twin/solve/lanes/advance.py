@@ -121,7 +121,7 @@ def _clear_sums(s, lanes, lane) -> None:
 
 @kernel()
 def _leave(s, lanes, lane) -> None:
-    """Take a twin out of its lane, and set it back to its state at the sample before."""
+    """Take a twin out of its lane, and set it back to its state at the previous sample."""
     member = lanes.member[lane]
     _clear_sums(s, lanes, lane)
     save_lane(s.states[member], s.totals[lane], lanes, lane)

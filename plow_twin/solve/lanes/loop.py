@@ -75,7 +75,7 @@ def bits_in_range(lanes):
 
 @kernel()
 def _another_method(p, harmonics, extent, flight, rest, state, lanes, lane, w, span) -> bool:
-    """Return whether the next step of a lane may be free flight or rest, which lanes cannot compute."""
+    """Return whether the next step of a lane may be free flight or rest, which cannot be computed in lanes."""
     if lanes.inside[lane] == 0:
         if flight is not None:
             for j in range(3):

@@ -24,7 +24,7 @@ _NEWTON_STEPS, _ROOT_FOUND = 6, 1e-9
 #: Largest usable term; products of larger terms would not be finite.
 _FINITE = 1e300
 #: Shortening a step also reduces its largest term, so shortening is repeated: at most `_SHORTER` times, and
-#: only while the new step is below the share `_SHORT_ENOUGH` of the step before.
+#: only while the new step is below the share `_SHORT_ENOUGH` of the previous step.
 _SHORTER, _SHORT_ENOUGH = 20, 0.9
 
 
@@ -166,7 +166,7 @@ def time_to_separation(p, parts, state, w, span, harmonics, stick):
 
 @kernel()
 def parting_of(penetration, order, reach) -> float:
-    """Return where a penetration's series first vanishes by Newton's method; infinity if not before `reach`."""
+    """Return, by Newton's method, where a penetration's series first vanishes; infinity if not before `reach`."""
     if penetration[1] >= 0.0:
         return np.inf
     t = -penetration[0] / penetration[1]
