@@ -196,7 +196,7 @@ class Feed:
     def part(self, name: str, part: Part) -> None:
         """Add a status, which replaces the previous status of that name."""
         level, message, values = part
-        # only the part of the diagnostics with this name has this key
+        # the diagnostics have a part of the same name as the topic; only that part has the key `estimates`
         if name == "estimate" and "estimates" not in values:
             self._sum_up()  # the publications that came before the estimate are summed up first
             self.motion.estimate = values

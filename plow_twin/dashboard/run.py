@@ -151,7 +151,7 @@ def show_run(path: Path, access: PageAccess, stopped: Callable[[], bool], on_ope
         for batch in reader.batches():
             if len(batch.entries) or batch.outputs:
                 run.add(batch)
-            else:  # all that is recorded so far has been read
+            else:  # all that has been recorded so far has been read, so the feed only waits
                 screen.feed.turn()
             if stopped() or screen.has_ended:
                 return

@@ -68,7 +68,7 @@ class Estimation:
         self.forecast: dict[str, Any] | None = None
         #: reason why there is no forecast
         self.forecast_error = "nothing has been estimated yet"
-        #: the newest estimate, for a new journal
+        #: the newest estimate, which is journalled again in a new journal
         self.entry: Estimated | None = None
 
     @property

@@ -116,7 +116,8 @@ class Publishing:
         self.held_frames = self.corrected_frames = 0
         #: steady time at which the samples of the next publication were received [ns]; 0 means that it has no samples
         self.received_ns = 0
-        #: stamp of the sample that changed the alarms of a series [ns], while these alarms are reported; otherwise None
+        #: stamp of the sample that changed the alarms, while changed alarms of a series are reported [ns]; otherwise
+        #: None
         self.series_ns: int | None = None
         self._newest: Rows | None = None
         self._catch_up = catch_up

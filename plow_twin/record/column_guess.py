@@ -90,7 +90,7 @@ class Guess:
         return text
 
 
-#: The zone at the end of a date with time.
+#: Pattern of the time zone at the end of a date with time.
 _ZONE: Final = re.compile(r"([Zz]|:\d\d([.,]\d+)?[+-]\d\d(:?\d\d)?)$")
 
 
@@ -243,7 +243,7 @@ def _find_units(guess: Guess, numbers: Mapping[str, Array], scene: Scene, given:
             guess.units[name] = other
             guess.because[name] += f", {other} like the other force"
             guess.values["excitation", name] *= UNITS["force"][other]
-    # the size of a moment does not show its unit, so it follows the unit of the forces
+    # the size of a moment does not show its unit, so the moment gets the unit of the forces
     if guess.units.get("fx") == "kN" and "m" not in guess.units and ("excitation", "m") in guess.columns:
         guess.units["m"] = "kN m"
         guess.because["m"] += ", kN m because the forces are in kN"

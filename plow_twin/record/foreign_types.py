@@ -6,7 +6,8 @@ from typing import Any, Final
 
 from plow_twin.errors import RecordingError
 
-#: Longest text of a type and all types that it uses, without comments [characters]; usual texts have some 10,000.
+#: Longest text of a type together with all types that it uses, without comments [characters]; usual texts have some
+#: 10,000.
 _LONGEST: Final = 2**18
 #: Largest number of parts (numbers, texts, arrays of numbers) of a message whose sequences have one item each.
 _MOST_PARTS: Final = 1_000
@@ -39,7 +40,7 @@ def _count(name: str, types: dict[str, Any], counts: dict[str, int]) -> int:
     if name not in types:
         return 1
     if name not in counts:
-        # a type counts as too large while its parts are counted, so that a type that contains itself is refused
+        # a type counts as too large until its parts are counted, so that a type that contains itself is refused
         counts[name] = _MOST_PARTS + 1
         counts[name] = max(1, sum(_parts(field, types, counts) for _, field in types[name][1]))
     if counts[name] > _MOST_PARTS:

@@ -33,7 +33,7 @@ from plow_twin.stream.journal import Entry, Loss, Sample
 
 #: Largest number of journal entries that wait for the messages sent after them, so that memory is bounded.
 _PENDING: Final = 65_536
-#: Smallest number of entries in a batch; a batch may be smaller once `_LEAST // 16` parts of outputs wait.
+#: Smallest number of entries in a batch. A batch may be smaller once the outputs of `_LEAST // 16` chunks wait.
 _LEAST: Final = 8192
 #: Smallest number of entries in a batch without outputs, which take most of the memory.
 _LEAST_ALONE: Final = 32_768

@@ -251,7 +251,7 @@ class Recorder:
                 return True
             self._snapshot_due = True
             if not (self._journal_gap and snapshot):
-                self._sequence += 1  # a lost entry keeps its number, as messages refer to it
+                self._sequence += 1  # a lost entry keeps its sequence number, because messages refer to this number
                 self._journal_gap += 1
                 self._lost[JOURNAL] += 1
             return False

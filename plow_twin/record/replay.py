@@ -161,8 +161,8 @@ class _Replay:
         self.topics = {header.topic(name): name for name in PUBLICATION_TOPICS if name not in absent}
         self.next_sequence = 0
         self.in_a_row = 0  # length of the unbroken series of entries directly before the next entry
-        self.synced = False  # whether the state of the session equals that of the live session
-        self.outputs_synced = False  # whether the windows between its messages also equal those of the live session
+        self.synced = False  # whether the session's state equals the state of the live session
+        self.outputs_synced = False  # whether the output windows of the session also equal those of the live session
         self.outputs_whole = True  # whether the current batch has a note for every missing message
         self.resumed = False  # whether the session took its state from a snapshot and has made no advance since then
         self.messages: Mapping[str, Message] | None = None
@@ -235,7 +235,7 @@ class _Replay:
             self._note(Divergence(*difference))
 
     def _messages(self, sent: SentMessages, begin: int, end: int) -> None:
-        # without a sink the topics computed from the journal are compared, with a sink the other topics are copied
+        # without a sink, the topics computed from the journal are compared; with a sink, the other topics are copied
         chosen = (sent.kind[begin:end] >= 0) == (self.sink is None)
         for index in (begin + np.flatnonzero(chosen)).tolist():
             self.output(sent.record(index))

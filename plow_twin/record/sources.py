@@ -201,7 +201,7 @@ class Decoder:
         for end in (len(data), len(data) - 8):  # rclpy adds 8 stray bytes after a final empty float64[]
             try:
                 return self._store.deserialize_cdr(data[:end], message_type)
-            except Exception:  # rosbags lets index, struct, unicode and assertion errors through
+            except Exception:  # rosbags does not catch index, struct, unicode and assertion errors
                 continue
         self._losses.counts["undecodable"] += 1
         return None

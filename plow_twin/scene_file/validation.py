@@ -113,7 +113,7 @@ def _explain(error: ValidationError, whole: str) -> Iterator[Problem]:
     elif error.validator == "anyOf":
         yield from _closest_branch(key or whole, error, whole)
     elif error.validator == "oneOf":
-        if isinstance(instance, dict):  # the problem of another type is reported separately
+        if isinstance(instance, dict):  # a value of any other type is reported as a problem of its own
             yield Problem(key or whole, sorted(map(str, instance)), schema["description"])
     else:
         yield Problem(key or whole, instance, schema.get("description", error.message))

@@ -26,7 +26,7 @@ except ImportError:
 
 #: Largest file [B]. A table of 200,000 rows fits, which takes ten seconds to read; longer tables belong in CSV.
 LARGEST_FILE: Final = 64 * 2**20
-#: Largest number of values in a file, for the same reason.
+#: Largest number of values in a file; it has room for the same table.
 MOST_VALUES: Final = 1_000_000
 #: Deepest nesting of collections; a scene has six levels.
 DEEPEST: Final = 20
@@ -119,7 +119,7 @@ def _excess(text: str, most_values: float) -> Problem | None:
     """Return the bound that the events of a document exceed, or None; YAML errors are raised."""
     scalar = _Size()
     values = repeated = 0
-    sizes: dict[str, _Size | None] = {}  # size by anchor; None while the node has not ended
+    sizes: dict[str, _Size | None] = {}  # size of each anchored node by anchor; None until the node ends
     outer, is_mapping, anchor = _Size(), False, None
     stack: list[tuple[_Size, bool, str | None]] = []  # size, kind and anchor of the collections around the event
     event: Any

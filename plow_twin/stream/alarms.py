@@ -79,7 +79,7 @@ class Alarm:
     #: cause of the latched level; None if no level is latched
     raised: Raised | None = None
     _since_ns: int | None = None
-    #: smallest threshold; an alarm without a level has none as long as its value is below this
+    #: smallest threshold; an alarm without a level has none as long as its value is below this threshold
     lowest: float = field(init=False)
 
     def __post_init__(self) -> None:

@@ -435,8 +435,8 @@ class Session:
                 continue
             if travel is not None:
                 end = int(np.searchsorted(stamps, travel.stamp_ns, side="right"))
-            # the first sample after a motion without samples advances alone, and the state after it is kept, because
-            # the session never goes back to the motion before it
+            # the first sample after a motion without samples advances alone, and the state after it is kept: the
+            # session never goes back to the motion before it
             if resumed:
                 end = begin + 1
             here = slice(begin, end)

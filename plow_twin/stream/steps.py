@@ -26,7 +26,7 @@ class Steps:
 
     def __init__(self, intake: Intake) -> None:
         self._intake = intake
-        #: the latest sample, if its stamp jumped
+        #: the sample that waits because its stamp jumped; otherwise None
         self._jumped: Timed | None = None
         #: times at which the latest stray stamps were found [ns]
         self._strays_ns: deque[int] = deque(maxlen=_MOST_STRAYS)

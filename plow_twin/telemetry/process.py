@@ -33,7 +33,7 @@ WAYS: Final = {
 _NICE: Final = 5
 #: Longest time between two reports [s].
 _REPORT_S: Final = 0.5
-#: Time [s] at the end for the receiver to take waiting messages.
+#: At the end, time for the receiver to take the waiting messages [s].
 _END_S: Final = 2.0
 
 

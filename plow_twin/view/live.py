@@ -16,7 +16,8 @@ from plow_twin.record.reader import RunReader
 from plow_twin.view.drawing import Drawing, Sink
 from plow_twin.view.rrd import ViewSummary
 
-#: Rate of the spans in which a curve keeps two values [Hz]; an hour of all curves then takes some 200 MB in the viewer.
+#: A curve keeps two values in each span; rate of these spans [Hz]. An hour of all curves then takes some 200 MB in the
+#: viewer.
 CURVE_HZ: Final = 25.0
 #: Rate of the cross-section in a live view [Hz].
 SECTION_HZ: Final = 20.0
@@ -46,7 +47,7 @@ def follow(
     for batch in reader.batches():
         if len(batch.entries) or batch.outputs:
             drawing.add(batch)
-        else:  # all that is recorded so far has been read
+        else:  # all that has been recorded so far is drawn, so the view is live from here on
             drawing.section_hz = SECTION_HZ
             drawing.flush()
             drawing.stream.flush()

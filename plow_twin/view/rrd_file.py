@@ -54,7 +54,7 @@ class RrdFile:
             self._stream.disconnect()
         os.close(self._inlet)
         self._writer.join()
-        if (kind is not None or self.failed) and self.path.is_file():  # the path is a file, not a device such as a pipe
+        if (kind is not None or self.failed) and self.path.is_file():  # the path is a file, not a device
             self.path.unlink()
         if kind is None:
             self.check()

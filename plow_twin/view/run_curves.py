@@ -211,7 +211,8 @@ class RunCurves:
             self.clearance.add(self._seconds(rows.stamp_ns), values)
             self._clearance = values[-1]
             if self._estimate is not None and rows.sequence[-1] > self._estimate[0]:
-                self._estimate = None  # publications after an estimate include it
+                # the estimate is no longer shown beside these clearances: publications after an estimate include it
+                self._estimate = None
         if "contact_forces" in found and "head_state" in found:
             for instant in _largest(found["contact_forces"], found["head_state"]):
                 if self.instant is None or instant.force.max() > self.instant.force.max():

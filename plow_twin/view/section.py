@@ -54,7 +54,7 @@ class Section:
     frame: Array
     cavity: Array
     labels: tuple[str, ...]
-    #: name of the fixed body; with a support the section is drawn in its axes
+    #: name of the body that is drawn at rest; on a support this body moves, and the section is drawn in its axes
     frame_name: str = "frame (fixed)"
     is_block: bool = False
     #: radius of the corners of the frame or of the block

@@ -61,7 +61,7 @@ class Feeder:
         self._by_topic: dict[str, list[tuple[str, Role]]] = {}
         for name, role in roles.items():
             self._by_topic.setdefault(role.topic, []).append((name, role))
-        #: newest stamp of a source that has its own time [ns]; a single stamp far ahead does not count
+        #: newest stamp of a source that has its own time [ns]; a single stamp far ahead of the others does not count
         self.newest_ns = 0
         self._far_ahead_ns: int | None = None
         #: reason why the first unreadable load was refused; empty if every load could be read

@@ -25,7 +25,7 @@ from plow_twin.scene_file.parquet_lines import ParquetLines, is_parquet
 
 #: Largest number of bytes that are read from a source at once.
 _BLOCK: Final = 1 << 18
-#: Number of newest bytes that are remembered, to recognise whether a file was rewritten.
+#: Number of bytes last read that are remembered, to recognise whether a file was rewritten.
 _REMEMBERED: Final = 256
 #: Interval at which a followed file is read [s].
 _LOOK_S: Final = 0.02

@@ -130,7 +130,7 @@ class Rows:
         self._json = False
         #: the delimiter that the header shows
         self.delimiter = ","
-        #: columns of the previous file, whose place this file has taken
+        #: columns of the previous file; this file has taken its place
         self._before: list[str] | None = None
 
     @property

@@ -98,7 +98,8 @@ class Model:
             if name in UNITS and "/" not in key:
                 await instantiate(folder, interval, node_id, browse_name, instantiate_optional=False)
                 node = self._server.get_node(node_id)
-                for point in _POINTS:  # without a modelling rule, only the type would have the points
+                # without a modelling rule, only the type would have the points, not its instances
+                for point in _POINTS:
                     await self._server.get_node(self.node_id(f"{begin}.{key}.{point}")).set_modelling_rule(True)
                 await self._set_unit(node, UNITS[name])
             elif name in UNITS:

@@ -36,14 +36,14 @@ _ANSWER_S: Final = 10.0
 _CLOSE_S: Final = 2.0
 #: Largest message that a server may send [B].
 _LARGEST_MESSAGE: Final = 64 << 20
-#: Largest part of a message [B]; the standard demands that at least 8 KiB are allowed.
+#: Largest part of a message [B]; the standard demands that a limit allows at least 8 KiB.
 _LARGEST_PART: Final = 1 << 20
 #: Largest number of values of the history that are read at once: 10 s of ten nodes at 10 kHz.
 _MOST_HISTORY: Final = 1_000_000
 #: Sequence numbers begin again at 1 after this number.
 _LAST_NUMBER: Final = 2**32 - 1
 
-#: Function that takes pairs of node number and value, and a flag: values before these are missing.
+#: Function that takes pairs of node number and value, and a flag, which says that values before these are missing.
 Take = Callable[[list[tuple[int, Any]], bool], Awaitable[None]]
 
 
