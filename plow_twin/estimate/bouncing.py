@@ -60,7 +60,8 @@ _LONGER = 2.0
 _HARD_BOUNDS, _FIRM_BOUNDS = (8e-7, 6e-4), (2e-6, 2e-2)
 #: Bound: number of rounds in which the noise of a draw is corrected.
 _NOISE_ROUNDS = 3
-#: Derived: smallest number of draws for a regression with twenty features, and of poses for a 99 % quantile.
+#: Derived: smallest number of draws for a regression with twenty features, and smallest number of poses for a 99 %
+#: quantile.
 _FEWEST, _FEWEST_WHOLE = 30, 100
 
 

@@ -139,7 +139,7 @@ class _Joint:
         """Return the joint fit, starting from the fit of the poses."""
         found, cells = self._found, self._cells
         felt = self._feeling.at(found.shared, found.point.states, cells.delay)
-        assert felt is not None  # the model can be run here, because `cells_of` has run it
+        assert felt is not None  # the model can be run with these unknowns, because `cells_of` has already run it
         near = np.isfinite(cells.force) & (felt.penetration > -2.0 * tuning.HEAD_ROOM)
         near[:, np.setdiff1d(np.arange(near.shape[1]), cells.pairs)] = False
         self._row, self._pair = np.nonzero(near)

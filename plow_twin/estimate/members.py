@@ -329,7 +329,7 @@ class Ensemble:
         after = min(bisect_left(times, t), len(times) - 1)
         path = np.stack([self._path[index][1] for index in range(after - 1, len(times))])
         share = min((t - times[after - 1]) / (times[after] - times[after - 1]), 1.0)
-        # the pose as the sensor of each member would have measured it
+        # the pose of each member as its sensor would have measured it
         then = ((1.0 - share) * path[0] + share * path[1] + biases_of(self._numbers))[:, there]
         since = self.first.time - self._drifted
         self._drift(load_error)

@@ -117,7 +117,7 @@ def refine(
         forward, unknowns, window, horizon=min(near_horizon(poses, period), horizon), differences=differences
     )
     starts = [shared]
-    if unknowns.is_hard(shared):  # only for hard contacts is this second start useful
+    if unknowns.is_hard(shared):  # this second start is useful only for hard contacts
         starts.append(range_of_hard(unknowns, poses, shared))
     fits = []
     for start in starts:

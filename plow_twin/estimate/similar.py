@@ -194,7 +194,7 @@ def _converted(scene: Scene, its: Scene) -> dict[str, Provenance]:
     for path, kind in KINDS.items():
         mark, (part, name) = marks.get(path), path.split(".")
         value = getattr(getattr(scene, part), name, None)
-        # a number of zero gives no ratio, so its deviation is left out; the ratio of a clearance is that of the lengths
+        # a number that is zero gives no ratio, so its deviation is left out; a clearance has the ratio of the lengths
         if mark is not None and mark.deviation is not None and (value or kind == "clearance"):
             ratio = length if kind == "clearance" else getattr(getattr(its, part), name) / value
             marks[path] = replace(mark, deviation=mark.deviation * ratio)

@@ -17,7 +17,7 @@ from plow_twin.model.scene import Scene
 
 Array = NDArray[np.float64]
 
-#: Definition: pairs of the walls to the right, left, top and bottom.
+#: Definition: masks of the pairs of the right, left, top and bottom wall, shape (8,) each.
 WALLS: Final = (NORMAL_X > 0.0, NORMAL_X < 0.0, NORMAL_Y > 0.0, NORMAL_Y < 0.0)
 #: Derived: the two pairs of each of these walls.
 _PADS: Final = [np.flatnonzero(wall).tolist() for wall in WALLS]

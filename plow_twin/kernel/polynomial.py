@@ -17,7 +17,7 @@ from plow_twin.kernel.simd import exact_row, set_row
 
 Array = NDArray[np.float64]
 
-#: Largest number of halvings of an interval when a root or a maximum is isolated.
+#: Largest number of times that an interval is halved to isolate a root or a maximum.
 MAX_HALVINGS: Final = 48
 
 

@@ -14,7 +14,7 @@ from plow_twin.solve.lanes.advance import Samples, advance_lanes
 from plow_twin.solve.lanes.record import WIDTH, new_lanes, powers
 from plow_twin.solve.state import STATE, TOTALS, Terms, new_records
 
-#: Total number of steps of all lanes in a slice, which takes about a millisecond.
+#: Number of steps of all lanes together in a slice; a slice takes about a millisecond.
 _SLICE: Final = 256
 
 _Array = NDArray[np.float64]

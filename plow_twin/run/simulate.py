@@ -378,7 +378,7 @@ def _result(
 def statistics_of(totals: Totals, duration: float) -> dict[str, dict[str, float]]:
     """Return the statistics of each pair over the motion (see `Result`)."""
     table = {}
-    # each field is read once, because access to a record's field is slow
+    # each field is read only once, because reading a field of a record is slow
     sums = [totals[name].tolist() for name in ("peak", "impulse", "time_in_contact", "makes")]
     for name, peak, impulse, contact, makes in zip(PAIR_NAMES, *sums, strict=True):
         table[name] = {

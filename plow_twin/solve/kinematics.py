@@ -18,7 +18,7 @@ from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, X, Y
 QUARTER_TURN = 0.5 * math.pi
 
 
-#: 1 if the state is in world axes (the head carries corners), otherwise None.
+#: 1 if the state is in world axes, as for a head that carries corners; otherwise None.
 fixed_axes = by_field("tumbles", lambda p: 1, lambda p: None)
 #: Whether the head may turn beyond 45 degrees (`model.geometry.tumbles`).
 may_tumble = by_field("tumbles", lambda p: p.tumbles != 0.0, lambda p: False)

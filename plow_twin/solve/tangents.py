@@ -79,7 +79,7 @@ ALONG: Final = np.dtype(
         ("lift", "f8", (_ROWS, PAIR_COUNT)),  # 1 + lambda d'
         ("damped", "f8", (_ROWS, PAIR_COUNT)),  # d^n d'
         ("push", "f8", (4, _ROWS)),  # fx, fy, derivative of the moment with respect to the angle, -fy
-        ("mode", "i8", (PAIR_COUNT,)),  # modes before the step's event
+        ("mode", "i8", (PAIR_COUNT,)),  # modes of the pairs before the step's event
         ("waiting", "i8"),  # number of consecutive ends of stretches at which no new stretch began
     ]
 )

@@ -53,7 +53,7 @@ class Store:
         self._chunks = folder / "chunks"
         if fresh:
             for path in [*self._chunks.glob("*.npz*"), *self._chunks.glob(".*.npz.*")]:
-                if _CHUNK_NAME.fullmatch(path.name):  # other files are kept
+                if _CHUNK_NAME.fullmatch(path.name):  # files with other names are kept
                     path.unlink()
             (folder / "sweep.json").unlink(missing_ok=True)
         if (folder / "sweep.json").exists():

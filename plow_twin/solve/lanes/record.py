@@ -127,7 +127,7 @@ LANES: Final = np.dtype(
         ("before_it", "f8", _LANES_OF),  # size of the previous step in s
         ("touch_time", "f8", _LANES_OF),  # time of the last touch
         ("release", "f8", _LANES_OF),  # penetration below which the force is negligible
-        ("may_stop", "i8", _LANES_OF),  # 1 if a step that is `whole` ends at `stop`
+        ("may_stop", "i8", _LANES_OF),  # 1 if a step of the size `whole` ends at `stop`
         ("touched", "i8", _LANES_OF),  # a bit for each pair that touches at the step's start
         ("touching", "i8", (PAIR_COUNT,)),  # a bit for each lane whose pair in the slot touches at the step's start
         # single numbers come last, so that every row before them fills a cache line

@@ -369,7 +369,7 @@ def _walk_own(
     for walker, prediction in zip(walkers, predictions, strict=True):
         walker.on_reset = prediction.restart
     walk = JournalWalk(walkers[:1], walkers[1:], whole=not header.part, same_scene=own)
-    journalled = Measured()  # poses are in the journal if the node uses them
+    journalled = Measured()  # the poses that the node has used are in its journal
     run_time = RunTime(header.parameters)
 
     def so_far() -> Analysis:

@@ -69,7 +69,7 @@ class Task:
     mapping: Path | None
     others: tuple[Path, ...]
     out: Path | None
-    #: other contents of the recording's folder, whose names the results contain
+    #: other contents of the recording's folder; the results contain their names
     left_out: tuple[Path, ...] = ()
     #: units of measured numbers by name; they take precedence over the units of the mapping
     units: Mapping[str, str] = field(default_factory=dict)
@@ -173,12 +173,12 @@ def _is_ours(file: Path) -> bool:
         return True
     if not re.fullmatch(r"run_\d+\.mcap", file.name):
         return False
-    if file.stat().st_size == 0:  # the process was killed before the first byte
+    if file.stat().st_size == 0:  # the process was killed before it wrote the first byte
         return True
     try:
         header = read_header(file)
         if header is None and next(iter(ChunkReader(file)), None) is None:
-            return True  # the process was killed before the header
+            return True  # the process was killed before it wrote the header
     except RecordingError:
         return False
     return header is not None and MAPPED_LOAD in header.parameters

@@ -104,7 +104,7 @@ class TargetSet:
     t_end_s: float
     tol: float = 1e-6
     source: str = ""
-    #: unknowns that the file proposes, as texts of the command line
+    #: unknowns that the file proposes, written as on the command line
     unknowns: tuple[str, ...] = ()
     settings: tuple[Mapping[str, Value], ...] = field(init=False)
 
