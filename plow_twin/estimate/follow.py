@@ -144,7 +144,7 @@ class Follower:
         self._members, self._seed = members, seed
         self._prior = prior(scene)
         self._speed = scene.wear.travel_speed_m_s if scene.wear is not None else 0.0
-        #: number of poses and estimates so far, including those that were not used
+        #: number of poses and estimates added so far, including those that were not used
         self.added = 0
         #: whether each row gets intervals of the forces, not only published rows
         self.every_row = False

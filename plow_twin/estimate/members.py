@@ -36,7 +36,8 @@ from plow_twin.stream.outputs import clearances
 Array = NDArray[np.float64]
 Rows = NDArray[np.void]
 
-#: Bound: so many seconds of motion are kept for late poses; the sensor's delay is included.
+#: Bound: largest age in s of a late pose that is still used, including the sensor's delay; the motion is kept for this
+#: time.
 LATEST_S: Final = 0.25
 #: Bound: smallest interval in s between kept states of the motion.
 _PATH_S: Final = 2e-3

@@ -23,7 +23,8 @@ DEFAULTS: Final[dict[str, dict[Mark, float]]] = {
 }
 #: Prior: half-normal deviation in m of the corners' radius, if the scene states no radius.
 ROUNDING: Final = 3e-3
-#: Prior: standard deviations of a sensor's scales of x, y and theta; an angle is often computed from two distances.
+#: Prior: standard deviations of a sensor's scales of x, y and theta; that of theta is larger, because an angle is often
+#: computed from two distances.
 SCALES: Final = (5e-3, 5e-3, 1e-2)
 #: Prior: standard deviation of a sensor's constant error of x, y [m] and theta [rad].
 BIAS: Final = (5e-3, 5e-3, 0.02)

@@ -54,7 +54,7 @@ BALANCE = np.dtype(
         ("now", "f8", (SIZE,)),  # powers and forces at one instant
         ("before", "f8", (SIZE,)),  # powers and forces at the end of the previous fixed step
         ("body", "f8", (STATE_SIZE,)),  # body coordinates at a node
-        ("ground", "f8", (STATE_SIZE,)),  # body coordinates relative to the ground, with a support
+        ("ground", "f8", (STATE_SIZE,)),  # with a support: body coordinates relative to the ground
         ("wear_depth", "f8", (PAIR_COUNT,)),  # wear depth at a node
         ("pairs", "f8", (3, PAIR_COUNT)),  # penetration, rate, force
         ("sums", SUMS),
