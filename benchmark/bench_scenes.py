@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parent.parent
 FINE_REFERENCE = ROOT.parent / "shared" / "reference"
 NAMES = ("kv", "hc")
 T_END = 20.0
-#: Interval between rows in s, for the sparse and for the dense output grid.
+#: `SPARSE` and `DENSE` are the intervals between rows in s of the two output grids.
 SPARSE, DENSE = 0.1, 1e-3
 
 

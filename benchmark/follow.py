@@ -38,8 +38,8 @@ GROUPS = {
     "law": Group("law: Kelvin-Voigt", law="kelvin_voigt"),
     "shape": Group("load: third harmonic of 10 %", third_harmonic=0.1),
 }
-#: Index, counted from 0, of the first load period in which forces are compared.
-#: Pairs with less than this share of the largest impulse are not compared.
+#: `FIRST_PERIOD` is the index, counted from 0, of the first load period in which forces are compared.
+#: `LEAST_SHARE`: pairs with less than this share of the largest impulse are not compared.
 FIRST_PERIOD, LEAST_SHARE = 4, 0.01
 #: Interval in s between the rows from which the truth's peaks and impulses are computed. It is a fifth of the duration
 #: of the shortest contact.

@@ -27,10 +27,10 @@ from plow_twin.stream.journal import Estimated
 from plow_twin.stream.topics import TOPICS
 
 _T0 = 1_795_000_000_000_000_000
-#: Sampling interval [s].
-#: End of the run [s].
-#: End of the warm-up, before which nothing is measured [s].
-#: Time of the estimate [s].
+#: `_STEP` is the sampling interval [s].
+#: `_END` is the end of the run [s].
+#: `_FIRST` is the end of the warm-up [s], before which nothing is measured.
+#: `_ESTIMATED` is the time of the estimate [s].
 _STEP, _END, _FIRST, _ESTIMATED = 1e-3, 6.0, 1.0, 0.5
 
 

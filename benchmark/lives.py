@@ -31,10 +31,10 @@ Array = NDArray[np.float64]
 RESULTS = Path(__file__).resolve().parent / "results"
 #: 5 % and 95 % points [m^2/N] of the prior. The true coefficient is drawn from this prior.
 PRIOR = (1e-15, 1e-14)
-#: Growth of a clearance that ends a life [m].
-#: Standard deviation of the noise of an estimated clearance [m].
-#: Number of visits in a life.
-#: Shares of the life at which it is forecast.
+#: `GROWTH` [m] is the growth of a clearance that ends a life.
+#: `NOISE` [m] is the standard deviation of an estimated clearance.
+#: `VISITS` is the number of visits in a life.
+#: `SHARES` are the shares of the life at which it is forecast.
 GROWTH, NOISE, VISITS, SHARES = 3e-3, 5e-5, 20, (0.3, 0.5, 0.7)
 #: Quantiles that bound the inner 80 % and the inner 90 % of a distribution.
 _INNER, _INNER_90 = (0.1, 0.9), (0.05, 0.95)

@@ -18,11 +18,11 @@ from plow_twin.model.scene import Scene
 
 Array = NDArray[np.float64]
 
-#: Number of steps in the shortest period of a contact's oscillation.
-#: Longest step in s.
+#: `_STEPS_A_PERIOD` is the number of steps in the shortest period of a contact's oscillation.
+#: `_LONGEST_STEP` is the longest step in s.
 _STEPS_A_PERIOD, _LONGEST_STEP = 60.0, 1e-4
-#: Mass in kg of a frame that stands on a spring.
-#: Damping ratio of this frame.
+#: `_FRAME_MASS` is the mass in kg of a frame that stands on a spring.
+#: `_FRAME_DAMPING` is the damping ratio of this frame.
 _FRAME_MASS, _FRAME_DAMPING = 500.0, 0.1
 #: Speed in m/s below which friction is viscous.
 _CREEP = 0.005

@@ -38,11 +38,12 @@ SPEED_M_S, PAD_AREA_M2 = 2.0, 0.06
 PRIOR = (3e-16, 3e-15)
 #: The estimated wear coefficient should be right within this factor.
 FACTOR = 1.3
-#: Sampling intervals of the true load, of the given load and of the pose [s].
+#: `_FINE`, `_LOAD_STEP` and `_POSE_STEP` are the sampling intervals [s] of the true load, of the given load and of the
+#: pose.
 _FINE, _LOAD_STEP, _POSE_STEP = 1e-3, 2e-3, 1e-2
 _SPAN = 10.0 * PERIOD
-#: Standard deviation of the load's broad-band part [N, N, N m].
-#: Standard deviation of the sensor's noise [m, m, rad].
+#: `_BROAD` is the standard deviation of the load's broad-band part [N, N, N m].
+#: `_NOISE` is the standard deviation of the sensor's noise [m, m, rad].
 _BROAD, _NOISE = np.array([8e3, 4e3, 1.1e4]), np.array([5e-4, 5e-4, 2e-3])
 
 

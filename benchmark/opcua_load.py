@@ -26,13 +26,13 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 NODES = ("Load.Fx", "Load.Fy", "Load.M")
 NAMESPACE = 2
-#: Publishing interval [ms] and queue length that the bare client requests. The twin requests the same.
+#: The bare client requests this publishing interval [ms] and this queue length, as the twin does.
 PUBLISHING_MS, QUEUE = 10.0, 10_000
 #: The bare client ends when it has received no value for this time [s].
 SILENCE_S = 3.0
 MAP = "excitation: {fx: {node: ns=2;s=Load.Fx}, fy: {node: ns=2;s=Load.Fy}, m: {node: ns=2;s=Load.M}}\n"
-#: Target: the 99th percentile of the age is at most this [ms].
-#: Target: at most this share of a core is used.
+#: `MOST_AGE_MS` is the target for the 99th percentile of the age [ms].
+#: `MOST_CORE` is the target for the share of a core.
 MOST_AGE_MS, MOST_CORE = 15.0, 0.5
 
 

@@ -46,8 +46,7 @@ SUBPACKAGES = {
     "__init__": CORE | {"scene_file", "record"},
     "__main__": {"cli"},
 }
-#: Parts of scipy that may be imported only where they are used. numba itself imports the package scipy, so only its
-#: parts count.
+#: Parts of scipy that may be imported only where they are used. The package scipy itself is always imported, by numba.
 SCIPY = ("scipy.linalg", "scipy.optimize", "scipy.special")
 MESSAGES = {
     f"{name}_msgs"

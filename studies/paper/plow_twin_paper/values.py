@@ -18,15 +18,17 @@ FACES: Final = ("top", "right", "bottom", "left")
 
 #: Clearance of Figs 6 to 9 (section 3): horizontal, vertical [m].
 CASE_M: Final = (0.025, 0.030)
-#: The fixed clearance of Figs 10 and 11, and the five values of the other clearance [m] (section 4).
+#: In Figs 10 and 11 (section 4), the clearance that is fixed [m].
 FIXED_M: Final = 0.020
+#: In Figs 10 and 11, the five values of the other clearance [m].
 GRID_M: Final = (0.020, 0.0225, 0.025, 0.0275, 0.030)
 #: Values of both clearances in Figs 14 and 15, section 5 [m].
 FACE_GRID_M: Final = (0.020, 0.025, 0.030)
 #: Length of the simulation for Figs 14 and 15 [s].
 FACE_T_END_S: Final = 20.0
-#: Angular frequency of the loads [rad/s] (section 3) and their period [s].
+#: Angular frequency of the loads [rad/s] (section 3).
 OMEGA_RAD_S: Final = 2.0
+#: Period of the loads [s].
 PERIOD_S: Final = 2.0 * math.pi / OMEGA_RAD_S
 
 
