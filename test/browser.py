@@ -16,7 +16,7 @@ from typing import Any
 
 from websockets.sync.client import ClientConnection, connect
 
-#: The browser's program, or None.
+#: Path of Chromium, or None if it is not installed.
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 #: Options that let Chromium draw WebGL without a graphics card.
 _OPTIONS = (
@@ -102,7 +102,7 @@ def page(folder: Path, url: str) -> Iterator[Page]:
         process.wait(20)
 
 
-#: Firefox's program, or None.
+#: Path of Firefox, or None if it is not installed.
 FIREFOX = shutil.which("firefox-esr") or shutil.which("firefox")
 
 

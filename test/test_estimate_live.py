@@ -153,7 +153,7 @@ def test_the_live_estimate_is_published_and_given_again_by_the_journal(tmp_path:
         "estimate_forces": 20,
         "forecast_limits": "[0.04, 0.05]",
         "forecast_horizon": 3.6e7,
-        "hold_limit": 3600.0,  # an estimate may take long on a busy machine
+        "hold_limit": 3600.0,  # an estimate may take long on a busy machine, so holding must not end
         "estimate_window": WINDOW_S,
         "estimate_interval": INTERVAL_S,
         "rollback_span": WAIT_S,

@@ -30,7 +30,7 @@ def test_the_prior_is_the_scene_s_or_that_of_the_mark() -> None:
     stated = Unknowns.stated(replace(scene, marks=marks), load, poses).deviations()
     # 10 % more stiffness makes 10 % less penetration; a penetration of 0.1 mm is treated as zero
     np.testing.assert_allclose(stated[:4], [2e-3, 2e-3, 0.1, 0.2], rtol=0.02)
-    # in the units of a machine of another size, the deviations are the same quantities
+    # in the units of a machine of another size, the deviations have other values but mean the same lengths and shares
     units = Units(0.5, 2.0, 0.25)
     other = units.scene(replace(scene, marks=marks))
     far = Unknowns.stated(other, units.load(load), units.poses(poses)).deviations()

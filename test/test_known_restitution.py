@@ -127,7 +127,8 @@ def test_the_page_shows_the_results_of_the_solver() -> None:
     tables = (restitution.page_table, restitution.laws_table, restitution.ratio_table, restitution.ramp_table)
     for line in (line for table in tables for line in table(rows)):
         assert f"{line}\n" in page, line
-    # the laws are damped as in the tests above; without damping each law returns 1 and needs other kernels
+    # the laws are damped as in the tests above; without damping each law delivers a restitution of 1 and needs other
+    # kernels
     for law in ("zhiying_qishao", "kelvin_voigt"):
         stored = {row.asked: row.delivered for row in rows if row.law == law}
         for again in restitution.measure(law, list(stored)[5:-1:10]):

@@ -843,7 +843,7 @@ def test_poses_gaps_and_speeds_that_cannot_be_are_not_used() -> None:
     used.clear()
     nan = math.nan
     poses = [(0.01, 0.0, 0.0), (0.04, nan, 0.0), (0.02, 0.06, 0.0), (-0.04, 0.0, 0.0), (nan, 0.001, 0.0)]
-    for at, pose in enumerate(poses):  # y of the third pose is too large, and the fourth changes too fast
+    for at, pose in enumerate(poses):  # y of the third pose is too large, and x of the fourth pose changes too fast
         used += [pose] if inputs.uses_pose(second + at * 50_000_000, pose) else []
     assert [pose[0] for pose in used[:2]] == [0.01, 0.04] and used[2][1] == 0.001 and len(used) == 3
     assert inputs.head_pose.counts[Verdict.IMPLAUSIBLE] == 2

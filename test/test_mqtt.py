@@ -416,7 +416,8 @@ class EdgeNode:
         return self.messages(kind)[count - 1]
 
     def ask_for_rebirth(self) -> None:
-        # field 2 of the payload is a metric with a name (1), a data type, boolean (4), and a value (14)
+        # field 2 of the payload is a metric; its fields are the name (1), the data type (4), here boolean, and the
+        # value (14)
         name = b"Node Control/Rebirth"
         metric = bytes([0x0A, len(name)]) + name + bytes([0x20, 11, 0x70, 1])
         for payload in (b"\xff\xff", bytes([0x12, len(metric)]) + metric):

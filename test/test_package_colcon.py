@@ -40,7 +40,7 @@ def test_colcon_build_gives_the_layout_of_ros2_run(options: list[str], tmp_path:
         assert installed == {path.name for path in (ROOT / folder).glob(pattern)}
         assert installed
 
-    if not options:  # an installation by copy must not refer to the sources
+    if not options:  # an installation that copies the files must not refer to the sources
         shutil.rmtree(source)
         shutil.rmtree(tmp_path / "build")
 

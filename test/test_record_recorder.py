@@ -187,7 +187,8 @@ def test_a_full_queue_is_counted_and_noted_in_the_file(tmp_path: Path) -> None:
     assert loss.closed and loss.error is None
     assert loss.lost[JOURNAL] > 0 and loss.lost[TOPIC] > 0 and taken["snapshot"] > 0
     assert len(kept_messages) + loss.lost[TOPIC] == 4000
-    assert len(kept_samples) + loss.lost[JOURNAL] >= 4000  # the lost entries may include refused snapshots
+    # the lost entries may include refused snapshots, so the sum may be larger
+    assert len(kept_samples) + loss.lost[JOURNAL] >= 4000
 
     reader = RunReader(tmp_path / "run")
     records = list(reader)

@@ -108,7 +108,7 @@ def test_a_disk_that_takes_nothing_leaves_the_old_file(tmp_path: Path, monkeypat
 
 
 def test_a_file_that_came_while_the_twin_ran_is_left_as_it_is(tmp_path: Path) -> None:
-    # a volume that is mounted late replaces the folder by another one, with earlier wear
+    # a volume that is mounted late replaces the folder by another folder, which has earlier wear
     folder, volume = tmp_path / "wear", tmp_path / "volume"
     volume.mkdir()
     path = _save(volume)

@@ -504,7 +504,7 @@ def test_an_absurd_load_gives_an_error_status_and_no_message(tmp_path: Path) -> 
         send(T0 + 5 * MS, (0.0, 0.0, 0.0))
         probe.until(lambda: len(forces) == 2, "recovery")
         probe.until(lambda: probe.status[-1].level == b"\x00", "status OK")
-        # the failure occurs again, followed at once by a good sample; the next report still shows it
+        # the failure occurs again, followed at once by a good sample; the next report still shows the failure
         send(T0 + 6 * MS, (1e200, 1e200, 1e200))
         for index in (7, 8):
             send(T0 + index * MS, (0.0, 0.0, 0.0))

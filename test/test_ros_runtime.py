@@ -256,7 +256,7 @@ def test_the_covariance_of_each_pose_goes_into_the_journal_and_the_estimate(tmp_
             taken = [Taken(b"", number, 0, serialize_message(message))]
             front.subscriptions._measured_poses(taken)
         assert front.runtime.inputs.head_pose.counts[Verdict.NON_FINITE] == 2
-        # an empty quaternion is not an angle of 0
+        # a quaternion of zeros must not be read as an angle of 0
         message.pose.pose.orientation.w = 0.0
         front.subscriptions._measured_poses([Taken(b"", 6, 0, serialize_message(message))])
         assert front.runtime.inputs.head_pose.counts[Verdict.MALFORMED] == 1
@@ -394,7 +394,7 @@ def test_the_middleware_is_asked_for_no_events() -> None:
         topics = [*node.publishers, *node.subscriptions, *node._front.subscriptions._taken_from.values()]  # type: ignore[union-attr]
         names = {topic.topic_name.rpartition("/")[2] for topic in topics}
         assert {"contact_forces", "excitation", "estimate", "status", "parameter_events"} <= names
-        # taking an event while another event arises blocks rmw_fastrtps for ever
+        # taking an event while another event arises blocks rmw_fastrtps for ever, so no topic has event handlers
         assert [topic.topic_name for topic in topics if topic.event_handlers] == []
 
 

@@ -71,7 +71,7 @@ def worn_by(exposure: float) -> float:
     return h0 * math.log(ratio * math.exp(exposure / h0) - ratio + 1.0)
 
 
-# explicit steps use kernels that other tests cover, so only the full run has them
+# explicit steps use kernels that other tests cover, so only the full run has this case
 @pytest.mark.parametrize(
     "damping", [pytest.param(1e3, id="explicit", marks=pytest.mark.stress), pytest.param(1e8, id="implicit")]
 )

@@ -345,7 +345,7 @@ def _troubled(seed: int, count: int) -> list[tuple[str, list[tuple[int, tuple[fl
             case "stray":
                 arrived[0] = (stamp + 100 * NS_PER_S, arrived[0][1])
             case "jump":
-                # the intake refuses a further step of this kind soon after
+                # the intake refuses another step of the clock that follows too soon
                 stamp, now = stamp - 50 * NS_PER_S, now + 4 * NS_PER_S
             case "nan":
                 arrived[0] = (stamp, (math.nan, 0.0, 0.0))
