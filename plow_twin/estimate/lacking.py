@@ -13,7 +13,7 @@ from plow_twin.estimate import tuning
 from plow_twin.estimate.fit import Fit, Problem, fit, whole_step
 from plow_twin.estimate.harmonics import COMPONENTS, Harmonics
 from plow_twin.estimate.measurements import Load
-from plow_twin.estimate.search import better_states, near_horizon, refine
+from plow_twin.estimate.search import better_states, near_horizon
 from plow_twin.estimate.unknowns import SIZE
 
 Array = NDArray[np.float64]
@@ -21,6 +21,8 @@ Array = NDArray[np.float64]
 #: Bound: number of fits with harmonics; number of iterations of each fit; number of consecutive fits, none of them
 #: better than all before, after which no more are made.
 _ROUNDS, _ITERATIONS, _IN_VAIN = 12, 6, 4
+#: Bound: horizon of the middle stage, relative to that of the first; the last stage has whole swings.
+_LONGER = 2.0
 
 
 def with_harmonics(problem: Problem, found: Fit, felt: Load, period: float) -> tuple[Problem, Fit, Harmonics] | None:
@@ -31,14 +33,16 @@ def with_harmonics(problem: Problem, found: Fit, felt: Load, period: float) -> t
     harmonics, poses = Harmonics.of(felt), problem.window.poses
     if harmonics is None or len(problem.link):
         return None
-    near = Problem(problem.forward, problem.unknowns, problem.window, horizon=near_horizon(poses, period))
-    begun = fit(near, found.shared, found.point.states, found.noise, _ITERATIONS)
-    first = None if begun is None else _alternated(near, begun, felt, harmonics)
-    if first is None:
-        return None
-    near, begun, harmonics = first
-    whole = refine(near.forward, near.unknowns, poses, period, begun.shared, begun.noise, None)
-    return None if whole is None else _alternated(*whole, felt, harmonics)
+    near = near_horizon(poses, period)
+    for horizon in (near, _LONGER * near, np.inf):
+        stage = Problem(problem.forward, problem.unknowns, problem.window, horizon=horizon)
+        states = better_states(stage, found.shared, found.point.states)
+        begun = fit(stage, found.shared, states, found.noise, _ITERATIONS)
+        ended = None if begun is None else _alternated(stage, begun, felt, harmonics)
+        if ended is None:
+            return None
+        problem, found, harmonics = ended
+    return problem, found, harmonics
 
 
 def _alternated(
