@@ -247,7 +247,7 @@ def compare(
         found.distance,
         path_deviate(eye.paths(eye.q, _LAGS_S), features[:, 5:], paths, measured[5:]),
         law,
-        # only hard contacts get odds, because the limit of the odds was tuned on them
+        # no odds near a known estimate, because their limit was tuned without one
         odds if near is None else -math.inf,
         *hidden_by_geometry(unknowns, poses, period, measured[:2]),
     )

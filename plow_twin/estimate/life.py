@@ -27,7 +27,7 @@ from plow_twin.run.simulate import simulate
 
 Array = NDArray[np.float64]
 
-#: Guard: wear in m that serves to measure the travel of sliding pads; it is too small to change the motion.
+#: Guard: wear in m of a run that counts sliding: the wear shows the travel, and is too small to change the motion.
 _TRACE_M = 1e-12
 #: Bound: number of rows inserted for each row of a path with running-in.
 _FINER = 16

@@ -184,7 +184,7 @@ def _save_or_warn(cache: Any) -> None:
             save(signature, result)
         except OSError as error:
             place = Path(cache.cache_path).parent
-            # `_said` prevents a second warning, because numba resets the registry of warnings that Python has issued
+            # numba resets the registry of warnings that Python has issued, so `_said` prevents a second warning
             if not _said:
                 _said.append(f"compiled kernels are not kept for the next start: {place}: {error.strerror or error}")
                 warnings.warn(_said[0], RuntimeWarning, stacklevel=1)

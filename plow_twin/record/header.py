@@ -17,7 +17,7 @@ from plow_twin.stream.journal import ParameterValue
 HEADER_RECORD: Final = "plow_twin"
 #: Name of the MCAP metadata record with the loss counters, written at close.
 LOSS_RECORD: Final = "plow_twin_loss"
-#: Key, in the loss record, of the reason why recording ended before the run; all other keys are topics.
+#: Key, in the loss record, of the reason why recording ended earlier than the run; all other keys are topics.
 STOPPED_EARLY_KEY: Final = "stopped_early"
 #: Version of the layout that `docs/recording.md` describes.
 LAYOUT_VERSION: Final = 4

@@ -94,7 +94,7 @@ def to_message(entry: Entry | Dropped, frame_id: str) -> Message:
     if isinstance(entry, Snapshot | Restore):
         values["data"] = base64.b64encode(entry.data).decode()
     elif isinstance(entry, Unused):
-        # infinity and NaN are written as texts, because JSON has no such numbers
+        # infinity and NaN are written as strings, because JSON has no such numbers
         values["values"] = [
             [number if math.isfinite(number) else repr(number) for number in row] for row in entry.values
         ]

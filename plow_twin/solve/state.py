@@ -166,7 +166,8 @@ PARAMS: Final = _in_lines(_PARAM_FIELDS)
 #: Further constants of scenes with an option of `Options`.
 _OPTION_FIELDS: Final[dict[str, list[tuple[Any, ...]]]] = {
     "corners": [("tumbles", "f8")],  # the head carries corners; 1 if the block may tumble
-    "rounded": [("roll", "f8")],  # distance of a rounded corner along its wall per angle [m/rad]
+    # movement of a rounded corner's touching point along the wall per angle of the head [m/rad]
+    "rounded": [("roll", "f8")],
     "falling": [  # a restitution that falls with the impact
         ("damping_numbers", "f8", (RESTITUTIONS + 1,)),  # e D(e) on a grid from 0 to 1
         ("restitution", "f8"),  # restitution of impacts up to `fall_speed`
@@ -280,7 +281,8 @@ WORK: Final = np.dtype(
         ("frame_saved", "f8", (6,)),  # state of the frame at the start of an advance
         ("load", "f8", (3, _ROWS)),  # S1, S2, M
         ("world", "f8", (4, _ROWS)),  # forces per mass in head and world axes
-        ("column", "f8", (2, _ROWS)),  # a polynomial, for example one guard
+        # scratch: coefficients of a polynomial in time, for example of a guard or a force
+        ("column", "f8", (2, _ROWS)),
         ("halves", "f8", (MAX_HALVINGS + 2, _ROWS)),
         ("bounds", "f8", (MAX_HALVINGS + 2, 2)),
         ("wrench", "f8", (2, 3)),  # linear load: its value at the step's start and its slope

@@ -29,7 +29,7 @@ class Cadence(Enum):
     #: with each publication, if `follow` is `full`
     FOLLOWED = "each publication, with `follow: full`"
     #: with the first publication in each 0.1 s of stamps
-    SLOW = "each 0.1 s of stamps"
+    SLOW = "every 0.1 s of stamps"
     #: with each marked publication, and with the first publication after it
     MARKED = "marked publications"
     #: with each estimate
