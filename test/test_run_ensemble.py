@@ -8,7 +8,20 @@ import numpy as np
 import pytest
 from scenes import preset
 
-from plow_twin import Clearance, Contact, Gravity, Harmonic, Initial, Scene, Status, Table, simulate, simulate_many
+from plow_twin import (
+    Clearance,
+    Contact,
+    Frame,
+    Gravity,
+    Harmonic,
+    Head,
+    Initial,
+    Scene,
+    Status,
+    Table,
+    simulate,
+    simulate_many,
+)
 from plow_twin.model import geometry
 from plow_twin.model.loads import compile_loads
 from plow_twin.solve import compiled_scene
@@ -117,3 +130,46 @@ def test_a_member_that_fails_does_not_stop_the_others() -> None:
 def test_times_are_checked_as_in_simulate(t_end: float) -> None:
     with pytest.raises(ValueError, match="t_end: got"):
         simulate_many([preset("paper")], t_end)
+
+
+#: Load that starts to push a head between walls without clearance, and a head without weight.
+SMALL_LOAD = Harmonic("load", (-3.0931353695787673, -2.0267345092034312), 21.16137888565331, 1.7436965700134877, 0.08)
+
+
+def test_a_head_that_starts_between_its_walls_has_the_same_bits_in_company() -> None:
+    """The guard of a pair that parts at once falls from a double zero; its root is 0, wherever its search ends."""
+    scene = Scene(
+        Head(0.2376573288673373, 0.001142509680508577),
+        Frame(0.26358762310928385, 0.28687215851288694),
+        Clearance(0.0, 0.0),
+        Contact("exact_restitution", 33954981.51011205, 1.5, restitution=0.9),
+        Gravity(0.0),
+        (SMALL_LOAD,),
+        initial=Initial(v=(0.00023219528530390025, 0.00025219026623066686, -0.0003327659050526975)),
+    )
+    alone, beside = simulate_many([scene], 0.1, 0.01, 1e-4), simulate_many([scene] * 8, 0.1, 0.01, 1e-4)
+    assert alone.events[0] > 10 and alone.set_time[0].max() > 0.0
+    for name in ("q", "v", "peak", "impulse", "time_in_contact", "set_time", "steps", "events"):
+        for member in range(8):
+            np.testing.assert_array_equal(getattr(beside, name)[member], getattr(alone, name)[0])
+
+
+def test_a_force_with_an_exponent_near_1_stays_finite() -> None:
+    """With a depth of some rounding errors the series of its power would overflow."""
+    scenes = [
+        Scene(
+            Head(1000.0, 20.0),
+            Frame(0.5, 0.4),
+            Clearance(1e-3, 1e-4),
+            Contact("hunt_crossley", 3e9, 1.1, damping=0.1),
+            Gravity(0.0),
+            (SMALL_LOAD,),
+            initial=Initial((1e-4, -5e-5 - depth, 0.0)),
+        )
+        for depth in np.linspace(1e-5, 6e-5, 8)
+    ]
+    many = simulate_many(scenes, 0.1, 0.01)
+    assert (many.status == Status.OK).all() and (many.events > 20).all()
+    one = simulate(scenes[0], 0.1, 0.01)
+    assert len(one.events) == pytest.approx(many.events[0], rel=0.1)
+    assert one.q == pytest.approx(many.q[0], abs=1e-7)

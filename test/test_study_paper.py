@@ -246,7 +246,7 @@ def test_the_page_has_the_run_s_numbers(study: PaperStudy) -> None:
     agree = sum(entry.verdict is Verdict.AGREES for entry in fitted)
     said = (
         f"Of {len(study.rows)} statements {yes} agree: {agree} of the {len(fitted)} that R1 was fitted to, "
-        f"{yes - agree} of the {len(study.rows) - len(fitted)} that it was not."
+        f"and {yes - agree} of the other {len(study.rows) - len(fitted)}."
     )
     assert said in " ".join(text.split())
     for entry in study.rows:

@@ -60,6 +60,8 @@ MAX_EVENTS_AT_ONCE = 64
 #: Rest is checked (`method.small_harmonics`) if the harmonics are at most this share of the load that presses the head
 #: to its walls.
 _SMALL_HARMONICS = 1e-2
+#: Penetration over the frame's half diagonal that is noise: some 45 rounding errors of the half diagonal.
+_NOISE = 1e-14
 
 _Found = TypeVar("_Found")
 
@@ -503,6 +505,9 @@ def _release(scene: Scene, tol: float, length: float, speed: float) -> float:
     share = 1e-5 if exponent == 1.5 or float(exponent).is_integer() else 1e-8
     impulse = share * tol * speed * scene.head.mass_kg
     release = float((impulse * (exponent + 1.0) * speed / scene.contact.stiffness) ** (1.0 / (exponent + 1.0)))
+    if not float(exponent).is_integer():
+        # a depth of few rounding errors is noise, and the series of its power would have non-finite terms
+        release = max(release, _NOISE * geometry.half_diagonal(scene))
     friction = scene.friction
     if friction is not None and friction.stick_stiffness_n_m is not None and friction.coefficient > 0.0:
         # when a pair becomes RELEASED, the spring of its sticking corner ends too; the jump of the spring's force must

@@ -297,8 +297,11 @@ def isolate(lanes, column, w, order, bits):
 @kernel()
 def cross(lanes, column, order, bits) -> None:
     """Find each column's only root in [0, reach] by Halley's method kept within the bracket (`polynomial`)."""
-    low, high, x = exact_splat(0.0), exact_row(lanes.reach, 0), exact_row(lanes.root, 0)
-    zero, open_bits = exact_splat(0.0), bits
+    low, high, x, zero = exact_splat(0.0), exact_row(lanes.reach, 0), exact_row(lanes.root, 0), exact_splat(0.0)
+    # of a column that falls from a double zero at its start, each change would only leave a third of x
+    falls_from_zero = below(exact_row(column, 2), zero) & ~below(zero, magnitude(exact_row(column, 0)))
+    x = choose(falls_from_zero & ~below(zero, magnitude(exact_row(column, 1))), zero, x)
+    open_bits = bits & below(zero, x)
     for _ in range(_MOST_CHANGES):
         value, slope, bend = exact_row(column, order), zero, zero
         for k in range(order - 1, -1, -1):
