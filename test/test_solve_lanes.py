@@ -149,7 +149,7 @@ def _check_beside_the_loop(seed: int, count: int, some: bool, powers: bool) -> N
         alone = simulate(scene, 0.7, 0.02, tol=1e-12)
         error = pose_error(scene, many.q[index], alone.q)
         if error > 1e-9:
-            # the scene amplifies rounding errors, so even runs of the single loop differ; two of them may agree by chance
+            # the scene amplifies rounding errors, so even runs of the single loop differ, but two may agree by chance
             others = [simulate(scene, 0.7, 0.02, tol=tol).q for tol in (3e-12, 1e-11, 3e-11)]
             assert error < 300.0 * max(pose_error(scene, q, alone.q) for q in others), index
             continue
