@@ -466,7 +466,7 @@ class Follower:
         estimates of nearly the same motion, the first is followed if the second has more rough clearances. After a
         withdrawn estimate the twin follows the prior again.
         """
-        self._add(t, _with_harmonics(text, start))
+        self._add(t, _harmonics_from(text, start))
 
     def _add(self, t: float, measured: list[float] | str) -> None:
         self.added += 1
@@ -507,7 +507,7 @@ class Follower:
 
     def follow_estimate(self, known: str) -> None:
         """Follow the estimate in another follower's `known`; its time may have another origin, so no phase is known."""
-        known = _with_harmonics(known, None)
+        known = _harmonics_from(known, None)
         if known != self._text:
             self.catch_up()
             self._begin_anew(known)
@@ -592,7 +592,7 @@ def follower(scene: Scene, follow: str, members: int, tol: float) -> Follower:
     return Follower(scene, members) if follow == "full" else Follower(scene, 1, tol=tol)
 
 
-def _with_harmonics(text: str, start: float | None) -> str:
+def _harmonics_from(text: str, start: float | None) -> str:
     """Return an estimate (JSON) whose harmonics of the load count from the time `start` in s; None leaves them out."""
     if _HARMONICS not in text:
         return text

@@ -251,13 +251,18 @@ def lowest_bit(typingctx: Any, bits: Any) -> Any:
     return types.int64(types.int64), codegen
 
 
+def _called(builder: Any, name: str, arguments: Any) -> Any:
+    """Call a function of LLVM on vectors."""
+    kind = ir.FunctionType(_VECTOR, [_VECTOR] * len(arguments))
+    return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v8f64"), arguments)
+
+
 @_operation
 def fused(typingctx: Any, factor: Any, other: Any, term: Any) -> Any:
     """Return factor * other + term of each lane, rounded once if the processor has fused operations."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        kind = ir.FunctionType(_VECTOR, [_VECTOR] * 3)
-        return builder.call(cgutils.get_or_insert_function(builder.module, kind, "llvm.fmuladd.v8f64"), arguments)
+        return _called(builder, "fmuladd", arguments)
 
     return factor(factor, other, term), codegen
 
@@ -267,9 +272,7 @@ def magnitude(typingctx: Any, value: Any) -> Any:
     """Return the absolute value of each lane."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        kind = ir.FunctionType(_VECTOR, [_VECTOR])
-        fabs = cgutils.get_or_insert_function(builder.module, kind, "llvm.fabs.v8f64")
-        return builder.call(fabs, [arguments[0]])
+        return _called(builder, "fabs", arguments)
 
     return value(value), codegen
 
@@ -279,9 +282,7 @@ def square_root(typingctx: Any, value: Any) -> Any:
     """Return the square root of each lane."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        kind = ir.FunctionType(_VECTOR, [_VECTOR])
-        root = cgutils.get_or_insert_function(builder.module, kind, "llvm.sqrt.v8f64")
-        return builder.call(root, [arguments[0]])
+        return _called(builder, "sqrt", arguments)
 
     return value(value), codegen
 

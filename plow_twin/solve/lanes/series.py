@@ -389,7 +389,6 @@ def _push_by_power(lanes, w, k, acts, hysteretic, fraction, c, s, x, y, dc, ds, 
             power, damped = _raise(lanes, w, slot, k, hysteretic)
         else:
             power, damped = _multiply(lanes, slot, k, hysteretic)
-        if fraction is None:
             power = choose(lanes.taken[slot], power, zero)
         if acts != _ALL:
             power, damped = choose(acts, power, zero), choose(acts, damped, zero)
