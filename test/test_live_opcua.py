@@ -116,8 +116,9 @@ def _free_port() -> int:
         return int(found.getsockname()[1])
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def server() -> Iterator[Plant]:
+    """A server for one test, because its history would also fill the breaks of another test."""
     plant = Plant()
     yield plant
     plant.close()
