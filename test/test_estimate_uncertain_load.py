@@ -10,10 +10,11 @@ from estimate_support import KINDS, known, mismatched
 
 from plow_twin.estimate import tuning
 from plow_twin.estimate.equation_error import EquationError
-from plow_twin.estimate.estimate import estimate
+from plow_twin.estimate.estimate import estimate, thinned
 from plow_twin.estimate.measurements import Load, Poses
 from plow_twin.estimate.result import Estimate, State
 from plow_twin.estimate.start import filled, range_of_motion
+from plow_twin.estimate.uncertain_load import compare_under_uncertain_load
 from plow_twin.estimate.unknowns import Unknowns
 
 
@@ -62,6 +63,14 @@ def test_without_an_angle_the_range_of_the_head_gives_a_rough_clearance_whose_in
     assert result.horizontal_state is State.ROUGH and (result.model, result.sensor) == ("ok", "ok")
     assert result.reasons == ("theta: measured 0 times, expected at least 20",)
     assert _holds(result, truth.clearance) and result.horizontal.deviation > 5.0 * exact.horizontal.deviation
+
+
+def test_a_clearance_that_no_drawn_motion_has_is_not_a_result() -> None:
+    """With soft walls, pads that are askew look like a negative clearance."""
+    truth = mismatched(replace(KINDS["hard_askew"], periods=4.0), 99002)
+    unknowns, period = Unknowns.stated(truth.nominal, truth.load, truth.poses), truth.load.period()
+    found, work = compare_under_uncertain_load(thinned(truth.load, period)[0], unknowns, truth.poses, period)
+    assert found is None and work > 0
 
 
 def test_a_quick_load_is_no_reason_to_look_at_the_poses_in_its_own_time() -> None:

@@ -90,7 +90,8 @@ def compare_under_uncertain_load(
 
     Returns
     -------
-    Compared, or None if too few motions could be run, and the work done.
+    Compared, or None if too few motions could be run or the result is smaller than any clearance drawn; and the work
+    done.
     """
     rng = np.random.default_rng(seed)
     seen = MotionFeatures(unknowns, poses, period)
@@ -123,6 +124,8 @@ def compare_under_uncertain_load(
             (value[4], max(tuning.FIRM_SPREAD[2], tuning.FIRM_SPREAD[1] * deviation[4])),
         )
     assert found is not None
+    if (spread.centre < _LEAST_CLEARANCE).any():  # the regression extrapolates, so no drawn motion is like the measured
+        return None, work
     share, least = tuning.CORRECTED
     unexplained = np.hypot(share * value[:2], least) if angle else np.zeros(2)
     # the change of a clearance in the last round is added to its deviation, because a clearance that still changes has
