@@ -10,9 +10,10 @@ from estimate_support import Truth, draw, known
 from scenes import gaps_at
 
 from plow_twin.estimate.estimate import estimate, with_gaps
-from plow_twin.estimate.gaps import Gaps, GapsError, fit_gaps
+from plow_twin.estimate.gaps import Gaps, GapsError, GapsFit, fit_gaps
 from plow_twin.estimate.measurements import Poses
 from plow_twin.estimate.result import State
+from plow_twin.model.pairs import PAIR_NAMES
 
 SENSOR_ERROR = 1e-4
 
@@ -36,7 +37,7 @@ def test_gaps_give_the_clearances_without_a_contact_model(
     some[:, list(pairs)] = gap[:, list(pairs)]
     gaps, _ = Gaps.of(truth.poses.t, some)
     found = fit_gaps(truth.nominal, gaps, truth.poses)
-    assert found is not None
+    assert isinstance(found, GapsFit)
     assert (np.abs(found.clearance - truth.clearance) < 3.0 * found.deviation).all() and (
         found.deviation < 1.5e-4
     ).all()
@@ -49,14 +50,22 @@ def test_gaps_give_the_clearances_without_a_contact_model(
         assert abs(value.mean - true) < 4.0 * SENSOR_ERROR
 
 
-def test_gaps_at_one_wall_alone_give_no_clearance(gapped: tuple[Truth, np.ndarray]) -> None:
+def test_gaps_that_do_not_determine_the_clearances_are_not_used_and_the_reason_names_the_sensors(
+    gapped: tuple[Truth, np.ndarray],
+) -> None:
     truth, gap = gapped
     gap = gap.copy()
     gap[:, [3, 5]] = np.nan  # the right wall has no gap sensor
     gaps, _ = Gaps.of(truth.poses.t, gap)
-    assert fit_gaps(truth.nominal, gaps, truth.poses) is None
+    names = ", ".join(PAIR_NAMES[pair] for pair in (0, 1, 2, 4, 6, 7))
+    why = f"gaps: got sensors at {names}, expected five pairs that determine theta, or one pair at each wall"
+    assert fit_gaps(truth.nominal, gaps, truth.poses) == why
     result = estimate(truth.nominal, truth.load, Poses(truth.poses.t[:0], truth.poses.q[:0]), gaps=gaps)
-    assert result.horizontal_state is State.PRIOR
+    assert result.horizontal_state is State.PRIOR and result.reasons[-1] == why
+    few, _ = Gaps.of(truth.poses.t[:9], gapped[1][:9])
+    assert str(fit_gaps(truth.nominal, few, truth.poses)).endswith("expected at least 20")
+    late = few.between(1e6, 2e6)
+    assert fit_gaps(truth.nominal, late, truth.poses) == "gaps: got no message within the load's span"
     with pytest.raises(GapsError, match=r"gap \(4, 3\), expected \(n,\) and \(n, 8\)"):
         Gaps.of(np.arange(4.0), np.zeros((4, 3)))
 
@@ -84,7 +93,7 @@ def test_gaps_without_a_pose_give_an_estimate_and_a_shifted_one_is_found(gapped:
     shifted = gap.copy()
     shifted[:, 1] += 2e-3
     found = fit_gaps(truth.nominal, Gaps.of(truth.poses.t, shifted)[0], truth.poses)
-    assert found is not None and found.contradiction > 5.0
+    assert isinstance(found, GapsFit) and found.contradiction > 5.0
     result = with_gaps(known()[0][1], found)
     assert result.horizontal_state is result.vertical_state is State.WITHDRAWN and result.sensor == "suspect"
     assert "gaps:" in result.reasons[0]

@@ -149,7 +149,7 @@ def _estimate(
     poses, spikes = poses.without_spikes(noise_level(filled(poses)))
     lost += spikes
     by_gaps = None if gaps is None else fit_gaps(scene, gaps.between(span[0], span[1] + 1e-9), poses)
-    if by_gaps is not None and len(by_gaps.poses.t) and (len(poses.t) < FEWEST_POSES or _lacking(poses)):
+    if isinstance(by_gaps, GapsFit) and len(by_gaps.poses.t) and (len(poses.t) < FEWEST_POSES or _lacking(poses)):
         poses = by_gaps.poses
     if forces is not None:
         forces = forces.between(span[0], span[1] + 1e-9)
@@ -164,7 +164,11 @@ def _estimate(
         result, following = _without_fit(Unknowns(scene), poses, lost, f"the fit cannot be computed: {error}"), ()
     if forces is not None and result.forces_measured is None:
         result = replace(result, forces_measured=ForcesUsed(unused="the motion is not known moment by moment"))
-    return (result, following) if by_gaps is None else (with_gaps(result, by_gaps), following)
+    if isinstance(by_gaps, GapsFit):
+        result = with_gaps(result, by_gaps)
+    elif by_gaps is not None:
+        result = replace(result, reasons=(*result.reasons, by_gaps))
+    return result, following
 
 
 def _known(result: Estimate) -> bool:

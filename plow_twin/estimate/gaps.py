@@ -18,7 +18,7 @@ from plow_twin.estimate import tuning
 from plow_twin.estimate.measurements import FEWEST_POSES, Poses, usable_rows
 from plow_twin.estimate.result import Interval
 from plow_twin.model.geometry import penetration_rows
-from plow_twin.model.pairs import NORMAL_X, NORMAL_Y
+from plow_twin.model.pairs import NORMAL_X, NORMAL_Y, PAIR_NAMES
 from plow_twin.model.scene import Clearance, Scene
 
 Array = NDArray[np.float64]
@@ -92,25 +92,29 @@ class GapsFit:
     contradiction: float
 
 
-def fit_gaps(scene: Scene, gaps: Gaps, poses: Poses) -> GapsFit | None:
+def fit_gaps(scene: Scene, gaps: Gaps, poses: Poses) -> GapsFit | str:
     """Fit clearances and poses to gaps, with theta from `poses` if the gaps do not determine it.
 
-    Of messages with different sensors, the most frequent set of enough sensors is used. Returns None if no such set has
-    20 messages.
+    Of messages with different sensors, the most frequent set of enough sensors is used. If no such set has 20 messages,
+    the reason why the most frequent set is not used is returned.
     """
     error = gaps.deviation or tuning.CONSTANT_ERROR
     rows = penetration_rows(replace(scene, clearance=Clearance(0.0, 0.0)))
     theta = _theta_at(gaps.t, poses)
-    best: GapsFit | None = None
+    fits: list[GapsFit] = []
+    unused = "gaps: got no message within the load's span"
     known = np.isfinite(gaps.gap)
-    for pairs in np.unique(known, axis=0):
+    sets, counts = np.unique(known, axis=0, return_counts=True)
+    for pairs in sets[np.argsort(counts, kind="stable")]:
         own = (known == pairs).all(axis=1)
         found = _fit_one_set(
             rows, gaps.t[own], gaps.gap[own][:, pairs], np.flatnonzero(pairs), theta[own], error, scene
         )
-        if found is not None and (best is None or found.used > best.used):
-            best = found
-    return best
+        if isinstance(found, str):
+            unused = found
+        else:
+            fits.append(found)
+    return max(fits, key=lambda fit: fit.used, default=unused)
 
 
 def _theta_at(t: Array, poses: Poses) -> Array:
@@ -124,8 +128,12 @@ def _theta_at(t: Array, poses: Poses) -> Array:
 
 def _fit_one_set(
     rows: Array, t: Array, gap: Array, pairs: NDArray[np.int64], theta: Array, error: float, scene: Scene
-) -> GapsFit | None:
-    """Fit the messages of one set of sensors; `gap`, shape (n, k), holds the gaps of the pairs `pairs`, shape (k,)."""
+) -> GapsFit | str:
+    """Fit the messages of one set of sensors; `gap`, shape (n, k), holds the gaps of the pairs `pairs`, shape (k,).
+
+    If they do not determine the clearances, the reason is returned.
+    """
+    names = ", ".join(PAIR_NAMES[pair] for pair in pairs)
     # the gap of a pair is half the clearances minus the reach of the pair's corner
     half = 0.5 * np.abs(np.stack([NORMAL_X, NORMAL_Y], axis=1))[pairs]
     fixed = np.concatenate([-rows[2:4, pairs].T, half], axis=1)
@@ -133,11 +141,12 @@ def _fit_one_set(
     turns = bool(np.linalg.matrix_rank(with_turn, _SINGULAR) == 5)
     if not turns:
         if np.linalg.matrix_rank(fixed, _SINGULAR) < 4:
-            return None
+            return f"gaps: got sensors at {names}, expected five pairs that determine theta, or one pair at each wall"
         good = np.isfinite(theta)
         t, gap, theta = t[good], gap[good], theta[good]
     if len(t) < FEWEST_POSES:
-        return None
+        beside = "" if turns else " while theta was measured"
+        return f"gaps: got {len(t)} messages of {names}{beside}, expected at least {FEWEST_POSES}"
     unknown = np.zeros((len(t), 5))
     unknown[:, 4] = 0.0 if turns else theta
     equations = with_turn if turns else fixed
