@@ -141,7 +141,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
     except RunInterrupted as error:
         return _fail(str(error))
     except (click.Abort, KeyboardInterrupt) as error:
-        # click replaces every KeyboardInterrupt by an Abort
+        # click replaces every KeyboardInterrupt by an Abort, whose cause is the original exception
         stopped = error.__cause__
         return _fail(str(stopped) if isinstance(stopped, RunInterrupted) else "interrupted")
     except (InputError, UnitError, ExcessError) as error:

@@ -162,7 +162,7 @@ def _plain(value: Any) -> str:
 
 
 def counts(found: Mapping[str, int]) -> str:
-    """Return counts with their names as text."""
+    """Return counts as one line of text, each with its name."""
     return ", ".join(f"{name}: {count}" for name, count in found.items())
 
 

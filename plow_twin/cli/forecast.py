@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from plow_twin.model.scene import Scene
 
 
-#: A limit below this share of the clearance was probably given in m instead of mm: it is then a thousandth of the limit
-#: meant.
+#: A limit below this share of the clearance was probably given in m instead of mm, which makes it a thousandth of the
+#: intended limit.
 _METRES: Final = 1e-2
 
 

@@ -135,18 +135,18 @@ class Feed:
     Parameters
     ----------
     link
-        The way to its process.
+        Link to the process that receives the updates.
     facts
         Facts about the machine (`facts.facts_of`).
     answer
-        Carries out an operator's request, `acknowledge` or `mark` with a text; returns success and a text.
-        None: no request is possible.
+        Function that carries out an operator's request (`acknowledge` or `mark`, with a text) and returns whether it
+        succeeded and a text for the operator; None if operators cannot make requests.
     load
-        Returns the load Fx, Fy [N], M [N m] at the newest publication, shape (3,).
+        Function that returns the load Fx, Fy [N], M [N m] at the newest publication, shape (3,).
     on_error
-        Receives the reason when the feed has ended.
+        Function that is called with the reason when the feed has ended.
     process, consequence
-        Name of the process, and the consequence of its end.
+        Name of the process, and what its end means for the user, both for the report of an error.
     by_second
         Send an update for each second of stamps even if samples arrive faster than in real time, as from a file.
     """

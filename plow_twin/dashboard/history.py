@@ -51,7 +51,7 @@ class History:
         return stepped_back
 
     def since(self, version: int) -> list[list[Any]]:
-        """Return the seconds that were changed after that update, in order."""
+        """Return the seconds that changed after the update `version`, in order of time."""
         count = 0
         for found in reversed(self._versions):
             if found <= version:

@@ -82,5 +82,5 @@ def number(value: float) -> float | None:
 
 
 def numbers(values: Any) -> list[float | None]:
-    """Return the numbers of an array."""
+    """Return the numbers of an array for JSON, each as by `number`."""
     return [number(value) for value in values.tolist()]

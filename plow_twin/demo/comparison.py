@@ -17,7 +17,7 @@ from plow_twin.stream.journal import Estimated
 
 Array = NDArray[np.float64]
 
-#: The last stretch of a run is compared; its length [s] is a load period of the paper.
+#: Length [s] of the part at the end of a run that is compared: a load period of the paper.
 COMPARED_S: Final = 3.2
 
 
@@ -28,9 +28,10 @@ class Comparison:
     Attributes
     ----------
     peaks : dict of str to ndarray, shape (8,)
-        Largest force of each pair in N, by `nominal`, `followed` and `true`.
+        Largest force of each pair in N, under the keys `nominal`, `followed` and `true`.
     error : dict of str to float
-        RMS of the difference from the true forces, divided by the RMS of the true forces, by `nominal` and `followed`.
+        RMS of the difference from the true forces, divided by the RMS of the true forces, under the keys `nominal` and
+        `followed`.
     estimates_s : list of float
         Times of the run in s at which an estimate was made.
     since_s : float

@@ -33,7 +33,8 @@ class RunSummary:
     makes : ndarray, shape (8,)
         Number of touches.
     contact_sets : dict
-        By sense and set of corners: share of the contact time in which exactly the corners of the set carry force.
+        Share of the contact time in which exactly the corners of a set carry force, by sense of swing and by set of
+        corners.
     clearance : dict
         Newest value, 5 % and 95 % point [m] of `horizontal` and `vertical`.
     wear_depth : ndarray, shape (8,)

@@ -18,8 +18,8 @@ from plow_twin.model.scene import Scene, Table
 
 #: Derived: number of load periods after which the members have forgotten their initial states.
 _SETTLE_PERIODS: Final = 1.0
-#: Derived: longest distance between two knots as a share of a load period; for the paper's period `tuning.LOAD_KNOT` is
-#: about half of this distance.
+#: Derived: longest distance between two knots of a load, as a share of the load's period; for the paper's period it is
+#: about twice `tuning.LOAD_KNOT`.
 _KNOT_SHARE: Final = 1.0 / 400.0
 
 

@@ -42,7 +42,7 @@ _MOST_ROWS, _MOST_NEAR_ROWS = 2000, 1200
 #: Derived: smallest number of rows in a part of a load period; the mean of nine values has a third of their scatter.
 _FEWEST_OF_PHASE = 9
 #: Derived: delays in s that are tried. For the measured path they reach two prior deviations to both sides, and for the
-#: drawn paths a tenth of that. `_NO_LAG` is the index of zero delay among the delays of drawn paths.
+#: paths of simulated motions a tenth of that. `_NO_LAG` is the index of zero among the delays of simulated motions.
 _LAGS_S: Final = np.linspace(-0.1, 0.1, 81)
 _OF_DRAWN_S: Final = np.linspace(-0.01, 0.01, 9)
 _NO_LAG = len(_OF_DRAWN_S) // 2
@@ -54,7 +54,7 @@ _CHANGES_BY_PHASE: Final = (1, 4)
 _SIDES: Final = ("frame.width_m", "frame.height_m")
 #: Guard: squared scatter, in m2 or rad2, that keeps logarithms and quotients finite.
 _NO_SCATTER = 1e-14
-#: Bound: largest work for a drawn motion, as a multiple of the work for ten load periods.
+#: Bound: largest factor on the work allowed for simulated motions if the window is longer than ten load periods.
 _LONGER = 2.0
 #: Guard: smallest and largest penetration in m that is drawn for a hard and for a firm contact.
 _HARD_BOUNDS, _FIRM_BOUNDS = (8e-7, 6e-4), (2e-6, 2e-2)
@@ -247,7 +247,7 @@ def compare(
         found.distance,
         path_deviate(eye.paths(eye.q, _LAGS_S), features[:, 5:], paths, measured[5:]),
         law,
-        # no odds near a known estimate, because their limit was tuned without one
+        # without odds if `near` is given, because the limit of the odds was tuned without `near`
         odds if near is None else -math.inf,
         *hidden_by_geometry(unknowns, poses, period, measured[:2]),
     )
@@ -293,19 +293,19 @@ class _Spread:
 
     @staticmethod
     def near(unknowns: Unknowns, vector: Array) -> _Spread:
-        """Return the distribution about the softness and damping of a vector."""
+        """Return the distribution about the softness and damping of a vector of unknowns."""
         mean = np.array([math.log(unknowns.penetration_of(float(vector[SOFTNESS]))), vector[DAMPING]])
         return _Spread(mean, tuning.FIRM_SPREAD[0] * np.array([1.0, float(unknowns.damped)]), _FIRM_BOUNDS)
 
     def narrowed(self, found: _Regressed) -> _Spread:
-        """Return the distribution about a result."""
+        """Return a narrower distribution, about the result of a regression."""
         _, over, least = tuning.FIRM_SPREAD
         deviation = np.minimum(np.maximum(over * found.deviation[5:7], least), self.deviation)
         return _Spread(found.value[5:7], deviation, _FIRM_BOUNDS)
 
 
 class _Drawn:
-    """Draws with one contact law: features, targets and changes, and the observed motions until they are cleared."""
+    """Motions drawn with one contact law: features, targets, changes, and the motions themselves until cleared."""
 
     def __init__(
         self, forward: Forward, unknowns: Unknowns, eye: MotionFeatures, spread: _Spread, rng: np.random.Generator

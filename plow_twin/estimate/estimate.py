@@ -344,7 +344,7 @@ def under_uncertain_load(
 
 
 def _from_bounced(unknowns: Unknowns, shared: Array, bounced: Bounced) -> Array:
-    """Return a vector with the clearances, softness and damping of a comparison."""
+    """Return a vector of unknowns with the clearances, softness and damping that a comparison has found."""
     start = shared.copy()
     start[[GX, GY]], start[DAMPING] = bounced.clearance, bounced.ln_damping[0]
     penetration = math.exp(bounced.ln_penetration[0])
