@@ -521,7 +521,8 @@ NEW_MOTION: Annotated[
     float,
     Tuned(
         "window",
-        "smallest share of new motion with which an estimate replaces one that has fewer rough clearances",
+        "smallest share of new motion of an early window, and of an estimate that replaces one with fewer rough "
+        "clearances",
         "windows that grow by half have a third, neighbouring windows of a node 0.31, those of 10.0 and 10.8 s 0.07",
     ),
 ] = 0.2

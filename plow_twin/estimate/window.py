@@ -66,7 +66,8 @@ class Windows:
     gaps : float
         Stated deviation of a gap sensor in m.
     early : bool
-        Whether shorter windows are formed at first, from the share `tuning.WINDOW_SHARES[1]` of the full length on.
+        Whether shorter windows are formed at first, from the share `tuning.WINDOW_SHARES[1]` of the full length on. A
+        short window is left out if less than the share `tuning.NEW_MOTION` of its motion is new.
     """
 
     def __init__(
@@ -95,6 +96,8 @@ class Windows:
         self._newest_ns: int | None = None
         self._end_ns: int | None = None
         self._first_ns: int | None = None
+        #: end of the newest window that was formed
+        self._formed_ns: int | None = None
 
     def set_load_deviation(self, deviation: Deviation) -> None:
         """Set the deviation of the load from here on: Fx, Fy [N], M [N m]."""
@@ -119,10 +122,12 @@ class Windows:
             end_ns = max(end_ns, self._early_end(stamp_ns))
         if self._end_ns is None:
             self._end_ns = end_ns
-        if end_ns <= self._end_ns:
+        if end_ns <= self._end_ns or self._is_hardly_new(end_ns):
             return None
         self._end_ns = end_ns
-        return self._form(end_ns)
+        window = self._form(end_ns)
+        self._formed_ns = self._formed_ns if window is None else end_ns
+        return window
 
     def last(self) -> Window | str:
         """Return the window that ends with the newest sample, for the end of the input, or why there is none."""
@@ -147,6 +152,14 @@ class Windows:
             end_ns = self._first_ns + round(span)
             span *= growth
         return end_ns
+
+    def _is_hardly_new(self, end_ns: int) -> bool:
+        """Return whether a window is short and has little motion that the previous window did not have."""
+        if not self._early or self._formed_ns is None or self._first_ns is None:
+            return False
+        span = end_ns - self._first_ns
+        is_short = span < tuning.WINDOW_SHARES[0] * self._length_ns
+        return is_short and end_ns - self._formed_ns < tuning.NEW_MOTION * span
 
     def _form(self, end_ns: int) -> Window | None:
         start_ns = end_ns - self._length_ns
