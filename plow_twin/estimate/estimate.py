@@ -321,8 +321,8 @@ def under_uncertain_load(
         mean, deviation = _both((float(found.clearance[index]), float(found.deviation[index])), prior)
         if beside is not None:
             by_fit = float(beside.shared[index]), math.sqrt(beside.covariance[index, index])
-            if abs(by_fit[0] - mean) < tuning.AGREES * math.hypot(deviation, by_fit[1]):
-                mean, deviation = _both((mean, deviation), by_fit)
+            if _apart((mean, deviation), by_fit) < tuning.AGREES:
+                mean, deviation = _both_of_one((mean, deviation), by_fit)
         observed = bool(found.touched[index]) and deviation < tuning.OBSERVED_SHARE * prior[1]
         values.append(Interval.normal(*((mean, deviation) if observed else prior)).above(0.0))
         known.append(_state(False, observed, rough=True))
@@ -363,9 +363,7 @@ def with_bounced(result: Estimate, bounced: Bounced, spent: int) -> Estimate:
         strict=True,
     ):
         if state is State.ESTIMATED and bounced.distance < tuning.MOST_DISTANCE and deviation < tuning.OBSERVED:
-            off = abs(value.mean - mean) / math.hypot(deviation, value.deviation)
-            mean, deviation = _both((value.mean, value.deviation), (mean, deviation))
-            value = Interval.normal(mean, deviation * max(1.0, off)).above(0.0)
+            value = Interval.normal(*_both_of_one((value.mean, value.deviation), (mean, deviation))).above(0.0)
         values.append(value)
     figures = result.figures | {"distance": bounced.distance, "path": bounced.path}
     figures["work"] += float(spent)
@@ -431,7 +429,7 @@ def with_gaps(result: Estimate, by_gaps: GapsFit) -> Estimate:
         strict=True,
     ):
         moved = value.deviation
-        off = abs(value.mean - mean) / math.hypot(deviation, moved)
+        off = _apart((value.mean, moved), (mean, deviation))
         if state.known and off > tuning.OUTLYING:
             found.append(
                 f"gaps: {name} {mean:.5f} m by the gaps, {value.mean:.5f} m by the motion, {off:.1f} deviations apart"
@@ -528,6 +526,20 @@ def _both(one: tuple[float, float], other: tuple[float, float]) -> tuple[float, 
     """Return mean and deviation of the combination of two independent measurements."""
     weights = one[1] ** -2, other[1] ** -2
     return (one[0] * weights[0] + other[0] * weights[1]) / sum(weights), sum(weights) ** -0.5
+
+
+def _apart(one: tuple[float, float], other: tuple[float, float]) -> float:
+    """Return the difference of two means in units of its standard deviation."""
+    return abs(one[0] - other[0]) / math.hypot(one[1], other[1])
+
+
+def _both_of_one(one: tuple[float, float], other: tuple[float, float]) -> tuple[float, float]:
+    """Return mean and deviation as `_both`, widened by the disagreement of two estimates from one motion.
+
+    Reference: Birge, Phys. Rev. 40 (1932) 207 (the ratio of external to internal consistency).
+    """
+    mean, deviation = _both(one, other)
+    return mean, deviation * max(1.0, _apart(one, other))
 
 
 def _state(withdrawn: bool, observed: bool, rough: bool = False) -> State:
