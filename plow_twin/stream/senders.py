@@ -1,7 +1,10 @@
-"""Choice of the sender to follow among several senders of one input, and the count of its lost samples.
+"""Selection of one sender when several send the same input, and the count of its lost samples.
 
-The middleware numbers the messages of each publisher from 1 on. A gap in the numbers is a loss on the way or in an
-overrun queue; this holds at any rate, and in bursts too.
+The middleware numbers the messages of each publisher, starting at 1. A gap in these numbers therefore means that
+
+messages were lost in transit or in an overrun queue. This holds at any message rate, and also when messages arrive in
+
+bursts.
 """
 
 from __future__ import annotations
@@ -10,7 +13,8 @@ from collections.abc import Collection
 
 #: Silence of the followed sender [ns] after which `OneSender` follows another sender.
 _SILENT_NS = 10_000_000_000
-#: Largest number of senders whose message numbers are kept; when there are more, the oldest sender is forgotten.
+#: Largest number of senders whose next message number is stored; when there are more, the sender that was heard first
+#: (except the followed sender) is forgotten.
 _MOST_SENDERS = 64
 
 
@@ -30,15 +34,15 @@ class Senders:
         self._other: bytes | None = None
 
     def start(self, present: Collection[bytes]) -> None:
-        """Note the senders that are present already; their messages until now are not counted as lost."""
+        """Register existing senders; messages that they have sent until now do not count as lost."""
         self._before = frozenset(present)
 
     def start_late(self, sender: bytes) -> None:
-        """Note a sender whose messages before its first heard sample are not counted as lost."""
+        """Register a sender; its messages before the first sample heard from it do not count as lost."""
         self._before |= {sender}
 
     def hear(self, sender: bytes, number: int, count: int = 1) -> bool:
-        """Add the arrival of sample `number` (from 1) of a sender, or of `count` samples from this number on.
+        """Count the arrival of a sender's sample `number` (from 1), or of `count` samples from it on.
 
         Returns whether the sender is followed.
         """
@@ -51,7 +55,7 @@ class Senders:
             self.followed = sender
         followed = sender == self.followed
         if followed:
-            # a message that arrives after all is no longer lost
+            # a message that was counted as lost and arrives late is subtracted again
             self.lost += number - expected if number >= expected else -1 if self.lost else 0
         else:
             self.ignored += count
@@ -60,9 +64,10 @@ class Senders:
         return followed
 
     def alive(self, present: Collection[bytes]) -> None:
-        """Note the present senders; when the followed sender has disappeared, the next sender heard is followed.
+        """Update the present senders; if the followed sender is gone, follow the next sender heard.
 
-        A sender that was never among the present senders may not have been discovered yet, and has not disappeared.
+        A sender that has never been among the present senders does not count as disappeared, because it may not have
+        been discovered yet.
         """
         gone = self._listed.difference(present)
         self._listed = set(present)
@@ -72,7 +77,7 @@ class Senders:
             self._other = None
 
     def switch(self) -> bool:
-        """Follow the other sender that was heard last; return False if there is none."""
+        """Follow the most recently heard other sender; return False if there is no other sender."""
         if self._other is None:
             return False
         self._other, self.followed = self.followed, self._other
@@ -91,7 +96,7 @@ class OneSender:
         self._listed: set[bytes] = set()
 
     def hear(self, sender: bytes, now_ns: int) -> bool:
-        """Add the arrival of a message at a steady time [ns]; return whether its sender is followed."""
+        """Register a message at a time [ns] of the steady clock; return whether its sender is followed."""
         if self.followed is None or now_ns - self._heard_ns > _SILENT_NS:
             self.followed = sender
         if sender != self.followed:
@@ -101,7 +106,7 @@ class OneSender:
         return True
 
     def alive(self, present: Collection[bytes]) -> None:
-        """Note the present senders, as in `Senders`."""
+        """Update the present senders, as in `Senders`."""
         if self.followed in self._listed.difference(present):
             self.followed = None
         self._listed = set(present)

@@ -48,12 +48,13 @@ from plow_twin.stream.outputs import NONE, NOTHING, THE_ONE, Outputs, Published,
 
 #: Number of advances from one digest to the next.
 DIGEST_INTERVAL: Final = 100
-#: Header of a snapshot: whether a stamp is known, origin, stamp reached, number of advances, whether the load is held,
-#: speed along the face, number of waiting speeds.
+#: Header of a snapshot: whether a stamp is known, stamp of model time 0, stamp reached, number of advances, whether the
+#: load is held, speed along the face, number of speeds that wait for their stamps.
 _HEADER: Final = struct.Struct("<?qqq?dq")
 _TRAVEL: Final = struct.Struct("<qd")
-#: Largest lead of a pose over the time reached [ns]. In a bag that is played fast, poses arrive before the load of
-#: their time; a pose with a larger lead is from another clock.
+#: Largest time [ns] by which a pose may be ahead of the time that the model has reached. When a bag is played fast,
+#: poses arrive before the load samples of the same time. A pose that is further ahead is assumed to come from another
+#: clock.
 _AHEAD_NS: Final = 3_600_000_000_000
 _WEAR_SIZE: Final = 8 * PAIR_COUNT
 _NO_LOAD: Final = np.zeros((1, 3))
@@ -65,9 +66,10 @@ def _ignore(entry: Entry) -> None:
 
 
 class _Measured(NamedTuple):
-    """A pose or an estimate that was given to the twin: its index, the time reached at that moment, and its stamp [ns].
+    """A pose or an estimate given to the twin, with its index, its stamp and the time then reached [ns].
 
-    The measurement has an effect from model time `known` [s] on, also when the session has gone back for a late sample.
+    The measurement has an effect only from model time `known` [s] on. This also holds after the session has gone back
+    in time to insert a late sample.
     """
 
     number: int
@@ -120,36 +122,38 @@ class Series(NamedTuple):
 
 
 class _UndoneError(Exception):
-    """An advance failed, and the twin is in its state before the samples."""
+    """An advance failed, and the twin has been restored to its state before the samples."""
 
 
 class Session:
-    """One run of a twin under a journal.
+    """One run of a twin whose inputs are entries of a journal.
 
-    The same entries in the same order give the same motion, publications (`outputs`) and digests, bit for bit, with any
-    clock. Model time is (stamp - origin), and the origin is the first stamp.
+    The same entries in the same order give bit-identical motion, publications (`outputs`) and digests, independently of
+    the clock. Model time is (stamp - origin); by default the origin is the first stamp.
 
-    Motion and wear are two states: a `Reset` restores the initial motion and keeps the wear, which only `SetWear` sets.
-    While the load is held or removed (`Hold`, `Unload`), there is no wear, because the load is unknown. With the
-    scene's own loads the load is known, and a `Hold` only advances the time.
+    Motion and wear are separate states: a `Reset` restores the initial motion but keeps the wear, which only `SetWear`
+    sets. While the load is held or removed (`Hold`, `Unload`), the pads do not wear, because the true load is unknown.
+    If the scene itself defines the loads, the load is known, and a `Hold` only advances the time.
 
-    A sample whose stamp is behind the time reached is late: the session goes back to the newest snapshot before it,
-    inserts the sample and runs again up to the newest sample. Later motion without samples is dropped.
+    A sample whose stamp is behind the time reached is late: the session goes back to the newest snapshot before this
+    stamp, inserts the sample and computes the motion again up to the newest sample. Motion without samples after the
+    newest sample is dropped.
 
     Parameters
     ----------
     twin
-        The twin to drive; only the session may advance it. A following twin gets the measured poses and the estimates.
+        The twin to drive; only the session may advance it. A twin that follows measurements also gets the measured
+        poses and the estimates.
     origin_ns
         Stamp of model time 0, or None: the first stamp.
     on_entry
-        Receives the entries in order of use: the entries of one call before the call applies them, and each digest
-        after the advance that it covers. An entry that the twin then refuses (a number is not finite) has already been
-        emitted; a replay refuses it too.
+        Function that receives the entries in order of use: the entries of one call before the call applies them, and
+        each digest after the advance that it covers. If the twin refuses an entry because a number is not finite, the
+        entry has already been emitted; a replay refuses this entry too.
     rollback_span_s
         Largest age of a late sample relative to the newest sample [s]; 0: late samples are refused.
     wear_depth
-        Initial wear depth of each pad [m], shape (8,); None: that of the scene.
+        Initial wear depth of each pad [m], shape (8,); None for the wear depth of the scene.
     """
 
     def __init__(
@@ -164,11 +168,11 @@ class Session:
         self._use(twin)
         #: poses and estimates since the earliest state that is kept
         self._measured: deque[_Measured] = deque()
-        #: number of dropped poses: those too far ahead of the load, and those removed from `_measured` because it was
+        #: number of poses that were dropped because they were too far ahead of the load, or because `_measured` was
         #: full
         self.poses_dropped = 0
         self._scene = twin.scene
-        #: changed numbers of the scene, by their keys
+        #: numbers of the scene that were changed while the model ran: new value by key
         self.changes: dict[str, float] = {}
         self.origin_ns = origin_ns
         #: the time that the model has reached [ns], None before the first stamp
@@ -196,9 +200,9 @@ class Session:
         self._advances = 0
 
     def _use(self, twin: Driven) -> None:
-        """Drive a twin from here on."""
+        """Make `twin` the twin that the session drives from now on."""
         self.twin: Driven = twin
-        #: the twin, if it follows measurements
+        #: the twin if it follows measurements, otherwise None
         self.following = twin if isinstance(twin, Following) else None
 
     def catch_up(self) -> None:
@@ -220,8 +224,8 @@ class Session:
     def apply(self, entry: Entry) -> Rows | None:
         """Emit one entry, apply it, and return the row of its advance, shape (1,), or None without an advance.
 
-        `outputs` publishes the row on request. A digest or a loss describes a journal and changes nothing, so it is not
-        emitted again.
+        `outputs` publishes the row on request. A digest or a loss only describes the journal from which it was read and
+        changes nothing, so it is not emitted a second time.
 
         Raises
         ------
@@ -244,7 +248,7 @@ class Session:
             case SetWear(_, depth):
                 self._on_entry(entry)
                 self._restart(np.array(depth))
-                # the estimate no longer applies, because it belongs to other pads
+                # the estimate belongs to the pads before this change of wear, so it no longer applies
                 self.outputs.clear_shift()
             case Estimated(shift=shift):
                 self._on_entry(entry)
@@ -279,9 +283,9 @@ class Session:
         return None
 
     def parts(self, samples: Sequence[Sample], *, each: bool = False) -> Iterator[Sequence[Sample]]:
-        """Yield the parts of samples for `apply_samples`; each part must be applied before the next.
+        """Divide samples into parts for `apply_samples`; each part must be applied before the next.
 
-        All samples from a late sample on are one part. Other parts are as long as the digests allow, or one sample long
+        A late sample and all samples after it are one part. Any other part ends at the next digest, or after one sample
         if `each` is set.
 
         Raises
@@ -309,7 +313,8 @@ class Session:
         samples : sequence of Sample
             At least one sample.
         each : bool
-            Whether to publish after each sample (of late samples, only after the last); otherwise `outputs` sums up.
+            Whether to publish after each sample (if samples are late, only after the last sample); otherwise `outputs`
+            accumulates the samples for the next publication.
 
         Raises
         ------
@@ -342,7 +347,7 @@ class Session:
         wrench : ndarray, shape (n, 3)
             Fx, Fy [N] and M [N m] at each stamp, finite.
         each : bool
-            Whether to publish after each sample; otherwise `outputs` sums up.
+            Whether to publish after each sample; otherwise `outputs` accumulates the samples for the next publication.
 
         Returns
         -------
@@ -435,8 +440,8 @@ class Session:
                 continue
             if travel is not None:
                 end = int(np.searchsorted(stamps, travel.stamp_ns, side="right"))
-            # the first sample after a motion without samples advances alone, and the state after it is kept: the
-            # session never goes back to the motion before it
+            # the first sample after a motion without samples is an advance of its own, and the state after this sample
+            # is kept, because the session never goes back to before this sample
             if resumed:
                 end = begin + 1
             here = slice(begin, end)
@@ -460,12 +465,12 @@ class Session:
         self._changed_twin(changes)
 
     def pop_error_estimate(self) -> float:
-        """Return the largest estimated error [m] due to `max_evaluations` since the last call."""
+        """Return the largest estimated error [m] that `max_evaluations` has caused since the last call."""
         largest, self._largest_error_m = self._largest_error_m, 0.0
         return largest
 
     def renew(self) -> Snapshot:
-        """Return the exact state, from which a journal can continue, and drop the past."""
+        """Return a snapshot from which a journal can continue, and drop all earlier states."""
         snapshot = self.snapshot()
         self._forget()
         return snapshot
@@ -537,7 +542,7 @@ class Session:
         return Applied(rows, self.outputs.add(rows, stamps, taken), digests, failed)
 
     def _follow(self, stamp_ns: int, entry: Pose | PartOfPose | Estimated, known: float = -math.inf) -> None:
-        """Give a measurement to a following twin; before the first sample it has no effect."""
+        """Pass a measurement to a twin that follows measurements; no effect before the first sample."""
         if self.following is None or self.origin_ns is None:
             return
         time = (stamp_ns - self.origin_ns) * 1e-9
@@ -555,7 +560,7 @@ class Session:
             self.poses_dropped += 1
 
     def _travel_on_the_way(self, travel: Travel, stamp_ns: int, wrench: NDArray[np.float64]) -> None:
-        """Advance to the stamp of a speed that is before the next sample, and use the speed."""
+        """Advance to the stamp of a speed that is due before the next sample, and apply the speed."""
         self._travels.pop(0)
         if self.stamp_ns is not None and travel.stamp_ns > self.stamp_ns:
             share = (travel.stamp_ns - self.stamp_ns) / (stamp_ns - self.stamp_ns)
@@ -565,7 +570,7 @@ class Session:
         self._set_speed(travel)
 
     def _is_late(self, stamp_ns: int) -> bool:
-        """Return whether a stamp is behind the time reached, or equal to it without a sample there."""
+        """Return whether a stamp is before the time reached, or equal to it if no sample is there."""
         if self.stamp_ns is None or stamp_ns > self.stamp_ns:
             return False
         return stamp_ns < self.stamp_ns or (self.held and self.history.oldest_ns is not None)
@@ -578,7 +583,7 @@ class Session:
             raise ValueError(f"stamp: got {stamp_ns} ns, expected at least {limit}, {bound_ns} ns")
 
     def _work_in(self, stamp_ns: int, late: Sequence[Sample], *travels: Travel) -> Applied:
-        """Go back to before a late stamp, and run again with late samples and speeds.
+        """Go back to a state before a late stamp, and run again with late samples and speeds.
 
         The next publication covers the motion from the earliest stamp inserted since the previous publication.
         """
@@ -594,23 +599,23 @@ class Session:
     def _rewind(self, stamp_ns: int, *more: Travel) -> list[Sample]:
         """Go back to the newest snapshot before `stamp_ns`; return the samples after the snapshot.
 
-        The speeds after the snapshot, and the speeds `more`, become pending again.
+        The speeds used after the snapshot, and the speeds in `more`, become pending again.
         """
         data, samples, travels = self.history.rewind(stamp_ns)
         advances, pending, slow = self._advances, self._travels, self.outputs.slow_before
         self._restore(data)
         self._advances, self.outputs.slow_before = advances, slow
         if self.following is not None:
-            # each measurement acts from the time at which it was known: publications decide how far the session goes
-            # back, and a publication must not change the motion
+            # each measurement acts only from the time at which it became known. Otherwise the motion would depend on
+            # how far the session goes back; publications decide this, but a publication must not change the motion
             measured, self._measured = self._measured, deque()
             for one in measured:
                 if one.number > self.following.added:
                     self._follow(one.stamp_ns, one.entry, one.known)
                 else:
                     self._measured.append(one)
-        # a speed with the snapshot's stamp may be in the snapshot and among the later speeds, so each stamp is used
-        # once
+        # a speed with the stamp of the snapshot may be both in the snapshot and among the later speeds, so only one
+        # speed is kept for each stamp
         known = {travel.stamp_ns: travel for travel in (*self._travels, *travels, *pending, *more)}
         self._travels = sorted(known.values(), key=lambda travel: travel.stamp_ns)
         return samples
@@ -655,14 +660,14 @@ class Session:
                 self.twin.set_travel_speed(0.0)
 
     def _resume_wear(self) -> bool:
-        """Let the load wear again; return whether wear was off."""
+        """Let the load wear the pads again after a hold; return whether the load was held."""
         held, self.held = self.held, False
         if held and self._wears:
             self.twin.set_travel_speed(self._speed)
         return held
 
     def _apply_travel(self, travel: Travel) -> None:
-        """Apply a speed: now, later when its stamp is reached, or by going back to its stamp."""
+        """Apply a speed along the face: now, when its stamp is reached, or by going back to its stamp."""
         newest_ns, oldest_ns = self.history.newest_sample_ns, self.history.oldest_ns
         if not self._wears:
             self._speed = travel.speed_m_s
@@ -672,8 +677,8 @@ class Session:
         elif travel.stamp_ns > self.stamp_ns:
             insort(self._travels, travel, key=lambda item: item.stamp_ns)
         elif oldest_ns is not None and travel.stamp_ns <= oldest_ns:
-            # the speed is too old to act at its stamp, so it acts from the newest sample on, or from the only kept
-            # state
+            # the speed is too old to act at its stamp, so it acts from the newest sample on or, if there is no sample,
+            # from the only kept state on
             self._set_speed(Travel(oldest_ns if newest_ns is None else newest_ns, travel.speed_m_s))
         elif newest_ns is None or oldest_ns is None or travel.stamp_ns >= newest_ns:
             self._set_speed(travel)
@@ -690,7 +695,7 @@ class Session:
             self.twin.set_travel_speed(self._speed)
 
     def _count(self, advances: int) -> None:
-        """Count advances, and emit a digest every `DIGEST_INTERVAL`."""
+        """Count advances, and emit a digest after every `DIGEST_INTERVAL` advances."""
         before, self._advances = self._advances, self._advances + advances
         if before // DIGEST_INTERVAL != self._advances // DIGEST_INTERVAL and self.stamp_ns is not None:
             self._on_entry(Digest(self.stamp_ns, self.twin.digest()))
@@ -727,7 +732,7 @@ class Session:
         return stamp_ns - round(self.twin.time * 1e9)
 
     def _change_model(self, changes: dict[str, float]) -> None:
-        """Change numbers of the scene; contacts start without history and the past is dropped."""
+        """Change numbers of the scene; contacts start without history, and earlier states are dropped."""
         before, speed = self.twin, 0.0 if self.held else self._speed
         self._use(self._changed_twin(changes))
         self._carry(before)
@@ -739,21 +744,21 @@ class Session:
         self._forget()
 
     def _changed_twin(self, changes: Mapping[str, float]) -> Driven:
-        """Return a twin with other numbers, for which the present and the waiting speeds must be possible."""
+        """Return a twin with changed numbers, which must allow the present and the waiting speeds."""
         found = changed_twin(self.twin, self._scene, changes)
         for speed in (self._speed, *(travel.speed_m_s for travel in self._travels)):
             check_travel_speed(found.scene, speed)
         return found
 
     def _carry(self, before: Driven) -> None:
-        """Take pose, rates, load and time from another twin, and keep the present wear."""
+        """Take pose, rates, load and time from the twin `before`, and keep the present wear."""
         now = before.advance(before.time)
         self.twin.reset(before.time, wear_depth=self.wear_depth, pose=(now.q, now.v))
         if self._sampled:
             self.twin.advance(before.time, before.wrench)
 
     def _restore_motion(self, data: bytes) -> None:
-        """Restore the motion of a snapshot; wear, model, speed along the face and counts stay."""
+        """Restore only the motion of a snapshot, not the wear, model, speed along the face or counts."""
         self._resume_wear()
         for travel in self._travels:
             self._set_speed(travel)
@@ -778,7 +783,7 @@ class Session:
         self.origin_ns = self.stamp_ns = None
 
     def _split_twin(self, data: bytes) -> tuple[bytes, dict[str, float]]:
-        """Return the snapshot of the twin and the changes of the model in the data of a snapshot."""
+        """Split the end of a session's snapshot into the twin's snapshot and the changes of the model."""
         size = len(self.twin.snapshot()) if self.following is None else self.following.snapshot_size(data)
         return data[:size], read_changes(data[size:].decode()) if len(data) > size else {}
 
@@ -805,7 +810,7 @@ def _all_finite(rows: Rows | None) -> bool:
 
 
 def wear_in(snapshot: bytes) -> tuple[float, ...]:
-    """Return the wear depths of the eight pads in m in a snapshot of a session."""
+    """Return the wear depths [m] of the eight pads that a session's snapshot contains."""
     travels = _HEADER.unpack_from(snapshot)[-1]
     depth: list[float] = np.frombuffer(snapshot, np.float64, PAIR_COUNT, _HEADER.size + travels * _TRAVEL.size).tolist()
     return tuple(depth)

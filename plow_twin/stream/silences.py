@@ -10,21 +10,21 @@ from numpy.typing import NDArray
 from plow_twin.stream.intake import NS_PER_S
 
 Indexes = NDArray[np.int64]
-#: A silence is longer than this many times the interval before it, so that a log with a sample each minute has no
-#: silences.
+#: An interval is a silence only if it is longer than this many times the interval before it. A log with one sample a
+#: minute therefore has no silences.
 _LONGER: Final = 5
 
 
 class Silences:
-    """Count silences: stretches between two stamps that are longer than the timeout of the excitation.
+    """Count silences: intervals between two stamps that are longer than the timeout of the excitation.
 
-    A silence is also longer than five times the interval before it. The motion continues in a silence, under the hold
-    policy or with a load that is linear up to the next sample.
+    To count as a silence, an interval must also be longer than five times the interval before it. During a silence the
+    motion continues, either under the hold policy or with a load that changes linearly up to the next sample.
 
     Parameters
     ----------
     timeout_s
-        Longest time between two samples [s] that is not a silence; it may change.
+        Longest time between two samples [s] that does not count as a silence; the value may be changed later.
     """
 
     def __init__(self, timeout_s: float) -> None:
@@ -40,7 +40,7 @@ class Silences:
         self._interval_ns: int | None = None
 
     def add(self, stamps_ns: Indexes) -> list[tuple[int, int, int]]:
-        """Add the stamps of samples, shape (n,) [ns]; return the silences that end at them.
+        """Add the stamps of samples, shape (n,) [ns]; return the silences that end at these samples.
 
         Each silence is (index of the sample that ends it, begin, end) [ns]. A late sample does not end a silence.
         """
@@ -85,7 +85,7 @@ class Silences:
         self._newest_ns = None
 
     def text(self) -> str:
-        """Return the silences in words, with times since the first sample; empty without a silence."""
+        """Describe the silences in words, with times since the first sample; empty without a silence."""
         if not self.count:
             return ""
         begin_s, end_s = ((at - (self._first_ns or 0)) * 1e-9 for at in self.longest_ns)
@@ -100,7 +100,7 @@ class Silences:
         return {"count": self.count, "total_s": self.total_ns * 1e-9, "longest_from_s": begin_s} if self.count else {}
 
     def _begin(self, stamp_ns: int) -> int:
-        """Return the newest stamp [ns], which is the given stamp at the start."""
+        """Return the newest stamp so far [ns]; at the start this is the given stamp."""
         if self._first_ns is None:
             self._first_ns = stamp_ns
         if self._newest_ns is None:

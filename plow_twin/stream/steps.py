@@ -1,4 +1,4 @@
-"""Distinction of a step of the sender's clock from a wrong stamp: a sample whose stamp jumps waits for the next one."""
+"""Distinction between a step of the sender's clock and a single wrong stamp, by the next sample."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from typing import Final
 
 from plow_twin.stream.intake import NS_PER_S, Intake, Verdict
 
-#: Smallest number of stray stamps within `_WINDOW_NS` that makes the stamps unsteady.
+#: Number of stray stamps (jumps that the next sample did not confirm) within `_WINDOW_NS` from which on the stamps
+#: count as unsteady.
 _MOST_STRAYS: Final = 5
 _WINDOW_NS: Final = 10 * NS_PER_S
 
@@ -69,7 +70,7 @@ class Steps:
         return jumped
 
     def end(self) -> None:
-        """Count a sample that still waits, because no next sample comes."""
+        """Count a sample that still waits as stray, because no further sample will come."""
         jumped, self._jumped = self._jumped, None
         if jumped is not None:
             self._intake.refuse(Verdict.STRAY, *jumped[:2])

@@ -60,8 +60,8 @@ class Topic:
     names : tuple of str
         Names in a `JointState`.
     columns : mapping
-        For each field of the message, the fields of the record that fill it, in order, each with its count of numbers.
-        Messages of a topic without columns are not made from a record alone.
+        For each field of the message, the fields of the record that fill it, in order, each as (name, count of
+        numbers). A topic without columns needs more than a record to make its messages.
     """
 
     name: str
@@ -81,11 +81,11 @@ class Topic:
 
     @property
     def count(self) -> int:
-        """Number of the message's numbers that come from the record."""
+        """How many numbers of the message come from the record."""
         return sum(count for _, count in self.parts)
 
     def record_of(self, published: Published) -> NDArray[np.void]:
-        """Return the records from which its messages are made."""
+        """Return the records from which the messages of this topic are made."""
         return published.slow if self.cadence is Cadence.SLOW else published.rows
 
     @property
@@ -94,7 +94,7 @@ class Topic:
         return SLOW if self.cadence is Cadence.SLOW else ROW
 
     def numbers(self, records: NDArray[np.void]) -> list[NDArray[np.float64]]:
-        """Return the numbers of its messages part by part, shapes (n, count), as views where the record has floats."""
+        """Return the messages' numbers, an array (n, count) for each of `parts`; floats are not copied."""
         columns = ((records[name], count) for name, count in self.parts)
         return [np.asarray(one[:, :count] if one.ndim > 1 else one[:, None], np.float64) for one, count in columns]
 

@@ -1,4 +1,6 @@
 """Offline studies of many runs: sweeps of a scene, calibration to figures or recordings, analysis of recordings.
 
-matplotlib, pyarrow, jinja2 and distributed are imported where they are used (extras `study` and `dask`).
+The optional packages matplotlib, pyarrow, jinja2 and distributed (extras `study` and `dask`) are imported only where
+
+they are used.
 """

@@ -1,4 +1,4 @@
-"""Analysis of one recording: the motion follows from a run's journal, or from another load by the live intake."""
+"""Analysis of one recording; the motion is computed from a run's journal or another recording's load."""
 
 from __future__ import annotations
 
@@ -49,17 +49,17 @@ _COLUMNS: Final = (
     *(f"force_{name}" for name in PAIR_NAMES),
     *(f"gap_{name}" for name in PAIR_NAMES),
 )
-#: Tolerance of the motion that an analysis computes if the recording is another program's.
+#: Tolerance with which the motion is computed if the recording comes from another program.
 _TOLERANCE: Final = 1e-9
-#: If a measured stamp is older than the newest stamp by more than this time [ns], the clock of the measurement has
-#: stepped.
+#: If a measured stamp is older than the newest stamp by more than this time [ns], the clock of the measurement is
+#: assumed to have stepped back.
 _STEP_NS: Final = 1_000_000_000
 #: Largest measured value, in any unit; larger values are left out, because their squares may overflow.
 _LARGEST: Final = 1e15
 #: Name that results give to the scene in a run's header.
 _OF_THE_RUN: Final = "of the run"
 _MAP: Final = "map_"
-#: Parameter that marks each run made by an analysis.
+#: Parameter whose presence marks a run as made by an analysis.
 MAPPED_LOAD: Final = f"{_MAP}excitation"
 #: Function that receives the share of the work that is done, 0..1.
 OnProgress = Callable[[float], object]
@@ -67,14 +67,15 @@ OnProgress = Callable[[float], object]
 
 @dataclass
 class Prediction:
-    """The prediction of a scene: its rows, and the sums of its contacts over all rows."""
+    """The prediction for one scene: rows of the motion, and load totals of the contacts over all rows."""
 
     name: str
     scene: Scene
     loads: LoadTotals
     longest: Thinned = field(default_factory=lambda: Thinned(len(_COLUMNS)))
     present: Thinned = field(default_factory=lambda: Thinned(len(_COLUMNS)))
-    #: number of resets of the motion so far, which is also the index of the present stretch
+    #: number of resets of the motion so far, which is also the index of the present stretch (the motion between two
+    #: resets)
     resets: int = 0
     #: first and last stamp [ns] of each stretch with rows, by index
     spans: dict[int, tuple[int, int]] = field(default_factory=dict)
@@ -92,7 +93,7 @@ class Prediction:
         self.clearance.add(slow["stamp_ns"], slow["clearance"])
 
     def is_inside(self, signal: ThinnedSignal) -> NDArray[np.bool_]:
-        """Return for each measured value whether it is within the time of the load."""
+        """Return for each measured value whether its stamp is within the time span of the load."""
         stamps = signal.series()[0]
         if not self.spans:
             return np.ones(len(stamps), np.bool_)
@@ -100,12 +101,12 @@ class Prediction:
         return np.asarray(np.any(inside, axis=0))
 
     def outside(self, signal: ThinnedSignal) -> int:
-        """Return the number of values of a measured signal outside the time of the load."""
+        """Return the number of values of a signal whose stamps are outside the time span of the load."""
         inside = self.is_inside(signal)
         return round(signal.came * (1.0 - float(inside.mean()))) if len(inside) else 0
 
     def restart(self) -> None:
-        """Begin a new stretch, whose stamps may be earlier."""
+        """Begin a new stretch after a reset; its stamps may be earlier than those of the stretch before."""
         self.loads.restart()
         self._longest_number = self.longest_number
         self.longest, self.present = self._longer(), Thinned(len(_COLUMNS))
@@ -119,8 +120,8 @@ class Prediction:
     def is_of_longest(self, signal: ThinnedSignal) -> NDArray[np.bool_]:
         """Return for each measured value whether it belongs to the longest stretch.
 
-        A value belongs to the stretch that contains its stamp. If several stretches do, as after a step back of the
-        clock, it belongs to the stretch in which it arrived.
+        A value belongs to the stretch that contains its stamp. If several stretches contain the stamp, as after a step
+        back of the clock, the value belongs to the stretch in which it arrived.
         """
         at, _ = signal.series()
         if len(self.spans) < 2:
@@ -144,26 +145,26 @@ class Prediction:
 
     @property
     def stride(self) -> int:
-        """Number n if every n-th row of the longest stretch is kept for the signals."""
+        """Number n such that every n-th row of the longest stretch is kept for the signals."""
         return self._longer().stride
 
 
 @dataclass
 class Measured:
-    """Measured values by signal, in order of arrival; of very many values only every second, fourth, ... is kept."""
+    """Measured values by signal, in order of arrival; long signals keep only every 2nd, 4th, ... value."""
 
     signals: dict[str, ThinnedSignal] = field(default_factory=dict)
     #: for each role, the stretch and the stamp [ns] of the latest message
     _latest: dict[str, tuple[int, int]] = field(default_factory=dict)
-    #: number of values that are impossible in any unit
+    #: number of values that are too large to be plausible in any unit
     implausible: int = 0
 
     def add(self, role: str, stamp_ns: int, numbers: Mapping[str, float], stretch: int = 0) -> None:
-        """Add the numbers of one message in a stretch; a number that is not finite means that nothing was measured."""
+        """Add the numbers of a message to a stretch; a number that is not finite counts as not measured."""
         before, newest = self._latest.get(role, (0, stamp_ns))
         back = newest - stamp_ns > _STEP_NS
-        # the measurement's clock may step back before the load's clock does; the measurement then begins a new stretch
-        # first
+        # the measurement's clock may step back earlier than the load's clock; the measurement then begins the new
+        # stretch before the load does
         stretch = max(stretch, before + back)
         self._latest[role] = stretch, stamp_ns if back else max(newest, stamp_ns)
         prefix = {"forces": "force_", "gaps": "gap_"}.get(role, "")
@@ -198,7 +199,7 @@ class Analysis:
 
     @property
     def lost(self) -> dict[str, int]:
-        """Losses, including measured signals without a value in the time of the load."""
+        """Counts of lost data, including values of signals that are entirely outside the load's time."""
         counts = ((self.predictions[0].outside(signal), signal.came) for signal in self.measured.signals.values())
         outside = sum(count for count, came in counts if count == came)
         found = {"measured_implausible": self.measured.implausible, "measured_outside_the_load": outside}
@@ -258,7 +259,7 @@ class Analysis:
         return facts if confusion is None else facts | {"contact_set_confusion": confusion}
 
     def _confusion(self, prediction: Prediction) -> dict[str, dict[str, int]] | None:
-        """Return by pair how often contact was predicted and measured; None without measured forces."""
+        """Return by pair the counts of predicted against measured contact; None without measured forces."""
         stamps, columns = prediction.series()
         found = {}
         for name in PAIR_NAMES:
@@ -307,10 +308,10 @@ def analyse(
     others
         Further scenes for predictions.
     out
-        Folder in which the run `run` is made from a recording of another program.
+        Folder in which a run named `run` is made from a recording of another program.
     tail, on_caught_up
-        With a `Tail`, a run of plow_twin is followed while it is written; `on_caught_up` receives the analysis so far
-        whenever everything has been read.
+        If a `Tail` is given, a run of plow_twin is read while it is still being written; `on_caught_up` receives the
+        analysis so far whenever everything written has been read.
 
     Raises
     ------
@@ -403,7 +404,7 @@ def _walk_own(
 
 
 def _measured_beside(path: Path, mapping: Path | None, node: str) -> tuple[Measured, dict[str, str], dict[str, int]]:
-    """Return the measurements beside a run, the topics of unknown type, and the counts of unusable messages by reason.
+    """Return measurements stored beside a run, topics of unknown type, and counts of unusable messages.
 
     Loads are not read, because the load of a run is in its journal.
     """
@@ -518,7 +519,7 @@ def left_out(path: Path, results: Sequence[Path] = ()) -> list[Path]:
 
 
 def expand(paths: Sequence[Path], results: Sequence[Path] = ()) -> list[Path]:
-    """Return the recordings at some paths. A folder that is not a recording is replaced by the recordings in it.
+    """Return the recordings at some paths; a folder of recordings is replaced by the recordings in it.
 
     `results` are folders with results of an earlier analysis; they are not recordings.
 
@@ -538,7 +539,8 @@ def expand(paths: Sequence[Path], results: Sequence[Path] = ()) -> list[Path]:
             # a recording with missing parts is analysed too; its analysis names the missing parts
             if item.suffix in (".mcap", ".db3") or _holds(item) or (item / "metadata.yaml").is_file()
         ]
-        # tables count only if there are no recordings, because a table beside recordings is the result of an analysis
+        # tables count only if there are no recordings, because a table beside recordings is assumed to be the result of
+        # an analysis
         if not inside and any(path.glob(f"*{SUFFIX}")):
             inside = [path]
         if not inside:
@@ -567,7 +569,7 @@ def counted_once(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
 
 
 def _identity(path: Path) -> object:
-    """Return a run's random id with the number of its first part; the path of any other recording."""
+    """Return the identity of a recording: a run's random id and first part number, otherwise the path."""
     try:
         header = read_header(mcap_path(path))
     except (RecordingError, OSError):  # the error will be reported where the recording is used

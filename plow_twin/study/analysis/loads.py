@@ -24,8 +24,8 @@ Array = NDArray[np.float64]
 CYCLE_BINS: Final = 16
 #: Length of a piece of the face [m].
 FACE_BIN_M: Final = 1.0
-#: Memory for the reversals of a pair [B], enough for 131,072 reversals. A longer series is kept on the disk; it is read
-#: back in blocks of this size.
+#: Memory [B] for the force reversals of one contact pair, enough for 131,072 reversals. A longer series is kept on the
+#: disk and read back in blocks of this size.
 _IN_MEMORY: Final = 2**20
 
 
@@ -97,7 +97,7 @@ class LoadTotals:
     _reversals: list[Series] = field(default_factory=lambda: [Series() for _ in range(PAIR_COUNT)])
 
     def restart(self) -> None:
-        """Continue after a reset; the interval across it is not counted."""
+        """Continue after a reset; the interval across the reset is not counted."""
         self._last = self._worn = None
 
     def add(self, walked: Walked) -> None:
@@ -128,10 +128,10 @@ class LoadTotals:
         self._last = (int(stamps[-1]), *(column[-1].copy() for column in last))
 
     def _contact_loss(self, walked: Walked, steps: Array) -> Array:
-        """Return the energy that contacts take between two rows [J]: the load's work minus the energy gained.
+        """Return the energy [J] that contacts dissipate between rows: work of the load minus energy gained.
 
-        The work of the load is its mean times the distance. The energy gained is kinetic, potential in gravity, and
-        elastic in the contacts.
+        The work of the load is the mean load of two rows times the displacement between them. The energy gained is the
+        sum of kinetic energy, potential energy in gravity and elastic energy in the contacts.
         """
         now = walked.wrench, walked.rows.q, walked.rows.v, walked.rows.penetration
         first = (column[0] for column in now) if self._last is None else self._last[1:]
@@ -181,7 +181,8 @@ class LoadTotals:
     def _wear(self, depth: Array, speed: float, pieces: NDArray[np.int64]) -> None:
         """Add the wear of the pads, and of the places of the slide that they pass, by direction of travel.
 
-        A pad wears over the whole distance, but a place of the slide only while the length of a pad passes it.
+        A pad wears over the whole distance travelled, but a place of the slide wears only while the length of a pad
+        passes it.
         """
         wear = self.scene.wear
         if wear is None or wear.coefficient_m2_n == 0.0:
@@ -208,13 +209,14 @@ class LoadTotals:
         if self.slide_wear:
             pieces = {piece for _, piece in self.slide_wear}
             total = np.sum(list(self.slide_wear.values()), axis=0) / len(pieces)
-            # mean over the pieces: the wear of the pads times the ratio of a pad's length to the face's length
+            # mean over the pieces of the face; it equals the wear of the pads times the ratio of a pad's length to the
+            # face's length
             out["slide_mean_m"] = dict(zip(PAIR_NAMES, total.tolist(), strict=True))
             out["slide_pieces"] = len(pieces)
         return out
 
     def cycles(self) -> dict[str, list[dict[str, float]]]:
-        """Return rainflow counts of the contact force by pair (ASTM E1049): upper end [N] and count of each range."""
+        """Return rainflow counts of each pair's force (ASTM E1049): upper end [N] and count of each bin."""
         import rainflow
 
         found = {}

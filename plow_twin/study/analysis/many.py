@@ -24,14 +24,14 @@ _OnDone = Callable[[int, dict[str, Any]], object]
 def run_many(
     tasks: Sequence[RunTask], *, workers: int, dask: str | None = None, on_progress: OnProgress = lambda share: None
 ) -> list[dict[str, Any]]:
-    """Return the facts of each task, or `error` if the task failed; stored facts are used again.
+    """Return the facts of each task, or an `error` if the task failed; stored facts are used again.
 
     Parameters
     ----------
     workers
         Number of processes on this machine.
     dask
-        Address of a scheduler to use instead; its workers must have access to the same files.
+        Address of a Dask scheduler to use instead of local processes; its workers must have access to the same files.
 
     Raises
     ------
@@ -64,7 +64,7 @@ def _here(tasks: Sequence[RunTask], waiting: list[int], workers: int, done: _OnD
 
 
 def _round(tasks: Sequence[RunTask], waiting: list[int], workers: int, done: _OnDone) -> list[int]:
-    """Run tasks and return the lost tasks; when a worker dies, all unfinished tasks are lost."""
+    """Run the waiting tasks once; return the tasks that were not finished because a worker died."""
     left = []
     others = active_children()
     pool = ProcessPoolExecutor(min(workers, len(waiting)), get_context("spawn"), _begin, (loaded_laws(),))

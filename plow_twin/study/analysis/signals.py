@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-#: Largest lag that is searched [s]; a longer lag cannot be distinguished from a period of the load.
+#: Largest lag [s] that is searched; a longer lag cannot be distinguished from a shift by a period of the load.
 LARGEST_LAG_S: Final = 1.0
 #: Smallest number of measured values for a comparison.
 _FEWEST: Final = 8
@@ -33,7 +33,7 @@ class Comparison:
     lag_s : float or None
         Lag in s of the measurement behind the prediction at which the correlation is largest.
     rms_aligned : float or None
-        Standard deviation of the difference at that lag.
+        Standard deviation of predicted minus measured at the lag `lag_s`.
     coherence : float or None
         Magnitude-squared coherence at the strongest frequency of the prediction.
     """
@@ -96,15 +96,15 @@ def _at(times: Array, t: Array, predicted: Array) -> Array:
 
 
 def _step(times: Array, span: float) -> float:
-    """Return the median distance between stamps [s], or a larger distance that limits the number of points."""
+    """Return the grid's step [s]: the median interval of stamps, or more to limit the number of points."""
     return max(float(np.median(np.diff(np.unique(times)))), span / _MOST_POINTS, 1e-6)
 
 
 def _correlations(longer: Array, shorter: Array) -> Array:
-    """Return Pearson's correlation of a series with each piece of a longer series, over the piece's known part.
+    """Return Pearson's correlation of a series with each equally long piece of a longer series.
 
-    The known part of the longer series, without NaN, is contiguous. The result is -1 for a piece whose known part is
-    too short.
+    Only numbers that are not NaN are used; they are contiguous in the longer series. The result is -1 for a piece with
+    too few such numbers.
     """
     from scipy.signal import correlate
 

@@ -47,7 +47,7 @@ def names_apart(paths: Sequence[Path]) -> list[str]:
 
 
 class RunTask(Protocol):
-    """Work on one recording that another process can run."""
+    """Interface of a task that works on one recording and can run in another process."""
 
     @property
     def path(self) -> Path:
@@ -69,7 +69,7 @@ class Task:
     mapping: Path | None
     others: tuple[Path, ...]
     out: Path | None
-    #: other contents of the recording's folder; the results contain their names
+    #: items in the recording's folder that are not analysed; the results list their names
     left_out: tuple[Path, ...] = ()
     #: units of measured numbers by name; they take precedence over the units of the mapping
     units: Mapping[str, str] = field(default_factory=dict)
@@ -102,7 +102,7 @@ class Task:
                 path.unlink(missing_ok=True)
 
     def check(self, inputs: Sequence[Path]) -> None:
-        """Raise a `RecordingError` if an input would be replaced."""
+        """Raise a `RecordingError` if this analysis would replace one of the files or folders `inputs`."""
         self._keep(self._old(), inputs)
 
     def _old(self) -> list[Path]:
@@ -200,7 +200,7 @@ def _is_result(file: Path, out: Path) -> bool:
 
 
 def _measured_near(folder: Path) -> list[Path]:
-    """Return the files and folders that are searched for measurements beside a single part."""
+    """Return the files and folders that are searched for measurements in addition to a single part."""
     return [*sorted(folder.glob("*.mcap")), *beside_folders(folder)]
 
 

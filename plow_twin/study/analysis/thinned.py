@@ -1,4 +1,4 @@
-"""Rows and values in bounded memory: of too many, only every second is kept, then every fourth, and so on."""
+"""Rows and values in bounded memory: if there are too many, every 2nd is kept, then every 4th, ..."""
 
 from __future__ import annotations
 

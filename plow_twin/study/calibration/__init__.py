@@ -1,1 +1,1 @@
-"""Unknowns of a scene fitted to figures or to a recording."""
+"""Fit of a scene's unknown parameters to published figures or to a recording."""

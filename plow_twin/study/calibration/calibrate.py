@@ -33,7 +33,7 @@ class Search:
     population: int = 30
     generations: int = 40
     simplex: int = 0
-    #: the evolution ends when the spread of the population's objectives, relative to their mean, is at most this
+    #: largest spread of the population's objectives, relative to their mean, at which the evolution ends
     spread: float = 1e-3
     #: step of the difference quotients of the Jacobian, in the unit cube
     step: float = 1e-6
@@ -200,9 +200,9 @@ def polish(space: Space, objective: Objective, point: Array, search: Search) -> 
 
 
 def jacobian(space: Space, objective: Objective, point: Array, step: float) -> Array:
-    """Return dr/dz in the unit cube, shape (r, n), by central differences, one-sided at the walls of the cube.
+    """Return the Jacobian of the residuals in the unit cube, shape (r, n), by differences.
 
-    Columns of choices are zero.
+    The differences are central, but one-sided at the walls of the cube. Columns of unknowns with choices are zero.
     """
     free = space.continuous
     moved = np.repeat(point[None], 2 * free.size, axis=0)
@@ -218,5 +218,5 @@ def jacobian(space: Space, objective: Objective, point: Array, step: float) -> A
 
 
 def sums(residuals: Array) -> Array:
-    """Return the objective of each row of residuals."""
+    """Return the objective of each row of residuals, which is the sum of their squares."""
     return np.asarray((residuals**2).sum(axis=1))

@@ -1,4 +1,4 @@
-"""The result of a calibration as tables and files: the fitted scene with marks, the targets, and how unique it is."""
+"""Results of a calibration as tables and files: the fitted scene, the targets, and the fit's uniqueness."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ Values = Mapping[str, Value]
 class Objective(Protocol):
     """The interface of an objective for a calibration."""
 
-    #: number of runs so far
+    #: number of simulation runs so far
     runs: int
 
     def residuals(self, candidates: Sequence[Values], cut: float = np.inf) -> Array:
@@ -51,7 +51,7 @@ class TargetObjective:
         self.scene = replace(self.scene, marks={})
 
     def residuals(self, candidates: Sequence[Values], cut: float = np.inf) -> Array:
-        """Return sqrt(weight) r of every target and candidate, shape (m, targets)."""
+        """Return residual times sqrt(weight) of every candidate and target, shape (m, targets)."""
         targets, settings = self.targets.targets, self.targets.settings
         paths = sorted({path for target in targets for path in target.paths})
         table = np.full((len(candidates), len(settings), len(paths)), np.nan)
@@ -64,12 +64,12 @@ class TargetObjective:
         return self._rows(table, paths, missing=FAILED_RESIDUAL)
 
     def unweighted(self, candidate: Values) -> Array:
-        """Return r of every target for one candidate, shape (targets,)."""
+        """Return the unweighted residual of every target for one candidate, shape (targets,)."""
         weights = np.sqrt([target.weight for target in self.targets.targets])
         return np.asarray(self.residuals([candidate])[0] / np.where(weights > 0.0, weights, 1.0))
 
     def table(self, candidate: Values) -> tuple[Array, list[str]]:
-        """Return the statistics of one candidate, shape (settings, paths), and the paths."""
+        """Return the statistics of one candidate, shape (settings, paths), and the paths that name them."""
         paths = sorted({path for target in self.targets.targets for path in target.paths})
         table = np.full((1, len(self.targets.settings), len(paths)), np.nan)
         self._fill(table, [candidate], np.arange(1), list(range(len(self.targets.settings))), paths)

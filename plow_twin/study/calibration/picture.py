@@ -66,7 +66,7 @@ def _notes(fit: Fit, space: Space) -> list[str]:
 
 
 def draw_targets(fit: Fit, space: Space, title: str, path: Path) -> None:
-    """Draw the residual of each figure, coloured by whether the figure is met, as a PNG.
+    """Draw the residual of each target as a PNG; the colour shows whether the target is met.
 
     Raises
     ------
@@ -90,7 +90,7 @@ def draw_targets(fit: Fit, space: Space, title: str, path: Path) -> None:
 
 
 def _got_and_asked(target: TargetRow) -> str:
-    """Return the figures of the fit and the published figures as text, forces in kN."""
+    """Return the fitted and the published values of a target as text, forces in kN."""
     unit = unit_of(target.statistic)
     factor, shown = (1e-3, " kN") if unit == "N" else (1.0, "" if unit == "1" else f" {unit}")
     got = ", ".join(signed(factor * value, ".4g") for value in target.got)

@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 COLUMNS: Final = ("t", "x", "y", "theta")
 #: Largest unpacked size of an archive [B].
 _LARGEST_ARCHIVE: Final = 2**28
-#: Largest number of rows of a simulated motion; it is interpolated to the recorded times.
+#: Largest number of rows of a simulated motion; the motion is then interpolated to the recorded times.
 _MOST_ROWS: Final = 20_000
 
 

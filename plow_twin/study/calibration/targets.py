@@ -7,9 +7,13 @@ Each target gives one residual r of a candidate, 0 if it is met exactly:
     above              r = max(0, largest of the others - s) / (tolerance |largest|)          met: r = 0
     trend              r = (steps the wrong way + shortfall of the rise or fall) / (tolerance mean)   met: r = 0
 
-Here s is the statistic of the run with the target's `set` of parameters, or the smallest if several statistics are
-named. A trend is a sequence of runs along one parameter. For `rises_then_falls` the turn with the smallest violation is
-used. Rise and fall must each be at least `margin` times the mean. The objective is the sum of weight times r^2.
+Here s is the statistic of the run with the parameters in the target's `set`; if the target names several statistics, s
+
+is the smallest of them. A trend is judged over a sequence of runs along one parameter. For `rises_then_falls` the
+
+turning point with the smallest violation is used. Rise and fall must each be at least `margin` times the mean. The
+
+objective is the sum of weight times r^2.
 """
 
 from __future__ import annotations
@@ -32,7 +36,7 @@ from plow_twin.study.statistics import statistic
 Array = NDArray[np.float64]
 
 TRENDS: Final = ("rises", "falls", "rises_then_falls")
-#: Residual of a target with a failed or omitted run.
+#: Residual of a target if one of its runs has failed or was omitted.
 FAILED_RESIDUAL: Final = 10.0
 
 

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Identifiability:
-    """Singular values of dr/dz at the optimum, where z are the places 0..1 of the unknowns with a range.
+    """Singular values of dr/dz at the optimum: residuals r, places z (0..1) of the unknowns with a range.
 
     `weakest` is the singular vector of the smallest value: the data determine this combination of unknowns least.
     """

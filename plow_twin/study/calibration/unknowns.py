@@ -43,7 +43,7 @@ class Unknown:
         return float(self.low + (self.high - self.low) * place)
 
     def place(self, value: Value) -> float:
-        """Return the place 0..1 of a value; the place of a choice is the middle of its share."""
+        """Return the place 0..1 of a value; a choice is at the middle of its equal share of 0..1."""
         if self.choices:
             return (self.choices.index(value) + 0.5) / len(self.choices)
         number = float(value)
@@ -145,7 +145,7 @@ class Space:
 
 
 def check_usable(space: Space, scene: Scene, trials: int = 100) -> None:
-    """Raise the first point's `SceneError` if all of `trials` random points fail."""
+    """Raise a `SceneError` (of the first point) if none of `trials` random points gives a usable scene."""
     points = np.random.default_rng(0).random((trials, space.size))
     if not any(is_usable(scene, values) for values in space.values_of(points)):
         with_parameters(scene, space.values(points[0]))

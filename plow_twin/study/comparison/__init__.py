@@ -1,1 +1,1 @@
-"""Comparison of runs: windows of their contacts, and statistically significant changes."""
+"""Comparison of runs: quantities of contacts in time windows, and statistically significant changes."""

@@ -1,4 +1,4 @@
-"""Comparison of groups of windows: distributions, changes with intervals, and the load's share in changes."""
+"""Comparison of groups of windows: distributions, changes with intervals, and the effect of the load."""
 
 from __future__ import annotations
 
@@ -41,13 +41,14 @@ class Change:
     Attributes
     ----------
     share, low, high : float
-        The change and its 95 % interval.
+        The relative change and the limits of its 95 % interval.
     chance : float
-        Probability of such a change by chance, adjusted for the number of cells that are judged together (Benjamini and
-        Hochberg). Of the cells below 0.05, about one in twenty is below it only by chance.
+        Probability that such a change occurs by chance, adjusted for the number of cells (a quantity of a pair, or a
+        clearance) that are judged together (Benjamini and Hochberg). Of the cells with a probability below 0.05, about
+        one in twenty is below 0.05 only by chance.
     machine, machine_low, machine_high, machine_chance : float or None
-        The same numbers at equal load; None if the load varies too little to show how the quantity depends on it, or if
-        the loads of the groups do not overlap.
+        The same four numbers for the change at equal load; None if the load varies too little to show how the quantity
+        depends on it, or if the loads of the groups do not overlap.
     """
 
     share: float
@@ -78,9 +79,10 @@ def points(values: Array) -> dict[str, float]:
 def with_neighbours(load: Array, start_ns: NDArray[np.int64]) -> Array:
     """Return the load of each window, of the window before and of the window after, shape (n, 3).
 
-    A missing neighbour gets the window's own load. The load may change within a window, and the head's motion still
-    depends on the load before. The effect of a lasting change of the load is therefore the sum of the slopes over all
-    three loads, not the slope over the window's own load.
+    A missing neighbour gets the window's own load. The neighbours are included because the load may change within a
+    window, and the head's motion still depends on the earlier load. The effect of a lasting change of the load is
+    therefore the sum of the slopes with respect to all three loads, not only the slope with respect to the window's own
+    load.
     """
     steps = np.diff(start_ns)
     joined = (steps > 0) & (steps < _NEXT * np.median(steps)) if len(steps) else steps > 0
@@ -90,7 +92,7 @@ def with_neighbours(load: Array, start_ns: NDArray[np.int64]) -> Array:
 
 
 class Drawn:
-    """Moments of a group. The first row is for all windows of the group, every other row for a draw from these windows.
+    """Means and covariances of a group: row 0 for all windows, every other row for a bootstrap draw.
 
     Parameters
     ----------
@@ -144,8 +146,9 @@ class Drawn:
 def changes(before: Drawn, after: Drawn) -> list[Change | None]:
     """Return the changes of quantities between two groups of windows, None if there are too few windows.
 
-    Means are compared by a bootstrap over windows. For the comparison at equal load, the part that depends on the load
-    is subtracted. Its slopes come from the load's variation within the groups (analysis of covariance).
+    Means are compared by a bootstrap over windows. For the comparison at equal load, the part of a change that follows
+    from the load is subtracted. The slopes for this part come from the variation of the load within the groups
+    (analysis of covariance).
 
     References
     ----------
@@ -171,9 +174,10 @@ def changes(before: Drawn, after: Drawn) -> list[Change | None]:
 
 
 def _tested(differences: Array, mean: Array, fewest: int) -> tuple[Array, Array, Array, Array]:
-    """Return share, low, high and adjusted chance of each difference; row 0 has the values, the other rows draws.
+    """Return share, low, high and adjusted chance of each column; row 0 has values, the other rows draws.
 
-    Student's t has the degrees of freedom of the smaller group, so that chances are too large rather than too small.
+    Student's t distribution gets the degrees of freedom of the smaller group, so that the probabilities are too large
+    rather than too small.
     """
     drawn = np.divide(differences, mean, out=np.full_like(mean, np.nan), where=mean > 0.0)
     low, high = np.nanpercentile(drawn[1:], (2.5, 97.5), axis=0)

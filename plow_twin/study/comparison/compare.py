@@ -102,7 +102,7 @@ def by_run(name: str, stamp_ns: int) -> str:
 
 
 def by_time(kind: str, shifts: Sequence[time] = SHIFTS, zone: tzinfo = UTC) -> Label:
-    """Return a function that labels days, or shifts that begin at the times `shifts`, in a time zone.
+    """Return a function that labels a window in a time zone with its day, or its shift (see `shifts`).
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ def compare(
     seed: int = 0,
     scenes: Mapping[str, tuple[str, str]] = MappingProxyType({}),
 ) -> Comparison:
-    """Return the groups of some runs, and the change from the first group to every other group.
+    """Return the windows of the runs in groups, and the change from the first group to every other group.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Windows of a run, each about a load period long, with the load and the quantities of each pair."""
+"""Time windows of a run, each about one load period long, with the load and quantities of each pair."""
 
 from __future__ import annotations
 
@@ -28,12 +28,13 @@ QUANTITIES: Final[Mapping[str, str]] = {
     "dissipation": "W",
     "wear": "m/h",
 }
-#: Length [s] of the load in which a period is searched.
+#: Duration [s], from the start of the load, that is searched for a period.
 _PERIOD_SPAN_S: Final = 60.0
 #: Length of a window if the load has no period [s].
 _NO_PERIOD_S: Final = 10.0
-#: Smallest number of messages in a window, as a share of the number in a full window. A window with fewer messages, cut
-#: by an end or a gap, is left out. The sample rates of runs may differ by the same share without a note.
+#: Smallest number of messages in a window, as a share of the number in a full window. A window with fewer messages,
+#: because the run ends or has a gap, is left out. No note is made if the lowest sample rate of the runs is at least
+#: this share of the highest.
 FULL: Final = 0.9
 _PADS: Final = np.array([CLEARANCE_NAMES.index(name) for name in PAD_NAMES])
 _TOTALS: Final = np.array([CLEARANCE_NAMES.index(name) for name in ("horizontal", "vertical")])
@@ -178,7 +179,7 @@ def windows_of(recording: Recording, window_s: float | None = None) -> Windows:
                 f"{recording.path}: got no {name}, expected a run with outputs: plow-twin replay --write"
             )
     full = FULL * float(np.median([row[0] for row in messages.rows.values()]))
-    # messages at the end of a silence cover the whole silence; therefore all windows of the silence are left out
+    # messages at the end of a silence describe the whole silence, so all windows that the silence touches are left out
     known, silent = np.array(sorted(messages.rows)), set[int]()
     for begin, end in silent_ns:
         first, last = np.searchsorted(known, begin // window_ns), np.searchsorted(known, end // window_ns, side="right")
@@ -219,13 +220,13 @@ def _between(sums: _Sums, count: _Sums, numbers: list[int]) -> Array:
 
 
 def _risen(part: Batched, window: Indexes) -> tuple[Batched, Indexes]:
-    """Return rows in order of their stamps, because late samples and steps of the clock have older stamps."""
+    """Return the rows sorted by stamp; with late samples or clock steps, older stamps can come later."""
     order = np.argsort(part.stamp_ns, kind="stable")
     return Batched(part.stamp_ns[order], part.values[order]), window[order]
 
 
 def _powers(part: Batched, newest: tuple[Indexes, Array] | None) -> tuple[Indexes, Array, Array]:
-    """Return stamps, power into each contact [W] and whether it has force; the previous row, `newest`, is the first."""
+    """Return stamps, power into each contact [W] and whether it has force; the row `newest` comes first."""
     stamps, values = part.stamp_ns, part.values
     if newest is not None and newest[0][0] < stamps[0]:
         stamps, values = np.concatenate((newest[0], stamps)), np.concatenate((newest[1], values))

@@ -35,7 +35,7 @@ class Drops:
     flight_rows : ndarray, shape (n,)
         Number of rows before the first impact.
     bounces : tuple of tuple of int
-        For each drop, the rows of the lowest places between rises of 3 mm.
+        For each drop, the rows of the lowest points between rises of 3 mm.
     """
 
     pose: Array
@@ -66,7 +66,7 @@ class Drops:
         return self.bounces[index][min(bounce, len(self.bounces[index]) - 1)]
 
     def inside(self, index: int, bounce: int = 2) -> NDArray[np.bool_]:
-        """Return whether measured x, z and theta are in their 90 % bands up to a bounce, shape (rows, 3)."""
+        """Return whether x, z and theta are in the predicted 90 % bands up to a bounce, shape (rows, 3)."""
         rows = self.until(index, bounce) + 1
         points = bands(self.pose[index, : self.flight_rows[index]], rows)
         found: NDArray[np.bool_] = (self.pose[index, :rows] >= points[:, 0]) & (self.pose[index, :rows] <= points[:, 2])
@@ -84,7 +84,7 @@ def _flight_rows(pose: Array) -> int:
 
 
 def _bounces(z: Array) -> tuple[int, ...]:
-    """Return the rows of the lowest places between rises."""
+    """Return the rows of the lowest points between rises."""
     found, falling, low, high = [], True, 0, 0
     for row, height in enumerate(z):
         if falling:

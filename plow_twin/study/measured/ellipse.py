@@ -21,7 +21,8 @@ Array = NDArray[np.float64]
 #: Semi-axes and radius of gyration in m.
 SEMI_AXES: Final = (0.035, 0.025)
 GYRATION: Final = 0.0192
-#: Stiffness per mass in 1/s^2. It affects only the duration, because place and arms are constant during an impact.
+#: Contact stiffness per mass in 1/s^2. It affects only the duration of an impact, because position and lever arms are
+#: taken as constant during the impact.
 _STIFFNESS: Final = 1e9
 #: Speed of approach in m/s to which given restitutions refer: the middle of the measured speeds.
 USUAL_SPEED: Final = 2.5
@@ -44,8 +45,8 @@ class EllipseContact:
     exponent : float
         n in F = K d^n.
     restitution : float
-        Restitution of an impact at 2.5 m/s without motion along the surface. For a law that has no restitution: its
-        damping number lambda v0, or its C relative to the critical damping.
+        Coefficient of restitution of an impact at 2.5 m/s without motion along the surface. For a law without such a
+        coefficient: the law's damping number lambda v0, or its damping C relative to the critical damping.
     fall : float
         Exponent q of the decrease (v / 2.5 m/s)^-q of the restitution with the speed of approach v.
     fall_along : float
@@ -167,7 +168,7 @@ def _preset() -> Scene:
 
 
 def impact_scene(before: ArrayLike) -> Scene:
-    """Return the preset `measured_ellipse` a nanometre before an impact.
+    """Return the preset `measured_ellipse` with the ellipse a nanometre from the surface, before an impact.
 
     Parameters
     ----------
