@@ -60,7 +60,7 @@ def likeliest(drawn: Array, gain: float, motions: Seen, measured: Seen) -> Array
 
 
 def _likeliest(drawn: Array, gain: float, motions: Seen, asked: Seen) -> Array:
-    """Return the likeliest clearances in m of the motions `asked`, shape (k, 2), from drawn motions."""
+    """Return the likeliest clearances in m, shape (k, 2), of the motions `asked`, by comparison with drawn motions."""
     middle, scale = drawn.mean(axis=0), drawn.std(axis=0)
     scale[scale <= _SAME] = 1.0
     terms = _terms((drawn - middle) / scale)

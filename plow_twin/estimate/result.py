@@ -51,7 +51,7 @@ class Interval:
 
     @staticmethod
     def normal(mean: float, deviation: float) -> Interval:
-        """Return the interval of a normal distribution."""
+        """Return mean, 5 % and 95 % point of a normal distribution."""
         half = NORMAL_P95 * float(deviation)
         return Interval(float(mean), float(mean) - half, float(mean) + half)
 

@@ -43,8 +43,8 @@ class KeptWear:
 class WearKeeper:
     """The wear of one head in one scene, in a folder.
 
-    Only a file that this keeper has read or written is replaced. Any other file, such as one put there by hand, holds
-    wear that no twin has used yet.
+    Only a file that this keeper has read or written is replaced. Any other file, such as a file put there by hand, may
+    hold wear that no twin has used yet, so it is kept.
 
     Parameters
     ----------

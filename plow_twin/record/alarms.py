@@ -38,7 +38,7 @@ Difference = tuple[int, int, str, str, str, str]
 
 
 def alarms_of(parameters: Mapping[str, Any]) -> Alarms:
-    """Return the alarms that the node's parameters configure, each at its lowest level."""
+    """Return the alarms that the node's parameters configure, before any of them is raised."""
     thresholds = {name: Thresholds(*parameters.get(f"alarm_{name}", ())) for name in _NAMES}
     residual = parameters.get("alarm_residual", ())
     if any(residual):

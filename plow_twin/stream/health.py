@@ -107,13 +107,13 @@ class RealTimeFactor:
         self.model_s += duration_s
 
     def mean(self) -> float:
-        """Return the factor from the first to the newest advance; 0 before the first advance."""
+        """Return model time over real time from the first to the newest advance; 0 before the first advance."""
         if self._start_ns is None or self._newest_ns <= self._start_ns:
             return 0.0
         return self.model_s / ((self._newest_ns - self._start_ns) * 1e-9)
 
     def recent(self, now_ns: int) -> float:
-        """Return the factor since the last call of this method; 0 before the first advance."""
+        """Return model time over real time since the last call of this method; 0 before the first advance."""
         last_ns, last_model_s = self._last
         if self._start_ns is None or now_ns <= last_ns:
             return 0.0

@@ -25,7 +25,7 @@ class RrdFile:
     Parameters
     ----------
     path
-        The file to write, with its folder.
+        The file to write; its folder is made if it does not exist.
 
     Raises
     ------

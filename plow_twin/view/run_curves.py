@@ -152,7 +152,7 @@ class RunCurves:
         self._samples(batch.entries.stamp_ns[samples[samples >= done]])
 
     def _samples(self, stamps: NDArray[np.int64]) -> None:
-        """Add the stamps of samples; the first sample after the beginning of a held stretch, even if late, ends it."""
+        """Add the stamps of samples; a sample after the load began to be held ends the hold, even if it is late."""
         if not len(stamps):
             return
         behind = stamps[stamps > (self._held_since_ns or 0)]

@@ -107,7 +107,7 @@ def _answer(p, one, w, gyration):
     along_t = third * x + (b * g - a * h) * y + (a * e - b * d) * t
     size = math.sqrt(abs(along_x) ** 2 + abs(along_y) ** 2 + abs(along_t) ** 2)
     size /= abs(a * first + b * second + c * third)
-    # x K x is at most |x| times the sum of the amplitudes of the harmonic and of the inertia force
+    # the elastic energy x K x is at most |x| times the sum of two amplitudes, of the harmonic and of the inertia force
     load = math.sqrt(abs(x) ** 2 + abs(y) ** 2 + abs(t) ** 2)
     return size, math.sqrt(load * size) + om * size
 
@@ -137,7 +137,8 @@ def _left_out(p, state, w, reach, rate, gyration) -> float:
 def stays_at_rest(p, acts, harmonics, state, w, distance, way, fast, gyration) -> bool:
     """Return whether the head stays within `way` [m] of its equilibrium and slower than `fast` [m/s] for all time.
 
-    `distance` is the present sqrt(W) without the harmonics' response; `w.hessian` has the stiffness.
+    `distance` is the present sqrt(W) of the module's docstring without the response to the harmonics, which is added
+    here; `w.hessian` has the stiffness.
     """
     least = _least_eigenvalue(w.hessian)
     _damping_at(p, acts, state, w, gyration)

@@ -40,7 +40,7 @@ def draw_motion(fit: Fit, space: Space, objective: RecordingObjective, title: st
 
 
 def _value(unknown: Unknown, fit: Fit) -> FittedValue:
-    """Return an unknown with its near-optimal values and its range."""
+    """Return an unknown for the picture: its best value, the range of nearly as good values, and the search range."""
     value = fit.calibration.best.values[unknown.path]
     assert isinstance(value, float)
     low, high = fit.clusters[0].spread.get(unknown.path, (value, value)) if fit.clusters else (value, value)
