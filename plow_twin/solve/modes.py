@@ -1,4 +1,4 @@
-"""The eight pairs: their penetrations, their modes, their factors in the series, and the model's range of validity."""
+"""The eight pairs of corner and wall: penetrations, modes, factors in the series, and range of validity."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ from plow_twin.solve.state import (
     Y,
 )
 
-#: A penetration below this share of the release penetration, or a speed below this share of the speed needed to reach
-#: it, counts as zero.
+#: A penetration below this share of the release penetration counts as zero, and so does a speed below this share of the
+#: speed needed to reach the release penetration.
 SHALLOW = 1e-3
 #: Number of iterations that find the damping and the speed of an impact under way, which depend on each other.
 _ROUNDS = 8
-#: Number of halvings of a bracket, enough for the last bit of a double.
+#: Number of bisections that find the impact speed, enough to settle the last bit of a double.
 _BISECTIONS = 60
 #: Largest |theta| in rad at which each corner meets the walls of its pairs: 45 degrees and a margin for rounding
 #: errors.
@@ -58,7 +58,8 @@ def _fallen_number(p, y, pair, speed):
     arm = row_value(p.arm_rows, pair, y[COS], y[SIN], y[X], y[Y])
     mobility = 1.0 + p.free[2] * arm * arm * p.inverse_inertia / p.inverse_mass
     impact = speed * mobility**-p.fall_mass
-    # rows 2 and 3 of the penetration (X and Y) hold the wall's normal, so that this is the speed along the wall
+    # rows 2 and 3 of the penetration (the factors of X and Y) hold the wall's normal, so `along` is the speed along the
+    # wall
     along = p.penetration_rows[2, pair] * y[VY] - p.penetration_rows[3, pair] * y[VX]
     e = p.restitution * max(impact / p.fall_speed, 1.0) ** -p.fall - p.fall_along * abs(along)
     at = max(e, 1.0 / RESTITUTIONS) * RESTITUTIONS
@@ -76,7 +77,7 @@ _falls = by_field("fall", lambda p: 1, lambda p: None)
 
 @kernel()
 def touch(p, state, pair) -> None:
-    """Start a contact: fix its lambda = D / v0 by the impact speed v0."""
+    """Start a contact: set its damping lambda = D / v0 from the impact speed v0."""
     if p.damping_number >= 0.0:
         _, speed = penetration_and_rate(p, state, pair)
         number = _damping_number(p, state.y, pair, speed)
@@ -88,7 +89,8 @@ def _impact_speed(number, rate, energy) -> float:
     """Return the speed v0 of the impact that led to a state inside a wall.
 
     `number` is D, `rate` the penetration rate d' in m/s, `energy` the elastic energy per mass E / m in m^2/s^2. The
-    first integral of the free impact, with u = D d' / v0, is  u - ln(1 + u) + D^2 E / (m v0^2) = D - ln(1 + D).
+    speed v0 solves the first integral of the free impact, where u = D d' / v0: u - ln(1 + u) + D^2 E / (m v0^2) = D -
+    ln(1 + D).
     """
     if number <= 0.0 or (energy <= 0.0 and rate == 0.0):
         return 0.0
@@ -135,7 +137,7 @@ def _start_inside(p, state, pair, energy) -> None:
 
 @kernel()
 def mode_inside(p, state, pair):
-    """Return the mode of a penetrating pair, and record on which side of the ramp's end it is."""
+    """Return the mode of a penetrating pair, and record whether it is beyond the ramp of the damping."""
     penetration, rate = penetration_and_rate(p, state, pair)
     state.beyond_ramp[pair] = 1 if penetration > p.ramp else 0
     if law_force(p, state, pair, penetration, rate) < 0.0:
@@ -169,9 +171,9 @@ def settle_modes(p, state, stick) -> None:
 
 @kernel(entry=True)
 def settle_moved(params, states, which, places, time, stick) -> None:
-    """Move the states `which` to the body coordinates `places` at `time`, and choose their modes.
+    """Move the states with indices `which` to coordinates `places` at `time`, and choose their modes.
 
-    A contact that lasts keeps the damping of its touch.
+    `places` are body coordinates. A pair that was already in contact keeps the damping that was set when it touched.
     """
     touched = np.zeros(PAIR_COUNT, np.int64)
     damping = np.zeros(PAIR_COUNT)
@@ -219,8 +221,8 @@ def weigh_pairs(p, state, w, viscous, fraction, ramp, stick) -> bool:
             if penetration > SHALLOW * p.release:
                 per_pair[BASE, pair] = 0.5 / math.sqrt(penetration) if p.exponent == 1.5 else 1.0 / penetration
             else:
-                # the step after the touch was cut short at a depth that is too shallow for a series of d^n, so the pair
-                # is RELEASED
+                # the step after the touch was cut short while the penetration d is still too small for a series of d^n,
+                # so the pair becomes RELEASED
                 mode[pair] = RELEASED
         acts = mode[pair] == ON
         per_pair[ACTS, pair] = p.stiffness if acts else 0.0

@@ -13,8 +13,8 @@ from plow_twin.kernel.compiler import kernel
 from plow_twin.model.contact import normal_force
 from plow_twin.model.friction import friction_force
 
-#: Constants of the contact, per mass: stiffness K, exponent n, C, ramp [m], mu, regularisation speed [m/s] (0 if
-#: friction is by a spring), and stiffness and damping of this tangential spring.
+#: Constants of the contact, per mass: stiffness K, exponent n, viscous damping C, ramp [m], friction coefficient mu,
+#: regularisation speed [m/s] (0 if a tangential spring models the friction), and stiffness and damping of this spring.
 POINT = np.dtype(
     [
         (name, "f8")

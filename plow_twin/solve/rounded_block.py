@@ -1,8 +1,12 @@
 """Short motions of many square blocks with rounded corners that are tossed on a table, each with its own parameters.
 
-Contacts have the normal force of `model.contact` and the spring friction of `solve.grip`. Here restitution and friction
-also fall with the impact speed, and both are scattered from touch to touch. Flight has linear drag. In contact, a step
-is a fixed fraction of the contact time. In flight, a step is as long as possible without a corner reaching the table.
+Contacts have the normal force of `model.contact` and the spring friction of `solve.grip`. In addition, restitution and
+
+friction fall with the impact speed and differ from touch to touch by a given scatter. Flight has linear drag. In
+
+contact, a step is a fixed fraction of the contact time. In flight, a step is as long as possible without a corner
+
+reaching the table.
 """
 
 from __future__ import annotations
@@ -35,12 +39,12 @@ BLOCK = np.dtype(
 CORNERS = 4
 #: Number of steps in half a period of the stiffest contact.
 _STEPS = 70.0
-#: Least speed in m/s from which the damping of a touch is computed; least and largest restitution.
+#: Lower limit in m/s of the impact speed that determines the damping of a touch; smallest and largest restitution.
 _SLOWEST, _LEAST, _LARGEST = 0.01, 0.05, 0.9
 #: Impact speed in m/s below which restitution and friction are constant.
 _SMALLEST_IMPACT = 0.05
-#: Mobility of a corner (times the mass) with which an impact's moving mass is compared: the mobility of a uniform
-#: square that lands on the end of an edge.
+#: Reference for the effective mass of an impact, given as the mobility of the corner times the mass: the value for a
+#: uniform square that lands on the end of an edge.
 _USUAL_MOBILITY = 1.5
 
 
@@ -130,7 +134,7 @@ def _toss(block, numbers, scatter, dt, rows) -> None:
 
 @kernel(entry=True)
 def toss_blocks(blocks, numbers, scatter, dt, rows) -> None:
-    """Write the motions of blocks, one row every `dt` seconds.
+    """Compute the motions of tossed blocks, and write one row every `dt` seconds.
 
     Parameters
     ----------
@@ -138,10 +142,11 @@ def toss_blocks(blocks, numbers, scatter, dt, rows) -> None:
     numbers : ndarray, shape (k,)
         Damping numbers D of evenly spaced restitutions from 0 to 1.
     scatter : ndarray, shape (m, touches, 3)
-        Scatter of each touch: addition to the restitution, addition to the logarithm of friction, and distance [m] of
-        the force from the lowest point. Later touches use the last row.
+        For each touch: a term added to the restitution, a term added to the logarithm of friction, and the distance [m]
+        of the normal force from the lowest point of the corner. When all rows are used, later touches use the last row
+        again.
     dt : float
-        Interval of the rows in s.
+        Time between rows in s.
     rows : ndarray, shape (m, n, 6)
         x, z, theta and their rates. The caller gives the first row of each block.
     """

@@ -2,9 +2,11 @@
 
     dh/dt = (k_s v / A) F sqrt(1 + (s' / v)^2) (1 + a exp(-h / h0))
 
-s' is the rate at which the corner slides along its wall, at right angles to the travel; a standing plough does not
-wear. At v = 0 the sliding distance has a kink where s' = 0, which no series could follow, so v in the root is at least
-`SLOWEST_TRAVEL`.
+s' is the rate at which the corner slides along its wall, at right angles to the travel, whose speed is v; a plough
+
+that stands still does not wear. At v = 0 the sliding distance has a kink where s' = 0, which no power series can
+
+follow, so the v under the root is at least `SLOWEST_TRAVEL`.
 """
 
 from __future__ import annotations
@@ -16,14 +18,14 @@ from plow_twin.kernel.compiler import kernel
 from plow_twin.solve.kinematics import slip_rate
 from plow_twin.solve.state import COS, OMEGA, SIN, VX, VY, X, Y
 
-#: Least value in m/s of the speed v by which the factor of in-plane sliding divides; below it this wear falls in
-#: proportion to v.
+#: Lower limit in m/s of the speed v that divides the sliding rate s'; below this limit, wear by in-plane sliding falls
+#: in proportion to v.
 SLOWEST_TRAVEL: Final = 0.01
 
 
 @kernel(inline="code")
 def time_per_way(p, pair) -> float:
-    """Return 1 / v in s/m of a pad, or 0 if sliding in the plane does not wear it."""
+    """Return 1 / v of a pad in s/m, v at least `SLOWEST_TRAVEL`; 0 if in-plane sliding causes no wear."""
     if p.speed_per_wear == 0.0:
         return 0.0
     return 1.0 / max(p.speed_per_wear * p.wear_per_impulse[pair], SLOWEST_TRAVEL)
@@ -31,7 +33,7 @@ def time_per_way(p, pair) -> float:
 
 @kernel()
 def rubbing(p, pair, y, depth, sliding, running_in) -> float:
-    """Return the factor on a pad's wear by travel alone, for its wear depth in m and the state y, shape (8,)."""
+    """Return the wear factor of sliding and running-in, for a wear depth in m and state y, shape (8,)."""
     factor = 1.0
     if sliding is not None:
         rate = slip_rate(p, pair, y[COS], y[SIN], y[OMEGA], y[X], y[Y], y[VX], y[VY])

@@ -1,6 +1,8 @@
 """Records of the compiled kernels: constants of a scene, dynamic state, scratch space and totals.
 
-A part that a scene lacks is `None`, which makes it a type of the compiled signature, so that its code is not compiled.
+A part that a scene lacks is `None`. Since `None` has a type of its own in the compiled signature, the code of this
+
+part is not compiled.
 """
 
 from __future__ import annotations
@@ -32,10 +34,10 @@ CLIPPED: Final = 2
 #: Mode for exponents that are not integers: the pair penetrates by less than `Params.release`, so its force is
 #: negligible.
 RELEASED: Final = 3
-#: Outcome of an event that does not change the mode: a pair's penetration crosses the end of the damping's ramp.
+#: Outcome of an event: a pair's penetration crosses the end of the damping's ramp; its mode does not change.
 CROSSING: Final = 4
-#: Further outcomes that do not change the mode: the corner begins to slip along the wall, forward or backward, or to
-#: stick.
+#: Further outcomes of an event that leave the mode unchanged: a corner begins to slip along the wall, forward or
+#: backward, or it begins to stick.
 SLIPS_FORWARD: Final = 5
 SLIPS_BACKWARD: Final = 6
 STICKS: Final = 7
@@ -87,8 +89,8 @@ _STATUS_TEXT: Final = {
 }
 
 
-# The types below are records rather than tuples of arrays, because a kernel then gets one pointer, shapes are
-# constants, and nothing is reference counted.
+# The types below are records rather than tuples of arrays: a kernel then gets a single pointer, the shapes of arrays
+# are constants, and nothing is reference counted.
 
 _ROWS: Final = MAX_ORDER + 1
 _WIDE: Final = (_ROWS, PAIR_COUNT)
@@ -111,8 +113,8 @@ def _in_lines(fields: list[tuple[Any, ...]]) -> np.dtype[np.void]:
     )
 
 
-#: Number of intervals of the grid of restitutions with tabulated damping numbers; the least restitution is one
-#: interval.
+#: Number of intervals of the table of damping numbers over restitutions from 0 to 1; the smallest restitution used is
+#: one interval.
 RESTITUTIONS: Final = 1000
 
 #: Constants of one scene at one tolerance, divided by mass and inertia where that saves work.
@@ -163,7 +165,7 @@ _PARAM_FIELDS: Final[list[tuple[Any, ...]]] = [
 ]
 PARAMS: Final = _in_lines(_PARAM_FIELDS)
 
-#: Further constants of scenes with an option of `Options`.
+#: Further constants of a scene, for each option of `Options` that the scene has.
 _OPTION_FIELDS: Final[dict[str, list[tuple[Any, ...]]]] = {
     "corners": [("tumbles", "f8")],  # the head carries corners; 1 if the block may tumble
     # movement of a rounded corner's touching point along the wall per angle of the head [m/rad]
@@ -190,7 +192,7 @@ class Options(NamedTuple):
 @cache
 def params_type(options: Options) -> np.dtype[np.void]:
     """Return the record type of a scene's constants."""
-    # further fields come first, as in `state_type`
+    # the fields of the options come first, for the reason given in `state_type`
     more = [field for name in Options._fields if getattr(options, name) for field in _OPTION_FIELDS[name]]
     return _in_lines([*more, *_PARAM_FIELDS]) if more else PARAMS
 
@@ -221,7 +223,7 @@ _STATE_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("order", "i8"),  # order of the series of the current step
     ("event_pair", "i8"),  # the pair whose event ends the step, or -1
     ("event_mode", "i8"),  # the mode of this pair after the event
-    # a bit for each pair that touches at the step's start; the series of these pairs need the square root of time
+    # bit mask of the pairs that touch at the step's start; the series of these pairs need the square root of time
     ("touching", "i8"),
     ("events_at_once", "i8"),  # number of events at the present instant so far
     ("piece", "i8"),  # index of the sampled load's present piece
@@ -245,12 +247,12 @@ _GRIP_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("anchor", "f8", (PAIR_COUNT,)),  # place along the wall in m where a sticking corner's spring is slack
     ("grip", "i8", (PAIR_COUNT,)),  # 0 sticks, 1 slips forward, -1 backward
 ]
-#: A frame on springs: its displacement x, y, theta from equilibrium and their rates. With this field, `State.y` is
-#: relative to the frame.
+#: State of a frame on springs: its displacements x, y, theta from equilibrium, then their rates. With this field,
+#: `State.y` is relative to the frame.
 _FRAME_FIELDS: Final[list[tuple[Any, ...]]] = [("frame", "f8", (6,))]
 
-#: Scratch space, mainly the series of one step. Rows are orders; the eight columns (SIMD lanes) are state components or
-#: pairs. Arrays of eight columns come first, so that each of their rows fills a cache line.
+#: Scratch space, mainly for the series of one step. Each row is one order of a series; the eight columns (SIMD lanes)
+#: are state components or pairs. Arrays of eight columns come first, so that each of their rows fills a cache line.
 WORK: Final = np.dtype(
     [
         ("series", "f8", _WIDE),  # state
@@ -302,7 +304,7 @@ WORK: Final = np.dtype(
     ]
 )
 
-#: Sums over the motion since they were last cleared.
+#: Totals of the motion since the totals were last cleared.
 TOTALS: Final = np.dtype(
     [
         ("peak", "f8", (PAIR_COUNT,)),
@@ -318,7 +320,8 @@ TOTALS: Final = np.dtype(
 FOLLOWED: Final = 1
 WITH_INTERVALS: Final = 2
 
-#: The motion at a time and the sums since the previous row; the solver passes these rows on to the messages.
+#: A row of output: the motion at one time, and the sums since the previous row. The solver passes these rows on to the
+#: messages.
 ROW: Final = np.dtype(
     [
         ("t", "f8"),
@@ -341,9 +344,9 @@ ROW: Final = np.dtype(
         ("marked", "i8"),  # 1 if `held` or `corrected` is 1, in this or in the previous publication
         ("orientation", "f8", (2,)),  # z and w of the head's quaternion
         ("twist", "f8", (3,)),  # rates along the head's own axes [m/s], and about z [rad/s]
-        # the following fields are written if the motion follows measurements. They are the 5 % and 95 % quantiles over
-        # the drawn twins, and the clearances [m] with their quantiles. Quantiles of peak and impulse cover the time
-        # since the previous publication
+        # the following fields are written if the motion follows measurements: the 5 % and 95 % quantiles over the
+        # randomly drawn twins, and the clearances [m] with their quantiles. Quantiles of peak and impulse cover the
+        # time since the previous publication
         ("followed", "i8"),  # `FOLLOWED` if only the clearances are filled, `WITH_INTERVALS` if all fields are filled
         *((f"{name}_{end}", "f8", (PAIR_COUNT,)) for name in ("force", "peak", "impulse") for end in ("low", "high")),
         ("known_clearance", "f8", (6,)),  # horizontal, then vertical clearance, each followed by its quantiles
@@ -357,11 +360,12 @@ Totals: TypeAlias = np.record
 Implicit: TypeAlias = np.record
 
 
-#: A harmonic load per mass and inertia: sine and cosine amplitudes of the forces S1 and S2 along `Params.direction`,
-#: and of the moment M.
+#: A harmonic load, divided by mass and inertia: sine and cosine amplitudes of the forces S1 and S2 along
+#: `Params.direction`, and of the moment M.
 HARMONIC: Final = np.dtype([("omega", "f8"), ("first", "f8", (2,)), ("second", "f8", (2,)), ("moment", "f8", (2,))])
 
-#: A linear piece of a load per mass and inertia: its value at the knot and its slope from there on.
+#: A linear piece of a load, divided by mass and inertia: the load at the knot where the piece begins, and its slope
+#: after this knot.
 SEGMENT: Final = np.dtype([("knot", "f8"), ("start", "f8", (3,)), ("slope", "f8", (3,))])
 
 Harmonics: TypeAlias = NDArray[np.void]
@@ -404,7 +408,8 @@ class Parts(NamedTuple):
     implicit: Implicit | None
 
 
-#: Limit of the work of an advance, and scratch space for its coarse end.
+#: Limit of the work of an advance, and scratch space for the coarse Runge-Kutta steps that end an advance at this
+#: limit.
 BOUND: Final = np.dtype(
     [
         ("steps", "i8"),  # number of Runge-Kutta steps reserved for the end
@@ -441,8 +446,7 @@ def state_type(terms: Terms) -> np.dtype[np.void]:
 
 @cache
 def _state_type(stick: bool, support: bool) -> np.dtype[np.void]:
-    # further fields come first: numba would take a record with further fields at its end for the record without these
-    # fields
+    # further fields come first: if they came last, numba would take the record for the record without these fields
     more = (_FRAME_FIELDS if support else []) + (_GRIP_FIELDS if stick else [])
     return _in_lines([*more, *_STATE_FIELDS]) if more else STATE
 

@@ -30,10 +30,11 @@ from plow_twin.solve.tumbling import turn_at, turn_corners
 METHODS: Final[tuple[Method, ...]] = (flight, rest, implicit, taylor)
 #: Longest step in s, so that every power of a step is finite.
 LONGEST_STEP = 100.0
-#: If modes would change back and forth at one instant without end, a step of this size in sigma leads beyond this
-#: instant.
+#: Size in sigma (the variable of the series) of the step that leads beyond an instant at which modes would otherwise
+#: change back and forth without end.
 PAST_AN_INSTANT = 1e-9
-#: Two times are the same instant if their relative difference is at most this, which covers some rounding errors.
+#: Two times count as the same instant if their relative difference is at most this value, which covers a few rounding
+#: errors.
 ONE_INSTANT = 1e-15
 
 

@@ -44,7 +44,7 @@ def to_ground(y, frame, out) -> None:
 
 @kernel()
 def from_ground(y, frame, out) -> None:
-    """Write the head's body coordinates relative to the frame; inverse of `to_ground`, which may work in place."""
+    """Write the head's coordinates relative to the frame to `out`, which may be y; undoes `to_ground`."""
     theta, spin = y[THETA], frame[5]
     c, s = math.cos(theta), math.sin(theta)
     bx, by = to_body_axes(c, s, frame[0], frame[1])
@@ -90,7 +90,7 @@ def start_frame(state, w) -> None:
 
 @kernel(fast=True)
 def see_from_frame(w, order, sigma, y) -> None:
-    """Make the head's body coordinates at sigma of a step, given relative to the ground, relative to the frame.
+    """Make the head's coordinates y at `sigma`, which are relative to the ground, relative to the frame.
 
     The frame's state at sigma is written to `w.frame_now`.
     """

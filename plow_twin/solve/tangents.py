@@ -1,20 +1,27 @@
 """Derivatives of a motion with respect to state and parameters, from equations linearised along each step's series.
 
-Each column holds one derivative: xi and eta of the position and velocity of the centre of mass (in head axes), phi and
-psi of the angle and its rate. With the contacts' force f = (fx, fy) in head axes, a column obeys
+Each column holds one derivative: xi and eta are the derivatives of the position and velocity of the centre of mass (in
+
+head axes), phi and psi the derivatives of the angle and its rate. With the contacts' force f = (fx, fy) in head axes,
+
+a column obeys
 
     xi'  = eta - omega J xi                   J = a quarter turn
     eta' = -omega J eta + (phi J f + df) / m  + the change of the load per mass
     phi' = psi,  psi' = (-fy xi_x + fx xi_y + phi dtau + sum arm dF) / I + the change of the moment per inertia
     dd   = n . xi - arm phi + de,             dd' its rate,     dF = F_d dd + F_d' dd' + the change by the law's numbers
 
-where n is the row of a penetration for X and Y, de its change by a clearance, and dtau the derivative of the contacts'
-moment by the angle. The factors are known as series of the step, so each order of a column is a sum of Cauchy products;
-eight columns are computed side by side.
+where n holds the factors of X and Y in a penetration, de is the change of this penetration by a clearance, and dtau is
 
-At a touch the force jumps by C d' (Kelvin-Voigt). The motion displaced by a column touches earlier by dd / d', so it
-has received the impulse C dd by the time that the motion itself touches. At all other changes of contact the force is
-continuous.
+the derivative of the contacts' moment with respect to the angle. The factors in these equations are known as series
+
+over the step, so each order of a column is a sum of Cauchy products; eight columns are computed side by side.
+
+At a touch the force jumps by C d' (Kelvin-Voigt). A motion displaced by a column touches earlier than the undisplaced
+
+motion by dd / d', so it has already received the impulse C dd when the undisplaced motion touches. At all other
+
+changes of contact the force is continuous.
 """
 
 from __future__ import annotations
@@ -48,7 +55,8 @@ _OF_PAIRS: Final = (PAIR_COUNT, _ROWS, WIDTH)
 COLUMNS: Final = np.dtype(
     [
         ("series", "f8", (6, _ROWS, WIDTH)),
-        # for pairs that act: change of penetration; `rate` and `force` hold the changes of its rate and of the force
+        # for pairs that exert force: `depth` is the change of the penetration, `rate` the change of its rate, and
+        # `force` the change of the force
         ("depth", "f8", _OF_PAIRS),
         ("rate", "f8", _OF_PAIRS),
         ("force", "f8", _OF_PAIRS),
@@ -166,7 +174,7 @@ def _slope_at_touch(w, along, order, pair) -> None:
 
 @kernel()
 def _expand_waves(omegas, amplitudes, state, w, columns, order) -> None:
-    """Write the series of the loads' change in eight columns.
+    """Write the series of the change of the loads that each of eight columns describes.
 
     `amplitudes`, shape (h, 2, 3, 8), holds the change of the sine and cosine amplitudes along x, y and theta.
     """
@@ -346,9 +354,10 @@ def _touch(p, state, w, columns, pair, viscous) -> None:
 
 @kernel()
 def _start_columns(c, s, columns, first) -> None:
-    """Begin a stretch: each column of the state starts with a displacement of 1, each column of a parameter with 0.
+    """Begin a stretch: set columns of the state to a displacement of 1, and columns of parameters to 0.
 
-    A contact that has already fixed its impact speed keeps the derivatives of its lambda with respect to parameters.
+    A stretch is a part of the motion; derivatives are taken from its beginning. A contact whose impact speed is already
+    fixed keeps the derivatives of its lambda with respect to parameters.
     """
     for lane in range(WIDTH):
         column = first + lane
@@ -377,9 +386,10 @@ def _read_columns(c, s, columns, first, out) -> None:
 
 @kernel()
 def _is_clear(p, state, room) -> bool:
-    """Return whether a stretch may begin.
+    """Return whether a new stretch (`_start_columns`) may begin.
 
-    Every pair must be at least `room` from touching, and no contact may have a damping fixed by its impact speed.
+    The gap or penetration of every pair must be at least `room`, and no contact may have a damping that its impact
+    speed has fixed.
     """
     for pair in range(PAIR_COUNT):
         if p.enabled[pair] == 1:
@@ -435,9 +445,10 @@ def follow_columns(
     ends : ndarray, shape (n,)
         Times in s.
     room : float
-        Least distance in m of every pair from touching for a stretch to begin.
+        Smallest gap or penetration in m that every pair must have for a stretch to begin.
     longest_wait : int
-        Number of ends in a row without a new stretch after which a stretch begins even without `room`.
+        Number of consecutive ends without a new stretch after which a stretch begins even if a pair is closer than
+        `room`.
     reached : ndarray of int64, shape (1,)
         Number of ends reached so far, from which the call continues.
     budget : int

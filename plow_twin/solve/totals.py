@@ -1,4 +1,4 @@
-"""Totals of a motion (peaks, impulses, times and sets of corners, from the force polynomials) and its event log."""
+"""Totals of a motion from the force polynomials (peaks, impulses, times in contact), and its event log."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from plow_twin.solve.state import FIRST, ON, SECOND, SUM
 
 @kernel()
 def _seal(row_of, window) -> None:
-    """Write the sums of the whole window to a row, and begin the next window; the count of touches continues."""
+    """Write the sums since the last publication (window) to a row; clear all sums but the touch count."""
     for pair in range(PAIR_COUNT):
         row_of.makes[pair], row_of.impulse[pair] = window.makes[pair], window.impulse[pair]
         row_of.peak[pair], row_of.measured_peak[pair] = window.peak[pair], window.measured_peak[pair]
@@ -35,8 +35,8 @@ def _seal(row_of, window) -> None:
 def publish(rows, stamps, held, taken, windows, waits) -> int:
     """Sum up advances; the rows taken for publication get the sums since the previous publication.
 
-    If the advance of a published row failed, the row gets motion and sums of the good rows before it, or the stamp 0 if
-    there are no good rows.
+    If the advance of a published row failed, the row gets the motion of the newest good row before it and the sums of
+    the good rows since the previous publication; if there are no such rows, it gets the stamp 0.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ def _copy_motion(row_of, target) -> None:
 
 @kernel(entry=True)
 def publish_window(windows, rows) -> None:
-    """Write a window that waits to be published to a row, shape (1,) each, and begin the next window."""
+    """Write the unpublished sums of a window to a row, shape (1,) each, and begin the next window."""
     rows[0] = windows[0]
     _seal(rows[0], windows[0])
 
@@ -121,8 +121,8 @@ def summary(rows, n) -> tuple[int, int, int, int, float, float, float, bool]:
     Returns
     -------
     tuple
-        Stamp [ns], whether it is marked, whether it is held, number of samples, x, y [m], the largest force of a pair
-        in advances with samples [N], and whether pose, rates, contacts and sums are finite.
+        Stamp [ns], `marked`, `held`, number of samples, x, y [m], the largest force of a pair in advances with samples
+        [N], and whether pose, rates, contacts and sums are finite.
     """
     row_of = rows[n]
     largest, total = row_of.measured_peak[0], 0.0
@@ -140,7 +140,7 @@ def summary(rows, n) -> tuple[int, int, int, int, float, float, float, bool]:
 def _sums(w, order, h) -> None:
     """Write an upper bound of each force over [0, h], and the sums of f_k h^k / (k+1) and f_k h^k / (k+2).
 
-    The bound is the larger value at the two ends plus h^2 / 8 times a bound of the downward curvature.
+    The bound is the larger of the force's values at the two ends plus h^2 / 8 times a bound on its downward curvature.
     """
     end = bend = first = second = splat(0.0)
     for k in range(order, -1, -1):
@@ -157,7 +157,7 @@ def _sums(w, order, h) -> None:
 
 @kernel()
 def add_to_totals(state, w, low, high, totals) -> None:
-    """Add peaks, impulses, times and sets of corners of the motion from sigma `low` to `high` of the step."""
+    """Add the peaks, impulses and contact times from sigma `low` to `high` of the step to the totals."""
     mode = state.mode
     acting = 0
     for pair in range(PAIR_COUNT):
@@ -191,7 +191,7 @@ def add_to_totals(state, w, low, high, totals) -> None:
 
 @kernel()
 def add_set_times(totals, carrying, elapsed) -> None:
-    """Add a time to the set of corners that carry force together, for each sense of rotation.
+    """Add `elapsed` to the time of the set of corners that carry force, for each sense of rotation.
 
     Bit i of `carrying` is set if pair i carries force.
     """

@@ -1,9 +1,14 @@
 """A tumbling block: beyond 45 degrees, and after each further quarter turn, its corners are renamed by their places.
 
 Up to 45 degrees the corner named bottom left is the lower left corner. Beyond 45 degrees another corner is the lower
-left corner and gets this name. The state of each pair (mode, damping, anchor) is passed to the pair with the corner's
-new name at the same wall. A square block looks the same after a quarter turn, so the geometry's rows stay; the angle
-whose cosine and sine are in the state jumps back by 90 degrees (`kinematics.named_angle`).
+
+left corner and takes over this name. The state of each pair (mode, damping, anchor) is passed to the pair at the same
+
+wall that bears the corner's new name. A square block looks the same after a quarter turn, so the coefficients of its
+
+geometry do not change; the angle whose cosine and sine are in the state jumps back by 90 degrees
+
+(`kinematics.named_angle`).
 """
 
 from __future__ import annotations
@@ -29,13 +34,14 @@ _HANDED_OVER = tuple(
         ("top_right_right", "bottom_right_right"),
     )
 )
-#: The block has reached 45 degrees if less than this angle [rad] is missing; it covers the rounding errors of a root.
+#: The block counts as having reached 45 degrees if less than this angle [rad] is missing; the angle covers the rounding
+#: errors of a root.
 _THERE = 1e-12
 
 
 @kernel()
 def turn_at(p, state, w, order, best) -> float:
-    """Return the sigma at which the block reaches 45 degrees, or `best` if that comes first."""
+    """Return the sigma at which the block reaches 45 degrees, or `best` if `best` is smaller."""
     if not may_tumble(p):
         return best
     column, angle = w.column[0], named_angle(p, state.y, state.y[THETA])

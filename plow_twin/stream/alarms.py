@@ -24,10 +24,10 @@ from plow_twin.stream.outputs import CLEARANCE_NAMES, Published, Rows
 
 #: An alarm leaves a level when its value falls below this share of the level's threshold.
 HYSTERESIS: Final = 0.95
-#: Time [ns] over which the growth rate of the clearance is computed. Over the 0.1 s between two slow parts the
+#: Time [ns] over which the growth rate of the clearance is computed. In the 0.1 s between two published clearances, the
 #: clearance grows too little.
 RATE_SPAN_NS: Final = 10 * NS_PER_S
-#: Time for which poses of the model are kept for late measured poses [ns].
+#: Time [ns] for which the model's poses are kept for measured poses that arrive late.
 _KEPT_NS: Final = 2 * NS_PER_S
 _PRUNED: Final = 500
 _MOST_WAITING: Final = 1000
@@ -79,7 +79,7 @@ class Alarm:
     #: cause of the latched level; None if no level is latched
     raised: Raised | None = None
     _since_ns: int | None = None
-    #: smallest threshold; an alarm without a level has none as long as its value is below this threshold
+    #: smallest threshold; while the level is NONE and the value is below this threshold, the level stays NONE
     lowest: float = field(init=False)
 
     def __post_init__(self) -> None:
@@ -111,7 +111,7 @@ class Alarm:
         return self.thresholds.error if self.latched is Level.ERROR else self.thresholds.warn
 
     def acknowledge(self) -> None:
-        """Release the alarm; it stays at the level that is still present."""
+        """Release the latched level, which falls to the present level of the alarm."""
         self.latched = self.level
         if not self.level:
             self.raised = None
@@ -150,7 +150,7 @@ class _Model:
         return [found for pose in due if (found := self.residual(*pose)) is not None]
 
     def residual(self, stamp_ns: int, x: float, y: float) -> tuple[int, float] | None:
-        """Return a measured pose's stamp and its distance [m] from the model, or None if it is unknown (as yet)."""
+        """Return a measured pose's stamp and distance [m] from the model; None if unknown (yet)."""
         if not self._stamps_ns or stamp_ns > self._stamps_ns[-1]:
             if len(self._waiting) < _MOST_WAITING:
                 self._waiting.append((stamp_ns, x, y))
@@ -170,10 +170,10 @@ class Alarms:
     Parameters
     ----------
     thresholds
-        By name: `force` [N], the largest force of a pair since the previous publication, while there were samples;
-        `clearance` [m], the larger of the horizontal and the vertical clearance; `clearance_rate` [m/s], its growth
-        over `RATE_SPAN_NS`; `wear_rate` [m/s], the largest wear rate of a pad; `residual` [m], the distance of a
-        measured pose from the model at the pose's stamp.
+        By name: `force` [N], the largest force of a pair in the advances with samples since the previous publication;
+        `clearance` [m], the larger of the horizontal and the vertical clearance; `clearance_rate` [m/s], the growth
+        rate of `clearance` over `RATE_SPAN_NS`; `wear_rate` [m/s], the largest wear rate of a pad; `residual` [m], the
+        distance of a measured pose from the model at the pose's stamp.
     duration_s
         Time for which a level must last before the alarm takes this level [s].
     """
@@ -199,7 +199,7 @@ class Alarms:
                 yield number
 
     def _feed_row(self, rows: Rows, number: int, slow: np.void | None) -> bool:
-        """Judge a row, and its slow part if it has one; return whether a level has changed."""
+        """Judge a row and its slow part (clearance, wear rate), if any; return whether a level changed."""
         stamp_ns, _, held, samples, x, y, force, _ = summary(rows, number)
         if held and not samples:
             return False

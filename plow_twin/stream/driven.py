@@ -13,8 +13,8 @@ from plow_twin.run.twin import Advanced
 
 Array = NDArray[np.float64]
 
-#: Largest number of poses that are kept because the motion may be computed again: ten seconds at 1 kHz. Estimates are
-#: always kept.
+#: Largest number of measured poses that are kept in case the motion must be computed again: ten seconds at 1 kHz. All
+#: estimates are kept.
 MOST_MEASURED: Final = 10_000
 
 
@@ -56,16 +56,16 @@ class Driven(Protocol):
 class Following(Driven, Protocol):
     """A twin that follows measurements; its rows have more columns (`followed` in `plow_twin.solve.state.ROW`)."""
 
-    #: number of poses and estimates so far
+    #: number of poses and estimates added so far
     added: int
-    #: whether the intervals and measurements of a row that is published by itself wait for `catch_up`
+    #: whether, for a row that is published by itself, the work on intervals and measurements is left to `catch_up`
     defers: bool
 
     def catch_up(self) -> None:
         """Finish the work that was left after the newest row; every other call does this first."""
 
     def add_pose(self, t: float, q: ArrayLike, known: float = ...) -> None:
-        """Add a pose measured at model time `t` in s, shape (3,), NaN where not measured.
+        """Add a pose `q`, shape (3,), measured at model time `t` in s; components not measured are NaN.
 
         The pose has an effect from model time `known` in s on.
         """
@@ -84,7 +84,7 @@ class Following(Driven, Protocol):
         """Continue from the state of the median twin with a single twin, without corrections by poses."""
 
     def end_spans(self, ends: NDArray[np.int64], begins: bool) -> None:
-        """State which rows of the next `advance_rows` are published, and whether a span begins with its first row."""
+        """Set which rows of the next `advance_rows` are published, and whether the first begins a span."""
 
     def snapshot_size(self, data: bytes) -> int:
-        """Return the length of the snapshot at the beginning of some bytes."""
+        """Return the length of the snapshot with which `data` begins."""

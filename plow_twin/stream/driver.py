@@ -65,10 +65,11 @@ class StreamState(Enum):
 class Policy:
     """Settings that may change at run time.
 
-    After `excitation_timeout_s` without a sample, the model follows the steady clock with this delay, so that a sample
-    with a smaller delay is still used. `hold` is `hold` (the last load is kept) or `zero` (the load falls to zero
-    within the first call); after `hold_limit_s` the model stands still. After `failure_limit` failed advances in a row
-    the model is reset (`Failures.wants_restart`); 0: never.
+    After `excitation_timeout_s` without a sample, the model follows the steady clock, delayed by this time, so that a
+    sample with a smaller delay is still used. The setting `hold` is `hold` (the last load is kept) or `zero` (the load
+    falls to zero within the first call of `Driver.silence` that advances the model); after a further `hold_limit_s` the
+    model stands still. After `failure_limit` failed advances in a row the model is reset (`Failures.wants_restart`); a
+    limit of 0 means never.
     """
 
     excitation_timeout_s: float = 0.5
@@ -102,13 +103,13 @@ class Driver:
         self.failed = Failures(session.emit)
         self.resets = 0
         self.holds = 0
-        #: number of late samples that were inserted by going back
+        #: number of late samples that were inserted by going back to a snapshot
         self.rolled_back = 0
         #: number of speeds along the face that could not act at their stamps
         self.travel_misplaced = 0
-        #: steady times of the latest resets by jumps of the clock [ns]
+        #: times of the latest resets by jumps of the clock, on the steady clock [ns]
         self._resets_ns: deque[int] = deque()
-        #: steady time of the latest refused reset [ns]
+        #: time of the latest refused reset, on the steady clock [ns]
         self._unsteady_ns: int | None = None
         self._steps = Steps(intake)
         self.clock = Intake(jump_back_s=intake.jump_back_s, jump_forward_s=intake.jump_forward_s)
@@ -140,7 +141,7 @@ class Driver:
         """Judge samples in order of arrival, advance to the accepted samples, and yield the publications.
 
         The caller sends each publication before the next one is computed, so that a recording has them in order. A
-        sample whose stamp jumps waits for the next sample.
+        sample whose stamp jumps is held back until the next sample arrives or the stream falls silent.
         """
         run: list[Sample] = []
         for stamp_ns, wrench in arrived:
@@ -162,7 +163,8 @@ class Driver:
         """Use many samples in order of arrival, stamps (n,) [ns] and wrenches (n, 3), as `samples` does.
 
         Samples without a jump are applied together as a `Series`, which the caller journals and publishes before the
-        next one is computed. All other samples go through `samples`. The outcome is the same as from `samples` alone.
+        next `Series` or publication is computed. All other samples go through `samples`. The outcome is the same as if
+        all samples went through `samples`.
         """
         run: list[Sample] = []
         goes_on = self.intake.go_on(stamps, wrench)
@@ -298,8 +300,8 @@ class Driver:
     def travel(self, stamp_ns: int, speed_m_s: float) -> None:
         """Use a speed along the face [m/s] from its stamp on; the sign is the direction, and wear uses the magnitude.
 
-        A stamp that is further ahead than `jump_forward_s`, or older than every kept state, is from another clock; such
-        a speed acts from the time reached on, and is counted.
+        A stamp that is further ahead than `jump_forward_s`, or older than every kept state, is taken to be from another
+        clock; such a speed acts from the time that the model has reached on, and is counted in `travel_misplaced`.
         """
         reached_ns, oldest_ns = self.session.stamp_ns, self.session.history.oldest_ns
         if reached_ns is not None:
@@ -323,13 +325,13 @@ class Driver:
         self.session.apply(Mark(stamp_ns, text))
 
     def snapshot(self) -> Snapshot:
-        """Journal and return the exact state; older samples can no longer be inserted."""
+        """Journal and return the exact state; samples older than this state can no longer be inserted."""
         snapshot = self.session.renew()
         self.session.emit(snapshot)
         return snapshot
 
     def restore(self, stamp_ns: int, snapshot: Snapshot) -> None:
-        """Return to the motion of a snapshot; the next sample, with any stamp, is at the snapshot's time."""
+        """Return to a snapshot's motion; the next sample, whatever its stamp, is at the snapshot's time."""
         self.failed.end()
         self.session.apply(Restore(stamp_ns, snapshot.data))
         self._begin_again()
@@ -337,7 +339,7 @@ class Driver:
         self.clock.restart()
 
     def set_model(self, stamp_ns: int, changes: Mapping[str, float]) -> None:
-        """Continue with other numbers of the scene, by their keys in its file; all other numbers are those of the file.
+        """Continue with `changes` to scene numbers, by key in its file; other numbers are as in the file.
 
         Raises
         ------
@@ -354,7 +356,7 @@ class Driver:
         Raises
         ------
         ValueError
-            Not 8 finite depths of at least 0; the twin is unchanged.
+            `depth_m` is not 8 finite depths of at least 0; the twin is unchanged.
         """
         depth = tuple(float(value) for value in depth_m)
         if len(depth) != PAIR_COUNT or not all(0.0 <= value < math.inf for value in depth):
@@ -371,7 +373,7 @@ class Driver:
         return refused or self._steps.unsteady(now_ns)
 
     def reset(self, stamp_ns: int, reason: str) -> None:
-        """Reset the motion to its initial state and keep the wear; the next sample restarts the time."""
+        """Reset the motion to its initial state, keep the wear; the next stamp is the new time origin."""
         self._restart_model(stamp_ns, reason, None)
         self.intake.restart()
         self.clock.restart()
@@ -382,7 +384,7 @@ class Driver:
         self._resumed = True
 
     def pause(self) -> None:
-        """Count a sample that waits for the next sample, because no sample will come at present."""
+        """Count a held-back sample as stray, because the next sample will not come at present."""
         self._steps.end()
 
     def close(self) -> None:
@@ -429,7 +431,8 @@ class Driver:
             if len(published.rows):
                 yield published
         if self._newest_ns is None:
-            # a silence between a reset and the next sample must also be noticed, so it counts from the stamp reached
+            # a silence between a reset and the next sample must also be noticed, so silence is measured from the stamp
+            # that the model has reached
             self._newest_ns = self.session.stamp_ns
 
     def _apply(self, samples: Sequence[Sample], now_ns: int) -> Published:
@@ -454,7 +457,7 @@ class Driver:
         return self.due() if self.every_sample else NOTHING
 
     def _advanced(self, now_ns: int) -> None:
-        """Count the model time since the last call."""
+        """Add the model time since the last call to the real-time factor."""
         reached_ns = self.session.stamp_ns
         if self._counted_ns is not None and reached_ns is not None:
             self.real_time.advanced((reached_ns - self._counted_ns) * 1e-9, now_ns)

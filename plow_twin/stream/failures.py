@@ -1,4 +1,4 @@
-"""Failed advances, counted and journalled by stretches; after several failures in a row the model restarts."""
+"""Failed advances, counted and journalled in stretches of consecutive failures, and restarts after them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ class Failures:
     Parameters
     ----------
     emit
-        Receives a `Failed` at the first failure of a stretch, and another `Failed` at its end.
+        Function that receives a `Failed` entry at the first failure of a stretch and, if more failures follow, another
+        `Failed` for these failures at the end of the stretch.
     """
 
     def __init__(self, emit: Callable[[Failed], object]) -> None:
@@ -57,9 +58,9 @@ class Failures:
     def wants_restart(self, limit: int) -> bool:
         """Return whether the model should restart, after `limit` failed advances in a row; 0: never.
 
-        If the model fails again at once after a restart, the next restart waits twice as long as the previous stretch.
-        The number of restarts then grows with the logarithm of time, and at most half of the time in which the model
-        could move is lost.
+        If the model fails again soon after a restart (within the length of the previous stretch of failures), the next
+        restart waits until the new stretch is twice as long as the previous stretch. The number of restarts then grows
+        with the logarithm of time, and at most half of the time in which the model could move is lost.
         """
         if not 0 < limit <= self._in_a_row:
             return False

@@ -42,7 +42,7 @@ class DurationHistogram:
         return self._quantile(np.array(self._counts), share)
 
     def recent(self, share: float) -> float:
-        """Return the same quantile of the durations since the last call of this method."""
+        """Return this quantile for the durations added since the last call of this method."""
         counts = np.array(self._counts)
         before, self._counted = self._counted, counts
         return self._quantile(counts - before, share)
@@ -62,7 +62,7 @@ class Periods:
     Parameters
     ----------
     period_s
-        Budget of the loop [s].
+        Nominal period of the loop [s]; longer times between turns count as missed periods.
     """
 
     def __init__(self, period_s: float) -> None:
@@ -77,7 +77,7 @@ class Periods:
         self._before_s = math.nan
 
     def turn(self, now_s: float) -> None:
-        """Note a turn at the steady time `now_s` [s]."""
+        """Note a turn of the loop at the time `now_s` [s] of the steady clock."""
         passed_s, self._before_s = now_s - self._before_s, now_s
         if passed_s >= 0.0:
             self._recent.append(passed_s)
@@ -99,7 +99,7 @@ class RealTimeFactor:
         self._last = (0, 0.0)
 
     def advanced(self, duration_s: float, now_ns: int) -> None:
-        """Count `duration_s` of model time, at the steady time `now_ns`."""
+        """Count `duration_s` [s] of model time at the time `now_ns` [ns] of the steady clock."""
         if self._start_ns is None:
             self._start_ns = now_ns
             self._last = (now_ns, 0.0)

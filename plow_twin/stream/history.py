@@ -1,8 +1,10 @@
 """The last seconds of a session, kept for late samples: snapshots, and all entries since the oldest snapshot.
 
-The age at which a sample is too old depends on the journal alone. Calls with one sample each make many snapshots; a
-call with many samples makes one snapshot and notes the stamps that the others would have had, so that the limit is the
-same.
+The age at which a sample is too old depends on the journal alone, not on the number of samples in a call. Calls with
+
+one sample each make many snapshots; a call with many samples makes one snapshot and notes the stamps at which calls
+
+with one sample would have made theirs, so that the age limit is the same.
 """
 
 from __future__ import annotations
@@ -16,7 +18,8 @@ from numpy.typing import NDArray
 
 from plow_twin.stream.journal import Sample, Travel
 
-#: Number of snapshots in the kept time; going back computes the samples after a snapshot again.
+#: Number of snapshots in the kept time. To insert a late sample, the session goes back to a snapshot and computes all
+#: samples after this snapshot again.
 SNAPSHOTS: Final = 100
 
 
@@ -33,10 +36,11 @@ class History:
         self._span_ns = span_ns
         self._spacing_ns = max(1, span_ns // SNAPSHOTS)
         self._snapshots: list[tuple[int, bytes]] = []
-        #: for each span, the stamp of its first sample; a session that takes samples one by one has a snapshot there
+        #: for each span (the kept time divided by `SNAPSHOTS`), the stamp of its first sample; a session that takes
+        #: samples one by one has a snapshot at each of these stamps
         self._kept_ns: list[int] = []
-        #: largest of these stamps so far. After going back, no kept stamp is dropped until the session has computed up
-        #: to this stamp again.
+        #: largest stamp in `_kept_ns` so far. After going back, no kept stamp is dropped until the session has computed
+        #: up to this stamp again.
         self._newest_kept_ns: int | None = None
         self._samples: list[Sample] = []
         self._stamps_ns: list[int] = []
@@ -58,7 +62,7 @@ class History:
 
     @property
     def earliest_ns(self) -> int | None:
-        """Stamp of the earliest kept state [ns], beyond which the session cannot go back."""
+        """Stamp of the earliest kept state [ns]; the session cannot go back further."""
         return self._snapshots[0][0] if self._snapshots else None
 
     @property
@@ -69,7 +73,7 @@ class History:
         return self._stamps_ns[-1] if self._stamps_ns else None
 
     def __contains__(self, stamp_ns: int) -> bool:
-        """Return whether there is a sample of that stamp."""
+        """Return whether there is a sample with this stamp."""
         self._make_samples()
         index = bisect_left(self._stamps_ns, stamp_ns)
         return self._stamps_ns[index : index + 1] == [stamp_ns]
@@ -98,7 +102,7 @@ class History:
         self._keep(stamps_ns[begins])
 
     def _keep(self, stamps_ns: NDArray[np.int64]) -> None:
-        """Add rising stamps of snapshots at the end, and forget everything that is older than the kept time."""
+        """Append rising stamps to `_kept_ns`, and forget everything that is older than the kept time."""
         if not len(stamps_ns):
             return
         newest_ns, before_ns = int(stamps_ns[-1]), self._newest_kept_ns
@@ -148,7 +152,7 @@ class History:
         self._travels.insert(place, travel)
 
     def add_snapshot(self, stamp_ns: int, data: bytes, *, kept: bool = True) -> None:
-        """Add the state at `stamp_ns`; with `kept`, its stamp is noted, even if it is not the first of a span."""
+        """Add a snapshot at `stamp_ns`; with `kept`, note its stamp even if it begins no span."""
         if not self._span_ns:
             return
         if not self._snapshots or self._snapshots[-1][0] < stamp_ns:
@@ -158,7 +162,7 @@ class History:
             self._keep(np.array([stamp_ns]))
 
     def rewind(self, stamp_ns: int) -> tuple[bytes, list[Sample], list[Travel]]:
-        """Remove the newest snapshot before `stamp_ns` and everything after it; return snapshot, samples and speeds."""
+        """Drop all after the last snapshot before `stamp_ns`; return it, dropped samples and speeds."""
         self._make_samples()
         while self._snapshots[-1][0] >= stamp_ns:
             self._snapshots.pop()
@@ -173,7 +177,7 @@ class History:
 
 
 class RecentStamps:
-    """Stamps of a stream whose values only need sorting, so that a value less than `span_s` late can be used."""
+    """Stamps of a stream whose values only need sorting: a value up to `span_s` late can still be used."""
 
     def __init__(self, span_s: float) -> None:
         self._span_ns = round(span_s * 1e9)

@@ -38,7 +38,7 @@ class Verdict(Enum):
     UNSTAMPED = "unstamped"
     DUPLICATE = "duplicate"
     OUT_OF_ORDER = "out_of_order"
-    #: the model has passed the stamp, and no kept state is older
+    #: the model has passed the stamp, and no kept state is older than the stamp
     LATE = "late"
     #: the model has passed the stamp, and the sample is inserted at its place
     WORKED_IN = "worked_in"
@@ -46,7 +46,7 @@ class Verdict(Enum):
     IMPLAUSIBLE = "implausible"
     #: the stamps jump repeatedly, so that this jump does not reset the model
     UNSTEADY = "unsteady"
-    #: the stamp jumped, but the next stamp continued the stamps from before the jump, so this stamp was wrong and the
+    #: the stamp jumped, but the next stamp continued the stamps from before the jump: this stamp was wrong, and the
     #: sender's clock did not step
     STRAY = "stray"
     #: names or lengths of the message do not fit the scene
@@ -79,16 +79,16 @@ class Intake:
     Parameters
     ----------
     jump_back_s
-        A stamp that is older than the newest stamp by more than this [s] is a step of the sender's clock; a stamp that
-        is older by less is a late packet.
+        A stamp that is older than the newest stamp by more than this [s] is taken as a step of the sender's clock; a
+        stamp that is older by less is taken as a late packet.
     jump_forward_s
-        A stamp that is newer than the model's time by more than this [s] is a step of the sender's clock.
+        A stamp that is newer than the model's time by more than this [s] is taken as a step of the sender's clock.
     expected_rate_hz
         Rate of the samples [Hz], from which gaps in the stamps are counted as missing samples; 0: unknown.
     limits
-        Largest values; None: any finite value is plausible.
+        Largest plausible values and rates of change; None: any finite value is plausible.
     on_unused
-        Receives the reason, stamp [ns] and values of each unused sample.
+        Function that receives the reason, stamp [ns] and values of each unused sample.
     """
 
     def __init__(
@@ -161,8 +161,8 @@ class Intake:
         history
             The stamps of the past, among which late samples are inserted.
         may_reset
-            Whether a step of the sender's clock may reset the model now. A return to the stamps before the last step
-            may always reset it; otherwise a single wrong stamp could exclude all correct stamps.
+            Whether a step of the sender's clock may reset the model now. A return to the stamps from before the last
+            step may always reset the model; otherwise a single wrong stamp could exclude all correct stamps.
         """
         verdict = self._judge(stamp_ns, values, reached_ns, history)
         self.returned = verdict.resets and self._goes_on_from_before(stamp_ns)
@@ -189,7 +189,7 @@ class Intake:
         return not self.near(stamp_ns, newest_ns, reached_ns)
 
     def near(self, stamp_ns: int, newest_ns: int, reached_ns: int | None = None) -> bool:
-        """Return whether a stamp can follow the newest stamp and the time reached without a step of the clock."""
+        """Return whether a stamp follows the newest stamp and the model's time without a clock step."""
         ahead_ns = stamp_ns - (newest_ns if reached_ns is None else max(newest_ns, reached_ns))
         return ahead_ns <= self.jump_forward_s * NS_PER_S and newest_ns - stamp_ns <= self.jump_back_s * NS_PER_S
 
@@ -212,7 +212,7 @@ class Intake:
         return near & self.limits.kept(values, ahead_ns * 1e-9)
 
     def accept(self, stamp_ns: int, values: Sequence[float], count: int = 1) -> None:
-        """Count a sample that `goes_on`, or the last of `count` such samples."""
+        """Count a sample for which `goes_on` is True, or the last of `count` such samples."""
         self.returned = False
         self.counts[Verdict.ACCEPTED] += count
         self._since_first += count
@@ -249,7 +249,8 @@ class Intake:
             return Verdict.JUMP_FORWARD
         if ahead_ns > 0:
             return Verdict.IMPLAUSIBLE if self._too_fast(stamp_ns, values) else Verdict.ACCEPTED
-        # the stamp is compared with the sender's own stamps, because the hold policy may be ahead of the sender's clock
+        # the stamp is compared with the sender's own stamps, because the hold policy may have moved the model's time
+        # ahead of the sender's clock
         if newest_ns - stamp_ns > self.jump_back_s * NS_PER_S:
             return Verdict.JUMP_BACK
         if history is not None and history.oldest_ns is not None and stamp_ns > history.oldest_ns:

@@ -14,9 +14,9 @@ ParameterValue = bool | int | float | str
 
 @dataclass(frozen=True)
 class Sample:
-    """Advance to `stamp_ns` with the load linear from the previous sample.
+    """Advance to `stamp_ns`; the load varies linearly from the previous sample to this sample.
 
-    A stamp behind the time reached belongs to a late sample, which is inserted at its place.
+    A stamp before the time that the model has reached belongs to a late sample, which is inserted at its place in time.
     `wrench` is Fx, Fy [N] and M [N m] about the cavity's centre, gravity not included.
     """
 
@@ -171,12 +171,12 @@ class Unused:
 
 @dataclass(frozen=True)
 class Estimated:
-    """The estimate of the window from `start_ns` to before `end_ns` is finished.
+    """The estimate from the window that begins at `start_ns` and ends just before `end_ns` is finished.
 
-    `samples` and `poses` count the window's rows of load and pose; the fit began at `guess`, or with a search if
-    `guess` is empty. `shift` has 6 numbers [m], which are added from here on to the model's horizontal clearance (with
-    wear) and its 5 % and 95 % points, and to the vertical clearance and its points. `result` is the whole estimate
-    (JSON).
+    `samples` and `poses` are the numbers of load samples and of poses in the window; the fit began at `guess`, or with
+    a search if `guess` is empty. `shift` has 6 numbers [m]. From this entry on they are added to the model's horizontal
+    clearance (with wear) and its 5 % and 95 % quantiles, and to the vertical clearance and its quantiles. `result` is
+    the whole estimate (JSON).
     """
 
     start_ns: int

@@ -1,4 +1,4 @@
-"""Largest size and rate of measured values; larger values are faults of the measurement."""
+"""Largest size and rate of measured values; larger values are treated as faults of the measurement."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from plow_twin.model.geometry import half_diagonal
 from plow_twin.model.loads import compile_loads
 from plow_twin.model.scene import Scene
 
-#: Largest measured load as a multiple of the sum of the scene's largest loads and the head's weight.
+#: Largest plausible load, as a multiple of the sum of the scene's largest loads and the head's weight.
 _MARGIN: Final = 10.0
 #: A load may change by its largest value within this time [s], so that an impact of a millisecond is accepted.
 _SHORTEST_S: Final = 1e-3
@@ -40,7 +40,7 @@ class Limits:
         return True
 
     def kept(self, values: NDArray[np.float64], duration_s: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return for each row (n, k) after the first whether `keep` is True for it and the previous row, shape (n-1,).
+        """Return `keep` for each row of `values` (n, k) after the first, with the row before; shape (n-1,).
 
         `duration_s`, shape (n-1,), is the time between rows in s.
         """
@@ -74,7 +74,7 @@ def largest_displacement(scene: Scene) -> float:
 
 
 def value_limits(largest: float, rate: float = 0.0) -> Limits:
-    """Return the limits of one number and of its rate; a `rate` of 0 means the number's limit within a millisecond."""
+    """Return the limits of a number and its rate; `rate` 0 allows a change by `largest` within 1 ms."""
     return Limits((largest,), (rate or largest / _SHORTEST_S,))
 
 

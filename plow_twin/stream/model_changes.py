@@ -24,12 +24,12 @@ CHANGEABLE: Final[Mapping[str, float]] = {
 
 
 def changed_scene(scene: Scene, changes: Mapping[str, float]) -> Scene:
-    """Return the scene with other numbers.
+    """Return the scene with the numbers in `changes` replaced.
 
     Raises
     ------
     ArgumentError
-        A key or a number cannot be used; the message names it, the value got and the value expected.
+        A key or a number cannot be used; the message names the key, the value got and the value expected.
     """
     for key, value in changes.items():
         if key not in CHANGEABLE:
@@ -48,7 +48,7 @@ def changed_scene(scene: Scene, changes: Mapping[str, float]) -> Scene:
 
 
 def changed_twin(twin: Driven, scene: Scene, changes: Mapping[str, float]) -> Driven:
-    """Return a twin of `scene` with other numbers at the initial state of the scene, with the settings of `twin`.
+    """Return a twin of `scene` with `changes`, at the scene's initial state, with the settings of `twin`.
 
     Raises
     ------

@@ -22,12 +22,13 @@ from plow_twin.solve.totals import publish, publish_window, summary
 Array = NDArray[np.float64]
 Rows = NDArray[np.void]
 
-#: Length of a span of stamps [ns]; only the first publication in a span has a slow part, `clearance` and `wear_rate`.
+#: Length of a span of stamps [ns]; only the first publication in a span has a slow part, which consists of `clearance`
+#: and `wear_rate`.
 SLOW_PERIOD_NS: Final = 100_000_000
 
 PAD_NAMES: Final = tuple(f"pad_{name}" for name in PAIR_NAMES)
 _CLEARANCES: Final = ("horizontal", "vertical", *PAD_NAMES)
-#: Names of the numbers in `clearance`: the best values, then the 5 % and 95 % points of each.
+#: Names of the numbers in `clearance`: the best values, then the 5 % and 95 % quantiles of each value.
 CLEARANCE_NAMES: Final = (*_CLEARANCES, *(f"{name}/{point}" for name in _CLEARANCES for point in ("p05", "p95")))
 
 #: The two pads on each side: left, right, top, bottom.
@@ -120,7 +121,7 @@ def _numbered_from(slow: Rows, first: int) -> Rows:
 
 
 class Stock:
-    """New rows, each used once, so that a kept publication never changes."""
+    """Supply of new rows; each row is handed out once, so that a kept publication never changes."""
 
     def __init__(self) -> None:
         self._rows, self._used = _NO_ROWS, 0
@@ -134,9 +135,10 @@ class Stock:
 
 
 def clearances(scene: Scene, wear_depth: Array) -> Array:
-    """Return the total horizontal and vertical clearance and the eight pad depths, (..., 10) [m], from depths (..., 8).
+    """Return the two total clearances and eight pad depths, (..., 10) [m], from wear depths (..., 8).
 
-    The wall of a side moves out by the mean wear depth of the two pads on this side.
+    The horizontal clearance comes first, then the vertical. The wall of a side is assumed to move out by the mean wear
+    depth of the two pads on this side.
     """
     moved = 0.5 * (wear_depth[..., _ON_SIDES[:, 0]] + wear_depth[..., _ON_SIDES[:, 1]])
     found = np.empty((*wear_depth.shape[:-1], len(_CLEARANCES)))
@@ -147,10 +149,11 @@ def clearances(scene: Scene, wear_depth: Array) -> Array:
 
 
 def prior_points(scene: Scene, wear_depth: Array) -> tuple[Array, Array]:
-    """Return the 5 % and 95 % points of the pad depths under the prior of the wear coefficient, shape (8,) each [m].
+    """Return the 5 % and 95 % quantiles of the pad depths under the wear prior, shape (8,) each [m].
 
-    The growth of a depth, taken without running-in, is proportional to k_s as long as it is small compared with the
-    clearance. Without wear, or with k_s = 0, both points equal the wear depth.
+    This assumes that the growth of a depth, with running-in removed, is proportional to the wear coefficient k_s; this
+    holds as long as the growth is small compared with the clearance. Without wear, or with k_s = 0, both quantiles
+    equal the wear depth.
     """
     if scene.wear is None or scene.wear.coefficient_m2_n == 0.0:
         return wear_depth, wear_depth
@@ -178,24 +181,25 @@ class Outputs:
         self._slow_wear_depth = np.zeros(PAIR_COUNT)
         #: stamp from which the published motion was computed again [ns]; valid while the window is marked as corrected
         self._corrected_ns = 0
-        #: the window from before this correction if it contained an advance, otherwise None
+        #: copy of the window from before this correction if an advance was waiting in it, otherwise None
         self._before: Rows | None = None
         #: amounts by which an estimate shifts the clearances and their quantiles, in the order of `CLEARANCE_NAMES`;
         #: None without an estimate
         self._shift: Array | None = None
 
     def set_shift(self, shift: Sequence[float]) -> None:
-        """Shift the horizontal and the vertical clearance of the model, and their points, from now on.
+        """Shift the model's horizontal and vertical clearance, and their quantiles, from now on.
 
-        `shift` has 6 numbers [m]: for the horizontal clearance, for its 5 % and 95 % points, and the same for the
-        vertical clearance. The shift is not part of `state`, so that an estimate stays when late samples are inserted.
+        `shift` has 6 numbers [m]: for the horizontal clearance, for its 5 % and 95 % quantiles, and the same for the
+        vertical clearance. The shift is not part of `state`, so that an estimate stays in force when late samples are
+        inserted.
         """
         values = np.zeros(len(CLEARANCE_NAMES))
         values[_KNOWN] = shift
         self._shift = values if values.any() else None
 
     def set_scene(self, scene: Scene) -> None:
-        """Use a scene with other numbers from here on."""
+        """Use `scene`, in which numbers have changed, from now on."""
         self._scene = scene
 
     def clear_shift(self) -> None:
@@ -208,7 +212,7 @@ class Outputs:
         Parameters
         ----------
         rows : ndarray of `ROW`, shape (n,)
-            The advances; the rows that are published become the publications.
+            The advances; the rows chosen by `taken` become the publications.
         stamps : ndarray of int64, shape (n,)
             Stamps of the advances [ns].
         taken : ndarray of int64, shape (m,)
@@ -236,9 +240,10 @@ class Outputs:
         return Published(rows, self._slow(rows))
 
     def correct(self, stamp_ns: int, oldest_ns: int) -> int:
-        """Note that the motion from `stamp_ns` on is computed again; return the earliest such stamp of the window.
+        """Note that the motion is computed again from `stamp_ns`; return the window's first such stamp.
 
-        A correction that began at or before `oldest_ns` is over; this call then begins a new correction.
+        The window is the time since the previous publication. A correction that began at or before `oldest_ns` is over;
+        this call then begins a new correction.
         """
         window = self._window[0]
         if not window["corrected"] or self._corrected_ns <= oldest_ns:
@@ -250,7 +255,7 @@ class Outputs:
         return self._corrected_ns
 
     def begin_correction(self) -> None:
-        """Begin impulses and peaks at the time that `correct` returned, to which the session has gone back.
+        """Restart impulses and peaks at the time that `correct` returned, to which the session went back.
 
         Advances that were published before are not published again, even if every later advance fails.
         """
@@ -339,7 +344,7 @@ class Outputs:
         return found
 
     def modelled(self, wear_depth: Array) -> Array:
-        """Return the model's horizontal clearance and its two points, then the vertical ones, shape (6,) [m]."""
+        """Return the model's horizontal clearance and two quantiles, then the vertical, shape (6,) [m]."""
         middle = clearances(self._scene, wear_depth)
         low, high = (clearances(self._scene, points) for points in prior_points(self._scene, wear_depth))
         return np.stack((middle, low, high), axis=1)[:2].ravel()
@@ -356,7 +361,8 @@ class Outputs:
         self._clear()
         self._window["makes"] = parts[0].view(np.int64)
         self._window["impulse"], self._window["peak"] = parts[1:3]
-        # a state has no `measured_peak`, the peak of the samples alone, so the peak of all advances takes its place
+        # a saved state has no `measured_peak` (the peak in advances with samples), so the peak of all advances takes
+        # its place
         self._window["measured_peak"] = parts[2]
         self._slow_wear_depth = parts[3].copy()
         slow_ns = int(np.frombuffer(data, np.int64, 1, offset=8 * _STATE_SIZE)[0])
