@@ -1,11 +1,8 @@
 """Short motions of many square blocks with rounded corners that are tossed on a table, each with its own parameters.
 
 Contacts have the normal force of `model.contact` and the spring friction of `solve.grip`. In addition, restitution and
-
 friction fall with the impact speed and differ from touch to touch by a given scatter. Flight has linear drag. In
-
 contact, a step is a fixed fraction of the contact time. In flight, a step is as long as possible without a corner
-
 reaching the table.
 """
 

@@ -2,11 +2,9 @@
 
     dh/dt = (k_s v / A) F sqrt(1 + (s' / v)^2) (1 + a exp(-h / h0))
 
-s' is the rate at which the corner slides along its wall, at right angles to the travel, whose speed is v; a plough
-
-that stands still does not wear. At v = 0 the sliding distance has a kink where s' = 0, which no power series can
-
-follow, so the v under the root is at least `SLOWEST_TRAVEL`.
+s' is the rate at which the corner slides along its wall, at right angles to the travel, whose speed is v; a plough that
+stands still does not wear. At v = 0 the sliding distance has a kink where s' = 0, which no power series can follow, so
+the v under the root is at least `SLOWEST_TRAVEL`.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Records of the compiled kernels: constants of a scene, dynamic state, scratch space and totals.
 
-A part that a scene lacks is `None`. Since `None` has a type of its own in the compiled signature, the code of this
-
-part is not compiled.
+A part that a scene lacks is `None`. Since `None` has a type of its own in the compiled signature, the code of this part
+is not compiled.
 """
 
 from __future__ import annotations

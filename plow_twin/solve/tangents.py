@@ -1,10 +1,8 @@
 """Derivatives of a motion with respect to state and parameters, from equations linearised along each step's series.
 
 Each column holds one derivative: xi and eta are the derivatives of the position and velocity of the centre of mass (in
-
-head axes), phi and psi the derivatives of the angle and its rate. With the contacts' force f = (fx, fy) in head axes,
-
-a column obeys
+head axes), phi and psi the derivatives of the angle and its rate. With the contacts' force f = (fx, fy) in head axes, a
+column obeys
 
     xi'  = eta - omega J xi                   J = a quarter turn
     eta' = -omega J eta + (phi J f + df) / m  + the change of the load per mass
@@ -12,16 +10,12 @@ a column obeys
     dd   = n . xi - arm phi + de,             dd' its rate,     dF = F_d dd + F_d' dd' + the change by the law's numbers
 
 where n holds the factors of X and Y in a penetration, de is the change of this penetration by a clearance, and dtau is
-
 the derivative of the contacts' moment with respect to the angle. The factors in these equations are known as series
-
 over the step, so each order of a column is a sum of Cauchy products; eight columns are computed side by side.
 
 At a touch the force jumps by C d' (Kelvin-Voigt). A motion displaced by a column touches earlier than the undisplaced
-
-motion by dd / d', so it has already received the impulse C dd when the undisplaced motion touches. At all other
-
-changes of contact the force is continuous.
+motion by dd / d', so it has already received the impulse C dd when the undisplaced motion touches. At all other changes
+of contact the force is continuous.
 """
 
 from __future__ import annotations

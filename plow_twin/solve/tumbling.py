@@ -1,13 +1,9 @@
 """A tumbling block: beyond 45 degrees, and after each further quarter turn, its corners are renamed by their places.
 
 Up to 45 degrees the corner named bottom left is the lower left corner. Beyond 45 degrees another corner is the lower
-
 left corner and takes over this name. The state of each pair (mode, damping, anchor) is passed to the pair at the same
-
 wall that bears the corner's new name. A square block looks the same after a quarter turn, so the coefficients of its
-
 geometry do not change; the angle whose cosine and sine are in the state jumps back by 90 degrees
-
 (`kinematics.named_angle`).
 """
 

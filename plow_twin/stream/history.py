@@ -1,9 +1,7 @@
 """The last seconds of a session, kept for late samples: snapshots, and all entries since the oldest snapshot.
 
 The age at which a sample is too old depends on the journal alone, not on the number of samples in a call. Calls with
-
 one sample each make many snapshots; a call with many samples makes one snapshot and notes the stamps at which calls
-
 with one sample would have made theirs, so that the age limit is the same.
 """
 

@@ -1,9 +1,7 @@
 """Selection of one sender when several send the same input, and the count of its lost samples.
 
 The middleware numbers the messages of each publisher, starting at 1. A gap in these numbers therefore means that
-
 messages were lost in transit or in an overrun queue. This holds at any message rate, and also when messages arrive in
-
 bursts.
 """
 

@@ -8,11 +8,8 @@ Each target gives one residual r of a candidate, 0 if it is met exactly:
     trend              r = (steps the wrong way + shortfall of the rise or fall) / (tolerance mean)   met: r = 0
 
 Here s is the statistic of the run with the parameters in the target's `set`; if the target names several statistics, s
-
 is the smallest of them. A trend is judged over a sequence of runs along one parameter. For `rises_then_falls` the
-
 turning point with the smallest violation is used. Rise and fall must each be at least `margin` times the mean. The
-
 objective is the sum of weight times r^2.
 """
 
