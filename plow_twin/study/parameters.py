@@ -1,4 +1,4 @@
-"""Numbers and words of a scene by path, such as `contact.stiffness`, `head.com_offset_m[0]`.
+"""Parameters of a scene by path, such as `contact.stiffness`, `head.com_offset_m[0]`: numbers and words.
 
 A load is given by its name: `loads.fx1.phase_rad`. Four paths are settings of a study, not fields of a scene:
 
@@ -7,10 +7,10 @@ A load is given by its name: `loads.fx1.phase_rad`. Four paths are settings of a
     loads.<name>.scale      factor of the load's force and free moment
     clearance.scale         factor of both clearances: 1 for a total, 2 for a published clearance per side
 
-`frame.labels` takes one of eight words such as `bottom_right_ccw`, which means that a is at the bottom right, and b, c,
-d follow counter-clockwise. The four settings act after the other paths. `contact.damping` replaces a restitution, and
-`contact.restitution` a damping. A scene without friction also has the paths of `friction`; setting one of them switches
-friction on.
+`frame.labels` takes one of eight words such as `bottom_right_ccw`, which means that corner a is at the bottom right,
+and corners b, c, d follow counter-clockwise. The four settings are applied after all other paths. Setting
+`contact.damping` replaces a restitution, and setting `contact.restitution` replaces a damping. A scene without friction
+also has the paths of `friction`; setting one of these paths switches friction on.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def nearest_of(path: str, known: Iterable[str]) -> str:
 
 
 def parameter_of(scene: Scene, path: str) -> Value | None:
-    """Return the value at a path, or None for a damping or restitution that is not given."""
+    """Return the value at a path, or None for a damping or restitution that the scene does not specify."""
     check_path(scene, path)
     if path == "frame.labels":
         return next((word for word, labels in label_words().items() if labels == dict(scene.frame.labels)), None)
@@ -112,7 +112,7 @@ def parameter_of(scene: Scene, path: str) -> Value | None:
 
 
 def with_parameters(scene: Scene, values: Mapping[str, Value]) -> Scene:
-    """Return the scene with new values, whose marks are removed.
+    """Return the scene with new values; a value that is set loses its mark in `Scene.marks`.
 
     Raises
     ------
@@ -149,7 +149,7 @@ def with_parameters(scene: Scene, values: Mapping[str, Value]) -> Scene:
 
 
 def label_words() -> dict[str, dict[str, str]]:
-    """Return the eight assignments of letters to corners, by their words."""
+    """Return the eight assignments of letters to corners, each by its word such as `bottom_right_ccw`."""
     words = {}
     for turn, corners in (("ccw", _CORNERS_CCW), ("cw", _CORNERS_CCW[::-1])):
         for first in range(4):
@@ -159,12 +159,12 @@ def label_words() -> dict[str, dict[str, str]]:
 
 
 def check_word(path: str, word: str) -> str:
-    """Return the word if it is possible for a path of `WORDS`.
+    """Return the word if the path, one of `WORDS`, can have this word as its value.
 
     Raises
     ------
     StudyError
-        The word is impossible; the error has the possible words.
+        The path cannot have this word; the error lists the possible words.
     """
     (rotation,) = (spec for spec in fields(Head) if spec.name == "rotation")
     words = {"contact.law": LAWS, "head.rotation": rotation.metadata["choices"], "frame.labels": label_words()}[path]
@@ -246,7 +246,7 @@ def _load(scene: Scene, owner: str) -> Any:
 
 
 def _is_set(key: str, values: Mapping[str, Value], scene: Scene) -> bool:
-    """Return whether the values change the number at a key of `Scene.marks`, where loads have indexes."""
+    """Return whether the values change the number at a `Scene.marks` key, which gives a load's index."""
     match = re.match(r"loads\[(\d+)\]\.(.+)", key)
     path = f"loads.{scene.loads[int(match[1])].name}.{match[2]}" if match else key
     whole = path.partition("[")[0]

@@ -61,7 +61,7 @@ def _embedded(png: bytes) -> str:
 
 
 def percent(share: float | None) -> str:
-    """Return a share as text with its sign, such as +3.5 %, or an empty text for None."""
+    """Return a share as a signed percentage, such as +3.5 %, or an empty text for None."""
     return "" if share is None else signed(100.0 * share, "+.1f") + " %"
 
 

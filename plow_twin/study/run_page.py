@@ -185,7 +185,7 @@ def _by_pad(recording: Recording) -> list[dict[str, str]]:
 
 
 def _plots(reader: RunReader, curves: RunCurves) -> list[dict[str, Any]]:
-    """Return title, curves, bands, thresholds and columns of each plot."""
+    """Return title, names of curves, bands, thresholds and data columns of each plot."""
     alarms = alarms_of(reader.header.parameters).alarms
     force, clearance = alarms["force"].thresholds, alarms["clearance"].thresholds
     ways = ("horizontal", "vertical")
@@ -216,7 +216,7 @@ def _plots(reader: RunReader, curves: RunCurves) -> list[dict[str, Any]]:
 
 
 def _columns(rows: Envelope, chosen: list[tuple[int, int]]) -> list[list[float | None]]:
-    """Return times and the least (side 0) or largest (side 1) values of chosen columns, None where a line ends."""
+    """Return times and, per (column, side), least (0) or largest (1) values; None where a line ends."""
     times: Array | None = None
     columns: list[list[float | None]] = []
     order = np.zeros(0, np.int64)

@@ -1,4 +1,4 @@
-"""Statistics of a run by path.
+"""Statistics of a run, each named by a path.
 
     max.top_left_top          largest force of one pair
     max.ccw.a                 largest force of corner a's pair that stops a counter-clockwise swing (cw: its other pair)
@@ -9,9 +9,10 @@
     events   steps            number of contact changes; number of steps of the solver
 
 Instead of `max` [N], a path may begin with `mean_in_contact` or `mean_over_time` [N], `impulse` [N s],
-`time_in_contact` [s], `makes` or `wear_depth` [m]. For several pairs, `max` and `wear_depth` are the largest values;
-impulses, times and touches are added, and means are computed from these sums. A corner is named by the scene's letter
-or by its own name; the names in a set are joined by `+`.
+`time_in_contact` [s], `makes` or `wear_depth` [m]. For several pairs, `max` and `wear_depth` are the largest values of
+all these pairs; impulses, times and touches are summed, and means are computed from the sums. A corner is named by the
+scene's letter or by its own name such as `top_left`; in a set, letters stand side by side (`ad`), and names are joined
+by `+`.
 """
 
 from __future__ import annotations
@@ -67,7 +68,7 @@ UNITS: Final[Mapping[str, str]] = {
 
 
 def statistics_of(members: Ensemble, scenes: Sequence[Scene], paths: Sequence[str]) -> Array:
-    """Return the statistics of runs, shape (m, paths), NaN for a failed run; scenes may have different letters."""
+    """Return statistics of runs, shape (m, paths), NaN for a failed run; corner letters may differ."""
     result = np.full((len(scenes), len(paths)), np.nan)
     names = [spec.name for spec in fields(Ensemble) if spec.name != "t"]
     groups: dict[tuple[tuple[str, str], ...], list[int]] = {}
@@ -131,7 +132,7 @@ def _labels(scene: Scene) -> list[str]:
 
 
 def _groups(scene: Scene) -> dict[str, list[int]]:
-    """Return the groups of pairs by the last part of a path."""
+    """Return the groups of pairs by the end of a path: empty for all pairs, or e.g. `.ccw`, `.ccw.a`."""
     ccw = [pair for pair in range(8) if STOPS_COUNTER_CLOCKWISE[pair]]
     cw = [pair for pair in range(8) if not STOPS_COUNTER_CLOCKWISE[pair]]
     groups: dict[str, list[int]] = {"": list(range(8)), ".ccw": ccw, ".cw": cw}

@@ -45,7 +45,8 @@ class Store:
     Raises
     ------
     StudyError
-        The folder has another sweep (the error names the difference) or other contents.
+        The folder contains another sweep (the error names the difference), an unreadable sweep, or chunks without
+        `sweep.json`.
     """
 
     def __init__(self, folder: Path, sweep: Sweep, chunk: int, fresh: bool = False) -> None:
@@ -101,7 +102,7 @@ class Store:
         return (table, build) if table.shape == shape else None
 
     def write(self, index: int, table: Array, build: str) -> None:
-        """Store a chunk, in one step."""
+        """Store a chunk; it appears under its name only when it is complete."""
         from io import BytesIO
 
         buffer = BytesIO()

@@ -33,7 +33,8 @@ class AccessError(InputError):
         super().__init__([Problem(key, got, expected)], "telemetry")
 
 
-#: Characters that the name of a topic for sending cannot have.
+#: Characters that a topic name for publishing must not contain: wildcards, control characters, and `$` at the
+#: beginning.
 _NO_TOPIC: Final = re.compile(r"[+#\x00-\x1f]|^\$")
 
 
@@ -44,13 +45,13 @@ class WayOut:
     Attributes
     ----------
     name : str
-        Name of its part of the diagnostics.
+        Name of the output's part in the diagnostics.
     address : str
         Address of the output, without credentials.
     modules : tuple of str
-        Modules that its process needs.
+        Python modules that the output's process needs.
     first : dict
-        First message to its process, with its options.
+        First message to the output's process, with the output's options.
     may_acknowledge : bool
         Whether an operator at the destination may acknowledge alarms.
     """
@@ -64,7 +65,7 @@ class WayOut:
 
 @dataclass(frozen=True)
 class Credentials:
-    """Credentials by section (`mqtt`, `opcua`, `influx`); files are relative to the file that names them."""
+    """Credentials by section (`mqtt`, `opcua`, `influx`); paths are relative to the credentials file."""
 
     sections: Mapping[str, Mapping[str, Any]] = field(default_factory=dict, repr=False)
     folder: Path = Path()
@@ -76,7 +77,8 @@ class Credentials:
         Raises
         ------
         InputError
-            The file is not YAML within the bounds, a section or key is not known, or a value is not a text.
+            The file is not YAML within the bounds of `read_yaml`, a section or key is not known, or a value is not a
+            text.
         OSError
             The file cannot be read.
         """
@@ -92,7 +94,7 @@ class Credentials:
         return str(self.sections.get(section, {}).get(key, otherwise))
 
     def file(self, section: str, key: str) -> str | None:
-        """Return the path of a file, or None.
+        """Return the absolute path of a file, or None if the credentials do not name the file.
 
         Raises
         ------
@@ -108,7 +110,7 @@ class Credentials:
         return str(path)
 
     def secret(self, section: str, key: str, variable: str) -> str:
-        """Return the first line of a file, or else an environment variable."""
+        """Return the first line of the named file or, without it, the variable `PLOW_TWIN_<variable>`."""
         path = self.file(section, key)
         return os.environ.get(f"PLOW_TWIN_{variable}", "") if path is None else read_secret(Path(path))
 
@@ -116,7 +118,7 @@ class Credentials:
 def mqtt_out(url: str, credentials: Credentials, *, plain: bool, sparkplug: str = "") -> list[WayOut]:
     """Return the outputs to an MQTT broker, `mqtt[s]://HOST[:PORT]/PREFIX`.
 
-    `sparkplug` is `GROUP/NODE`, or empty; with it JSON is sent only if there is a prefix.
+    `sparkplug` is `GROUP/NODE`, or empty. If it is set, plain JSON is also sent only if `url` has a prefix.
 
     Raises
     ------
@@ -167,7 +169,7 @@ def influx_out(url: str, credentials: Credentials, *, plain: bool) -> WayOut:
 
 
 def opcua_out(url: str, credentials: Credentials, *, plain: bool, acknowledges: bool) -> WayOut:
-    """Return the output to clients of an OPC UA server: `opc.tcp://HOST:PORT` with the address that it listens on.
+    """Return an OPC UA server as an output; the server listens on the address `url`, `opc.tcp://HOST:PORT`.
 
     Raises
     ------
@@ -212,7 +214,7 @@ def _broker_options(host: str, port: int, credentials: Credentials, *, tls: bool
 def _address(
     option: str, url: str, schemes: tuple[str, ...], expected: str, *, plain: bool
 ) -> tuple[str, int, str, bool]:
-    """Return host, port, path, and whether the connection is encrypted, as the last of the schemes means."""
+    """Return host, port and path, and whether `url` has the last of `schemes`, which means encryption."""
     try:
         parts = urlsplit(url)
         port = parts.port or _PORTS.get(parts.scheme, 0)

@@ -23,14 +23,14 @@ _WAITING: Final = 2000
 _AT_ONCE: Final = 500
 #: Longest wait for an answer [ms].
 _ANSWER_MS: Final = 5000
-#: First wait before another attempt [s].
+#: Wait after the first failed attempt to write [s]; the wait doubles with each further failure.
 _FIRST_WAIT_S: Final = 1.0
-#: Longest wait before another attempt [s].
+#: Longest wait between two attempts to write [s].
 _LONGEST_WAIT_S: Final = 30.0
 
 
 class Influx:
-    """Lines `plow_twin_<group>,head=... name=value,... stamp` to a bucket.
+    """Writes lines `plow_twin_<group>,head=... name=value,... stamp` to a bucket of InfluxDB.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ class Influx:
     org, bucket, token
         Destination of the points, and the permission to write there.
     ca
-        Authority for checking the database's certificate; None: the system's authorities.
+        File of the authority that certifies the database; None: the authorities that the system trusts.
     """
 
     def __init__(self, url: str, org: str, bucket: str, token: str, ca: str | None) -> None:
@@ -63,7 +63,7 @@ class Influx:
             self.state.lost += 1
 
     async def turn(self) -> None:
-        """Write waiting lines, unless the database failed a moment ago."""
+        """Write waiting lines, unless the wait after a failed attempt is not yet over."""
         while self._waiting and time.monotonic() >= self._again_s:
             lines = [self._waiting[index] for index in range(min(len(self._waiting), _AT_ONCE))]
             try:
@@ -76,7 +76,7 @@ class Influx:
             self.state.connected, self.state.trouble, self._wait_s = True, "", 0.0
 
     async def close(self, patience_s: float) -> None:
-        """Write waiting lines once more; the rest is lost."""
+        """Try once more to write the waiting lines, and count all lines that remain as lost."""
         if self.state.connected and patience_s:
             await self.turn()
         self.state.lost += len(self._waiting)

@@ -35,12 +35,12 @@ class Message(NamedTuple):
 
 
 class Broker:
-    """A connection to a broker that is restored when it breaks, with a bounded queue before it.
+    """A connection to a broker, which is restored after a break, with a bounded queue of waiting messages.
 
     Parameters
     ----------
     host, port, client_id, user, password
-        The broker, and who connects.
+        Address of the broker, and identity, name and password of this client.
     tls
         Files `ca`, `certificate` and `key`, or None: not encrypted.
     will
@@ -77,7 +77,7 @@ class Broker:
         self._most, self._keeps = waiting, keeps
         self._waiting: deque[Message] = deque()
         self._unacknowledged: set[int] = set()
-        #: the lock is held while messages are put in order
+        #: lock held while messages are numbered and queued, so that they are sent in order
         self.lock = threading.RLock()
         self.client = make_client(client_id, clean=True)
         self._set_will()
@@ -160,7 +160,7 @@ class Broker:
 
 
 class MqttOut:
-    """JSON objects on `<prefix>/<group>`; all but peaks are retained, and `<prefix>/online` is true or false.
+    """Sends JSON to `<prefix>/<group>`, retained except for `peaks`; `<prefix>/online` is true or false.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The outputs of a node: a process beside it reads its topics; acknowledgements go to its service."""
+"""Outputs of a ROS node: a separate process reads the node's topics and calls its acknowledge service."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def send_node(
     namespace, name
         Namespace and name of the node.
     scene
-        Its scene, if the node's name for the scene cannot be read on this machine.
+        Scene of the node; needed if the scene that the node names cannot be read on this machine.
     ways
-        The outputs; each has its own process and its own listener.
+        The outputs; each output has its own process and its own listener to the node's topics.
     rate_hz
         Rate of updates [Hz].
     wait_s
@@ -38,7 +38,7 @@ def send_node(
     stopped
         Returns whether to end.
     on_error
-        Receives a text when a receiver stops or resumes taking messages.
+        Called with a text when the receiver of an output stops or resumes taking messages.
 
     Raises
     ------

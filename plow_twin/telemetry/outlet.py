@@ -1,4 +1,4 @@
-"""An output beside a twin: its process, the feed to it, and its part of the diagnostics."""
+"""An output of a twin: its separate process, the feed to this process, and its part of the diagnostics."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _START_S: Final = 60.0
 
 
 class Outlet(Beside):
-    """A running output, as a context manager that ends it.
+    """A running output; used as a context manager, it ends the output's process on exit.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ class Outlet(Beside):
     facts, answer
         As in `Feed`.
     on_error
-        Receives a text when the receiver stops or resumes taking messages.
+        Called with a text when the receiver of the output stops or resumes taking messages.
 
     Raises
     ------
@@ -63,7 +63,7 @@ class Outlet(Beside):
             raise TelemetryError(failed)
 
     def turn(self) -> None:
-        """Send an update, and report changes at the receiver."""
+        """Send an update, and report when the receiver has stopped or resumed taking messages."""
         self.feed.turn()
         self._report()
 
@@ -96,7 +96,7 @@ class Outlet(Beside):
 
 
 def _is_there(name: str) -> bool:
-    """Return whether a module can be imported, importing only its parents."""
+    """Return whether a module can be imported; only its parent packages are imported to find out."""
     try:
         return find_spec(name) is not None
     except ModuleNotFoundError:

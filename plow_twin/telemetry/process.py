@@ -1,7 +1,7 @@
 """The process of one output: `python -m plow_twin.telemetry.process LINK`; the first message names the output.
 
-It takes the updates of a feed one by one. While the receiver does not answer, the output keeps as many updates as its
-bound allows and counts the others; the twin is never delayed.
+The process takes the updates of the feed one by one. While the receiver does not answer, the output keeps as many
+updates as its bound allows and counts the updates that it drops; the twin is never delayed.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ WAYS: Final = {
 }
 #: Increment of `nice`: the process has a lower priority than the twin.
 _NICE: Final = 5
-#: Longest time between two reports [s].
+#: Longest wait before the process checks whether the output's state has changed and must be reported [s].
 _REPORT_S: Final = 0.5
 #: At the end, time for the receiver to take the waiting messages [s].
 _END_S: Final = 2.0
@@ -82,7 +82,7 @@ async def _run(link: Link, first: dict[str, Any]) -> None:
 
 
 def main() -> None:
-    """Serve the output; the argument is the descriptor of its link."""
+    """Serve one output; the command-line argument is the file descriptor of the link to the twin."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(_NICE)
     end = socket.socket(fileno=int(sys.argv[1]))

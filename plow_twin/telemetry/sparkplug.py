@@ -1,7 +1,7 @@
 """Sparkplug B over MQTT: birth with all metrics, data with changed metrics, death, and rebirth on request.
 
-Messages are those of `sparkplug_b.proto` of Eclipse Tahu, made from its published field numbers, because the file
-itself has another licence and is not included.
+The messages have the format of `sparkplug_b.proto` of Eclipse Tahu. They are built from its published field numbers,
+because the file itself has another licence and is not included.
 
 References
 ----------
@@ -40,13 +40,13 @@ _FIELDS: Final = {
 }  # fmt: skip
 #: Numbers of the data types of metrics.
 _INT32, _UINT64_TYPE, _DOUBLE_TYPE, _BOOLEAN, _TEXT = 3, 8, 10, 11, 12
-#: Metrics that the protocol requires.
+#: Names of the two metrics that Sparkplug requires.
 BIRTH_NUMBER: Final = "bdSeq"
 REBIRTH: Final = "Node Control/Rebirth"
 
 
 def _messages() -> tuple[Any, Any]:
-    """Return the classes of a payload and of a metric."""
+    """Return the protobuf message classes `Payload` and `Metric`."""
     file = descriptor_pb2.FileDescriptorProto(name="sparkplug_b.proto", package="plow_twin.sparkplug", syntax="proto2")
     for name, fields in _FIELDS.items():
         message = file.message_type.add(name=name)
@@ -57,7 +57,7 @@ def _messages() -> tuple[Any, Any]:
                 added.type_name = f".plow_twin.sparkplug.{of}"
     pool = descriptor_pool.DescriptorPool()
     pool.Add(file)
-    # this has been a function since protobuf 4.22; before, it was a method of a factory
+    # `GetMessageClass` has been a function since protobuf 4.22; before, a factory had the method `GetPrototype`
     class_of = getattr(message_factory, "GetMessageClass", None) or message_factory.MessageFactory(pool).GetPrototype
     return tuple(class_of(pool.FindMessageTypeByName(f"plow_twin.sparkplug.{name}")) for name in ("Payload", "Metric"))
 
@@ -105,13 +105,13 @@ class Sparkplug:
                 self._broker.send(self._numbered("NDATA", payload))
 
     def _news(self, name: str, group: Group) -> Group:
-        """Return a group with the values that differ from the values sent last."""
+        """Return a group with only the values that differ from the values sent last; note them as sent."""
         values = {key: value for key, value in group.values.items() if self._sent.get((name, key), self) != value}
         self._sent |= {(name, key): value for key, value in values.items()}
         return group._replace(values=values)
 
     async def turn(self) -> None:
-        """Send the birth again where a rebirth was requested."""
+        """Send the birth message again if a rebirth was requested."""
         if self._rebirth:
             self._rebirth = False
             with self._broker.lock:

@@ -34,7 +34,7 @@ class Group(NamedTuple):
     values : mapping
         Values by name; numbers in SI.
     held : bool
-        Whether they were computed without samples.
+        Whether the values were computed while the load had no new samples.
     """
 
     time_s: float
@@ -45,9 +45,9 @@ class Group(NamedTuple):
 class Newest:
     """The newest values of all groups, from the updates of a feed.
 
-    The groups are `clearance` [m] and `wear` [m] with their 5 % and 95 % points, `peaks` [N] since the last update,
-    `life` (points of the forecast), `flags`, `status` and `alarms`. Each group has all of its names from the first
-    update on.
+    The groups are `clearance` [m] and `wear` [m] with their 5 % and 95 % points, `peaks` (largest forces [N] since the
+    last update), `life` (P10, P50 and P90 of the forecast), `flags`, `status` and `alarms`. Each group has all of its
+    names from the first update on, even while their values are unknown.
     """
 
     def __init__(self) -> None:
@@ -96,7 +96,7 @@ class Newest:
 
 
 def _unknown(names: list[str]) -> dict[str, dict[str, Value]]:
-    """Return all groups with unknown values."""
+    """Return all groups with all of their names, but with unknown values."""
     by_pair: dict[str, Value] = {f"{name}{point}": None for point in _POINTS for name in names}
     axes: dict[str, Value] = {f"{axis}{point}": None for point in _POINTS for axis in ("horizontal", "vertical")}
     return {
@@ -111,7 +111,7 @@ def _unknown(names: list[str]) -> dict[str, dict[str, Value]]:
 
 
 def _part(name: str, level: int, message: str, values: Mapping[str, str]) -> dict[str, dict[str, Value]]:
-    """Return the groups that follow from a part."""
+    """Return the groups whose values come from this part of the diagnostics; there may be none."""
     if name == "status":
         return {
             "status": {"level": level, "message": message},
@@ -136,7 +136,7 @@ def _alarms(level: int, message: str, values: Mapping[str, str]) -> dict[str, Va
 
 
 def _number(text: str) -> float | None:
-    """Return a finite number, or None."""
+    """Return the number in a text, or None if the text is not a finite number."""
     try:
         found = float(text)
     except ValueError:

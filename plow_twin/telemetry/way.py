@@ -23,9 +23,9 @@ class State:
     connected : bool
         Whether the receiver answers.
     sent, lost : int
-        Numbers of messages (or points, or updates) that the receiver has taken and that were dropped.
+        Number of messages (or points, or updates) that the receiver has taken, and number that were dropped.
     trouble : str
-        Why the receiver takes no messages; empty if it does.
+        Why the receiver takes no messages; empty if it takes messages.
     """
 
     connected: bool = False

@@ -41,9 +41,9 @@ class TimeAxis:
 class Curves:
     """Curves with common times: one entity for each column of the rows.
 
-    With `span_ns` a curve keeps the least and the largest value in each span of stamps, so that no peak is lost. `rows`
-    is the number of rows added, and `sent` is the number of values of the first curve that were sent. A row without
-    values ends the lines at a gap.
+    If `span_ns` is not 0, a curve keeps only the least and the largest value in each span of stamps, so that no peak is
+    lost. `rows` is the number of rows added, and `sent` is the number of values of the first curve that were sent. At a
+    gap, a row without values ends the lines.
     """
 
     def __init__(self, stream: rr.RecordingStream, axis: TimeAxis, entities: Sequence[str], span_ns: int = 0) -> None:
@@ -58,7 +58,7 @@ class Curves:
 
     @property
     def thinned(self) -> bool:
-        """Whether the curves are thinned."""
+        """Whether the curves keep only the least and the largest value in each span."""
         return self.span_ns > 0
 
     def add(self, stamps: Indexes, steps: Indexes, values: Array) -> None:

@@ -21,18 +21,18 @@ _CCW_BITS: Final = int((STOPS_COUNTER_CLOCKWISE.astype(np.int64) << np.arange(PA
 
 
 def set_color(mask: int) -> Color:
-    """Return the colour of a set of pairs, given as bits."""
+    """Return the colour of a set of pairs; `mask` has a bit for each pair."""
     return _COLORS[(1 if mask & _CCW_BITS else 0) + (2 if mask & ~_CCW_BITS else 0)]
 
 
 def masks_of(force: Array) -> Indexes:
-    """Return the pairs that carry force as bits, (n,) from (n, 8)."""
+    """Return for each row a bit mask of the pairs that carry force, shape (n,), from forces (n, 8)."""
     masks: Indexes = ((force > 0.0) << np.arange(PAIR_COUNT)).sum(axis=1)
     return masks
 
 
 class ContactSets:
-    """Write each change of the set; of a thinned run, write only the first change and the last set in each span."""
+    """Writes changes of the contact set; in a thinned run, the first change and last set of each span."""
 
     def __init__(self, stream: rr.RecordingStream, axis: TimeAxis, labels: tuple[str, ...], span_ns: int) -> None:
         self._names = tuple(label or name for label, name in zip(labels, CORNER_NAMES, strict=True))
@@ -41,7 +41,7 @@ class ContactSets:
         self._before: str | None = None
         self._at: int | None = None
         self._last: tuple[int, int] | None = None
-        #: newest set within the span, and the step of its row
+        #: newest set of the present span that has not been written yet, and the step of its row
         self._left: tuple[str, int] | None = None
         names: dict[str, Color] = {}
         for ccw, cw in product(range(16), range(16)):
@@ -86,7 +86,7 @@ class ContactSets:
             self._end_span(int(stamps[-1]))
 
     def _end_span(self, stamp_ns: int) -> None:
-        """Write the last set of a span once a stamp lies beyond it."""
+        """Write the last set of the present span if the stamp lies beyond this span."""
         if self._left is None or self._at is None or stamp_ns // self._span_ns == self._at:
             return
         name, step = self._left

@@ -32,8 +32,8 @@ from plow_twin.view.residuals import Residuals
 from plow_twin.view.section import ARROW_MM_PER_N, LABEL_MM, LOAD_COLOR, PAIR_COLORS, Section
 from plow_twin.view.what_if import WhatIf
 
-#: Largest distance of stamps from the recorder's clock [ns]; stamps farther away are from another clock and have no
-#: age.
+#: Largest difference between a stamp and the recorder's clock [ns]; a larger difference is taken to mean that the stamp
+#: comes from another clock, and no age is drawn.
 _LARGEST_AGE_NS: Final = 3_600_000_000_000
 _GREY: Final = (150, 155, 165)
 _WHITE: Final = (235, 235, 235)
@@ -67,7 +67,7 @@ class Drawing:
     section_hz
         Rate of the cross-section [Hz].
     exaggerate
-        Factor of the width of the clearance in the second cross-section; None: chosen by the size of the clearance.
+        Factor by which the second cross-section widens the clearance; None: chosen by the size of the clearance.
     span_ns
         Span of stamps in which a curve keeps its least and largest value [ns]; 0: it keeps every row.
     others
@@ -269,7 +269,7 @@ class Drawing:
 
     @staticmethod
     def _loads(entries: Entries, advance: NDArray[np.bool_], before: Array) -> Array:
-        """Return the load at the end of each advance, (n, 3): its sample, the held load, or NaN."""
+        """Return the load at the end of each advance, (n, 3): sampled, held, zero, or NaN if unknown."""
         places = np.flatnonzero(advance)
         loads = np.where(entries.sample[places, None], entries.wrench[places], 0.0)
         for row in np.flatnonzero(~entries.sample[places]).tolist():

@@ -29,8 +29,8 @@ class Envelope:
         self._segment = 0
         #: width of a bin [s]; 0 while every row is kept
         self._bin_s = 0.0
-        # segment of each row (n,); its bin number (n,), or its time [s] while every row is kept; its least and its
-        # largest values (n, width)
+        # for each row: its segment (its line between two gaps), shape (n,); its bin number, or its time [s] while every
+        # row is kept, (n,); its least and its largest values, (n, width)
         self._kept = _Rows(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, width)), np.zeros((0, width)))
         self._added: list[_Rows] = []
         self._added_rows = 0
@@ -58,7 +58,7 @@ class Envelope:
         return self._bin_s
 
     def bands(self, column: int) -> tuple[Array, Array, Array]:
-        """Return times [s], least and largest values of a column, shape (n,) each, with NaN between two segments.
+        """Return times [s], least and largest values of a column, shape (n,) each; NaN where a line ends.
 
         The time of a bin is its middle; a single row has equal smallest and largest values.
         """
@@ -108,7 +108,7 @@ class _Rows:
         )
 
     def binned(self, width: float) -> _Rows:
-        """Return the rows with the numbers of bins of this width as their places."""
+        """Return the rows with each place replaced by the number of its bin of this width."""
         return _Rows(self.segment, np.floor(self.place / width), self.least, self.largest)
 
     def merged(self) -> _Rows:

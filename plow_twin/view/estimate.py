@@ -22,9 +22,9 @@ def estimate_picture(
     result
         The estimate.
     prior
-        The prior, by the names of `QUANTITIES`.
+        Prior interval of each quantity, by its name in `QUANTITIES`.
     poses
-        The measured poses; without a fitted motion, only they are drawn.
+        The measured poses; if there is no fitted motion, only these poses are drawn.
     labels
         Name with unit of each quantity.
     title

@@ -36,7 +36,7 @@ class Events:
         self._lines.add(stamp_ns, step, text=[text], level=[level])
 
     def sample(self, stamp_ns: int, step: int) -> None:
-        """Write the end of a silence."""
+        """Write that the excitation is back, if it was silent before this sample."""
         if self.silent:
             self.add(stamp_ns, step, "excitation is back")
         self.silent = False

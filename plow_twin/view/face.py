@@ -15,9 +15,10 @@ from plow_twin.view.columns import Array, Batches, Indexes, TimeAxis
 
 #: Width of the chart in the units of its view.
 WIDTH: Final = 300.0
-#: Height of the chart in the same units.
+#: Height of the chart in the units of its view.
 HEIGHT: Final = 90.0
-#: First length of a piece of the face [m]; it doubles when there are more than `_MOST_PIECES` pieces.
+#: Initial length of the pieces into which the chart divides the face [m]; the length doubles when there are more than
+#: `_MOST_PIECES` pieces.
 _PIECE_M: Final = 0.1
 _MOST_PIECES: Final = 600
 #: Number of passes drawn; the newest is bright.
@@ -30,7 +31,7 @@ _EARLIER: Final = (90, 110, 130)
 class FaceChart:
     """Collects forces by place and draws them.
 
-    `known` is whether the run has a speed along the face.
+    `known` is true once the run has had a speed along the face other than zero.
     """
 
     def __init__(self, stream: rr.RecordingStream, axis: TimeAxis) -> None:
@@ -50,7 +51,7 @@ class FaceChart:
         self.known = False
 
     def travel(self, travel: Travel) -> None:
-        """Change the speed from its stamp on."""
+        """Change the speed from the stamp of `travel` on."""
         if self._reached_ns is not None and travel.stamp_ns > self._reached_ns:
             insort(self._coming, travel, key=lambda one: one.stamp_ns)
         else:
@@ -122,13 +123,13 @@ class FaceChart:
         self._ticks.add(stamp_ns, step, positions=[(x, y) for x, y, _ in ticks], labels=[text for *_, text in ticks])
 
     def flush(self) -> None:
-        """Draw the chart at the end."""
+        """Send the collected charts."""
         self._lines.flush()
         self._ticks.flush()
 
 
 def _halved(one: dict[int, float]) -> dict[int, float]:
-    """Return the forces for pieces twice as long."""
+    """Return the largest forces of one pass for pieces that are twice as long."""
     found: dict[int, float] = {}
     for piece, force in one.items():
         found[piece // 2] = max(found.get(piece // 2, 0.0), force)

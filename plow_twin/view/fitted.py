@@ -32,10 +32,10 @@ _FARTHEST: Final = 2.0
 
 @dataclass(frozen=True)
 class FittedValue:
-    """A value with its interval, and its prior, each as middle, low, high in the unit of the label.
+    """A fitted value and its prior, each as middle, low, high in the unit of the label.
 
-    `prior` may be None; `note` is the state of the value, or another short word; `is_log` states whether its place in
-    the prior is measured on a logarithmic scale.
+    `prior` may be None; `note` is the state of the value, or another short word; `is_log` states whether the value's
+    place relative to the prior is measured on a logarithmic scale.
     """
 
     label: str
@@ -150,7 +150,7 @@ class FittedPicture:
 
 
 def _broken(t: Array, values: Array) -> tuple[Array, Array]:
-    """Return a curve with NaN in each gap, which is much longer than the usual interval, so that no line crosses it."""
+    """Return a curve with NaN in each interval far longer than the median, so that no line crosses it."""
     there = np.isfinite(values)
     t, values = t[there], values[there]
     steps = np.diff(t)

@@ -1,4 +1,4 @@
-"""Picture of a forecast: the clearances over time, and the time at which the first reaches its limit."""
+"""Picture of a forecast: the clearances over time, and when the first clearance reaches its limit."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def draw_forecast(found: Forecast, path: FilePath, title: str) -> None:
     left, right = figure.subplots(1, 2)
     plan = found.plan
     reached = found.hours[np.isfinite(found.hours)]
-    # limits that have already been reached leave no span to show
+    # if the limits have already been reached, `last` is 0, and the whole horizon is shown
     last = 1.3 * float(np.quantile(reached, 0.95)) if len(reached) else 0.0
     end = min(plan.horizon_h, last) if last > 0.0 else plan.horizon_h
     hours = np.linspace(0.0, end, _MOMENTS)

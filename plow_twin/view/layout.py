@@ -22,7 +22,7 @@ from plow_twin.view.section import ARROW_MM_PER_N, LOAD_COLOR, PAD_MM_PER_MM, PA
 
 FORCE: Final = tuple(f"force/{name}" for name in PAIR_NAMES)
 FORCE_AT_STAMP: Final = tuple(f"force_at_stamp/{name}" for name in PAIR_NAMES)
-#: Bounds of the forces at the stamps, for a twin that follows its machine.
+#: 5 % and 95 % bounds of the forces at the stamps, for a twin that follows its machine.
 FORCE_BOUNDS: Final = tuple(f"force_interval/{name}/{point}" for point in ("p05", "p95") for name in PAIR_NAMES)
 POSE: Final = ("pose/x", "pose/y", "pose/theta")
 MEASURED: Final = ("pose/measured/x", "pose/measured/y", "pose/measured/theta")
@@ -69,8 +69,8 @@ def blueprint(
 ) -> rrb.Blueprint:
     """Return the arrangement: cross-sections beside the curves, with events and data quality below.
 
-    With `what_if` the view of other scenes is in front; with `followed` there are intervals of the forces. `title` is
-    appended to the name of the forces.
+    If `what_if` is true, the view of other scenes is in front; if `followed` is true, there is also a view of the
+    forces with their 90 % intervals. `title` is appended to the name of the view of the forces.
     """
     half_x, half_y = (float(half) for half in section.half_view)
     picture = rrb.Spatial2DView(
@@ -175,7 +175,7 @@ def band_colors(entity: str) -> list[tuple[int, ...]]:
 
 
 def style_load(stream: rr.RecordingStream, largest: Iterable[float]) -> None:
-    """Name the curves of the load with their largest values, as a low plot labels only powers of ten."""
+    """Put the largest values into the names of the load curves: a low plot labels only powers of ten."""
     for entity, name, unit, color, value in zip(LOAD, *_LOAD_NAMES, _LOAD_COLORS, largest, strict=True):
         named = f"{name}, to {value:.3g} {unit}" if value else f"{name} [{unit}]"
         _style(stream, entity, named, color, AggregationPolicy.MinMax)

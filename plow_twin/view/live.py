@@ -33,7 +33,7 @@ def follow(
     exaggerate: float | None = None,
     others: Mapping[str, Scene] | None = None,
 ) -> ViewSummary:
-    """Show a recording until its recorder closes it or ends, or `stop` is true; `to_rrd` explains the options.
+    """Show a recording until its recorder closes it or ends, or `stop` returns true; options: `to_rrd`.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Picture of the first seconds of a user's file as the mapping reads it: load, pose and speed."""
+"""Picture of the first seconds of a user's file: load, pose and speed as the mapping reads them."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ _LABEL_ROOM_MM: Final = 50.0
 #: Width of an upright label as a share of its axes.
 _LABEL_WIDTH: Final = 0.015
 _LOAD_NAMES: Final = ("Fx [kN]", "Fy [kN]", "M [kN m]")
-#: Origin of a clearance by its state, in the words of the screen.
+#: Words for the origin of a clearance, by its state; the operator's screen uses the same words.
 _STATES: Final = {
     "prior": "assumed",
     "estimated": "estimated",
@@ -199,10 +199,10 @@ def _curves(
     only_largest: bool = False,
     gaps: Sequence[tuple[float, float]] = (),
 ) -> None:
-    """Draw curves, or for bins the band from the smallest to the largest value, unless `only_largest`.
+    """Draw curves; if the rows are in bins, draw the band from the least to the largest value of each bin.
 
-    `only_largest` is for forces, whose bands would all begin at zero. No line crosses a gap; `gaps` has the ends of
-    each [s].
+    With `only_largest`, only the largest values are drawn; this is for forces, whose bands would all begin at zero. No
+    line crosses a gap; `gaps` contains the beginning and the end of each gap [s].
     """
     axis.set_ylabel(label)
     if not rows:
@@ -220,7 +220,7 @@ def _curves(
 
 
 def _widest(times: NDArray[np.float64], begin: float, end: float) -> int:
-    """Return the index after the longest step of times [s] that overlaps a gap, or the end if no step does."""
+    """Return the index after the longest step [s] overlapping a gap, or `len(times)` if there is none."""
     steps = np.where((times[1:] > begin) & (times[:-1] < end), np.diff(times), 0.0)
     return int(steps.argmax()) + 1 if steps.any() else len(times)
 

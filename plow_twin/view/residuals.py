@@ -15,7 +15,7 @@ _SCALE = 1e3
 
 
 class Residuals:
-    """Compares poses once the model has passed their stamps, interpolating linearly between its rows."""
+    """Compares measured poses with linearly interpolated model rows, once these reach the poses' stamps."""
 
     def __init__(self) -> None:
         self._waiting: list[tuple[int, int, tuple[float, ...]]] = []
@@ -27,7 +27,7 @@ class Residuals:
         Parameters
         ----------
         poses
-            Poses, and their indexes among the entries; `steps` has an element for each entry.
+            Each pose with its index among the journal entries; `steps` has an element for each entry.
         head
             Rows of `head_state`.
         """

@@ -16,7 +16,7 @@ from plow_twin.view.rrd_file import RrdFile
 MOST_ROWS: Final = 200_000
 #: Rate of the cross-section [Hz]; curves keep every row.
 SECTION_HZ: Final = 100.0
-#: Size of a recording per row of its curves [B].
+#: Assumed size of a recording per row of its curves [B], from which the number of rows is estimated.
 _BYTES_PER_ROW: Final = 400
 
 
@@ -25,8 +25,8 @@ class ViewSummary:
     """Content of a .rrd: first stamp, rows of the curves, instants of the cross-section, events.
 
     `status` is how the recording ended. `lost` has the recorder's counts by topic, the counts of missing parts and of
-    parts of another run, and the count of samples too late for other scenes. `failed` advances have no forces. Of the
-    `rows` of the force curves, `curve_rows` were sent.
+    parts of another run, and the count of samples that came too late for other scenes. `failed` is the number of failed
+    advances, which have no forces. `rows` is the number of rows of the force curves, of which `curve_rows` were sent.
     """
 
     path: Path
@@ -66,7 +66,7 @@ def to_rrd(
     others: Mapping[str, Scene] | None = None,
     on_progress: Callable[[float], object] | None = None,
 ) -> ViewSummary:
-    """Write the .rrd of a recording, complete or cut off, with at most some chunks of it in memory.
+    """Write the .rrd of a complete or cut-off recording, with only a few of its chunks in memory at a time.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def to_rrd(
     section_hz
         Rate of the cross-section [Hz].
     exaggerate
-        Factor of the width of the clearance in the second cross-section; None: chosen by the size of the clearance.
+        Factor by which the second cross-section widens the clearance; None: chosen by the size of the clearance.
     most_rows
         Largest number of rows of a curve; the limit for the cross-section is a twentieth of this number. A longer run
         is thinned: a curve keeps the least and the largest value of each span, so that no peak is lost.
@@ -114,6 +114,6 @@ def to_rrd(
 
 
 def _span_ns(reader: RunReader, duration_s: float, most_rows: int) -> int:
-    """Return the span in which a curve keeps two rows [ns]; 0 for a run of few rows."""
+    """Return the span [ns] of which a curve keeps two rows; 0 for a short run, which keeps every row."""
     rows = reader.size() / _BYTES_PER_ROW
     return 0 if rows <= most_rows else max(1, round(2e9 * duration_s / most_rows))

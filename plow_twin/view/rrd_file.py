@@ -13,7 +13,7 @@ import rerun.blueprint as rrb
 
 from plow_twin.errors import RecordingError
 
-#: Largest number of bytes that are copied at once. A pipe holds fewer bytes, so each copy takes all that are waiting.
+#: Largest number of bytes that are copied at once. A pipe holds fewer bytes, so each copy takes all waiting bytes.
 _CHUNK: Final = 1 << 20
 
 
@@ -30,7 +30,7 @@ class RrdFile:
     Raises
     ------
     RecordingError
-        The file cannot be opened. `check` and the end raise it if the file cannot be written.
+        The file cannot be opened. `check` and the end of the context raise this error if the file cannot be written.
     """
 
     def __init__(self, path: Path) -> None:

@@ -30,8 +30,8 @@ _CLEARANCE_COLUMNS: Final = np.array(
 _NS: Final = 1e-9
 #: States of a clearance whose value comes from measurements.
 _KNOWN_STATES: Final = ("estimated", "rough")
-#: Largest number of marks of each kind that are drawn (silent, held and failed stretches, changes); more marks would
-#: cover the picture.
+#: Largest number of marks of each kind that are drawn (silent, held and failed intervals, changes of the clearance);
+#: more marks would cover the picture.
 _MOST_MARKS: Final = 40
 
 
@@ -48,10 +48,10 @@ class Instant(NamedTuple):
 class RunCurves:
     """Largest forces [kN], load [kN, kN m] and clearances [mm] over time, and the instant of the largest force.
 
-    Times [s] count from `first_ns`, the first stamp of a sample or message. `held_s` are the stretches without samples,
-    bridged by the hold policy or by a straight line of the load. `failed_s` are the times of `failed` advances, which
-    have no forces. `changes` are the instants at which the clearance changed for a reason other than wear, with the
-    reason.
+    Times [s] count from `first_ns`, the first stamp of a sample or message. `held_s` contains the intervals without
+    samples, which the hold policy or a straight line of the load bridges. `failed_s` contains the intervals of failed
+    advances, which have no forces; `failed` is the number of these advances. `changes` contains each instant at which
+    the clearance changed for a reason other than wear, with the reason.
     """
 
     first_ns: int | None = None
@@ -103,7 +103,7 @@ class RunCurves:
 
     @property
     def instant_s(self) -> float | None:
-        """Time of the instant [s]."""
+        """Time of the instant of the largest force [s]; None if there is no such instant."""
         return None if self.instant is None else (self.instant.stamp_ns - (self.first_ns or 0)) * _NS
 
     def __bool__(self) -> bool:
@@ -175,7 +175,7 @@ class RunCurves:
             self._break_lines()
 
     def _failed(self, stamp_ns: int, since_ns: int, advances: int) -> None:
-        """Add the first failed advance of a series, or at the series' end, all other advances."""
+        """Add the first failed advance of a series or, when the series ends, all its other advances."""
         first = self.first_ns or 0
         self.failed += advances
         if stamp_ns == since_ns:

@@ -1,4 +1,4 @@
-"""Drops of a square block: fit of the first flight, and bands of the later motion from a batch of blocks."""
+"""Drops of a square block: a fit of the first flight, and bands of the later motion from random motions."""
 
 from __future__ import annotations
 
@@ -18,11 +18,12 @@ Array = NDArray[np.float64]
 #: Rate of the measured rows in Hz.
 RATE_HZ: Final = 250.0
 _DT: Final = 1.0 / RATE_HZ
-#: Number of steps in the table of damping numbers.
+#: Number of equal steps of restitution from 0 to 1 in the table of `damping_numbers`.
 _NUMBERS: Final = 1000
 #: Number of touches of one motion for which scatter is drawn; later touches have the scatter of the last of them.
 _TOUCHES: Final = 64
-#: If a row's angle differs from the extrapolated angle by more than this [rad], there was an impact.
+#: An impact is assumed if a row's angle differs by more than this [rad] from the angle extrapolated from the three rows
+#: before it.
 _TURN_IN_A_ROW: Final = 0.1
 #: Smallest number of rows of a first flight; the speeds of the drop are fitted to them.
 LEAST_ROWS: Final = 4
@@ -40,8 +41,8 @@ SQUARE: Final = np.array(
 class Marker:
     """The tracked frame on the block, whose pose the sensor measures.
 
-    In 242 of 250 drops the block lies flat at rest, but its tracked angle is 33 mrad less. The tracked height at rest
-    depends on the side on which the block lies.
+    In 242 of 250 drops the block lies flat at rest, but its tracked angle is 33 mrad below the angle of a flat block.
+    The tracked height at rest depends on the side on which the block lies.
 
     Attributes
     ----------
@@ -83,12 +84,12 @@ MARKER: Final = Marker(-0.0308, (2.3e-4, 5.2e-4))
 
 @dataclass(frozen=True)
 class Scatter:
-    """Scatter in addition to the parameters, as standard deviations.
+    """Standard deviations of the scatter about the parameters, the fitted speeds and the measured rows.
 
     Attributes
     ----------
     restitution, friction : float
-        Scatter of the restitution of each touch [1], and of the logarithm of its friction.
+        Scatter from touch to touch of the restitution [1], and of the logarithm of the friction.
     table, spin : float
         Scatter of the table's height from drop to drop [m], and of the fitted rate of turning [rad/s].
     speed : float
@@ -117,7 +118,7 @@ SCATTER: Final = Scatter()
 
 @cache
 def damping_numbers() -> Array:
-    """Return D of `exact_restitution` for restitutions from 0 to 1, shape (1001,)."""
+    """Return damping numbers D of `exact_restitution` for restitutions from 0 to 1, shape (1001,)."""
     law = LAWS["exact_restitution"]
     return np.array([law.damping_number(i / _NUMBERS) for i in range(_NUMBERS + 1)])
 
@@ -158,7 +159,7 @@ class Flight:
     covariance : ndarray, shape (3, 2, 2)
         Covariance of place and rate at the last row, for each of x, z, theta.
     times : ndarray, shape (k,)
-        Times of the rows relative to the last row in s; lost rows are taken into account.
+        Times of the rows relative to the last row in s; a lost row adds one interval.
     """
 
     state: Array
@@ -174,9 +175,9 @@ def fit_flight(first_flight: ArrayLike, block: NDArray[np.void] = SQUARE, scatte
     first_flight : array_like, shape (k, 3)
         Rows of x, z [m] and theta [rad] before the first impact.
     block : ndarray of BLOCK, shape ()
-        Only gravity and drag are used.
+        Parameters of the block; only gravity and drag are used.
     scatter : Scatter
-        Errors of a measured row.
+        Standard deviations; only the errors of a measured row (`place`, `angle`) are used.
 
     Raises
     ------
@@ -212,7 +213,7 @@ def fit_flight(first_flight: ArrayLike, block: NDArray[np.void] = SQUARE, scatte
 
 
 def _leaves_flight(rows: Array) -> bool:
-    """Return whether the last row is after an impact, because the rate of turning has changed or the block rises."""
+    """Return whether the last row follows an impact: it turns differently, or rises after a fall."""
     t = np.arange(-3.0, 1.0)
     turn = float(np.polyval(np.polyfit(t[:3], rows[-4:-1, 2], 1), t[3]))
     return bool(
@@ -221,7 +222,7 @@ def _leaves_flight(rows: Array) -> bool:
 
 
 def _row_times(rows: Array, gravity: float) -> Array:
-    """Return the times of the rows in s, 0 at the last row. A doubled distance between two rows means a lost row."""
+    """Return the row times in s, 0 at the last row; a doubled row distance is taken for a lost row."""
     way = np.hypot(*np.diff(rows[:, :2], axis=0).T)
     steps = np.ones(len(way))
     for _ in range(3):
@@ -251,7 +252,7 @@ def _fit_line(way: Array, values: Array, noise: float) -> tuple[Array, Array]:
 def draw(
     flight: Flight, members: int, seed: int, block: NDArray[np.void], scatter: Scatter
 ) -> tuple[Array, NDArray[np.void], Array]:
-    """Draw initial states (m, 6), blocks (m,) and the scatter of their touches (m, touches, 3)."""
+    """Return randomly drawn initial states (m, 6), blocks (m,) and scatter of touches (m, touches, 3)."""
     rng = np.random.default_rng(seed)
     states = np.tile(flight.state, (members, 1))
     for j, more in enumerate((scatter.speed, scatter.speed, scatter.spin)):
@@ -274,7 +275,7 @@ def ensemble(
     scatter: Scatter = SCATTER,
     marker: Marker = MARKER,
 ) -> Array:
-    """Return motions compatible with the first flight, shape (members, n_rows, 3): x, z, theta as measured.
+    """Return random marker motions x, z, theta that fit the first flight, shape (members, n_rows, 3).
 
     Parameters
     ----------
@@ -313,7 +314,7 @@ def ensemble(
 
 
 def bands(first_flight: ArrayLike, n_rows: int) -> Array:
-    """Return 90 % bands of a drop of the square from its first flight.
+    """Return the 90 % bands of a drop of the square block, predicted from its first flight.
 
     Parameters
     ----------

@@ -28,7 +28,8 @@ _COUNTS: Final = ("makes", "events", "steps")
 def write_parquet(table: Table, path: Path) -> None:
     """Write one row for each member: parameters, status (0 if done), status in words, and statistics.
 
-    The metadata under `plow_twin` is JSON with the arguments (the scene as YAML), units, package version and builds.
+    The file's metadata has the key `plow_twin`, whose value is JSON with the arguments (the scene as YAML), units,
+    package version and builds.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -130,7 +131,7 @@ def _places(axis: Axis) -> np.ndarray[Any, np.dtype[np.float64]]:
 
 
 def _edges(axis: Axis) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Return the borders of the cells, halfway between the values (between their logarithms on a log axis)."""
+    """Return the cell borders of a heat map, halfway between values (between logarithms on a log axis)."""
     places = np.log(_places(axis)) if axis.log else _places(axis)
     if len(places) == 1:
         half = 0.5 * abs(places[0]) or 0.5

@@ -1,4 +1,4 @@
-"""Computation of the missing chunks in a sweep's folder, on this machine or on a Dask cluster, by the same code."""
+"""Computation of the missing chunks of a sweep, by the same code on this machine and a Dask cluster."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from plow_twin.study.statistics import statistic, statistics_of
 
 Array = NDArray[np.float64]
 
-#: Status of a member whose values no scene can have.
+#: Status of a member whose parameter values make the scene unusable.
 UNUSABLE: Final = -1
 #: Largest number of members of a sweep; the number is limited, because the table and the list of chunks are kept in
 #: memory.
@@ -113,19 +113,19 @@ class Sweep:
         return math.prod(self.shape)
 
     def values(self, member: int) -> dict[str, Value]:
-        """Return the parameters of a member."""
+        """Return the parameter values of a member by path."""
         places = np.unravel_index(member, self.shape)
         return {axis.path: axis.values[int(place)] for axis, place in zip(self.axes, places, strict=True)}
 
     def arguments(self) -> dict[str, Any]:
-        """Return all inputs of the result as plain data for JSON."""
+        """Return everything that determines the sweep's result, as plain data for JSON."""
         plain: dict[str, Any] = json.loads(json.dumps(asdict(self)))
         return plain
 
 
 @dataclass(frozen=True)
 class Table:
-    """Results of a sweep: one row for each member, in order.
+    """Results of a sweep: one row for each member, in the order of the members.
 
     Attributes
     ----------
@@ -164,7 +164,8 @@ def run_members_of(
 ) -> Array:
     """Compute the members with these indices; return status and statistics, shape (k, 1 + statistics).
 
-    A member has the same bits in any chunk, in any thread, and on any machine of the same build.
+    The results of a member are identical bit for bit in any chunk, in any thread, and on any machine with the same
+    build.
     """
     scene = replace(sweep.scene(), marks={})
     table = np.full((len(members), 1 + len(sweep.statistics)), np.nan)

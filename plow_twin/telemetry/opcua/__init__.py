@@ -1,1 +1,1 @@
-"""Results as an OPC UA server: a device type of the mining model, and alarms as conditions."""
+"""Results as an OPC UA server: a device type based on OPC UA's mining model, and alarms as conditions."""

@@ -45,19 +45,19 @@ class Conditions:
     Parameters
     ----------
     server, model
-        A server and its model.
+        The OPC UA server, and its information model.
     """
 
     def __init__(self, server: Server, model: Model) -> None:
         self._server, self._model = server, model
-        #: asks the twin to acknowledge its alarms, and returns whether the request was passed on; None if acknowledging
-        #: is not allowed
+        #: function that asks the twin to acknowledge its alarms and returns whether the request was passed on; None if
+        #: acknowledging is not allowed
         self.acknowledge: Callable[[], bool] | None = None
         self._conditions: dict[str, Condition] = {}
         self._values: Mapping[str, Value] = {}
 
     async def build(self, names: Mapping[str, list[float]]) -> None:
-        """Make a condition for each alarm that has thresholds (warning and error), by its name."""
+        """Make a condition for each alarm; `names` maps its name to its thresholds (warning, error)."""
         alarms = self._server.get_node(self._model.nodes["alarms/message"])
         folder = await alarms.get_parent()
         assert folder is not None
@@ -86,13 +86,13 @@ class Conditions:
         self._server.link_method(self._server.get_node(general), self._called)
 
     async def update(self, alarms: Group) -> None:
-        """Update the alarms, and send an event for each that has changed."""
+        """Update the alarms, and send an event for each alarm that has changed."""
         self._values = values = alarms.values
         for name, condition in self._conditions.items():
             before = condition.level, condition.acknowledged
             condition.level = str(values[f"{name}_level"] or "none")
             raised = values[f"{name}_time"]
-            # the new time is None if no alarm is latched; then there is nothing to acknowledge
+            # `raised` is None if the alarm is not latched; then there is nothing to acknowledge
             if raised != condition.raised:
                 condition.raised, condition.acknowledged = raised, raised is None
             if (condition.level, condition.acknowledged) != before:
@@ -111,7 +111,7 @@ class Conditions:
         await condition.events.trigger(datetime.now(UTC), message=f"{name} {values[name]}{place}, {condition.level}")
 
     async def _called(self, parent: ua.NodeId, *arguments: ua.Variant) -> ua.StatusCode:
-        """Acknowledge: the method of a condition; its arguments are the identifier of an event and a comment."""
+        """Carry out a condition's method Acknowledge, called with an event's identifier and a comment."""
         if len(arguments) != 2:
             missing = len(arguments) < 2
             return ua.StatusCode(StatusCodes.BadArgumentsMissing if missing else StatusCodes.BadTooManyArguments)

@@ -17,11 +17,12 @@ from plow_twin.telemetry.values import UNITS, Group
 #: Namespace of the types and the instance.
 NAMESPACE: Final = "https://plow-twin.readthedocs.io/opcua"
 _NODESETS: Final = Path(__file__).with_name("nodesets")
-#: The files are listed so that each depends only on earlier files.
+#: Nodeset files, in an order in which each file depends only on earlier files.
 _FILES: Final = ("Opc.Ua.Di", "Opc.Ua.Machinery", "Opc.Ua.Mining.General")
 _DI, _MINING = "http://opcfoundation.org/UA/DI/", "http://opcfoundation.org/UA/Mining/General/"
 _FUNCTIONAL_GROUP, _DEVICE_SET, _EQUIPMENT, _IDENTIFICATION = 1005, 5001, 1002, 1003
-#: Units by their numbers in OPC UA (UN/CEFACT, three characters as one number).
+#: UN/CEFACT code and name of each unit; OPC UA identifies a unit by the three characters of its code, read as one
+#: number.
 _UNITS: Final = {"m": ("MTR", "metre"), "N": ("NEW", "newton")}
 _POINTS: Final = ("p05", "p95")
 _TYPE: Final = "PloughHeadTwinType"
@@ -45,7 +46,7 @@ class Model:
         self.device: Node
 
     async def build(self, groups: Mapping[str, Group], facts: Mapping[str, Any]) -> None:
-        """Make the types and the instance for groups that have all of their names."""
+        """Make the types and the instance; each of the `groups` must already have all of its names."""
         for name in _FILES:
             await self._server.import_xml(str(_NODESETS / f"{name}.NodeSet2.xml"))
         self._index = await self._server.register_namespace(NAMESPACE)
@@ -76,7 +77,7 @@ class Model:
         return ua.QualifiedName(text, self._index)
 
     async def _interval_type(self) -> Node:
-        """Return a type of variable in a unit with its 5 % and 95 % points."""
+        """Return a variable type whose value has a unit and also 5 % and 95 % points."""
         analog = self._server.get_node(ua.NodeId(ObjectIds.AnalogUnitType))
         made = await analog.add_variable_type(
             self.node_id("IntervalType"), self._name("IntervalType"), ua.NodeId(ObjectIds.Double)

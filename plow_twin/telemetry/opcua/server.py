@@ -32,13 +32,13 @@ _POLICIES: Final = [
 ]
 #: Status of an unknown number.
 _UNKNOWN: Final = ua.StatusCode(StatusCodes.BadWaitingForInitialData)
-#: Status of a number computed without samples.
+#: Status of a number computed while the load had no new samples.
 _HELD: Final = ua.StatusCode(StatusCodes.UncertainLastUsableValue)
 _GOOD: Final = ua.StatusCode()
 
 
 class OneUser(UserManager):
-    """Admits one user or, without a user, every client that may connect."""
+    """Admits the one named user or, if no user is named, every client that may connect."""
 
     def __init__(self, user: str, password: str) -> None:
         self._user, self._password = user, password
@@ -64,7 +64,7 @@ class OpcUaServer:
     trusted
         Folder with certificates of the admitted clients or of their authorities; None: all clients.
     user, password
-        The only user; empty: clients need no name.
+        Name and password of the only user; if they are empty, clients need no login.
     acknowledges
         Whether alarms may be acknowledged.
     """
