@@ -24,14 +24,15 @@ FAINT_N: Final = 500.0
 #: Distance of the body's drawn outline from the cavity [mm]; a scene states no outline.
 BODY_MARGIN_MM: Final = 60.0
 
-#: Drawn depth of a pad per depth of its wear [mm/mm].
+#: Depth at which a pad is drawn per depth of its wear [mm/mm].
 PAD_MM_PER_MM: Final = 200.0
 #: Drawn length of a pad [mm].
 _PAD_MM: Final = 60.0
 #: Distance of a label below its place [mm].
 LABEL_MM: Final = 16.0
 
-#: One hue for each corner; the pair with the vertical wall has a lighter colour (Okabe and Ito's palette).
+#: Hues of the corners; of a corner's two pairs, the pair that touches a vertical wall has the lighter colour (Okabe and
+#: Ito's palette).
 _HUES: Final = ((0, 114, 178), (230, 159, 0), (213, 94, 0), (0, 158, 115))
 _LIGHTER: Final = ((86, 180, 233), (240, 228, 66), (255, 158, 105), (110, 220, 185))
 PAIR_COLORS: Final = tuple(color for pair in zip(_HUES, _LIGHTER, strict=True) for color in pair)
@@ -45,7 +46,7 @@ _OUTWARDS: Final[Array] = np.stack((NORMAL_X, NORMAL_Y), axis=1)
 
 @dataclass(frozen=True)
 class Section:
-    """Sizes [mm] that are constant in a run.
+    """Sizes of the cross-section [mm], which are constant in a run.
 
     A head that carries walls is drawn as the cavity that moves about the frame; a head that carries corners is drawn as
     the block that moves in the cavity.
@@ -84,7 +85,8 @@ class Section:
     def corners(self, pose: Iterable[float] = (0.0, 0.0, 0.0)) -> Array:
         """Corners of the frame, or of a block at a pose, in the order of `CORNER_NAMES`, shape (4, 2).
 
-        A block's corners are named by their place, so beyond 45 degrees each corner has another name.
+        The corners of a block are named by their place, so their names change when the block has turned beyond 45
+        degrees.
         """
         # distance along each axis from the point where the sides would meet to the middle of the corner's arc
         within = self.radius * (1.0 - math.sqrt(0.5))
@@ -109,8 +111,8 @@ class Section:
     def exaggerated(self, penetration: Array, factor: float) -> tuple[Array, NDArray[np.bool_]]:
         """Return the four walls with gaps `factor` times as wide, shape (4, 2, 2), and which of them touch.
 
-        Walls in the order top, right, bottom, left. Each wall passes through its two points at the frame's corners,
-        wear included, and ends at the next wall.
+        The order of the walls is top, right, bottom, left. Each wall passes through two points at the frame's corners,
+        where it is displaced by the pad's wear, and ends at the next wall.
         """
         places = (0.5 * self.frame * _SIGNS - _OUTWARDS * (_MM * factor * penetration)[:, None]) * _FLIP
         walls = np.array([(0, 2), (3, 5), (4, 6), (7, 1)])

@@ -19,7 +19,7 @@ import rerun.blueprint as rrb
 from plow_twin.errors import RecordingError
 
 LOOPBACK: Final = "127.0.0.1"
-#: Memory limit of the viewer, and of its server; above it the oldest data are dropped.
+#: Memory limit of the viewer and of its server; above this limit they drop the oldest data.
 _MEMORY: Final = "2GB"
 _START_S: Final = 60.0
 

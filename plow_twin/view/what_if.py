@@ -19,12 +19,12 @@ from plow_twin.view.columns import Array, Curves, Indexes, TimeAxis
 
 
 class WhatIf:
-    """Passes the journal of a run through other scenes, by name, and draws their forces; idle without scenes.
+    """Runs other scenes, each with a name, under the journal of a run, and draws their forces; idle without scenes.
 
     Raises
     ------
     RecordingError
-        The run was under the loads of its scene, so its journal has no load.
+        The run was under the loads of its own scene, so its journal contains no load that another scene could take.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class WhatIf:
 
     @property
     def lost(self) -> dict[str, int]:
-        """Number of samples that came after the scenes had passed their stamps, under its key in `lost`."""
+        """Number of samples too late for the other scenes, by their key in `lost`."""
         return {"samples_too_late": self._walk.late} if self._walk.late else {}
 
     def add(self, entries: Entries, stamps: Indexes, steps: Indexes) -> None:

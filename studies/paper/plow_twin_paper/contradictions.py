@@ -17,7 +17,7 @@ from plow_twin_paper.values import FACE_T_END_S, MOMENTS, OMEGA_RAD_S, SENSE_NAM
 
 @dataclass(frozen=True)
 class Contradiction:
-    """A place in the paper, its statement, and the number that bears on it."""
+    """A contradiction: its place in the paper, the paper's statement, and the number that decides about it."""
 
     source: str
     statement: str

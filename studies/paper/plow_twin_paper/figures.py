@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure on disk, its heading, what it shows, and what the paper's figure shows by the paper's text."""
+    """A picture file with its heading, a description, and the paper's description of the corresponding figure."""
 
     path: Path
     heading: str
@@ -97,7 +97,7 @@ def _plans(runs: PaperRuns) -> list[tuple[str, str, str, str, Callable[[], Figur
 
 
 def _falls(runs: PaperRuns) -> str:
-    """Describe how far each curve of Fig. 11 falls below its earlier maximum, including between the marks."""
+    """Describe how far each curve of Fig. 11 falls below its earlier maximum, also between the five computed places."""
     forces = runs.horizontal.largest_n
     falls = np.max(np.maximum.accumulate(forces, axis=0) - forces, axis=0)
     listed = ", ".join(f"{corner} {1e-3 * fall:.1f}" for corner, fall in zip(CORNERS, falls, strict=True))

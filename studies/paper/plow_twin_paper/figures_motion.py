@@ -90,7 +90,7 @@ def fig09(runs: PaperRuns) -> Figure:
 
 
 def _close_up(runs: PaperRuns, sense: Sense) -> Figure:
-    """Forces of one sense over one period around the quoted times; below, when each point carries force."""
+    """Forces of one sense over a period around the quoted times; below, the times at which each point carries force."""
     times = {moment: shown_time(moment.time_s, runs.t_end) for moment in MOMENTS if moment.sense == sense}
     # a shorter run may end before some of the quoted times, so all times are moved back by the same amount
     back = max(moment.time_s - time for moment, time in times.items())

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 #: Interval of the samples [s].
 SAMPLE_S: Final = 1e-3
-#: A message is written at every n-th sample. Its peaks cover all samples since the message before.
+#: A message is written at every n-th sample. Its peaks cover all samples since the previous message.
 MESSAGE_EVERY: Final = 4
 _CHUNK_B: Final = 256 * 1024
 _MIN_FREE_B: Final = 64 * 1024 * 1024

@@ -18,13 +18,13 @@ from plow_twin.run.simulate import Result, simulate
 from plow_twin_paper import sets as paper_sets
 from plow_twin_paper.values import CORNERS, SENSE_NAMES
 
-#: Distance [m] above which two motions count as separated.
+#: Distance between two motions [m] above which they count as separated.
 PARTED_M = 1e-3
 
 
 @dataclass(frozen=True)
 class Rotation:
-    """Three runs: constant moment, exact with I about the centre of mass, exact with I about the cavity's centre."""
+    """Three runs: constant moment; exact, with I about the centre of mass; exact, with I about the cavity's centre."""
 
     scenes: tuple[Scene, Scene, Scene]
     results: tuple[Result, Result, Result]

@@ -39,7 +39,7 @@ class Row:
     verdict, criterion
         Whether the values agree, and the rule that decides this.
     inputs : str
-        Whether the scene's fitted numbers were fitted to this very statement.
+        Whether the scene's fitted numbers were fitted to this statement (`FITTED`) or not (`CHECK`).
     published_value, value : float, optional
         Both values as numbers in `unit`, for numeric statements.
     """

@@ -41,7 +41,7 @@ def rises(values: Array) -> bool:
 
 
 def rises_then_falls(values: Array) -> bool:
-    """Return whether a curve rises to a value inside its range and falls from there on, with the same slack."""
+    """Return whether a curve rises to an inner value and then falls; steps against the trend as in `rises`."""
     slack, top = TREND_SLACK * float(values.max()), int(values.argmax())
     if not 0 < top < len(values) - 1:
         return False
@@ -89,9 +89,10 @@ def _trend(group: str, source: str, what: str, values: Array, at: str, falls: bo
 def longest_faces(runs: PaperRuns, mark: FaceMark, since_s: float = 0.0) -> tuple[float, float] | None:
     """Return start and length in s of the longest time with the mark's number of faces in contact in its sense, if any.
 
-    The search goes from `since_s` to the end of the section's 20 s.
+    The search goes from `since_s` to the end of the 20 s of the paper's section 5.
 
-    A corner has one pair in each sense, each with another wall, so that the numbers of points and of faces are equal.
+    In each sense a corner has one pair, and the pairs of different corners touch different faces, so the numbers of
+    points and of faces in contact are equal.
     """
     chosen = paper_sets.of_sense(mark.sense)
     faces = [face for pair, face in enumerate(face_of_pair()) if chosen[pair]]

@@ -38,7 +38,7 @@ SHORTEST_S: Final = 2.0 * PERIOD_S
 LONGEST_S: Final = 1000.0
 #: Interval of the rows in figures [s]. Forces change over tens of milliseconds, so the rows show every change.
 OUTPUT_DT_S: Final = 1e-3
-#: The paper's curves are read at five places. Between two neighbouring places a curve is computed in this many steps.
+#: The paper's curves are read at five places. Between two neighbouring places a curve is computed at this many steps.
 _FINE_STEPS: Final = 10
 
 
@@ -73,7 +73,7 @@ class FaceRun:
 
 @dataclass(frozen=True)
 class PaperRuns:
-    """All runs, and what they were computed from.
+    """All runs, with the scene and the settings from which they were computed.
 
     `scale` is the ratio of the scene's clearances (horizontal, vertical) to the published clearances. `failed` counts
     the runs that could not be completed; the case itself is always complete.
@@ -115,7 +115,8 @@ def run_all(scene: Scene, t_end: float, workers: int | None = None, on_progress:
     Parameters
     ----------
     scene : Scene
-        Scene at the clearance of the paper's Figs 6 to 9 in any convention; the other clearances are scaled alike.
+        Scene with the clearance of the paper's Figs 6 to 9, measured by any convention; the other clearances are scaled
+        in proportion.
     t_end : float
         End of the runs in s, at least `SHORTEST_S`; the runs of section 5 end at 20 s, or at `t_end` if it is smaller.
     workers, on_progress

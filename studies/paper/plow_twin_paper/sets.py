@@ -20,7 +20,7 @@ _CARRIES = 1
 
 @dataclass(frozen=True)
 class Hold:
-    """A set of corners, e.g. `abd`, that carries force unchanged from `start_s` to `end_s`; "" is the empty set."""
+    """A time from `start_s` to `end_s` in which the same corners carry force, e.g. `abd`; "" if no corner does."""
 
     start_s: float
     end_s: float

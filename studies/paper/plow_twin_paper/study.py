@@ -28,7 +28,7 @@ FORMS = ("constant moment", "exact, I about the centre of mass", "exact, I about
 
 @dataclass(frozen=True)
 class Change:
-    """A statement that has another verdict with another form of the head's rotation."""
+    """A statement whose verdict changes with another form of the head's rotation."""
 
     form: str
     row: Row
@@ -141,7 +141,7 @@ def _changes(runs: PaperRuns) -> list[Change]:
 
 
 def row_as_plain(row: Row) -> dict[str, Any]:
-    """Return a row as in JSON and CSV; the difference is a share, and published values are `given`."""
+    """Return a row for JSON and CSV; the difference is a share, and published values have the mark `given`."""
     return asdict(row) | {
         "difference": row.difference,
         "verdict": row.verdict.value,

@@ -1,8 +1,8 @@
-"""The paper's published values, as data with their place in the text; every number here is `given`.
+"""The paper's published values with their place in the text; in the terms of scenes their mark is `given`.
 
 Source: Mao, Zhang et al., "Dynamic characteristics of plough head under contact-impact with clearances", J. Vibration
-and Shock 34(19), 2015. Its curves are known only from its text, so places are sections and figures. The criteria of
-agreement at the end are ours.
+and Shock 34(19), 2015. Only the text describes its curves, so the places are sections and figures. The criteria of
+agreement at the end are this project's.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ FACES: Final = ("top", "right", "bottom", "left")
 
 #: Clearance of Figs 6 to 9 (section 3): horizontal, vertical [m].
 CASE_M: Final = (0.025, 0.030)
-#: In Figs 10 and 11 (section 4), the clearance that is fixed [m].
+#: In Figs 10 and 11 (section 4), one clearance is fixed at this value [m].
 FIXED_M: Final = 0.020
 #: In Figs 10 and 11, the five values of the other clearance [m].
 GRID_M: Final = (0.020, 0.0225, 0.025, 0.0275, 0.030)
@@ -34,7 +34,7 @@ PERIOD_S: Final = 2.0 * math.pi / OMEGA_RAD_S
 
 @dataclass(frozen=True)
 class Force:
-    """A published force. It is the largest of its kind over the four points, so it also states at which point."""
+    """A published force: the largest of its kind over the four points, and the point at which it occurs."""
 
     sense: Sense
     statistic: Literal["max", "mean_in_contact"]
