@@ -1,4 +1,4 @@
-"""Contact forces with intervals, from twins drawn from an estimate and advanced together under the believed load.
+"""Contact forces with intervals, from twins whose parameters are drawn from an estimate and that run together.
 
 Each member has its own clearances, contact parameters and load gains, drawn from the estimate with their correlation.
 The quantiles over the members are the interval. After some load periods the members have forgotten their initial
@@ -29,9 +29,9 @@ Array = NDArray[np.float64]
 MEMBERS: Final = 256
 #: Definition: quantiles at which an interval has its ends and its middle.
 POINTS: Final = (0.05, 0.5, 0.95)
-#: Derived: smallest number of members of which one member is 5 %; fewer members have no 5 % point.
+#: Derived: smallest number of members for which one member is 5 % of all; with fewer members there is no 5 % point.
 FEWEST: Final = 20
-#: Guard: smallest drawn clearance, as a share of the estimated clearance.
+#: Guard: smallest clearance that a member may have, as a share of the estimated clearance.
 _LEAST_SHARE = 0.02
 #: Derived: tolerance of the members, equal to the fit's.
 TOLERANCE: Final = tuning.TOLERANCE
@@ -45,7 +45,7 @@ class ForcesError(PlowTwinError):
 
 @dataclass(frozen=True, eq=False)
 class Forces:
-    """Quantiles over the members, in the order of `POINTS`.
+    """Quantiles of the forces over the members, in the order of `POINTS`.
 
     start : time in s at which peaks and impulses begin
     t : (n,) in s
@@ -81,7 +81,7 @@ class Forces:
 
 
 class ForceEnsemble:
-    """Twins drawn from an estimate, advanced sample by sample.
+    """Twins whose parameters are drawn from an estimate, and which are advanced together, sample by sample.
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ class ForceEnsemble:
     def advance(self, t: Array, wrench: Array, *, over_time: bool = True) -> Forces:
         """Advance all members through samples of the believed load; `t` (n,) in s, `wrench` (n, 3).
 
-        Without `over_time` the forces at each sample stay 0; computing them doubles the cost.
+        Without `over_time` the forces at each sample are not computed and stay 0; computing them doubles the cost.
 
         Raises
         ------
@@ -208,7 +208,7 @@ def draw_biases(found: Estimate, members: int, rng: np.random.Generator) -> Arra
 
 
 def amplitudes_of(found: Estimate, members: int, rng: np.random.Generator) -> Array:
-    """Return amplitudes of the load's harmonics drawn from an estimate, shape (m, k, 3), and without error first."""
+    """Return amplitudes of the load's harmonics drawn from an estimate, (m, k, 3); the first member's have no error."""
     harmonics = found.load_harmonics
     return np.zeros((members, 0, 3)) if harmonics is None else harmonics.drawn(members, rng)
 
@@ -222,7 +222,7 @@ def loads_of(t: Array, wrench: Array, gain: Array, harmonics: Harmonics | None, 
 
 
 def _normal(value: Interval, white: Array) -> Array:
-    """Return two-piece normal numbers with the 5 % and 95 % points of the interval."""
+    """Return random numbers whose 5 % and 95 % points are those of the interval, from normal numbers `white`."""
     below, above = (value.mean - value.p05) / NORMAL_P95, (value.p95 - value.mean) / NORMAL_P95
     return value.mean + np.where(white < 0.0, below, above) * white
 

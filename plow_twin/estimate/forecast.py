@@ -27,13 +27,13 @@ Array = NDArray[np.float64]
 
 #: Definition: number of seconds in an hour.
 HOUR_S = 3600.0
-#: Guard: a drawn clearance is smaller than the present clearance by at most this share of the present clearance.
+#: Guard: a randomly drawn clearance is smaller than the estimated present clearance by at most this share of it.
 _LEAST_SHARE = 0.9
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """Another load and wear coefficient, as multiples of the expected ones."""
+    """Another load and another wear coefficient, as multiples of the expected load and coefficient."""
 
     name: str
     load: float = 1.0
@@ -119,7 +119,7 @@ class Forecast:
     scenarios: dict[str, Forecast] = field(default_factory=dict)
 
     def quantile(self, share: float) -> float | None:
-        """Return the hours by which the limit is reached with this probability; None beyond the horizon."""
+        """Return the hours after which the limit is reached with probability `share`; None if beyond the horizon."""
         value = float(np.sort(self.hours)[min(int(share * len(self.hours)), len(self.hours) - 1)])
         return value if math.isfinite(value) else None
 
@@ -130,7 +130,7 @@ class Forecast:
     def clearances(self, hours: Array) -> Array:
         """Return P10, P50 and P90 of both clearances in m after some hours, shape (3, n, 2).
 
-        They are infinite beyond the end of the path, where a limit has been reached.
+        They are infinite after the end of the path, because a limit has been reached there.
         """
         grown = self.path.clearance_growth()
         exposure = np.multiply.outer(self.rate, hours)
@@ -223,7 +223,7 @@ def _forecast(
         coefficient, load = known.draw(plan.draws, rng), 1.0 + tuning.PATH_DEVIATION * rng.standard_normal(plan.draws)
     coefficient = coefficient * multiple
     size = np.array([scene.clearance.horizontal_m, scene.clearance.vertical_m])
-    # a drawn clearance stays above zero, even if the clearance is hardly known
+    # a randomly drawn clearance stays above zero, even if the clearance is hardly known
     now = np.maximum(rng.normal(0.0, 1.0, (plan.draws, 2)) * deviation_m, -_LEAST_SHARE * size)
     most = float(coefficient.max() * load.max()) * travel / wear.pad_area_m2
     # a smaller present clearance is further from its limit, so the path must be longer
@@ -244,7 +244,7 @@ def _forecast(
 
 
 def check_prior(wear: Wear) -> None:
-    """Raise LifeError if the coefficient lies outside its prior, from which a forecast without a history draws."""
+    """Raise LifeError if the scene's coefficient lies outside its prior, from which forecasts draw coefficients."""
     low, high = wear.prior_m2_n
     if not low <= wear.coefficient_m2_n <= high:
         raise LifeError(

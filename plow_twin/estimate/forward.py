@@ -30,7 +30,7 @@ _IMPLICIT_WORK = 10
 
 @dataclass(frozen=True, eq=False)
 class Motions:
-    """Poses and rates of all rows, shape (n, 3) each, and the time in contact of each pair and run in s, (s, 8)."""
+    """Poses and rates of all rows, shape (n, 3) each, and contact times of each run and pair in s, shape (s, 8)."""
 
     q: Array
     v: Array
@@ -75,15 +75,15 @@ class Forward:
         self.work = 0
 
     def renewed(self) -> Forward:
-        """Return a copy with a work of zero."""
+        """Return a copy whose counter of work is zero."""
         return Forward(self._scene, self.load)
 
     def of(self, scene: Scene) -> Forward:
-        """Return a model of another nominal scene under the same load, with a work of zero."""
+        """Return a model of another nominal scene under the same load; its counter of work is zero."""
         return Forward(scene, self.load)
 
     def under(self, load: Load) -> Forward:
-        """Return a model of the same nominal scene under another load, with a work of zero."""
+        """Return a model of the same nominal scene under another load; its counter of work is zero."""
         return Forward(self._scene, load)
 
     def run(
@@ -135,14 +135,14 @@ class Forward:
     def _compiled(
         self, scene: Scene, gain: Array, depth: Array | None, push: Array | None, share: Array | None
     ) -> tuple[Any, Any]:
-        """Return parameters, cached because successive runs often share them, and segments of the load."""
+        """Return the parameters, which are cached because successive runs often share them, and the load's segments."""
         walls = tuple(None if part is None else part.tobytes() for part in (depth, share))
         if self._params is None or self._params[:2] != (scene, walls):
             params = compile_scene(scene, tuning.TOLERANCE, sampled=True).params
             if depth is not None:
                 params["penetration_rows"][4] -= depth
             if share is not None:
-                # scaling the penetration of a linear contact scales its stiffness
+                # in a linear contact, scaling the penetration has the same effect as scaling the stiffness
                 params["penetration_rows"][:] *= share
             self._params = scene, walls, params
         inertia = inertias(scene)

@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 
 #: Guard: a number above this is not a gap [m].
 _LARGEST = 1e3
-#: Bound: number of rounds, each of which corrects the pose by the nonlinear residual.
+#: Bound: number of rounds; in each round the residual of the nonlinear equations corrects the pose.
 _ROUNDS = 4
 #: Guard: singular value of the equations below which the sensors do not determine an unknown.
 _SINGULAR = 1e-6
@@ -93,7 +93,7 @@ class GapsFit:
 
 
 def fit_gaps(scene: Scene, gaps: Gaps, poses: Poses) -> GapsFit | str:
-    """Fit clearances and poses to gaps, with theta from `poses` if the gaps do not determine it.
+    """Fit clearances and poses to gaps; theta is taken from `poses` if the gaps do not determine it.
 
     Of messages with different sensors, the most frequent set of enough sensors is used. If no such set has 20 messages,
     the reason why the most frequent set is not used is returned.
@@ -131,7 +131,7 @@ def _fit_one_set(
 ) -> GapsFit | str:
     """Fit the messages of one set of sensors; `gap`, shape (n, k), holds the gaps of the pairs `pairs`, shape (k,).
 
-    If they do not determine the clearances, the reason is returned.
+    If these pairs do not determine the clearances, the reason is returned.
     """
     names = ", ".join(PAIR_NAMES[pair] for pair in pairs)
     # the gap of a pair is half the clearances minus the reach of the pair's corner

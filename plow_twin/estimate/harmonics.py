@@ -47,7 +47,7 @@ class Harmonics:
 
     @staticmethod
     def of(load: Load) -> Harmonics | None:
-        """Return harmonics without amplitude of a load's frequency; None for a load without two periods."""
+        """Return harmonics of a load's frequency with zero amplitude; None if the load has fewer than two periods."""
         omega = frequency(load)
         if omega is None:
             return None
@@ -56,7 +56,7 @@ class Harmonics:
 
     @staticmethod
     def from_dict(data: Mapping[str, Any]) -> Harmonics:
-        """Return the harmonics that `as_dict` returned."""
+        """Return the harmonics from `data`, made by `as_dict`."""
         mean, deviation = np.array(data["mean"]), np.array(data["deviation"])
         return Harmonics(
             data["omega_rad_s"], tuple(data["multiples"]), np.ones(3), mean, deviation**2, data.get("begin_s", 0.0)
@@ -77,7 +77,7 @@ class Harmonics:
         return replace(self, omega=self.omega / time, size=size, begin=self.begin * time)
 
     def basis(self, t: Array) -> Array:
-        """Return each term at the times `t`, shape (n, k)."""
+        """Return the value of each term at the times `t` for an amplitude of 1, shape (n, k)."""
         turns = self.omega * np.outer(t - self.begin, self.multiples)
         waves = np.stack([np.sin(turns), np.cos(turns)], axis=2).reshape(len(t), -1)
         return np.concatenate([np.ones((len(t), 1)), waves], axis=1)
@@ -117,7 +117,7 @@ class Harmonics:
 def frequency(load: Load) -> float | None:
     """Return the angular frequency in rad/s of the strongest oscillation of a load; None without two periods of it.
 
-    The change of its phase from the first to the second half corrects the frequency.
+    The frequency is corrected by the difference between the phases in the first and in the second half of the load.
     """
     period, span = load.oscillation(), float(load.t[-1] - load.t[0])
     if period is None:

@@ -18,10 +18,10 @@ from plow_twin.estimate.unknowns import SIZE
 
 Array = NDArray[np.float64]
 
-#: Bound: number of fits with harmonics; number of iterations of each fit; number of consecutive fits, none of them
-#: better than all before, after which no more are made.
+#: Bound: largest number of fits with harmonics; number of iterations of each fit; number of consecutive fits without an
+#: improvement after which the rounds end.
 _ROUNDS, _ITERATIONS, _IN_VAIN = 12, 6, 4
-#: Bound: horizon of the middle stage, relative to that of the first; the last stage has whole swings.
+#: Bound: horizon of the middle stage, relative to the horizon of the first stage; the last stage has whole swings.
 _LONGER = 2.0
 
 
@@ -79,7 +79,7 @@ def _alternated(
 
 
 def named(harmonics: Harmonics) -> str:
-    """Return the clearest harmonic as a reason."""
+    """Describe the most significant harmonic in words, as a reason of the estimate."""
     clear = harmonics.amplitude**2 / harmonics.variance
     clear[1::2] += clear[2::2]
     clear[2::2] = 0.0

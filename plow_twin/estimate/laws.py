@@ -31,7 +31,7 @@ _STEPS, _DAMPED, _ENOUGH, _SMALL = 30, 1e-2, 1e-2, 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Draws:
-    """Motions under one law: their features (n, m), and the unknowns with which they were drawn (n, 7).
+    """Motions simulated under one law: their features (n, m), and the randomly drawn unknowns (n, 7).
 
     The unknowns are the logarithms of penetration and damping, three gains of the load, and the differences of the two
     clearances from the reach.

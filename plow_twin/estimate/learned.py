@@ -1,4 +1,4 @@
-"""Parameters of a follower's members, learned from the poses that move the members.
+"""Learning of the members' parameters from the poses by which the members of a follower are moved.
 
 With a hard contact the motion is too irregular to be fitted, so an estimate hardly determines stiffness and load gains.
 The members' predictions differ partly because their parameters differ. Regression of the predictions on the parameters
@@ -54,7 +54,7 @@ def biases_of(numbers: Array) -> Array:
 
 
 def with_numbers(scene: Scene, numbers: Array) -> tuple[Scene, Array]:
-    """Return a member's scene and load gains, (3,), with other parameters, (10,)."""
+    """Return a member's scene and load gains, (3,), with its parameters replaced by `numbers`, (10,)."""
     softness, damping, horizontal, vertical, *gain = (numbers * np.array(tuning.LEARNED_TO)).tolist()[:-3]
     number = None
     if scene.contact.restitution is not None:
@@ -92,13 +92,13 @@ class Learner:
 
     @classmethod
     def of(cls, drawn: Array, time: float) -> Learner | None:
-        """Return a learner of the parameters whose deviation exceeds a unit; None if there are none, or few members."""
+        """Return a learner of the parameters with a deviation above one unit; None without them or with few members."""
         learned = np.flatnonzero(drawn[1:].std(axis=0) > 1.0)
         enough = len(drawn) >= _MEMBERS * (len(learned) + 1)
         return cls(drawn, learned, time) if len(learned) and enough else None
 
     def _begin(self) -> None:
-        """Forget the poses since the last update of the distribution."""
+        """Forget the information from poses since the last update of the distribution."""
         self._precision, self._score = np.zeros((len(self.open), len(self.open))), np.zeros(len(self.open))
 
     def take_over(self, before: Learner) -> None:
@@ -136,8 +136,8 @@ class Learner:
         rest = seen - apart @ slope
         alone = rest.T @ rest / (len(own) - len(self.open) - 1)
         inverse = np.linalg.inv(alone + np.diag(noise**2))
-        # the scatter of the members alone also gives a slope; the information that this random slope seems to contain
-        # is subtracted
+        # with unrelated numbers the scatter of the members would give a slope too; the information that such a random
+        # slope seems to contain is subtracted
         self._precision += slope @ inverse @ slope.T - spread * np.trace(inverse @ alone)
         self._score += slope @ inverse @ (off - (self.mean - middle) @ slope)
 
@@ -161,7 +161,7 @@ class Learner:
         self._begin()
 
     def numbers(self, which: NDArray[np.int64]) -> Array:
-        """Return the parameters of some members, shape (k, 10)."""
+        """Return the learned parameters of the members `which`, shape (k, 10)."""
         found = self._all[which].copy()
         own = self.mean + self._white[which] @ np.linalg.cholesky(self.covariance).T
         found[:, self.open] = np.clip(own, self._least, self._most)

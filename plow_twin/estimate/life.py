@@ -27,9 +27,10 @@ from plow_twin.run.simulate import simulate
 
 Array = NDArray[np.float64]
 
-#: Guard: wear in m of a run that counts sliding: the wear shows the travel, and is too small to change the motion.
+#: Guard: wear in m of a trial run by which sliding is measured: large enough to show the sliding distance, and too
+#: small to change the motion.
 _TRACE_M = 1e-12
-#: Bound: number of rows inserted for each row of a path with running-in.
+#: Bound: number of interpolated rows between two rows of a path with running-in.
 _FINER = 16
 #: Bound: largest number of steps of a path.
 _MOST_STEPS = 400
@@ -38,7 +39,7 @@ _LEAST_CLEARANCE = 1e-3
 
 
 class LifeError(PlowTwinError):
-    """Wear over a machine's life cannot be computed from the input."""
+    """The wear over a machine's life cannot be computed from the given input."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +135,7 @@ def wear_in_travel(scene: Scene) -> Wear:
 
 
 def _trace(scene: Scene, period: float) -> float:
-    """Return a wear coefficient in m^2/N so small that the head's weight wears a pad by about `_TRACE_M`."""
+    """Return a wear coefficient [m^2/N], so small that under the head's weight a pad wears by about `_TRACE_M`."""
     wear = wear_in_travel(scene)
     impulse = scene.head.mass_kg * 10.0 * sum(tuning.MEAN_PERIODS) * period
     return _TRACE_M * wear.pad_area_m2 / (wear.travel_speed_m_s * impulse)
@@ -185,7 +186,7 @@ def wear_path(scene: Scene, limit: tuple[float, float], most_exposure: float) ->
 
 
 def _finer(columns: list[Array]) -> list[Array]:
-    """Return columns with linearly interpolated rows in between; running-in between rows is neglected."""
+    """Return the columns with linearly interpolated rows in between, where running-in is neglected."""
     at = np.arange(len(columns[0]), dtype=np.float64)
     more = np.linspace(0.0, at[-1], _FINER * (len(at) - 1) + 1)
     before = np.minimum(more.astype(int), max(len(at) - 2, 0))

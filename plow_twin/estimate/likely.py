@@ -1,10 +1,10 @@
 """The clearances that make the measured path over the load's period most likely.
 
-The features of drawn motions, including their mean path over the period, are modelled as a quadratic function of the
-drawn parameters plus normal noise (synthetic likelihood: Wood, Nature 466 (2010) 1102). The clearances of largest
-likelihood are then features of a regression over the drawn motions (semi-automatic approximate Bayesian computation:
-Fearnhead and Prangle, J. R. Stat. Soc. B 74 (2012) 419). A regression on the path itself is not possible, because a
-path has more numbers than there are draws.
+Motions with randomly drawn parameters are simulated. Their features, including the mean path over the period, are
+modelled as a quadratic function of the parameters plus normal noise (synthetic likelihood: Wood, Nature 466 (2010)
+1102). The clearances of largest likelihood are then features of a regression over the simulated motions (semi-automatic
+approximate Bayesian computation: Fearnhead and Prangle, J. R. Stat. Soc. B 74 (2012) 419). A regression on the path
+itself is not possible, because a path has more numbers than there are motions.
 """
 
 from __future__ import annotations
@@ -45,11 +45,11 @@ class Seen:
 
 
 def likeliest(drawn: Array, gain: float, motions: Seen, measured: Seen) -> Array:
-    """Return the likeliest clearances in m of n drawn motions and of the measured motion, shape (n + 1, 2).
+    """Return the likeliest clearances in m of n simulated motions and of the measured motion, shape (n + 1, 2).
 
-    The clearances of a drawn motion are found from other draws; the last row belongs to the measured motion. `drawn`,
-    shape (n, 7), holds clearances, the logarithms of penetration and damping, and the load gains, whose deviation is
-    `gain`.
+    The clearances of a simulated motion are found without this motion; the last row belongs to the measured motion.
+    `drawn`, shape (n, 7), holds the drawn parameters: clearances, the logarithms of penetration and damping, and the
+    load gains, whose deviation is `gain`.
     """
     found = np.zeros((len(drawn) + 1, 2))
     found[-1] = _likeliest(drawn, gain, motions, measured)[0]

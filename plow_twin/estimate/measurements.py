@@ -75,7 +75,7 @@ class Poses:
         return Poses(times[index], rows[index], deviation), len(times) - len(index)
 
     def interval(self) -> float:
-        """Return the interval in s between complete poses, with partial poses merged."""
+        """Return the interval in s between complete poses, after poses of single components have been merged."""
         measured = int(np.isfinite(self.q).sum())
         return float(np.median(np.diff(self.t))) * self.q.size / max(measured, 1)
 
@@ -113,8 +113,7 @@ class Poses:
         return Poses(self.t, np.where(spikes, np.nan, self.q), self.deviation), count
 
     def fresh(self) -> Poses:
-        """Leave out repeated values of a sensor that is slower than its sender, because they are late and share their
-        noise.
+        """Leave out repeated values from a sensor slower than its sender: they are late and repeat the same noise.
 
         A value that is repeated for longer shows that the sensor has stopped; then all values are kept.
         """
@@ -177,7 +176,7 @@ class Load:
         return Load(self.t[first:last], self.wrench[first:last])
 
     def longest_stretch(self) -> Load:
-        """Return the longest part without a silence."""
+        """Return the longest part of the load in which no samples are missing."""
         apart = np.diff(self.t)
         silent = np.flatnonzero(apart > max(tuning.LONGEST_GAP[0], tuning.LONGEST_GAP[1] * float(np.median(apart))))
         if not len(silent):
@@ -258,7 +257,7 @@ class Load:
         rows = self.wrench / np.where(scale > 0.0, scale, 1.0)
         out = np.zeros(len(rows))
         out[[0, -1]] = np.inf
-        # all lines of a level are split at once; a line that is not split has no lower levels
+        # all lines of one level are divided at once; a line that is not divided has no lines in lower levels
         left, right, least = np.array([0]), np.array([len(rows) - 1]), np.array([np.inf])
         while len(left):
             inner = right - left > 1
@@ -273,7 +272,7 @@ class Load:
             chord = rows[right] - rows[left]
             error = np.abs(rows[place] - rows[left][line] - along[:, None] * chord[line]).max(axis=1)
             largest = np.maximum.reduceat(error, first[:-1])
-            # for each line, the first sample that has the line's largest error
+            # for each line, the first of the samples that are farthest from the line
             at = np.flatnonzero(error == largest[line])
             middle = place[at[np.unique(line[at], return_index=True)[1]]]
             least = np.minimum(least, largest)
@@ -366,7 +365,7 @@ def filled(poses: Poses) -> Array:
 
 
 def own_deviations(brought: Iterable[tuple[float, ...]]) -> Array:
-    """Return the deviations stated with poses, shape (n, 3), NaN where not stated."""
+    """Return the deviations that the messages of poses state, shape (n, 3); NaN where a message states none."""
     return np.array([one or (math.nan,) * 3 for one in brought], dtype=np.float64).reshape(-1, 3)
 
 
@@ -383,7 +382,7 @@ def believed(stated: Deviation, q: Array, own: Array) -> tuple[Array, Deviation]
     stated : tuple of 3 float
         Smallest deviation of each component.
     q, own : ndarray, shape (n, 3)
-        Poses and their stated deviations, NaN where not stated.
+        Poses, and the deviations stated with them; NaN where not stated.
 
     Returns
     -------

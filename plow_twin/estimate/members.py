@@ -1,8 +1,9 @@
 """The members of a follower: twins drawn from a prior or an estimate, moved by an ensemble Kalman filter.
 
 Each pose moves all members, with perturbed observations (Burgers et al., Mon. Weather Rev. 126 (1998) 1719). A late
-pose acts through the covariance of past and present states. A member skips a correction that would press a wall with
-more than half of the head's weight, because with a hard contact a tenth of a millimetre would cause a false impact.
+pose acts through the covariance between past and present states. A member skips a correction that would press it
+against a wall with more than half of the head's weight, because with a hard contact a correction of a tenth of a
+millimetre would cause a false impact.
 
 Parameters that an estimate hardly determines are learned from the poses (`learned`). At each pose some members adopt
 their learned parameters.
@@ -41,10 +42,11 @@ Rows = NDArray[np.void]
 LATEST_S: Final = 0.25
 #: Bound: smallest interval in s between kept states of the motion.
 _PATH_S: Final = 2e-3
-#: Bound: largest number of successive outlying poses that are ignored. A longer series is no glitch: the head has
+#: Bound: largest number of successive outliers that are ignored. More successive outliers mean that the head really has
 #: jumped.
 _MOST_OUTLYING: Final = 5
-#: Bound: smallest number of members that get other parameters at once, because a call costs as much as three members.
+#: Bound: smallest number of members whose parameters are changed at once, because one call costs as much as the change
+#: of three members.
 _AT_ONCE: Final = 8
 #: Definition: slice that selects all members.
 _ALL: Final = slice(None)
@@ -129,7 +131,7 @@ class Ensemble:
 
     @property
     def moved(self) -> bool:
-        """Whether any pose has moved the members."""
+        """Whether a pose has already moved the members."""
         return bool(self.square.any())
 
     @property
@@ -229,7 +231,7 @@ class Ensemble:
         return values[0].copy(), np.minimum(low, values[0]), np.maximum(high, values[0])
 
     def _used(self) -> NDArray[np.bool_]:
-        """Return the members that determine intervals: those in the model's range, or all if there are none."""
+        """Return which members determine intervals: those in the model's range, or all members if none is in range."""
         return self.good if self.good.any() else np.ones(len(self.good), dtype=bool)
 
     def clearance(self) -> Array:
@@ -296,11 +298,11 @@ class Ensemble:
         return np.where(self._free, room, 1.0)
 
     def _shares(self, room: Array) -> Array:
-        """Return the ratio of each member's free space to `room`, shape (m, 3)."""
+        """Return each member's free space relative to the free space `room`, shape (m, 3)."""
         return np.divide(self._room(), room, out=np.ones_like(room), where=room > 0.0)
 
     def _stand(self, q: Array, v: Array, force: Array, which: NDArray[np.int64] | None = None) -> None:
-        """Move members to poses, or less far from the middle so that no pair bears much more than `force`, (m, 8)."""
+        """Move members to poses, or less far from the middle, so that no pair bears much more than `force`, (m, 8)."""
         which = np.arange(len(q)) if which is None else which
         q, v, force = q[which], v[which], force[which]
         low, high = np.zeros(len(q)), np.ones(len(q))
@@ -436,7 +438,7 @@ class Ensemble:
         self._stand(self.pose, self._v, force, which)
 
     def _recover(self) -> None:
-        """Move members that have left the model's range to the poses of other members, unless all have left."""
+        """Move members outside the model's range to the poses of members in range, unless all are outside."""
         lost, left = np.flatnonzero(~self.good), np.flatnonzero(self.good)
         self.good[:] = True
         if not len(lost) or not len(left):

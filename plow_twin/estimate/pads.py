@@ -90,7 +90,7 @@ def with_differences(problem: Problem, found: Fit) -> tuple[Problem, Fit] | None
 
 
 def of_differences(problem: Problem, found: Fit) -> Array:
-    """Return the covariance of the shared unknowns due to the differences, shape (SIZE, SIZE).
+    """Return the covariance that uncertain differences of pads and sensor cause in the shared unknowns, (SIZE, SIZE).
 
     If the head touches only one pad of each wall, the places of the other pads are unknown.
     """

@@ -57,11 +57,11 @@ class Interval:
 
     @property
     def deviation(self) -> float:
-        """Standard deviation of the normal distribution that has this interval."""
+        """Standard deviation of the normal distribution that has these 5 % and 95 % points."""
         return (self.p95 - self.p05) / (2.0 * NORMAL_P95)
 
     def times(self, unit: float) -> Interval:
-        """Return the interval of the value times a unit."""
+        """Return the interval with its value and both points multiplied by a unit."""
         return Interval(self.mean * unit, self.p05 * unit, self.p95 * unit)
 
     def above(self, least: float) -> Interval:
@@ -142,7 +142,7 @@ class ForcesUsed:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A measured motion, and the model's motion as the sensor would show it, with bias and delay.
+    """The measured motion, and the model's motion as the sensor would show it, that is with bias and delay.
 
     t : (n,) stamps in s
     measured, model : (n, 3) x, y in m, theta in rad; NaN where nothing was measured or the model was not fitted

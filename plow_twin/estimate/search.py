@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Stage:
-    """One round: the horizon as a share of the period, the iterations, and the number of candidates kept afterwards."""
+    """A round: horizon as a share of the period, number of iterations, and number of candidates kept afterwards."""
 
     horizon: float
     iterations: int
@@ -31,7 +31,7 @@ class Stage:
 #: Derived: smallest numbers of rows within a horizon and within a swing, so that each component has more values than
 #: the six unknowns of the swing's start.
 _FEWEST_ROWS = (8, 12)
-#: Prior: the differences of a machine whose sensor has a slow low pass and which has no other difference.
+#: Prior: the differences of a machine that differs from the model only by a slow low pass of its sensor.
 LOW_PASS: Final = np.array([0.0] * LAG + [UNSTATED["filter"]])
 #: Bound: the rounds of the search; each round keeps fewer candidates than the previous round.
 STAGES: Final = (Stage(0.1, 4, 5), Stage(0.2, 3, 2))
@@ -65,10 +65,10 @@ def candidate(forward: Forward, unknowns: Unknowns, poses: Poses, period: float)
 
 
 def _have_met(fits: list[Fit], newest: Fit) -> bool:
-    """Return whether the newest fit and another have the same clearances and loss, and no fit is better than both.
+    """Return whether the newest and another fit agree in clearances and loss, and no fit is better than these two.
 
-    `fits` are ordered, best first. Starts of different stiffness lead to such a point only if it is the optimum. With
-    another loss, one of them is in a false optimum of a swing's starting state.
+    `fits` are ordered, best first. If starts of different stiffness lead to the same point, it is the optimum. If only
+    the clearances agree, one of the two fits is in a false optimum of a swing's starting state.
     """
     if len(fits) < 2 or newest not in fits[:2]:
         return False
@@ -108,7 +108,8 @@ def refine(
     shortest = tuning.SHORTEST[0 if hard else 1 if drift is None else 2]
     horizon = tuning.HARD_HORIZON if hard else np.inf
     if drift is not None and not hard:
-        # a swing is so short that during it the unknown part of the load moves the head by less than the sensor's noise
+        # during a swing, the unknown part of the load may move the head by no more than the sensor's noise, so swings
+        # must be short
         shortest = min(max(shortest, float(np.cbrt(3.0 * noise**2 / drift).min()) / period), tuning.SHORTEST[1])
     shortest = max(shortest * period, rows[1], float(poses.t[-1] - poses.t[0]) / _MOST_SWINGS)
     horizon = max(horizon * period, rows[0])

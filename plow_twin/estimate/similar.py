@@ -162,7 +162,7 @@ class Units:
         )
 
     def _damping(self, contact: Contact) -> float:
-        """Return the unit of the law's damping: N s/m, or s/m if the damping multiplies the elastic force."""
+        """Return the SI value of the unit of the law's damping: in N s/m, or in s/m if damping multiplies the force."""
         return self.mass / self.time if LAWS[contact.law].additive else self.time / self.length
 
     def _contact(self, contact: Contact) -> Contact:
@@ -194,7 +194,8 @@ def _converted(scene: Scene, its: Scene) -> dict[str, Provenance]:
     for path, kind in KINDS.items():
         mark, (part, name) = marks.get(path), path.split(".")
         value = getattr(getattr(scene, part), name, None)
-        # a number that is zero gives no ratio, so its deviation is left out; a clearance has the ratio of the lengths
+        # if a number is zero, the ratio of the units cannot be computed from it, so its deviation is left out; a
+        # clearance has the ratio of the lengths
         if mark is not None and mark.deviation is not None and (value or kind == "clearance"):
             ratio = length if kind == "clearance" else getattr(getattr(its, part), name) / value
             marks[path] = replace(mark, deviation=mark.deviation * ratio)

@@ -53,7 +53,7 @@ def smooth_width(poses: Poses, span: float = 0.06) -> int:
 
 
 def range_of_motion(scene: Scene, poses: Poses) -> tuple[Array, Array]:
-    """Return the clearances (2,) and the bias of x and y (2,) in m, from the range of motion alone."""
+    """Return clearances (2,) and bias of x and y (2,) in m that follow from the range of motion alone."""
     reach = reaches(scene, smoothed(filled(poses), smooth_width(poses)))
     right, left, top, bottom = np.quantile(reach, 0.99, axis=0)
     # when the head moves to the right, the frame moves to the left relative to the head

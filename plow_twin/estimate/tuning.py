@@ -1,4 +1,4 @@
-"""The numbers of the estimator that are chosen, not derived, each with the data on which it was set.
+"""All numbers of the estimator that were chosen and not derived, each with the data on which it was set.
 
 They are read as `tuning.NAME` where they are used, so that `benchmark/tuning_sensitivity.py` can vary them;
 `benchmark/results/tuning.md` shows them with the sensitivity that it measured. Seeds: `benchmark/estimate.py`. All
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Value = float | int | tuple[Any, ...] | Array
 
-#: Basis of a number without a recorded experiment.
+#: Basis of a number that was chosen without a recorded experiment.
 JUDGED = "judgement"
 
 

@@ -202,7 +202,7 @@ def _draw(spread: _Spread, rng: np.random.Generator) -> tuple[Array, Array, floa
 
 
 def _with_exponent(unknowns: Unknowns, rng: np.random.Generator) -> Unknowns:
-    """Return the prior with a larger exponent in half of the draws, because no wall is stiffest at its surface."""
+    """Return the prior, in half of the draws with a larger exponent, because no wall is stiffest at its surface."""
     step = tuning.UNCERTAIN_EXPONENT * max(0.0, rng.standard_normal())
     contact = unknowns.scene.contact
     return replace(unknowns, scene=replace(unknowns.scene, contact=replace(contact, exponent=contact.exponent + step)))
