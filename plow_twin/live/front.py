@@ -1,4 +1,4 @@
-"""The live twin without ROS: a bridge feeds it, and its reports go to one function."""
+"""The live twin without ROS: a bridge feeds the twin, and one function receives its reports."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ NAME: Final = "/plow_twin"
 #: Longest wait for a message [s]; a request to stop is noticed within this time.
 _POLL_S: Final = 0.1
 _REPORT_S: Final = 1.0
-#: Share of unused samples above which a likely cause is named.
+#: Share of unused samples above which the report names a likely cause.
 _MANY: Final = 0.01
 
 #: Receives `status`, `alarms` or a part of the diagnostics by name, with level, message and values.
@@ -151,7 +151,7 @@ class BridgeFront:
         """Do nothing: `say` gets the alarms."""
 
     def time_text(self, stamp_ns: int) -> str:
-        """Return a stamp in words, as in the input."""
+        """Return a stamp in words, in the form in which the input states its stamps."""
         return time_text(stamp_ns, own_start=True)
 
     def changed(self) -> None:
@@ -198,7 +198,7 @@ class BridgeFront:
         return []
 
     def causes(self) -> list[str]:
-        """Return in words the silences, and likely causes of samples that were not used or that reset the motion."""
+        """Describe silences, and likely causes of samples that were not used or that reset the motion."""
         counts, found = self.runtime.driver.intake.counts, []
         many = _MANY * max(1, sum(counts.values()))
         if self._feeder.unfit:
@@ -269,7 +269,7 @@ class BridgeFront:
                 watcher.part(name, part)
 
     def _messages(self, timeout_s: float) -> Messages:
-        """Return the next messages, first the messages that the check of units has already read."""
+        """Return the next messages; first come the messages that were already read for the check of units."""
         if not self._first:
             return self._bridge.poll(timeout_s)
         return self._first.popleft()
@@ -283,7 +283,7 @@ class BridgeFront:
 
 
 def _first_messages(bridge: Bridge) -> Iterator[Messages]:
-    """Yield the messages that the check of units looks at."""
+    """Yield the first messages of the source, from which the check of units judges the numbers."""
     count = 0
     while count < CHECKED and len(found := bridge.poll(0.0)):
         count += len(found)

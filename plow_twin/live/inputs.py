@@ -24,7 +24,7 @@ TOPICS: Final = ("excitation", "tool_forces", "travel", "head_pose", "gaps")
 OPTIONAL: Final = ("travel", "head_pose", "gaps")
 #: Time [ns] for which another sender counts as present after its last sample.
 _OTHER_SENDER_NS: Final = 3_000_000_000
-#: Time after which an optional input that was heard counts as silent [ns].
+#: Time [ns] without a message after which an optional input counts as silent, if it was heard before.
 _SILENT_NS: Final = 10_000_000_000
 
 
@@ -40,9 +40,9 @@ class Inputs:
     depth
         Length of the queue of the excitation.
     late_span_s
-        How late a measured pose or gap may be [s].
+        Largest delay of a measured pose or gap with which it is still used [s].
     journaled
-        Whether messages that are not used are collected for the journal.
+        Whether unused messages are collected for the journal.
     intake
         Settings of the intake that judges the excitation, as in `Intake`.
     """
@@ -55,7 +55,7 @@ class Inputs:
         self.intake = Intake(on_unused=self._sample_unused, **intake)
         #: messages that are not used, for the journal
         self.unused = UnusedMessages(journaled)
-        #: topic and sender of the message being processed, unless it is from the source
+        #: topic and sender of the message being processed; empty if the message comes from the selected source
         self.arriving = ("", b"")
         self._poses, self._gap_stamps = RecentStamps(late_span_s), RecentStamps(late_span_s)
         self.depth = depth
@@ -92,21 +92,21 @@ class Inputs:
         self.travel.limits, self.head_pose.limits, self._gap_limits = travel, pose, gap
 
     def other_senders(self) -> list[str]:
-        """Return the inputs on which a sender besides the followed one sends."""
+        """Return the inputs on which another sender than the followed sender is present."""
         if not self._other_heard_ns:
             return []
         now_ns = time.monotonic_ns()
         return [topic for topic, heard_ns in self._other_heard_ns.items() if now_ns - heard_ns < _OTHER_SENDER_NS]
 
     def silent(self) -> list[str]:
-        """Return the optional inputs that were heard before and are silent now."""
+        """Return the optional inputs that were heard before and have become silent."""
         if self.ended:
             return []
         now_ns = time.monotonic_ns()
         return [topic for topic, heard_ns in self._heard_ns.items() if now_ns - heard_ns > _SILENT_NS]
 
     def waited(self, messages: int, longest_s: float) -> None:
-        """Note how many messages waited in the queue, and how long the first waited [s]."""
+        """Record how many messages waited in the queue, and how long the first message waited [s]."""
         self.wait_s = max(self.wait_s, longest_s)
         most, before_s = self._queue_peak
         if messages > most or longest_s > before_s:
@@ -118,7 +118,7 @@ class Inputs:
         return peak
 
     def wanted(self, sender: bytes, number: int, stamp_ns: int, values: Sequence[float], fits: bool = True) -> bool:
-        """Note message `number` (from 1) of a sender; if it is not used, count it and return False.
+        """Register message `number` (from 1) of a sender; if it is not used, count it and return False.
 
         `fits` states whether the message can be read as a sample; `values` are all its numbers.
         """
@@ -145,14 +145,14 @@ class Inputs:
         return True
 
     def _other_heard(self, topic: str, sender: bytes, stamp_ns: int, values: Sequence[float]) -> None:
-        """Count a message of a sender that is not followed."""
+        """Count a message from a sender that is not the followed sender."""
         if topic not in self.other_senders():
             self._front.look_for_senders(topic)
         self._other_heard_ns[topic] = time.monotonic_ns()
         self.unused.note(topic, sender, "not_followed", stamp_ns, values)
 
     def _follows(self, topic: str, stamp_ns: int, values: Sequence[float]) -> bool:
-        """Return whether the message on an optional input is from the followed sender; others are counted."""
+        """Return whether a message on an optional input comes from the followed sender; count it if it does not."""
         sender = self.arriving[1]
         followed = self.optional[topic].hear(sender, time.monotonic_ns())
         if not followed:

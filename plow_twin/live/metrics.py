@@ -18,7 +18,7 @@ from plow_twin.live.part import Part
 if TYPE_CHECKING:
     from prometheus_client.metrics_core import Metric
 
-#: Characters that a metric's name cannot have.
+#: Characters that must not occur in the name of a metric.
 _OTHER: Final = re.compile(r"[^a-zA-Z0-9_]")
 #: Largest number of readers at once.
 _READERS: Final = 16

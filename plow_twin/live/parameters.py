@@ -526,7 +526,7 @@ def settings(values: Mapping[str, Any]) -> Settings:
 
 
 def services_off(given: Settings) -> frozenset[str]:
-    """Return the names of the services that are refused."""
+    """Return the names of the services that these settings switch off."""
     return frozenset(name.strip() for name in given.services_off.split(",") if name.strip())
 
 

@@ -35,7 +35,8 @@ class Front(Protocol):
     topics : mapping
         Resolved names of the outputs by their base names.
     follows_samples : bool
-        Whether only samples advance the time, as with `/clock` or a file, so that silence is not bridged.
+        Whether only samples advance the time, as with `/clock` or a file; then the twin does not continue during a
+        silence.
     sends_motion : bool
         Whether messages of the motion are sent; otherwise they are at most recorded.
     """
@@ -52,16 +53,16 @@ class Front(Protocol):
         """Send a message on the topic with a base name."""
 
     def look_for_senders(self, topic: str) -> None:
-        """Find out whether the followed sender of an input still exists."""
+        """Check whether the followed sender of an input still exists."""
 
     def sender_name(self, topic: str, sender: bytes) -> str:
         """Return the name of a sender of an input."""
 
     def changed(self) -> None:
-        """Note that the state of the stream may have changed."""
+        """Take notice that the state of the stream may have changed."""
 
     def time_text(self, stamp_ns: int) -> str:
-        """Return a stamp in the form of the input."""
+        """Return a stamp in words, in the form in which the input states its stamps."""
 
     def say_alarm(self, level: int, text: str) -> None:
         """Log an alarm that has been raised to a level."""
@@ -108,16 +109,16 @@ class Publishing:
             self._messages = Messages(*frames, intervals=settings.follows == "full")
         self.latency = DurationHistogram()
         self.age = DurationHistogram()
-        #: `published`: number of publications
-        #: `withheld`: number of publications withheld because a number was not finite
+        #: `published`: number of publications that were sent `withheld`: number of publications that were not sent
+        #: because a number was not finite
         self.published = self.withheld = 0
         #: `held_frames`: number of publications computed without a sample
         #: `corrected_frames`: number of publications that correct earlier publications because of late samples
         self.held_frames = self.corrected_frames = 0
         #: steady time at which the samples of the next publication were received [ns]; 0 means that it has no samples
         self.received_ns = 0
-        #: stamp of the sample that changed the alarms, while changed alarms of a series are reported [ns]; otherwise
-        #: None
+        #: stamp [ns] of the sample that changed the alarms, set only while the alarms of a series of samples are
+        #: reported
         self.series_ns: int | None = None
         self._newest: Rows | None = None
         self._catch_up = catch_up
@@ -179,7 +180,7 @@ class Publishing:
             yield from self.alarms_changed(stamp_ns)
 
     def series(self, series: Series, journal: Callable[[Series], object]) -> Iterator[Outgoing]:
-        """Journal and record samples that were applied together, and yield the messages of alarms, each at its place.
+        """The intervals come last, because `catch_up` must first advance many twins to compute them.
 
         No messages of the motion are sent.
         """

@@ -1,4 +1,4 @@
-"""Requests for priority, processors and locked memory of this process; a refusal is a warning."""
+"""Requests for the priority, processors and locked memory of this process; if refused, the process warns."""
 
 from __future__ import annotations
 

@@ -112,11 +112,11 @@ class Recording:
 
     @property
     def behind(self) -> bool:
-        """Whether so much is queued that losses may soon occur."""
+        """Whether the recorder's queue is so full that messages may soon be lost."""
         return self.recorder.counters.queued > _QUEUE_SIZE // 2
 
     def renew(self, session: Session) -> bool:
-        """Journal a snapshot when entries were lost and there is room again; return whether it was journalled."""
+        """If entries were lost and there is room again, journal a snapshot; return whether this was done."""
         wanted = self.recorder.snapshot_wanted
         if wanted:
             self.recorder.journal(session.renew())

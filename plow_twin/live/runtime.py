@@ -85,13 +85,13 @@ class Runtime:
         self.scene = prepared.scene
         #: time that compiling or loading the solver took [s]
         self.compile_s = prepared.compile_s
-        #: periods of the loop that publishes at a fixed rate or follows the clock; None if samples set the pace
+        #: periods of the loops at a fixed rate or on the clock; None if the samples determine when the twin advances
         self.periods = _periods(settings)
-        #: state of the clock: `waiting` for the first `/clock`, `paused` or `running`
+        #: state of the clock: `waiting` until the first message on `/clock`, then `paused` or `running`
         self.clock = "running"
         #: whether another node publishes under the names of this twin's outputs
         self.others_publish = False
-        #: whether only the parameters follow the measurements, because the twins were too slow
+        #: whether the twins were too slow, so that only the parameters follow the measurements
         self.reduced = False
         self._waiting_seconds = 0
         self._clock_before_ns = 0
@@ -188,7 +188,7 @@ class Runtime:
 
     @property
     def reads_at_once(self) -> bool:
-        """Whether many samples may be applied and published at once: they have their own time and nothing is sent."""
+        """Whether many samples may be used in one call: they carry their own time, and no motion is sent."""
         return self._front.follows_samples and not self._front.sends_motion
 
     @property
@@ -215,7 +215,7 @@ class Runtime:
         return None if end_ns is None else (self._front.now_ns() - end_ns) * 1e-9
 
     def look_at_clock(self) -> None:
-        """Check at intervals whether the time of the samples continues."""
+        """Check, at intervals, whether the clock under which the samples arrive still advances."""
         now_ns = self._front.now_ns()
         if self._front.follows_samples:
             stands = now_ns == self._clock_before_ns
@@ -223,7 +223,7 @@ class Runtime:
         self._clock_before_ns = now_ns
 
     def time_text(self, stamp_ns: int) -> str:
-        """Return a stamp in words."""
+        """Return a stamp in words, as the front does."""
         return self._front.time_text(stamp_ns)
 
     def send_alarms(self) -> None:
@@ -231,7 +231,7 @@ class Runtime:
         self._send([self.publishing.alarms_now(self.stamp_ns)])
 
     def mark(self, text: str) -> tuple[bool, str]:
-        """Write a text to the journal, and the ring, if there is one."""
+        """Write a text to the journal, and write the recorder's ring to the disk if there is a ring."""
         if (problem := mark_problem(text)) is not None:
             return False, problem
         self.driver.mark(self.stamp_ns, text)
@@ -351,8 +351,8 @@ class Runtime:
     def step_series(self, stamps: NDArray[np.int64], wrench: NDArray[np.float64]) -> Iterator[Outgoing]:
         """Use many samples of a source with its own time, like `step`; stamps [ns], shape (n,), wrenches (n, 3)."""
         if self.waits_for_clock or self.publishing.watch is not None or self.settings.record_ring:
-            # samples are used one by one, because an observer gets each of them, and a ring needs the state right after
-            # the sample that raised its alarm
+            # samples are used one by one if an observer must get each sample, or if a ring needs the state right after
+            # the sample that raises its alarm
             yield from self.step(list(zip(stamps.tolist(), map(tuple, wrench.tolist()), strict=True)))
             return
         self.publishing.received_ns = now_ns = time.monotonic_ns()
@@ -520,7 +520,8 @@ class Runtime:
         assert self.recording is not None
         renewed = self.recording.renew(self.driver.session)
         if renewed and self.estimation and self.estimation.entry and self.driver.session.following is None:
-            # the snapshot of a follower has the estimate; that of a twin lacks it, so the estimate is journalled again
+            # the snapshot of a twin that follows measurements contains the estimate; other snapshots do not, so the
+            # estimate is journalled again
             self.recording.recorder.journal(self.estimation.entry)
 
 

@@ -37,7 +37,7 @@ class Services:
         return done
 
     def mark(self, text: str | None = None) -> tuple[bool, str]:
-        """Write a text, by default the parameter `mark`, to the journal, and write the ring if there is one."""
+        """Write a text (by default the parameter `mark`) to the journal, and write the ring if there is a ring."""
         return self._runtime.mark((self._runtime.settings.mark or "service") if text is None else text)
 
     def reset(self) -> tuple[bool, str]:

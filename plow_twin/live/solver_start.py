@@ -72,7 +72,7 @@ class Preparation:
 
 
 def key(settings: Settings) -> tuple[object, ...]:
-    """Return the settings that a prepared twin depends on; a rewritten scene file counts as another scene."""
+    """Return the settings on which a prepared twin depends; a scene file that was rewritten counts as another scene."""
     try:
         found = os.stat(scene_path(settings.scene))
     except (OSError, PlowTwinError):
@@ -103,7 +103,7 @@ def _prepare(settings: Settings, warm_up: Callable[[], None]) -> Prepared:
 
 
 def leave(code: int, *, at_once: bool = False) -> int:
-    """Return the exit code; end the process here with `at_once`, or if an abandoned compiler would delay its end."""
+    """Return the exit code; end the process here if `at_once` is set or an abandoned compiler would delay the end."""
     if at_once:  # a stream without a reader can no longer be flushed, so the process ends without a flush
         os._exit(code)
     if all(future.done() for future in _started):

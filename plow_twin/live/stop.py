@@ -8,7 +8,7 @@ from typing import Self
 
 
 class StopRequested(BaseException):
-    """The process was asked to stop while it could not look at a flag."""
+    """The process was asked to stop while it could not check a flag, as during a long start."""
 
 
 def stop_signals() -> list[signal.Signals]:

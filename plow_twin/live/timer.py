@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 
 class Timer:
-    """Call `do` every `period_s`; missed calls are left out, and the phase is kept.
+    """Call `do` every `period_s`; calls that were missed are not made up for, and later calls keep their phase.
 
     `do` may return the time [s] before which it need not be called.
     """

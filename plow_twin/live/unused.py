@@ -14,7 +14,7 @@ _MOST: Final = 500
 
 @dataclass
 class _Pending:
-    """Unused messages with one input, sender and reason since the last journal entry about them."""
+    """Unused messages with the same input, sender and reason, since the last journal entry about them."""
 
     count: int = 0
     stamps_ns: list[int] = field(default_factory=list)
@@ -22,7 +22,7 @@ class _Pending:
 
 
 class UnusedMessages:
-    """Collect unused messages, so that many of them make few entries of the journal.
+    """Collect unused messages, so that many messages give few entries of the journal.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ class UnusedMessages:
             self._pending.setdefault((topic, sender, "lost"), _Pending()).count += count
 
     def pop_all(self, name_of: Callable[[str, bytes], str]) -> list[Unused]:
-        """Return the entries collected, and forget them; `name_of` names a sender of an input."""
+        """Return the collected entries and start a new collection; `name_of` names a sender of an input."""
         pending, self._pending = self._pending, {}
         return [
             Unused(topic, name_of(topic, sender), reason, found.count, tuple(found.stamps_ns), tuple(found.values))

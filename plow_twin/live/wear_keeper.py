@@ -26,14 +26,14 @@ from plow_twin.record.wear_state import (
 
 @dataclass(frozen=True)
 class KeptWear:
-    """Wear that an earlier runtime of this process left.
+    """Wear that an earlier runtime of this process has left for the next runtime.
 
     Attributes
     ----------
     depth_m
         Depths [m].
     older_files
-        Contents of files that these depths should have replaced but could not.
+        Contents of the files that should have been replaced by these depths, but could not be replaced.
     """
 
     depth_m: tuple[float, ...]
@@ -89,7 +89,7 @@ class WearKeeper:
         return kept.depth_m if kept is not None and found in (None, *kept.older_files) else self._saved
 
     def kept(self, depth: NDArray[np.float64]) -> KeptWear:
-        """Return depths [m] for the next runtime of this process; to be called after the close."""
+        """Return the depths [m] as the wear for the next runtime of this process; to be called after `close`."""
         return KeptWear(tuple(depth.tolist()), self._own if self.error else ())
 
     def save(self, depth: NDArray[np.float64]) -> None:

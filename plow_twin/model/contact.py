@@ -90,7 +90,7 @@ def power_term(
 @kernel(fast=True, inline="code")
 def power_terms(base: NDArray[np.float64], power: NDArray[np.float64], k: int, exponent: float) -> Any:
     """Return coefficient k >= 1 of base^exponent times base[0], for the eight columns; `power_term` without a shift."""
-    # the newest orders are added last, so that most of the sum need not wait until they are computed
+    # the newest orders are added last, so that most of the sum can be computed before the newest orders are known
     even, odd = splat(0.0), splat(0.0)
     weight = (exponent + 1.0) * (k - 1) - k
     for j in range(k - 1, 2, -2):

@@ -28,7 +28,7 @@ def friction_force(normal: float, slip_rate: float, coefficient: float, speed: f
 
 
 def painleve_coefficients(scene: Scene) -> NDArray[np.float64]:
-    """Return the mu above which each pair's sliding corner can be in Painleve's case, shape (8,); inf if it never is.
+    """Return for each pair, shape (8,), the mu above which Painleve's case is possible; inf if it is impossible.
 
     In Painleve's case a sliding corner is pressed into the wall by its own friction: in d'' = -p N the factor p = 1/m +
     a^2/I - mu |a b|/I is negative, with the arms a of N and b of T about the centre of mass (here at q = 0). Rigid

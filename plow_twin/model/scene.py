@@ -143,8 +143,8 @@ class Contact:
     """
 
     law: str = _choice("contact law", LAWS, "exact_restitution")
-    # the stiffness must be given: its default, NaN, is not admissible. There is a default only because the field before
-    # has one
+    # a scene must give the stiffness: the default NaN is not admissible, and exists only because dataclasses demand a
+    # default after a field with a default
     stiffness: float = _quantity("N/m^exponent", "K in F = K d^n (...)", math.nan, gt=0.0)
     exponent: float = _quantity("1", "n in F = K d^n (...)", 1.0, ge=1.0, le=4.0)
     damping: float | None = _quantity(
@@ -274,7 +274,8 @@ class Constant:
 class Table:
     """A load given by samples; before the first and after the last sample it keeps that sample's value.
 
-    With `hold` = `linear` the samples are interpolated; with `zero` each value is kept until the next sample.
+    If `hold` is `linear`, the samples are joined by straight lines; if it is `zero`, each value is kept until the next
+    sample.
 
     Attributes
     ----------

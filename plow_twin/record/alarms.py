@@ -19,9 +19,9 @@ from plow_twin.stream.alarms import Alarms, Thresholds
 from plow_twin.stream.journal import Parameter, Pose
 from plow_twin.stream.outputs import Published
 
-#: Base name of the alarms' topic.
+#: Base name of the topic of the alarms.
 ALARMS: Final = "alarms"
-#: Name under which the journal notes an acknowledgement, as if it were a parameter.
+#: Name under which the journal records an acknowledgement, in the form of a changed parameter.
 ACKNOWLEDGED: Final = "alarms_acknowledged"
 #: For each quantity, the factor from SI and the unit in an alarm's text.
 _UNITS: Final = {
@@ -33,7 +33,8 @@ _UNITS: Final = {
 }
 _NAMES: Final = ("force", "clearance", "clearance_rate", "wear_rate")
 
-#: A difference: step, stamp [ns], topic, field, recorded value, computed value.
+#: A difference between a recorded and a computed message: step, stamp [ns], topic, field, recorded value, computed
+#: value.
 Difference = tuple[int, int, str, str, str, str]
 
 
@@ -104,7 +105,7 @@ class AlarmCheck:
         self.compared = self.not_compared = 0
 
     def give_up(self) -> None:
-        """Stop comparing: a publication or an entry is missing."""
+        """Stop comparing, because a publication or an entry of the journal is missing."""
         self.possible = False
         self.not_compared += len(self._recorded)
         self._recorded.clear()
@@ -162,7 +163,8 @@ class AlarmCheck:
     def differences(self) -> Iterator[Difference]:
         """Yield the differences between recorded and computed messages.
 
-        A message without a counterpart waits, because the journal may note a loss later.
+        A message whose counterpart is missing waits, because the journal may later record that the counterpart was
+        lost.
         """
         while self._recorded and self._computed:
             record, (sequence, step, computed) = self._recorded.popleft(), self._computed.popleft()

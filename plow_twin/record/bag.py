@@ -117,7 +117,7 @@ def beside_folders(run: Path) -> Sequence[Path]:
 def readable_beside(run: Path, lost: Counter[str]) -> list[Path]:
     """Return the readable folders of `beside_folders` and count the losses in `lost`.
 
-    The losses are the files of the unreadable folders, and by topic the messages that the recorders lost.
+    The losses are the files in unreadable folders and, by topic, the messages that the recorders have lost.
     """
     found = []
     for folder in beside_folders(run):

@@ -43,7 +43,7 @@ _INDEX_HEAD: Final = _HEAD.size + 2
 UNPACKED_RATIO: Final = 200
 #: Largest number of schemas and channels in a file.
 _MOST_DECLARED: Final = 10_000
-#: Number of channels that have a bit of their own in a channel mask.
+#: Number of channels that have a bit in a channel mask; the mask of a chunk with another channel is -1.
 _CHANNEL_BITS: Final = 63
 #: Number of record heads that are read at once.
 _AHEAD: Final = 64
@@ -114,11 +114,11 @@ class ChunkReader:
     path
         The file.
     wanted
-        Called with the channel numbers of each chunk whose index can be read; if it returns False, the chunk is not
-        opened.
+        Function that is called with the channel numbers of each chunk whose index can be read; if it returns False, the
+        chunk is not read.
     more
-        Called with the stream and the known size at the end of a file that is being written; it returns True when the
-        file has grown. All messages and then an empty batch are yielded before the call.
+        Function that is called with the stream and the known size at the end of a file that is still being written,
+        after all messages and then an empty batch have been yielded. It returns True when the file has grown.
     """
 
     path: Path
@@ -131,7 +131,7 @@ class ChunkReader:
     #: number of damaged chunks that a repair has left out
     left_out: int = 0
     position: int = 0
-    #: for each channel mask, the answer of `wanted`
+    #: result of `wanted` for each channel mask seen so far
     _answers: dict[int, bool] = field(default_factory=dict, init=False)
     #: number of rows of the next table of messages
     _room: int = field(default=256, init=False)
@@ -316,7 +316,7 @@ class ChunkReader:
 
 
 class _Waiting:
-    """Chunk contents, and messages outside chunks, to be scanned together, because each scan has a fixed cost."""
+    """Contents of chunks, and messages outside chunks, that are scanned together, because a scan has a fixed cost."""
 
     def __init__(self) -> None:
         self._contents: list[Bytes] = []
