@@ -28,7 +28,7 @@ class SentMessages:
 
     @classmethod
     def of(cls, outputs: list[Outputs], topics: Mapping[str, str]) -> Self:
-        """Collect messages; `topics` maps the topics that follow from the motion to base names."""
+        """Collect messages; `topics` gives the base name of each topic whose messages follow from the motion."""
         # few tables are made, because parts share their topics
         tables = {id(part.topics): _kinds(part.topics, topics) for part in outputs}
         sequence = _joined(part.sequence for part in outputs)
@@ -70,7 +70,7 @@ def _joined(arrays: Iterable[Indexes]) -> Indexes:
 
 
 def _kinds(channels: Mapping[int, tuple[str, str]], topics: Mapping[str, str]) -> Indexes:
-    """Return the kinds of messages by channel."""
+    """Return the kind of the messages (see `kind`) by channel."""
     lookup = np.full(max(channels, default=-1) + 1, -1)
     for channel, (topic, _) in channels.items():
         if topic in topics:

@@ -34,8 +34,8 @@ _ROWS: Final = 1000
 _ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
 #: Largest message that is unpacked [B].
 _LARGEST_MESSAGE: Final = 2**26
-#: Query that returns a row if `topics` or `messages` is a view, is a virtual table or has computed columns: reading
-#: such a table may never end.
+#: Query that returns a row if `topics` or `messages` is a view or a virtual table, or has computed columns. Such a
+#: table is not read, because reading it may never end.
 _COMPUTED: Final = """
     SELECT 1 FROM sqlite_master
     WHERE name COLLATE NOCASE IN ('topics', 'messages') AND (type != 'table' OR rootpage = 0)
@@ -146,13 +146,13 @@ def open_source(path: Path) -> Source:
 
 
 def packed(path: Path) -> str:
-    """Return a hint if rosbag2 has compressed files as a whole, otherwise an empty text."""
+    """Return a hint if rosbag2 has compressed whole files, which cannot be read; otherwise an empty text."""
     files = sorted(path.glob("*.zstd")) if path.is_dir() else [path] if path.suffix == ".zstd" else []
     return f" ({files[0].name} is compressed as a whole: unpack it with zstd -d)" if files else ""
 
 
 def _decompressed(data: bytes) -> bytes:
-    """Return a message of a bag with separately compressed messages; no bytes for a damaged message."""
+    """Return a message of a bag whose messages are compressed one by one; empty for a damaged message."""
     import zstandard
 
     try:
@@ -173,7 +173,7 @@ class Decoder:
         self._store = get_typestore(Stores.ROS2_JAZZY)
 
     def knows(self, topic: str, message_type: str, schema: str = "") -> bool:
-        """Return whether a type can be decoded; other types are noted as unknown."""
+        """Return whether a type can be decoded; a type that cannot is recorded as unknown."""
         from plow_twin.record.foreign_types import parsed_types
 
         if message_type not in self._store.types and schema:
@@ -214,7 +214,7 @@ def _behind_holes(parts: Sequence[Path], missing: Sequence[Path]) -> set[Path]:
 
 
 class McapSource:
-    """The MCAP files of a recording in order; the files `missing` are absent."""
+    """The MCAP files of a recording in order; `missing` are the files that the recording should have and lacks."""
 
     def __init__(self, parts: list[Path], missing: Sequence[Path] = ()) -> None:
         self.parts = parts

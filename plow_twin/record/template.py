@@ -28,7 +28,7 @@ _SECOND_NS: Final = 1_000_000_000
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a function that works on bytes."""
+    """Compile a function whose arguments are arrays of bytes."""
     dispatcher: Callable[..., Any] = kept(function)
     return dispatcher
 
@@ -90,14 +90,14 @@ def _fits(buffer: Bytes, start: int, length: int, data: Bytes, fixed: Bytes) -> 
 
 @compiled
 def stamp_word(stamp_ns: int) -> int:
-    """Return the stamp as in a message: seconds and nanoseconds side by side in one word."""
+    """Return the stamp as one 64-bit word, with seconds and nanoseconds side by side as in a message."""
     seconds = stamp_ns // _SECOND_NS
     return (seconds & 0xFFFFFFFF) | ((stamp_ns - seconds * _SECOND_NS) << 32)
 
 
 @compiled
 def read_numbers(buffer, starts, lengths, data, fixed, places, stamps, values, good):  # type: ignore[no-untyped-def]
-    """Read the stamp and numbers of each message that fits the template; `good` is False for the others."""
+    """Read stamp and numbers of each message that fits the template; `good` is False for a message that does not."""
     for n in range(starts.size):
         start = starts[n]
         good[n] = _fits(buffer, start, lengths[n], data, fixed)

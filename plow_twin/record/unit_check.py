@@ -34,10 +34,11 @@ _BROKEN_SHARE: Final = 1e-4
 _SMALLER: Final = {"kN": 1.0, "MN": 1e-3}
 #: Largest angle of the model [rad], 45 degrees.
 _LARGEST_ANGLE_RAD: Final = 0.25 * np.pi
-#: A swing larger than this multiple of the angle that the clearance allows is in degrees: wear and pressed contacts
-#: alone do not let a head turn so far.
+#: A swing larger than this multiple of the angle that the clearance allows must be in degrees, because wear and pressed
+#: contacts alone do not let a head turn so far.
 _BEYOND_CLEARANCE: Final = 3.0
-#: A swing up to this [rad] is accepted, because soft pads let a head turn farther than a narrow clearance does.
+#: A swing up to this angle [rad] is accepted in any case, because soft pads let a head turn farther than a narrow
+#: clearance does.
 _BELIEVED_SWING_RAD: Final = 0.1
 #: Stamps further apart than this [s] are too coarse for a load that changes smoothly from sample to sample.
 _SLOW_S: Final = 0.5
@@ -45,8 +46,8 @@ _SLOW_S: Final = 0.5
 _SMOOTH: Final = 0.05
 #: Ploughs travel at 3.6 m/s at most (Caterpillar GH1600); a speed above this [m/s] is in another unit.
 _FASTEST_M_S: Final = 5.0
-#: Share of falling stamps above which the column is not a time.
-#: Share of falling stamps above which the rows are in reverse order.
+#: Share of stamps below their predecessor above which the column is not a time. Share above which the rows are in
+#: reverse order.
 _FALLING, _REVERSED = 0.2, 0.9
 #: Length [s] of each unit of time except the second.
 _TIMES: Final = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
@@ -102,7 +103,7 @@ def unit_doubts(
     load_stamps_s
         Stamps of the load [s].
     scene
-        Scene whose loads and sizes say which magnitudes are plausible.
+        Scene whose loads and sizes determine which magnitudes are plausible.
     """
     magnitudes = {key: _usual_magnitude(np.asarray(found, float)) for key, found in values.items()}
     load = [values["excitation", name] for name in ("fx", "fy", "m") if ("excitation", name) in values]
@@ -205,7 +206,7 @@ def _stated(doubt: UnitDoubt, roles: Mapping[str, Role]) -> bool:
 
 
 def _usual_magnitude(values: Array, percent: float = 99.0) -> float:
-    """Return the magnitude that one value in a hundred exceeds, since an outlier does not show the unit."""
+    """Return the magnitude that only one value in a hundred exceeds, because an outlier does not show the unit."""
     known = np.abs(values)[np.isfinite(values)]
     return float(np.percentile(known, percent)) if known.size else 0.0
 

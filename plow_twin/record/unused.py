@@ -16,9 +16,10 @@ from plow_twin.stream.journal import Entry, Gaps, PartOfPose, Pose, Sample, Trav
 
 @dataclass
 class InputCounts:
-    """Counts of messages by input and outcome: `used`, or a reason of `Unused`.
+    """Counts of messages by input and outcome; an outcome is `used` or a reason of `Unused`.
 
-    The sum of the counts of `source`, without `not_followed`, is the number of messages that its publisher has sent.
+    For the input `source`, the sum of all counts except `not_followed` is the number of messages that its publisher has
+    sent.
     """
 
     source: str

@@ -39,7 +39,7 @@ from plow_twin.stream.session import DIGEST_INTERVAL, Applied, Session
 if TYPE_CHECKING:
     from plow_twin.record.writer import RunWriter
 
-#: Number of samples in one advance of the session.
+#: Number of samples by which the session advances at once.
 BATCH: Final = 4096
 #: A walk stops at these entries. Across all other entries, late samples are sorted in.
 _ACTING: Final = (Travel, Reset, Loss, Restore, Snapshot, SetModel, SetWear)
@@ -55,7 +55,7 @@ class Walked:
 
     stamp_ns: NDArray[np.int64]
     wrench: NDArray[np.float64]
-    #: the rows of `published`, with the number of touches so far
+    #: the rows of `published`, with the total number of touches so far
     rows: AdvanceSeries
     published: Published
     #: touches since the previous advance, shape (n, 8)
@@ -176,13 +176,13 @@ class Walker:
 class JournalWalk:
     """Pass the journal of a run through walkers of its scene and of other scenes.
 
-    `used` and `late` count samples; a late sample is sorted in by its stamp unless the walkers have passed it.
-    `missing` counts the entries that the journal lacks; a new stretch begins after each gap.
+    `used` and `late` count samples; a late sample is sorted in by its stamp unless the walkers have passed this stamp.
+    `missing` counts the entries that are missing in the journal; after each gap a new part of the motion begins.
 
     Parameters
     ----------
     own
-        Walkers that take their state from the journal after a loss, and after wear was set.
+        Walkers that take over the state in the journal after a loss, and after wear was set.
     others
         Walkers that keep their own states.
     whole
@@ -216,7 +216,7 @@ class JournalWalk:
         self._whole(entries[begin:])
 
     def _hole(self, count: int) -> None:
-        """Begin a new stretch: no load is interpolated over missing entries."""
+        """Begin a new part of the motion, because no load may be interpolated over missing entries."""
         self.missing += count
         self._entry(Loss(count))
 
@@ -251,7 +251,7 @@ class JournalWalk:
     def _speed(self, speed_m_s: float) -> None:
         for walker in self._all:
             walker.speed_m_s = speed_m_s
-            # the stamp is the time reached, so that the speed acts at once
+            # the stamp is the time already reached, so that the speed acts at once
             walker.apply(Travel(max(0, self._reached_ns), speed_m_s))
 
     def _begin_anew(self) -> None:

@@ -149,7 +149,8 @@ def save_wear(folder: Path, content: bytes) -> None:
     Raises
     ------
     OSError
-        The disk refuses the file, which then has the old content, or the new content without confirmation by the disk.
+        The disk refuses the file. The file then has the old content, or it has the new content but the disk has not
+        confirmed it.
     """
     folder.mkdir(parents=True, exist_ok=True)
     write_whole(folder / FILE_NAME, content, sync=True)

@@ -29,7 +29,7 @@ from plow_twin.stream.journal import Digest, Entry, Sample
 from plow_twin.stream.outputs import Published
 from plow_twin.stream.topics import TOPICS, Cadence, topics_of
 
-#: Folder of other topics in the folder of a run; further such folders are `beside_2`, ...
+#: Folder for other topics in the folder of a run; if it exists, `beside_2`, `beside_3`, ... are used.
 BESIDE: Final = "beside"
 _SEQUENCE_MASK: Final = 0xFFFFFFFF
 Made = TypeVar("Made")

@@ -114,7 +114,7 @@ class Connections:
         return found, refused
 
     def look_for_subscribers(self, publishers: Iterable[Publisher]) -> None:
-        """Report the subscribers that cannot connect to the node's own topics."""
+        """Report the subscribers that cannot connect to the topics that this node publishes."""
         for publisher in publishers:
             topic, kind = publisher.topic_name, type_name(publisher.msg_type)
             for subscriber in self._node.get_subscriptions_info_by_topic(topic):
@@ -141,7 +141,7 @@ def type_name(message_class: Any) -> str:
 
 
 def _in_full(own: QoSProfile) -> QoSProfile:
-    """Return one of the node's own profiles, with its defaults resolved as in the ROS graph."""
+    """Return the profile of a publisher or subscription of this node, with its defaults resolved as in the graph."""
     return QoSProfile(
         depth=own.depth,
         reliability=own.reliability,

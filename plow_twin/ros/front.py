@@ -63,7 +63,7 @@ class RosFront:
         self.follows_samples: bool = node.get_parameter("use_sim_time").value
         self.sends_motion = True
         self._changed = changed
-        #: one thread at a time uses the twin
+        #: only one thread at a time may use the twin, and threads take turns
         self.turns = Turns()
         self._lost: list[str] = []
         self._server: OpcUaInput | None = None
@@ -145,7 +145,7 @@ class RosFront:
         return time_text(stamp_ns)
 
     def changed(self) -> None:
-        """Note that the state of the stream may have changed."""
+        """Take notice that the state of the stream may have changed."""
         self._changed()
 
     def say_error(self, text: str) -> None:
@@ -158,7 +158,7 @@ class RosFront:
         return self._loop.error
 
     def look_for_others(self) -> None:
-        """Check whether another node publishes on this twin's topics, and the state of a server."""
+        """Check whether another node publishes on this twin's topics, and check the connection to a server."""
         if self._server is not None:
             with self.turns:
                 self._server.look()

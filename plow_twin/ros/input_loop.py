@@ -75,7 +75,7 @@ class InputLoop:
 
     def __init__(self, turns: Turns, on_error: Callable[[Exception], None]) -> None:
         self._turns, self._on_error = turns, on_error
-        #: queue, receiver and topic for each file descriptor
+        #: timers; the first timer polls all queues and always runs
         self._queues: dict[int, tuple[Queue, Receiver, str]] = {}
         #: the first timer, which looks at all queues, always runs
         self._timers = [Timer(_LOOK_S, self._look_at_all)]
@@ -96,7 +96,7 @@ class InputLoop:
         self._look_again()
 
     def every(self, period_s: float, do: Callable[[], float | None]) -> None:
-        """Call a function every `period_s` while the timers run; to be called before the start."""
+        """Call a function every `period_s` seconds while the timers run; call this method before `start`."""
         self._timers.append(Timer(period_s, do))
 
     def start(self) -> None:
@@ -152,7 +152,7 @@ class InputLoop:
             self._on_error(error)
 
     def _receive(self, fd: int, *, all_there_are: bool = False) -> bool:
-        """Take messages from a queue; return whether more are waiting."""
+        """Take messages from a queue and pass them on; return whether more messages are waiting."""
         queue, receiver, topic = self._queues[fd]
         batch, more = queue.pop(_MOST, all_there_are=all_there_are)
         if batch:

@@ -31,7 +31,7 @@ class Taken(NamedTuple):
 
 
 class _Info(ctypes.Structure):
-    """`rmw_message_info_t`, with spare room at the end because other versions have more fields."""
+    """`rmw_message_info_t`, with spare bytes at the end, because other versions of ROS have more fields."""
 
     _fields_ = [
         ("source_ns", ctypes.c_int64),
@@ -102,8 +102,8 @@ class InputQueue:
     def pop(self, most: int, *, all_there_are: bool = False) -> tuple[list[Taken], bool]:
         """Return up to `most` waiting messages in order of arrival, and whether there are more.
 
-        It takes as many messages as were signalled, or `most` with `all_there_are`, because reading an empty queue
-        costs a fifth of the time of a sample.
+        The method takes as many messages as were signalled, or up to `most` with `all_there_are`. It does not try to
+        read further messages, because reading an empty queue costs a fifth of the time of a sample.
         """
         try:
             signs = os.eventfd_read(self.fd)
@@ -112,7 +112,7 @@ class InputQueue:
         self._signs += signs
         wanted = most if all_there_are else min(most, self._signs)
         taken = self._taken(wanted)
-        # an overrun of the queue leaves more notifications than messages
+        # if the queue has overflowed, there were more signals than messages
         self._signs = max(0, self._signs - len(taken)) if len(taken) == wanted else 0
         return taken, self._signs > 0 or (all_there_are and len(taken) == most)
 

@@ -163,7 +163,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
         return self._entered("unconfigured")
 
     def release(self) -> None:
-        """Release everything and close the recording; can be called at any time."""
+        """Release everything and close the recording; the call is allowed in any state."""
         # the runtime is part of reference cycles, so it would never be freed while its objects are frozen
         gc.unfreeze()
         front, self._front = self._front, None

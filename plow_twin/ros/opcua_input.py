@@ -74,7 +74,7 @@ class OpcUaInput:
         self._feeder.feed(batch)
 
     def look(self) -> None:
-        """Update losses and the state of the connection; to be called at intervals."""
+        """Update the losses and the state of the connection; the front calls this method at intervals."""
         bridge = self._bridge
         self._inputs.lost += bridge.lost - self._lost
         self._lost = bridge.lost

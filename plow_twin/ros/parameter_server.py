@@ -56,7 +56,7 @@ class ParameterServer:
     node
         The node.
     unconfigured
-        Returns whether parameters that take effect on configure can be changed now.
+        Function that returns whether the node is unconfigured, so that parameters for configure may change.
     changed
         Called with name and value of each parameter that has changed at run time and takes effect at once.
     refusals
@@ -105,7 +105,7 @@ class ParameterServer:
         values = {parameter.name: parameter.value for parameter in asked}
         reasons = [str(problem) for problem in parameters.problems(values)]
         if not self._unconfigured():
-            # an unchanged value, as in a file of all parameters, has no effect
+            # a value that does not change, as in a file that sets all parameters, is not refused
             reasons += [
                 f"{name}: takes effect {Effect.CONFIGURE.value}"
                 for name, value in values.items()

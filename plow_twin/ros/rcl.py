@@ -51,7 +51,7 @@ def _publish() -> Any:
 
 
 class Sender:
-    """Sends the present content of a fixed buffer on a topic.
+    """Sends what a fixed buffer contains at the time of the call, on one topic.
 
     Parameters
     ----------

@@ -49,7 +49,7 @@ class Subscriptions:
     loop, turns
         The thread that takes the messages, and the lock that keeps it apart from the executor's thread.
     elsewhere
-        Inputs that come from a server instead of topics.
+        Inputs that come from a server and therefore have no subscription.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class Subscriptions:
         self._inputs, self._intake = runtime.inputs, runtime.driver.intake
         self._connections = Connections(node)
         self._taken_from: dict[str, Subscription] = {}
-        #: publishers of each input at the last look
+        #: publishers of each input when they were last looked up
         self._found: dict[str, list[bytes]] = {}
         self._tool_forces = ToolForces(runtime.scene)
         self._source, depth = runtime.settings.excitation_source, self._inputs.depth

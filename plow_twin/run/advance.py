@@ -31,7 +31,7 @@ class _Column(Generic[Number]):
 
 
 class _View:
-    """Columns of a row or of many rows; a column is an array even for a single row."""
+    """Columns of a row or of many rows; even for a single row, a column is an array."""
 
     __slots__ = ("rows",)
 
@@ -74,7 +74,7 @@ class Advance(_View):
     steps : int
         Number of steps that the solver took.
     status : Status
-        Status of the advance; with any value but `OK` the state is the last good state.
+        Status of the advance; if it is not `OK`, the state is the last good state.
     error_estimate_m : float
         Estimated error of the pose in m if `max_evaluations` was too small for the tolerance, otherwise 0.
     """

@@ -30,8 +30,8 @@ __all__ = ["TwinBatch"]
 
 _Array = NDArray[np.float64]
 _NO_MARKS = np.zeros(0, np.int64)
-#: Terms that have no effect if their parameters are zero. A scene without such a term can therefore run with compiled
-#: code that has it.
+#: Terms that have no effect if their parameters are zero, so that a scene without such a term can run with compiled
+#: code that includes the term.
 _OPTIONAL = ("hysteretic", "wear", "sliding", "running_in", "offset", "free", "slip")
 
 
@@ -243,7 +243,7 @@ class TwinBatch:
             self._states["y"][index] = geometry.state_of(self.scenes[index], there[:3], there[3:])
 
     def move(self, which: ArrayLike, q: ArrayLike, v: ArrayLike) -> None:
-        """Set the poses and rates of some twins at the present time; their wear and counts stay.
+        """Set the poses and rates of some twins at the present time; their wear and counters are kept.
 
         Parameters
         ----------
@@ -419,7 +419,7 @@ class _Worker(NamedTuple):
 
 
 def _merge(compiled: Sequence[CompiledScene]) -> Terms:
-    """Return the joint terms of all members.
+    """Return the terms that the compiled code needs for all members.
 
     Raises
     ------

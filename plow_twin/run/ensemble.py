@@ -82,8 +82,9 @@ def simulate_many(
 ) -> Ensemble:
     """Simulate every scene from t = 0 to `t_end`; the bits of a member depend on its scene alone.
 
-    Scenes with any law without a ramp, constant or harmonic loads and no other terms run eight at a time in the lanes
-    of a SIMD vector and agree with `simulate` to the tolerance. All other scenes have the bits of `simulate`.
+    Scenes with any law without a ramp, with constant or harmonic loads, and without further terms run eight at a time
+    in the lanes of a SIMD vector; they agree with `simulate` to the tolerance. All other scenes have the bits of
+    `simulate`.
 
     Parameters
     ----------
@@ -136,8 +137,8 @@ def simulate_many(
     return ensemble
 
 
-#: Smallest number of members that a thread takes at a time. With fewer members, lanes would be empty for too large a
-#: part of the time, because they stay empty while the last members of a share end.
+#: Smallest number of members that a thread takes at a time. When the last members of a share end, lanes stay empty;
+#: with fewer members this would be too large a part of the time.
 _LEAST_SHARE = 64
 #: Number of shares for each thread; with several small shares all threads end at about the same time.
 _SHARES = 4
@@ -206,7 +207,7 @@ class _Run:
                 self._on_progress(self.done)
 
     def _run_lanes(self, run: LaneRun, share: NDArray[np.int64]) -> None:
-        """Run some members that fit the lanes."""
+        """Run some members in lanes; their scenes must fit the lanes."""
         waiting = share
         while len(waiting):
             self._look()

@@ -1,4 +1,4 @@
-"""Scenes run in the lanes of a SIMD vector, in slices; the loop for a single scene takes the steps of other methods."""
+"""Scenes run in the lanes of a SIMD vector, in slices of work. Steps of other methods run in the single loop."""
 
 from __future__ import annotations
 
