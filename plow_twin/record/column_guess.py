@@ -23,7 +23,8 @@ from plow_twin.scene_file.csv_rows import csv_rows, delimiter_of, open_csv
 
 Array = NDArray[np.float64]
 
-#: For each role and number, a pattern that fits the column's name without spaces and signs.
+#: Regular expression for the column name of each quantity, by role and name of the quantity; the column name is first
+#: reduced by `_plain`.
 _NAMES: Final = {
     ("excitation", "fx"): r"fx|(force|load|kraft|last)x|x(force|load|kraft)|fhor(izontal)?|horizontalforce",
     ("excitation", "fy"): r"fy|(force|load|kraft|last)y|y(force|load|kraft)|fver(tical)?|verticalforce",
@@ -37,11 +38,12 @@ _TIME: Final = r"t|time|timestamp|stamp|zeit|zeitstempel|date|datetime|datum"
 _UNIT: Final = re.compile(
     r"(.+?)\s*(?:[\[(]\s*([^\])]+?)\s*[\])]|[ _](kN ?m|N ?m|kN|N|mm|cm|m|mrad|rad|deg|ms|us|ns|s))"
 )
-#: Times above these limits count from 1970 in the named unit; each limit is a date in 2001.
+#: A time above one of these limits is taken as a count from 1970 in the unit before the limit; each limit is a date in
+#: 2001.
 _DATES: Final = (("ns", 1e18), ("us", 1e15), ("ms", 1e12), ("s", 1e9))
 #: Largest number of cells that are examined: the wider a file, the fewer of its rows are examined.
 _MOST_CELLS: Final = 2_000_000
-#: Role and name of each number that a load needs.
+#: Role and name of each component of a load; each component needs a column.
 _NEEDED: Final = tuple(("excitation", name) for name in ROLES["excitation"])
 
 
@@ -49,9 +51,9 @@ _NEEDED: Final = tuple(("excitation", name) for name in ROLES["excitation"])
 class Guess:
     """The guessed meaning of a file's columns.
 
-    `columns` maps role and number to a column, and `units` maps each number that is not in SI to its unit. `time` is
-    the column of the time and `time_unit` its unit, empty for dates as text. `because` says how each column was found.
-    `open` maps each undecided number, or `t`, to the columns or units to choose from.
+    `columns` maps role and name of a quantity to a column, and `units` maps the name of each quantity that is not in SI
+    to its unit. `time` is the time column and `time_unit` its unit, empty for dates as text. `because` says how each
+    column was found. `open` maps each undecided quantity, or `t` for the time, to the columns or units to choose from.
     """
 
     path: Path
@@ -65,7 +67,7 @@ class Guess:
     because: dict[str, str] = field(default_factory=dict)
     open: dict[str, tuple[str, ...]] = field(default_factory=dict)
     stamps_s: Array = field(default_factory=lambda: np.zeros(0))
-    #: numbers in SI, by role and number
+    #: values of the columns in SI, by role and name of the quantity
     values: dict[tuple[str, str], Array] = field(default_factory=dict)
 
     def mapping(self) -> dict[str, Any]:
@@ -104,12 +106,12 @@ def guess_columns(path: Path, scene: Scene, columns: Mapping[str, str], units: M
     scene
         Scene whose loads and sizes say which magnitudes are plausible.
     columns, units
-        Columns and units that are known, by number (fx, ..., t).
+        Columns and units that the user states, by name of the quantity (fx, ..., or t for the time).
 
     Raises
     ------
     RecordingError
-        The file cannot be read, has no header or no rows, or lacks a given column.
+        The file cannot be read, has no header or no rows, or lacks a column that the user states.
     """
     guess, rows = _read(path)
     for name, column in columns.items():
@@ -262,6 +264,6 @@ def _unit_of(name: str) -> str:
 
 
 def _plain(name: str) -> str:
-    """Return a name in lower case without its unit, spaces and signs."""
+    """Return a column's name in lower case without its unit, spaces and punctuation."""
     found = _UNIT.fullmatch(name)
     return re.sub(r"[^a-z0-9]", "", (found[1] if found else name).lower())

@@ -1,4 +1,4 @@
-"""Compiled comparison, byte for byte, of the messages that a run sent with the publications of its replay."""
+"""Comparison, byte for byte, of the messages that a run sent with the messages that its replay computes."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ _IS_SLOW = np.array([topic.cadence is Cadence.SLOW for topic in REPLAYED])
 
 
 class Sent:
-    """For each message of a run, the advance after which it was sent.
+    """Find, for each message sent during a series of journal entries, the advance that precedes it.
 
     Parameters
     ----------
     sequence, kind : ndarray of int64, shape (n,)
-        Number of the journal entry before each message (rising), and the message's index in `REPLAYED` (-1: another
-        topic).
+        Number of the journal entry before each message (rising), and index of the message's topic in `REPLAYED` (-1 for
+        any other topic).
     done : ndarray of int64, shape (k,)
-        Number of advances up to each entry of the run, whose first entry has the number `first`.
+        Number of advances up to each entry of the series, whose first entry has the sequence number `first`.
     advances
-        Number of advances of the run.
+        Number of advances in the series.
     """
 
     def __init__(self, sequence: Indexes, kind: Indexes, done: Indexes, first: int, advances: int) -> None:
         self.kind = kind
         #: for each message, the index of the advance after which it was sent
         self.after = np.empty(len(kind), np.int64)
-        #: number of messages of each kind
+        #: number of messages on each topic of `REPLAYED`
         self.counts = np.zeros(_KINDS, np.int64)
         numbers = np.full(advances, -1)
         find_advances(sequence, kind, done, first, self.after, self.counts, numbers)
-        #: advances after which messages were sent
+        #: indexes of the advances after which messages were sent
         self.taken = np.flatnonzero(numbers >= 0)
         #: sequence number of the first message after each of these advances
         self.first_sequence = numbers[self.taken]
@@ -50,7 +50,7 @@ class Sent:
         self.publication[self.taken] = np.arange(len(self.taken))
 
     def expect(self, published: Published, templates: Templates, kinds: NDArray[np.bool_]) -> None:
-        """Set the publications after the advances `taken`; `kinds` is a mask of the message kinds to compare."""
+        """Set the publication after each advance in `taken`; `kinds` is True for each topic to compare."""
         rows, slow = published
         slow_of = np.full(len(rows), -1)
         slow_of[slow["row"]] = np.arange(len(slow))
@@ -63,7 +63,7 @@ class Sent:
         )  # fmt: skip
 
     def differing(self, messages: Messages, chosen: slice) -> list[int]:
-        """Return the indexes of `messages` that differ; `chosen` is the slice of these messages in the run."""
+        """Return the indexes of differing messages; `chosen` is the slice of `messages` in the series."""
         wrong = np.empty(len(messages), bool)
         places = messages.start, messages.length
         count = compare(messages.buffer, *places, self.kind[chosen], self.after[chosen], *self._expected, wrong)
@@ -72,7 +72,7 @@ class Sent:
 
 @compiled
 def find_advances(sequence, kind, done, first, after, counts, numbers):  # type: ignore[no-untyped-def]
-    """Fill the arrays of `Sent`; `numbers` receives the number of the first message after each advance."""
+    """Fill the arrays of `Sent`; `numbers` gets the number of the entry before each advance's messages."""
     for n in range(sequence.size):
         advance = done[sequence[n] - first] - 1
         after[n] = advance
@@ -83,14 +83,15 @@ def find_advances(sequence, kind, done, first, after, counts, numbers):  # type:
 
 
 def _with_whole_rows(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the numbers with contiguous rows; there may be gaps between rows."""
+    """Return the numbers as an array whose rows are each contiguous; copy them only if necessary."""
     return numbers if numbers.strides[1] == numbers.itemsize else np.ascontiguousarray(numbers)
 
 
 def _pieces(numbers: list[list[NDArray[np.float64]]], templates: Templates) -> tuple[Indexes, Indexes]:
-    """Return the pieces, which are contiguous both in the message and in the row, and the end of each kind's pieces.
+    """Return the pieces of all kinds of messages, and for each kind the index at which its pieces end.
 
-    A piece is (offset in the message [B], count of numbers, address in the first row, stride between rows [B]).
+    A piece is a series of numbers that is contiguous both in the message and in the row: (offset in the message [B],
+    count of numbers, address in the first row, stride between rows [B]).
     """
     found, ends = [], [0]
     for kind, parts in enumerate(numbers):
@@ -119,15 +120,16 @@ def compare(  # type: ignore[no-untyped-def]
     kinds, after : ndarray of int64, shape (n,)
         As in `Sent`.
     publication, slow : ndarray of int64
-        Publication of each advance, and row of each publication's slow part (below 0: no slow part).
+        Index of each advance's publication, and index of each publication's slow part, which has clearance and wear
+        rate (below 0: no slow part).
     compared : ndarray of bool
-        Whether each kind is compared.
+        Whether messages of each kind are compared.
     pieces, piece_ends
         As in `_pieces`.
     data, fixed, ends
         As in `Templates`.
     different : ndarray of bool, shape (n,)
-        Receives whether each message differs; the function returns the number of messages that differ.
+        Receives True for each message that differs. The function returns the number of these messages.
     """
     count = 0
     for n in range(starts.size):

@@ -14,7 +14,8 @@ import numpy as np
 from plow_twin.errors import RecordingError
 from plow_twin.record.template import Bytes
 
-#: Largest record and largest chunk content [B]; a greater length is damage, as writers close a chunk at a few MiB.
+#: Largest record and largest chunk content [B]; a greater length is taken as damage, because writers close a chunk at a
+#: few MiB.
 RECORD_LIMIT: Final = 64 * 1024 * 1024
 _of_thread: Final = threading.local()
 #: Format of an LZ4 frame: head, magic number, flags, and the length before each block.
@@ -25,7 +26,7 @@ _LZ4_LENGTH: Final = struct.Struct("<I")
 
 
 def decompress(compression: str, data: memoryview, size: int) -> bytes | Bytes:
-    """Return the content of a chunk, of at most `size` bytes."""
+    """Return the decompressed content of a chunk, which has at most `size` bytes."""
     if compression == "zstd":
         import zstandard
 
@@ -62,9 +63,9 @@ def _lz4_block() -> Callable[[int, int, int, int], int] | None:
 def independent_blocks(data: memoryview, size: int) -> Bytes | None:
     """Return the content, `size` bytes, of an LZ4 frame written by the recorder, or None for any other frame.
 
-    The blocks of such a frame are independent and have no checksums, because the chunk has a checksum. The lz4 package
-    decompresses into its own memory and copies the result, which takes a third longer and costs a replay 13 % more
-    processor time.
+    The recorder writes independent blocks without checksums, because the chunk has a checksum. They are decompressed
+    here directly into the result. The lz4 package decompresses into its own memory and copies the content, which takes
+    a third longer and costs a replay 13 % more processor time.
     """
     block = _lz4_block()
     if block is None or len(data) < _LZ4_HEAD.size or len(data) > RECORD_LIMIT:
@@ -90,7 +91,7 @@ def independent_blocks(data: memoryview, size: int) -> Bytes | None:
 
 
 def _zstd() -> Any:
-    """Return the decompressor of this thread: making its tables takes as long as decompressing a small chunk."""
+    """Return this thread's decompressor; making a new one takes as long as decompressing a small chunk."""
     import zstandard
 
     if not hasattr(_of_thread, "zstd"):

@@ -1,4 +1,4 @@
-"""Selection of the publications to record: all, none, or some; these include the impulses and peaks of the rest."""
+"""Selection of publications to record; a kept publication has the impulses and peaks of the others too."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ class Decimation:
     outputs
         `all`, `decimated` or `none`.
     rate_hz
-        Rate of a decimated recording [Hz]: the first publication of each period and each publication with a slow part
-        are kept.
+        Rate of a decimated recording [Hz]. The first publication of each period is kept, and so is each publication
+        with a slow part (clearance and wear rate).
     """
 
     def __init__(self, outputs: str, rate_hz: float) -> None:
@@ -33,7 +33,7 @@ class Decimation:
         return self._outputs == "all"
 
     def select(self, published: Published) -> Published | None:
-        """Return the publication to record, or None, given a publication of one row."""
+        """Return the publication to record for `published`, which has one row, or None to leave it out."""
         if self._outputs == "all":
             return published
         if self._outputs == "none":

@@ -1,6 +1,6 @@
-"""Examination and repair of a recording: a truncated or damaged part gets its end and index again.
+"""Examination of a recording, and repair, which restores the end and index of a truncated or damaged file.
 
-A repair copies every readable message into a new file and keeps the old one under another name. Lost messages stay
+A repair copies every readable message into a new file and keeps the old file under another name. Lost messages stay
 lost and are counted.
 """
 
@@ -36,21 +36,21 @@ from plow_twin.record.unused import InputCounts
 from plow_twin.stream.journal import Digest, Failed, Sample, Snapshot
 
 _CHUNK_SIZE: Final = 2**20
-#: Key under which `metadata.yaml` lists the repaired parts, without the prefix `plow_twin_`.
+#: Key under which `metadata.yaml` lists the repaired parts; in the file it has the prefix `plow_twin_`.
 REPAIRED_KEY: Final = "repaired"
 _HASH: Final = "topic_type_hash"
 
 
 @dataclass
 class PartReport:
-    """One file: how it ended and how much of it could not be read."""
+    """State of one file of a recording: whether it has an end, and how much of it could not be read."""
 
     path: Path
     bytes: int
     finished: bool
     damaged_chunks: int
     messages: dict[str, int]
-    #: number of bytes after the last MCAP record; because of them other readers refuse the file
+    #: number of bytes after the end of the MCAP content; other readers refuse a file that has such bytes
     trailing_bytes: int = 0
     #: number of chunks that an earlier repair left out
     left_out: int = 0
@@ -65,7 +65,7 @@ class PartReport:
 
 @dataclass
 class RunReport:
-    """A recording: its parts, its journal and its losses."""
+    """Report on a recording: its parts, journal entries, losses and problems."""
 
     path: Path
     parts: list[PartReport] = field(default_factory=list)
@@ -80,12 +80,12 @@ class RunReport:
     inputs: dict[str, dict[str, int]] = field(default_factory=dict)
     #: number of failed advances, whose samples have no forces
     failed_advances: int = 0
-    #: the same as `duration_s` in the facts of a recording
+    #: time from the first advance to the last [s], equal to `duration_s` in `cli/recording_facts.py`
     span_s: float = 0.0
     problems: list[str] = field(default_factory=list)
 
     def facts(self) -> dict[str, Any]:
-        """Return all facts for JSON."""
+        """Return all facts in a form that can be written as JSON."""
         parts = [
             {
                 "file": part.path.name,
@@ -286,7 +286,7 @@ def _mend(parts: Sequence[Path], last: Path) -> list[Path]:
 
 
 def _put_aside(file: Path, ending: str) -> None:
-    """Rename a file to an unused name with an ending."""
+    """Append `.<ending>` to the name of a file, with a number if the new name is already used."""
     target, number = file.with_name(f"{file.name}.{ending}"), 2
     while target.exists():
         target, number = file.with_name(f"{file.name}.{ending}_{number}"), number + 1
@@ -306,7 +306,7 @@ def _list_parts(folder: Path, parts: Sequence[Path], repaired: Sequence[str]) ->
 def _rewrite(part: Path, *, last: bool) -> None:
     """Replace a file by a new file with its readable messages and a note at each gap.
 
-    The end of the last part is the end of the recording, not a gap.
+    A missing end counts as a gap, except in the last part: there the recording ended.
     """
     target = part.with_name(f"{part.name}.partial")
     target.unlink(missing_ok=True)

@@ -11,7 +11,7 @@ from typing import BinaryIO
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Add the path to errors of writing to a file or folder, such as the error of a full disk."""
+    """Add the path to an `OSError` raised inside this context, such as the error of a full disk."""
     try:
         yield
     except OSError as error:
@@ -24,8 +24,8 @@ def naming(path: Path) -> Iterator[None]:
 def whole_file(path: Path, *, sync: bool = False) -> Iterator[BinaryIO]:
     """Open a stream whose content becomes the file `path` in one step at the end.
 
-    Until then, and after an error or a kill, the file stays as it was. With `sync` the new file also survives a loss of
-    power. A pipe or a device is written to directly.
+    Until the end, and after an error or a kill, an existing file stays unchanged. With `sync` the new file also
+    survives a loss of power. A pipe or a device is written to directly.
 
     Raises
     ------

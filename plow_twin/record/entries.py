@@ -50,10 +50,11 @@ Record = EntryRecord | OutputRecord
 
 @dataclass(frozen=True)
 class Entries:
-    """Journal entries as arrays of shape (n,), in order of use.
+    """Journal entries as arrays of shape (n,), in the order in which the twin used them.
 
-    `sample` is True for samples. `digest_at` (m,) has the indexes of the digests and `digest` (m,) their values; their
-    stamps are in `stamp_ns`. All other entries are in `rest` by index. Sequence numbers do not wrap at 2^32.
+    `sample` is True for samples of the load. `digest_at` (m,) has the indexes of the digests (hashes of the twin's
+    state), `digest` (m,) their values, and `stamp_ns` their stamps. `rest` maps the index of each other entry to the
+    entry. The numbers in `sequence` do not wrap at 2^32.
     """
 
     sequence: Indexes
@@ -136,7 +137,7 @@ NO_ENTRIES: Final = Entries(_NONE, _NONE, np.zeros(0, bool), _NONE, np.zeros((0,
 
 @dataclass(frozen=True)
 class Outputs:
-    """Outputs of one chunk; `sequence` does not wrap at 2^32, `topics` has topic and type of each channel."""
+    """Outputs of one chunk; `topics` maps channels to topic and type; `sequence` does not wrap at 2^32."""
 
     messages: Messages
     sequence: Indexes
@@ -147,7 +148,7 @@ class Outputs:
 
     @cached_property
     def newest(self) -> int:
-        """The highest sequence number; there is at least one message."""
+        """The highest sequence number; there must be at least one message."""
         return int(self.sequence.max())
 
     def __getitem__(self, chosen: slice) -> Outputs:
@@ -180,7 +181,7 @@ class Batch:
     damaged: bool = False
 
     def parted(self, places: Sequence[int]) -> Iterator[Batch]:
-        """Yield the batch in pieces, the first of which end before the entries `places` (rising indexes)."""
+        """Yield the batch in pieces; a new piece begins at each entry of `places` (rising indexes)."""
         outputs, begin = self.outputs, 0
         for place in places:
             now, outputs = parted_at(outputs, int(self.entries.sequence[place]))
@@ -196,7 +197,7 @@ class Holes:
         self._next: int | None = None  # sequence number that the next entry should have
 
     def find(self, entries: Entries) -> dict[int, int]:
-        """Return the number of entries that are missing before an index, for each index after a gap, in order."""
+        """Map the index of each entry after a gap to the number of entries missing in the gap, in order."""
         if not len(entries):
             return {}
         reached = np.maximum.accumulate(entries.sequence) + 1
@@ -208,7 +209,7 @@ class Holes:
 
 
 def parted_at(outputs: Sequence[Outputs], end: int) -> tuple[list[Outputs], list[Outputs]]:
-    """Return the messages with a number below `end`, and the others."""
+    """Return the messages with sequence numbers below `end`, and the other messages."""
     before, after = [], []
     for part in outputs:
         place = len(part) if part.newest < end else int((part.sequence >= end).argmax())
@@ -222,8 +223,8 @@ def in_order(batch: Batch) -> Iterator[Record]:
     sequences = [part.sequence for part in batch.outputs]
     owners = np.concatenate([np.full(len(part), number) for number, part in enumerate(sequences)] or [np.zeros(0, int)])
     places = np.concatenate([np.arange(len(part)) for part in sequences] or [np.zeros(0, int)])
-    # a message is placed before the first entry with a higher sequence number; entries may be out of order, so the
-    # highest number so far counts
+    # a message is placed before the first entry with a higher sequence number; because entries may be out of order, the
+    # highest number up to each entry is compared
     bounds = np.maximum.accumulate(batch.entries.sequence) if len(batch.entries) else batch.entries.sequence
     slots = np.searchsorted(bounds, np.concatenate(sequences or [np.zeros(0, np.int64)]), side="right")
     order = np.argsort(slots, kind="stable")
@@ -239,6 +240,6 @@ def in_order(batch: Batch) -> Iterator[Record]:
 
 @compiled
 def unwrap(sequence: Indexes, base: int, out: Indexes) -> None:
-    """Write the unwrapped numbers; each is the possible value nearest to `base`."""
+    """Unwrap 32-bit sequence numbers into `out`; each gets the possible value nearest to `base`."""
     for n in range(sequence.size):
         out[n] = base + ((sequence[n] - base + _HALF) & (_WHOLE - 1)) - _HALF

@@ -28,7 +28,7 @@ from plow_twin.stream.session import wear_in
 
 @dataclass(frozen=True, eq=False)
 class LiveEstimate:
-    """An estimate from the journal of a node, with its window formed again from the journal.
+    """An estimate in a node's journal, and its window of measurements, formed again from the journal.
 
     `window` is None if part of it is missing because files were removed or entries were lost.
     """
@@ -73,7 +73,7 @@ def live_estimates(reader: RunReader) -> Iterator[LiveEstimate]:
 
 
 def left_by(reader: RunReader) -> tuple[Scene, Estimated | None]:
-    """Return the scene at the end of a run, with its wear and changed numbers, and the newest estimate of the pads."""
+    """Return the scene at the end of a run, with wear and model changes, and the newest pad estimate."""
     scene, newest = reader.header.scene(reader.path), None
     depth, changes = None, dict[str, float]()
     for batch in reader.batches(outputs=False):
@@ -94,13 +94,13 @@ def left_by(reader: RunReader) -> tuple[Scene, Estimated | None]:
 
 
 def stated(parameters: Mapping[str, Any]) -> tuple[Deviation, Deviation]:
-    """Return the deviations of poses and load that the node's parameters state."""
+    """Return the standard deviations of poses and load that the node's parameters state."""
     poses, load = (parameters.get(f"{name}_deviation", UNSTATED) for name in ("head_pose", "excitation"))
     return tuple(map(float, poses)), tuple(map(float, load))
 
 
 def _whole(window: Window | str, entry: Estimated) -> Window | None:
-    """Return the window if its bounds and counts equal those in the journal, otherwise None."""
+    """Return the window if its bounds and counts are as in the journal, otherwise None."""
     if isinstance(window, str):
         return None
     formed = window.start_ns, window.end_ns, window.samples, window.poses

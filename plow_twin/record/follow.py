@@ -1,4 +1,4 @@
-"""A recording that is still being written: checks for its writer, and waits for further content.
+"""Reading of a recording that is still being written: check whether its writer runs, wait for new content.
 
 A writer locks its file; the operating system releases the lock however the process ends.
 """
@@ -10,12 +10,12 @@ import time
 from collections.abc import Callable
 from typing import IO, Final
 
-#: Interval at which a waiting reader looks again [s].
+#: Interval at which a waiting reader checks the file for new content [s].
 POLL_S: Final = 0.1
 
 
 def claim(descriptor: int) -> None:
-    """Lock a file, until it is closed, as being written; do nothing on a file system without locks."""
+    """Lock a file as being written until it is closed; do nothing on a file system without locks."""
     import fcntl
 
     try:
@@ -25,7 +25,7 @@ def claim(descriptor: int) -> None:
 
 
 def is_claimed(descriptor: int) -> bool:
-    """Return whether a process writes to a file."""
+    """Return whether another process still writes to a file, which it has locked by `claim`."""
     import fcntl
 
     try:
@@ -51,9 +51,9 @@ class Tail:
         self.stopped = False
 
     def more(self, stream: IO[bytes], size: int) -> bool:
-        """Wait until a file is longer than `size` [B]; False when its writer has ended."""
+        """Wait until a file is longer than `size` [B]; return False if its writer ends or `stop` is true."""
         while True:
-            # the claim is checked before the size: otherwise the bytes that a writer adds between both checks, just
+            # the lock is checked before the size: otherwise the bytes that a writer adds between the two checks, just
             # before it ends, would not be read
             alive = is_claimed(stream.fileno())
             if os.fstat(stream.fileno()).st_size > size:

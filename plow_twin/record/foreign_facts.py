@@ -14,7 +14,7 @@ from plow_twin.record.sources import open_source
 
 @dataclass
 class _Seen:
-    """Messages of a role: numbers of used and unfit messages, and the range of their stamps [ns] and numbers in SI."""
+    """Messages of a role: counts of used and unfit messages, ranges of their stamps [ns] and SI values."""
 
     used: int = 0
     unfit: int = 0
@@ -54,10 +54,10 @@ def foreign_facts(path: Path, mapping: Path | None, units: Mapping[str, str]) ->
     Returns
     -------
     facts : dict
-        Topics with their types. For each role: its topic, the numbers of messages and of unfit messages, the span [s],
-        the rate [Hz], and the least and the largest value of each number in SI.
+        Topics with their types. For each role: its topic, the counts of its messages that fit and do not fit the role,
+        their span [s] and rate [Hz], and the smallest and the largest value of each quantity in SI.
     lossy : bool
-        Whether something could not be read.
+        Whether a part of the recording could not be read.
 
     Raises
     ------

@@ -6,10 +6,10 @@ from typing import Any, Final
 
 from plow_twin.errors import RecordingError
 
-#: Longest text of a type together with all types that it uses, without comments [characters]; usual texts have some
-#: 10,000.
+#: Largest length of the text of a type and of all types that it uses, without comments [characters]; usual texts have
+#: some 10,000 characters.
 _LONGEST: Final = 2**18
-#: Largest number of parts (numbers, texts, arrays of numbers) of a message whose sequences have one item each.
+#: Largest number of parts (numbers, texts, arrays of numbers) of a message; a sequence counts as if it had one item.
 _MOST_PARTS: Final = 1_000
 
 
@@ -36,7 +36,7 @@ def parsed_types(text: str, message_type: str) -> dict[str, Any]:
 
 
 def _count(name: str, types: dict[str, Any], counts: dict[str, int]) -> int:
-    """Return the number of parts of a message of a type; a type of the store is one part."""
+    """Return the number of parts of a message of type `name`; a type not in `types` counts as one part."""
     if name not in types:
         return 1
     if name not in counts:

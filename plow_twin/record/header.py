@@ -127,7 +127,7 @@ class RunHeader:
 
 
 def _fits(value: Any, kind: str) -> bool:
-    """Return whether a value of the header is of its type; integers have 64 bits."""
+    """Return whether a value of the header has the type `kind`; an integer must fit into 64 bits."""
     if kind.startswith("Mapping"):
         kinds = str | bool | int | float | list if "ParameterValue" in kind else str
         return isinstance(value, dict) and all(isinstance(item, kinds) for item in value.values())

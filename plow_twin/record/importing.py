@@ -1,4 +1,4 @@
-"""The load of any recording as input of a twin, with the intake, late samples and journal as in a live run."""
+"""Use of any recording's load as input of a twin; checks, late samples and journal are as in a live run."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from plow_twin.stream.steps import Steps
 
 @dataclass
 class Feed:
-    """Pass messages in order of arrival to walkers; samples of the load are judged first.
+    """Pass messages to walkers, which advance twins, in order of arrival; check samples of the load first.
 
-    `measured` receives the role, stamp [ns] and numbers of all messages except load and speed.
+    `measured` is called with the role, stamp [ns] and numbers of each message that is neither a load nor a speed.
     """
 
     walkers: list[Walker]
     roles: dict[str, Role]
     measured: Callable[[str, int, dict[str, float]], object]
     intake: Intake = field(default_factory=Intake)
-    #: number of unused messages by reason; the intake also counts those of the load
+    #: number of unused messages by reason; the intake also counts the unused messages of the load
     unfit: Counter[str] = field(default_factory=Counter)
     #: whether the measured poses go into the first walker's journal; they do not affect the motion
     with_poses: bool = False
@@ -77,7 +77,7 @@ class Feed:
             walker.close()
 
     def _hole(self) -> None:
-        """Begin a new stretch: no load is interpolated over missing messages."""
+        """Start anew after missing messages, so that no load is interpolated across them."""
         self._steps.end()
         self.flush()
         self.silences.restart()
@@ -138,7 +138,7 @@ class Feed:
 
 
 def _pose(stamp_ns: int, values: dict[str, float]) -> Pose | PartOfPose:
-    """Return the entry of a measured pose."""
+    """Return the journal entry of a measured pose, a `PartOfPose` if numbers are missing."""
     pose = tuple(values.get(name, math.nan) for name in DOF_NAMES)
     known = tuple(place for place, value in enumerate(pose) if math.isfinite(value))
     if len(known) < len(pose):

@@ -151,7 +151,7 @@ def _from_json(text: str, source: str) -> Entry | Dropped:
 
 
 def _exactly(*kinds: type) -> Callable[[Any], Any]:
-    """Return a reader that accepts only these types, so that 1, 1.0 and True are distinguished."""
+    """Return a function that accepts only values of exactly these types, so that 1, 1.0 and True differ."""
 
     def read(value: Any) -> Any:
         if type(value) not in kinds:
@@ -182,7 +182,7 @@ def _ints(value: Any) -> tuple[int, ...]:
 
 
 def _rows(value: Any) -> tuple[tuple[float, ...], ...]:
-    """Return rows of numbers; infinity and NaN are given as texts."""
+    """Return the rows of numbers in `value`, in which infinity and NaN are texts."""
     read = _exactly(float, str)
     rows = tuple(tuple(float(read(item)) for item in row) for row in value)
     return rows
@@ -198,7 +198,7 @@ _READERS: Final[dict[str, Callable[[Any], Any]]] = {
     "tuple[tuple[float, ...], ...]": _rows,
     "ParameterValue": _exactly(bool, int, float, str),
 }
-#: For each kind of entry, the name and the reader of each of its fields.
+#: For each kind of entry, the name of each field and the function that reads its value.
 _FIELDS: Final = {
     name: [(spec.name, _READERS[str(spec.type)]) for spec in fields(kind)] for name, kind in _KINDS.items()
 }

@@ -13,7 +13,7 @@ from plow_twin.record.times import STAMP_UNITS
 from plow_twin.scene_file.validation import NUMBER, Schema, choice, mapping, validate
 from plow_twin.scene_file.yaml_text import read_yaml
 
-#: For each role that a topic can have, the names of its numbers.
+#: For each role that a topic can have, the names of the quantities that its messages may contain.
 ROLES: Final[dict[str, tuple[str, ...]]] = {
     "excitation": ("fx", "fy", "m"),
     "head_pose": ("x", "y", "theta"),

@@ -32,7 +32,8 @@ from plow_twin.record.times import NO_TIME, NUMBER, STAMP_UNITS, TIMES, likely_u
 from plow_twin.scene_file.parquet_lines import SUFFIX
 
 Number = TypeVar("Number", float, NDArray[np.float64])
-#: Prefix of each reason why messages do not fit their role, in the counts of these messages.
+#: Prefix of the keys under which the losses count messages that do not fit their role; the rest of the key is the
+#: reason.
 UNFIT: Final = "unfit, "
 _WRENCH: Final = {"fx": "wrench.force.x", "fy": "wrench.force.y", "m": "wrench.torque.z"}
 _POSE: Final = {"x": "pose.position.x", "y": "pose.position.y", "theta": "pose.orientation"}
@@ -47,7 +48,7 @@ _FIELDS: Final[dict[tuple[str, str], dict[str, str]]] = {
     ("forces", "sensor_msgs/msg/JointState"): {name: f"effort[{name}]" for name in PAIR_NAMES},
     ("gaps", "sensor_msgs/msg/JointState"): {name: f"position[{name}]" for name in PAIR_NAMES},
 }
-#: Without a mapping, a role is found by these names of topics.
+#: Topic names by which a role is found if there is no mapping.
 _NAMES: Final = {
     "excitation": ("excitation", "load", "wrench"),
     "head_pose": ("head_pose", "pose"),
@@ -59,13 +60,13 @@ _NAMES: Final = {
 
 @dataclass(frozen=True)
 class Role:
-    """The role of a topic.
+    """The role of a topic (load, pose, ...): where a message has each quantity, and how to convert it.
 
-    A number is (`scale` times the field plus `offset`) times `factor`, in SI; numbers outside `limits` are not used.
+    A quantity in SI is (`scale` times the field plus `offset`) times `factor`; values outside `limits` are not used.
     `stamp` is `header`, `log`, or for CSV and JSON the path of the time (a number in `stamp_unit`, or an ISO 8601
-    text); `clock_offset_ns` is added to it. `sequence` is the path of the sender's message number, or empty. A field is
-    a path of names; `[3]` or `[name]` is an item of an array, and the name is looked up in the message's `name`. A path
-    to a quaternion gives the angle about z.
+    text); `clock_offset_ns` is added to the stamp. `sequence` is the path of the sender's message number, or empty. A
+    field is a path of names. `[3]` selects an array item by its index, and `[name]` by the index of this name in the
+    message's field `name`. A path to a quaternion gives the angle about z.
     """
 
     topic: str
@@ -83,7 +84,7 @@ class Role:
     stamp_unit_is_stated: bool = False
 
     def read(self, arrived: Arrived) -> tuple[int, dict[str, float]] | None:
-        """Return stamp [ns] and numbers (NaN for an empty field), or None for a message that does not fit."""
+        """Return stamp [ns] and numbers (NaN: empty field), or None if a number or the stamp is missing."""
         values = {}
         for name, path in self.fields.items():
             value = _follow(arrived.content, path)
@@ -94,7 +95,7 @@ class Role:
         return None if stamp_ns is None else (stamp_ns, values)
 
     def in_si(self, name: str, value: Number) -> Number:
-        """Return a number, or an array of numbers, called `name` in SI."""
+        """Return a number or an array of the quantity `name`, given in the recording's units, in SI."""
         return (value * self.scale.get(name, 1.0) + self.offset.get(name, 0.0)) * self.factor.get(name, 1.0)
 
     def stamp_ns(self, arrived: Arrived) -> int | None:
@@ -150,7 +151,7 @@ class Role:
         )
 
     def empty(self, arrived: Arrived) -> bool:
-        """Return whether all fields of this role are empty."""
+        """Return whether all fields of this role are empty in a message."""
         content = arrived.content
         return isinstance(content, Mapping) and all(_at(content, path) in (None, "") for path in self.fields.values())
 
@@ -247,7 +248,7 @@ def readings(
 
 
 def stamps_by(roles: Iterable[Role]) -> StampOf[Arrived]:
-    """Return a function that reads a message's stamp by its roles; the first role with a stamp is used."""
+    """Return a function that returns a message's stamp [ns], from the first role that finds a stamp."""
     by_topic: dict[str, list[Role]] = {}
     for role in roles:
         by_topic.setdefault(role.topic, []).append(role)
@@ -268,7 +269,7 @@ def messages_of(source: Source, roles: Mapping[str, Role]) -> Iterator[Arrived]:
 def roles_by_source(
     sources: Sequence[Source], path: Path | None, left_out: str = ""
 ) -> Iterator[tuple[Source, dict[str, Role]]]:
-    """Yield each recording of one run with the roles of its topics; `read_map` sees all topics together.
+    """Yield each recording of a run with its topics' roles, which are found among all topics together.
 
     Topics that begin with `left_out` have no role.
     """
@@ -282,9 +283,10 @@ def roles_by_source(
 
 
 def read_map(path: Path | None, topics: Mapping[str, TopicType] | None) -> dict[str, Role]:
-    """Return the roles of topics: from the YAML file, or without a file by names and types.
+    """Return the roles of topics, by the YAML file `path` or, if it is None, by names and types.
 
-    `topics` maps topics to types. If the types are unknown (None), each topic in the file is read as JSON.
+    `topics` maps topics to types. If it is None, the types are unknown, and each topic has the type that the file
+    states, by default JSON.
 
     Raises
     ------
@@ -331,7 +333,7 @@ def _role(path: Path, role: str, entry: Mapping[str, Any], topics: Mapping[str, 
 
 
 def _check_nodes(path: Path, role: str, found: Role) -> None:
-    """Raise a `MapError` for a key that samples of nodes do not have."""
+    """Raise a `MapError` for a stamp, stamp unit or sequence that OPC UA nodes do not have."""
     if found.stamp not in (SOURCE_STAMP, SERVER_STAMP):
         raise map_error(path, f"{role}.stamp", found.stamp, f"{SOURCE_STAMP} or {SERVER_STAMP} for nodes")
     if found.stamp_unit != "ns":
@@ -341,12 +343,12 @@ def _check_nodes(path: Path, role: str, found: Role) -> None:
 
 
 def with_units(roles: Mapping[str, Role], units: Mapping[str, str]) -> dict[str, Role]:
-    """Return the roles with other units; `units` maps a number's name (fx, x, ..., or t for stamps) to its unit.
+    """Return the roles with changed units; `units` maps a quantity (fx, x, ...; t: the stamps) to its unit.
 
     Raises
     ------
     UnitError
-        No role has a number of that name, or the unit measures something else.
+        No role has a quantity of the stated name, or the stated unit is not a unit of this quantity.
     """
     changed = dict(roles)
     for name, unit in units.items():
@@ -368,7 +370,7 @@ def with_units(roles: Mapping[str, Role], units: Mapping[str, str]) -> dict[str,
 
 
 def _limits(path: Path, key: str, given: float | list[float]) -> tuple[float, float]:
-    """Return the smallest and the largest value; a single number is the bound for both signs."""
+    """Return the smallest and the largest allowed value; a single number limits the absolute value."""
     low, high = given if isinstance(given, list) else (-given, given)
     if not low < high:
         raise map_error(path, key, given, "the smallest number, then the largest")
@@ -430,7 +432,7 @@ def _default_fields(role: str, kind: TopicType) -> dict[str, str]:
 
 
 def _guess(role: str, topics: Mapping[str, TopicType]) -> Role | None:
-    """Return the role with a topic found by its name, or with the only topic of a fitting type."""
+    """Return the role of a topic found by its name, or of the only topic of a fitting type, or None."""
     fitting = {}
     for topic, kind in topics.items():
         fields = _default_fields(role, kind)

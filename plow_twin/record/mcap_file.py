@@ -78,7 +78,7 @@ class ChunkBuilder:
         self._note(channels, log_time_ns, starts)
 
     def reserve(self, size: int) -> int:
-        """Return the place of `size` new bytes."""
+        """Make room for `size` more bytes and return the offset of the first of them."""
         place = self.size
         self.size += size
         if self.size > len(self._buffer):
@@ -124,7 +124,7 @@ def heads(buffer, starts, channel, sequence, log_time, publish_time, length):  #
 
 @compiled
 def spread(buffer, starts, length, data):  # type: ignore[no-untyped-def]
-    """Copy messages, which follow each other in `data`, to their places."""
+    """Copy the messages in `data`, which follow each other, to the offsets `starts` of `buffer`."""
     place = 0
     for n in range(starts.size):
         start, end = starts[n], place + length[n]
@@ -157,8 +157,8 @@ class ByteFile(Protocol):
 class McapFile:
     """An MCAP file that is being written.
 
-    Every method may raise `OSError` (disk full). A failed `chunk` is taken back and its messages are lost; after any
-    other failed method only `close` may be called.
+    Every method may raise `OSError` (disk full). The bytes of a failed `chunk` are removed and its messages are lost;
+    after any other failed method only `close` may be called.
     """
 
     def __init__(self, out: ByteFile, library: str) -> None:
@@ -190,7 +190,7 @@ class McapFile:
 
     @property
     def times(self) -> tuple[int, int]:
-        """First and last log time [ns], zeros without a message."""
+        """First and last log time [ns], or (0, 0) if there are no messages."""
         return (min(self._times), max(self._times)) if self._times else (0, 0)
 
     def _write(self, record: Any) -> int:
@@ -207,7 +207,7 @@ class McapFile:
         self._metadata.append(MetadataIndex(offset=offset, length=length, name=name))
 
     def channel(self, topic: str, message_type: str, schema: bytes, metadata: Mapping[str, str]) -> int:
-        """Return the number of a new channel; it is declared before the next chunk."""
+        """Add a channel and return its number; the file declares it before the next chunk."""
         from mcap.records import Channel, Schema
 
         if message_type not in self._schemas:
@@ -279,7 +279,7 @@ class McapFile:
         )
 
     def finish(self) -> None:
-        """Write the index and the end."""
+        """Write the index and the end of the MCAP file."""
         from mcap.opcode import Opcode
         from mcap.records import DataEnd, Footer, Statistics, SummaryOffset
 
@@ -327,7 +327,7 @@ class McapFile:
         return self._file.is_linked()
 
     def close(self) -> None:
-        """Close the file as it is."""
+        """Close the file without writing an index or an end."""
         self._file.close()
 
 
@@ -352,7 +352,7 @@ def _compress(compression: str, content: Bytes) -> bytes:
     if compression == "lz4":
         import lz4.frame
 
-        # independent blocks are decompressed in two thirds of the time and are 1 % larger
+        # independent blocks take two thirds of the time of linked blocks to decompress and are 1 % larger
         data = lz4.frame.compress(content, block_linked=False)
     else:
         import zstandard

@@ -44,8 +44,8 @@ FORCES_FILE = "contact_forces.csv"
 _LOAD_COLUMNS: Final = ("t", "fx", "fy", "m")
 _POSE_COLUMNS: Final = ("t", "x", "y", "theta")
 _NOT_STATED: Final = (math.nan,) * 3
-#: Largest number of rows of a table that are kept; the newest rows are kept. This many rows of a load take 320 MB and
-#: cover nearly three hours at 1 kHz.
+#: Largest number of rows that are kept of a table; the newest rows are kept. At this length a load takes 320 MB and
+#: covers nearly three hours at 1 kHz.
 MOST_ROWS: Final = 10_000_000
 #: Key under which the losses count rows that are older than the kept rows.
 OLDER_ROWS: Final = "older_rows"
@@ -65,7 +65,7 @@ class _Rows:
         return self.dropped + len(self._values) // self._columns
 
     def add(self, values: Iterable[float] | Array) -> None:
-        """Add the numbers of a row, or rows, shape (n, columns)."""
+        """Add the numbers of one row, or an array of rows, shape (n, columns)."""
         if isinstance(values, np.ndarray):
             self._values.frombytes(values.tobytes())
         else:
@@ -98,13 +98,13 @@ class Measured:
     unreadable : int
         Number of rows and messages that could not be read or used.
     pose_deviation, load_deviation : tuple of float
-        Stated standard deviations, 0 if not stated.
+        Standard deviations of x, y [m], theta [rad] and of Fx, Fy [N], M [N m] that the run states, 0 if not stated.
     gaps : ndarray, shape (m, 9)
         t [s] and the gaps of the eight pairs [m], NaN without a sensor.
     gaps_deviation : float
-        Stated standard deviation of the gaps, 0 if not stated.
+        Standard deviation of the gaps that the run states [m], 0 if not stated.
     lost : mapping of str to int
-        The numbers that `unreadable` sums up, by reason.
+        Counts by reason; their sum is `unreadable`.
     forces : ndarray, shape (m, 9)
         t [s] and the contact forces of the eight pairs [N].
     """
@@ -122,7 +122,7 @@ class Measured:
 
 
 def read_measured(folder: Path, scene: Path | None = None) -> Measured:
-    """Read a folder; `scene` replaces its scene.yaml.
+    """Read the measurements in a folder; the file `scene`, if given, replaces the folder's scene.yaml.
 
     Raises
     ------
@@ -143,7 +143,7 @@ def read_measured(folder: Path, scene: Path | None = None) -> Measured:
         poses = _read(file, lost, _POSE_COLUMNS)
     model = load_scene(scene_path(str(scene)) if scene else folder / SCENE_FILE)
     if len(load) and load[0, 0] >= EPOCH_S:
-        # as in a recording, times count from the first sample of the load
+        # dates are replaced by the time since the first sample of the load, as in a recording
         for table in (poses, gaps, forces, load):
             table[:, 0] -= load[0, 0]
     return Measured(model, load, poses, lost.total(), gaps=gaps, lost=dict(lost), forces=forces)
@@ -162,10 +162,10 @@ def _table(folder: Path, name: str) -> Path:
 
 
 def read_recording(path: Path, scene: Path | None = None, mapping: Path | None = None) -> Measured:
-    """Read a run through its journal, or another recording (MCAP, rosbag2's sqlite3, CSV) through the mapping.
+    """Read a run by its journal, or another recording (MCAP, rosbag2's sqlite3, CSV) by the mapping.
 
-    The measured pose of a run is in its journal if the node used it; otherwise it is read from other
-    topics in the run's folder, which include the folders `beside`. Times count from the first sample of the load.
+    The measured pose of a run is in its journal if the node used it. Otherwise it is read from the other topics in the
+    run's folder and in its subfolders `beside`, `beside_2`, .... Times count from the first sample of the load.
 
     Raises
     ------
@@ -216,9 +216,9 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
 def _journal(reader: RunReader, lost: Counter[str]) -> tuple[Array, list[int], Array, Array, Array, Array]:
     """Return the samples, the rows before which samples are missing, the poses, the gaps, and the stated deviations.
 
-    The first column of each table is the stamp [ns]. The deviations are the largest of the load, shape (3,), and those
-    of each pose, shape (n, 3), NaN if not stated. Only the data after the last change of the pads or step of the clock
-    are returned, because earlier data belong to another machine or time.
+    The first column of each table is the stamp [ns]. The standard deviations are the largest stated for the load, shape
+    (3,), and those of each pose, shape (n, 3), NaN if not stated. Only the data after the last change of the pads or
+    step of the clock are returned, because earlier data were measured with other pads or on another time scale.
     """
     loads, poses, gaps = _Rows(4), _Rows(7), _Rows(1 + PAIR_COUNT)
     holes, begins, spread = Holes(), list[int](), np.zeros(3)
@@ -250,8 +250,8 @@ def _journal(reader: RunReader, lost: Counter[str]) -> tuple[Array, list[int], A
 def _longest(rows: Array, begins: list[int]) -> Array:
     """Return the longest stretch of a load without missing samples.
 
-    A stretch begins at each row of `begins` before which many samples are missing. In such a gap, unlike in a silence,
-    an unknown load acted.
+    A new stretch begins at a row of `begins` if the gap before it is long. Samples in this gap were lost, so an unknown
+    load acted; in a silence, by contrast, no samples were sent.
     """
     if len(rows) < 2:
         return rows
@@ -265,9 +265,9 @@ def _longest(rows: Array, begins: list[int]) -> Array:
 def _collect(
     places: list[Path], mapping: Path | None, wanted: tuple[str, ...], node: str
 ) -> tuple[dict[str, Array], list[int], Counter[str], str]:
-    """Return the rows of each wanted role with stamps in ns, the rows after gaps, the losses and a reason.
+    """Return each wanted role's rows (stamps in ns), the indexes of rows after gaps, losses and a reason.
 
-    The rows after gaps belong to the load; the reason says why no message fits.
+    The indexes refer to the rows of the load. The reason is a text that says why messages do not fit their role.
     """
     rows = {name: _Rows(1 + len(ROLES[name])) for name in wanted}
     lost, begins = Counter[str](), list[int]()
@@ -291,7 +291,7 @@ def _collect(
 def _read(path: Path, lost: Counter[str], columns: tuple[str, ...], some: tuple[str, ...] = ()) -> Array:
     """Return the rows of a csv file, NaN for an empty cell; rows that could not be read are counted in `lost`.
 
-    All of `columns` are required; missing columns of `some` are NaN.
+    All of `columns` and at least one column of `some` are required; other missing columns of `some` are NaN.
     """
     header, rows = read_table(path)
     names = list(header.names)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 Float64s = NDArray[np.float64]
 
-#: An empty array of a message.
+#: Empty array, the default of the arrays in a message.
 EMPTY: Final[Float64s] = np.zeros(0)
 _ZERO36: Final[Float64s] = np.zeros(36)
 

@@ -39,7 +39,7 @@ def qos_profile(base_name: str) -> dict[str, Any]:
 
 
 def offered(reliable: bool, latched: bool, depth: int) -> dict[str, Any]:
-    """Return a QoS as rosbag2 writes it."""
+    """Return a QoS profile in the form in which rosbag2 writes it."""
     return {
         "history": "keep_last",
         "depth": depth,
@@ -54,7 +54,7 @@ def offered(reliable: bool, latched: bool, depth: int) -> dict[str, Any]:
 
 
 def qos_text(base_name: str) -> str:
-    """Return the QoS of a topic as the text that a channel of the file carries."""
+    """Return the QoS of a topic as the text that its channel in an MCAP file carries."""
     return dump_yaml([qos_profile(base_name)], flow=False).strip()
 
 

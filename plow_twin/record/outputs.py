@@ -1,4 +1,4 @@
-"""The messages made from a publication's record by the table of topics; they are equal in a live run and a replay."""
+"""Messages of a publication, made by the table of topics in the same way in a live run and in a replay."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from plow_twin.stream.topics import JOINT_STATE, Cadence, Topic, names_of, topic
 Array = NDArray[np.float64]
 
 #: Topics whose messages a replay computes from the journal. Some have a message in each publication, the others in each
-#: publication that has intervals or a slow part.
+#: publication that has intervals of forces or a slow part (clearance and wear rate).
 REPLAYED: Final = topics_of(Cadence.EACH, Cadence.FOLLOWED, Cadence.SLOW)
 #: Base names of the topics in `REPLAYED`.
 PUBLICATION_TOPICS: Final = tuple(topic.name for topic in REPLAYED)
@@ -61,5 +61,5 @@ def template(topic: Topic, frame_id: str, child_frame_id: str) -> Template:
 
 
 def publication_templates(frame_id: str, child_frame_id: str) -> dict[str, Template]:
-    """Return the templates of the messages that follow from the journal, by base name of their topic."""
+    """Return the templates of the messages that a replay computes, by base name of their topic."""
     return {topic.name: template(topic, frame_id, child_frame_id) for topic in REPLAYED}

@@ -37,7 +37,7 @@ _PENDING: Final = 65_536
 _LEAST: Final = 8192
 #: Smallest number of entries in a batch without outputs, which take most of the memory.
 _LEAST_ALONE: Final = 32_768
-#: Growth of a recording of all outputs at 1 kHz [B/s].
+#: Growth of a recording of all outputs at 1 kHz [B/s], used to estimate the duration of a recording without an index.
 _BYTES_PER_S: Final = 400_000
 #: Indexes of Fx, Fy and M among the six numbers of a sample.
 _WRENCH: Final = np.array([0, 1, 5])
@@ -101,7 +101,7 @@ class RunReader:
         raise ForeignRecordingError(f"{self.path}: metadata {HEADER_RECORD!r} is missing: not a recording of plow_twin")
 
     def _look_for_parts(self) -> None:
-        """Find the files and order them by the part numbers in their headers, or in their names without a header."""
+        """Find the files and order them by part number, from the header or, without header, from the name."""
         files = run_parts(self._place)
         for file in files:
             if file not in self._headers and (len(files) == 1 or (is_begun(file) and is_mcap(file))):
@@ -166,7 +166,7 @@ class RunReader:
         return {name: count for name, count in found.items() if count}
 
     def number(self, file: Path) -> int:
-        """Return the number of a part by its header, or by its name without a header."""
+        """Return the number of a part from its header or, if it has no header, from its name."""
         return self._headers[file].part if file in self._headers else part_number(file)[0]
 
     def _place_of(self, file: Path) -> tuple[int, bool, str]:
@@ -318,7 +318,7 @@ class _Merger:
         self._chunks = None
 
     def is_journal(self, part: Path, numbers: set[int]) -> bool:
-        """Return whether one of these channels belongs to the journal."""
+        """Return whether one of the channels `numbers` belongs to the journal."""
         assert self._chunks is not None
         return any(self._chunks.channels[number].topic in self._journal for number in numbers)
 
@@ -371,7 +371,7 @@ class _Merger:
         return unwrapped
 
     def _read_to(self, end: int) -> Iterator[Batch]:
-        """Yield everything with a sequence number below `end`."""
+        """Yield the waiting entries and outputs with sequence numbers below `end`."""
         waiting = Entries.joined(self._entries)
         later = np.flatnonzero(waiting.sequence >= end)
         count = int(later[0]) if later.size else len(waiting)

@@ -1,8 +1,8 @@
 """The recorder of a live node: it queues entries and publications without waiting and writes them in its own thread.
 
 The caller only reads a clock and appends to the queue. The thread empties the queue every 50 ms, writes many messages
-into chunks by one compiled call, and compresses the chunks without the interpreter lock. When it falls behind, items
-that do not fit in the queue are dropped, counted by topic, and noted at their place in the file.
+into chunks by one compiled call, and compresses the chunks without the interpreter lock. When the thread falls behind,
+entries and messages that do not fit in the queue are dropped, counted by topic, and noted at their place in the file.
 """
 
 from __future__ import annotations
@@ -48,10 +48,11 @@ _BURST: Final = 128
 
 @dataclass(frozen=True)
 class RecorderCounters:
-    """State of a recorder. `lost` counts by topic the messages that did not reach the file; `journal` counts entries.
+    """State of a recorder. `lost` counts lost messages by topic, and lost journal entries under `journal`.
 
-    `error` is the reason why recording has stopped (None once it continues), or why the last ring was not written.
-    `marks` counts the rings that were written, and `marks_lost` the rings that could not be written.
+    `error` is the reason why recording has stopped (None once it continues), or why the last ring (the newest seconds,
+    kept in memory) was not written. `marks` counts the rings that were written, and `marks_lost` the rings that could
+    not be written.
     """
 
     written: int
@@ -100,18 +101,19 @@ class Recorder:
     queue_size
         Number of items that may wait for the thread; the last quarter of the queue is kept for the journal.
     flush_period_s
-        Interval between writes to the operating system [s]: a killed process loses at most the entries of that time and
-        the messages of twice that time.
+        Interval between writes to the operating system [s]. A killed process loses at most the journal entries of one
+        interval and the messages of two intervals.
     chunk_size
-        Size of waiting journal and outputs [B] at which their chunks are closed.
+        Total size [B] of the waiting journal entries and outputs at which their two chunks are closed.
     min_free_bytes
         Free space on the disk [B] below which recording pauses.
     part_bytes, part_s
-        Size [B] and time [s] at which a new part is started; 0: never.
+        Size [B] and duration [s] of a part (file) at which a new part is started; 0: never.
     keep_bytes
         Size of all ended parts together [B] above which the oldest parts are removed; 0: all are kept.
     ring_s
-        Time kept in a ring in memory [s], which is written at each `mark`; 0: no ring, everything is written.
+        Length [s] of the ring, the newest part of the run, which is kept in memory and written at each `mark`; 0: no
+        ring, everything is written.
     sync
         Whether each flush, new part and ring waits for the disk (`fdatasync`), so that it survives a loss of power.
     now_ns
@@ -173,6 +175,7 @@ class Recorder:
         self._part_since = time.monotonic()
         self._queue: deque[_Item] = deque()
         #: number of waiting entries and publications minus number of items in the queue, since an item may hold several
+        #: entries or publications
         self._more = 0
         self._queue_size = queue_size
         self._flush_period_s = flush_period_s
@@ -214,8 +217,8 @@ class Recorder:
     def mark(self) -> Path | None:
         """Write the ring as soon as the next `Snapshot` is journalled or the recorder is closed.
 
-        Returns the folder of the ring, or None for a recorder without a ring. Further calls before the ring is written
-        have no effect.
+        Returns the folder to which the ring will be written, or None for a recorder without a ring. Further calls
+        before the ring is written have no effect.
         """
         from plow_twin.record.writer import free_folder
 
@@ -268,7 +271,7 @@ class Recorder:
         """Queue the messages of a publication of one row; return False if they were lost.
 
         `sent` has the bytes of the messages by base name of the topic. If it is empty, the recorder makes the messages
-        that follow from the journal.
+        that a replay can compute from the journal.
         """
         now = self._now_ns()
         topics = self._topics_of[len(published.slow) > 0, bool(sent) and bool(published.rows["marked"][0])]
@@ -280,8 +283,7 @@ class Recorder:
     def series(self, series: Series) -> NDArray[np.int64]:
         """Queue the samples and digests of a series as entries of the journal, or lose all of them.
 
-        Returns, for the publication after each sample, the number of the journal entry before this publication, shape
-        (n,).
+        Returns, for each sample, the number of the journal entry that precedes its publication, shape (n,).
         """
         now, samples = self._now_ns(), len(series.stamps)
         count = samples + len(series.digests)
@@ -299,7 +301,7 @@ class Recorder:
         return item.sequence + np.arange(samples) + np.cumsum(ends)
 
     def publications(self, published: Published, sequence: NDArray[np.int64]) -> bool:
-        """Queue publications whose messages were not sent, each after its journal entry; return False if lost."""
+        """Queue unsent publications, each after its entry in `sequence`; return False if they were lost."""
         now, count = self._now_ns(), len(published.rows)
         topics = Counter(dict.fromkeys(self._topics_of[False, False], count))
         topics.update(dict.fromkeys(set(self._topics_of[True, False]) - topics.keys(), len(published.slow)))
@@ -309,7 +311,7 @@ class Recorder:
         return fits
 
     def _admitted(self, now: int, items: int, topics: Iterable[str]) -> bool:
-        """Note earlier losses on the topics if there is room for these messages; otherwise count them as lost too."""
+        """Return whether messages may be queued; if so, note earlier losses, otherwise count new losses."""
         if not self._room(items, self._queue_size * 3 // 4):
             self._snapshot_due = True
             self._output_gaps.update(topics)
@@ -325,7 +327,7 @@ class Recorder:
 
     @property
     def _queued(self) -> int:
-        """Number of waiting items, in which each entry and publication of a series is counted."""
+        """Number of waiting items; each entry and publication of a series counts as one item."""
         return len(self._queue) + self._more
 
     def _push_many(self, item: _SeriesItem | _PublicationsItem, count: int) -> None:
@@ -345,8 +347,8 @@ class Recorder:
     def close(self, timeout_s: float = 5.0) -> LossReport:
         """Write the queued items, close the file and return the losses.
 
-        Waits while items are being written, but at most `timeout_s` [s] without a written item. A second call only
-        returns the report.
+        Waits until all items are written, but gives up after `timeout_s` [s] in which no item was written. A second
+        call only returns the report.
         """
         atexit.unregister(self.close)
         with self._lock:
@@ -416,7 +418,7 @@ class Recorder:
                 time.sleep(1e-6)
 
     def _write(self, items: list[_Item]) -> None:
-        """Write items in order, all neighbours of one kind at once; journal and outputs each keep their order."""
+        """Write items, neighbours of one kind together; journal and outputs each keep their order."""
         samples: list[_EntryItem] = []
         publications: list[_PublicationItem] = []
         for item in items:
@@ -463,7 +465,7 @@ class Recorder:
         return full or (part_s > 0.0 and time.monotonic() - self._part_since >= part_s)
 
     def _split(self) -> None:
-        """Start a new part; the next snapshot makes it self-contained."""
+        """Start a new part; the snapshot that is written next makes the part self-contained."""
         with self._lock:
             lost = dict(self._lost)
         self._writer.split(lost, self._limits[2])
@@ -528,7 +530,7 @@ class Recorder:
             self._on_error(error)
 
     def _give_up(self, reason: str, unsafe: Mapping[str, int] = MappingProxyType({})) -> None:
-        """Refuse items from now on, count queued and `unsafe` items as lost, and report the reason once."""
+        """Refuse further items, count queued and unflushed (`unsafe`) items as lost, report why once."""
         first = self._error is None
         with self._lock:
             self._accepting, self._paused = False, None
@@ -589,7 +591,7 @@ def _numbers(items: Sequence[_EntryItem | _PublicationItem]) -> tuple[NDArray[np
     return np.array(sequence, np.int64), np.array(log_time_ns, np.int64)
 
 
-# four thousand of these are made each second; a named tuple takes a quarter of the time of a frozen dataclass
+# four thousand of these items are made each second; a named tuple takes a quarter of the time of a frozen dataclass
 class _EntryItem(NamedTuple):
     """A journal entry on its way to the file."""
 

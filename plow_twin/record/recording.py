@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 Indexes = NDArray[np.int64]
 
 _POSE: Final = ("x", "y", "theta")
-#: For quantities that have another name in the tables than in the record: name in the record, name in the tables.
+#: Names of quantities that differ between record and tables: name in the record, name in the tables.
 _NAMES: Final = {"makes": "touches"}
 
 

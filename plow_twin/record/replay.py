@@ -118,7 +118,7 @@ def _sink(folder: Path, header: RunHeader) -> RunWriter:
 
 
 def following_twin(header: RunHeader, scene: Scene) -> Driven:
-    """Return a twin that follows its measurements like the twin of a run."""
+    """Return a twin that follows measurements as the twin of the run with this header did."""
     from plow_twin.estimate.follow import MEMBERS, follower
 
     return follower(scene, header.follow, int(header.parameters.get("follow_members", MEMBERS)), header.tol)
@@ -129,7 +129,8 @@ class _Replay:
 
     def __init__(self, header: RunHeader, report: ReplayReport, digests_only: bool) -> None:
         self.digests_only = digests_only
-        #: whether every publication was recorded, so that the windows between publications are known
+        #: whether every publication was recorded, so that each output window (the time since the previous publication)
+        #: is known
         self.all_outputs = not digests_only and header.record_outputs == "all"
         self.header = header
         self.report = report
@@ -152,7 +153,7 @@ class _Replay:
             _warm_up(scene, header.tol, self.templates, rows=not digests_only)
         self.sink: RunWriter | None = None
         self.rows = np.zeros(0, ROW)  # buffer for the rows of the newest run of samples
-        # publications of the newest run of samples; messages of the last publication may still follow
+        # publications of the newest unbroken series of samples; messages of the last of them may still follow
         self.published: Published | None = None
         self.session = Session(
             twin, header.origin_ns, rollback_span_s=float(header.parameters.get("rollback_span", 0.0))
@@ -173,7 +174,7 @@ class _Replay:
         self.alarms = AlarmCheck(header, self.all_outputs)
 
     def batch(self, batch: Batch) -> None:
-        """Apply and compare a batch: runs of samples at once, other entries one by one."""
+        """Apply and compare a batch: unbroken series of samples at once, other entries one by one."""
         self.outputs_whole = not batch.damaged
         self.outputs_synced = self.outputs_synced and self.outputs_whole
         if batch.damaged:
@@ -222,7 +223,7 @@ class _Replay:
         return self.synced and expected and bool(entries.sample[place]) and sampled
 
     def _compare_alarms(self, batch: Batch) -> None:
-        """Compare the messages of the alarms of a batch."""
+        """Compare the alarm messages of a batch."""
         topic = self.header.topic(ALARMS)
         said = []
         for part in batch.outputs:
@@ -235,13 +236,14 @@ class _Replay:
             self._note(Divergence(*difference))
 
     def _messages(self, sent: SentMessages, begin: int, end: int) -> None:
-        # without a sink, the topics computed from the journal are compared; with a sink, the other topics are copied
+        # without a new recording (`sink`), the topics computed from the journal are compared; with a new recording, the
+        # other topics are copied to it
         chosen = (sent.kind[begin:end] >= 0) == (self.sink is None)
         for index in (begin + np.flatnonzero(chosen)).tolist():
             self.output(sent.record(index))
 
     def _run(self, entries: Entries, sent: SentMessages, begin: int, end: int) -> bool:
-        """Apply a run of samples and digests at once and compare the messages sent; False if nothing was applied."""
+        """Apply a series of samples and digests and compare its messages; False: nothing was applied."""
         done: Indexes = np.cumsum(entries.sample, dtype=np.int64)
         digests = entries.digest_at
         stamps, wrench = entries.samples()
@@ -292,7 +294,7 @@ class _Replay:
         return True
 
     def _write_run(self, entries: Entries, found: Applied) -> None:
-        """Write a run of samples and digests, and a publication after each sample."""
+        """Write a series of samples and digests, and a publication after each sample."""
         assert self.sink is not None
         begin = 0
         for end in (*sorted(entries.others), len(entries)):
@@ -316,7 +318,7 @@ class _Replay:
         assert self.sink is not None
         entry = record.entry
         if isinstance(entry, Snapshot) and self.synced:
-            # this session's own snapshot is written, because its windows fit the publications written here
+            # this session's own snapshot is written, because its output windows fit the publications written here
             entry = self.session.snapshot()
         self.sink.write_entry(record.sequence, record.log_time_ns, entry)
         published = self.session.outputs.pop() if self.synced and isinstance(entry, Sample | Hold | Unload) else NOTHING
@@ -333,7 +335,7 @@ class _Replay:
         done: Indexes,
         first_step: int,
     ) -> list[tuple[int, int, str, str, str, str]]:
-        """Return the differences between the messages sent and the messages of the publications."""
+        """Return the differences between the messages that the run sent and the computed messages."""
         poses = [
             (int(entries.sequence[index]) & _SEQUENCE_MASK, first_step + int(done[index]) - 1, entry)
             for index, entry in sorted(entries.rest.items())
@@ -426,7 +428,7 @@ class _Replay:
     def _snapshot(self, snapshot: Snapshot) -> None:
         if self.synced and self.outputs_synced:
             self.report.snapshots_compared += 1
-            # the live session also dropped its past when it journalled the snapshot
+            # `renew` drops all earlier states, as the live session did when it journalled the snapshot
             computed = self.session.renew().data
             self._compare("snapshot", snapshot.stamp_ns, "state", _hash(snapshot.data), _hash(computed))
             return
@@ -439,11 +441,11 @@ class _Replay:
         if before is not None:
             self._compare("snapshot", snapshot.stamp_ns, "state", self.session.twin.digest(), before)
         self.synced = self.resumed = True
-        # the windows of the outputs are known only if every publication was recorded
+        # the output windows are known only if every publication was recorded
         self.outputs_synced = self.all_outputs and self.outputs_whole
 
     def output(self, record: OutputRecord) -> None:
-        """Compare a recorded message with the model's message at that place."""
+        """Compare a recorded message with the message computed after the same journal entry."""
         if self.sink is not None:  # messages of other topics are copied unchanged
             place = (record.topic, record.sequence, record.log_time_ns, record.publish_time_ns)
             self.sink.write_output(*place, record.message())
@@ -505,7 +507,7 @@ class _Replay:
 
 
 def _warm_up(scene: Scene, tol: float, templates: Templates, *, rows: bool) -> None:
-    """Compile the kernels of a replay beforehand, so that its time does not include compiling."""
+    """Compile the kernels of a replay beforehand, so that its measured time excludes compiling."""
     session = Session(Twin(scene, tol=tol, excitation="sampled"))
     stamps = np.arange(1, 3, dtype=np.int64) * 1000
     memory = np.zeros(2, ROW) if rows else None

@@ -93,7 +93,7 @@ class RingWriter(RunWriter):
         self._kept = []
 
     def _dump(self, folder: Path, loss: Mapping[str, int], undone: ExitStack) -> None:
-        """Write to a folder, and list the files to remove if that fails."""
+        """Write the parts to a folder; `undone` gets the removal of each file in case of a failure."""
         shortage = self._shortage(folder)
         if shortage is not None:
             raise RecordingError(shortage)

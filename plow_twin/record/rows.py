@@ -51,8 +51,8 @@ def rows_by_topic(
         topics
             Base names by topic.
         templates
-            Templates by base name. A message whose texts differ from its template (such as an older name) is decoded by
-            itself; a message with another count of numbers is left out.
+            Templates by base name. A message whose texts differ from its template (such as an older name) is decoded
+            individually; a message with another count of numbers is left out.
     """
     found: dict[str, list[Rows]] = {}
     for part in outputs:

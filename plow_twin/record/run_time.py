@@ -22,7 +22,7 @@ class RunTime:
     Parameters
     ----------
     parameters
-        The parameters of the run.
+        Parameters of the node in the run's header, of which `excitation_timeout` is used.
     """
 
     def __init__(self, parameters: Mapping[str, Any]) -> None:
@@ -33,7 +33,7 @@ class RunTime:
 
     @property
     def span_s(self) -> float:
-        """Time from the first advance to the last [s], without the clock's steps at resets."""
+        """Time from the first advance to the last [s]; steps of the clock at resets are not counted."""
         return self._span_ns * 1e-9
 
     def add(self, entries: Entries) -> list[tuple[int, int, int]]:

@@ -26,7 +26,7 @@ class Messages:
     frame_id, child_frame_id
         Frames named in the messages.
     intervals
-        Whether to make messages with the intervals of forces.
+        Whether to make the messages with the 5 % to 95 % intervals of forces.
     """
 
     def __init__(self, frame_id: str, child_frame_id: str, *, intervals: bool = False) -> None:
@@ -62,7 +62,7 @@ class Messages:
 
 
 class _Group(NamedTuple):
-    """The messages of one record, one after the other; only their stamps and numbers change."""
+    """Buffer of the messages made from one record, one after the other; only stamps and numbers change."""
 
     #: base name of each topic, and the part of `buffer` that holds its message
     parts: tuple[tuple[str, memoryview], ...]
@@ -101,7 +101,7 @@ def _sources(topic: Topic) -> NDArray[np.int64]:
 
 
 def _integers(topic: Topic) -> NDArray[np.bool_]:
-    """Return which numbers of a message are integers in its record."""
+    """Return, for each number of a message, whether it is an integer in its record."""
     fields: Any = topic.record_type.fields
     return np.concatenate([np.full(count, fields[name][0].base.kind == "i") for name, count in topic.parts])
 

@@ -1,4 +1,4 @@
-"""Live twins in the lanes of a SIMD vector, advanced in slices; another method makes the advances that lanes cannot."""
+"""Live twins in SIMD lanes, advanced in slices; advances that lanes cannot make are made one by one."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from plow_twin.solve.lanes.advance import Samples, advance_lanes
 from plow_twin.solve.lanes.record import WIDTH, new_lanes, powers
 from plow_twin.solve.state import STATE, TOTALS, Terms, new_records
 
-#: Number of steps of all lanes together in a slice; a slice takes about a millisecond.
+#: Number of steps in a slice of work, summed over all lanes; a slice takes about a millisecond.
 _SLICE: Final = 256
 
 _Array = NDArray[np.float64]
@@ -30,7 +30,7 @@ class LaneTwins:
     terms : Terms
         Joint terms of all twins.
     members : range
-        Indices of the twins that advance here.
+        Indices of the twins that these lanes advance.
     work : ndarray of `WORK`, shape (1,)
         Scratch space.
     max_steps : int

@@ -1,4 +1,4 @@
-"""A run in slices of the compiled loop, between which limits, progress and Ctrl-C are handled."""
+"""Runs of the compiled loop in slices; limits, progress and Ctrl-C are handled between slices."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ Array = NDArray[np.float64]
 _FIRST_LOG: Final = 4096
 #: Default number of steps after which a run ends with an error.
 BUDGET: Final = 10**8
-#: Computing time in s between two looks at the clock; number of steps before the first look, for explicit and for
-#: implicit steps.
+#: Target computing time in s of a slice of a run; number of steps in the first slice, for explicit and for implicit
+#: steps.
 _SLICE_S: Final = 0.02
 _FIRST_SLICE, _FIRST_SLICE_IMPLICIT = 2048, 64
 
@@ -43,7 +43,7 @@ class Motion:
     sums: BalanceSums | None = None
     #: number of rows written
     first: NDArray[np.int64] = field(default_factory=lambda: np.zeros(1, np.int64))
-    #: time in s that fixed steps have reached; they leave `time` in the state unchanged
+    #: time in s reached by fixed steps, which leave the state's `time` unchanged
     fixed_time: float | None = None
 
     @property
@@ -58,7 +58,7 @@ class Motion:
 
     @staticmethod
     def start(compiled: CompiledScene, q: Array, v: Array, outputs: bool = False) -> Motion:
-        """Start at the scene's initial state; rows go to q and v, shape (n, 3), and pair outputs to new arrays."""
+        """Return a motion at the initial state with rows q, v, shape (n, 3); `outputs` adds arrays for the pairs."""
         eight = (len(q), PAIR_COUNT)
         penetration, force = (np.zeros(eight), np.zeros(eight)) if outputs else (None, None)
         frame = np.zeros((len(q), 6)) if outputs and compiled.scene.support is not None else None

@@ -23,12 +23,12 @@ class OutOfTimeError(Exception):
 
 
 class Pace:
-    """Slices of work, for successive calls.
+    """Work in slices within the time limit of a call; one object serves successive calls.
 
     Parameters
     ----------
     state_type : dtype
-        Type of the state. The state at the beginning of the present advance is kept.
+        Type of the state; `saved` keeps a copy of the state at the beginning of the present advance.
     implicit : bool
         Whether the scene may need implicit steps.
     max_wall_s : float
@@ -56,7 +56,7 @@ class Pace:
         Raises
         ------
         OutOfTimeError
-            The time limit is reached, or `stopped` was set meanwhile; `record` has the progress.
+            The time limit is reached, or `stopped` was set during the call; `record` holds the progress.
         """
         self._bytes[:] = self._start
         begin = _time.perf_counter()

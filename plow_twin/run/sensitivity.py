@@ -1,9 +1,9 @@
 """Growth of errors along a motion, which shows how long the tolerance is met.
 
 The columns of the fundamental matrix are solutions of the linearised equations (`solve.tangents`). For scenes with
-terms that `solve.tangents` does not have, the columns are differences between the motion and displaced motions
-(shadows), which start close to it and are followed over short stretches. These columns include the jumps at touches and
-separations (saltation), because each shadow has its own events.
+terms that `solve.tangents` does not cover, the columns are differences between the motion and its shadows: displaced
+motions that start close to the motion and are followed over short stretches of time. These columns include the jumps at
+touches and separations (saltation), because each shadow has its own events.
 """
 
 from __future__ import annotations
@@ -29,16 +29,17 @@ from plow_twin.solve.tangents import ALONG, STATE_COLUMNS, follow_columns
 
 Array = NDArray[np.float64]
 
-#: Displacement of a shadow as a share of the clearance; smallest displacement near a wall, as such a share; tolerance
-#: of a shadow.
+#: `DISPLACEMENT`: displacement of a shadow as a share of the clearance; `_LEAST_DISPLACEMENT`: smallest displacement
+#: near a wall, as a share of the clearance; `SHADOW_TOLERANCE`: tolerance of a shadow's motion.
 DISPLACEMENT: Final = 1e-7
 _LEAST_DISPLACEMENT: Final = 1e-10
 SHADOW_TOLERANCE: Final = 1e-12
 _STRETCHES: Final = 200
 #: Change of a parameter that is not a length, as a share of the parameter's value.
 _RELATIVE_CHANGE: Final = 1e-6
-#: At the beginning of a stretch the walls must be at least this many displacements away; the displacement is reduced
-#: for this. If it would become too small, the previous stretch is continued, at most `_MOST_MERGED` times in a row.
+#: At the beginning of a stretch each wall must be at least this many displacements away; the displacement is reduced if
+#: necessary. If it would become too small, the previous stretch is continued instead, at most `_MOST_MERGED` times in a
+#: row.
 _CLEAR_OF_WALLS: Final = 100.0
 _MOST_MERGED: Final = 20
 #: Largest number of steps of a shadow in a stretch.
@@ -49,7 +50,7 @@ _EQUATIONS_TOLERANCE, _LARGEST_ERROR = 1e-6, 1e-2
 #: `_FIRST_SLICE`: number of steps before the first check of the time limit
 #: `_MOST_WITHOUT_IMPLICIT`: largest number of explicit steps in a scene that can need implicit steps
 _FIRST_SLICE, _MOST_WITHOUT_IMPLICIT = 2048, 200_000
-#: Growth above which an error is no longer within ten tolerances (`docs/solver.md`).
+#: Largest growth at which an error is still within ten tolerances (`docs/solver.md`).
 TRUSTED_GROWTH: Final = 1e4
 
 
@@ -62,11 +63,12 @@ class Sensitivity:
     t : ndarray, shape (n,)
         Times in s.
     growth : ndarray, shape (n,)
-        Largest factor by which an earlier error has grown at `t`. Errors of poses are relative to the clearance; errors
-        of velocities are first multiplied by the time in which the largest load moves the head across the clearance.
+        Largest factor by which an error at any earlier time has grown until `t`. Errors of poses are relative to the
+        clearance; errors of velocities are first multiplied by the time in which the largest load moves the head across
+        the clearance.
     from_start : ndarray, shape (n, k, k)
-        Derivatives of the state at `t` with respect to the initial state; a state has the places, then the rates, of
-        the k / 2 free degrees of freedom.
+        Derivatives of the state at `t` with respect to the initial state; a state has the coordinates, then the rates,
+        of the k / 2 free degrees of freedom.
     exponent : float
         Largest Lyapunov exponent in 1/s in the second half of the motion; if it is above 0, errors grow for ever.
     tol : float
@@ -84,7 +86,7 @@ class Sensitivity:
 
     @property
     def trusted(self) -> bool:
-        """Whether the tolerance is met over the whole motion."""
+        """Whether the tolerance is met over the whole motion: `growth` does not exceed `TRUSTED_GROWTH`."""
         return bool(self.growth.max() <= TRUSTED_GROWTH)
 
     def good_until(self, accuracy: float) -> float:
@@ -110,7 +112,7 @@ class Sensitivity:
 def sensitivity_parameters(scene: Scene) -> dict[str, float]:
     """Return the parameters with respect to which a motion can be differentiated.
 
-    These are stiffness, damping or restitution, both clearances, and a factor of each load.
+    These are stiffness, damping or restitution, both clearances, and a scale factor of each load.
 
     Parameters
     ----------
@@ -119,7 +121,7 @@ def sensitivity_parameters(scene: Scene) -> dict[str, float]:
     Returns
     -------
     dict of str to float
-        The parameters' values in the scene, by path.
+        Values of the parameters in the scene; the keys are paths such as `contact.stiffness`.
     """
     contact, clearance = scene.contact, scene.clearance
     found = {"contact.stiffness": contact.stiffness, "contact.damping": contact.damping or 0.0}
@@ -130,7 +132,7 @@ def sensitivity_parameters(scene: Scene) -> dict[str, float]:
 
 
 def _changed(scene: Scene, path: str, value: float) -> Scene:
-    """Return the scene with another value of one of `sensitivity_parameters`."""
+    """Return the scene with a new value of the parameter at `path`, one of `sensitivity_parameters`."""
     part, _, name = path.rpartition(".")
     if part in ("contact", "clearance"):
         return replace(scene, **{part: replace(getattr(scene, part), **{name: value})})
@@ -148,7 +150,7 @@ def _scaled(load: Load, factor: float) -> Load:
 
 @dataclass(frozen=True)
 class ChangedScene:
-    """A scene with one parameter a little larger."""
+    """A scene with a small change of one parameter."""
 
     path: str
     compiled: CompiledScene
@@ -156,7 +158,7 @@ class ChangedScene:
 
     @staticmethod
     def of(scene: Scene, path: str, tol: float) -> ChangedScene:
-        """Return the scene with the parameter at a path a little larger."""
+        """Return the scene with a small change of the parameter at `path`."""
         value = sensitivity_parameters(scene)[path]
         length = path.startswith("clearance")
         change = DISPLACEMENT * geometry.length_scale(scene) if length else _RELATIVE_CHANGE * value
@@ -166,7 +168,7 @@ class ChangedScene:
 
 
 def refuse_support(scene: Scene) -> None:
-    """Raise `ArgumentError` for a scene with a `Support`, because shadows have no displacements of its frame."""
+    """Raise `ArgumentError` for a scene with a `Support`, because shadows displace only the head."""
     if scene.support is not None:
         raise ArgumentError(f"sensitivity: got a scene with {scene.support}, expected a scene without support")
 
@@ -177,7 +179,7 @@ class StretchProduct:
     Parameters
     ----------
     size : int
-        Number of places and rates.
+        Number of free coordinates and rates.
     parameters : int
         Number of parameters.
 
@@ -188,7 +190,7 @@ class StretchProduct:
     rows : ndarray, shape (p, k)
         Derivatives of the present state with respect to the parameters.
     growth : float
-        Largest growth of an error since any of the kept times, at least 1.
+        Largest factor by which an error at any of the kept earlier times has grown until now, at least 1.
     """
 
     def __init__(self, size: int, parameters: int) -> None:
@@ -197,24 +199,24 @@ class StretchProduct:
         self._basis, self._scratch = np.eye(size), np.zeros((5 + MOST_KEPT, size, size))
 
     def follow(self, matrices: Array, changes: Array, ends: NDArray[np.bool_]) -> tuple[Array, Array, Array, Array]:
-        """Multiply by one stretch after the other; the attributes then belong to the end of the last stretch.
+        """Multiply by the matrices of further stretches; the attributes then belong to the last stretch's end.
 
-        Within a stretch only the growth of places counts, because in the middle of an impact a stiff contact turns any
-        displacement into a large, temporary difference of velocities.
+        At a time within a stretch only the growth of coordinates counts, not of rates, because in the middle of an
+        impact a stiff contact turns any displacement into a large, temporary difference of velocities.
 
         Parameters
         ----------
         matrices : ndarray, shape (n, k, k)
-            Fundamental matrices of the stretches so far.
+            Fundamental matrices, each from the beginning of its stretch to one of n times.
         changes : ndarray, shape (n, p, k)
-            Effects of the parameters in these stretches.
+            Effects of the parameters over the same n intervals.
         ends : ndarray of bool, shape (n,)
-            Whether a stretch ends after each matrix.
+            Whether a stretch ends at each of the n times.
 
         Returns
         -------
         totals, rows, growth : ndarray, shapes (n, k, k), (n, p, k) and (n,)
-            The attributes after each matrix.
+            The attributes at each of the n times.
         logs : ndarray, shape (n, k)
             Logarithms of the factors by which a stretch has extended the vectors of a basis, in the row at which the
             stretch ends; other rows are 0.
@@ -231,22 +233,22 @@ class StretchProduct:
 
 
 def sensitivity_of(scene: Scene, t_end: float, tol: float, parameters: Sequence[str] = ()) -> Sensitivity:
-    """Follow the derivatives of a scene's motion up to `t_end`.
+    """Return the growth of errors and the derivatives of a scene's motion up to `t_end`.
 
     Parameters
     ----------
     scene : Scene
     t_end : float
-        End in s, above 0.
+        End of the motion in s, above 0.
     tol : float
-        Tolerance of the motion itself.
+        Tolerance of the simulated motion; the derivatives may be computed at another tolerance.
     parameters : sequence of str
-        Paths of the parameters for derivatives, from `sensitivity_parameters`.
+        Paths of the parameters with respect to which derivatives are computed, from `sensitivity_parameters`.
 
     Raises
     ------
     ArgumentError
-        The scene does not have a parameter, or it has a `Support`.
+        The scene does not have one of the parameters, or it has a `Support`.
     SolverError
         A shadow could not be followed.
     """
@@ -271,7 +273,7 @@ def sensitivity_of(scene: Scene, t_end: float, tol: float, parameters: Sequence[
         stretches = _by_equations(scene, t_end, tol, parameters) or stretches
         totals, rows, growth, logs = follow(stretches)
     times, ends = _ends(t_end), stretches.ends
-    # the exponent is computed only from stretches that begin in the second half
+    # the exponent is computed only from stretches that begin in the second half of the motion
     edges = np.concatenate([[0.0], times[ends]])
     first = int(np.searchsorted(edges, 0.5 * t_end))
     stretched = logs[ends][first:].sum(axis=0)
@@ -284,7 +286,7 @@ def sensitivity_of(scene: Scene, t_end: float, tol: float, parameters: Sequence[
 
 
 class _Stretches(NamedTuple):
-    """Derivatives at the times `_ends` with respect to the previous stretch's last state, scaled by `scale_of`."""
+    """Derivatives at the times `_ends` since the beginning of each stretch, scaled by `scale_of`."""
 
     matrices: Array  #: derivatives with respect to the state, shape (n, k, k)
     changes: Array  #: derivatives with respect to the parameters, shape (n, p, k)
@@ -292,7 +294,7 @@ class _Stretches(NamedTuple):
 
 
 def _by_equations(scene: Scene, t_end: float, tol: float, parameters: Sequence[str]) -> _Stretches | None:
-    """Follow the linearised equations along the motion; None if this is impossible or takes too many steps."""
+    """Return derivatives by the linearised equations, or None if these lack a term or take too many steps."""
     compiled = compile_scene(scene, tol)
     changed = [ChangedScene.of(scene, path, tol) for path in parameters]
     if not fits_tangents(compiled) or any(one.compiled.parts.terms != compiled.parts.terms for one in changed):
@@ -322,7 +324,7 @@ def _by_equations(scene: Scene, t_end: float, tol: float, parameters: Sequence[s
 
 
 def _by_shadows(scene: Scene, t_end: float, tol: float, parameters: Sequence[str]) -> _Stretches:
-    """Follow the motion and displaced motions."""
+    """Return derivatives by differences between the motion and its shadows."""
     # `SHADOW_TOLERANCE` is 1e-5 of a displacement; the run's tolerance is used if it is tighter
     fine = min(max(SHADOW_TOLERANCE, TOLERANCE_RANGE[0]), tol)
     compiled = compile_scene(scene, fine)
@@ -358,7 +360,7 @@ def _by_shadows(scene: Scene, t_end: float, tol: float, parameters: Sequence[str
 
 
 def _ends(t_end: float) -> Array:
-    """Return the ends of stretches in s, which are spaced unevenly so that they do not align with a period."""
+    """Return the times [s] at which stretches may end, unevenly spaced to avoid alignment with a period."""
     ends = np.arange(1, _STRETCHES + 1, dtype=np.float64)
     ends[:-1] += 0.4 * (np.mod(ends[:-1] * 0.5 * (math.sqrt(5.0) - 1.0), 1.0) - 0.5)
     ends *= t_end / _STRETCHES
@@ -367,7 +369,7 @@ def _ends(t_end: float) -> Array:
 
 
 def scale_of(compiled: CompiledScene) -> Array:
-    """Return the units of places and rates in which the clearance is 1, shape (6,)."""
+    """Return the units of coordinates and rates in which the clearance is 1, shape (6,)."""
     params, length = compiled.params, geometry.length_scale(compiled.scene)
     place = np.array([1.0, 1.0, 1.0 / float(params.radius)]) * length
     scale: Array = np.concatenate([place, place * float(params.velocity_tolerance / params.position_tolerance)])
@@ -377,7 +379,7 @@ def scale_of(compiled: CompiledScene) -> Array:
 def displacement_beside(
     penetration: Array, length: float, *, held: bool = False, reads_speed: bool = False
 ) -> float | None:
-    """Return the largest displacement of shadows, in shares of the clearance, for a stretch that begins here.
+    """Return the largest displacement of shadows, in clearances, for a stretch that begins at `penetration`.
 
     A stretch does not begin during a contact with a spring, because the spring would turn a displacement into a
     velocity larger than any error of the solver. If a damper holds the head, a displacement persists, so a small
@@ -388,18 +390,18 @@ def displacement_beside(
     penetration : ndarray, shape (n,)
         Penetrations in m of the pairs that can touch.
     length : float
-        The clearance in m, of which displacements are shares.
+        Clearance in m, to which displacements are relative.
     held : bool
         Whether overdamped contact holds the head.
     reads_speed : bool
-        Whether a contact's damping depends on the speed of its touch, which a displacement within the contact does not
-        change.
+        Whether a contact's damping depends on the speed of its touch; a displacement within the contact does not change
+        this speed.
 
     Returns
     -------
     float or None
-        None if a pair is too near its wall for a displacement that is small compared with the distance, or if a
-        contact's damping depends on the speed of its touch.
+        None if a pair is closer to its wall than `_CLEAR_OF_WALLS` displacements, or if a pair is in a contact whose
+        damping depends on the speed of its touch.
     """
     if reads_speed and bool((penetration > 0.0).any()):
         return None
@@ -408,7 +410,7 @@ def displacement_beside(
 
 
 def free_places(scene: Scene) -> NDArray[np.int64]:
-    """Return the indices of places and rates of the free degrees of freedom."""
+    """Return the indices of the free coordinates and rates."""
     places = [index for index, name in enumerate(DOF_NAMES) if name not in scene.locked]
     return np.array(places + [3 + index for index in places], dtype=np.int64)
 
@@ -421,9 +423,10 @@ def _beside(
     before: Sequence[State],
     work: Work,
 ) -> list[State]:
-    """Return a state and its shadows: one displaced by `moved` in each free place or rate, and one per changed scene.
+    """Return a state and its shadows: one displaced in each free coordinate or rate, one per changed scene.
 
-    Shadows of changed scenes are not displaced; they keep the damping that was set at a touch, given by `before`.
+    `moved` has the displacements. Shadows of changed scenes are not displaced; they keep the damping factors that were
+    set at their own touches, taken from the states `before`.
     """
     start = _pose_and_rate(_follow(compiled, state, float(state.time), work))
     states = [state]
@@ -446,7 +449,7 @@ def _copy(state: State) -> State:
 
 
 def _follow(compiled: CompiledScene, state: State, end: float, work: Work) -> Motion:
-    """Advance a copy of a state to `end`; return the motion with a row at `end`."""
+    """Advance a copy of a state to `end`; return its motion, whose only output row is at `end`."""
     motion = Motion.start(compiled, np.zeros((1, 3)), np.zeros((1, 3)), outputs=True)
     motion.state = _copy(state)
     code, _ = run_events(compiled, motion, np.array([end]), end, work, int(motion.state.steps) + _SHADOW_BUDGET)

@@ -55,18 +55,18 @@ class Result:
     events : ndarray of `EVENT_DTYPE`, shape (k,)
         All contact changes in order of time.
     statistics : mapping
-        By pair name: max, mean_in_contact, mean_over_time [N], impulse [N s], time_in_contact [s] and makes, of the
-        whole motion and not only of the output rows.
+        By pair name: max, mean_in_contact, mean_over_time [N], impulse [N s], time_in_contact [s] and makes (number of
+        touches), computed from the whole motion and not only from the output rows.
     contact_sets : mapping
         By sense (`ccw`, `cw`) and set of corners: the share of the sense's contact time in which exactly the corners of
         the set carry force. Corners have the scene's labels, otherwise their names.
     solver : mapping
-        method, tol or dt, and the numbers of steps, evaluations and events. An evaluation is an order of a series, or
-        for fixed steps an evaluation of the right-hand side.
+        method, tol or dt, and the numbers of steps, evaluations and events. For the series each order counts as an
+        evaluation, for fixed steps each evaluation of the right-hand side.
     wear_depth : ndarray, shape (8,)
         Wear depth of each pad at the end in m.
     wall_s, compile_s : float
-        Time in s that the run took, and that compiling before the run took.
+        Wall-clock time in s of the run, and of compiling before the run.
     energy_balance : EnergyBalance or None
         Balance of energy and momentum, on request.
     sensitivity : Sensitivity or None
@@ -150,7 +150,7 @@ def simulate(
     ----------
     scene : Scene
     t_end : float
-        End in s, not negative.
+        End of the motion in s, not negative.
     output_dt : float, optional
         Interval of the output rows in s, by default a thousandth of the motion. The rows do not change the motion. For
         the fixed-step methods, `output_dt` must be a whole multiple of `dt`.
@@ -159,7 +159,7 @@ def simulate(
     method : {"events", "rk4", "euler"}
         Event-located Taylor series, or a fixed step without event location.
     dt : float, optional
-        The fixed step in s.
+        Step in s of the fixed-step methods.
     energy_balance : bool
         Whether to compute the balance of energy and momentum (`Result.energy_balance`).
     max_steps : int
@@ -187,9 +187,10 @@ def simulate(
     SolverError
         The motion could not be continued; the message has the time and the cause.
     LimitError
-        A limit is reached; `result` has the motion up to there.
+        `max_steps` or `max_wall_s` is reached; the error's `result` has the motion up to this limit.
     RunInterrupted
-        The user pressed Ctrl-C; `result` has the motion up to there. The error is also a `KeyboardInterrupt`.
+        The user pressed Ctrl-C; the error's `result` has the motion up to the interruption. The error is also a
+        `KeyboardInterrupt`.
     """
     check_times(t_end, output_dt, method, dt)
     check_limits(max_steps, max_wall_s)
@@ -288,10 +289,10 @@ def output_times(t_end: float, output_dt: float | None) -> Array:
     return times if t_end - times[-1] <= 1e-9 * output_dt else np.append(times, t_end)
 
 
-#: Scratch space of the last run, kept for the next run. A run that is simultaneous with another (in another thread, or
-#: started from `on_progress`) finds none and makes its own.
+#: Scratch space of the last run, kept for the next run. If two runs overlap (in two threads, or because `on_progress`
+#: starts a run), the second run makes its own scratch space.
 _spare: Final[deque[Work]] = deque(maxlen=1)
-#: Kinds of run whose kernels this process has compiled or loaded.
+#: Kinds of run (terms, options and method) whose kernels this process has compiled or loaded.
 _ready: set[tuple[object, ...]] = set()
 
 
@@ -393,7 +394,7 @@ def statistics_of(totals: Totals, duration: float) -> dict[str, dict[str, float]
 
 
 def contact_sets_of(scene: Scene, totals: Totals) -> dict[str, dict[str, float]]:
-    """Return the time share of each set of corners that carry force together, for each sense, largest share first."""
+    """Return the shares of contact time of the sets of corners (see `Result`), largest share first."""
     letters = {corner: letter for letter, corner in scene.frame.labels.items()}
     labels = [letters.get(corner, corner) for corner in CORNER_NAMES]
     joint = "" if letters else "+"

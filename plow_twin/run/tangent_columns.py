@@ -1,4 +1,4 @@
-"""The columns of `solve.tangents`, made from a scene and from scenes with one changed parameter."""
+"""Columns of the linearised equations (`solve.tangents`) for displacements and parameter changes."""
 
 from __future__ import annotations
 
@@ -47,7 +47,8 @@ def columns_beside(
     omegas : ndarray, shape (h,)
         Angular frequencies of the loads in rad/s.
     amplitudes : ndarray, shape (b, h, 2, 3, 8)
-        Change of the sine and cosine amplitudes that each column makes, divided by mass or inertia.
+        Changes of the loads' sine and cosine amplitudes per unit of each column's parameter, divided by mass or
+        inertia.
     """
     blocks = -(-(STATE_COLUMNS + len(changed)) // WIDTH)
     columns, omegas = new_records(COLUMNS, blocks), compiled.loads.omega

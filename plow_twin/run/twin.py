@@ -45,8 +45,8 @@ __all__ = ["Advance", "AdvanceSeries", "Status", "Twin"]
 
 #: Default number of steps after which an advance fails.
 DEFAULT_BUDGET = 50_000_000
-#: The compiled kernels; the types of a kernel's arguments follow from its key. They are kept because numba's dispatch
-#: takes milliseconds.
+#: Compiled kernels by signature and kind, which determine the types of a kernel's arguments. The kernels are kept
+#: because numba's dispatch takes milliseconds.
 _entries: dict[tuple[Any, ...], Callable[..., bool]] = {}
 _NO_DIGESTS = np.zeros(0, np.int64)
 _THE_ONE = np.zeros(1, np.int64)
@@ -63,7 +63,7 @@ class Twin:
     tol : float
         Tolerance of the pose relative to the clearance.
     excitation : {"scene", "sampled"}
-        `scene`: the scene's own loads. `sampled`: wrenches given to `advance`, joined by straight lines; the scene's
+        `scene`: the scene's own loads. `sampled`: the wrenches given to `advance`, interpolated linearly; the scene's
         loads are not used.
     start : float
         Model time of the scene's initial state in s.
@@ -75,7 +75,7 @@ class Twin:
         Largest number of steps of an advance; an advance that needs more has the status `BUDGET` and leaves the twin
         unchanged.
     max_wall_s : float
-        Time in s that a call for advances may take.
+        Wall-clock time in s that a call of an advancing method may take.
 
     Notes
     -----
@@ -124,14 +124,14 @@ class Twin:
         #: model time, as a view of the state
         self._time = self._states["time"]
         self._wrench = np.zeros(3)
-        #: `_one_load`: work space for the load of one sample, per mass and inertia
-        #: `_no_snapshots`: an empty array of snapshots
+        #: `_one_load`: work space for one sample of the load, divided by mass and inertia; `_no_snapshots`: an empty
+        #: array of snapshots
         self._one_load, self._no_snapshots = np.empty((1, 2, 3)), self._states[:0]
         self._travel_speed = scene.wear.travel_speed_m_s if scene.wear is not None else 0.0
 
     @property
     def signature(self) -> tuple[bool, ...]:
-        """Terms of the equations; twins with equal terms share their compiled code."""
+        """Which optional terms the equations have; twins with equal signatures share their compiled code."""
         parts = self._parts
         there = (*parts.terms, parts.harmonics, parts.segments, parts.implicit, self._bound)
         return (*(part is not None for part in there), *options(self.scene))
@@ -175,13 +175,13 @@ class Twin:
         t : float
             Model time in s, not before the present model time.
         wrench : array_like, shape (3,), optional
-            Fx, Fy [N] and M [N m] about the cavity's centre at `t` (`excitation="sampled"` only), reached linearly from
-            the previous sample. Without it the last sample is held.
+            Fx, Fy [N] and M [N m] about the cavity's centre at `t` (`excitation="sampled"` only). The load changes
+            linearly from the previous sample to this sample. Without `wrench` the last sample is held.
 
         Returns
         -------
         Advance
-            State at `t`, and sums since the previous advance. With a `status` other than `OK` nothing has moved.
+            State at `t`, and sums since the previous advance. If `status` is not `OK`, the twin has not moved.
 
         Raises
         ------
@@ -198,7 +198,7 @@ class Twin:
         return Advance(rows[0])
 
     def advance_samples(self, t: ArrayLike, wrench: ArrayLike) -> AdvanceSeries:
-        """Advance through many samples, with the same bits as by one `advance` for each sample.
+        """Advance through many samples, with the same result, bit for bit, as one `advance` per sample.
 
         Parameters
         ----------
@@ -242,7 +242,7 @@ class Twin:
         rows : ndarray of `ROW`, shape (n,), or None
             Receives a row for each time. With None the motion is the same, but no forces are computed for output.
         digest_after : ndarray of int64, shape (m,)
-            Increasing numbers from 1 to n: the counts of advances after which a digest is made.
+            Increasing numbers from 1 to n; after each of these numbers of advances a digest of the state is made.
 
         Returns
         -------
@@ -282,7 +282,7 @@ class Twin:
 
     @property
     def wrench(self) -> NDArray[np.float64]:
-        """The last sample: Fx, Fy [N] and M [N m], shape (3,); zero before the first sample."""
+        """The last sample of the load: Fx, Fy [N] and M [N m], shape (3,); zero before the first sample."""
         return self._wrench.copy()
 
     def reset(
@@ -324,7 +324,7 @@ class Twin:
         self._wrench = np.zeros(3)
 
     def move(self, q: ArrayLike, v: ArrayLike) -> None:
-        """Set the pose and rate of a head under sampled loads at the present time; its wear and counts stay.
+        """Set pose and rates at the present time (sampled loads only); wear and counters are unchanged.
 
         Parameters
         ----------
@@ -336,7 +336,7 @@ class Twin:
         settle_moved(self._params, self._states, _THE_ONE, place, self.time, self._parts.terms.stick)
 
     def set_travel_speed(self, speed_m_s: float) -> None:
-        """Set the speed along the face from here on; only wear depends on it.
+        """Set the speed along the face from the present time on; only wear depends on it.
 
         Parameters
         ----------
@@ -396,7 +396,7 @@ class Twin:
         Returns
         -------
         str
-            The reason; for `OUT_OF_RANGE` it contains the head's value and the limit of the model.
+            The reason; for `OUT_OF_RANGE` it contains the head's value that is out of range, and the model's limit.
         """
         if status != Status.OUT_OF_RANGE:
             return Status(status).text
@@ -417,8 +417,8 @@ class Twin:
             return None
         if state.step_size < 0.0:
             return np.array(state.frame)
-        # under the scene's own loads the present time may lie within a step; the frame's state is then computed from
-        # the step's series, at the sigma of `dense_output.sigma_at`
+        # under the scene's own loads the present time may lie within a step; the frame's state is then evaluated from
+        # the step's series, at the value of sigma that `dense_output.sigma_at` gives
         used, beta = float(state.elapsed), float(state.beta)
         sigma = 2.0 * used / (state.alpha + math.sqrt(max(state.alpha**2 + 2.0 * beta * used, 0.0)))
         return frame_at(work.frame, int(state.order), sigma)
@@ -439,14 +439,14 @@ class Twin:
         return int(self._state.bounded)
 
     def _kernel(self, kind: tuple[bool, bool], arguments: tuple[Any, ...]) -> Callable[..., bool]:
-        """Return the kernel compiled for its arguments, whose types follow from the signature and `kind`."""
+        """Return the kernel compiled for these arguments; signature and `kind` determine their types."""
         key = self.signature, kind
         if key not in _entries:
             _entries[key] = for_arguments(loop.advance_rows, arguments)
         return _entries[key]
 
     def _digests(self, states: NDArray[np.void], wrench: NDArray[np.float64]) -> list[str]:
-        """Return the digests of states with their last samples, shape (m, 3)."""
+        """Return a digest of each state together with its last sample of the load; `wrench` has shape (m, 3)."""
         size = states.itemsize
         rows = np.empty((len(states), size + 32), np.uint8)  # each row has the layout of `snapshot`
         rows[:, :size] = states.view(np.uint8).reshape(len(states), size)
@@ -457,7 +457,7 @@ class Twin:
     def _stopped(
         self, stop: BaseException, count: int, samples: NDArray[np.float64] | None, rows: NDArray[np.void] | None
     ) -> NoReturn:
-        """Restore the state after the last complete one of `count` advances, and raise an error."""
+        """Restore the state after the last completed advance of the `count` advances, and raise an error."""
         steps, done = self.steps, int(self._pace.record.row)
         self._go_back()
         if samples is not None and done > 0:
@@ -489,7 +489,7 @@ class Twin:
 
 
 class Advanced(NamedTuple):
-    """Number of failed advances of a call, and its digests."""
+    """Result of a call: the number of failed advances, and the digests."""
 
     failed: int
     digests: list[str]
@@ -515,7 +515,7 @@ def _digest(snapshot: bytes | memoryview) -> str:
 
 
 def _bounded(max_evaluations: int | None, order: int, max_steps: int) -> tuple[int, Bound | None]:
-    """Return the largest number of series steps of an advance, and the evaluations reserved for its coarse end."""
+    """Return the largest number of series steps of an advance, and the Runge-Kutta steps that may end it."""
     if max_evaluations is None:
         return max_steps, None
     if isinstance(max_evaluations, bool) or not max_evaluations >= LEAST_EVALUATIONS:

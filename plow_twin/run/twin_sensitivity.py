@@ -27,8 +27,8 @@ from plow_twin.solve.state import Status
 
 Array = NDArray[np.float64]
 
-#: `_STRETCH_S`: length of a stretch in s
-#: `_FAR`: distance between shadow and twin, in displacements, at which a stretch ends earlier
+#: `_STRETCH_S`: length of a stretch in s; `_FAR`: a stretch ends earlier if a shadow is more than this many
+#: displacements away from the twin
 _STRETCH_S, _FAR = 0.1, 100.0
 #: Longest stretch in s; a stretch becomes longer than `_STRETCH_S` if a contact prevents the start of the next stretch.
 _LONGEST_S = 0.5
@@ -40,10 +40,10 @@ class TwinSensitivity:
     Parameters
     ----------
     twin : Twin
-        A twin with `excitation="sampled"`; from here on only `advance` advances it, with the same bits as without
-        sensitivity.
+        A twin with `excitation="sampled"`. From here on it must be advanced only by this object's `advance`, which
+        gives the same bits as `Twin.advance`.
     parameters : sequence of str
-        Paths of the parameters for derivatives, from `sensitivity_parameters`.
+        Paths of the parameters with respect to which derivatives are computed, from `sensitivity_parameters`.
 
     Attributes
     ----------
@@ -51,19 +51,19 @@ class TwinSensitivity:
         Model time in s to which the other attributes belong: the end of the last complete stretch, some 0.1 s before
         the twin's time, or up to 0.5 s before it during a contact.
     from_start : ndarray, shape (k, k)
-        Derivatives of the state at `t` with respect to the initial state; a state has the places, then the rates, of
-        the k / 2 free degrees of freedom.
+        Derivatives of the state at `t` with respect to the twin's state when this object was made; a state has the
+        coordinates, then the rates, of the k / 2 free degrees of freedom.
     by_parameter : dict of str to ndarray, shape (k,)
-        Derivatives of the state at `t` with respect to the parameters at constant initial state.
+        Derivatives of the state at `t` with respect to the parameters, for an unchanged state at the beginning.
     growth : float
-        Largest factor by which an earlier error has grown at `t`, as in `Sensitivity.growth`.
+        Largest factor by which an error at any earlier time has grown until `t`, as in `Sensitivity.growth`.
     exponent : float
-        Largest Lyapunov exponent in 1/s since the beginning.
+        Largest Lyapunov exponent in 1/s since this object was made.
 
     Raises
     ------
     ArgumentError
-        The scene does not have a parameter, the twin is not sampled, or the scene has a `Support`.
+        The scene does not have one of the parameters, the twin is not sampled, or the scene has a `Support`.
     """
 
     def __init__(self, twin: Twin, parameters: Sequence[str] = ()) -> None:
@@ -89,20 +89,20 @@ class TwinSensitivity:
 
     @property
     def from_start(self) -> Array:
-        """Derivatives with respect to the state at the beginning."""
+        """Derivatives of the state at `t` with respect to the state at the beginning."""
         scale = self._scale[self._free]
         return np.asarray(self._product.total * scale[:, None] / scale[None, :])
 
     @property
     def by_parameter(self) -> dict[str, Array]:
-        """Derivatives with respect to the parameters."""
+        """Derivatives of the state at `t` with respect to the parameters."""
         return {
             one.path: row * self._scale[self._free] for one, row in zip(self._changed, self._product.rows, strict=True)
         }
 
     @property
     def growth(self) -> float:
-        """Largest factor by which an earlier error has grown."""
+        """Largest factor by which an error at any earlier time has grown until `t`."""
         return self._product.growth
 
     @property

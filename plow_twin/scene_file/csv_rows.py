@@ -41,7 +41,7 @@ def open_csv(path: Path) -> IO[str]:
 
 
 def tables(folder: Path) -> list[Path]:
-    """Return the CSV and Parquet files of a folder by name; of two files with the same name, only the CSV file."""
+    """Return a folder's CSV and Parquet files, sorted by name; if a file exists as both, only the CSV file."""
     found = {path.stem: path for ending in (SUFFIX, ".csv") for path in folder.glob(f"*{ending}")}
     return [found[name] for name in sorted(found)]
 
@@ -69,7 +69,7 @@ def check_text(begin: bytes) -> None:
 
 
 def delimiter_of(header: str) -> str:
-    """Return the delimiter of a header line: of comma, semicolon and tab, the most frequent one outside quotes."""
+    """Return a header line's delimiter: the most frequent of comma, semicolon and tab outside quotes."""
     return max(",;\t", key=re.sub(r'"[^"]*"', "", header).count)
 
 
@@ -82,7 +82,7 @@ def csv_rows(stream: IO[str], comment: str = "") -> Iterator[tuple[int, list[str
     Raises
     ------
     csv.Error
-        A line is not a row.
+        A line cannot be read as a row.
     ExcessError
         A row is longer than `LONGEST_ROW`, or there are more than `MOST_COLUMNS` columns.
     """

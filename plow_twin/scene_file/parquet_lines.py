@@ -52,7 +52,7 @@ class ParquetLines(io.RawIOBase):
         csv.Error
             The file is not Parquet, or is damaged; reading raises this too.
         ExcessError
-            The unpacked file would be larger than telemetry can be.
+            The unpacked file would exceed this module's bounds for columns, rows or the size of a column.
     """
 
     def __init__(self, path: Path) -> None:
@@ -113,7 +113,7 @@ class ParquetLines(io.RawIOBase):
         return count
 
     def tell(self) -> int:
-        """Return the number of bytes of the file that have been read."""
+        """Return the number of bytes of the file read so far, estimated from the share of rows read."""
         return round(self._size * self._done / self._rows) if self._rows else self._size
 
     def close(self) -> None:
@@ -144,7 +144,7 @@ def _first_line(error: BaseException) -> str:
 
 
 def _is_plain(kind: pa.DataType) -> bool:
-    """Return whether a value of a type fits into a cell."""
+    """Return whether values of a type can be written to a CSV cell."""
     import pyarrow as pa
 
     kind = kind.value_type if pa.types.is_dictionary(kind) else kind

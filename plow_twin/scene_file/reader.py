@@ -30,7 +30,7 @@ from plow_twin.scene_file.validation import Schema, validate
 from plow_twin.scene_file.yaml_text import load_yaml, read_yaml
 
 _SECTIONS: Final = "the sections of a scene"
-#: Replacements for parts with problems, so that the other parts can be checked against each other.
+#: Valid parts that replace parts with problems, so that the other parts can be checked against each other.
 _SOUND: Final[Mapping[str, Any]] = MappingProxyType(
     {
         "head": Head(1.0, 1.0),
@@ -52,7 +52,7 @@ def load_scene(path: str | Path) -> Scene:
     Returns
     -------
     Scene
-        The scene, with the marks of its numbers.
+        The scene, with the provenance marks of its numbers.
 
     Raises
     ------
@@ -74,8 +74,8 @@ def loads_scene(text: str, base: str | Path | None = ".", *, source: str = "scen
     text : str
         The scene as YAML.
     base : str or Path, optional
-        Folder against which load tables are looked up; the working directory by default. With None, tables in files are
-        refused.
+        Folder to which the paths of load tables are relative; the working directory by default. With None, tables in
+        files are refused.
     source : str
         Name of the scene in messages.
 
@@ -93,7 +93,7 @@ def _schema() -> Schema:
 
 
 def _scene(raw: Any, problems: list[Problem], base: Path | None, source: str) -> Scene:
-    """Return the scene in a document, or raise its `problems`, which include those found while it was read."""
+    """Return the scene of a document, or raise a `SceneError` with `problems` and all further problems."""
     if raw is None and problems:
         raise SceneError(problems, source)
     problems += validate(raw, _schema(), "scene")
@@ -111,7 +111,7 @@ def _scene(raw: Any, problems: list[Problem], base: Path | None, source: str) ->
 def _read_parts(
     raw: Mapping[str, Any], bad: set[str], marks: dict[str, Provenance], base: Path | None, problems: list[Problem]
 ) -> dict[str, Any]:
-    """Build the parts of a scene without problems."""
+    """Build the parts of a scene that have no problems."""
     parts: dict[str, Any] = {}
     for key, part in SECTIONS.items():
         if key in raw and key not in bad:
@@ -184,7 +184,7 @@ def _samples(raw: Mapping[str, Any], path: str, base: Path | None) -> tuple[Any,
 
 
 def _problems_across(parts: Mapping[str, Any]) -> tuple[Problem, ...]:
-    """Return the problems between parts; parts with problems of their own are replaced by parts without problems."""
+    """Return the problems between parts; each part that has problems of its own is replaced by a valid part."""
     try:
         Scene(**{**_SOUND, **parts})
     except SceneError as error:

@@ -1,4 +1,4 @@
-"""JSON Schema of the scene file, made from the dataclasses of `plow_twin.model.scene`, so that they cannot differ.
+"""JSON Schema of the scene file, made from the dataclasses of `plow_twin.model.scene` so that both agree.
 
 A number or a list of numbers is either plain or `{value, mark, source}`. Samples of a table load are plain.
 """
@@ -39,7 +39,7 @@ SECTIONS: Final[dict[str, type]] = {
 }
 #: Required sections.
 REQUIRED_SECTIONS: Final = ("head", "frame", "clearance", "contact")
-#: Kinds of load; a load has exactly one.
+#: Kinds of load; each load has exactly one kind.
 LOAD_KINDS: Final[dict[str, type[Load]]] = {"harmonic": Harmonic, "constant": Constant, "table": Table}
 #: Columns of a load file unless `columns` names others: time, Fx, Fy, M.
 TABLE_COLUMNS: Final = ("t", "fx", "fy", "m")

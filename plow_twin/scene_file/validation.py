@@ -27,7 +27,7 @@ NUMBER: Final[Schema] = {"type": "number", "description": "a finite number"}
 
 
 def mapping(properties: Mapping[str, Schema], required: Sequence[str] = ()) -> Schema:
-    """Return the schema of a mapping that may have only these keys."""
+    """Return the schema of a mapping that may have only the keys of `properties`."""
     return {
         "type": "object",
         "properties": dict(properties),
@@ -56,14 +56,16 @@ class _Shown:
 NOTHING: Final = _Shown("nothing")
 #: Longest value and longest name that are printed [characters].
 _LONGEST: Final = 200
-#: Largest number of problems that are listed; it is limited because finding the nearest key for each takes time.
+#: Largest number of problems that are listed; it is limited because the search for the nearest known key takes time for
+#: each problem.
 MOST_PROBLEMS: Final = 50
 
 
 def validate(raw: Any, schema: Schema, name: str) -> list[Problem]:
     """Return the problems of plain data in the order of the schema; messages call the whole data `name`."""
     problems = (problem for error in _validator(schema).iter_errors(raw) for problem in _explain(error, name))
-    # jsonschema reports a mapping once for each missing key, and `_explain` lists all its missing keys each time
+    # jsonschema reports a mapping once for each missing key, and `_explain` lists all missing keys each time, so
+    # duplicates are dropped
     unique: dict[str, Problem] = {}
     for problem in islice(map(_brief, problems), 2 * MOST_PROBLEMS):
         unique[str(problem)] = problem
@@ -120,7 +122,7 @@ def _explain(error: ValidationError, whole: str) -> Iterator[Problem]:
 
 
 def _closest_branch(key: str, error: ValidationError, whole: str) -> Iterator[Problem]:
-    """Yield the problems of the branch whose type fits the value, or one problem of the key if no branch fits."""
+    """Yield the problems of the `anyOf` branch that fits the value's type, or one problem of the key."""
     branches: dict[Any, list[ValidationError]] = {}
     for inner in error.context or ():
         branches.setdefault(inner.schema_path[0], []).append(inner)
@@ -133,7 +135,7 @@ def _closest_branch(key: str, error: ValidationError, whole: str) -> Iterator[Pr
 
 
 def _is_misfit(error: ValidationError) -> bool:
-    """Return whether an error shows that the branch is for values of another type or with other keys."""
+    """Return whether an error shows that an `anyOf` branch is for values of another type or with other keys."""
     keys_alone = error.validator == "required" and "properties" not in cast(Schema, error.schema)
     return keys_alone or error.validator in ("type", "const", "enum")
 

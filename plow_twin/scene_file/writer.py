@@ -42,7 +42,7 @@ def dump_scene(scene: Scene) -> str:
     Returns
     -------
     str
-        The text, including the marks.
+        The text, including the provenance marks.
     """
     raw: dict[str, Any] = {"version": SCENE_VERSION}
     for key in SECTIONS:
@@ -57,7 +57,7 @@ def dump_scene(scene: Scene) -> str:
 
 
 def _plain(part: Any, path: str, marks: Mapping[str, Provenance], without: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Return a dataclass as plain lists, mappings and numbers, with the marks put back."""
+    """Return a dataclass as plain lists, mappings and numbers, with the provenance marks put back."""
     plain: dict[str, Any] = {}
     for spec in fields(part):
         value = getattr(part, spec.name)

@@ -24,9 +24,9 @@ except ImportError:
     from yaml import SafeDumper as _Dumper  # type: ignore[assignment]
     from yaml import SafeLoader as _Loader  # type: ignore[assignment]
 
-#: Largest file [B]. A table of 200,000 rows fits, which takes ten seconds to read; longer tables belong in CSV.
+#: Largest file [B]. A table of 200,000 rows fits and takes ten seconds to read; longer tables belong in CSV.
 LARGEST_FILE: Final = 64 * 2**20
-#: Largest number of values in a file; it has room for the same table.
+#: Largest number of values in a file; a table of 200,000 rows fits.
 MOST_VALUES: Final = 1_000_000
 #: Deepest nesting of collections; a scene has six levels.
 DEEPEST: Final = 20
@@ -108,7 +108,7 @@ def load_yaml(text: str, name: str, sections: str, *, most_values: float = math.
 
 @dataclass
 class _Size:
-    """Size of a node with its children; an alias has the size of its node."""
+    """Size of a node with its children; an alias has the size of the node that it repeats."""
 
     values: int = 1
     keys: int = 0
@@ -116,7 +116,7 @@ class _Size:
 
 
 def _excess(text: str, most_values: float) -> Problem | None:
-    """Return the bound that the events of a document exceed, or None; YAML errors are raised."""
+    """Return the problem of a document whose events exceed a bound, or None; YAML errors are raised."""
     scalar = _Size()
     values = repeated = 0
     sizes: dict[str, _Size | None] = {}  # size of each anchored node by anchor; None until the node ends

@@ -1,4 +1,4 @@
-"""Conversion of a scene to the records of the kernels, in this module alone."""
+"""Conversion of a scene to the records that the kernels read; no other module does this."""
 
 from __future__ import annotations
 
@@ -51,16 +51,17 @@ TOLERANCE_RANGE = (1e-13, 1e-1)
 #: Admissible error of one step as a share of the tolerance; it is small, because the errors of hundreds of steps add up
 #: and impacts amplify them.
 STEP_SHARE = 3e-4
-#: Largest admissible error of a step relative to the length scale; it limits the error of a step at a loose tolerance.
+#: Largest admissible error of a step relative to the length scale; it applies at loose tolerances.
 LARGEST_STEP_ERROR = 1e-6
 #: `STEP_SHARE` for exponents that are not integers; it is smaller, because series converge slowly near a branch point.
 STEP_SHARE_FRACTION = 1e-6
 #: Number of mode changes at one instant after which the solver steps beyond this instant.
 MAX_EVENTS_AT_ONCE = 64
-#: Rest is checked (`method.small_harmonics`) if the harmonics are at most this share of the load that presses the head
-#: to its walls.
+#: Largest harmonics, as a share of the load that presses the head to its walls, for which rest is checked
+#: (`method.small_harmonics`).
 _SMALL_HARMONICS = 1e-2
-#: Penetration over the frame's half diagonal that is noise: some 45 rounding errors of the half diagonal.
+#: Penetration, relative to the frame's half diagonal, that counts as noise: some 45 rounding errors of the half
+#: diagonal.
 _NOISE = 1e-14
 
 _Found = TypeVar("_Found")
@@ -88,7 +89,7 @@ class CompiledScene:
         return state
 
     def start(self, state: State | np.void) -> None:
-        """Write place, rates, damping and wear of the initial state to a record of zeros, without choosing modes."""
+        """Write coordinates, rates, damping and wear of the initial state to a zero record; modes are not set."""
         state["y"][:] = geometry.state_of(self.scene, self.scene.initial.q, self.scene.initial.v)
         if self.parts.terms.hysteretic is not None:
             state["damping_factor"][:] = self.scene.contact.damping or 0.0
@@ -113,7 +114,8 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
         The tolerance is out of range.
     """
     _check_tolerance(tol)
-    # a table of loads may be large, so it must not be kept longer than its scene
+    # a load table may be large, so scenes with tables do not use `_LATELY`, which would keep a table longer than its
+    # scene
     tables = any(isinstance(load, Table) for load in scene.loads)
     return _describe(scene, tol, sampled, _Shared() if tables else _LATELY).compiled()
 
@@ -157,7 +159,7 @@ def _check_tolerance(tol: float) -> None:
 
 
 class _Shared:
-    """Results that scenes share, computed once for each set of objects on which they depend.
+    """Results that scenes share; each result is computed once for the objects on which it depends.
 
     If `most` is given, only the newest `most` results are kept.
     """
@@ -167,9 +169,9 @@ class _Shared:
         self._known: OrderedDict[tuple[Any, ...], tuple[Any, Any]] = OrderedDict()
 
     def of(self, compute: Callable[..., _Found], *sources: object, given: tuple[Any, ...] | None = None) -> _Found:
-        """Return compute(*sources), or compute(*given), and keep the result for the next call with the same sources.
+        """Return compute(*sources), or compute(*given) if `given` is passed.
 
-        `given` must be determined by the sources.
+        The result is kept for the next call with the same sources, which must therefore determine `given`.
         """
         key = (compute, *map(id, sources))
         known = self._known.get(key)
@@ -182,14 +184,14 @@ class _Shared:
         return found
 
 
-#: Results computed from parts of the last scenes. Studies vary some parts of a scene and reuse the results of the
-#: others.
+#: Results computed from parts of the most recently compiled scenes. Studies vary some parts of a scene and reuse the
+#: results of the other parts.
 _LATELY: Final = _Shared(64)
 
 
 @dataclass(frozen=True)
 class _Description:
-    """A scene as the solver describes it; `values` has the fields of its `PARAMS`."""
+    """The solver's description of a scene; `values` holds the fields of its `PARAMS` record."""
 
     scene: Scene
     values: dict[str, Any]
@@ -206,7 +208,7 @@ class _Description:
 
 
 class _Unchanged(NamedTuple):
-    """All results that do not depend on a scene's clearance; `values` has fields of its `PARAMS`."""
+    """All results that do not depend on the clearance; `values` holds the fields of `PARAMS` among them."""
 
     loads: LoadSet
     acceleration: float  #: largest acceleration in m/s^2
@@ -290,7 +292,7 @@ def _describe(scene: Scene, tol: float, sampled: bool, shared: _Shared) -> _Desc
 
 
 def options(scene: Scene) -> Options:
-    """Return which options a scene has, for which its constants need further fields."""
+    """Return the options of a scene, each of which adds fields to its constants."""
     falls = scene.contact.restitution_fall is not None or scene.contact.restitution_fall_along_s_m is not None
     return Options(scene.head.carries == "corners", scene.frame.corner_radius_m is not None, falls)
 
@@ -316,7 +318,7 @@ def _of_options(scene: Scene) -> dict[str, Any]:
 
 @cache
 def damping_numbers(law: str) -> Array:
-    """Return e D(e) of a law on an even grid of restitutions from 0 to 1, shape (RESTITUTIONS + 1,)."""
+    """Return restitution times damping number on an even grid of restitutions 0..1, shape (RESTITUTIONS + 1,)."""
     grid = np.arange(RESTITUTIONS + 1) / RESTITUTIONS
     return grid * [LAWS[law].damping_number(float(e)) for e in grid]
 
@@ -382,7 +384,7 @@ def _initial_depth(scene: Scene) -> float:
 
 @lru_cache(64)
 def _thresholds(admissible: float, order: int) -> Array:
-    """Return the admissible size of each term, relative to that of the first term."""
+    """Return the admissible size of each term of a series, relative to that of its first term."""
     sizes: Array = admissible ** (np.arange(MAX_ORDER + 1) / order)
     return sizes
 
@@ -393,7 +395,7 @@ def order_for(admissible: float) -> int:
 
 
 def _lacuna(exponent: float) -> int:
-    """Return how many consecutive orders can vanish: d^n alone gives a term only every n + 1 orders."""
+    """Return how many consecutive orders can vanish: a force d^n gives a term only every n + 1 orders."""
     if not float(exponent).is_integer():
         return 6
     return 2 if exponent == 1.0 else int(exponent) + 1
@@ -419,7 +421,7 @@ def _segments(scene: Scene, pieces: Pieces) -> Segments:
 
 
 def law_terms(contact: Contact) -> tuple[Terms, float]:
-    """Return the law's terms, with all other terms absent, and D in lambda = D / v0 (-1 if lambda is constant)."""
+    """Return the law's terms alone, and D of the factor D / v0 at touch speed v0 (-1 for a constant factor)."""
     law, exponent = LAWS[contact.law], float(contact.exponent)
     viscous = law.additive and bool(contact.damping)
     number = -1.0 if contact.restitution is None else law.damping_number(contact.restitution)
@@ -439,7 +441,7 @@ def _flags(present: dict[str, bool]) -> dict[str, int]:
 
 
 def _harmonics(head: Head, loads: LoadSet) -> tuple[Array, Harmonics | None]:
-    """Return the directions of S1 and S2 and the harmonic loads.
+    """Return the directions of the harmonic forces S1 and S2, and the harmonic loads.
 
     If all forces are parallel, S1 alone has their direction; otherwise S1 is along x and S2 along y.
     """
@@ -498,8 +500,8 @@ def _largest_acceleration(scene: Scene, wrench: Array) -> float:
 def _release(scene: Scene, tol: float, length: float, speed: float) -> float:
     """Return the penetration in m below which the impulse until separation is negligible.
 
-    The impulse at the speed v is K d^(n+1) / ((n+1) v). It must be a small share of the velocity tolerance, since there
-    may be many separations, some of them a hundred times slower.
+    A pair that separates from the penetration d at the speed v receives the impulse K d^(n+1) / ((n+1) v). It must be a
+    small share of the velocity tolerance, since there may be many separations, some of them a hundred times slower.
     """
     exponent = scene.contact.exponent
     share = 1e-5 if exponent == 1.5 or float(exponent).is_integer() else 1e-8
@@ -522,7 +524,7 @@ def _release(scene: Scene, tol: float, length: float, speed: float) -> float:
 
 
 def _implicit(scene: Scene, terms: Terms, values: dict[str, Any]) -> Implicit | None:
-    """Return nodes and scratch space of implicit steps, or None if no damping can outweigh its spring."""
+    """Return nodes and scratch space of implicit steps, or None if nothing can be overdamped."""
     contact = scene.contact
     mobility = 1.0 / scene.head.mass_kg + values["radius"] ** 2 / scene.head.inertia_kg_m2
     if scene.support is not None:
@@ -557,7 +559,7 @@ def _rubbing(scene: Scene) -> dict[str, Any]:
 
 
 def _slip(scene: Scene) -> dict[str, Any]:
-    """Return the constants of friction, all zero without friction except the speed, by which kernels divide."""
+    """Return the constants of friction; without friction only the slip speed, a divisor, is not zero."""
     friction = scene.friction
     if friction is None:
         return {"slip_speed": 1.0}

@@ -17,13 +17,13 @@ from plow_twin.solve.support import see_from_frame
 
 @kernel(inline="source")
 def time_along(alpha, beta, sigma):
-    """Return the time at sigma since the step's start, t = alpha sigma + beta sigma^2 / 2."""
+    """Return the time since the step's start at the variable sigma, t = alpha sigma + beta sigma^2 / 2."""
     return alpha * sigma + 0.5 * beta * sigma * sigma
 
 
 @kernel(inline="source")
 def sigma_at(state, used):
-    """Return sigma at `used` seconds into the step."""
+    """Return the series' variable sigma at `used` seconds after the step's start."""
     if used >= state.step_size:
         return state.sigma_end
     # in a step that begins at a touch (alpha = 0) the formula gives 0 / 0 at used = 0
@@ -59,8 +59,8 @@ def wear_depth_at(state, w, sigma, out) -> None:
     """Write each pad's wear depth at sigma of the step to `out`, shape (8,)."""
     wear_depth = row(state.wear_depth, 0)
     if any_penetrates(state):
-        # without a penetrating pair no pad wears. The sum leaves out row 0, so that it is the growth since the step's
-        # start
+        # without a penetrating pair no pad wears. The sum leaves out row 0 of `w.wear`, so that it is the growth since
+        # the step's start
         order = state.order
         growth = row(w.wear, order)
         for k in range(order - 1, 0, -1):

@@ -29,7 +29,7 @@ from plow_twin.solve.state import ON, Harmonics, Segments
 class Acting(NamedTuple):
     """Arguments of the equations of motion other than the law.
 
-    They have few different types, so that scenes share compiled code.
+    Few combinations of their types occur, so that scenes share compiled code.
     """
 
     harmonics: Harmonics | None
@@ -50,9 +50,10 @@ def acting(parts):
 
 @kernel()
 def push(p, slip, stick, state, frozen, pair, force, c, s, theta, omega, x, y, vx, vy):
-    """Return force, moment and power of friction of a pair that pushes with `force`, in body axes.
+    """Return force and moment of a pair with the normal force `force`, in body axes, and friction's power.
 
-    The wall's tangent is its normal turned by +90 degrees. The rows for X and Y of a penetration are minus the normal.
+    The wall's tangent is its normal turned by +90 degrees. In `p.penetration_rows` the rows for X and Y are the normal
+    with the opposite sign.
     """
     fx, fy = -p.penetration_rows[2, pair] * force, -p.penetration_rows[3, pair] * force
     torque, power = row_value(p.arm_rows, pair, c, s, x, y) * force, 0.0
@@ -82,7 +83,7 @@ def about_mass(p, c, s, load):
 
 @kernel()
 def accelerate(p, acts, frozen, state, t, z, load, out) -> None:
-    """Write the rate of z = (x, y, theta, vx, vy, omega), or with a support of the z of `support.to_world_both`.
+    """Write the rate of z = (x, y, theta, vx, vy, omega); with a support z is as in `support.to_world_both`.
 
     `acts` is an `Acting`. If `frozen`, the pairs that are ON act by their law even where it would pull; otherwise the
     pairs that penetrate act and never pull.

@@ -1,8 +1,8 @@
 """The energy balance of a run compares the change of energy and momentum with the work and impulse of the forces.
 
-Forces are computed at single instants, independently of the series: loads from their time, contacts by `model.contact`
-and `model.friction`. Power and force are integrated by Gauss-Legendre quadrature over each step of the series, or by
-the trapezoidal rule over fixed steps. Kinetic energy and momentum are computed from the state alone.
+Forces are computed at single instants, independently of the series: loads from the time, contact forces by
+`model.contact` and `model.friction`. Power and force are integrated by Gauss-Legendre quadrature over each step of the
+series, or by the trapezoidal rule over fixed steps. Kinetic energy and momentum are computed from the state alone.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from plow_twin.solve.support import to_ground
 #: Number of nodes of the quadrature; with 8 nodes it is exact up to degree 15. More nodes would not reduce the
 #: imbalance, because the higher terms of a step's series are as small as the series' error.
 _NODES = 8
-#: Largest phase [rad] of the fastest harmonic over a panel of a flight or rest; up to this phase products of two
-#: harmonics are integrated to 1e-13.
+#: Largest phase [rad] of the fastest harmonic over a panel, the interval of one quadrature in a flight or rest; up to
+#: this phase products of two harmonics are integrated to 1e-13.
 _PANEL_PHASE = 2.0
 # indices into the powers [W] and forces [N, N m] at one instant
 LOADS, NORMAL, FRICTION, SUPPORT, LOAD_X, LOAD_Y, LOAD_M, CONTACT_X, CONTACT_Y, CONTACT_M, SIZE = range(11)
@@ -140,7 +140,7 @@ def _powers_under(p, offset, free, slip, stick, state, wear_depth, y, ground, lo
 
 @kernel()
 def _balance(p, support, seen, frame, balance, start) -> None:
-    """Compute energy and momentum from the state, and record the largest imbalances so far."""
+    """Compute energy and momentum from the state, and update the largest imbalances so far."""
     sums, y = balance.sums, _on_ground(support, seen, frame, balance)
     m, inertia = 1.0 / p.inverse_mass, 1.0 / p.inverse_inertia
     c, s = along(p, math.cos(y[THETA]), math.sin(y[THETA]))
@@ -189,7 +189,7 @@ def _add(balance, powers, weight) -> None:
 
 @kernel()
 def balance_step(p, parts, wear, flight, state, w, balance) -> None:
-    """Add the step that has been laid out but not yet completed."""
+    """Add the integrals over the step whose series has been computed but which is not yet completed."""
     y, wear_depth, end, support = balance.body, balance.wear_depth, state.sigma_end, parts.terms.support
     set_row(wear_depth, 0, row(state.wear_depth, 0))
     panels = 1
@@ -211,7 +211,7 @@ def balance_step(p, parts, wear, flight, state, w, balance) -> None:
 
 @kernel()
 def balance_fixed_step(p, parts, state, y, t, dt, balance) -> None:
-    """Add a fixed step that ends at body coordinates y and time t."""
+    """Add the integrals over a fixed step that ends at body coordinates y and time t."""
     frame = _frame_of(parts.terms.support, state)
     _powers(p, parts, state, state.wear_depth, y, frame, t, balance, balance.now)
     _add(balance, balance.before, 0.5 * dt)

@@ -1,7 +1,7 @@
 """The first event of a step.
 
-A guard is a polynomial over the step that is positive as long as a mode lasts. The event is at the first point where a
-guard turns negative, found by `polynomial.first_root`.
+A guard is a polynomial over the step that is positive as long as a pair keeps its mode. The event is at the first point
+where a guard turns negative, found by `polynomial.first_root`.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ _AT_ONCE = 1e-12
 #: Penetration at which a pair changes from ON to RELEASED, as a share of `Params.release`. The pair is ON again at
 #: `Params.release` itself.
 LET_GO = 0.25
-#: Allowances for rounding in the proof that no guard turns negative: a factor on the sums of terms, and an error of 1 +
-#: lambda d'.
+#: Allowances for rounding in the proof that no guard turns negative: a factor on the sums of terms, and an absolute
+#: error of the guard 1 + lambda d'.
 _ROUNDED, _ROUNDING = 1.0 + 1e-9, 1e-9
 _ALL_PAIRS = 2**PAIR_COUNT - 1
 #: Penetration below which a RELEASED pair counts as resting on its wall, as a share of `Params.release`.
@@ -30,8 +30,9 @@ ON_THE_WALL = 1e-6
 def _guards(p, state, w, order, penetrating, viscous, ramp) -> None:
     """Write each pair's first guard to `w.guard`.
 
-    The guard of a pair that is OFF is -d. The guard of a pair that is ON is F / K = d + (C / K) d' for Kelvin-Voigt;
-    for other laws it is d, less a small penetration if the exponent is not an integer. All other guards are d.
+    The guard of a pair that is OFF is -d, with the penetration d. The guard of a pair that is ON is F / K = d + (C / K)
+    d' for Kelvin-Voigt; for other laws it is d, less a small penetration if the exponent is not an integer. All other
+    guards are d.
     """
     guard, weights = w.guard, w.per_pair
     for pair in range(PAIR_COUNT):
@@ -64,8 +65,8 @@ def _guards(p, state, w, order, penetrating, viscous, ramp) -> None:
 def _second_guard(p, state, w, order, pair, viscous, hysteretic, integer, fraction, ramp) -> bool:
     """Write the second guard of a penetrating pair to `w.column[0]`; return whether it has one.
 
-    The guard of a pair that is ON is 1 + lambda d', or F with a ramp. A CLIPPED pair's guard is positive as long as its
-    force would pull. A RELEASED pair's guard is p.release - d.
+    For a pair that is ON the second guard is 1 + lambda d', or the force F with a ramp. For a CLIPPED pair it is
+    positive as long as the force would pull. For a RELEASED pair it is p.release - d.
     """
     g, mode = w.column[0], state.mode[pair]
     g[order] = 0.0
@@ -93,7 +94,7 @@ def _second_guard(p, state, w, order, pair, viscous, hysteretic, integer, fracti
 
 @kernel(inline="code")
 def elastic_term(p, w, k, pair, integer, fraction):
-    """Return order k of the series d^n of a pair."""
+    """Return order k of the series of d^n, with the penetration d of a pair."""
     if integer is not None:
         return w.power[int(p.exponent) - 2, k, pair]
     if fraction is not None:
@@ -149,8 +150,9 @@ def _unsafe_pairs(w, order, h):
 def _nothing_ends(p, state, w, order, h, penetrating, hysteretic) -> bool:
     """Return whether every pair is proved to keep its mode on [0, h], for an integer exponent without a ramp.
 
-    It makes the first test of `_unsafe_pairs` and the test of `_stays` for all pairs side by side, without credit for a
-    rising linear term. An allowance for rounding makes sure that guards that pass here would also pass there.
+    The function makes the first test of `_unsafe_pairs` and the test of `_stays` for all pairs side by side, without
+    credit for a rising linear term. An allowance for rounding makes sure that guards that pass this test would also
+    pass those two tests.
     """
     weights = w.per_pair
     for pair in range(PAIR_COUNT):

@@ -29,7 +29,7 @@ _LOG_FULL = int(Status.LOG_FULL)
 
 @kernel()
 def _switch(p, state, penetration, rate, time, totals, log) -> None:
-    """Update the modes of pairs that have touched or parted by the step's end, and log these events."""
+    """Update the modes of pairs that have touched or parted by the step's end, and log these mode changes."""
     for pair in range(PAIR_COUNT):
         inside = p.enabled[pair] == 1 and penetration[pair] > 0.0
         mode = ON if inside else OFF

@@ -1,14 +1,16 @@
 """Friction with stick: the force of sticking corners, and the conditions for slip and stick.
 
-A spring and a damper connect a sticking corner to its anchor a on the wall; a slipping corner drags the wall along:
+A spring and a damper connect a sticking corner to its anchor a on the wall; a slipping corner exerts sliding friction
+on the wall:
 
     sticks    T = k (s - a) + c s'      while |T| <= mu_s N
     slips     T = +-mu N                while +-(k s' + c s'') >= mu N'
 
-s is the corner's place along the wall, N the normal force. While a corner slips, the anchor follows the corner so that
-spring and damper carry mu N. The corner slips as long as the force of spring and damper would grow at least as fast as
-mu N after a stick. If mu_s = mu, T and the accelerations are continuous at the change, so each pair can be decided
-separately. Sources: Cundall and Strack, Geotechnique 29 (1979) 47; Luding, Granul. Matter 10 (2008) 235, sec. 3.2.
+T is the tangential force, N the normal force, s the corner's place along the wall; k and c are the stiffness and
+damping of spring and damper. While a corner slips, the anchor follows the corner so that spring and damper carry mu N.
+The corner slips as long as the force of spring and damper would grow at least as fast as mu N after a change to stick.
+If mu_s = mu, T and the accelerations are continuous at the change, so each pair can be decided separately. Sources:
+Cundall and Strack, Geotechnique 29 (1979) 47; Luding, Granul. Matter 10 (2008) 235, sec. 3.2.
 """
 
 from __future__ import annotations
@@ -52,13 +54,13 @@ def _along(p, pair, y):
 
 @kernel(inline="code")
 def held_force(p, state, pair, place, rate):
-    """Return the force T in N of a corner's spring and damper."""
+    """Return the tangential force T in N of a corner's spring and damper."""
     return p.stick_stiffness * (place - state.anchor[pair]) + p.stick_damping * rate
 
 
 @kernel(inline="code")
 def tangential_force(p, state, frozen, pair, normal, place, rate):
-    """Return T in N for a normal force in N; unless `frozen`, T is limited by the force at which the corner slips."""
+    """Return the tangential force T in N; unless `frozen`, it is limited by the force at which the corner slips."""
     grip = state.grip[pair]
     if state.mode[pair] != ON:
         return 0.0
@@ -79,7 +81,7 @@ def _anchor(p, state, pair, force, place, rate) -> None:
 
 @kernel(inline="code")
 def _normal_force(p, state, pair, depth):
-    """Return N of a pair that pushes, by the law of its series even if a rounding error makes the depth negative."""
+    """Return the normal force of a pair that pushes, even if a rounding error makes the depth negative."""
     return max(law_force(p, state, pair, depth, rate_of(p, pair, state.y)), 0.0)
 
 
@@ -133,7 +135,7 @@ def settle_grips(p, state, force) -> None:
 
 @kernel()
 def weigh_grips(p, state, w) -> None:
-    """Write to `w.grip` the factors by which T depends on the normal force, the corner's place and its slip rate."""
+    """Write to `w.grip` the factors by which T depends on normal force, place and slip rate of each corner."""
     for pair in range(PAIR_COUNT):
         acts = state.mode[pair] == ON
         sticks = acts and state.grip[pair] == 0
@@ -144,7 +146,7 @@ def weigh_grips(p, state, w) -> None:
 
 @kernel(fast=True, inline="code")
 def grip_terms(p, state, w, k, place, rate):
-    """Return order k of T of the eight pairs.
+    """Return order k of the tangential forces T of the eight pairs.
 
     `place` and `rate` are order k of the corners' places and slip rates; `w.force` holds the normal forces.
     """
@@ -155,10 +157,10 @@ def grip_terms(p, state, w, k, place, rate):
 
 @kernel()
 def grip_guard(p, state, w, order, pair, side) -> int:
-    """Write a guard of a corner's grip to `w.column[0]`; return the outcome if it turns negative, or 0 without a guard.
+    """Write a guard of a corner's grip to `w.column[0]`; return the switch that it causes, 0 without a guard.
 
-    The guard of a sticking corner is mu_s N -+ T, one for each side. A slipping corner has a guard for the first side
-    only: the condition for slip in the module's docstring, times the time per sigma.
+    A sticking corner has two guards mu_s N -+ T, one for each direction of slip (`side`). A slipping corner has a guard
+    for side 0 only: the condition for slip in the module's docstring, times the time per sigma.
     """
     g, rate, force, drag = w.column[0], w.slip[0], w.force, w.slip[4]
     grip = state.grip[pair]
