@@ -1,8 +1,9 @@
 """The vector of unknowns, its prior, and the scene of a vector.
 
 The unknown for the stiffness K is a softness, psi = ln(u + u0). Here u = (F0 / K)^(1/n) is the penetration in m under
-the reference force F0. For soft contacts psi is linear in ln K. For hard contacts it is linear in the compliance and
-has a lower limit, because their motion only shows that K is large.
+the reference force F0, and u0 is the penetration that a pose cannot distinguish from zero. For soft contacts psi is
+linear in ln K. For hard contacts psi is linear in the compliance and has a lower limit, because the motion then only
+shows that K is large.
 """
 
 from __future__ import annotations
@@ -29,19 +30,23 @@ class Quantity:
     Attributes
     ----------
     name : str
-        Its name in an estimate.
+        Name of the quantity in an estimate.
     label, factor, digits : str, float, str
         How the quantity is printed: its name with unit, the factor to this unit, and the format.
     deviation : float
         Standard deviation of the prior about the nominal scene, in the unknown's own unit.
     dimension : tuple of 3 int
-        Powers of length, mass and time in its published unit; those of the contact's quantities follow from its law.
+        Powers of length, mass and time in the unit of the published value; the powers of stiffness and damping follow
+        from the contact law.
     step : float, optional
-        Step of its difference quotient; None where the derivative is known exactly.
+        Step of the difference quotient that gives the motion's derivative with respect to this quantity; None where the
+        derivative is known exactly.
     fine_step : float, optional
-        Step for measured forces, which are less linear.
+        Step of the difference quotient of measured forces, which depend less linearly on the quantity than the motion
+        does.
     probe : float
-        Standard deviation of the displacement that probes predictability.
+        Standard deviation of the random displacement of this quantity that tests whether the motion is predictable
+        (`fit.unpredicted`).
     """
 
     name: str
@@ -86,27 +91,29 @@ DAMPING: Final = _place("damping")
 GAIN: Final = slice(_place("gain_fx"), _place("gain_m") + 1)
 BIAS: Final = slice(_place("bias_x"), _place("bias_theta") + 1)
 DELAY: Final = _place("delay")
-#: Definition: slice of the quantities on which the scene of a vector depends (`Unknowns.scene_of`).
+#: Definition: slice of the quantities that determine the scene (`Unknowns.scene_of`).
 OF_SCENE: Final = slice(0, GAIN.start)
 SIZE: Final = len(QUANTITIES)
 #: Indices of the quantities that move the head.
 MOVING: Final = tuple(place for place, quantity in enumerate(QUANTITIES) if quantity.step is not None)
-#: Standard deviations of the displacements that probe predictability, shape (SIZE,).
+#: Standard deviations of the random displacements that test whether the motion is predictable, shape (SIZE,).
 PROBES: Final = np.array([quantity.probe for quantity in QUANTITIES])
-#: Names in the published correlation; softness is the penetration under a force.
+#: Names of the quantities in the published correlation matrix; softness is the penetration under the reference force.
 CORRELATED: Final = tuple("softness" if place == SOFTNESS else QUANTITIES[place].name for place in MOVING)
 
-#: Guard: smallest and largest simulated penetration in m. All harder contacts give the same motion; softer contacts let
-#: the head through the wall.
+#: Guard: smallest and largest simulated penetration in m under the reference force. Contacts with a smaller penetration
+#: give the same motion; contacts with a larger penetration let the head through the wall.
 _HARDEST, _SOFTEST = 3e-5, 0.12
 #: Guard: smallest clearance in m that is simulated.
 _LEAST_CLEARANCE = 5e-4
 
 
-#: For the law of a linear contact, the alternative law that an estimate tries.
+#: For each contact law that has an alternative: the alternative law, which an estimate tries if the contact is linear
+#: (exponent 1).
 OTHER_LAW: Final = {"hunt_crossley": "kelvin_voigt"}
 
-#: Guard: smallest prior deviation; it is so small that a number stated as exact keeps its value.
+#: Guard: smallest standard deviation of the prior; it is so small that a number stated as exact keeps its value in the
+#: estimate.
 _HELD = 1e-6
 #: Guard: largest prior deviation of a load's gain.
 _MOST_GAIN = 1.0
@@ -118,7 +125,7 @@ def _prior() -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Unknowns:
-    """The prior about a nominal scene, and the meaning of a vector of unknowns.
+    """The prior about a nominal scene, and conversions between a vector of unknowns and a scene.
 
     Attributes
     ----------
@@ -139,13 +146,13 @@ class Unknowns:
 
     @staticmethod
     def stated(scene: Scene, load: Load, poses: Poses) -> Unknowns:
-        """Return the prior with the stated deviations of scene, load (for its gains) and poses."""
+        """Return the prior with the deviations stated for scene, load (for its gains) and poses."""
         unknowns, deviation, contact = Unknowns(scene), _prior(), scene.contact
         deviation[GX] = deviation_of(scene, "clearance.horizontal_m")
         deviation[GY] = deviation_of(scene, "clearance.vertical_m")
         deviation[SOFTNESS] = deviation_of(scene, "contact.stiffness")
         if is_stated(scene, "contact.stiffness"):
-            # the deviation is converted from ln K to ln(u + u0)
+            # the standard deviation of ln K is converted to the standard deviation of psi = ln(u + u0)
             u = math.exp(unknowns.softness_of(contact.stiffness)) - tuning.RESOLVED
             deviation[SOFTNESS] *= u / (u + tuning.RESOLVED) / contact.exponent
         damped = "contact.damping" if contact.restitution is None else "contact.restitution"
@@ -155,7 +162,7 @@ class Unknowns:
 
     @property
     def damped(self) -> bool:
-        """Whether the law has a damping that can be estimated."""
+        """Whether the contact law has a damping or a restitution that can be estimated."""
         contact = self.scene.contact
         return bool(contact.damping) or (contact.restitution is not None and 0.0 < contact.restitution < 1.0)
 
@@ -172,7 +179,7 @@ class Unknowns:
         return vector
 
     def deviations(self) -> Array:
-        """Return the prior's standard deviations, shape (SIZE,); the damping of a law without it is fixed."""
+        """Return the prior's standard deviations (SIZE,); if the law has no damping, its entry is 1e-6."""
         deviations = self.deviation.copy()
         if not self.damped:
             deviations[DAMPING] = 1e-6
@@ -183,15 +190,15 @@ class Unknowns:
         return bool(vector[SOFTNESS] < math.log(tuning.CERTAINLY_HARD + tuning.RESOLVED))
 
     def softness_of(self, stiffness: float) -> float:
-        """Return psi for a stiffness."""
+        """Return the softness psi for a stiffness."""
         return math.log((self.force / stiffness) ** (1.0 / self.scene.contact.exponent) + tuning.RESOLVED)
 
     def penetration_of(self, psi: float) -> float:
-        """Return the penetration in m under the reference force."""
+        """Return the penetration in m under the reference force for a softness psi."""
         return math.exp(psi) - tuning.RESOLVED
 
     def stiffness_of(self, psi: float) -> float:
-        """Return the stiffness for psi, at most that of the hardest simulated contact."""
+        """Return the stiffness for a softness psi, limited to that of the hardest simulated contact."""
         u = max(math.exp(psi) - tuning.RESOLVED, _HARDEST)
         return float(self.force / u**self.scene.contact.exponent)
 
@@ -201,11 +208,11 @@ class Unknowns:
 
     @property
     def hardest_believed(self) -> float:
-        """Upper end of the stiffness' interval if the motion only shows that the contact is hard."""
+        """Upper end of the published stiffness interval if the motion shows only a hard contact."""
         return float(self.force / (1e-6) ** self.scene.contact.exponent)
 
     def damping_of(self, value: float) -> float:
-        """Return the law's restitution or damping."""
+        """Return the law's restitution or damping from its unknown (logit or logarithm) `value`."""
         number = math.exp(float(np.clip(value, -30.0, 30.0)))
         return min(number / (1.0 + number), 0.999) if self._restitution else number
 
@@ -226,7 +233,7 @@ class Unknowns:
         return self.scene.contact.restitution is not None
 
     def scene_of(self, vector: Array) -> Scene:
-        """Return the scene of a vector."""
+        """Return the scene that a vector of unknowns describes, without loads and wear."""
         damping = self.damping_of(float(vector[DAMPING])) if self.damped else None
         contact = contact_with(self.scene.contact, self.stiffness_of(float(vector[SOFTNESS])), damping)
         if self._restitution:
@@ -238,7 +245,7 @@ class Unknowns:
 
 
 def contact_with(contact: Contact, stiffness: float, damping: float | None) -> Contact:
-    """Return a contact with another stiffness, and with another damping number of its law unless it is None."""
+    """Return a contact with another stiffness and, unless it is None, another damping or restitution."""
     contact = replace(contact, stiffness=stiffness)
     if damping is None:
         return contact
@@ -248,7 +255,7 @@ def contact_with(contact: Contact, stiffness: float, damping: float | None) -> C
 
 
 def with_other_law(unknowns: Unknowns) -> Unknowns | None:
-    """Return the prior about a scene with the other possible law of its contact; None if there is no such law."""
+    """Return the prior for the alternative contact law in `OTHER_LAW`; None if there is no such law."""
     contact = unknowns.scene.contact
     law = OTHER_LAW.get(contact.law)
     if law is None or contact.exponent != 1.0:

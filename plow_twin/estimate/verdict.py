@@ -26,13 +26,13 @@ Array = NDArray[np.float64]
 
 COMPONENTS = ("x", "y", "theta")
 
-#: Bound: approximate number of moments in a window that are tested for a change.
+#: Bound: approximate number of moments in a window at which a change of a bias or a clearance is tested.
 MOMENTS = 60
 
 
 @dataclass
 class Verdict:
-    """Faults of model and sensor.
+    """Faults of the model and of the sensor that the tests have found.
 
     figures : statistics of the tests
     by_scale : whether the scales are the sensor's only fault
@@ -90,7 +90,7 @@ def judge_sensor(poses: Poses) -> list[str]:
 
 
 def predicted(fit: Fit) -> NDArray[np.bool_]:
-    """Return which measurements the model predicts, shape (n, 3)."""
+    """Return which measurements the model predicts almost to within the noise, shape (n, 3)."""
     there: NDArray[np.bool_] = np.isfinite(fit.point.residual) & (fit.variance < 1.5 * fit.noise**2)
     return there
 
@@ -103,7 +103,8 @@ def _colour(fit: Fit, verdict: Verdict) -> None:
         if quick <= 0.0 or len(rows) < 50:
             continue
         ratio = float(np.mean(np.minimum(np.abs(rows), 5.0 * quick) ** 2) / quick**2)
-        # the last term allows for the scatter of the ratio, which divides a mean square by a median of differences
+        # the last term allows for the sampling scatter of this ratio of a mean square to a squared median of
+        # differences
         limit = 1.0 + (tuning.MOST_RATIO - 1.0) + 4.0 * 2.5 / np.sqrt(len(rows))
         verdict.figures[f"colour_{name}"] = ratio
         if ratio > limit and not verdict.sensor:
@@ -111,10 +112,10 @@ def _colour(fit: Fit, verdict: Verdict) -> None:
 
 
 def _repeated(problem: Problem, fit: Fit, period: float, verdict: Verdict) -> None:
-    """Test whether the residuals repeat with the load (analysis of variance).
+    """Test whether the residuals repeat in each period of the load (analysis of variance).
 
-    Residuals of a wrong law, or of a wrong shape of the load, repeat in each period; noise and disturbances of any
-    colour do not.
+    Residuals caused by a wrong contact law or by a wrong shape of the load repeat in each period. Noise and
+    disturbances do not repeat, whatever their spectrum.
     """
     t, there = problem.window.poses.t, predicted(fit)
     turns = np.floor((t - t[0]) / period).astype(int)
@@ -144,10 +145,10 @@ def _repeated(problem: Problem, fit: Fit, period: float, verdict: Verdict) -> No
 
 
 def _other_law(problem: Problem, fit: Fit, verdict: Verdict) -> None:
-    """Test whether another law explains the residuals (score test, linearised).
+    """Test whether another contact law explains the residuals (score test, linearised).
 
-    An additional unknown mixes the motion under the other law, with the same starting states, into the motion under the
-    believed law. All other unknowns are eliminated.
+    The motion under the other law, computed from the same starting states, is mixed into the motion under the believed
+    law. The share of the other law is an additional unknown; all other unknowns are eliminated.
     """
     unknowns = with_other_law(problem.unknowns)
     if unknowns is None or not fit.finished:
@@ -173,7 +174,7 @@ def _other_law(problem: Problem, fit: Fit, verdict: Verdict) -> None:
 
 
 def _scale(problem: Problem, fit: Fit, verdict: Verdict) -> None:
-    """Test the sensor's scales; they are suspect only if no other test has found a fault."""
+    """Test the sensor's scale factors; they are suspect only if no other test has found a fault."""
     if not fit.finished:
         return
     scales = scales_of(problem, fit)
@@ -188,7 +189,7 @@ def _scale(problem: Problem, fit: Fit, verdict: Verdict) -> None:
 
 
 def quick_noise(residual: Array, swing: NDArray[np.int64]) -> float:
-    """Return the standard deviation of a component from the changes between neighbouring rows in a swing."""
+    """Return the standard deviation of a residual, from changes between neighbouring rows of a swing."""
     there = np.isfinite(residual)
     value, part = residual[there], swing[there]
     if len(value) < 10:
@@ -274,7 +275,7 @@ def _felt(problem: Problem, fit: Fit) -> bool:
 
 
 def _excess(fit: Fit) -> float:
-    """Return the sum of squared residuals beyond their quick noise, relative to the fit's variances."""
+    """Return the sum of squared residuals minus squared `quick_noise`, relative to the fit's variances."""
     total = 0.0
     for i in range(3):
         quick = quick_noise(fit.point.residual[:, i], fit.point.swing)
@@ -284,7 +285,7 @@ def _excess(fit: Fit) -> float:
 
 
 def _changes(problem: Problem, fit: Fit, columns: NDArray[np.intp]) -> Iterator[tuple[Array, Array]]:
-    """Yield information and score of a change of some shared unknowns at each swing, other unknowns eliminated."""
+    """Yield information and score for a change of the unknowns `columns` at a swing, others eliminated."""
     count = len(columns)
     size = SIZE + OWN * problem.window.swings
     cross, own, score = np.zeros((size, count)), np.zeros((count, count)), np.zeros(count)
@@ -311,7 +312,7 @@ class Block:
 
 
 def swing_blocks(problem: Problem, fit: Fit) -> list[Block]:
-    """Return information and score of each swing that has measurements, as if it were not linked."""
+    """Return a block for each swing with at least four poses, as if it had no link to other swings."""
     out = []
     for measured, *_ in pieces(problem, fit.point, fit.linear, fit.variance):
         if len(measured.residual) < 12:  # fewer than four poses

@@ -1,8 +1,8 @@
 """Windows of the sliding estimate, formed from arriving samples and poses.
 
-The stamps alone determine the windows. Each window ends at a multiple of the interval, and is formed when the load is
-ahead of this end by the waiting time for late data. The order of arrival within the waiting time has no effect, so the
-journal gives the same windows as the live node.
+The stamps alone determine the windows. Each window ends at a multiple of the interval between windows. It is formed as
+soon as a load sample is newer than this end by the waiting time for late data. The order of arrival within the waiting
+time has no effect, so the journal gives the same windows as the live node.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ Array = NDArray[np.float64]
 #: A stamp in ns and the measured values.
 Row = tuple[int, tuple[float, ...]]
 
-#: Bound: largest number of poses, and of rows of gaps, that are kept. More arrive only if the load has stopped or a
-#: clock is ahead by hours.
+#: Bound: largest number of poses that are kept, and of rows of measured gaps. More arrive only if the load has stopped
+#: or a clock is ahead by hours.
 MOST_KEPT = 600_000
 
 
@@ -60,9 +60,10 @@ class Windows:
     Parameters
     ----------
     length_s, interval_s, wait_s : float
-        Full length of a window, interval of the windows' ends, and waiting time for late data, in s.
+        Full length of a window, interval between the ends of successive windows, and waiting time for late data, in s.
     poses, load : tuple of 3 float
-        Smallest stated deviation of the poses, and stated deviation of the load until `set_load_deviation` is called.
+        Smallest standard deviation stated for the poses, and standard deviation stated for the load, which applies
+        until `set_load_deviation` is called.
     gaps : float
         Stated deviation of a gap sensor in m.
     early : bool
@@ -91,7 +92,8 @@ class Windows:
         self._loads: list[Row] = []
         self._poses: deque[tuple[int, tuple[float, ...], tuple[float, ...]]] = deque(maxlen=MOST_KEPT)
         self._gaps: deque[tuple[int, tuple[int, ...], tuple[float, ...]]] = deque(maxlen=MOST_KEPT)
-        #: of the newest window that was checked: its length [s], and its number of poses or gaps
+        #: length [s] of the newest window that was checked, and its number of poses or of rows of gaps, whichever is
+        #: larger
         self._left = (0.0, 0)
         self._newest_ns: int | None = None
         self._end_ns: int | None = None
@@ -108,7 +110,7 @@ class Windows:
         self._poses.append((stamp_ns, q, deviation))
 
     def add_gaps(self, stamp_ns: int, pairs: tuple[int, ...], gaps: tuple[float, ...]) -> None:
-        """Add measured gaps in m of the pairs with these numbers."""
+        """Add measured gaps in m; `pairs` are the numbers of their pairs of corner and wall."""
         self._gaps.append((stamp_ns, pairs, gaps))
 
     def add_load(self, stamp_ns: int, wrench: tuple[float, ...]) -> Window | None:
@@ -130,7 +132,7 @@ class Windows:
         return window
 
     def last(self) -> Window | str:
-        """Return the window that ends with the newest sample, for the end of the input, or why there is none."""
+        """At the input's end, return the window up to the newest sample, or why no window can be formed."""
         if self._newest_ns is None:
             return "got no load"
         window = self._form(self._newest_ns + 1)
@@ -203,7 +205,7 @@ class Windows:
 
 
 def _table(rows: list[Row], start_ns: int) -> tuple[Array, Array]:
-    """Return times in s, shape (n,), and values, shape (n, 3)."""
+    """Return the times of rows in s from `start_ns` on, shape (n,), and their values, shape (n, 3)."""
     stamps = np.array([row[0] for row in rows], dtype=np.int64)
     values = np.array([row[1] for row in rows], dtype=np.float64).reshape(-1, 3)
     return np.multiply(stamps - start_ns, 1e-9, dtype=np.float64), values

@@ -1,8 +1,9 @@
-"""The sliding estimate in its own process, so that it does not delay the samples.
+"""The sliding estimate in its own process, so that the twin's samples do not wait for it.
 
-`Worker` is the near side. It queues data, and a thread sends them. The far side, `python -m plow_twin.estimate.worker`,
-compiles its kernels, reports that it is ready, estimates each window that is due and sends the result back. If several
-windows become due while another is computed, only the newest of them is estimated.
+`Worker` is the near side, in the twin's process: it queues data, and a thread sends them. The far side is the process
+`python -m plow_twin.estimate.worker`. It compiles its kernels, reports that it is ready, estimates each window that is
+due and sends the result back. If several windows become due during an estimate, only the newest of them is estimated
+next.
 """
 
 from __future__ import annotations
@@ -49,13 +50,13 @@ def _view(contents: dict[Any, Any]) -> MappingProxyType[Any, Any]:
     return MappingProxyType(contents)
 
 
-# a scene keeps its marks in a mapping proxy, which pickle does not support
+# a scene contains a mapping proxy (its marks), which pickle does not support
 ForkingPickler.register(MappingProxyType, lambda view: (_view, (dict(view),)))
 
 
 @dataclass(frozen=True)
 class Found:
-    """The estimate of one window: its bounds [ns], numbers of rows, guess, and result.
+    """The estimate of one window: its bounds [ns] and numbers of rows, the first guess, and the result.
 
     wall_s : duration of the computation
     skipped, restarts : numbers of skipped windows and of restarts before this window
@@ -84,7 +85,7 @@ class Worker:
     scene : Scene
         The nominal scene.
     windows : Windows
-        Forms the windows. It must be empty, and is copied to the process.
+        The object that forms the windows. It must be empty, and is copied to the process.
     asked : Asked
         The answers to give beside the estimate.
     """
@@ -107,8 +108,8 @@ class Worker:
         self._closed = threading.Event()
         #: reason why estimating has ended; empty until it ends
         self.error = ""
-        #: None until everything before `finish` is done; then an empty text, or the reason why the last window could
-        #: not be estimated
+        #: None until all data queued before `finish` have been processed; then an empty text, or the reason why the
+        #: last window could not be estimated
         self.ended: str | None = None
         self._thread = threading.Thread(target=self._send_queue, name="estimate", daemon=True)
         self._thread.start()
@@ -122,7 +123,7 @@ class Worker:
         self._waiting.append(("pose", stamp_ns, q, deviation))
 
     def add_gaps(self, stamp_ns: int, pairs: tuple[int, ...], gaps: tuple[float, ...]) -> None:
-        """Queue measured gaps of the pairs with these numbers."""
+        """Queue measured gaps in m; `pairs` are the numbers of their pairs of corner and wall."""
         self._waiting.append(("gaps", stamp_ns, pairs, gaps))
 
     def set_load_deviation(self, deviation: Deviation) -> None:
@@ -143,11 +144,11 @@ class Worker:
 
     @property
     def behind(self) -> bool:
-        """Whether much data waits to be sent."""
+        """Whether the queue of data to be sent is more than a tenth full."""
         return len(self._waiting) > _MOST_WAITING // 10
 
     def poll(self) -> Found | None:
-        """Return the newest result since the last call, if any; results from before a restart are dropped."""
+        """Return the next result that has arrived, or None; results from before a restart are dropped."""
         if self.error or self.ended is not None:
             return None
         if len(self._waiting) > _MOST_WAITING:
@@ -199,7 +200,7 @@ class Worker:
 
 
 def serve(connection: Connection) -> None:
-    """Estimate until the other side closes the connection."""
+    """Receive data and estimate windows until the near side closes the connection."""
     scene, windows, asked = connection.recv()
     warm_up(scene)
     connection.send(None)  # the far side has compiled its kernels
@@ -233,7 +234,7 @@ def serve(connection: Connection) -> None:
 
 
 def add(windows: Windows, item: tuple[Any, ...]) -> Window | None:
-    """Add an item from `Worker`; return a window if it is due."""
+    """Add a queued item of `Worker` to the windows; return a window if it is due."""
     kind, *values = item
     if kind == "load":
         return windows.add_load(*values)

@@ -1,1 +1,1 @@
-"""Tools of all compiled functions (compiler, SIMD lanes, polynomials), which know nothing of the machine."""
+"""Tools for all compiled functions (compiler, SIMD lanes, polynomials), independent of the machine."""

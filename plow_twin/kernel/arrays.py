@@ -1,7 +1,7 @@
-"""Arrays and records inside kernels: without a reference count, and copied, searched and checked in few lines.
+"""Helpers for arrays and records in kernels: views without a reference count, copies, searches, checks.
 
-These lines compile faster than numba's own code. Its assignment of a slice brings the formatting of an error message,
-which takes 2 s in each process that compiles a twin.
+These helpers compile faster than numba's own code. For example, numba's assignment of a slice also compiles the
+formatting of an error message, which takes 2 s in each process that compiles a twin.
 """
 
 from __future__ import annotations
@@ -41,7 +41,8 @@ unowned = cast("Callable[[Any], Any]", intrinsic(_unowned))
 def _copy_record(typingctx: Any, target: Any, source: Any) -> Any:
     """Copy a record to a record of the same type.
 
-    Numba's assignment loads the record as an array of bytes, which LLVM takes apart byte by byte in 0.8 s.
+    Numba's assignment loads the record as an array of bytes, and LLVM then needs 0.8 s to split this array into single
+    bytes.
     """
     if not isinstance(target, types.Record) or target != source:
         return None
@@ -75,7 +76,7 @@ def all_finite(numbers: Any) -> bool:
 
 @kernel()
 def count_up_to(rising: Any, limit: float) -> int:
-    """Return how many of the rising numbers are at most `limit`."""
+    """Return how many numbers are at most `limit`; the numbers must be sorted in rising order."""
     low, high = 0, rising.size
     while low < high:
         middle = (low + high) // 2

@@ -1,4 +1,4 @@
-"""The decorator of compiled functions: numba with a cache on disk that is renewed after a change in any kernel.
+"""The decorator of compiled functions: numba with a disk cache that is renewed if any kernel changes.
 
 Numba's own cache checks only the file of the cached function and misses changes in the functions that it calls. Here
 each cached function is stamped with a digest of the source of all kernels.
@@ -32,8 +32,8 @@ _said: list[str] = []
 def _load_numba() -> None:
     """Load numba's tables of types and of code, without importing SciPy's linear algebra.
 
-    The import takes 0.15 s, a third of a start. Numba needs it here only to check for a BLAS; compiled functions that
-    use a BLAS import it themselves.
+    The import of SciPy's linear algebra takes 0.15 s, a third of a start. Numba needs it here only to check whether
+    there is a BLAS; compiled functions that use a BLAS import it themselves.
     """
     found = linalg.ensure_blas
     linalg.ensure_blas = lambda: None
@@ -91,7 +91,8 @@ def kernel(
         cache_file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
         if cache_file is not None:
             cache_file._source_stamp = SOURCE_DIGEST
-            # numba compares the version before it unpickles the index, which fails if the index names a removed type
+            # numba compares the version before it unpickles the index; unpickling fails if the index names a type that
+            # was removed
             cache_file._version = f"{numba.__version__} {SOURCE_DIGEST}"
             if inline != "source" and not entry:
                 keep_from_python(dispatcher)
@@ -102,9 +103,10 @@ def kernel(
 
 
 def for_kernels(entry: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a kernel with the code of an entry, for other kernels to call.
+    """Return a copy of an entry (a kernel that Python calls) for other kernels to call.
 
-    An entry that a kernel calls would itself be optimised and get machine code, which nobody runs.
+    If a kernel called the entry itself, numba would also optimise the entry alone and generate machine code that nobody
+    runs.
     """
     function = getattr(entry, "py_func", None)
     if function is None:
@@ -119,7 +121,7 @@ def for_kernels(entry: Callable[..., Any]) -> Callable[..., Any]:
 def _read_only_cache() -> Iterator[None]:
     """Let numba read the cache beside the sources without testing whether it can be written.
 
-    Another user may have filled it, for example when the package was installed.
+    Another user may have filled this cache, for example when the package was installed.
     """
     locator: Any = caching._CacheLocator
     found = locator.ensure_cache_path
@@ -147,15 +149,15 @@ def kept(function: Callable[..., Any], **options: Any) -> Any:
 def share(cache_file: Any) -> None:
     """Make numba's cache of a function on disk safe for processes that compile at the same time.
 
-    Numba names the files of code by numbers from the index, and writes the index first, so that of two processes that
-    compile different signatures one could store its code under the signature of the other. Here a file is named by a
-    hash of its content, and is written before the index. A race can still lose an entry of the index, and its signature
-    is then compiled again.
+    Numba names the files of code by numbers from the index, and writes the index first. If two processes compile
+    different signatures, one process could therefore store its code under the signature of the other process. Here a
+    file is named by a hash of its content, and is written before the index. A race can still lose an entry of the
+    index; the signature of this entry is then compiled again.
 
     Parameters
     ----------
     cache_file : numba.core.caching.IndexDataCacheFile
-        Its method `save` is replaced.
+        The function's cache file; its method `save` is replaced.
     """
     stem = cache_file._index_name.removesuffix("nbi")
 

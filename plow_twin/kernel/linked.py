@@ -1,9 +1,9 @@
 """Two compilers for numba: one for kernels that only kernels call, one for kernels that Python calls too.
 
 LLVM optimises a kernel together with every kernel that it calls. Numba would also optimise each called kernel alone and
-generate its machine code, which takes a quarter of the compile time; the first compiler stops before that, at code that
-callers can link. Both compilers use numba's extension point (its manual, "Customizing the Compiler"), each with its own
-class of code library.
+generate its machine code, which takes a quarter of the compile time. The first compiler stops before this optimisation,
+at code that callers can link. Both compilers use numba's extension point (its manual, "Customizing the Compiler"), each
+with its own class of code library.
 """
 
 from __future__ import annotations
@@ -75,10 +75,10 @@ def _variables(module: llvmlite.ir.Module, names: set[str]) -> llvm.ModuleRef:
 class EntryLibrary(JITCodeLibrary):
     """The code of a kernel that Python calls, with its own copy of every kernel that it calls.
 
-    If entries shared copies, all would use the copies of the entry that is loaded first, which may differ in the last
-    bit because they were optimised for that entry. Copies become internal before LLVM optimises, so that LLVM inlines
-    kernels with one caller. Copies of `fast` kernels become internal afterwards, because inlining may change the order
-    of their sums.
+    If entries shared copies, all entries would use the copies of the entry that is loaded first. These copies may
+    differ in the last bit, because they were optimised for that entry. Copies become internal before LLVM optimises, so
+    that LLVM inlines kernels with one caller. Copies of `fast` kernels become internal only after the optimisation,
+    because inlining may change the order of their sums.
     """
 
     def _optimize_final_module(self) -> None:
@@ -87,7 +87,7 @@ class EntryLibrary(JITCodeLibrary):
         self._keep(llvm.Linkage.linkonce_odr)
 
     def _keep(self, linkage: llvm.Linkage) -> None:
-        """Make the defined functions of this linkage internal."""
+        """Give internal linkage to the defined functions that have this linkage."""
         for function in self._final_module.functions:
             if function.linkage == linkage and not function.is_declaration:
                 function.linkage = llvm.Linkage.internal

@@ -1,4 +1,4 @@
-"""A first-order low pass of a pose, tau dy/dt = u - y."""
+"""A first-order low pass of a pose, tau dy/dt = u - y, with the input u and the output y."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ _SHORTEST: Final = 1e-6
 
 @kernel(entry=True)
 def lagged(tau, edges, starts, places, rates, memory, t, q, v):
-    """Return poses and rates (n, 3) behind a low pass with the time constant `tau` in s.
+    """Return the low pass's output and its rates, shape (n, 3); the time constant `tau` is in s.
 
-    Swing m has the rows edges[m]:edges[m + 1] of `t`, `q`, `v`. It starts at time starts[m] with the pose places[m],
-    the rates rates[m] and the low pass's output memory[m]. Between rows the pose is taken as a cubic, through which the
-    low pass is integrated exactly.
+    A swing is a part of the motion with its own starting state. Swing m has the rows edges[m]:edges[m + 1] of `t`, `q`,
+    `v`. It starts at time starts[m] with the pose places[m], the rates rates[m] and the low pass's output memory[m].
+    The pose is assumed to be a cubic between rows; for this cubic the low pass is integrated exactly.
     """
     out, rate = np.empty_like(q), np.empty_like(q)
     for swing in range(len(starts)):

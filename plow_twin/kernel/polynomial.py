@@ -1,4 +1,4 @@
-"""First root and maximum of a polynomial on an interval, found without a miss from its Bernstein form.
+"""First root and maximum of a polynomial on an interval; its Bernstein form ensures that no root is missed.
 
 A polynomial lies within the hull of its Bernstein coefficients, and has at most as many roots as these coefficients
 have sign changes. Both bounds become sharper when the interval is halved (Farouki, Comput. Aided Geom. Des. 29 (2012)
@@ -23,7 +23,7 @@ MAX_HALVINGS: Final = 48
 
 @kernel()
 def to_bernstein(g: Array, n: int, h: float, inverse_binomial: Array, b: Array) -> None:
-    """Write the Bernstein coefficients of g on [0, h] to b[0..n]."""
+    """Write the Bernstein coefficients of the polynomial g of degree n on [0, h] to b[0..n]."""
     power = 1.0
     for k in range(n + 1):
         b[k] = g[k] * power * inverse_binomial[k]
@@ -50,7 +50,7 @@ def sum_to_bernstein(b: Array, n: int) -> None:
 
 @kernel(inline="code")
 def _halve(left: Array, right: Array, n: int) -> None:
-    """Split the Bernstein coefficients at the middle: `left` keeps its left half, `right` gets the right half."""
+    """Halve an interval: `left` keeps the coefficients of its left half, `right` gets the right half's."""
     for r in range(n + 1):
         right[n - r] = left[n]
         for j in range(n, r, -1):
@@ -148,7 +148,7 @@ def maximum(g: Array, n: int, h: float, floor: float, w) -> float:
     """Return the larger of `floor` >= 0 and the maximum of g on [0, h], to a relative error of 1e-12.
 
     If the Bernstein coefficients of g' change their sign at most once, a maximum between the ends is at the only root
-    of g'. Otherwise the hull of g's own coefficients is narrowed.
+    of g'. Otherwise intervals are halved until the hull of g's own coefficients bounds the maximum (`_narrowed`).
     """
     best, slope, b = max(floor, g[0], _value(g, n, h)), w.column[1], w.halves
     steepest, power = 0.0, 1.0

@@ -31,7 +31,7 @@ def _operation(function: Callable[..., Any]) -> Callable[..., Any]:
 class Lanes(types.Type):
     """Numba's type of eight float64."""
 
-    #: LLVM's names of the changes that it may make to sums
+    #: LLVM's flags for the changes that it may make to sums
     flags: tuple[str, ...] = _FLAGS
 
     def __init__(self, name: str = "Lanes") -> None:
@@ -86,7 +86,7 @@ def exact_row(typingctx: Any, array: Any, index: Any) -> Any:
 def gathered(typingctx: Any, array: Any, index: Any, places: Any) -> Any:
     """Return eight numbers of a contiguous array of shape (n, 8).
 
-    The tuple `places` holds their offsets, counted in numbers from the start of row `index`.
+    The tuple `places` holds the offsets of the eight numbers, counted in numbers from the start of row `index`.
     """
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -190,9 +190,9 @@ def total(typingctx: Any, value: Any) -> Any:
 
 @_operation
 def three_totals(typingctx: Any, first: Any, second: Any, third: Any) -> Any:
-    """Return a vector with the sums of the lanes of three vectors in its lanes 2, 3 and 4, and 0 in the others.
+    """Return a vector with the lane sums of three vectors in lanes 2, 3 and 4, and 0 in the other lanes.
 
-    The sums share their additions, which is faster than three times `total`.
+    The three sums share vector additions, which is faster than three calls of `total`.
     """
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -252,7 +252,7 @@ def lowest_bit(typingctx: Any, bits: Any) -> Any:
 
 
 def _called(builder: Any, name: str, arguments: Any) -> Any:
-    """Call a function of LLVM on vectors."""
+    """Emit a call of an LLVM function whose arguments are vectors."""
     kind = ir.FunctionType(_VECTOR, [_VECTOR] * len(arguments))
     return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v8f64"), arguments)
 

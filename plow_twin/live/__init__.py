@@ -1,1 +1,1 @@
-"""The live twin without a transport: session, recording, wear, alarms, health; and its inputs without ROS."""
+"""The live twin apart from its transport: session, recording, wear, alarms, health; inputs without ROS."""

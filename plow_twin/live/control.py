@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from plow_twin.live.services import Services
 
 _LARGEST: Final = 65536
-#: Largest number of requests that are answered in one turn.
+#: Largest number of requests that are answered in one call of `Control.turn`.
 _MOST: Final = 8
 #: How long a client waits for the answer [s].
 _PATIENCE_S: Final = 5.0
-#: Time between two turns [s].
+#: Time between two calls of `Control.turn` [s].
 TURN_S: Final = 0.1
 
 
@@ -31,7 +31,7 @@ class ControlError(PlowTwinError):
 
 
 class Control:
-    """The socket of a running twin, for its user alone, as a context manager that removes the socket.
+    """Context manager of a twin's socket: only the twin's user may connect; the exit removes the socket.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ class Control:
     Attributes
     ----------
     services : Services or None
-        The services, once the twin exists.
+        The services that clients can request; None until the twin exists.
 
     Raises
     ------

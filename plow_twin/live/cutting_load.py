@@ -1,4 +1,4 @@
-"""A cutting load along the face: Gamma-distributed about its mean, correlated in space, new in each pass.
+"""A cutting load along the face: Gamma-distributed, correlated in space, drawn anew for each pass.
 
 The fluctuation depends on the place along the face and on the pass: at one place and pass, the same seed gives the same
 load at any sampling rate and speed.
@@ -25,7 +25,8 @@ from plow_twin.scene_file.validation import Schema, validate
 
 Array = NDArray[np.float64]
 
-#: Points of the field per correlation length; linear interpolation between them loses 1 % of its variance.
+#: Grid points of the random field per correlation length; linear interpolation between the points loses 1 % of the
+#: field's variance.
 _POINTS: Final = 25
 
 
@@ -59,9 +60,10 @@ class Face:
     turn_s: float = 4.0
 
     def travel(self, t: Array) -> tuple[Array, Array, NDArray[np.int64]]:
-        """Return position [m], signed speed [m/s] and number of the pass at times `t` (n,) [s], from 0 on.
+        """Return position [m], signed speed [m/s] and number of the pass at times `t` >= 0 (n,) [s].
 
-        In a turn the speed falls linearly to zero and rises in the other direction; each pass has one half of the turn.
+        In a turn the speed falls linearly to zero and rises in the other direction. The first half of a turn belongs to
+        the pass before it, the second half to the pass after it.
         """
         # when a turn begins, the head is still within the face; it reaches the end of the face in the middle of the
         # turn
@@ -95,7 +97,7 @@ class CuttingLoad:
     lateral_n : float
         Standard deviation of the lateral force along y [N], normally distributed.
     at_m : tuple of float
-        Point of action from the cavity's centre [m]: M = x Fy - y Fx.
+        Point of action (x, y), measured from the cavity's centre [m]: M = x Fy - y Fx.
     variation : float
         Coefficient of variation of the cutting force.
     correlation_m : float
@@ -125,7 +127,7 @@ class CuttingLoad:
             raise ArgumentError(f"turn_s: got {face.turn_s!r}, expected less than two passes of {face.length_m:g} m")
 
     def at(self, t: Array) -> Array:
-        """Return Fx, Fy [N], M [N m] at times `t` (n,) [s], shape (n, 3); in a turn they fall with the speed."""
+        """Return Fx, Fy [N], M [N m] at times `t` (n,) [s], shape (n, 3); they scale with the speed."""
         position, speed, number = self.face.travel(t)
         force = np.zeros((len(t), 2))
         for one in np.unique(number):

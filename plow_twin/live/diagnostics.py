@@ -240,7 +240,7 @@ def summary(lifecycle: str, reason: str, runtime: Runtime | None, preparing: boo
 
 
 def failures(runtime: Runtime) -> list[str]:
-    """Return in words how many advances failed, reason and time of the newest failure, and how the model continued."""
+    """Describe how many advances of the model failed, the newest failure, and how the model continued."""
     failed = runtime.driver.failed
     if not failed.count:
         return []
@@ -272,7 +272,7 @@ class Health:
         return parts
 
     def state(self, lifecycle: str, reason: str, runtime: Runtime | None, now_ns: int) -> Part:
-        """Return lifecycle, stream and solver."""
+        """Return the part `state`: the lifecycle, the stream of samples, and the solver."""
         level, message, _ = summary(lifecycle, reason, runtime)
         if runtime is not None and self._grown({"solver_failures": runtime.driver.failed.count}, ("solver_failures",)):
             level, message = ERROR, "; ".join(failures(runtime))
@@ -344,7 +344,7 @@ class Health:
         return (WARN if grown else OK), "; ".join(grown) or "no trouble since the last report", values
 
     def output(self, runtime: Runtime) -> Part:
-        """Return how much was published and how fast."""
+        """Return the part `output`: numbers of published messages, their latency and their age."""
         latency, age = runtime.publishing.latency, runtime.publishing.age
         values = {
             "published": str(runtime.publishing.published),
@@ -377,7 +377,7 @@ class Health:
         return f"{new} periods left out since the last report" if 0 < runtime.settings.missed_periods <= new else ""
 
     def estimate(self, runtime: Runtime) -> Part:
-        """Return the state of the estimate."""
+        """Return the part `estimate`: the state of the estimate."""
         values = dict.fromkeys(KEYS["estimate"], "")
         found = runtime.estimation
         if found is None:
@@ -397,7 +397,7 @@ class Health:
         return (ERROR if found.worker.error else WARN if trouble else OK), trouble or doing, values
 
     def follow(self, runtime: Runtime) -> Part:
-        """Return how the twin follows the machine, as a part of the diagnostics."""
+        """Return the part `follow`: how the twin follows the machine."""
         follower, reduced = runtime.follower, runtime.reduced
         values = dict.fromkeys(KEYS["follow"], "")
         values["follow"] = "off" if follower is None else "full" if follower.steered else "parameters"
@@ -420,7 +420,7 @@ class Health:
         return OK, "following", values
 
     def recorder(self, runtime: Runtime) -> Part:
-        """Return the state of the recording; loss is an error."""
+        """Return the part `recorder`: the state of the recording; lost data are an error."""
         values = dict.fromkeys(KEYS["recorder"], "")
         if runtime.recording is None:
             return OK, "not recording", values

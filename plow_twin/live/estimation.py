@@ -1,4 +1,4 @@
-"""Link between a live twin and the estimate beside it; imported only where estimates are made."""
+"""Link of a live twin to the estimate in another process; imported only where estimates are made."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ from plow_twin.stream.journal import (
 )
 from plow_twin.stream.session import Series, Session
 
-#: Published topics, by base name.
+#: Base names of the published topics.
 ESTIMATE, WINDOW_FORCES, FORECAST = ESTIMATES
-#: For each name of a forecast's number that is not in SI units, the name of the same number in SI units.
+#: For each unit of a forecast that is not an SI unit: the SI unit in which the number is published.
 _SI: Final = {"hours": "seconds", "km": "metres"}
 #: Rate of checks for a finished estimate [Hz].
 RATE_HZ: Final = 10.0
@@ -51,7 +51,7 @@ class Estimation:
         self.worker = Worker(scene, windows, asked)
         sent = {ESTIMATE: True, WINDOW_FORCES: bool(asked.members), FORECAST: asked.plan is not None}
         self._topics = [topic for topic, wanted in sent.items() if wanted]
-        #: time at which other pads were set [ns], until empty messages have withdrawn the estimate; otherwise None
+        #: stamp [ns] at which other pads were set, until empty messages have withdrawn the old estimate; otherwise None
         self._set_ns: int | None = None
         #: origin of each clearance according to the newest estimate
         self.states = {"horizontal": State.PRIOR, "vertical": State.PRIOR}
@@ -117,7 +117,7 @@ class Estimation:
     def poll(self, session: Session) -> dict[str, plain.JointState]:
         """Pass a finished estimate to the session and return its messages by topic, empty without an estimate.
 
-        After other pads have been set, empty messages replace the latched ones.
+        After other pads have been set, empty messages replace the latched messages of the old estimate.
         """
         found = self.worker.poll()
         stamp_ns, self._set_ns = self._set_ns, None
@@ -142,7 +142,7 @@ class Estimation:
         return messages
 
     def _forget(self) -> None:
-        """Return to the model's clearances."""
+        """Discard the estimate, so that the model's clearances apply again."""
         self.entry = None
         self.states = dict.fromkeys(self.states, State.PRIOR)
 

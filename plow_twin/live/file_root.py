@@ -46,7 +46,7 @@ def outside(settings: Named) -> list[Problem]:
 
 
 def refused_changes(before: Named, after: Named) -> list[str]:
-    """Return why parameters that name files cannot be changed in this way after the start; presets are not files."""
+    """Return why parameters that name files cannot be changed so after the start; presets are allowed."""
     if after.file_root:
         return [str(problem) for problem in outside(after)]
     changed = [name for name in FILES if getattr(before, name) != getattr(after, name)]

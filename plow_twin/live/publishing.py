@@ -109,8 +109,8 @@ class Publishing:
             self._messages = Messages(*frames, intervals=settings.follows == "full")
         self.latency = DurationHistogram()
         self.age = DurationHistogram()
-        #: `published`: number of publications that were sent `withheld`: number of publications that were not sent
-        #: because a number was not finite
+        #: `published`: number of publications that were sent
+        #: `withheld`: number of publications that were not sent because a number was not finite
         self.published = self.withheld = 0
         #: `held_frames`: number of publications computed without a sample
         #: `corrected_frames`: number of publications that correct earlier publications because of late samples

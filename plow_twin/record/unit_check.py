@@ -46,8 +46,8 @@ _SLOW_S: Final = 0.5
 _SMOOTH: Final = 0.05
 #: Ploughs travel at 3.6 m/s at most (Caterpillar GH1600); a speed above this [m/s] is in another unit.
 _FASTEST_M_S: Final = 5.0
-#: Share of stamps below their predecessor above which the column is not a time. Share above which the rows are in
-#: reverse order.
+#: Share of stamps below their predecessor above which the column is not a time.
+#: Share of such stamps above which the rows are in reverse order.
 _FALLING, _REVERSED = 0.2, 0.9
 #: Length [s] of each unit of time except the second.
 _TIMES: Final = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}

@@ -26,10 +26,10 @@ _CREDENTIALS: Final = mapping(
 class Access:
     """Address and credentials.
 
-    `url` is `SCHEME://HOST:PORT`; a missing host means this machine. `user` and `password` may be empty. `ca` names the
-    trusted authority, or the other side's certificate itself; `certificate` and `key` identify this side;
-    `user_certificate` and `user_key` identify its user instead of name and password. `plain` allows a connection to
-    another machine without encryption. `client_id` names the session at a broker.
+    `url` is `SCHEME://HOST:PORT`; a missing host means this machine. `user` and `password` may be empty. `ca` is the
+    file of the trusted authority's certificate, or of the broker's or server's own certificate. `certificate` and `key`
+    identify the twin; `user_certificate` and `user_key` identify its user instead of name and password. `plain` allows
+    a connection to another machine without encryption. `client_id` names the session at a broker.
     """
 
     url: str
@@ -50,7 +50,7 @@ def host_and_port(access: Access, ports: Mapping[str, int], *, has_path: bool = 
     Raises
     ------
     BridgeError
-        The address is invalid, or it contains a user, a password or, unless it `has_path`, a path.
+        The address is invalid; or it contains a user, a password, or a path that `has_path` does not allow.
     """
     expected = " or ".join(f"{scheme}://HOST:PORT" for scheme in ports)
     try:
@@ -79,12 +79,12 @@ def password(path: Path | None, source: str) -> str:
 
 
 def read_access(url: str, path: Path | None) -> Access:
-    """Return the access to an OPC UA server with credentials from a YAML file; its paths are relative to its folder.
+    """Return the access to an OPC UA server; paths in the credentials file (YAML) start at its folder.
 
     Raises
     ------
     InputError
-        The file is not YAML within the bounds, or a key or value is not expected.
+        The file is not YAML or exceeds the reader's limits, or a key or value is not expected.
     OSError
         The YAML file or the password's file cannot be read.
     """

@@ -22,19 +22,21 @@ from plow_twin.record.sources import Arrived
 from plow_twin.stream.driver import Arrival
 from plow_twin.stream.intake import Intake, Verdict
 
-#: The sender has restarted if a message number jumps by more than this and the next message number follows it.
+#: A sender counts as restarted if its message number jumps by more than this and the next message number continues from
+#: there.
 _RESTART = 1000
 #: Largest number of samples lost between two messages: a day at 10 kHz.
 _MOST_LOST = 10**9
-#: After at least this many messages, the number 0 or 1 means that the sender has restarted; before, it belongs to a
-#: late message.
+#: After at least this many messages, the number 0 or 1 is taken as a restart of the sender; before that, it is taken as
+#: the number of a late message.
 _FIRST = 10
-#: A change of the load's deviation is journalled if it exceeds this share of the larger deviation.
+#: A change of the load's deviation is journalled if it exceeds this share of the larger of the old and the new
+#: deviation.
 _NOTABLE = 0.02
 
 
 class Feeder:
-    """Reads messages by their roles and passes them to a runtime.
+    """Reads messages as the mapping says and passes them to the runtime of a live twin.
 
     Parameters
     ----------
@@ -45,7 +47,7 @@ class Feeder:
     send
         Sends each resulting message.
     model
-        Model of the load from the drive's signals; None: the load is measured.
+        Model that computes the load from the drive's signals; None if the load itself is measured.
     """
 
     def __init__(
@@ -71,14 +73,14 @@ class Feeder:
         #: next number
         #: `_unnumbered`: count of these assumptions that proved wrong, since the numbers of this sender began
         self._assumed = self._unnumbered = 0
-        #: number of the newest message if this number does not continue the earlier numbers
+        #: number of the newest message if this number does not continue the earlier numbers; otherwise None
         self._odd: int | None = None
         #: whether the sender numbers its messages
         self._counts = False
         self._sender = 0
         self._source = next((role.topic for name, role in roles.items() if name in ("excitation", "drive")), "")
         inputs = runtime.inputs
-        #: whether the source has its own time, so that samples can be published together
+        #: whether many samples may be used in one call: they carry their own time, and no motion is sent
         self._at_once = runtime.reads_at_once
         self._optional: dict[str, Intake] = {
             "travel": inputs.travel,
@@ -89,7 +91,7 @@ class Feeder:
         inputs.senders.alive([self._name])
 
     def begin(self, messages: Iterable[Arrived]) -> None:
-        """Set the time of a source that has its own time, from the first message whose successor continues its time."""
+        """Set the start time of a source with its own time: the first stamp not followed by a jump back."""
         read = (role.read(arrived) for arrived in messages for _, role in self._by_topic.get(arrived.topic, ()))
         stamps = (found[0] for found in read if found is not None)
         back_ns = round(self._runtime.settings.jump_back * 1e9)
@@ -126,7 +128,7 @@ class Feeder:
             self._send(topic, message)
 
     def _feed_table(self, table: Table) -> bool:
-        """Process lines as a table; if the load cannot be read so, return False without any effect."""
+        """Process lines as a table; return False, without any effect, if the load cannot be read so."""
         roles, inputs = self._by_topic.get(table.topic, []), self._runtime.inputs
         role = next((role for name, role in roles if name == "excitation"), None)
         if role is None or role.sequence or not (self._at_once and inputs.active):
@@ -149,7 +151,7 @@ class Feeder:
         return True
 
     def _follow_times(self, stamps: NDArray[np.int64]) -> None:
-        """Advance to the times of samples, as `_follow_time` does for each."""
+        """Advance the source's time to the stamps of samples, as `_follow_time` does for each sample."""
         newest = np.maximum.accumulate(np.append(self.newest_ns, stamps))
         jump_ns = round(self._runtime.settings.jump_forward * 1e9)
         if self.newest_ns and self._far_ahead_ns is None and (stamps <= newest[:-1] + jump_ns).all():
@@ -159,7 +161,7 @@ class Feeder:
             self._follow_time(stamp_ns)
 
     def _follow_time(self, stamp_ns: int) -> None:
-        """Advance to the time of a sample; a sample far ahead counts only if the next sample is far ahead too."""
+        """Advance to the stamp of a sample; a stamp far ahead counts only if the next is far ahead too."""
         jump_ns = round(self._runtime.settings.jump_forward * 1e9)
         far_ns, self._far_ahead_ns = self._far_ahead_ns, None
         if far_ns is not None and stamp_ns >= far_ns - jump_ns:
@@ -208,11 +210,11 @@ class Feeder:
         return [(stamp_ns, wrench)]
 
     def _numbered(self, role: Role, arrived: Arrived) -> tuple[bytes, int, bool]:
-        """Return sender, message number (counted here if the message has none), and whether it is a repetition."""
+        """Return sender, message number (counted here if missing), and whether the message is repeated."""
         number = role.number(arrived) if role.sequence else None
         if number is None:
             # a message without a readable number is assumed to have the next number; the next message with a number
-            # shows whether this was right
+            # shows whether this assumption was right
             self._assumed += 1
             self._number += 1
             return self._name, self._number + self._unnumbered, False
@@ -248,7 +250,7 @@ class Feeder:
         return abs(number - before) <= _RESTART and not number <= 1 < before - _FIRST
 
     def _begin_anew(self) -> None:
-        """Count the following messages as those of another sender."""
+        """Treat the following messages as the messages of a new sender, with a count of their own."""
         self._sender += 1
         self._assumed = self._unnumbered = 0
         self._runtime.inputs.senders.start([self._name])
@@ -260,7 +262,8 @@ class Feeder:
         if found is None:
             intake.refuse(Verdict.MALFORMED)
         elif arrived.retained and name != "travel":
-            # of the retained values only a speed is used, because a speed applies until the next speed
+            # of the values that a broker has retained only a speed is used, because a speed applies until the next
+            # speed
             intake.refuse(Verdict.INACTIVE, found[0], tuple(found[1].values()))
         elif not role.plausible(found[1]):
             intake.refuse(Verdict.IMPLAUSIBLE, found[0], tuple(found[1].values()))

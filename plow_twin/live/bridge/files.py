@@ -44,7 +44,7 @@ class _Tail:
     lines: Lines = field(default_factory=Lines)
     rows: Rows = field(default_factory=Rows)
     _file: Any = None
-    #: the last bytes that were read; a rewritten file has other bytes at their place
+    #: the last bytes that were read; if the file has other bytes at this place now, it was rewritten
     _newest: bytes = b""
     #: number of lines that were never completed because the file was cut or replaced
     left: int = 0
@@ -129,13 +129,13 @@ class _Tail:
 
 
 def _open(path: Path) -> Any:
-    """Open a file of lines, or a Parquet file as lines."""
+    """Open a text file, or a Parquet file whose rows are read as lines."""
     return ParquetLines(path) if is_parquet(path) else path.open("rb")
 
 
 @contextmanager
 def _readable(path: Path) -> Iterator[None]:
-    """Turn errors of files that are not tables into `BridgeError`."""
+    """Raise a `BridgeError` if a file turns out not to be a table."""
     try:
         yield
     except csv.Error as error:
@@ -143,10 +143,10 @@ def _readable(path: Path) -> Iterator[None]:
 
 
 class _Dated:
-    """The files of a pattern, as one topic under the pattern's name.
+    """The files that match a name pattern, read as one topic with the pattern's name.
 
-    When followed, the topic begins with the newest file and continues with each new file. The previous file is still
-    read beside the new file.
+    When the files are followed, the topic begins with the newest file and continues with each new file. The previous
+    file is then still read beside the newest file.
     """
 
     def __init__(self, pattern: Path) -> None:
@@ -157,7 +157,7 @@ class _Dated:
 
     @property
     def path(self) -> Path:
-        """Return the present file, or the pattern while there is no file."""
+        """Return the newest file that is read, or the pattern while there is no file."""
         return self._tails[-1].path if self._tails else self._pattern
 
     def columns(self, *, grows: bool) -> list[str] | None:
@@ -166,11 +166,11 @@ class _Dated:
         return _Tail(max(there, key=_changed_ns)).columns(grows=grows) if there else None
 
     def files(self) -> list[Path]:
-        """Return the files in the order of the numbers in their names."""
+        """Return the files that match the pattern, sorted by the numbers in their names."""
         return sorted(self._pattern.parent.glob(self._pattern.name), key=_numbered)
 
     def read(self) -> list[Arrived]:
-        """Return the messages of the next blocks."""
+        """Return the messages in the next block of each file."""
         found = [arrived for tail in self._tails for arrived in tail.read()]
         if found or time.monotonic() < self._look_s:
             return found
@@ -207,7 +207,7 @@ def _numbered(path: Path) -> list[tuple[int, str]]:
 
 
 def messages(topic: str, lines: list[bytes | None], rows: Rows) -> list[Arrived]:
-    """Return the messages in whole lines; their receive time is now."""
+    """Return the messages in whole lines, with the present time as their receive time."""
     now_ns = time.time_ns()
     found = []
     for line in lines:
@@ -218,14 +218,15 @@ def messages(topic: str, lines: list[bytes | None], rows: Rows) -> list[Arrived]
 
 
 class Files(SourceState):
-    """Files; each is a topic with its name without the ending, and the files of a pattern (`load_*.csv`) are one topic.
+    """Files as topics, named without the ending; the files of a pattern (`load_*.csv`) are one topic.
 
     Parameters
     ----------
     paths
-        The files, or patterns; when they are read once, their messages are put in the order of the times in them.
+        The files, or patterns of file names; if files are read once, their messages are sorted by the stamps in them.
     follow
-        Continue at the end with lines that are appended later, and wait for a file that is not there yet.
+        Whether to wait at the end of a file for lines that are appended later, and to wait for a file that is not there
+        yet.
 
     Raises
     ------
@@ -339,12 +340,12 @@ def is_pattern(path: Path) -> bool:
 
 
 def _sent_ns(row: Arrived, stamp_ns: StampOf[Arrived] | None) -> int | None:
-    """Return the stamp in a row, or None, since the time of reading cannot replace a stamp."""
+    """Return the stamp in a row; None without a stamp, because the time of reading cannot replace it."""
     return None if stamp_ns is None else stamp_ns(Arrived(row.topic, NO_TIME, row.content))
 
 
 class StandardInput(SourceState):
-    """Lines on standard input or another descriptor, until its end.
+    """Lines from standard input or another file descriptor, until the end of the input.
 
     Raises
     ------
@@ -389,4 +390,4 @@ class StandardInput(SourceState):
         return messages(STDIN_TOPIC, lines, self._rows)
 
     def close(self) -> None:
-        """Do nothing: the descriptor belongs to its owner."""
+        """Do nothing, because the caller owns the descriptor."""

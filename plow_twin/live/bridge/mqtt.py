@@ -61,7 +61,7 @@ class Mqtt(SourceState):
         self._client = self._make_client(tls)
 
     def topics(self) -> None:
-        """Return None: any topic of the broker can be named."""
+        """Return None, because the mapping may name any topic of the broker."""
         return
 
     def start(self, topics: list[str], stamp_ns: StampOf[Arrived] | None = None) -> None:

@@ -24,7 +24,7 @@ class BridgeError(PlowTwinError):
 
 
 class Messages(Protocol):
-    """Messages in order of arrival; some sources read them on request."""
+    """Messages in order of arrival; some sources parse them only during iteration."""
 
     def __len__(self) -> int: ...
     def __iter__(self) -> Iterator[Arrived]: ...
@@ -53,7 +53,7 @@ class Bridge(Protocol):
     trouble: str
 
     def topics(self) -> Mapping[str, TopicType] | None:
-        """Return types by topic, or None if the mapping may name any topic."""
+        """Return the type of each topic, or None if the mapping may name any topic."""
 
     def start(self, topics: list[str], stamp_ns: StampOf[Arrived] | None = None) -> None:
         """Subscribe to these topics; messages of files that are read once are ordered by `stamp_ns`."""
@@ -66,7 +66,7 @@ class Bridge(Protocol):
 
 
 class SourceState:
-    """The attributes of a `Bridge` before it is started."""
+    """Base class with the attributes of a `Bridge`, and their values before the bridge is started."""
 
     def __init__(self, *, ends: bool = False, connected: bool = False) -> None:
         self.ends, self.finished, self.connected = ends, False, connected
@@ -82,7 +82,7 @@ class Reporting(Protocol):
 
 
 def read_json(data: bytes) -> dict[str, Any] | None:
-    """Return the object in JSON text, or None."""
+    """Return the object in a JSON text, or None if the text is too long or is not a JSON object."""
     if len(data) > LONGEST:
         return None
     try:
@@ -112,7 +112,7 @@ class Lines:
 
     @property
     def begun(self) -> bool:
-        """Whether a line is incomplete."""
+        """Whether the last line is still incomplete."""
         return self._skipping or bool(self._rest)
 
     def end(self) -> list[bytes | None]:
@@ -122,7 +122,7 @@ class Lines:
 
 
 class Rows:
-    """Parser of lines: CSV under a header, or JSON objects, as the first line shows."""
+    """Parser of lines; the first line shows whether they are CSV under a header, or JSON objects."""
 
     def __init__(self) -> None:
         #: names of the columns, or keys of the first object; None before the first line
@@ -130,7 +130,7 @@ class Rows:
         self._json = False
         #: the delimiter that the header shows
         self.delimiter = ","
-        #: columns of the previous file; this file has taken its place
+        #: columns of the previous file, if this file has replaced another file
         self._before: list[str] | None = None
 
     @property
@@ -139,11 +139,11 @@ class Rows:
         return self.columns is not None and not self._json
 
     def header(self, source: str) -> Columns:
-        """Return the columns of `source`; the errors are those of `columns_of`."""
+        """Return the columns of `source`; raise the errors of `columns_of`."""
         return columns_of(source, self.columns or ())
 
     def of_another_file(self) -> Rows:
-        """Return a parser for the file that replaces this one; a file without a header takes the present header."""
+        """Return a parser for the next file; if that file has no header, the present header applies."""
         rows = Rows()
         rows._before = self.columns
         return rows

@@ -45,8 +45,8 @@ class Table:
     def read(self, role: Role) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
         """Return stamps [ns], shape (n,), and numbers (n, k) of a role as `Role.read` does.
 
-        None if the lines must be read one by one, because a line is not a row, or a number is missing or not plain
-        decimal.
+        The result is None if the lines must be read one by one, because a line is not a row, or a number is missing or
+        not plain decimal.
         """
         names = self._rows.columns or []
         stamp = next((name for name in TIMES if name in names), None) if role.stamp == "header" else role.stamp

@@ -31,16 +31,17 @@ from plow_twin.record.sources import Arrived, TopicType
 #: Largest number of samples that wait to be read; further samples are counted as lost, except samples of the history.
 _QUEUE: Final = 100_000
 _PORTS: Final = {"opc.tcp": 4840}
-#: Longest wait [s] for all values of a stamp. They come in one message or in two successive messages; the wait has a
-#: margin for a busy machine.
+#: Longest wait [s] for all values with the same stamp. These values come in one message or in two successive messages;
+#: the wait has a margin for a busy machine.
 _WAIT_S: Final = 5e-3 * PUBLISHING_MS
 #: The history is read in pieces of this length [ns].
 _PIECE_NS: Final = 10_000_000_000
-#: Longest delay of one node's values after those of another node [ns].
+#: Longest assumed delay of one node's values behind the values of another node [ns].
 _OVERLAP_NS: Final = 1_000_000_000
-#: A stamp that is further ahead of the system's time than this [ns] neither begins nor ends a break.
+#: A value whose stamp is further ahead of the system's time than this [ns] is passed on alone, and is ignored in the
+#: search for gaps.
 _AHEAD_NS: Final = 86_400_000_000_000
-#: Longest delay [s] after which a value that was sent is also in the server's history.
+#: Longest assumed delay [s] until a value that the server has sent is also in the server's history.
 _HISTORY_LAG_S: Final = 5.0
 #: Longest wait for the first values of a subscription [s]; a server sends these values at once.
 _FIRST_VALUES_S: Final = 10.0
@@ -64,7 +65,8 @@ class OpcUa(SourceState):
     connect_s
         Longest wait for the first connection [s].
     waits
-        Whether `start` returns before the first connection, which is then retried like later connections.
+        Whether `start` returns without waiting for the first connection, which is then attempted repeatedly like later
+        connections.
     on_arrival
         Called, from another thread, when samples have arrived.
 
@@ -97,7 +99,7 @@ class OpcUa(SourceState):
         self._samples = {
             topic: Samples(sorted(set(role.fields.values())), _WAIT_S) for topic, role in self._roles.items()
         }
-        #: topics of each node, by the node's number
+        #: for each node, by its number: the topics that use the node
         self._topics_of = [
             [topic for topic, role in self._roles.items() if node in role.fields.values()] for node in self._nodes
         ]
@@ -114,16 +116,17 @@ class OpcUa(SourceState):
         self._loop: asyncio.AbstractEventLoop | None = None
         self._task: asyncio.Task[None] | None = None
         self._link: Link | None = None
-        #: values that come while the history is read
+        #: values that have come while the history is read, each list with a flag that earlier values were lost; None if
+        #: values are used at once
         self._held_back: list[tuple[list[tuple[int, Any]], bool]] | None = None
-        #: steady time at which the connection broke [s]; None while it is connected
+        #: time of the steady clock at which the connection broke [s]; None while there is a connection
         self._broken_s: float | None = None
         #: why the history of this connection cannot be read; empty if it can
         self._no_history = ""
         logging.getLogger("asyncua").addHandler(logging.NullHandler())
 
     def topics(self) -> dict[str, TopicType]:
-        """Return the roles as topics, all of the type for nodes."""
+        """Return the roles as topics, all of the type `OPCUA`."""
         return dict.fromkeys(self._roles, OPCUA)
 
     def start(self, topics: list[str], stamp_ns: StampOf[Arrived] | None = None) -> None:
@@ -199,7 +202,7 @@ class OpcUa(SourceState):
             wait_s = min(2.0 * wait_s, _LONGEST_WAIT_S)
 
     async def _follow(self, link: Link) -> None:
-        """Read one connection until it breaks or a stop is requested."""
+        """Receive values over one connection until it breaks or a stop is requested."""
         self._held_back, self._no_history, self._link = [], "", link
         self._revised = await link.open()
         self._uris = self._uris or link.uris
@@ -216,14 +219,14 @@ class OpcUa(SourceState):
             self.trouble = f"the connection broke: {link.trouble}; reconnecting"
 
     async def _first_values(self) -> list[tuple[int, Any]]:
-        """Return the first values of the new subscription, up to which the history is read."""
+        """Wait for and return the first values of the new subscription; the history is read up to them."""
         give_up = time.monotonic() + _FIRST_VALUES_S
         while not self._held_back and time.monotonic() < give_up:
             await asyncio.sleep(0.01)
         return self._held_back[0][0] if self._held_back else []
 
     async def _release(self) -> None:
-        """Take the values that came while the history was read."""
+        """Use the values that came while the history was read."""
         while self._held_back:
             waiting, self._held_back = self._held_back, []
             for values, lost in waiting:
@@ -231,7 +234,7 @@ class OpcUa(SourceState):
         self._held_back = None
 
     async def _take(self, values: list[tuple[int, Any]], lost: bool) -> None:
-        """Use values of the subscription; values lost before them are first read from the history."""
+        """Use values of the subscription; if values before them were lost, first read the history."""
         if self._held_back is not None:
             self._held_back.append((values, lost))
             return
@@ -262,7 +265,7 @@ class OpcUa(SourceState):
         return found is not None and found[0] <= end_ns
 
     def _is_known(self, number: int, value: Any) -> bool:
-        """Return whether the history had a value; a much older value is new, since the server's clock was set back."""
+        """Return whether the history had this value; a much older value is new (server clock set back)."""
         found = reading(value, self._by_server(number), Counts())
         return found is not None and 0 <= self._newest_ns(number) - found[0] < _PIECE_NS
 
@@ -286,7 +289,7 @@ class OpcUa(SourceState):
                     samples.begin(node, *found)
 
     async def _fill(self, up_to: list[tuple[int, Any]]) -> bool:
-        """Fill the gap before these values from the history; return whether the gap is complete."""
+        """Fill the gap before these values from the history; return whether the whole gap is filled."""
         ends_ns: dict[int, int] = {}
         for number, value in up_to:
             found = reading(value, self._by_server(number), Counts())
@@ -327,7 +330,7 @@ class OpcUa(SourceState):
             self._no_history = "the server's history is empty"
 
     async def _take_piece(self, begin_ns: int, end_ns: int) -> int:
-        """Take the values of the history in a piece of time; return the number of new ones."""
+        """Use the history's values between two stamps [ns]; return the number of new values."""
         assert self._link is not None
         values = await self._link.history(begin_ns, end_ns)
         new = [item for item in values if self._is_new(*item)]

@@ -36,14 +36,14 @@ _ANSWER_S: Final = 10.0
 _CLOSE_S: Final = 2.0
 #: Largest message that a server may send [B].
 _LARGEST_MESSAGE: Final = 64 << 20
-#: Largest part of a message [B]; the standard demands that a limit allows at least 8 KiB.
+#: Largest part (chunk) of a message [B]; the OPC UA standard demands that a limit allows at least 8 KiB.
 _LARGEST_PART: Final = 1 << 20
 #: Largest number of values of the history that are read at once: 10 s of ten nodes at 10 kHz.
 _MOST_HISTORY: Final = 1_000_000
 #: Sequence numbers begin again at 1 after this number.
 _LAST_NUMBER: Final = 2**32 - 1
 
-#: Function that takes pairs of node number and value, and a flag, which says that values before these are missing.
+#: Function that takes pairs of node number and value, and a flag that is true if values before these pairs were lost.
 Take = Callable[[list[tuple[int, Any]], bool], Awaitable[None]]
 
 
@@ -74,7 +74,7 @@ class Link:
     nodes
         Identifiers of the nodes.
     uris
-        Namespaces of the server to which the numbers in these identifiers refer; empty: the present namespaces.
+        Namespaces of the server to which the namespace numbers in `nodes` refer; empty: the present namespaces.
     sampling_ms
         Requested sampling interval [ms]; 0: the server's fastest.
     take
@@ -158,7 +158,7 @@ class Link:
         return f"no sign of life for {silent_s:.0f} s" if silent_s > 3.0 * self._keepalive_s else ""
 
     async def history(self, begin_ns: int, end_ns: int) -> list[tuple[int, Any]]:
-        """Return the values of all nodes between two stamps [ns], both included, by number of the node.
+        """Return pairs of node number and value for all values between two stamps [ns], both included.
 
         Raises
         ------
@@ -263,7 +263,7 @@ class Link:
         await self._take_message(message, lost=lost > 0)
 
     def _missing(self, number: int) -> range:
-        """Return the sequence numbers that should have come before this one."""
+        """Return the sequence numbers of the messages that are missing before the message `number`."""
         expected = self._next_number
         if expected is not None and number == expected - 1:  # the server has sent the newest message again
             return range(0)
@@ -271,7 +271,7 @@ class Link:
         return range(0) if expected is None or number < expected else range(expected, number)
 
     async def _again(self, number: int) -> ua.NotificationMessage | None:
-        """Return a message, if the server still has it."""
+        """Request a lost message again; return None if the server no longer has it."""
         try:
             message = await self._client.uaclient.session.republish(self._subscription, number)
         except UaError:

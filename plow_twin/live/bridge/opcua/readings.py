@@ -9,7 +9,7 @@ from typing import Any, Final
 from plow_twin.live.bridge.opcua.samples import NOT_MEASURED, Value
 
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
-#: Times beyond this mean that there is no time [ns].
+#: A time beyond this [ns] counts as missing, because servers without a time may send a date in 9999.
 _FARTHEST_NS: Final = 4_000_000_000_000_000_000
 _MICROSECOND: Final = timedelta(microseconds=1)
 _SEVERITY: Final = 0xC0000000
@@ -20,7 +20,7 @@ _OVERFLOW: Final = 0x00000480
 
 @dataclass
 class Counts:
-    """Counts of values of a server."""
+    """Counts of a server's values, of lost messages and of broken connections."""
 
     values: int = 0
     bad: int = 0
@@ -49,7 +49,7 @@ def reading(data: Any, by_server: bool, counts: Counts) -> tuple[int, Value] | N
     """Return stamp [ns] and value of a `DataValue`, or None for a value without a stamp.
 
     A value whose status is Bad or Uncertain, or that is not a number, counts as not measured. Without a source
-    timestamp the server's is used.
+    timestamp the server timestamp is used.
     """
     counts.values += 1
     stamp_ns = None if by_server else _stamp_ns(data.SourceTimestamp, data.SourcePicoseconds)

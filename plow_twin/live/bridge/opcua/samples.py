@@ -16,8 +16,9 @@ _MOST_WAITING: Final = 10_000
 class Samples:
     """Samples of one role; a sample is the values of the role's nodes at one stamp.
 
-    A server does not resend an unchanged value: a node without a value at a stamp keeps its last value. A stamp is
-    complete when each node has a value there or at a later stamp; otherwise it waits for `wait_s`.
+    A server does not resend an unchanged value, so a node without a value at a stamp is assumed to keep its last value.
+    A stamp is complete when each node has a value at this stamp or at a later stamp. An incomplete stamp waits for
+    `wait_s`.
 
     Parameters
     ----------
@@ -38,13 +39,13 @@ class Samples:
         #: nodes whose only value so far is from before the first sample
         self._begun: set[str] = set()
         self._released_ns = 0
-        #: samples with impossible stamps
+        #: samples with impossible stamps (too far ahead of the system's time), by stamp
         self._strays: dict[int, tuple[float, dict[str, Value]]] = {}
         #: number of late stamps that were dropped because values were missing
         self._incomplete = 0
 
     def add(self, node: str, stamp_ns: int, value: Value, now_s: float) -> None:
-        """Add a value; the same stamp of a node again is ignored."""
+        """Add a value; a second value of the same node at the same stamp is ignored."""
         if stamp_ns == self.newest_ns[node]:
             return
         # a starting server may stamp the first value by another clock, so later values may have older stamps
@@ -56,17 +57,17 @@ class Samples:
         self._waiting[stamp_ns][1].setdefault(node, value)
 
     def add_stray(self, node: str, stamp_ns: int, value: Value, now_s: float) -> None:
-        """Add a value with an impossible stamp; its sample is passed on alone, for the intake to count."""
+        """Add a value with an impossible stamp; its sample is passed on separately, to be counted."""
         self._strays.setdefault(stamp_ns, (now_s, {}))[1].setdefault(node, value)
 
     def begin(self, node: str, stamp_ns: int, value: Value) -> None:
-        """Take the value that a node had before the first sample, to complete that sample."""
+        """Store the value that a node had before the first sample; it completes the first sample."""
         self.newest_ns[node] = stamp_ns
         self._begun.add(node)
         self._held[node] = value
 
     def take(self, now_s: float) -> list[tuple[int, dict[str, Value]]]:
-        """Return in order the stamps [ns] that no longer wait at `now_s`, with the value of each node."""
+        """Return the stamps [ns] that no longer wait at `now_s`, in order, each with all nodes' values."""
         found = []
         while self._stamps_ns and self._is_due(self._stamps_ns[0], now_s):
             stamp_ns = self._stamps_ns.pop(0)
@@ -93,7 +94,7 @@ class Samples:
         return found
 
     def take_incomplete(self) -> int:
-        """Return the number of late stamps since the last call that were dropped because values were missing."""
+        """Return how many late stamps were dropped since the last call because values were missing."""
         found, self._incomplete = self._incomplete, 0
         return found
 

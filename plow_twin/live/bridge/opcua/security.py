@@ -72,7 +72,7 @@ async def identify(client: Client, access: Access) -> None:
 
 
 def _first(chain: bytes) -> bytes:
-    """Return the server's certificate, without the authorities that may follow it (DER, long form of the length)."""
+    """Return the server's certificate, the first in a chain (DER, long form of the length)."""
     return chain[: int.from_bytes(chain[2:4], "big") + 4]
 
 
@@ -119,7 +119,7 @@ def _hosts(certificate: x509.Certificate) -> list[str]:
 
 
 def _application_uri(certificate: x509.Certificate, otherwise: str) -> str:
-    """Return the application's name in the certificate, which servers compare with the name that it states."""
+    """Return the application URI in the certificate; servers compare it with the URI of the client."""
     names = _names(certificate)
     uris = names.get_values_for_type(x509.UniformResourceIdentifier) if names else []
     return uris[0] if uris else otherwise
