@@ -172,6 +172,14 @@ def _frame_of(support, state):
 
 
 @kernel()
+def _frame_now(support, w):
+    """Return the state of a frame on springs when the motion was last read, None for a fixed frame."""
+    if support is not None:
+        return w.frame_now
+    return None
+
+
+@kernel()
 def start_balance(p, parts, state, y, t, balance) -> None:
     """Record energy, momentum, powers and forces at the start of a run."""
     frame = _frame_of(parts.terms.support, state)
@@ -191,6 +199,7 @@ def _add(balance, powers, weight) -> None:
 def balance_step(p, parts, wear, flight, state, w, balance) -> None:
     """Add the integrals over the step whose series has been computed but which is not yet completed."""
     y, wear_depth, end, support = balance.body, balance.wear_depth, state.sigma_end, parts.terms.support
+    frame = _frame_now(support, w)
     set_row(wear_depth, 0, row(state.wear_depth, 0))
     panels = 1
     if flight is not None and (state.in_flight == 1 or state.at_rest == 1):
@@ -203,10 +212,10 @@ def balance_step(p, parts, wear, flight, state, w, balance) -> None:
             if wear is not None:
                 wear_depth_at(state, w, sigma, wear_depth)
             t = state.step_start + time_along(state.alpha, state.beta, sigma)
-            _powers(p, parts, state, wear_depth, y, w.frame_now, t, balance, balance.now)
+            _powers(p, parts, state, wear_depth, y, frame, t, balance, balance.now)
             _add(balance, balance.now, balance.weights[i] * width * (state.alpha + state.beta * sigma))
     evaluate(p, parts.harmonics, flight, support, state, w, end, y)
-    _balance(p, support, y, w.frame_now, balance, False)
+    _balance(p, support, y, frame, balance, False)
 
 
 @kernel()

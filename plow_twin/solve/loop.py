@@ -123,10 +123,10 @@ def _clear(totals) -> None:
 def _undo(support, state, w, target) -> None:
     """Set the time to `target` after a failed advance, and the head to its place and wear before the advance.
 
-    If the advance began within a step, this step ends there: `w.saved` has the place and the wear.
+    If the advance began within a step, this step ends there: `w.saved_y` has the place, `w.saved_wear` the wear.
     """
-    set_row(state.y, 0, row(w.saved, 0))
-    set_row(state.wear_depth, 0, row(w.saved, 1))
+    set_row(state.y, 0, row(w.saved_y, 0))
+    set_row(state.wear_depth, 0, row(w.saved_wear, 0))
     if support is not None:
         copy_into(state.frame, w.frame_saved)
     state.touch_time += target - state.time
@@ -144,10 +144,10 @@ def _advance(p, parts, states, index, saved, w, totals, target, stop_time, budge
     state = states[index]
     if pace.underway == 0:
         copy_record(saved[0], state)
-        _present(p, parts.harmonics, parts.terms.flight, parts.terms.support, state, w, w.saved[0])
+        _present(p, parts.harmonics, parts.terms.flight, parts.terms.support, state, w, w.saved_y)
         if parts.terms.support is not None:
             copy_into(w.frame_saved, w.frame_now)
-        _worn_now(state, w, parts.terms.wear, w.saved[1])
+        _worn_now(state, w, parts.terms.wear, w.saved_wear)
     before, begin = saved[0].steps, state.steps
     code = _proceed(p, parts, state, w, totals, target, stop_time, min(before + budget, begin + pace.left))
     pace.left = max(pace.left - (state.steps - begin), 0)
@@ -315,7 +315,7 @@ def _rows_in_flight(p, harmonics, flight, state, w, t, i, q, v, penetration, for
     This is a function of its own, because the loop over rows in `integrate` is a tenth faster without this branch.
     """
     if flight is not None:
-        t0, y, rate = state.step_start, w.read[0], w.read[1]
+        t0, y, rate = state.step_start, w.read_y, w.read_rate
         while i < t.size and t[i] < t0 + state.step_size:
             fly(p, harmonics, flight, state, w, max(t[i] - t0, 0.0), y)
             pose_of(p, y, None, q[i], v[i])
@@ -335,7 +335,7 @@ def integrate(
     """
     parts, log, t = _unowned_loads(parts), unowned(log), unowned(t)
     q, v, pair_penetration, pair_force = unowned(q), unowned(v), unowned(penetration), unowned(force)
-    y, rate, wear_depth, wear = w.read[0], w.read[1], w.read[2], parts.terms.wear
+    y, rate, wear_depth, wear = w.read_y, w.read_rate, w.read_wear, parts.terms.wear
     i = first[0]
     if balance is not None and state.steps == 0:
         start_balance(p, parts, state, state.y, state.step_start, balance)

@@ -276,8 +276,12 @@ WORK: Final = np.dtype(
         ("grip", "f8", (3, PAIR_COUNT)),  # friction with stick: factors of normal force, place and slip rate
         ("per_pair", "f8", (9, PAIR_COUNT)),  # masks and sums of the eight pairs
         ("moved", "f8", (STATE_SIZE,)),
-        ("saved", "f8", (2, PAIR_COUNT)),  # body coordinates and wear depth at the start of an advance
-        ("read", "f8", (3, PAIR_COUNT)),  # body coordinates, rate and wear depth at a time of output
+        # fields of one row have the type of the state's fields, so that kernels are compiled once for both
+        ("saved_y", "f8", (STATE_SIZE,)),  # body coordinates and wear depth at the start of an advance
+        ("saved_wear", "f8", (PAIR_COUNT,)),
+        ("read_y", "f8", (STATE_SIZE,)),  # body coordinates, rate and wear depth at a time of output
+        ("read_rate", "f8", (PAIR_COUNT,)),
+        ("read_wear", "f8", (PAIR_COUNT,)),
         ("frame_now", "f8", (6,)),  # state of the frame when the motion was last read
         ("frame_saved", "f8", (6,)),  # state of the frame at the start of an advance
         ("load", "f8", (3, _ROWS)),  # S1, S2, M
