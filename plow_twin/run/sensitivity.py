@@ -400,8 +400,8 @@ def displacement_beside(
     Returns
     -------
     float or None
-        None if a pair is closer to its wall than `_CLEAR_OF_WALLS` displacements, or if a pair is in a contact whose
-        damping depends on the speed of its touch.
+        None if a pair is closer to its wall than `_CLEAR_OF_WALLS` times the smallest admissible displacement, or if a
+        pair is in a contact whose damping depends on the speed of its touch.
     """
     if reads_speed and bool((penetration > 0.0).any()):
         return None

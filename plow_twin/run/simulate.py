@@ -58,8 +58,9 @@ class Result:
         By pair name: max, mean_in_contact, mean_over_time [N], impulse [N s], time_in_contact [s] and makes (number of
         touches), computed from the whole motion and not only from the output rows.
     contact_sets : mapping
-        By sense (`ccw`, `cw`) and set of corners: the share of the sense's contact time in which exactly the corners of
-        the set carry force. Corners have the scene's labels, otherwise their names.
+        By sense of the swing that the contacts stop (`ccw`, `cw`) and set of corners: the share of the sense's contact
+        time in which exactly the corners of the set carry force. Corners have the scene's labels, otherwise their
+        names.
     solver : mapping
         method, tol or dt, and the numbers of steps, evaluations and events. For the series each order counts as an
         evaluation, for fixed steps each evaluation of the right-hand side.
