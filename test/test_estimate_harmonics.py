@@ -8,10 +8,11 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from estimate_support import GROUPS, Truth, draw
+from estimate_support import GROUPS, KINDS, Truth, draw, mismatched
 
 from plow_twin import simulate
 from plow_twin.estimate import estimate as estimating
+from plow_twin.estimate import lacking
 from plow_twin.estimate.estimate import estimate
 from plow_twin.estimate.follow import Follower
 from plow_twin.estimate.forces import forces_of
@@ -86,6 +87,20 @@ def test_a_load_that_explains_the_motion_is_fitted_without_harmonics(monkeypatch
     result = estimate(truth.nominal, truth.load, truth.poses)
     assert result.model == "ok" and result.load_harmonics is None and "load_harmonics" not in result.as_dict()
     assert fitted.call_count == 0
+
+
+@pytest.mark.parametrize(("kind", "tried"), [("load_5", False), ("friction_05", True)])
+def test_harmonics_that_explain_nothing_are_given_up_before_whole_swings(
+    kind: str, tried: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Harmonics are not even tried if the residuals do not repeat with the load, as with random errors of the load."""
+    stages = Mock(side_effect=lacking.Problem)
+    monkeypatch.setattr(lacking, "Problem", stages)
+    truth = mismatched(replace(KINDS[kind], periods=6.0), 97001)
+    result = estimate(truth.nominal, truth.load, truth.poses)
+    assert result.model == "suspect" and result.load_harmonics is None
+    horizons = [call.kwargs["horizon"] for call in stages.call_args_list]
+    assert bool(horizons) is tried and np.isfinite(horizons).all()
 
 
 def _error(force: np.ndarray, true: np.ndarray) -> float:

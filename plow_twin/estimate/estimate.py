@@ -17,7 +17,7 @@ from plow_twin.estimate.discrepancy import Graded, graded, variants
 from plow_twin.estimate.fit import Fit, Problem, freed
 from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.gaps import Gaps, GapsFit, fit_gaps
-from plow_twin.estimate.lacking import named, with_harmonics
+from plow_twin.estimate.lacking import with_harmonics
 from plow_twin.estimate.measurements import FEWEST_POSES, Load, Poses, filled, useless_deviation
 from plow_twin.estimate.pads import by_group, of_differences, shown, with_differences
 from plow_twin.estimate.result import NORMAL_P95, Estimate, ForcesUsed, Interval, Motion, State
@@ -271,17 +271,18 @@ def _searched(
         return summarise_bounced(unknowns, poses, bounced, lost, spent + forward.work), ()
     if found is None:
         return under_uncertain_load(_without_fit(unknowns, poses, lost), unknowns, forward.load, poses, period), ()
-    verdict, plain = judge(*found, period), found
+    verdict = judge(*found, period)
+    plain, repeated = found, verdict.figures.get("repeated", math.inf) > tuning.MOST_RATIO
     behind = behind_low_pass(*searched) if searched and _fails(found[1], verdict) and not verdict.broken else None
     if behind is not None:
         again = refine(forward.renewed(), unknowns, poses, period, behind.shared, behind.noise, drift, LOW_PASS)
         if again and again[1].loss < found[1].loss:
             found, verdict = again, judge(*again, period)
     found, verdict = _with_differences(found, verdict, period)
-    if bounced is None and _fails(found[1], verdict) and not verdict.sensor:
-        # a low pass or a change of the machine can look like harmonics, so harmonics are tried only after the
-        # differences
-        found, verdict = _with_harmonics(plain, forward.load, period) or (found, verdict)
+    if bounced is None and _fails(found[1], verdict) and not verdict.sensor and repeated:
+        # residuals of a load that lacks harmonics repeat with the load; those of a low pass or of a change of the
+        # machine may too, so harmonics are tried only after the differences
+        found, verdict = with_harmonics(*plain, forward.load, period) or (found, verdict)
     result = summarise(*found, verdict, lost, forces if bounced is None else None)
     if bounced is None and _fails(found[1], verdict) and not verdict.broken:
         result = under_uncertain_load(result, unknowns, forward.load, poses, period, found)
@@ -387,18 +388,6 @@ def _with_differences(
     if again and other and not _fails(again[1], other):
         return again, other
     return found, verdict
-
-
-def _with_harmonics(
-    found: tuple[Problem, Fit], felt: Load, period: float
-) -> tuple[tuple[Problem, Fit], Verdict] | None:
-    """Repeat a fit with harmonics that the measured load lacks; None if it then still fails a check."""
-    again = with_harmonics(*found, felt, period)
-    if again is None:
-        return None
-    verdict = judge(*again[:2], period)
-    verdict.lacking = named(again[2])
-    return None if _fails(again[1], verdict) else (again[:2], verdict)
 
 
 def _moved_back(result: Estimate, bias: Array) -> Estimate:

@@ -15,6 +15,7 @@ from plow_twin.estimate.harmonics import COMPONENTS, Harmonics
 from plow_twin.estimate.measurements import Load
 from plow_twin.estimate.search import better_states, near_horizon
 from plow_twin.estimate.unknowns import SIZE
+from plow_twin.estimate.verdict import Verdict, judge
 
 Array = NDArray[np.float64]
 
@@ -25,10 +26,13 @@ _ROUNDS, _ITERATIONS, _IN_VAIN = 12, 6, 4
 _LONGER = 2.0
 
 
-def with_harmonics(problem: Problem, found: Fit, felt: Load, period: float) -> tuple[Problem, Fit, Harmonics] | None:
+def with_harmonics(
+    problem: Problem, found: Fit, felt: Load, period: float
+) -> tuple[tuple[Problem, Fit], Verdict] | None:
     """Repeat a fit with harmonics of the measured load `felt`.
 
-    Returns None if the load is not periodic, swings are linked, or the model cannot be run.
+    Returns None if the load is not periodic, swings are linked, the model cannot be run, or a check fails. If the fit
+    of the beginnings fails a check, so would the fit of whole swings, which costs several times as much.
     """
     harmonics, poses = Harmonics.of(felt), problem.window.poses
     if harmonics is None or len(problem.link):
@@ -42,7 +46,11 @@ def with_harmonics(problem: Problem, found: Fit, felt: Load, period: float) -> t
         if ended is None:
             return None
         problem, found, harmonics = ended
-    return problem, found, harmonics
+        verdict = judge(problem, found, period)
+        if verdict.model or verdict.sensor:
+            return None
+    verdict.lacking = _named(harmonics)
+    return ((problem, found), verdict) if found.finished else None
 
 
 def _alternated(
@@ -78,7 +86,7 @@ def _alternated(
     return problem, found, harmonics
 
 
-def named(harmonics: Harmonics) -> str:
+def _named(harmonics: Harmonics) -> str:
     """Describe the most significant harmonic in words, as a reason of the estimate."""
     clear = harmonics.amplitude**2 / harmonics.variance
     clear[1::2] += clear[2::2]
