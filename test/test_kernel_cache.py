@@ -104,6 +104,26 @@ def normal_force(*numbers: float) -> float:
     return contact.normal_force(*numbers)
 
 
+@kernel()
+def twice(number: int) -> int:
+    """Return twice the number."""
+    return 2 * number
+
+
+@kernel(entry=True)
+def twice_both(number: int) -> int:
+    """Pass a number and a constant to the same kernel."""
+    return twice(number) + twice(3)
+
+
+def test_a_kernel_is_compiled_once_for_numbers_and_constants(tmp_path: Path) -> None:
+    program = (
+        f"import sys; sys.path.insert(0, {str(ROOT / 'test')!r}); from test_kernel_cache import twice, twice_both; "
+        "print(twice_both(4), len(twice.signatures))"
+    )
+    assert run(tmp_path, program) == "14 1"
+
+
 def test_a_disk_that_takes_no_cache_is_one_warning_and_the_run_goes_on(tmp_path: Path) -> None:
     full = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0)); "
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(ROOT)}

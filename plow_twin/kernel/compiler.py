@@ -20,7 +20,7 @@ from numba.core import caching
 from numba.core.registry import cpu_target
 from numba.np import linalg
 
-from plow_twin.kernel.linked import EntryCompiler, LinkedCompiler, garbage_kept, keep_from_python
+from plow_twin.kernel.linked import EntryCompiler, LinkedCompiler, for_any_value, garbage_kept, keep_from_python
 
 #: Relaxations of `fast` kernels: sums may be reordered and fused, but NaN and infinity are still handled correctly.
 FASTMATH: Final = frozenset({"contract", "reassoc", "nsz", "arcp"})
@@ -87,7 +87,8 @@ def kernel(
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         dispatcher = kept(function, **options)
-        # with NUMBA_DISABLE_JIT the function stays plain Python and has no `_cache`
+        if hasattr(dispatcher, "_compiler"):  # with NUMBA_DISABLE_JIT the function stays plain Python
+            for_any_value(dispatcher)
         cache_file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
         if cache_file is not None:
             cache_file._source_stamp = SOURCE_DIGEST

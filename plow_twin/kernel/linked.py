@@ -15,6 +15,7 @@ from typing import Any
 
 import llvmlite.binding as llvm
 import llvmlite.ir
+from numba.core import types
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import register_pass
@@ -175,3 +176,18 @@ def keep_from_python(dispatcher: Any) -> None:
         )
 
     dispatcher._insert, dispatcher._compile_for_args = lambda *overload, **options: None, refuse
+
+
+def for_any_value(dispatcher: Any) -> None:
+    """Compile a kernel for the types of its arguments alone.
+
+    Numba would compile it once more for each constant that a caller passes, and for a variable that begins as a
+    constant, even where no call remains that uses this code.
+    """
+    fold = dispatcher._compiler.fold_argument_types
+
+    def fold_without_values(arguments: Any, named: Any) -> Any:
+        signature, found = fold(arguments, named)
+        return signature, tuple(map(types.unliteral, found))
+
+    dispatcher._compiler.fold_argument_types = fold_without_values
