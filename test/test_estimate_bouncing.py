@@ -230,6 +230,16 @@ def test_a_hard_motion_unlike_the_model_is_rough() -> None:
     assert result.horizontal.deviation > 2.0 * tuning.UNEXPLAINED_HARD
 
 
+def test_a_clearance_at_its_bound_is_not_observable() -> None:
+    rng = np.random.default_rng(1)
+    poses = Poses.of(np.arange(100) * 0.01, 1e-3 * rng.standard_normal((100, 3)))[0]
+    found = np.zeros(3), np.zeros(3), (-12.0, 1.0), (0.0, 1.0), np.ones(3), 1.0, 1.0, 0.0, -np.inf
+    bounced = Bounced(np.array([-2e-3, 0.02]), np.full(2, 5e-5), *found)
+    result = summarise_bounced(Unknowns(preset("paper")), poses, bounced, 0, 0)
+    assert result.horizontal_state is State.NOT_OBSERVABLE and result.vertical_state is State.ESTIMATED
+    assert result.horizontal.p95 - result.horizontal.p05 > 0.02
+
+
 def test_the_likeliest_clearances_are_found_from_paths_with_more_parts_than_drawn_motions() -> None:
     """The clearances of each drawn motion are found as for a new motion, for any drawn parameters and any delay."""
     rng = np.random.default_rng(5)

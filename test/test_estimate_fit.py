@@ -12,10 +12,12 @@ from scipy.stats import truncnorm
 
 from plow_twin.estimate import search
 from plow_twin.estimate.arrow import Arrow
+from plow_twin.estimate.estimate import summarise
 from plow_twin.estimate.fit import fit, link_weights
 from plow_twin.estimate.forward import Forward
-from plow_twin.estimate.result import Interval
-from plow_twin.estimate.unknowns import MOVING, Unknowns
+from plow_twin.estimate.result import Interval, State
+from plow_twin.estimate.unknowns import GX, LEAST_CLEARANCE, MOVING, Unknowns
+from plow_twin.estimate.verdict import Verdict
 from plow_twin.kernel.low_pass import lagged
 
 
@@ -69,6 +71,21 @@ def test_an_interval_is_cut_off_where_the_head_has_been() -> None:
     for least in (-3.0, 0.0, 2.0, 20.0, 40.0):
         one, other = Interval.normal(0.0, 1.0).above(least), truncnorm(least, np.inf)
         assert (one.mean, one.p05, one.p95) == pytest.approx((other.mean(), *other.ppf([0.05, 0.95])), abs=2e-4)
+
+
+def test_a_clearance_at_its_bound_is_not_observable() -> None:
+    truth = draw(replace(GROUPS["plain"], periods=3.0), 2)
+    unknowns = Unknowns(truth.nominal)
+    forward = Forward(truth.nominal, truth.load)
+    problem, found = search.candidate(forward, unknowns, truth.poses, truth.load.period()) or (None, None)
+    assert problem is not None and found is not None
+    shared = found.shared.copy()
+    shared[GX] = LEAST_CLEARANCE
+    bound = replace(found, point=replace(found.point, shared=shared))
+    for one, state in ((found, State.ESTIMATED), (bound, State.NOT_OBSERVABLE)):
+        result = summarise(problem, one, Verdict(broken=True), 0)
+        assert result.horizontal_state is state and result.vertical_state is State.ESTIMATED
+    assert result.horizontal.p95 - result.horizontal.p05 > 5e-3
 
 
 @pytest.mark.parametrize(("group", "least", "most"), [("plain", 3, 4), ("noisy", 8, 11)])

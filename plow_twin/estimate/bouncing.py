@@ -24,10 +24,20 @@ from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.laws import Draws, log_odds
 from plow_twin.estimate.likely import Seen, likeliest
 from plow_twin.estimate.measurements import FEWEST_FOR_SCATTER, Poses, filled
-from plow_twin.estimate.priors import deviation_of, is_stated
+from plow_twin.estimate.priors import UNSTATED, deviation_of, is_stated
 from plow_twin.estimate.regression import ridge
 from plow_twin.estimate.start import noise_level, range_of_motion, reaches, smooth_width
-from plow_twin.estimate.unknowns import DAMPING, GAIN, GX, GY, OTHER_LAW, SOFTNESS, Unknowns, with_other_law
+from plow_twin.estimate.unknowns import (
+    DAMPING,
+    GAIN,
+    GX,
+    GY,
+    LEAST_CLEARANCE,
+    OTHER_LAW,
+    SOFTNESS,
+    Unknowns,
+    with_other_law,
+)
 from plow_twin.model import geometry
 
 Array = NDArray[np.float64]
@@ -326,7 +336,7 @@ class _Drawn:
             if self.forward.work > most_work:
                 return
             numbers = self._numbers()
-            clearance = np.maximum(centre + about * self.rng.standard_normal(2), 5e-4)
+            clearance = np.maximum(centre + about * self.rng.standard_normal(2), LEAST_CLEARANCE)
             q = self.eye.look(self.forward, self.unknowns, clearance, numbers, delay, self.rng)
             if q is not None:
                 seen = self.eye.features(q)

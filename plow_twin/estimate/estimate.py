@@ -30,6 +30,7 @@ from plow_twin.estimate.unknowns import (
     DAMPING,
     GX,
     GY,
+    LEAST_CLEARANCE,
     MOVING,
     QUANTITIES,
     SIZE,
@@ -471,7 +472,7 @@ def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: 
         value = Interval.normal(value.mean, math.hypot(deviation, bounced.unseen[index]))
         lowest = math.hypot(value.mean - value.p05, _HALF_NORMAL_P95 * bounced.rounded[index])
         value = replace(value, p05=value.mean - lowest)
-        observed = deviation < 2.0 * tuning.OBSERVED
+        observed = deviation < 2.0 * tuning.OBSERVED and bounced.clearance[index] > LEAST_CLEARANCE
         if not observed:
             value = _unobserved(unknowns, np.zeros(2), index, 0.0, bounced.noise)
         clearances.append(value.above(0.0))
@@ -654,7 +655,8 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
                 f"{COMPONENTS[index]} is predicted, expected {tuning.PREDICTED:.0%} or more"
             )
         touched = min(float(fit.point.contact[:, _SIDES[side]].sum()) for side in sides)
-        observed = tested and touched > tuning.TOUCHED
+        # at its bound, a clearance has no result
+        observed = tested and touched > tuning.TOUCHED and shared[index] > LEAST_CLEARANCE
         observed &= deviation[index] < (2.0 * tuning.OBSERVED if rough else tuning.OBSERVED) and (finished or rough)
         value = Interval.normal(shared[index], deviation[index])
         if not observed:

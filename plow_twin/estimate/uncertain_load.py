@@ -21,7 +21,7 @@ from plow_twin.estimate.equation_error import DEPTHS, EquationError
 from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.measurements import Load, Poses
 from plow_twin.estimate.start import noise_level, range_of_motion
-from plow_twin.estimate.unknowns import DAMPING, Unknowns
+from plow_twin.estimate.unknowns import DAMPING, LEAST_CLEARANCE, Unknowns
 from plow_twin.model import geometry
 
 Array = NDArray[np.float64]
@@ -34,8 +34,6 @@ _KNOT = 0.025
 _ROUNDS = 3
 #: Bound: smallest number of draws for a regression.
 _FEWEST = 40
-#: Guard: smallest drawn clearance in m.
-_LEAST_CLEARANCE = 5e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +122,7 @@ def compare_under_uncertain_load(
             (value[4], max(tuning.FIRM_SPREAD[2], tuning.FIRM_SPREAD[1] * deviation[4])),
         )
     assert found is not None
-    if (spread.centre < _LEAST_CLEARANCE).any():  # the regression extrapolates, so no drawn motion is like the measured
+    if (spread.centre < LEAST_CLEARANCE).any():  # the regression extrapolates, so no drawn motion is like the measured
         return None, work
     share, least = tuning.CORRECTED
     unexplained = np.hypot(share * value[:2], least) if angle else np.zeros(2)
@@ -193,7 +191,7 @@ def _damping(unknowns: Unknowns) -> float:
 def _draw(spread: _Spread, rng: np.random.Generator) -> tuple[Array, Array, float]:
     """Draw clearances (2,) in m; (5,) logarithms of penetration and damping, and gains; logarithm of the load error."""
     white = rng.standard_normal(8)
-    clearance = np.maximum(spread.centre + spread.about * white[:2], _LEAST_CLEARANCE)
+    clearance = np.maximum(spread.centre + spread.about * white[:2], LEAST_CLEARANCE)
     ln_depth = np.clip(spread.ln_depth[0] + spread.ln_depth[1] * white[2], *np.log(DEPTHS))
     ln_damping = spread.ln_damping[0] + spread.ln_damping[1] * white[3]
     gains = 1.0 + tuning.UNCERTAIN_GAIN * white[4:7]

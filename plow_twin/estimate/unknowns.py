@@ -104,8 +104,8 @@ CORRELATED: Final = tuple("softness" if place == SOFTNESS else QUANTITIES[place]
 #: Guard: smallest and largest simulated penetration in m under the reference force. Contacts with a smaller penetration
 #: give the same motion; contacts with a larger penetration let the head through the wall.
 _HARDEST, _SOFTEST = 3e-5, 0.12
-#: Guard: smallest clearance in m that is simulated.
-_LEAST_CLEARANCE = 5e-4
+#: Guard: smallest clearance in m that is simulated; a smaller estimate is none, because no motion was compared with it.
+LEAST_CLEARANCE: Final = 5e-4
 
 
 #: For each contact law that has an alternative: the alternative law, which an estimate tries if the contact is linear
@@ -219,7 +219,7 @@ class Unknowns:
     def within(self, vector: Array) -> Array:
         """Return the nearest vector that can be simulated."""
         out = vector.copy()
-        out[[GX, GY]] = np.maximum(out[[GX, GY]], _LEAST_CLEARANCE)
+        out[[GX, GY]] = np.maximum(out[[GX, GY]], LEAST_CLEARANCE)
         out[SOFTNESS] = np.clip(
             out[SOFTNESS], math.log(_HARDEST + tuning.RESOLVED), math.log(_SOFTEST + tuning.RESOLVED)
         )
