@@ -202,11 +202,8 @@ def test_what_a_hard_motion_hides_widens_the_clearances_and_not_the_twins() -> N
     found = (-12.0, 1.0), (0.0, 1.0), np.ones(3), 1.0, 1.0, 0.0, -np.inf
     bounced = Bounced(truth.clearance, narrow, zero, zero, *found, unseen, rounded)
     result = summarise_bounced(unknowns, truth.poses, bounced, 0, 0)
-    assert (
-        result.horizontal.mean - result.horizontal.p05
-        > 1.9 * rounded[0]
-        > result.horizontal.p95 - result.horizontal.mean
-    )
+    below, above = (abs(end - result.horizontal.mean) for end in (result.horizontal.p05, result.horizontal.p95))
+    assert below > 1.9 * rounded[0] and below > 1.1 * above
     assert result.apparent is not None and result.apparent[0].deviation == pytest.approx(5e-5)
     back = Estimate.from_dict(json.loads(json.dumps(result.as_dict())))
     assert back.apparent == result.apparent
@@ -217,7 +214,7 @@ def test_what_a_hard_motion_hides_widens_the_clearances_and_not_the_twins() -> N
     marks = {**truth.nominal.marks, "frame.width_m": exact, "frame.height_m": exact}
     stated = replace(unknowns, scene=replace(truth.nominal, marks=marks))
     unseen, rounded = hidden_by_geometry(stated, truth.poses, period, eye.features(eye.q)[:2])
-    assert not rounded.any() and (unseen > 1e-4).all(), "theta's scale is left"
+    assert not rounded.any() and (unseen > 7e-4).all(), "scales of the sensor and turned walls are left"
 
 
 def test_a_hard_motion_unlike_the_model_is_rough() -> None:

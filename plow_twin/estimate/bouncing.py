@@ -91,8 +91,8 @@ class Bounced:
         believed law; 0 if no other law is known, or too few of its motions can be run, or the contact is not hard
     odds : log odds of the other law; minus infinity in the same cases, and if the motions are drawn about a given
         vector
-    unseen : (2,) deviation of the clearances in m due to errors of the frame's sides and of theta's scale, which the
-        motion does not show
+    unseen : (2,) deviation of the clearances in m due to errors of the frame's sides, the sensor's scales and turned
+        walls, which the motion does not show
     rounded : (2,) excess of the clearances in m if the frame's corners are rounded by `priors.ROUNDING`; zero if the
         scene states the corners or the sides' deviations
     """
@@ -267,19 +267,26 @@ def hidden_by_geometry(unknowns: Unknowns, poses: Poses, period: float, reach: A
     """Return `unseen` and `rounded` of `Bounced`; `reach`, shape (2,), holds the sums of opposite reaches in m.
 
     A resting head touches the frame at three corners, always at the same angle. At this angle, errors of the sides, the
-    scale and the corners change the reach as another clearance would.
+    scales and the corners change the reach as another clearance would. At a turned wall it touches with the same pad,
+    half the turn away from the wall's middle; the turns of two opposite walls add up.
     """
     scene = unknowns.scene
     width, height = (deviation_of(scene, path) for path in _SIDES)
 
-    def moved(width: float = 0.0, height: float = 0.0, scale: float = 0.0) -> Array:
+    def moved(width: float = 0.0, height: float = 0.0, scale: Array | float = 0.0) -> Array:
         frame = replace(scene.frame, width_m=scene.frame.width_m + width, height_m=scene.frame.height_m + height)
         other = replace(unknowns, scene=replace(scene, frame=frame))
         seen = MotionFeatures(other, poses, period)
-        off: Array = np.abs(seen.features(seen.q * [1.0, 1.0, 1.0 + scale])[:2] - reach)
+        off: Array = np.abs(seen.features(seen.q * (1.0 + scale))[:2] - reach)
         return off
 
-    unseen = np.sqrt(moved(width) ** 2 + moved(0.0, height) ** 2 + moved(scale=priors.SCALES[2]) ** 2)
+    turned = np.array(
+        [[UNSTATED[f"turn_{wall}"] for wall in walls] for walls in (("left", "right"), ("top", "bottom"))]
+    )
+    scaled = [moved(scale=scale) for scale in np.diag(priors.SCALES)]
+    unseen = np.sqrt(
+        np.square([moved(width), moved(0.0, height), *scaled]).sum(axis=0) + (0.25 * turned**2).sum(axis=1)
+    )
     # the prior of round corners is not needed if the scene states the corners' radius, or the deviation of a side,
     # which covers the corners too
     known = scene.frame.corner_radius_m is not None or any(is_stated(scene, path) for path in _SIDES)
