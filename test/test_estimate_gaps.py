@@ -89,7 +89,7 @@ def test_gaps_without_a_pose_give_an_estimate_and_a_shifted_one_is_found(gapped:
     result = estimate(truth.nominal, truth.load, nothing, lost, gaps)
     assert (result.horizontal_state, result.model, result.sensor) == (State.ESTIMATED, "ok", "ok")
     for value, true in zip((result.horizontal, result.vertical), truth.clearance, strict=True):
-        assert abs(value.mean - true) < 1e-4 and value.p95 - value.p05 < 2e-4
+        assert abs(value.mean - true) < 1e-4 and value.p95 - value.p05 < 3e-4
     shifted = gap.copy()
     shifted[:, 1] += 2e-3
     found = fit_gaps(truth.nominal, Gaps.of(truth.poses.t, shifted)[0], truth.poses)

@@ -114,8 +114,10 @@ for day in np.linspace(0.0, DAYS, VISITS, endpoint=False):
     if State.WITHDRAWN in (found.horizontal_state, found.vertical_state):
         print("  " + "; ".join(found.reasons))
         continue
-    mean = np.array([found.horizontal.mean, found.vertical.mean])
-    history.append((float(day), mean, np.array([found.horizontal.deviation, found.vertical.deviation])))
+    # an error of the frame is the same at each visit, so the growth is known as well as the apparent clearances
+    seen = found.apparent or (found.horizontal, found.vertical)
+    mean, deviation = (np.array([getattr(value, name) for value in seen]) for name in ("mean", "deviation"))
+    history.append((float(day), mean, deviation))
     if len(history) < 2:
         continue
     days, means, deviations = (np.array(column) for column in zip(*history, strict=True))

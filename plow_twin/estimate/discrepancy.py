@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Final
 
@@ -78,6 +78,9 @@ class Graded:
         Mean square of the differences in units of their prior deviations, at least 1.
     harmonics : Harmonics, optional
         The harmonics that were added to the load, if any.
+    unseen : ndarray, shape (2,)
+        Deviation of the clearances in m due to differences that the motion neither shows nor excludes, beside
+        `covariance`; zero if `covariance` includes them.
     """
 
     shared: Array
@@ -87,6 +90,7 @@ class Graded:
     inflation: Array
     surprise: float
     harmonics: Harmonics | None = None
+    unseen: Array = field(default_factory=lambda: np.zeros(2))
 
 
 def graded(problem: Problem, found: Fit, doubtful: bool = False, seed: int = 0) -> Graded:
@@ -114,11 +118,16 @@ def graded(problem: Problem, found: Fit, doubtful: bool = False, seed: int = 0) 
     linear.eliminate()
     mean, covariance, often, exact = linear.averaged(np.random.default_rng(seed))
     surprise, named = linear.surprise(mean, often), linear.named(mean, often)
+    free = linear.free()
     if doubtful or not exact:
         # if the machine differs, every quantity may differ
-        mean, covariance = linear.free()
+        mean, covariance = free
         surprise = max(surprise, linear.surprise(mean, np.ones(len(often))))
-    covariance = covariance * max(1.0, linear.scatter()) * surprise
+    # mean square about `mean` if every quantity may differ
+    square = np.diag(free[1])[[GX, GY]] + (free[0] - mean)[[GX, GY]] ** 2
+    widened = max(1.0, linear.scatter()) * surprise
+    unseen = np.sqrt(widened * np.maximum(square - np.diag(covariance)[[GX, GY]], 0.0))
+    covariance = covariance * widened
     harmonics = problem.harmonics and problem.harmonics.moved(mean[linear.waves], np.diag(covariance)[linear.waves])
     step, covariance = mean[:SIZE], covariance[:SIZE, :SIZE]
     covariance += np.diag((tuning.BENT * step) ** 2)
@@ -126,7 +135,7 @@ def graded(problem: Problem, found: Fit, doubtful: bool = False, seed: int = 0) 
     bent = tuning.BENT_BY_EXPONENT * share * exponent**2
     unexplained = tuning.UNEXPLAINED * math.sqrt(float(linear.inflation.mean()) - 1.0)
     covariance[[GX, GY], [GX, GY]] += bent**2 + unexplained**2
-    return Graded(found.shared + step, covariance, named, linear.load, linear.inflation, surprise, harmonics)
+    return Graded(found.shared + step, covariance, named, linear.load, linear.inflation, surprise, harmonics, unseen)
 
 
 @dataclass(frozen=True, eq=False)

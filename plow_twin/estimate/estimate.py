@@ -20,6 +20,7 @@ from plow_twin.estimate.gaps import Gaps, GapsFit, fit_gaps
 from plow_twin.estimate.lacking import with_harmonics
 from plow_twin.estimate.measurements import FEWEST_POSES, Load, Poses, filled, useless_deviation
 from plow_twin.estimate.pads import by_group, of_differences, shown, with_differences
+from plow_twin.estimate.priors import UNSTATED
 from plow_twin.estimate.result import NORMAL_P95, Estimate, ForcesUsed, Interval, Motion, State
 from plow_twin.estimate.search import LOW_PASS, behind_low_pass, candidate, refine
 from plow_twin.estimate.similar import Units
@@ -356,20 +357,42 @@ def _from_bounced(unknowns: Unknowns, shared: Array, bounced: Bounced) -> Array:
 
 def with_bounced(result: Estimate, bounced: Bounced, spent: int) -> Estimate:
     """Combine a fit and a comparison of the same motion; their disagreement widens the interval."""
-    values = []
-    for value, state, mean, deviation in zip(
-        (result.horizontal, result.vertical),
-        (result.horizontal_state, result.vertical_state),
-        bounced.clearance.tolist(),
-        bounced.clearance_deviation.tolist(),
-        strict=True,
-    ):
-        if state is State.ESTIMATED and bounced.distance < tuning.MOST_DISTANCE and deviation < tuning.OBSERVED:
-            value = Interval.normal(*_both_of_one((value.mean, value.deviation), (mean, deviation))).above(0.0)
-        values.append(value)
     figures = result.figures | {"distance": bounced.distance, "path": bounced.path}
     figures["work"] += float(spent)
-    return replace(result, horizontal=values[0], vertical=values[1], figures=figures)
+    if bounced.distance >= tuning.MOST_DISTANCE:
+        return replace(result, figures=figures)
+    apparent = tuple(
+        Interval.normal(*_both_of_one((value.mean, value.deviation), (mean, deviation)))
+        if state is State.ESTIMATED and deviation < tuning.OBSERVED
+        else value
+        for value, state, mean, deviation in zip(
+            _apparent(result),
+            (result.horizontal_state, result.vertical_state),
+            bounced.clearance.tolist(),
+            bounced.clearance_deviation.tolist(),
+            strict=True,
+        )
+    )
+    return replace(_with_apparent(result, apparent), figures=figures)
+
+
+def _apparent(result: Estimate) -> tuple[Interval, Interval]:
+    """Return the clearances of a machine that has exactly the scene's frame."""
+    return result.apparent or (result.horizontal, result.vertical)
+
+
+def _with_apparent(result: Estimate, apparent: tuple[Interval, ...]) -> Estimate:
+    """Return an estimate with other apparent clearances, and with the same uncertainty of the frame beside them."""
+    horizontal, vertical = (
+        Interval.normal(new.mean, math.hypot(new.deviation, math.sqrt(max(value.deviation**2 - old.deviation**2, 0.0))))
+        for value, old, new in zip((result.horizontal, result.vertical), _apparent(result), apparent, strict=True)
+    )
+    return replace(
+        result,
+        horizontal=horizontal.above(0.0),
+        vertical=vertical.above(0.0),
+        apparent=None if result.apparent is None else (apparent[0], apparent[1]),
+    )
 
 
 def _with_differences(
@@ -539,6 +562,20 @@ def _state(withdrawn: bool, observed: bool, rough: bool = False) -> State:
     return known if observed else State.NOT_OBSERVABLE
 
 
+def _unseen(fit: Fit, beside: Graded | None) -> Array:
+    """Return the deviation of the clearances in m due to differences that the motion does not show, shape (2,).
+
+    If the head touches only one pad of a wall, the wall's turn is one of them; to the linearised fit the other pad is a
+    bound at which the turn may end.
+    """
+    square = np.zeros(2) if beside is None else beside.unseen**2
+    seconds = fit.point.contact.sum(axis=0)
+    for side, pads in _SIDES.items():
+        if seconds[list(pads)].min() < tuning.TOUCHED:
+            square[GX if side in ("left", "right") else GY] += (0.5 * UNSTATED[f"turn_{side}"]) ** 2
+    return np.sqrt(square)
+
+
 def _figures(beside: Graded | None) -> dict[str, float]:
     """Return the sizes of the differences from the model."""
     if beside is None:
@@ -634,6 +671,7 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
         covariance = beside.covariance
         covariance[[GX, GY], [GX, GY]] += _between_optima(unknowns, shared) ** 2
     rough = beside is not None and (suspect or not finished or bool(verdict.lacking))
+    unseen = _unseen(fit, beside)
     deviation = np.sqrt(np.diag(covariance))
     reasons = verdict.model + verdict.sensor + ([verdict.lacking] if verdict.lacking else [])
     if not finished and not suspect:
@@ -643,7 +681,7 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
     given = tuning.GIVEN * float(np.exp(shared[SOFTNESS] + NORMAL_P95 * min(deviation[SOFTNESS], 1.0)))
     least = range_of_motion(unknowns.scene, poses)[0] - given
     share = predicted(fit).sum(axis=0) / np.maximum(np.isfinite(fit.point.residual).sum(axis=0), 1)
-    clearances, states = [], []
+    apparent, clearances, states = [], [], []
     untested: dict[int, Interval] = {}
     for index, sides in ((GX, ("left", "right")), (GY, ("top", "bottom"))):
         # only instants at which the motion is predicted test a clearance; hard contacts are exempt, because their
@@ -658,7 +696,8 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
         # at its bound, a clearance has no result
         observed = tested and touched > tuning.TOUCHED and shared[index] > LEAST_CLEARANCE
         observed &= deviation[index] < (2.0 * tuning.OBSERVED if rough else tuning.OBSERVED) and (finished or rough)
-        value = Interval.normal(shared[index], deviation[index])
+        apparent.append(Interval.normal(shared[index], deviation[index]))
+        value = Interval.normal(shared[index], math.hypot(deviation[index], unseen[index]))
         if not observed:
             value = _unobserved(unknowns, deviation, index, least[index], fit.noise)
         clearances.append(value.above(0.0))
@@ -679,6 +718,7 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
         sensor="suspect" if verdict.sensor else "ok",
         reasons=tuple(reasons),
         lost=lost,
+        apparent=(apparent[0], apparent[1]) if unseen.any() and all(state.known for state in states) else None,
         load_harmonics=None if beside is None else beside.harmonics,
         groups=_groups(
             problem, fit, float(np.sqrt(alone[GX, GX] / plain[GX, GX])), states, untested, shared, covariance - alone
@@ -722,11 +762,13 @@ def _with_forces(result: Estimate, problem: Problem, fit: Fit, forces: ContactFo
     covariance[[GX, GY], [GX, GY]] += _between_optima(problem.unknowns, joint.shared) ** 2
     deviation = np.sqrt(np.diag(covariance))
     normal = [Interval.normal(value, spread) for value, spread in zip(joint.shared, deviation, strict=True)]
-    known = State.ESTIMATED
+    states = result.horizontal_state, result.vertical_state
+    apparent = tuple(
+        new if state is State.ESTIMATED else old
+        for state, old, new in zip(states, _apparent(result), (normal[GX], normal[GY]), strict=True)
+    )
     return replace(
-        result,
-        horizontal=normal[GX].above(0.0) if result.horizontal_state is known else result.horizontal,
-        vertical=normal[GY].above(0.0) if result.vertical_state is known else result.vertical,
+        _with_apparent(result, apparent),
         **_numbers(problem.unknowns, normal),
         correlation=_correlation(covariance),
     )
@@ -798,7 +840,7 @@ def _groups(
 
     `untested` holds, by axis, the clearances that no predicted motion tests; they replace the clearances of the groups
     along that axis. `shared` are the unknowns of a machine that may differ from the model; `added` is their covariance
-    beyond the fit's.
+    beyond the fit's. The clearances belong to a machine that has exactly the scene's frame.
     """
     out = {}
     for name, (value, deviation) in by_group(problem, fit, widened).items():
