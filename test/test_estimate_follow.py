@@ -109,7 +109,7 @@ def test_intervals_hold_from_the_first_row_on_and_narrow(truth: Truth, followed:
         assert ((low <= true) & (true <= high)).mean() > 0.85
         assert 0.02 < high[0] - low[0] < 0.04  # at the start the interval is as wide as the prior's
         assert (low <= value).all() and (value <= high).all()
-        assert high[-1] - low[-1] < 1e-3
+        assert high[-1] - low[-1] < 2e-3  # errors of the frame and of the sensor's scales are part of it
 
 
 def test_a_row_uses_measurements_up_to_its_time_only(truth: Truth, followed: Stretch) -> None:
