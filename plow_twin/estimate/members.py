@@ -31,7 +31,7 @@ from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import DOF_NAMES, Clearance, Gravity, Scene, fastest_travel
 from plow_twin.run.batch import TwinBatch
 from plow_twin.run.twin import Twin
-from plow_twin.solve.state import FOLLOWED, ROW, WITH_INTERVALS
+from plow_twin.solve.state import ADVANCE, FOLLOWED, WITH_INTERVALS
 from plow_twin.stream.outputs import clearances
 
 Array = NDArray[np.float64]
@@ -169,7 +169,7 @@ class Ensemble:
         parts = [_bytes(rows[None])]
         if self.others is not None:
             parts.append(_bytes(self.others.advance_samples(t, self._loads(t, wrench, slice(1, None))).rows))
-        whole = np.concatenate(parts).view(ROW)
+        whole = np.concatenate(parts).view(ADVANCE)[..., 0]
         good = whole["status"] == 0
         if len(self.good) == 1:
             self.good[:] = True
@@ -521,8 +521,8 @@ class Ensemble:
 
 
 def _bytes(rows: Rows) -> NDArray[np.uint8]:
-    """Return rows (m, n) as bytes, because numpy copies a record slowly, field by field."""
-    found: NDArray[np.uint8] = np.ascontiguousarray(rows).view(np.uint8)
+    """Return the fields of `ADVANCE` in rows (m, n) as bytes, because numpy copies a record field by field."""
+    found: NDArray[np.uint8] = np.ascontiguousarray(rows)[..., None].view(np.uint8)[..., : ADVANCE.itemsize]
     return found
 
 

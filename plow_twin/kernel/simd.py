@@ -18,6 +18,7 @@ from numba.extending import intrinsic, lower_builtin, models, register_model
 
 _WIDTH = 8
 _VECTOR = ir.VectorType(ir.DoubleType(), _WIDTH)
+_BITS = ir.VectorType(ir.IntType(64), _WIDTH)
 #: Flags that let sums be fused and reordered, as `kernel(fast=True)` does.
 _FLAGS = ("contract", "reassoc", "nsz", "arcp")
 
@@ -230,6 +231,50 @@ def below(typingctx: Any, left: Any, right: Any) -> Any:
 
 
 @_operation
+def equal(typingctx: Any, array: Any, index: Any, number: Any) -> Any:
+    """Return an integer whose bit i is set if lane i of row `index` of a contiguous int64 array is `number`."""
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        place, sought = (context.cast(builder, arguments[i], signature.args[i], types.int64) for i in (1, 2))
+        pointer = _pointer(context, builder, signature.args[0], arguments[0], place)
+        found = builder.load(builder.bitcast(pointer, _BITS.as_pointer()), align=8)
+        wanted = builder.bitcast(_splatted(builder, builder.bitcast(sought, ir.DoubleType())), _BITS)
+        same = builder.icmp_signed("==", found, wanted)
+        return builder.zext(builder.bitcast(same, ir.IntType(_WIDTH)), ir.IntType(64))
+
+    return types.int64(array, index, number), codegen
+
+
+@_operation
+def transpose(typingctx: Any, target: Any, source: Any) -> Any:
+    """Write the transpose of a contiguous array of shape (8, 8) to another such array."""
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        def place(i: int, row_index: int) -> Any:
+            index = ir.Constant(ir.IntType(64), row_index)
+            return _pointer(context, builder, signature.args[i], arguments[i], index)
+
+        rows = [builder.load(place(1, i), align=8) for i in range(_WIDTH)]
+        distance = 1
+        while distance < _WIDTH:
+            # exchange the blocks beside the diagonal of each block of twice the distance
+            low = [i if i & distance == 0 else _WIDTH + i - distance for i in range(_WIDTH)]
+            high = [i + distance if i & distance == 0 else _WIDTH + i for i in range(_WIDTH)]
+            for i in range(_WIDTH):
+                if i & distance == 0:
+                    pair = rows[i], rows[i + distance]
+                    for row_index, places in ((i, low), (i + distance, high)):
+                        order = ir.Constant(ir.VectorType(ir.IntType(32), _WIDTH), places)
+                        rows[row_index] = builder.shuffle_vector(*pair, order)
+            distance *= 2
+        for i, value in enumerate(rows):
+            builder.store(value, place(0, i), align=8)
+        return context.get_dummy_value()
+
+    return types.void(target, source), codegen
+
+
+@_operation
 def choose(typingctx: Any, bits: Any, there: Any, elsewhere: Any) -> Any:
     """Return lane i of `there` if bit i of `bits` is set, otherwise lane i of `elsewhere`."""
 
@@ -285,9 +330,6 @@ def square_root(typingctx: Any, value: Any) -> Any:
         return _called(builder, "sqrt", arguments)
 
     return value(value), codegen
-
-
-_BITS = ir.VectorType(ir.IntType(64), _WIDTH)
 
 
 def _each(number: int) -> Any:

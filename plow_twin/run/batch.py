@@ -21,10 +21,22 @@ from plow_twin.run.pace import MOST_SECONDS, OutOfTimeError, Pace, check_limits
 from plow_twin.run.twin import DEFAULT_BUDGET, read_snapshot
 from plow_twin.solve import loop
 from plow_twin.solve.compiled_scene import CompiledScene, compile_scene, inertias, options, wear_rate
+from plow_twin.solve.lanes.advance import Load
 from plow_twin.solve.lanes.record import fits_lanes
 from plow_twin.solve.method.implicit import new_implicit
 from plow_twin.solve.modes import settle_moved
-from plow_twin.solve.state import ROW, SEGMENT, TOTALS, WORK, Parts, Terms, new_records, new_work, state_type
+from plow_twin.solve.state import (
+    ADVANCE,
+    ROW,
+    SEGMENT,
+    TOTALS,
+    WORK,
+    Parts,
+    Terms,
+    new_records,
+    new_work,
+    state_type,
+)
 
 __all__ = ["TwinBatch"]
 
@@ -95,8 +107,10 @@ class TwinBatch:
             self._params[index] = compiled.params
         self._stick = terms.stick
         self._states = new_records(state_type(self._compiled[0].parts.terms), len(scenes))
+        #: copy of the states from before a call
+        self._before = np.zeros(self._states.nbytes, np.uint8)
         self._wrench = np.zeros((len(scenes), 3))
-        self._masses = np.array([inertias(scene) for scene in scenes])[:, None]
+        self._masses = np.array([inertias(scene) for scene in scenes])
         self._max_steps, self._max_wall_s = max_steps, max_wall_s
         count = max(1, min(workers, os.cpu_count() or 1, len(scenes)))
         self._workers = [_Worker.of(terms, self._compiled, max_wall_s) for _ in range(count)]
@@ -181,11 +195,10 @@ class TwinBatch:
         shape = (len(self), len(times), 3)
         if samples.shape not in (shape, shape[1:]) or not np.isfinite(samples).all():
             raise ArgumentError(f"wrench: got {samples!r}, expected finite numbers of shape {shape} or {shape[1:]}")
-        ends = np.empty((len(self), len(times) + 1, 3))
-        ends[:, 0], ends[:, 1:] = self._wrench, samples
-        rows = np.zeros((len(self), len(times)), ROW)
-        self._run(times, ends / self._masses, rows)
-        self._wrench = ends[:, -1].copy()
+        samples = np.ascontiguousarray(samples if samples.ndim == 3 else samples[None])
+        rows = self._run(times, samples)
+        if len(times):
+            self._wrench[:] = samples[:, -1]
         return AdvanceBatch(rows)
 
     def reset(self, t: float) -> None:
@@ -337,25 +350,31 @@ class TwinBatch:
         """Return a hash of the exact state, 16 hexadecimal digits."""
         return hashlib.blake2b(self.snapshot(), digest_size=8).hexdigest()
 
-    def _run(self, times: NDArray[np.float64], ends: NDArray[np.float64], rows: NDArray[np.void]) -> None:
+    def _run(self, times: NDArray[np.float64], samples: NDArray[np.float64]) -> NDArray[np.void]:
+        """Advance all twins under samples of shape (m or 1, n, 3) and return their rows, shape (m, n)."""
+        in_lanes = self._workers[0].lanes is not None
+        # lanes write every field of their rows
+        rows = (np.empty if in_lanes else np.zeros)((len(self), len(times)), ADVANCE if in_lanes else ROW)
+
         def run(index: int) -> None:
             worker, (first, last) = self._workers[index], self._edges[index : index + 2]
             if worker.lanes is None:
+                ends = self._ends(samples, slice(None))
                 worker.advance(self._params, self._states, first, last, times, ends, self._max_steps, rows)
                 return
 
             def alone(member: int, i: int) -> None:
                 one, row = slice(member, member + 1), np.zeros((1, 1), ROW)
-                line = np.ascontiguousarray(ends[one, i : i + 2])
+                line = self._ends(samples[:, : i + 1], one)[:, i:]
                 records = self._params[one], self._states[one]
-                worker.advance(*records, 0, 1, times[i : i + 1], line, self._max_steps, row)
-                rows[member, i] = row[0, 0]
+                worker.advance(*records, 0, 1, times[i : i + 1], np.ascontiguousarray(line), self._max_steps, row)
+                rows[member, i] = row.view(np.uint8)[0, : ADVANCE.itemsize].view(ADVANCE)[0]
 
-            worker.lanes.advance(times, ends, rows, worker.pace, alone)
+            worker.lanes.advance(times, Load(self._wrench, samples, self._masses), rows, worker.pace, alone)
 
         # records are copied as bytes, because numpy copies a record field by field
         states, begun = self._states.view(np.uint8), list[Future[None]]()
-        before = states.copy()
+        self._before[:] = states
         try:
             if self._pool is None:
                 run(0)
@@ -365,12 +384,20 @@ class TwinBatch:
                     one.result()
         except (OutOfTimeError, KeyboardInterrupt) as stop:
             self._stop(begun)
-            states[...] = before
+            states[:] = self._before
             late = isinstance(stop, OutOfTimeError)
             reason = f"max_wall_s = {self._max_wall_s:g} reached" if late else "interrupted"
             span = f"t = {self.time:.9g} s to {float(times[-1]):.9g} s"
             message = f"{reason} in advances from {span} of {len(self)} twins"
             raise (LimitError if late else RunInterrupted)(message, None, self.time) from None
+        return rows
+
+    def _ends(self, samples: NDArray[np.float64], members: slice) -> NDArray[np.float64]:
+        """Return the previous sample and the samples of some twins per mass and inertia, shape (k, n + 1, 3)."""
+        before, masses = self._wrench[members, None], self._masses[members, None]
+        own = samples[members] if len(samples) > 1 else np.broadcast_to(samples, (len(before), *samples.shape[1:]))
+        joined: NDArray[np.float64] = np.concatenate([before, own], axis=1) / masses
+        return joined
 
     def _stop(self, begun: Sequence[Future[None]]) -> None:
         """Stop the other threads, each at the end of its slice of work."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Final
 
 import numpy as np
@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from plow_twin.kernel.compiler import for_arguments
 from plow_twin.run.pace import Pace
-from plow_twin.solve.lanes.advance import Samples, advance_lanes
+from plow_twin.solve.lanes.advance import Load, Samples, advance_lanes
 from plow_twin.solve.lanes.record import WIDTH, new_lanes, powers
-from plow_twin.solve.state import STATE, TOTALS, Terms, new_records
+from plow_twin.solve.state import TOTALS, Terms
 
 #: Number of steps in a slice of work, summed over all lanes; a slice takes about a millisecond.
 _SLICE: Final = 256
@@ -48,7 +48,7 @@ class LaneTwins:
     ) -> None:
         self._params, self._states, self._terms, self._work = params, states, terms, work
         self._members, self._max_steps, self._order = np.array(members), max_steps, int(params["order"][members[0]])
-        self._saved, self._place = new_records(STATE, WIDTH), np.zeros(len(params), np.int64)
+        self._place, self._queue = np.zeros(len(params), np.int64), self._members.copy()
         self._other, self._progress = np.zeros(len(params), np.int64), np.zeros(2, np.int64)
         self._kernel: Callable[..., bool] | None = None
         self.clear()
@@ -58,21 +58,22 @@ class LaneTwins:
         self._lanes, self._totals = new_lanes(), np.zeros(WIDTH, TOTALS)
 
     def advance(
-        self, times: _Array, wrench: _Array, rows: NDArray[np.void], pace: Pace, alone: Callable[[int, int], None]
+        self, times: _Array, load: Load, rows: NDArray[np.void], pace: Pace, alone: Callable[[int, int], None]
     ) -> None:
         """Advance all twins to all times; `alone` advances a single twin to one of these times by other methods.
 
-        `wrench` and `rows` are as in `Samples`.
+        `load` and `rows` are as in `Samples`.
         """
         if not len(times):
             return
         self._place[self._members] = 0
-        waiting: Sequence[int] | _Array | NDArray[np.int64] = self._members
-        while len(waiting):
+        self._queue[:] = self._members
+        queue = self._queue
+        while len(queue):
             self._progress[:] = 0
             samples = Samples(
-                self._params, self._states, self._saved, self._totals, times, wrench, rows, self._place,
-                np.array(waiting), self._progress, self._other,
+                self._params, self._states, self._totals, times, load, rows, self._place, queue, self._progress,
+                self._other,
             )  # fmt: skip
             terms = self._terms
             arguments = (
@@ -82,7 +83,9 @@ class LaneTwins:
             if self._kernel is None:
                 self._kernel = for_arguments(advance_lanes, arguments)
             pace.run(self._kernel, arguments)
-            waiting = self._advance_others(len(times), alone) if self._progress[1] else ()
+            if not self._progress[1]:
+                return
+            queue = np.array(self._advance_others(len(times), alone), np.int64)
 
     def _advance_others(self, count: int, alone: Callable[[int, int], None]) -> list[int]:
         """Advance each twin without a lane to its next time; return those that have not reached all `count` times."""

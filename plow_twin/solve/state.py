@@ -323,20 +323,25 @@ TOTALS: Final = np.dtype(
 FOLLOWED: Final = 1
 WITH_INTERVALS: Final = 2
 
-#: A row of output: the motion at one time, and the sums since the previous row. The solver passes these rows on to the
-#: messages.
+#: The motion at the end of an advance, and the sums over it; the rows of twins in lanes.
+_ADVANCE_FIELDS: Final[list[tuple[Any, ...]]] = [
+    ("t", "f8"),
+    ("q", "f8", (3,)),
+    ("v", "f8", (3,)),
+    *((name, "f8", (PAIR_COUNT,)) for name in ("penetration", "rate", "force", "peak", "impulse")),
+    ("time_in_contact", "f8", (PAIR_COUNT,)),
+    ("makes", "i8", (PAIR_COUNT,)),
+    ("wear_depth", "f8", (PAIR_COUNT,)),
+    ("steps", "i8"),
+    ("status", "i8"),
+    ("error_estimate", "f8"),
+]
+ADVANCE: Final = np.dtype(_ADVANCE_FIELDS)
+
+#: A row of `ADVANCE` with the further values of a published message; the solver passes these rows on to the messages.
 ROW: Final = np.dtype(
     [
-        ("t", "f8"),
-        ("q", "f8", (3,)),
-        ("v", "f8", (3,)),
-        *((name, "f8", (PAIR_COUNT,)) for name in ("penetration", "rate", "force", "peak", "impulse")),
-        ("time_in_contact", "f8", (PAIR_COUNT,)),
-        ("makes", "i8", (PAIR_COUNT,)),
-        ("wear_depth", "f8", (PAIR_COUNT,)),
-        ("steps", "i8"),
-        ("status", "i8"),
-        ("error_estimate", "f8"),
+        *_ADVANCE_FIELDS,
         # in a published row (`solve.totals.publish`) `makes` counts touches since the beginning; impulse and peak cover
         # the time since the previous publication
         ("stamp_ns", "i8"),

@@ -11,9 +11,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.kernel.arrays import copy_into, copy_record, unowned
+from plow_twin.kernel.arrays import copy_into, unowned
 from plow_twin.kernel.compiler import kernel
-from plow_twin.kernel.simd import below, choose, exact_row, exact_splat, fused, set_row
+from plow_twin.kernel.simd import below, choose, exact_row, exact_splat, fused, set_row, transpose
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.dense_output import pair_outputs
 from plow_twin.solve.kinematics import pose_of
@@ -31,13 +31,14 @@ from plow_twin.solve.lanes.maps import choose_maps, note_durations
 from plow_twin.solve.lanes.record import (
     COMPONENTS,
     WIDTH,
+    join_lanes,
     linear_at,
     load_lane,
+    note_modes,
     penetration_at,
-    save_lane,
+    save_lanes,
     weigh_lanes,
     write_place,
-    write_state,
 )
 from plow_twin.solve.lanes.series import accurate_steps, accurate_steps_by_power, expand, raised
 from plow_twin.solve.lanes.totals import add_step, sum_step
@@ -57,17 +58,23 @@ _BUDGET: Final = int(Status.BUDGET)
 _AT_SAMPLE: Final = 7
 
 
+class Load(NamedTuple):
+    """The samples of the load of all twins."""
+
+    before: NDArray[np.float64]  #: previous sample, Fx, Fy [N] and M [N m] about the cavity's centre, shape (m, 3)
+    samples: NDArray[np.float64]  #: shape (m, n, 3), or (1, n, 3) for all twins
+    masses: NDArray[np.float64]  #: mass, mass and inertia of each twin, shape (m, 3)
+
+
 class Samples(NamedTuple):
     """The samples through which twins are advanced, and the progress of each twin."""
 
     params: NDArray[np.void]  #: parameters of all twins, shape (m,)
     states: NDArray[np.void]
-    saved: NDArray[np.void]  #: states at the previous sample, by lane, shape (8,)
     totals: NDArray[np.void]  #: counts of touches since the previous sample, by lane, shape (8,)
     times: NDArray[np.float64]  #: times of the samples in s, shape (n,)
-    #: load per mass and inertia at the previous sample and at the samples, shape (m, n + 1, 3)
-    wrench: NDArray[np.float64]
-    rows: NDArray[np.void]  #: rows to fill, shape (m, n)
+    load: Load
+    rows: NDArray[np.void]  #: rows of `ADVANCE` to fill, shape (m, n)
     place: NDArray[np.int64]  #: number of samples that each twin has passed, shape (m,)
     queue: NDArray[np.int64]  #: indices of the twins that wait for a lane
     #: first the number of twins taken from the queue, then the number of twins that left for another method
@@ -78,70 +85,134 @@ class Samples(NamedTuple):
 @kernel(inline="source")
 def _unowned_samples(s):
     """Return the arrays without reference counts."""
+    load = Load(unowned(s.load.before), unowned(s.load.samples), unowned(s.load.masses))
     return Samples(
-        unowned(s.params), unowned(s.states), unowned(s.saved), unowned(s.totals), unowned(s.times), unowned(s.wrench),
-        unowned(s.rows), unowned(s.place), unowned(s.queue), unowned(s.progress), unowned(s.other),
+        unowned(s.params), unowned(s.states), unowned(s.totals), unowned(s.times), load, unowned(s.rows),
+        unowned(s.place), unowned(s.queue), unowned(s.progress), unowned(s.other),
     )  # fmt: skip
 
 
 @kernel()
-def _begin_sample(s, lanes, lane) -> None:
-    """Make the load of a lane linear up to the next sample, and save the lane's present state."""
-    member = lanes.member[lane]
-    i, state = s.place[member], s.states[member]
-    lanes.stop[lane], lanes.knot[lane], lanes.before[lane] = s.times[i], lanes.time[lane], state.steps
-    copy_record(s.saved[lane], state)
-    span = lanes.stop[lane] - lanes.knot[lane]
-    per_span = 1.0 / span if span > _SHORTEST_SPAN else 0.0
+def _begin_samples(s, lanes, bits) -> None:
+    """Make the loads of some lanes linear up to their next samples, and keep the lanes' present states."""
+    samples = s.load.samples
     for j in range(3):
-        before = s.wrench[member, i, j]
-        lanes.sample[j, lane] = before
-        lanes.slope[j, lane] = (s.wrench[member, i + 1, j] - before) * per_span
+        set_row(lanes.sample, j, choose(bits, exact_row(lanes.next, j), exact_row(lanes.sample, j)))
+    for lane in range(WIDTH):
+        if bits >> lane & 1:
+            member = lanes.member[lane]
+            i, own, state = s.place[member], member if samples.shape[0] > 1 else 0, s.states[member]
+            lanes.stop[lane], lanes.kept_touched[lane] = s.times[i], lanes.touched[lane]
+            for j in range(3):
+                lanes.next[j, lane] = samples[own, i, j]
+            _keep_counts(state, lanes, lane)
+    time, stop, zero = exact_row(lanes.time, 0), exact_row(lanes.stop, 0), exact_splat(0.0)
+    span = stop - time
+    per_span = choose(below(exact_splat(_SHORTEST_SPAN), span), exact_splat(1.0) / span, zero)
+    for j in range(3):
+        after = exact_row(lanes.next, j)
+        after = choose(bits, after / exact_row(lanes.mass, j), after)
+        set_row(lanes.next, j, after)
+        slope = (after - exact_row(lanes.sample, j)) * per_span
+        set_row(lanes.slope, j, choose(bits, slope, exact_row(lanes.slope, j)))
+    set_row(lanes.knot, 0, choose(bits, time, exact_row(lanes.knot, 0)))
+    for i in range(PAIR_COUNT):
+        _keep(lanes, i, exact_row(lanes.y, i), bits)
+        _keep(lanes, PAIR_COUNT + i, exact_row(lanes.factor, i), bits)
+        _keep(lanes, 2 * PAIR_COUNT + i, exact_row(lanes.mode, i), bits)
+    _keep(lanes, 3 * PAIR_COUNT, exact_row(lanes.touch_time, 0), bits)
+    _keep(lanes, 3 * PAIR_COUNT + 1, exact_row(lanes.before_it, 0), bits)
+
+
+@kernel(inline="code")
+def _keep(lanes, i, value, bits) -> None:
+    set_row(lanes.kept, i, choose(bits, value, exact_row(lanes.kept, i)))
+
+
+@kernel(inline="code")
+def _keep_counts(state, lanes, lane) -> None:
+    counts = lanes.counts
+    counts[0, lane], counts[1, lane], counts[2, lane] = state.steps, state.evaluations, state.events
+    counts[3, lane], counts[4, lane] = state.guard_roots, state.recoveries
+    counts[5, lane] = state.events_at_once
 
 
 @kernel()
-def _load_next(s, lanes, lane) -> None:
-    """Move the next waiting twin into a lane."""
-    member = s.queue[s.progress[0]]
-    s.progress[0] += 1
-    p = s.params[member]
-    load_lane(p, s.states[member], s.totals[lane], lanes, lane, member)
-    lanes.small[lane], lanes.stale[0] = _VANISHED * p.threshold[p.order], 1
-    _begin_sample(s, lanes, lane)
+def _load_waiting(s, power, lanes) -> bool:
+    """Move waiting twins into empty lanes, and begin their advances; return whether any was waiting."""
+    bits = 0
+    for lane in range(WIDTH):
+        if lanes.member[lane] < 0 and s.progress[0] < s.queue.size:
+            member = s.queue[s.progress[0]]
+            s.progress[0] += 1
+            p = s.params[member]
+            load_lane(p, s.states[member], power, lanes, lane, member)
+            lanes.small[lane] = _VANISHED * p.threshold[p.order]
+            i, before = s.place[member], s.load.before
+            own = member if s.load.samples.shape[0] > 1 else 0
+            for j in range(3):
+                lanes.mass[j, lane] = s.load.masses[member, j]
+                lanes.next[j, lane] = before[member, j] if i == 0 else s.load.samples[own, i - 1, j]
+            bits |= 1 << lane
+    if bits == 0:
+        return False
+    for j in range(3):
+        before_it = exact_row(lanes.next, j)
+        set_row(lanes.next, j, choose(bits, before_it / exact_row(lanes.mass, j), before_it))
+    join_lanes(lanes, bits)
+    _begin_samples(s, lanes, bits)
+    return True
 
 
 @kernel()
-def _clear_sums(s, lanes, lane) -> None:
-    """Clear the sums of a row."""
+def _clear_sums(s, lanes, bits) -> None:
+    """Clear the sums of the rows of some lanes."""
+    zero = exact_splat(0.0)
     for pair in range(PAIR_COUNT):
-        lanes.peak[pair, lane] = lanes.impulse[pair, lane] = lanes.time_in_contact[pair, lane] = 0.0
-        s.totals[lane].makes[pair] = 0
-    s.totals[lane].logged = 0
+        set_row(lanes.peak, pair, choose(bits, zero, exact_row(lanes.peak, pair)))
+        set_row(lanes.impulse, pair, choose(bits, zero, exact_row(lanes.impulse, pair)))
+        set_row(lanes.time_in_contact, pair, choose(bits, zero, exact_row(lanes.time_in_contact, pair)))
+    for lane in range(WIDTH):
+        sums = s.totals[lane]
+        if bits >> lane & 1 and sums.logged != 0:
+            sums.logged = 0
+            set_row(sums.makes, 0, zero)
 
 
 @kernel()
 def _leave(s, lanes, lane) -> None:
-    """Take a twin out of its lane, and set it back to its state at the previous sample."""
-    member = lanes.member[lane]
-    _clear_sums(s, lanes, lane)
-    save_lane(s.states[member], s.totals[lane], lanes, lane)
-    copy_record(s.states[member], s.saved[lane])
+    """Set a twin back to its state at the previous sample, and take it out of its lane; `note_modes` must follow."""
+    state, kept, counts = s.states[lanes.member[lane]], lanes.kept, lanes.counts
+    for i in range(PAIR_COUNT):
+        lanes.y[i, lane], lanes.factor[i, lane] = kept[i, lane], kept[PAIR_COUNT + i, lane]
+    bit = 1 << lane
+    for i in range(PAIR_COUNT):
+        set_row(lanes.mode, i, choose(bit, exact_row(kept, 2 * PAIR_COUNT + i), exact_row(lanes.mode, i)))
+    lanes.time[lane], lanes.touched[lane] = lanes.knot[lane], lanes.kept_touched[lane]
+    lanes.touch_time[lane], state.last_step_size = kept[3 * PAIR_COUNT, lane], kept[3 * PAIR_COUNT + 1, lane]
+    state.steps, state.evaluations, state.events = counts[0, lane], counts[1, lane], counts[2, lane]
+    state.guard_roots, state.recoveries, state.events_at_once = counts[3, lane], counts[4, lane], counts[5, lane]
+    _clear_sums(s, lanes, bit)
+    save_lanes(s.states, lanes, bit)
 
 
 @kernel()
 def _fail(s, lanes, lane, code) -> None:
     """Undo a failed advance: the twin keeps its state, with the time of the next sample, and waits for a lane again."""
     member = lanes.member[lane]
-    i, steps = s.place[member], s.states[member].steps - lanes.before[lane]
+    i, steps = s.place[member], s.states[member].steps - lanes.counts[0, lane]
     _leave(s, lanes, lane)
-    p, state, out = s.params[member], s.states[member], s.rows[member, i]
+    p, state, out, zero = s.params[member], s.states[member], s.rows[member, i], exact_splat(0.0)
     state.touch_time += s.times[i] - state.time
     state.step_start = state.time = s.times[i]
-    out.t, out.status, out.steps = s.times[i], code, steps
+    out.t, out.status, out.steps, out.error_estimate = s.times[i], code, steps, 0.0
     pose_of(p, state.y, None, out.q, out.v)
     copy_into(out.wear_depth, state.wear_depth)
     pair_outputs(p, state, out.wear_depth, state.y, out.penetration, out.rate, out.force)
     copy_into(out.peak, out.force)
+    set_row(out.impulse, 0, zero)
+    set_row(out.time_in_contact, 0, zero)
+    set_row(out.makes, 0, zero)
     s.place[member] += 1
     if s.place[member] < s.times.size:
         s.progress[0] -= 1
@@ -183,58 +254,64 @@ def _tell(lanes, reached, viscous, hysteretic, power, fraction) -> None:
 
 
 @kernel()
-def _write_row(s, lanes, lane) -> None:
-    """Write the row of the sample that a lane has reached."""
-    member = lanes.member[lane]
-    state, sums, i, told, now = s.states[member], s.totals[lane], s.place[member], lanes.told, lanes.out
-    out = s.rows[member, i]
-    out.t, out.status, out.steps = s.times[i], _OK, state.steps - lanes.before[lane]
-    out.q[0], out.q[1], out.q[2] = now[X, lane], now[Y, lane], now[THETA, lane]
-    out.v[0], out.v[1], out.v[2] = now[VX, lane], now[VY, lane], now[OMEGA, lane]
-    set_row(out.wear_depth, 0, exact_row(state.wear_depth, 0))
-    for pair in range(PAIR_COUNT):
-        out.penetration[pair], out.rate[pair], out.force[pair] = (
-            told[0, pair, lane],
-            told[1, pair, lane],
-            told[2, pair, lane],
-        )
-        out.peak[pair], out.impulse[pair] = lanes.peak[pair, lane], lanes.impulse[pair, lane]
-        out.time_in_contact[pair], out.makes[pair] = lanes.time_in_contact[pair, lane], sums.makes[pair]
-
-
-@kernel()
-def _clear_reached(s, lanes, reached) -> None:
-    """Clear the sums of the lanes that have reached a sample."""
-    zero = exact_splat(0.0)
-    for pair in range(PAIR_COUNT):
-        set_row(lanes.peak, pair, choose(reached, zero, exact_row(lanes.peak, pair)))
-        set_row(lanes.impulse, pair, choose(reached, zero, exact_row(lanes.impulse, pair)))
-        set_row(lanes.time_in_contact, pair, choose(reached, zero, exact_row(lanes.time_in_contact, pair)))
+def _write_rows(s, lanes, reached) -> None:
+    """Write the rows of the samples that lanes have reached."""
+    turned = lanes.turned
+    transpose(turned[0], lanes.out)
+    for i in range(3):
+        transpose(turned[1 + i], lanes.told[i])
+    transpose(turned[4], lanes.peak)
+    transpose(turned[5], lanes.impulse)
+    transpose(turned[6], lanes.time_in_contact)
     for lane in range(WIDTH):
-        sums = s.totals[lane]
-        if reached >> lane & 1 and sums.logged != 0:
-            sums.logged = 0
-            for pair in range(PAIR_COUNT):
-                sums.makes[pair] = 0
+        if reached >> lane & 1:
+            member = lanes.member[lane]
+            state, now = s.states[member], turned[0, lane]
+            i = s.place[member]
+            out = s.rows[member, i]
+            out.t, out.status, out.steps = s.times[i], _OK, state.steps - lanes.counts[0, lane]
+            out.error_estimate = 0.0
+            out.q[0], out.q[1], out.q[2] = now[X], now[Y], now[THETA]
+            out.v[0], out.v[1], out.v[2] = now[VX], now[VY], now[OMEGA]
+            set_row(out.wear_depth, 0, exact_row(state.wear_depth, 0))
+            set_row(out.penetration, 0, exact_row(turned, WIDTH + lane))
+            set_row(out.rate, 0, exact_row(turned, 2 * WIDTH + lane))
+            set_row(out.force, 0, exact_row(turned, 3 * WIDTH + lane))
+            set_row(out.peak, 0, exact_row(turned, 4 * WIDTH + lane))
+            set_row(out.impulse, 0, exact_row(turned, 5 * WIDTH + lane))
+            set_row(out.time_in_contact, 0, exact_row(turned, 6 * WIDTH + lane))
+            set_row(out.makes, 0, exact_row(s.totals[lane].makes, 0))
 
 
 @kernel()
-def _go_on(s, lanes, lane) -> bool:
-    """Begin the advance of a lane to its next sample; after the last sample its twin leaves.
+def _go_on(s, lanes, reached) -> int:
+    """Begin the advances of lanes to their next samples; after the last sample a twin leaves.
 
-    Returns whether the lane can take a step at once, without another check.
+    Returns a bit for each lane that can take a step at once, without another check.
     """
-    member = lanes.member[lane]
-    state = s.states[member]
-    s.place[member] += 1
-    if s.place[member] == s.times.size:
-        save_lane(state, s.totals[lane], lanes, lane)
-        return False
-    write_state(state, lanes, lane)
-    _begin_sample(s, lanes, lane)
-    left = lanes.stop[lane] - lanes.time[lane]
-    lanes.whole[lane] = min(left, LONGEST_STEP)
-    return left > 0.0
+    over = 0
+    for lane in range(WIDTH):
+        if reached >> lane & 1:
+            member = lanes.member[lane]
+            s.place[member] += 1
+            over |= 1 << lane if s.place[member] == s.times.size else 0
+    if over != 0:
+        save_lanes(s.states, lanes, over)
+    if reached == over:
+        return 0
+    _begin_samples(s, lanes, reached & ~over)
+    return _limit_steps(lanes) & reached & ~over
+
+
+@kernel()
+def _limit_steps(lanes) -> int:
+    """Write the longest wanted step of each lane; return a bit for each lane whose sample is still ahead."""
+    left, longest = exact_row(lanes.stop, 0) - exact_row(lanes.time, 0), exact_splat(LONGEST_STEP)
+    ahead = below(exact_splat(0.0), left)
+    whole = choose(below(left, longest), left, longest)
+    # an empty lane keeps its longest step, so that its results stay finite
+    set_row(lanes.whole, 0, choose(ahead, whole, exact_row(lanes.whole, 0)))
+    return ahead
 
 
 @kernel(inline="source")
@@ -244,62 +321,61 @@ def _is_steady(lanes, lane) -> bool:
 
 
 @kernel()
-def _look(s, rest, lanes, lane, budget, in_range) -> int:
+def _look(s, rest, lanes, lane, budget, in_range, ahead) -> int:
     """Return `OK` if a lane can take a step, `_AT_SAMPLE` if it has reached a sample, else the code of its failure."""
     member = lanes.member[lane]
-    p, state = s.params[member], s.states[member]
-    if not in_range and not lane_in_range(lanes, p, state, lane):
+    state = s.states[member]
+    if not in_range and not lane_in_range(lanes, s.params[member], state, lane):
         return _RANGE
-    left, taken = lanes.stop[lane] - lanes.time[lane], state.steps - lanes.before[lane]
-    if left <= 0.0:
+    taken = state.steps - lanes.counts[0, lane]
+    if not ahead:
         return _AT_SAMPLE
     if taken >= budget:
         return _BUDGET
     if rest is not None:  # noqa: SIM102 - left out by types
         if taken >= _MAY_REST and _is_steady(lanes, lane):
             write_place(state, lanes, lane)
-            if slow_enough(p, state.y):
+            if slow_enough(s.params[member], state.y):
                 return OTHER_METHOD
-    lanes.whole[lane] = min(left, LONGEST_STEP)
     return _OK
 
 
 @kernel()
 def _get_ready(s, viscous, hysteretic, power, fraction, rest, lanes, budget) -> bool:
     """Write the rows of reached samples and fill empty lanes; return whether any lane has a step to take."""
+    left = False
     while True:
-        in_range, reached, live, changed = bits_in_range(lanes), 0, False, False
+        if _load_waiting(s, power, lanes):
+            left = False
+        in_range, ahead, reached, live, changed = bits_in_range(lanes), _limit_steps(lanes), 0, 0, False
         for lane in range(WIDTH):
             if lanes.member[lane] < 0:
-                if s.progress[0] < s.queue.size:
-                    _load_next(s, lanes, lane)
-                    changed = True
                 continue
-            code = _look(s, rest, lanes, lane, budget, in_range >> lane & 1 == 1)
+            code = _look(s, rest, lanes, lane, budget, in_range >> lane & 1 == 1, ahead >> lane & 1 == 1)
             if code == _OK:
-                live = True
+                live |= 1 << lane
             elif code == _AT_SAMPLE:
                 reached |= 1 << lane
             elif code == OTHER_METHOD:
                 s.other[s.progress[1]] = lanes.member[lane]
                 s.progress[1] += 1
                 _leave(s, lanes, lane)
-                changed = True
+                changed = left = True
             else:
                 _fail(s, lanes, lane, code)
-                changed = True
+                changed = left = True
         if reached != 0:
             _tell(lanes, reached, viscous, hysteretic, power, fraction)
-            for lane in range(WIDTH):
-                if reached >> lane & 1:
-                    _write_row(s, lanes, lane)
-            _clear_reached(s, lanes, reached)
-            for lane in range(WIDTH):
-                if reached >> lane & 1:
-                    ready = _go_on(s, lanes, lane)
-                    live, changed = live or ready, changed or not ready
+            _write_rows(s, lanes, reached)
+            _clear_sums(s, lanes, reached)
+            ready = _go_on(s, lanes, reached)
+            live |= ready
+            changed |= ready != reached
+            left |= ready != reached
         if not changed:
-            return live
+            if left and live != 0:
+                note_modes(lanes)
+            return live != 0
 
 
 @kernel()
@@ -309,11 +385,12 @@ def _step(s, viscous, hysteretic, power, fraction, order, lanes, w) -> None:
     for j in range(3):
         sampled = fused(exact_row(lanes.slope, j), time, exact_row(lanes.sample, j))
         set_row(lanes.held, j, exact_row(lanes.constant, j) + sampled)
-    if hysteretic is None and power is None and lanes.stale[0] == 1:
-        weigh_lanes(lanes)
+    if lanes.stale[0] == 1:
+        if hysteretic is None and power is None:
+            weigh_lanes(lanes)
         lanes.stale[0] = 0
     if fraction is not None:
-        choose_maps(s.params, None, None, None, None, hysteretic, fraction, 1, lanes, w)
+        choose_maps(None, None, None, None, hysteretic, fraction, 1, lanes, w)
     used = expand(lanes, w, order, None, None, viscous, hysteretic, power, fraction, 1)
     if power is None:
         infinite = accurate_steps(s.params, lanes, order)
@@ -323,6 +400,7 @@ def _step(s, viscous, hysteretic, power, fraction, order, lanes, w) -> None:
         for lane in range(WIDTH):
             if infinite >> lane & 1:
                 _fail(s, lanes, lane, _NON_FINITE)
+        note_modes(lanes)
     first_events(s.states, lanes, w, used, order, hysteretic, power, fraction)
     go_past_an_instant(s.params, s.states, lanes)
     note_switches(lanes, used, viscous, fraction)
@@ -335,6 +413,8 @@ def _step(s, viscous, hysteretic, power, fraction, order, lanes, w) -> None:
         member = lanes.member[lane]
         if member >= 0:
             complete(s.params[member], s.states[member], s.totals[lane], lanes, lane, hysteretic, fraction)
+    if lanes.stale[0] == 1:
+        note_modes(lanes)
 
 
 @kernel(entry=True)

@@ -17,10 +17,11 @@ from plow_twin.solve.lanes.maps import choose_maps, duration_of, note_durations,
 from plow_twin.solve.lanes.record import (
     COMPONENTS,
     WIDTH,
+    join_lanes,
     load_lane,
     note_modes,
     penetration_at,
-    save_lane,
+    save_lanes,
     weigh_lanes,
     write_place,
 )
@@ -223,7 +224,10 @@ def end_of(lanes, lane, fraction):
 
 @kernel()
 def complete(p, state, sums, lanes, lane, hysteretic, fraction) -> None:
-    """Move the time, counts and modes of a lane to the end of its step; its state must already be there."""
+    """Move the time, counts and modes of a lane to the end of its step; its state must already be there.
+
+    If modes change, `lanes.stale` is set, and `note_modes` must follow.
+    """
     begin, parted = lanes.time[lane], False
     state.steps += 1
     state.evaluations += lanes.orders[lane]
@@ -246,7 +250,6 @@ def complete(p, state, sums, lanes, lane, hysteretic, fraction) -> None:
     else:
         state.events_at_once = state.events_at_once + 1 if at_once else 0
         _switch(p, state, sums, lanes, lane, hysteretic, fraction)
-    note_modes(p, lanes, lane)
     lanes.stale[0] = 1
 
 
@@ -276,9 +279,13 @@ def go_past_an_instant(params, states, lanes) -> None:
 def _leave(members, lanes, w, order, lane, code, t) -> None:
     """Take the scene out of a lane and record its status; if it is at the end, write the remaining rows."""
     member = lanes.member[lane]
-    p, state = members.params[member], members.states[member]
+    p, state, totals = members.params[member], members.states[member], members.totals[member]
     find_peaks(lanes, w, order - 1)
-    save_lane(state, members.totals[member], lanes, lane)
+    for pair in range(PAIR_COUNT):
+        totals.peak[pair], totals.impulse[pair] = lanes.peak[pair, lane], lanes.impulse[pair, lane]
+        totals.time_in_contact[pair] = lanes.time_in_contact[pair, lane]
+    save_lanes(members.states, lanes, 1 << lane)
+    note_modes(lanes)
     members.status[member] = _OK if code == _DONE else code
     if code != _DONE:
         return
@@ -305,6 +312,17 @@ def _unowned_members(members):
     )
 
 
+@kernel()
+def _load(members, power, lanes, lane, member) -> None:
+    """Put a scene and its sums into a lane."""
+    totals = members.totals[member]
+    load_lane(members.params[member], members.states[member], power, lanes, lane, member)
+    join_lanes(lanes, 1 << lane)
+    for pair in range(PAIR_COUNT):
+        lanes.peak[pair, lane], lanes.impulse[pair, lane] = totals.peak[pair], totals.impulse[pair]
+        lanes.time_in_contact[pair, lane] = totals.time_in_contact[pair]
+
+
 @kernel(entry=True)
 def run_lanes(
     members, waves, second, viscous, hysteretic, power, fraction, flight, rest, order, lanes, w, queue, t_end, budget,
@@ -328,10 +346,8 @@ def run_lanes(
                         break
                     member = queue[waiting]
                     waiting += 1
-                    load_lane(
-                        members.params[member], members.states[member], members.totals[member], lanes, lane, member
-                    )
-                    sure, lanes.stale[0] = False, 1
+                    _load(members, power, lanes, lane, member)
+                    sure = False
                 code = _look(members, flight, rest, lanes, lane, w, t_end, budget, sure)
                 if code == _OK:
                     live += 1
@@ -339,8 +355,9 @@ def run_lanes(
                 _leave(members, lanes, w, order, lane, code, t)
         if live == 0:
             return True
-        if lanes.stale[0] == 1 and hysteretic is None and power is None:
-            weigh_lanes(lanes)
+        if lanes.stale[0] == 1:
+            if hysteretic is None and power is None:
+                weigh_lanes(lanes)
             lanes.stale[0] = 0
         _step(members, waves, second, viscous, hysteretic, power, fraction, order, lanes, w, t)
     for lane in range(WIDTH):
@@ -353,9 +370,7 @@ def run_lanes(
 def _step(members, waves, second, viscous, hysteretic, power, fraction, order, lanes, w, t) -> None:
     """Take one step in each lane."""
     if fraction is not None:
-        choose_maps(
-            members.params, members.harmonics, members.extent, waves, second, hysteretic, fraction, None, lanes, w
-        )
+        choose_maps(members.harmonics, members.extent, waves, second, hysteretic, fraction, None, lanes, w)
     if waves is not None:
         expand_loads(members.harmonics, members.extent, second, fraction, lanes, w, order)
     expand(lanes, w, order, waves, second, viscous, hysteretic, power, fraction, None)
@@ -388,3 +403,5 @@ def _step(members, waves, second, viscous, hysteretic, power, fraction, order, l
         if member >= 0:
             p, state, sums = members.params[member], members.states[member], members.totals[member]
             complete(p, state, sums, lanes, lane, hysteretic, fraction)
+    if lanes.stale[0] == 1:
+        note_modes(lanes)

@@ -49,14 +49,14 @@ def sigma_of(lanes, lane, used, fraction) -> float:
 
 
 @kernel()
-def choose_maps(params, harmonics, extent, waves, second, hysteretic, fraction, segments, lanes, w) -> None:
+def choose_maps(harmonics, extent, waves, second, hysteretic, fraction, segments, lanes, w) -> None:
     """Choose each lane's variable, and convert `lanes.whole` to a value of it.
 
     A pair that is ON, but too shallow for a series of its power, is RELEASED.
     """
     shallow, near = _look_at_pairs(lanes)
     if shallow != 0:
-        _release(params, lanes)
+        _release(lanes)
         shallow, near = _look_at_pairs(lanes)
     for lane in range(WIDTH):
         touches = lanes.touched[lane] != 0
@@ -133,19 +133,19 @@ def _look_at_pairs(lanes):
 
 
 @kernel()
-def _release(params, lanes) -> None:
+def _release(lanes) -> None:
     """Release the pairs that are too shallow."""
+    found = False
     for lane in range(WIDTH):
-        member, found = lanes.member[lane], False
-        if member < 0:
+        if lanes.member[lane] < 0:
             continue
         for slot in range(PAIR_COUNT):
             rests_on_power = lanes.taken[slot] & ~lanes.touching[slot]
             if rests_on_power >> lane & 1 and not lanes.depth[slot, 0, lane] > SHALLOW * lanes.release[lane]:
                 lanes.mode[lanes.slot[slot, lane], lane] = RELEASED
                 found = True
-        if found:
-            note_modes(params[member], lanes, lane)
+    if found:
+        note_modes(lanes)
 
 
 @kernel()

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.polynomial import sum_to_bernstein
-from plow_twin.kernel.simd import choose, exact_row, exact_splat, fused, set_row
+from plow_twin.kernel.simd import choose, equal, exact_row, exact_splat, fused, lowest_bit, set_row, transpose
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.compiled_scene import CompiledScene, options
 from plow_twin.solve.state import COS, MAX_ORDER, OFF, ON, Terms, new_records
@@ -32,6 +32,11 @@ MOST_LACUNA: Final = 6
 _ROWS: Final = MAX_ORDER + 1
 _PAIRS: Final = (PAIR_COUNT, WIDTH)
 _LANES_OF: Final = (WIDTH,)
+#: Blocks of `staged`: five rows of the penetrations, two of the arms, then state, lambda, modes, and whether a pair can
+#: touch.
+_ARM, _Y, _FACTOR, _MODE, _ENABLED, _BLOCKS = 5, 7, 8, 9, 10, 11
+#: Numbers of events, steps and searches that are set back if an advance fails.
+COUNTS: Final = 6
 
 LANES: Final = np.dtype(
     [
@@ -59,6 +64,8 @@ LANES: Final = np.dtype(
         ("slope", "f8", (3, WIDTH)),  # sampled loads: slope from the previous sample to the next sample
         ("sample", "f8", (3, WIDTH)),  # sampled loads: value at the previous sample
         ("held", "f8", (3, WIDTH)),  # load at the step's start, including the constant loads
+        ("next", "f8", (3, WIDTH)),  # sampled loads: value at the next sample
+        ("mass", "f8", (3, WIDTH)),  # sampled loads: mass, mass and inertia
         ("knot", "f8", _LANES_OF),  # sampled loads: time of the previous sample
         ("small", "f8", _LANES_OF),  # size below which a term over the longest wanted step counts as vanished
         ("direction", "f8", (4, WIDTH)),
@@ -89,9 +96,16 @@ LANES: Final = np.dtype(
         ("time_in_contact", "f8", _PAIRS),
         ("out", "f8", (COMPONENTS, WIDTH)),  # values of one scene at eight instants, or of eight scenes
         ("told", "f8", (3, PAIR_COUNT, WIDTH)),  # penetration, rate, force
+        # blocks whose rows are lanes and whose columns are pairs or components, and the transposed blocks
+        ("staged", "f8", (_BLOCKS, WIDTH, PAIR_COUNT)),
+        ("turned", "f8", (_BLOCKS, PAIR_COUNT, WIDTH)),
+        # state, lambda, modes, `touch_time` and `before_it` at the previous sample
+        ("kept", "f8", (3 * PAIR_COUNT + 2, WIDTH)),
         ("time", "f8", _LANES_OF),
         ("member", "i8", _LANES_OF),  # the scene in a lane, -1 for an empty lane
         ("mode", "i8", _PAIRS),
+        ("enabled", "i8", _PAIRS),  # 1 if the pair can touch
+        ("filled", "i8", _LANES_OF),  # number of slots that a lane's pairs fill
         ("switch", "i8", _PAIRS),  # modes that pairs take at the step's end, -1 for no change
         ("on", "i8", (PAIR_COUNT,)),  # a bit for each lane in which the pair is ON
         ("off", "i8", (PAIR_COUNT,)),  # a bit for each lane in which the pair is OFF and can touch
@@ -108,7 +122,9 @@ LANES: Final = np.dtype(
         ("bulge_pair", "i8", _LANES_OF),
         ("bulge_lane", "i8", _LANES_OF),
         ("orders", "i8", _LANES_OF),  # order of each lane's series; the terms beyond have vanished
-        ("before", "i8", _LANES_OF),  # number of steps up to the previous sample
+        # at the previous sample: steps, evaluations, events, searches of roots, recoveries, events at one instant
+        ("counts", "i8", (COUNTS, WIDTH)),
+        ("kept_touched", "i8", _LANES_OF),  # `touched` at the previous sample
         ("carrying", "i8", _LANES_OF),  # a bit for each pair that is ON
         # the following fields are used only for exponents other than 1
         ("power", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # d^n of each slot's pairs
@@ -170,20 +186,20 @@ def new_lanes() -> NDArray[np.void]:
 
 
 @kernel()
-def load_lane(p, state, totals, lanes, lane, member) -> None:
-    """Put a scene into a lane."""
-    lanes.member[lane] = member
-    for i in range(COMPONENTS):
-        lanes.y[i, lane] = state.y[i]
-    lanes.time[lane] = state.step_start
-    for pair in range(PAIR_COUNT):
-        for i in range(5):
-            lanes.rows[pair, i, lane] = p.penetration_rows[i, pair]
-        lanes.rows[pair, 4, lane] -= state.wear_depth[pair]
-        lanes.arms[pair, 0, lane], lanes.arms[pair, 1, lane] = p.arm_rows[0, pair], p.arm_rows[1, pair]
-        lanes.mode[pair, lane], lanes.factor[pair, lane] = state.mode[pair], state.damping_factor[pair]
-        lanes.peak[pair, lane], lanes.impulse[pair, lane] = totals.peak[pair], totals.impulse[pair]
-        lanes.time_in_contact[pair, lane] = totals.time_in_contact[pair]
+def load_lane(p, state, power, lanes, lane, member) -> None:
+    """Put a scene into a lane; `join_lanes` must follow."""
+    lanes.member[lane], lanes.time[lane] = member, state.step_start
+    for i in range(5):
+        constant = exact_row(p.penetration_rows, i)
+        if i == 4:
+            constant = constant - exact_row(state.wear_depth, 0)
+        set_row(lanes.staged, WIDTH * i + lane, constant)
+    for i in range(2):
+        set_row(lanes.staged, WIDTH * (_ARM + i) + lane, exact_row(p.arm_rows, i))
+    set_row(lanes.staged, WIDTH * _Y + lane, exact_row(state.y, 0))
+    set_row(lanes.staged, WIDTH * _FACTOR + lane, exact_row(state.damping_factor, 0))
+    set_row(lanes.staged, WIDTH * _MODE + lane, exact_row(state.mode, 0))
+    set_row(lanes.staged, WIDTH * _ENABLED + lane, exact_row(p.enabled, 0))
     for j in range(3):
         lanes.constant[j, lane] = p.constant[j]
     for i in range(2):
@@ -193,14 +209,37 @@ def load_lane(p, state, totals, lanes, lane, member) -> None:
     lanes.radius[lane], lanes.weight[lane] = p.radius, p.weight
     lanes.stiffness[lane], lanes.viscous[lane] = p.stiffness, p.viscous
     lanes.half_cavity[lane] = p.half_cavity
-    lanes.exponent[lane], lanes.release[lane] = p.exponent, p.release
-    for i in range(MOST_LACUNA):
-        lanes.threshold[i, lane] = p.threshold[p.order - i] if i < p.lacuna else np.inf
-    lanes.stretch[lane] = math.log2(p.velocity_tolerance / (p.position_tolerance * (p.order + 1)))
+    if power is not None:
+        lanes.exponent[lane], lanes.release[lane] = p.exponent, p.release
+        for i in range(MOST_LACUNA):
+            lanes.threshold[i, lane] = p.threshold[p.order - i] if i < p.lacuna else np.inf
+        lanes.stretch[lane] = math.log2(p.velocity_tolerance / (p.position_tolerance * (p.order + 1)))
     lanes.before_it[lane], lanes.touch_time[lane] = state.last_step_size, state.touch_time
     lanes.touched[lane] = state.touching
     state.in_flight = state.at_rest = 0
-    note_modes(p, lanes, lane)
+
+
+@kernel()
+def join_lanes(lanes, bits) -> None:
+    """Spread the staged numbers of newly loaded lanes over the rows of all lanes, and note the modes."""
+    for block in range(_BLOCKS):
+        transpose(lanes.turned[block], lanes.staged[block])
+    turned = lanes.turned
+    for pair in range(PAIR_COUNT):
+        for i in range(5):
+            at = 5 * pair + i
+            set_row(lanes.rows, at, choose(bits, exact_row(turned, WIDTH * i + pair), exact_row(lanes.rows, at)))
+        for i in range(2):
+            at, new = 2 * pair + i, exact_row(turned, WIDTH * (_ARM + i) + pair)
+            set_row(lanes.arms, at, choose(bits, new, exact_row(lanes.arms, at)))
+        set_row(lanes.y, pair, choose(bits, exact_row(turned, WIDTH * _Y + pair), exact_row(lanes.y, pair)))
+        factor, mode = exact_row(turned, WIDTH * _FACTOR + pair), exact_row(turned, WIDTH * _MODE + pair)
+        set_row(lanes.factor, pair, choose(bits, factor, exact_row(lanes.factor, pair)))
+        set_row(lanes.mode, pair, choose(bits, mode, exact_row(lanes.mode, pair)))
+        enabled = exact_row(turned, WIDTH * _ENABLED + pair)
+        set_row(lanes.enabled, pair, choose(bits, enabled, exact_row(lanes.enabled, pair)))
+    note_modes(lanes)
+    lanes.stale[0] = 1
 
 
 @kernel()
@@ -212,55 +251,47 @@ def write_place(state, lanes, lane) -> None:
 
 
 @kernel()
-def write_state(state, lanes, lane) -> None:
-    """Write the whole state of a lane to a state's record."""
-    write_place(state, lanes, lane)
-    state.time = lanes.time[lane]
-    state.touching, state.touch_time = lanes.touched[lane], lanes.touch_time[lane]
-    for pair in range(PAIR_COUNT):
-        state.mode[pair], state.damping_factor[pair] = lanes.mode[pair, lane], lanes.factor[pair, lane]
+def save_lanes(states, lanes, bits) -> None:
+    """Write the states of some lanes to their records, and empty these lanes; `note_modes` must follow."""
+    transpose(lanes.turned[0], lanes.y)
+    transpose(lanes.turned[1], lanes.factor)
+    transpose(lanes.turned[2], lanes.mode)
+    for lane in range(WIDTH):
+        if bits >> lane & 1:
+            state = states[lanes.member[lane]]
+            set_row(state.y, 0, exact_row(lanes.turned, lane))
+            set_row(state.damping_factor, 0, exact_row(lanes.turned, WIDTH + lane))
+            set_row(state.mode, 0, exact_row(lanes.turned, 2 * WIDTH + lane))
+            state.step_start = state.time = lanes.time[lane]
+            state.touching, state.touch_time = lanes.touched[lane], lanes.touch_time[lane]
+            lanes.member[lane], lanes.touched[lane] = -1, 0
 
 
 @kernel()
-def save_lane(state, totals, lanes, lane) -> None:
-    """Write the state and totals of a lane to their records, and empty the lane."""
-    write_state(state, lanes, lane)
+def note_modes(lanes) -> None:
+    """Derive the guards of all lanes from the modes of their pairs, and put the pairs that are ON into slots."""
+    live, damped = 0, exact_row(lanes.viscous, 0) / exact_row(lanes.stiffness, 0)
+    for lane in range(WIDTH):
+        live |= 1 << lane if lanes.member[lane] >= 0 else 0
+        lanes.inside[lane] = lanes.carrying[lane] = lanes.watched[lane] = lanes.filled[lane] = 0
     for pair in range(PAIR_COUNT):
-        totals.peak[pair], totals.impulse[pair] = lanes.peak[pair, lane], lanes.impulse[pair, lane]
-        totals.time_in_contact[pair] = lanes.time_in_contact[pair, lane]
-    clear_lane(lanes, lane)
-
-
-@kernel()
-def clear_lane(lanes, lane) -> None:
-    """Empty a lane."""
-    lanes.member[lane], lanes.watched[lane], lanes.touched[lane], rest = -1, 0, 0, ~(1 << lane)
-    for pair in range(PAIR_COUNT):
-        lanes.on[pair] &= rest
-        lanes.off[pair] &= rest
-        lanes.taken[pair] &= rest
-
-
-@kernel()
-def note_modes(p, lanes, lane) -> None:
-    """Derive the guards of a lane from the modes of its pairs, and put the pairs that are ON into slots."""
-    bit, inside, carrying, taken, watched = 1 << lane, 0, 0, 0, 0
-    for pair in range(PAIR_COUNT):
-        mode, rest = lanes.mode[pair, lane], ~bit
-        lanes.ratio[pair, lane] = p.viscous / p.stiffness if mode == ON else 0.0
-        lanes.on[pair] = lanes.on[pair] & rest | (bit if mode == ON else 0)
-        lanes.off[pair] = lanes.off[pair] & rest | (bit if mode == OFF and p.enabled[pair] != 0 else 0)
-        lanes.taken[pair] &= rest
-        inside += 0 if mode == OFF else 1
-        if mode == ON:
-            carrying |= 1 << pair
-            _take_slot(lanes, lane, pair, taken)
-            taken += 1
-        elif mode != OFF:
-            watched |= 1 << pair | 1 << SECOND + pair
-    for slot in range(taken):
-        lanes.taken[slot] |= bit
-    lanes.inside[lane], lanes.carrying[lane], lanes.watched[lane] = inside, carrying, watched
+        on, off = equal(lanes.mode, pair, ON) & live, equal(lanes.mode, pair, OFF) & live
+        set_row(lanes.ratio, pair, choose(on, damped, exact_splat(0.0)))
+        lanes.on[pair], lanes.off[pair] = on, off & ~equal(lanes.enabled, pair, 0)
+        lanes.taken[pair], left = 0, live & ~off
+        while left != 0:
+            lane = lowest_bit(left)
+            left &= left - 1
+            lanes.inside[lane] += 1
+            if on >> lane & 1:
+                lanes.carrying[lane] |= 1 << pair
+                _take_slot(lanes, lane, pair, lanes.filled[lane])
+                lanes.filled[lane] += 1
+            else:
+                lanes.watched[lane] |= 1 << pair | 1 << SECOND + pair
+    for lane in range(WIDTH):
+        for slot in range(lanes.filled[lane]):
+            lanes.taken[slot] |= 1 << lane
 
 
 @kernel()
