@@ -7,14 +7,31 @@ formatting of an error message, which takes 2 s in each process that compiles a 
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Callable
-from typing import Any, cast
+from typing import Any, Final, cast
 
 from llvmlite import ir
 from numba.core import cgutils, types
+from numba.core.typing.arraydecl import GetItemBuffer, SetItemBuffer
+from numba.core.typing.templates import infer_global
 from numba.extending import intrinsic
 
 from plow_twin.kernel.compiler import kernel
+
+#: Numba tries templates of the processor first. Its own templates for arrays come after seven for other types, which
+#: take a fifth of the compile time.
+_FIRST: Final = {"target": "cpu"}
+
+
+@infer_global(operator.getitem)  # type: ignore[no-untyped-call]
+class _ArrayItem(GetItemBuffer):
+    metadata = _FIRST
+
+
+@infer_global(operator.setitem)  # type: ignore[no-untyped-call]
+class _SetArrayItem(SetItemBuffer):
+    metadata = _FIRST
 
 
 def _unowned(typingctx: Any, array: Any) -> Any:

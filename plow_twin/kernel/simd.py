@@ -374,6 +374,9 @@ def _elementwise(operation: Callable[..., Any], emit: str) -> None:
 
     @infer_global(operation)
     class _Typing(AbstractTemplate):
+        # numba tries templates of the processor before its general templates, of which an operator has twenty
+        metadata = {"target": "cpu"}  # noqa: RUF012
+
         def generic(self, args: tuple[Any, ...], kws: Any) -> Any:
             known = all(isinstance(kind, (Lanes, types.Float, types.Integer)) for kind in args)
             found = {kind for kind in args if isinstance(kind, Lanes)}
