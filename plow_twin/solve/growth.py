@@ -1,4 +1,4 @@
-"""Products of the fundamental matrices of a motion's stretches, and the growth of errors since earlier times."""
+"""Growth of errors along a motion, from the fundamental matrices of successive stretches of time."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import Final
 from plow_twin.kernel.arrays import copy_into
 from plow_twin.kernel.compiler import kernel
 
-#: Largest number of earlier times from which growth is followed; when the number is reached, every second time is
-#: dropped.
+#: Largest number of earlier times since which the growth of errors is computed; when this number is reached, every
+#: second of these times is dropped.
 MOST_KEPT: Final = 256
-#: Largest number of squarings of a matrix; with it, singular values closer than 1e-6 are not distinguished. The
-#: iteration ends earlier if the square of the matrix, scaled to trace 1, has a trace above `_RANK_ONE`: the matrix then
-#: has rank one.
+#: Largest number of squarings of a matrix; after this number, singular values whose ratio is within 1e-6 of 1 still
+#: count as equal. Squaring ends earlier if the matrix, scaled to trace 1, has a square whose trace is above
+#: `_RANK_ONE`: the matrix then has rank one.
 _SQUARINGS, _RANK_ONE = 18, 1.0 - 1e-9
 
 
@@ -32,8 +32,9 @@ def _multiply(a, b, out) -> None:
 def _larger_norm(a, height, most, gram, power, square) -> float:
     """Return the larger of `most` and the largest singular value of the first `height` rows of a matrix.
 
-    With G = A^T A the square of the largest singular value lies between trace(G^(m+1)) / trace(G^m) and
-    trace(G^m)^(1/m). G is squared until the upper bound is below `most`, or until the power has rank one.
+    With A the matrix of these rows and G = A^T A, the square of the largest singular value lies between trace(G^(m+1))
+    / trace(G^m) and trace(G^m)^(1/m). G is squared repeatedly until the root of the upper bound is below `most`, or
+    until the power of G has rank one.
     """
     size, trace = a.shape[1], 0.0
     for i in range(size):
@@ -110,7 +111,7 @@ def _largest(grown, count, height, scratch) -> float:
 
 @kernel()
 def _stretch_basis(matrix, basis, moved, logs) -> None:
-    """Multiply a basis by a matrix and orthonormalise it; write the logarithms of its vectors' stretching."""
+    """Multiply a basis by a matrix and orthonormalise it; write the log of each vector's stretching factor."""
     size = len(matrix)
     _multiply(matrix, basis, moved)
     for j in range(size):
@@ -133,21 +134,22 @@ def _stretch_basis(matrix, basis, moved, logs) -> None:
 
 @kernel(entry=True)
 def follow_growth(matrices, changes, ends, since, kept, whole, basis, scratch, totals, rows, growth, logs) -> None:
-    """Multiply the products by n fundamental matrices, one after another.
+    """For n times in turn, compute products of fundamental matrices and the growth of errors.
 
     Parameters
     ----------
     matrices : ndarray, shape (n, k, k)
-        Fundamental matrices since the end of the last whole stretch.
+        Fundamental matrices from the end of the last whole stretch to the time of each row.
     changes : ndarray, shape (n, p, k)
-        Effects of the parameters since then.
+        Effects of the parameters on the state since the end of the last whole stretch.
     ends : ndarray of int64, shape (n,)
-        1 for a row at the end of a stretch. The other rows describe the stretch so far, and their growth is computed
-        from places without rates.
+        1 for a row at the end of a stretch. The other rows lie within a stretch; of the errors at their time, growth
+        counts those of places but not those of rates.
     since : ndarray, shape (2, k, m, k)
-        since[0, :, i, :] are the products since earlier times, i < `kept[0]`; since[1] is scratch space.
+        since[0, :, i, :] is the product of the fundamental matrices since earlier time i, for i < `kept[0]`; since[1]
+        is scratch space.
     kept : ndarray of int64, shape (1,)
-        Number of the earlier times.
+        Number of earlier times in `since`.
     whole : tuple of ndarray, shapes (k, k) and (p, k)
         Fundamental matrix and effects of the parameters over all whole stretches, renewed at the end of each.
     basis : ndarray, shape (k, k)
@@ -156,7 +158,7 @@ def follow_growth(matrices, changes, ends, since, kept, whole, basis, scratch, t
         Scratch space, with at least m numbers beyond the first five matrices.
     totals, rows, growth, logs : ndarray, shapes (n, k, k), (n, p, k), (n,) and (n, k)
         Receive the products, the effects of the parameters, the largest growth since an earlier time, and the
-        logarithms of the basis' stretching.
+        logarithms of the factors by which the basis vectors are stretched.
     """
     most = since.shape[2]
     for index in range(len(matrices)):

@@ -1,6 +1,7 @@
 """Kinematics of the head: penetrations, their rates, and conversions between body and world axes.
 
-`rows` are coefficients of cosine, sine and place (`model.geometry`).
+`rows` are the coefficients of each pair for cosine and sine of the head's angle and for its place x, y
+(`model.geometry`).
 """
 
 from __future__ import annotations
@@ -14,11 +15,11 @@ from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import row, splat
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, X, Y
 
-#: A quarter turn in rad, after which each corner of a tumbling block takes the name of the next corner.
+#: A quarter turn in rad; each time a tumbling block has turned by it, each corner takes the name of the next corner.
 QUARTER_TURN = 0.5 * math.pi
 
 
-#: 1 if the state is in world axes, as for a head that carries corners; otherwise None.
+#: 1 if the state is in world axes, as it is for a head that carries corners; None if it is in the head's axes.
 fixed_axes = by_field("tumbles", lambda p: 1, lambda p: None)
 #: Whether the head may turn beyond 45 degrees (`model.geometry.tumbles`).
 may_tumble = by_field("tumbles", lambda p: p.tumbles != 0.0, lambda p: False)
@@ -31,7 +32,7 @@ _roll = by_field("roll", lambda p: p.roll, lambda p: 0.0)
 
 @kernel(inline="code")
 def along(p, c, s):
-    """Return cosine and sine of the angle of the state's axes, where (c, s) are those of the head's axes."""
+    """Return cosine and sine of the angle of the state's axes; (c, s) belong to the head's axes."""
     if fixed_axes(p) is not None:
         return 1.0, 0.0
     return c, s
@@ -49,7 +50,8 @@ def spin_of_axes(p, omega):
 def named_angle(p, y, theta):
     """Return theta less the quarter turns by which the corners have been renamed (`solve.tumbling`).
 
-    y has the cosine and sine of this angle. The angle of a head that carries walls is theta itself.
+    The body coordinates y contain the cosine and sine of the returned angle. For a head that carries walls, theta
+    itself is returned.
     """
     if fixed_axes(p) is not None:
         turns = np.rint((y[THETA] - math.atan2(y[SIN], y[COS])) / QUARTER_TURN)
@@ -59,19 +61,19 @@ def named_angle(p, y, theta):
 
 @kernel(inline="source")
 def row_value(rows, pair, c, s, x, y):
-    """Return rows . (c, s, x, y) of one pair."""
+    """Return the scalar product of one pair's rows with (c, s, x, y)."""
     return rows[0, pair] * c + rows[1, pair] * s + rows[2, pair] * x + rows[3, pair] * y
 
 
 @kernel(fast=True)
 def row_values(rows, c, s, x, y):
-    """Return rows . (c, s, x, y) of all pairs side by side."""
+    """Return the scalar products of all pairs' rows with (c, s, x, y), side by side."""
     return (row(rows, 0) * c + row(rows, 1) * s) + (row(rows, 2) * x + row(rows, 3) * y)
 
 
 @kernel(inline="source")
 def row_rate(p, rows, pair, c, s, omega, x, y, vx, vy):
-    """Return the rate of rows . (c, s, x, y) of one pair."""
+    """Return the rate of change of one pair's `row_value`."""
     spin = spin_of_axes(p, omega)
     return row_value(rows, pair, -omega * s, omega * c, vx + spin * y, vy - spin * x)
 
@@ -96,7 +98,7 @@ def slip_rate(p, pair, c, s, omega, x, y, vx, vy):
 
 @kernel(inline="code")
 def slip_arm(p, pair, c, s, x, y):
-    """Return the arm in m of a force along the wall at a corner's touching point."""
+    """Return the moment arm in m of a force that acts along the wall at a corner's touching point."""
     arm = row_value(p.slip_arm_rows, pair, c, s, x, y)
     if _is_rounded(p) is not None:
         arm -= _roll(p)
@@ -105,7 +107,7 @@ def slip_arm(p, pair, c, s, x, y):
 
 @kernel(fast=True, inline="code")
 def rolled(p, values, angle):
-    """Add the part due to rounded corners, proportional to the angle or its rate, to all places or slip rates."""
+    """Add to all places or slip rates the part due to rounded corners, proportional to `angle` or its rate."""
     if _is_rounded(p) is not None:
         values = values + splat(_roll(p) * angle)
     return values
@@ -113,7 +115,7 @@ def rolled(p, values, angle):
 
 @kernel(fast=True, inline="code")
 def slip_arms(p, arms, k):
-    """Return order k of all pairs' arms (`slip_arm`) from the arms of sharp corners; only order 0 differs."""
+    """Return series order k of all pairs' arms (`slip_arm`), given that of sharp corners; only order 0 differs."""
     if _is_rounded(p) is not None and k == 0:
         arms = arms - splat(_roll(p))
     return arms

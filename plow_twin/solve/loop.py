@@ -39,7 +39,7 @@ def _end(p, parts, state, w, totals, log) -> None:
 
 @kernel(inline="source")
 def _next(p, parts, state, w, stop_time, budget) -> int:
-    """Lay out the next step, unless the motion is within a step."""
+    """Lay out the next step, unless the motion is within a step; return a `Status`."""
     if state.step_size >= 0.0:
         return _OK
     if state.steps >= budget:
@@ -67,7 +67,7 @@ def _present(p, harmonics, flight, support, state, w, y) -> None:
 def _proceed(p, parts, state, w, totals, target, stop_time, budget) -> int:
     """Advance the motion to `target`, by steps that may reach beyond it up to `stop_time`; return a `Status`.
 
-    Without totals nothing is counted, and the motion is the same.
+    Without `totals` (None) no impulses, peaks and times are summed; the motion is the same.
     """
     while True:
         t0 = state.step_start
@@ -92,7 +92,7 @@ def _proceed(p, parts, state, w, totals, target, stop_time, budget) -> int:
 
 @kernel()
 def _worn_at(state, w, wear, sigma, out) -> None:
-    """Write each pad's wear depth at sigma of the current step."""
+    """Write each pad's wear depth at the value `sigma` of the current step's variable."""
     if wear is not None:
         wear_depth_at(state, w, sigma, out)
     else:
@@ -138,8 +138,8 @@ def _advance(p, parts, states, index, saved, w, totals, target, stop_time, budge
     """Start or continue an advance to `target`; return a `Status` and the number of steps of the advance.
 
     If the advance fails, the time becomes `target`, the head keeps its state, and nothing is counted. `saved` is an
-    array of one record. With a bound, a used-up budget is no failure, because the rest is computed by a few coarse
-    steps.
+    array of one record, for the state before the advance. If there is a `bound`, a used-up budget is no failure,
+    because the rest of the advance is computed by a few coarse steps.
     """
     state = states[index]
     if pace.underway == 0:
@@ -210,20 +210,20 @@ def _follow_line(piece, start, time, before, sample) -> None:
 def advance_rows(
     params, parts, states, saved, work, totals, first, last, times, wrench, budget, rows, marks, snapshots, bound, pace
 ) -> bool:
-    """Advance members `first` to `last` - 1 to each time; a single twin is one member, with the same bits.
+    """Advance members `first` to `last` - 1 to each time; a twin alone gets the same bits as in a group.
 
     Parameters
     ----------
     params, states : ndarray of records, shape (m,)
         Constants and states of all members.
     saved, work, totals : ndarray of records, shape (1,)
-        The state before the present advance, scratch space and sums. Without totals (None) nothing is counted or read
-        out, and the motion is the same.
+        The state before the present advance, scratch space and sums. Without `totals` (None) nothing is summed or read
+        out; the motion is the same.
     times : ndarray, shape (n,)
         Times in s, not decreasing.
     wrench : ndarray, shape (m, n + 1, 3), or None
-        Samples of the load per mass and inertia, joined by straight lines: the previous sample, then a sample at each
-        time, which ends a step. None for the scene's own loads.
+        Samples of the load per mass and inertia, joined by straight lines: the sample before the first time, then the
+        sample at each time. A step ends at each of these times. None for the scene's own loads.
     rows : ndarray of `ROW`, shape (m, n), or None
         Receives the motion and the totals at each time; None without totals.
     marks : ndarray of int64, shape (k,)
@@ -290,7 +290,8 @@ def interrupt_step(p, parts, state, w, totals) -> None:
 def lay_out_again(p, parts, state, w) -> None:
     """Compute the current step again after a restore, because its series are not part of the state.
 
-    Only under the scene's own loads can a saved state lie within a step, and these steps have no stop time.
+    A saved state can lie within a step only if the loads are the scene's own, and steps under these loads have no stop
+    time.
     """
     if state.at_rest == 1:
         write_rest(p, state, w)

@@ -1,7 +1,7 @@
 """Many live twins in lanes under sampled loads: a twin advances from sample to sample and writes a row at each sample.
 
-If a load is sampled frequently, a step ends at the next sample long before its series loses accuracy. So a series is
-ended at the order whose terms vanish over this step (`series.expand`).
+If a load is sampled frequently, a step ends at the next sample long before its series loses accuracy. A series is
+therefore cut off at the order from which its terms are negligible over this step (`series.expand`).
 """
 
 from __future__ import annotations
@@ -46,10 +46,11 @@ from plow_twin.solve.method.rest import slow_enough
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, Status, X, Y
 from plow_twin.solve.step import LONGEST_STEP
 
-#: If the way to a sample takes more than this number of steps, rest is checked under a constant load; the check costs
-#: as much as these steps.
+#: Under a constant load, a lane that has taken this number of steps towards a sample is checked for rest; the check
+#: costs as much as these steps.
 _MAY_REST: Final = 32
-#: A term has vanished if it is below this share of the admissible size of the last order (`method.series`).
+#: A term of a series counts as vanished if it is below this share of the admissible size of the last order's term
+#: (`method.series`).
 _VANISHED: Final = 0.4
 _SHORTEST_SPAN: Final = 1e-100
 
@@ -198,7 +199,7 @@ def _leave(s, lanes, lane) -> None:
 
 @kernel()
 def _fail(s, lanes, lane, code) -> None:
-    """Undo a failed advance: the twin keeps its state, with the time of the next sample, and waits for a lane again."""
+    """Undo a failed advance: the twin has its old state at the next sample's time, and is queued again."""
     member = lanes.member[lane]
     i, steps = s.place[member], s.states[member].steps - lanes.counts[0, lane]
     _leave(s, lanes, lane)
@@ -223,7 +224,7 @@ def _fail(s, lanes, lane, code) -> None:
 def _tell(lanes, reached, viscous, hysteretic, power, fraction) -> None:
     """Write poses and rates of all lanes to `lanes.out`; write penetrations, their rates and forces to `lanes.told`.
 
-    In lanes that have `reached` a sample, the force at the sample raises the peak.
+    `reached` has a bit for each lane that is at a sample; there the force at the sample is included in the peak.
     """
     for i in range(COMPONENTS):
         set_row(lanes.out, i, exact_row(lanes.y, i))
@@ -424,8 +425,8 @@ def advance_lanes(
     """Advance the twins in the queue through all samples, eight at a time; return False if `iterations` are used up.
 
     `eight` and `work`, shape (1,), are lanes and scratch space. `budget` is the largest number of steps of an advance
-    to a sample. If an advance fails, the twin keeps its state and its time goes on. A twin at rest leaves its lane
-    before the advance, for another method (`Samples.other`).
+    to a sample. If an advance fails, the twin keeps its state, and its time becomes that of the sample. A twin at rest
+    leaves its lane in its state at the previous sample, and another method continues it (`Samples.other`).
     """
     s, lanes, w = _unowned_samples(s), eight[0], work[0]
     for _ in range(iterations):

@@ -1,8 +1,9 @@
 """The first event of each lane's step.
 
-Few guards can turn negative within a step. Each lane lists these guards, and each round searches eight of them, of any
-lanes. If a CLIPPED or RELEASED pair parts, the step does not end, because no force changes; the rest of the step is
-then searched for the pair's next touch.
+An event is the instant at which a guard, a function of the motion, turns negative. Few guards can do so within a step:
+each lane lists these guards, and each round searches eight of them, of any lanes. If a CLIPPED or RELEASED pair parts
+from its wall, the step does not end, because no force changes; the rest of the step is then searched for the pair's
+next touch.
 """
 
 from __future__ import annotations
@@ -33,8 +34,8 @@ _AT_ONCE = 1e-12
 #: is below `_ROUNDED`, a rounding error.
 _FOUND, _STRAIGHT, _ROUNDED = 1e-6, 1e-3, 2e-16
 _MOST_CHANGES = 80
-#: A root found over a longer step lies beyond the present step, whatever the rounding, if it exceeds the step by this
-#: factor.
+#: If the step has been shortened since the search for a root began, the root certainly lies beyond the step, whatever
+#: the rounding, if it exceeds the step by this factor.
 _SURELY_LATER = 1.0 + 1e-9
 #: Indices in `lanes.chosen` after the five rows of a penetration: factor of d, factor of d', further constant.
 _DEPTH, _RATE, _CONSTANT = 5, 6, 7
@@ -44,9 +45,10 @@ _DEPTH, _RATE, _CONSTANT = 5, 6, 7
 def _list_guards(lanes, order, hysteretic, power, fraction) -> None:
     """Write to `lanes.todo` a bit for each guard of a lane that may turn negative.
 
-    The guard of a pair that is OFF is -d. A pair that is ON has the guard F / K = d + (C / K) d', or with lambda d' the
-    two guards d and 1 + lambda d'. The guards of a CLIPPED pair are d and the force with the opposite sign, those of a
-    RELEASED pair (`modes`) d and the distance to the release penetration.
+    The guard of a pair that is OFF is -d, where d is the penetration. A pair that is ON has the guard F / K = d + (C /
+    K) d' or, if the damping is lambda d', the two guards d and 1 + lambda d'. A CLIPPED pair has the guards d and the
+    force with the opposite sign. A RELEASED pair (`modes`) has the guards d and the distance to the release
+    penetration.
     """
     for lane in range(WIDTH):
         lanes.todo[lane] = lanes.watched[lane]
@@ -92,9 +94,10 @@ def _list_powers(lanes, order, hysteretic, fraction) -> None:
 
 @kernel()
 def _may_end(series, factor, first, order, h):
-    """Return a bit for each lane whose guard, `first` and `factor` times the series' terms, may turn negative.
+    """Return a bit for each lane whose guard may turn negative.
 
-    The test is that of `_write_guard`.
+    Term 0 of the guard is `first`, its other terms are those of `series` times `factor`. The test is that of
+    `_write_guard`.
     """
     reach = term = exact_splat(0.0)
     for k in range(order, 0, -1):
@@ -152,9 +155,9 @@ def _row_of(array, k, places):
 def _write_guard(lanes, places, rows, of_depth, of_rate, constant, guard, order, h, fraction):
     """Write to `guard` the series of the guards `of_depth` d + `of_rate` d' + `constant`, with the penetrations d.
 
-    `places` has the guards' lanes; None means one guard of each lane in turn. Returns a bit for each guard that may
-    turn negative. A guard g stays positive on [0, h] if g_0 and g_0 + g_1 h - sum over k > 1 of max(-g_k, 0) h^k are
-    positive, because this lower bound is concave in h.
+    `places` has the lanes to which the guards belong; None means one guard of each lane in turn. Returns a bit for each
+    guard that may turn negative. A guard g stays positive on [0, h] if g_0 and g_0 + g_1 h - sum over k > 1 of
+    max(-g_k, 0) h^k are positive, because this lower bound is concave in h.
     """
     cosine, sine, x, y = lanes.series[COS], lanes.series[SIN], lanes.series[X], lanes.series[Y]
     reach = term = deeper = zero = exact_splat(0.0)
@@ -168,8 +171,8 @@ def _write_guard(lanes, places, rows, of_depth, of_rate, constant, guard, order,
             term = fused(of_rate * (k + 1.0), deeper, of_depth * depth)
             deeper = depth
         else:
-            # the variable of the series may be a root of time, so the rate is no derivative of this series and has one
-            # of its own
+            # the series may be in a root of time instead of time; the rate d' is then not the derivative of this
+            # series, but has a series of its own
             term = of_depth * depth
             if damped != 0 and k < order:
                 deeper = linear_at(
@@ -218,7 +221,7 @@ def _choose_guards(lanes, at, hysteretic, fraction) -> int:
 
 @kernel()
 def _write_choice(lanes, lane, guard, i, hysteretic, fraction) -> None:
-    """Write the factors of guard `i` of a round and the end of its search."""
+    """Write guard number `i` of a round: factors of d and d', constant, and the interval to search."""
     chosen, pair = lanes.chosen, guard % PAIR_COUNT
     mode, sign, constant, rate = lanes.mode[pair, lane], 1.0, 0.0, lanes.viscous[lane] / lanes.stiffness[lane]
     begin = 0.0
@@ -243,7 +246,7 @@ def _write_choice(lanes, lane, guard, i, hysteretic, fraction) -> None:
 
 @kernel()
 def _allowance(lanes, pair, lane, mode) -> float:
-    """Return the constant in a pair's guard d for exponents that are not integers (`solve.events`)."""
+    """Return the constant that is added to a pair's guard d if the exponent is no integer (`solve.events`)."""
     rows, y, let_go = lanes.rows[pair], lanes.y, LET_GO * lanes.release[lane]
     depth = rows[0, lane] * y[COS, lane] + rows[1, lane] * y[SIN, lane] + rows[4, lane]
     depth = max(depth + rows[2, lane] * y[X, lane] + rows[3, lane] * y[Y, lane], 0.0)
@@ -272,8 +275,9 @@ def _shift(lanes, guard, order, again, fraction) -> None:
 def isolate(lanes, column, w, order, bits):
     """Return the bits of lanes whose column has one root in [0, reach), and of lanes that may have several.
 
-    The root of the chord is written to `root`. The number of sign changes of the Bernstein coefficients is the number
-    of roots, or larger by an even number.
+    `column` has one polynomial for each lane. The root of the chord between the Bernstein coefficients that change sign
+    is written to `lanes.root`. The number of sign changes of these coefficients is the number of roots, or larger by an
+    even number.
     """
     h, b, zero = exact_row(lanes.reach, 0), lanes.bernstein, exact_splat(0.0)
     to_bernstein(lanes, column, w, order, h)
@@ -298,7 +302,8 @@ def isolate(lanes, column, w, order, bits):
 def cross(lanes, column, order, bits) -> None:
     """Find each column's only root in [0, reach] by Halley's method kept within the bracket (`polynomial`)."""
     low, high, x, zero = exact_splat(0.0), exact_row(lanes.reach, 0), exact_row(lanes.root, 0), exact_splat(0.0)
-    # of a column that falls from a double zero at its start, each change would only leave a third of x
+    # if a polynomial falls from a double zero at 0, each change would only reduce x to a third, so the root is set to 0
+    # at once
     falls_from_zero = below(exact_row(column, 2), zero) & ~below(zero, magnitude(exact_row(column, 0)))
     x = choose(falls_from_zero & ~below(zero, magnitude(exact_row(column, 1))), zero, x)
     open_bits = bits & below(zero, x)
@@ -356,8 +361,8 @@ def _note_root(lanes, lane, at, i, order) -> None:
 def first_events(states, lanes, w, order, full, hysteretic, power, fraction) -> None:
     """Shorten each lane's step to end at its first event; write the guard to `lanes.event`, or -1 without an event.
 
-    `order` is the order of the series. Guards always have `full` orders, the largest, because the bits of their
-    Bernstein coefficients depend on the number of orders.
+    `order` is the order of the series. Guards always have the largest number of orders, `full`, because the rounding of
+    their Bernstein coefficients would otherwise depend on `order`.
     """
     never = exact_splat(np.inf)
     for pair in range(PAIR_COUNT):
@@ -380,7 +385,7 @@ def first_events(states, lanes, w, order, full, hysteretic, power, fraction) -> 
 
 @kernel()
 def _write_chosen(lanes, at, order, full, fraction):
-    """Write the guards of a round; return a bit for each that may turn negative."""
+    """Write the series of a round's guards; return a bit for each guard that may turn negative."""
     chosen, guard, zero = lanes.chosen, lanes.guard[at], exact_splat(0.0)
     places = places_of(lanes.row_place)
     for i in range(5):
@@ -399,7 +404,7 @@ def _write_chosen(lanes, at, order, full, fraction):
 
 @kernel()
 def _search(states, lanes, w, at, order, bits) -> None:
-    """Find the first root of each guard; a guard is searched again if its step has become shorter and this matters."""
+    """Find each guard's first root; search a guard again later if a shorter step may change the result."""
     guard = lanes.guard[at]
     single, several = isolate(lanes, guard, w, order, bits)
     if single != 0:
@@ -474,8 +479,8 @@ def note_switches(lanes, order, viscous, fraction) -> None:
             guard, lane = lanes.guarded[at, i], lanes.owner[at, i]
             if lanes.event[lane] >= 0 and 0 <= guard < AGAIN:
                 pair = guard % PAIR_COUNT
-                # if both guards of a pair end here, the first guard decides: the second is left out for a pair that has
-                # a new mode
+                # if both guards of a pair turn negative here, the first guard decides: the second guard is ignored for
+                # a pair that already has a new mode
                 if lanes.switch[pair, lane] < 0 and lanes.parted[pair, lane] >= lanes.step[lane]:
                     _note_switch(lanes, lane, guard, viscous, fraction)
     for lane in range(WIDTH):

@@ -172,14 +172,14 @@ def _rate(p, lanes, pair, lane) -> float:
 
 @kernel()
 def _touch(p, lanes, pair, lane) -> None:
-    """Start a contact: fix its lambda = D / v0 by the impact speed v0 (`modes.touch`)."""
+    """Start a contact: set its damping lambda = D / v0 from the impact speed v0 (`modes.touch`)."""
     if p.damping_number >= 0.0:
         lanes.factor[pair, lane] = p.damping_number / max(_rate(p, lanes, pair, lane), p.speed_floor)
 
 
 @kernel()
 def _touch_or_release(p, lanes, pair, lane) -> None:
-    """Begin the contact of a pair whose force is d^n; a slow touch begins with a RELEASED pair (`step`)."""
+    """Begin the contact of a pair whose force is d^n; after a slow touch the pair is RELEASED (`step`)."""
     lanes.touched[lane] &= ~(1 << pair)
     if lanes.mode[pair, lane] == ON:
         if _rate(p, lanes, pair, lane) > slow_touch(p):
@@ -209,7 +209,7 @@ def _switch(p, state, sums, lanes, lane, hysteretic, fraction) -> None:
                 _touch_or_release(p, lanes, pair, lane)
             else:
                 lanes.touched[lane] &= ~(1 << pair)
-            # a RELEASED pair counts as ON
+            # a RELEASED pair counts as ON, so a change between RELEASED and ON is not counted
             sums.logged += 0 if old in (ON, RELEASED) and new in (ON, RELEASED) else 1
 
 
@@ -263,7 +263,7 @@ def move(lanes) -> None:
 
 @kernel()
 def go_past_an_instant(params, states, lanes) -> None:
-    """Step beyond an instant at which modes would change back and forth without end, with the present modes."""
+    """Step past an instant at which modes would switch back and forth endlessly; keep the present modes."""
     for lane in range(WIDTH):
         member = lanes.member[lane]
         if member >= 0 and lanes.event[lane] >= 0:
@@ -298,7 +298,7 @@ def _leave(members, lanes, w, order, lane, code, t) -> None:
 
 @kernel(inline="source")
 def _unowned_members(members):
-    """Return the arrays of all scenes without reference counts."""
+    """Return the members with arrays that are not reference counted; the caller keeps them alive."""
     return Members(
         unowned(members.params),
         unowned(members.states),
@@ -330,9 +330,10 @@ def run_lanes(
 ) -> bool:  # fmt: skip
     """Advance the members numbered in `queue` to `t_end`, eight at a time; return False if `iterations` are used up.
 
-    `power` is 1 for exponents other than 1, `fraction` for exponents that are not integers, otherwise they are None.
-    `t` holds the times of the rows, `order` is the series' order, and `budget` the largest number of steps of a scene.
-    A scene leaves its lane with a `Status`, with `OTHER_METHOD` or, when the iterations are used up, with `PAUSED`.
+    `power` is 1 for exponents other than 1, otherwise None; `fraction` is 1 for exponents that are not integers,
+    otherwise None. `t` holds the times of the rows, `order` is the series' order, and `budget` the largest number of
+    steps of a scene. A scene leaves its lane with a `Status`, with `OTHER_METHOD` or, when the iterations are used up,
+    with `PAUSED`.
     """
     members, queue, t = _unowned_members(members), unowned(queue), unowned(t)
     waiting = 0

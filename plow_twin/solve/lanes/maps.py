@@ -1,7 +1,8 @@
 """The variable sigma of each lane's series, if the exponent is not an integer: time, or a root of time.
 
-The time since a step's start is t = alpha sigma + beta sigma^2 / 2 (`method.series`). Near a touch or a separation with
-exponent 1.5 sigma is the root of the time since the touch or of the time left, as in `method.taylor`.
+The time since a step's start is t = alpha sigma + beta sigma^2 / 2 (`method.series`). With exponent 1.5, sigma is
+derived from the square root of the time since a recent touch or of the time left until a near separation, as in
+`method.taylor`.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ def sigma_of(lanes, lane, used, fraction) -> float:
 def choose_maps(harmonics, extent, waves, second, hysteretic, fraction, segments, lanes, w) -> None:
     """Choose each lane's variable, and convert `lanes.whole` to a value of it.
 
-    A pair that is ON, but too shallow for a series of its power, is RELEASED.
+    A pair that is ON becomes RELEASED if its penetration d is too small for a series of d^n.
     """
     shallow, near = _look_at_pairs(lanes)
     if shallow != 0:
@@ -75,7 +76,7 @@ def choose_maps(harmonics, extent, waves, second, hysteretic, fraction, segments
 
 @kernel()
 def _choose_map(lanes, w, lane, order, near) -> None:
-    """Choose the variable of one lane (`method.taylor`)."""
+    """Choose the variable sigma of one lane (`method.taylor`)."""
     span = lanes.whole[lane]
     if lanes.touched[lane] != 0:
         lanes.whole[lane] = math.sqrt(span)
@@ -112,7 +113,7 @@ def _mark_touching(lanes) -> None:
 
 @kernel()
 def _look_at_pairs(lanes):
-    """Return the bits of lanes in which a pair is too shallow for its power, and in which one may part soon."""
+    """Return two masks of lanes: with a pair too shallow for a series of d^n, with a pair that may part soon."""
     _mark_touching(lanes)
     y, zero = lanes.y, exact_splat(0.0)
     c, s, om = exact_row(y, COS), exact_row(y, SIN), exact_row(y, OMEGA)

@@ -19,7 +19,7 @@ from plow_twin.solve.state import COS, MAX_ORDER, OFF, ON, Terms, new_records
 WIDTH: Final = 8
 #: Number of state components in a lane's series.
 COMPONENTS: Final = 8
-#: Indices of the moment's factors of cosine, sine, X and Y.
+#: Indices in `moment` of the factors by which cosine, sine, X and Y are multiplied in the contacts' moment.
 DC, DS, DX, DY = range(4)
 #: Numbering of guards: from 0 the first guards of the eight pairs, from `SECOND` their second guards, from `AGAIN` the
 #: guards of pairs that part within the step and may touch again.
@@ -43,7 +43,7 @@ LANES: Final = np.dtype(
         ("series", "f8", (COMPONENTS, _ROWS, WIDTH)),  # state
         ("moment", "f8", (4, _ROWS, WIDTH)),  # factors of c, s, X and Y in the moment of the contacts
         ("load", "f8", (3, _ROWS, WIDTH)),  # S1, S2, M
-        # penetrations of the pairs in each slot, unless F is linear in d and d'
+        # penetrations of the pairs in each slot; not written if F is linear in d and d'
         ("depth", "f8", (PAIR_COUNT, _ROWS, WIDTH)),
         ("push", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # F / K of the pairs in each slot
         ("guard", "f8", (GUARDS, _ROWS, WIDTH)),  # the eight guards of each round, which may belong to any lanes
@@ -128,7 +128,7 @@ LANES: Final = np.dtype(
         ("carrying", "i8", _LANES_OF),  # a bit for each pair that is ON
         # the following fields are used only for exponents other than 1
         ("power", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # d^n of each slot's pairs
-        # d; for a pair that touches at the step's start, d / sigma^2; d^2 if n is an integer
+        # base of the power: d, or d / sigma^2 for a pair that touches at the step's start; d^2 if n is an integer
         ("base", "f8", (PAIR_COUNT, _ROWS, WIDTH)),
         ("rate", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # d' of each slot's pairs
         ("per_base", "f8", _PAIRS),  # 1 / base at the step's start
@@ -164,7 +164,7 @@ _COVERED: Final = {"harmonics", "second", "viscous", "hysteretic", "integer", "f
 def fits_lanes(compiled: CompiledScene, *, sampled: bool = False) -> bool:
     """Return whether a scene can run in lanes.
 
-    It may have no other terms than those of its law and harmonics (or samples), no ramp, and no `Options`.
+    Its terms must be those of its contact law and of harmonics (or samples); it may have no ramp and no `Options`.
     """
     parts = compiled.parts._replace(terms=compiled.parts.terms._replace(segments=None)) if sampled else compiled.parts
     there = (name for name, term in zip(Terms._fields, parts.terms, strict=True) if term is not None)
@@ -172,7 +172,7 @@ def fits_lanes(compiled: CompiledScene, *, sampled: bool = False) -> bool:
 
 
 def powers(terms: Terms) -> tuple[int | None, int | None]:
-    """Return 1 for exponents other than 1, and 1 for exponents that are not integers, otherwise None."""
+    """Return two flags, 1 or None: for exponents other than 1, and for exponents that are not integers."""
     return 1 if terms.integer or terms.fraction else None, terms.fraction
 
 
@@ -306,7 +306,7 @@ def _take_slot(lanes, lane, pair, slot) -> None:
 
 @kernel()
 def weigh_lanes(lanes) -> None:
-    """Sum the linear maps from the state's orders to the forces' orders over the acting pairs of each lane.
+    """Sum, over each lane's acting pairs, the linear maps from an order of the state to that of the forces.
 
     Along a wall's normal  f = -n F  with  F = K (a c + b s + n Z) + C (a c' + b s' + n Z'),  where Z is X or Y. The
     moment is  c Gc + s Gs - X fy + Y fx,  where Gc and Gs are the sums of the arms' factors times F.

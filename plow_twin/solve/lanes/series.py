@@ -1,9 +1,10 @@
 """Taylor series of eight scenes side by side with the contact modes frozen (equations in `method.series`).
 
-If the contact force is linear in penetration and rate, the sum of a scene's acting pairs is one affine map of the
-state. An order then takes twelve Cauchy products, for any number and choice of acting pairs. With lambda d' the force
-K d (1 + lambda d') is K (d + lambda / 2 (d^2)'), which takes half a product more for each slot, and d^n (1 + lambda d')
-three. A slot holds one acting pair of each lane; the pairs of different lanes in a slot may differ.
+If the contact force is linear in penetration and rate, the sum over a scene's acting pairs is one affine map of the
+state. An order then takes twelve Cauchy products, for any number and choice of acting pairs. A force with the damping
+lambda d' takes more: K d (1 + lambda d') is K (d + lambda / 2 (d^2)'), which takes half a product more for each slot,
+and d^n (1 + lambda d') takes three more. A slot holds one acting pair of each lane; the pairs of different lanes in a
+slot may differ.
 """
 
 from __future__ import annotations
@@ -88,8 +89,9 @@ def expand_loads(harmonics, extent, second, fraction, lanes, w, order) -> None:
 def expand(lanes, w, limit, waves, second, viscous, hysteretic, power, fraction, segments) -> int:
     """Write the series of the state; return the order.
 
-    Under sampled loads the series of a lane ends at the order whose terms vanish over the longest wanted step. Its
-    further terms are zero, so that a lane's bits do not depend on the other lanes' orders.
+    Under sampled loads the series of a lane ends at the order from which its terms are negligible over the longest
+    wanted step. Its further terms are zero, so that a lane's results do not depend, even in the last bit, on the orders
+    of the other lanes.
     """
     series, moment = lanes.series, lanes.moment
     zero = exact_splat(0.0)
@@ -251,7 +253,7 @@ def expand(lanes, w, limit, waves, second, viscous, hysteretic, power, fraction,
 
 @kernel(inline="code")
 def _long_quiet(history) -> int:
-    """Return the bits that are set in each of the last orders but the newest."""
+    """Return a bit for each lane whose terms were negligible in all the orders just before the newest."""
     bits = history
     for i in range(1, MOST_LACUNA - 1):
         bits &= history >> WIDTH * i
@@ -268,7 +270,7 @@ def _set_rates(lanes, k, dx, dy, dc, ds) -> None:
 
 @kernel()
 def _live(lanes) -> int:
-    """Return a bit for each lane that has a scene, and mark no series as ended."""
+    """Return a bit for each lane that has a scene, and mark all series as not yet ended."""
     bits = 0
     for lane in range(WIDTH):
         bits |= 1 << lane if lanes.member[lane] >= 0 else 0
@@ -300,7 +302,7 @@ def _set_state(series, k, x, y, vx, vy, om, c, s, angle) -> None:
 
 @kernel(inline="code")
 def _add_ends(load, k, c0, s0, c, s, share, wc, ws):
-    """Add the first and the newest order to order k of a load's series times cosine and sine."""
+    """Complete order k of a load times cosine and sine by the products with the first and the newest order."""
     first, newest = exact_row(load, 0) * share, exact_row(load, k)
     return fused(newest, c0, fused(first, c, wc)), fused(newest, s0, fused(first, s, ws))
 
@@ -309,8 +311,8 @@ def _add_ends(load, k, c0, s0, c, s, share, wc, ws):
 def _start(lanes, viscous, c, s, x, y, dc, ds, dx, dy):
     """Return order 0 of the contacts' forces along X and Y and of their factors of cosine and sine in the moment.
 
-    They are computed from the same penetrations as the guards. A sum of maps would be rounded differently, so that the
-    force would begin 1e-17 m away from the event.
+    They are computed from the same penetrations as the guards. The summed maps (`weigh_lanes`) would be rounded
+    differently, so that the force would begin 1e-17 m away from the event.
     """
     fx = fy = gc = gs = exact_splat(0.0)
     for slot in range(PAIR_COUNT):
@@ -404,7 +406,7 @@ def _push_by_power(lanes, w, k, acts, hysteretic, fraction, c, s, x, y, dc, ds, 
 
 @kernel(inline="code")
 def _multiply(lanes, slot, k, hysteretic):
-    """Return order k of the penetration's power and of its product with the rate, without the power's order k.
+    """Return order k of d^n and of d^n d'; the latter lacks the product with order k of d^n.
 
     The exponents are integers from 2 to 4, which may differ from lane to lane.
     """
@@ -475,7 +477,7 @@ def _raise(lanes, w, slot, k, hysteretic):
 
 @kernel(inline="code")
 def _invert(lanes, slot, value, bits) -> None:
-    """Keep 1 / `value` in some lanes, 0 in lanes without a pair in the slot."""
+    """Write 1 / `value` for the lanes in `bits`, and 0 for those of them without a pair in the slot."""
     there = choose(lanes.taken[slot], exact_splat(1.0) / value, exact_splat(0.0))
     set_row(lanes.per_base, slot, choose(bits, there, exact_row(lanes.per_base, slot)))
 
@@ -536,7 +538,7 @@ def _size(lanes, vx, vy, om, c, s):
 
 @kernel()
 def accurate_steps(params, lanes, order) -> int:
-    """Write the step over which each lane's series meets its share of the tolerance to `lanes.step`.
+    """Write to `lanes.step` the step over which each lane's series meets its share of the tolerance.
 
     The test is that of `method.step_size.accurate_step`. Returns a bit for each lane whose series is not finite.
     """
@@ -568,7 +570,7 @@ def accurate_steps(params, lanes, order) -> int:
 
 @kernel()
 def _not_too_far(lanes, step):
-    """Shorten the steps in the root of time since a touch (`method.taylor`)."""
+    """Limit the steps whose variable is the square root of the time since a touch (`method.taylor`)."""
     zero, alpha, beta = exact_splat(0.0), exact_row(lanes.alpha, 0), exact_row(lanes.beta, 0)
     furthest = alpha / beta * FURTHEST
     far = below(zero, alpha) & below(zero, beta) & below(furthest, step)

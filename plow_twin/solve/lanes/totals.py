@@ -125,9 +125,9 @@ def _impulses_by_power(lanes, w, slot, order, fraction):
 def _raise_peaks(totals, lanes, w, slot, order, full, on) -> int:
     """Raise the peaks in `lanes.gained` by the series of F / K; return a bit for each lane that was checked.
 
-    If an upper bound of the force exceeds the peak, the larger value at the step's two ends is taken. A force whose
-    maximum may lie between the ends is kept for `find_peaks`. Under samples it is examined at once, because rows need
-    their peaks and steps are short.
+    If an upper bound of the force exceeds the peak so far, the peak is raised to the larger of the forces at the step's
+    two ends. A force whose maximum may lie between the ends is kept for `find_peaks`. Under samples it is examined at
+    once, because rows need their peaks and steps are short.
     """
     h, zero, half, push = exact_row(lanes.step, 0), exact_splat(0.0), exact_splat(0.5), lanes.push[slot]
     end = bend = slope = zero
@@ -164,7 +164,7 @@ def _raise_peaks(totals, lanes, w, slot, order, full, on) -> int:
 
 @kernel()
 def _hull_top(lanes, push, w, order, full):
-    """Return the largest Bernstein coefficient over each lane's step."""
+    """Return the largest Bernstein coefficient of `push`, its upper bound over each lane's step."""
     zero = exact_splat(0.0)
     for k in range(order + 1, full + 1):
         set_row(push, k, zero)
@@ -201,8 +201,8 @@ def _keep_bulge(lanes, push, pair, lane, order) -> None:
 def find_peaks(lanes, w, order) -> None:
     """Raise the peaks by the maxima of the forces in `lanes.bulge`, which are of any lanes and steps.
 
-    A maximum is found as a root of F', independently of the peak so far, so that its bits do not depend on the other
-    lanes.
+    A maximum is found as a root of F', independently of the peak so far, so that it does not depend, even in the last
+    bit, on the other lanes.
     """
     if lanes.bulges[0] == 0:
         return

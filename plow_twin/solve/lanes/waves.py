@@ -33,7 +33,8 @@ _COSINE = (
     -1.13596475577881948265e-11, 2.08757232129817482790e-09, -2.75573143513906633035e-07, 2.48015872894767294178e-05,
     -1.38888888888741095749e-03, 4.16666666666666019037e-02,
 )  # fmt: skip
-#: Interpolation at Chebyshev points of log2 on [1, 2] (error 1.2e-4), and of 2^x on [0, 1] (relative error 3.5e-6).
+#: Polynomials that interpolate at Chebyshev points: log2 on [1, 2] (error 1.2e-4), and 2^x on [0, 1] (relative error
+#: 3.5e-6).
 _LOGARITHM = (
     -0.07844067620915011, 0.6260321821639458, -2.0783351682517304, 4.029211391071475, -2.4983531488141586,
 )  # fmt: skip

@@ -25,9 +25,9 @@ def held(p, state, y, least) -> bool:
 
 @kernel()
 def stiffness_at(p, acts, state, w, gyration) -> None:
-    """Write the accelerations at `w.rest[0]` to `w.rest[1]`.
+    """Write the accelerations at the state `w.rest[0]` to `w.rest[1]`, and the stiffness to `w.hessian`.
 
-    Minus their derivatives with respect to place is written to `w.hessian`.
+    The stiffness is minus the derivatives of these accelerations with respect to place.
 
     The matrix has shape (3, 3). The angle is multiplied by the radius of gyration, which makes the matrix symmetric.
     """
@@ -49,7 +49,7 @@ def stiffness_at(p, acts, state, w, gyration) -> None:
 
 @kernel()
 def stiffer_than(h, least) -> bool:
-    """Return whether the symmetric matrix h exceeds `least` times the unit matrix, by its leading minors' signs."""
+    """Return whether the eigenvalues of the symmetric matrix h exceed `least`, by signs of leading minors."""
     a, b, c = h[0, 0] - least, h[1, 1] - least, h[2, 2] - least
     if not a > 0.0:
         return False

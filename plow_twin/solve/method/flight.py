@@ -32,7 +32,7 @@ def amplitudes(p, one, j):
 
 @kernel()
 def _smallest_gap(p, state) -> float:
-    """Return the smallest distance in m of a pair from touching."""
+    """Return the smallest gap in m of any pair: the distance from touching."""
     y, nearest = state.y, np.inf
     for pair in range(PAIR_COUNT):
         if p.enabled[pair] == 1:
@@ -106,8 +106,8 @@ def safe_time(p, harmonics, state, w, span) -> float:
     z = w.flight[0]
     to_world(p, state.y, z)
     _bounds(p, harmonics, state.step_start, z, w)
-    # the walls turn with the head about its centre of mass, so the leverage includes the head's distance from the
-    # centre
+    # the walls turn with the head about its centre of mass, so the distance of this centre from the origin adds to the
+    # leverage
     leverage = p.leverage + math.hypot(z[0], z[1]) + max(gap, 0.0)
     time = span
     while time >= least:

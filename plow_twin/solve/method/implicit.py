@@ -50,8 +50,8 @@ from plow_twin.solve.support import (
 
 #: Number s of stages, the degree of the polynomials; the method's order is 2 s - 1.
 STAGES = 9
-#: A contact is overdamped if its dampers act this many times faster than its springs. The same ratio decides, when the
-#: scene is compiled, whether the scene can need implicit steps.
+#: A contact is overdamped if the decay rate of its dampers is more than this many times the angular frequency of its
+#: springs. The same ratio decides, when the scene is compiled, whether the scene can need implicit steps.
 OVERDAMPED_RATIO = 20.0
 #: Cost of an implicit step, as a number of explicit steps; an implicit step must be longer than this number of stable
 #: explicit steps.
@@ -62,14 +62,15 @@ _GAIN = 100.0
 _NOISE = 1e-12
 #: Rounding error of a guard of the corners' grip, as a share of its largest term.
 _GUARD_NOISE = 1e-6
-#: Number of failed attempts up to which each attempt doubles the wait for the next attempt.
+#: Number of failed attempts at an implicit step up to which each attempt doubles the wait for the next attempt.
 _MOST_REFUSED = 12
 
 
 def _coefficients(nodes: NDArray[np.longdouble]) -> NDArray[np.longdouble]:
     """Return the matrix that gives a polynomial's coefficients from its values at the nodes, shape (n, n).
 
-    It is the inverse of a Vandermonde matrix, computed in extended precision because it loses half of the digits.
+    It is the inverse of a Vandermonde matrix, computed in extended precision because the inversion loses half of the
+    digits.
     """
     n = len(nodes)
     columns = np.zeros((n, n), np.longdouble)
@@ -191,7 +192,7 @@ def stable_decay(order):
 
 @kernel(inline="source")
 def has_decayed(p, state) -> bool:
-    """Return whether enough decay times have passed since a change of contact for its fast motion to vanish.
+    """Return whether enough decay times have passed since a contact changed for fast motion to vanish.
 
     Each failed attempt of an implicit step doubles the wait.
     """
@@ -231,7 +232,7 @@ def _jacobian(p, acts, state, t, z, implicit, base, out) -> None:
 
 @kernel()
 def _newton_matrix(implicit, h) -> None:
-    """Write the derivatives of the residual with respect to the nodes' velocities; x_i = x_0 + h sum a_ij v_j."""
+    """Write the residual's derivatives by the nodes' velocities v; places are x_i = x_0 + h sum a_ij v_j."""
     a, jacobians, matrix, s = implicit.weights, implicit.jacobians, implicit.matrix, implicit.nodes.size
     n = implicit.accelerations.shape[1]
     for i in range(s):
@@ -302,7 +303,7 @@ def _bodies(p, support, state, implicit, i) -> None:
 
 @kernel()
 def _seen(support, implicit):
-    """Return the body coordinates at the start and the nodes, relative to the frame, on which the pairs depend."""
+    """Return the body coordinates relative to the frame at start and nodes; penetrations depend on them."""
     if support is not None:
         return implicit.seen
     return implicit.body
@@ -404,8 +405,8 @@ def _solve(p, acts, support, state, t, h, implicit, wear, sliding, running_in) -
 def _interpolate(values, coefficients, h, out) -> None:
     """Write the series of eight polynomials, given by their values at the nodes of a step of size h.
 
-    The differences from the last value are interpolated: the large coefficients would cancel the common value, which
-    leaves rounding errors.
+    The differences from the last value are interpolated. Otherwise the large coefficients would have to cancel the part
+    that is common to all values, which leaves rounding errors.
     """
     scale, n = 1.0, len(coefficients)
     last = row(values, n - 1)
@@ -436,7 +437,7 @@ def _series_seen(support, h, w, implicit):
 
 @kernel()
 def _frame_terms(p, support, w, implicit, scale):
-    """Return the frame's `off` and `size` for `_write_series`: velocity left out at the start, last term's size."""
+    """Return, for the frame, the velocity that the series leave out at the start, and the last term's size."""
     off = size = 0.0
     if support is not None:
         s = implicit.nodes.size
@@ -517,9 +518,9 @@ def _write_grip(p, state, h, w, implicit, seen, series) -> None:
 
 @kernel()
 def _last_of_guards(p, state, w, h) -> float:
-    """Return the largest share of the last term in a guard of a corner's grip.
+    """Return the largest ratio of the last term to the largest term in a guard of a corner's grip.
 
-    The term is compared with its guard, since even a small force decides whether a corner slips.
+    The term is compared with terms of its own guard, since even a small force decides whether a corner slips.
     """
     guard, share = w.column[0], 0.0
     for pair in range(PAIR_COUNT):
@@ -599,7 +600,7 @@ def at_most_stable(p, implicit, state, w, sigma):
 
 @kernel()
 def note_step(implicit, state, w, step_size, has_event) -> None:
-    """Record what a laid-out step means for the next implicit step: the decay times passed, and its size."""
+    """Record for the next implicit step: the decay times in the step laid out, and a limit of the size."""
     if implicit is not None:
         note_decay(state, w.decay[0], step_size)
         if has_event:

@@ -32,7 +32,7 @@ from plow_twin.solve.state import Params, Parts, State, Work
 
 
 class Method(Protocol):
-    """A module with these two compiled functions; this module's docstring has the rules of `lay_out`."""
+    """A method is a module with two compiled functions; this module's docstring has the rules of `lay_out`."""
 
     def own(self, parts: Parts) -> Any:
         """Return the parts of a scene for which the method is compiled, with None for each part that it lacks."""

@@ -26,7 +26,7 @@ _SHARE = 1e-3
 _MARGIN = 10.0
 #: Least penetration or gap in m of every pair, so that difference quotients for the stiffness can be computed.
 _DEEP = 1e-7
-#: Largest number of evaluations of the equations of motion in the check.
+#: Largest number of evaluations of the equations of motion in a check for rest.
 AT_REST = 5 + EVALUATIONS
 
 
@@ -48,7 +48,7 @@ def slow_enough(p, y) -> bool:
 
 @kernel()
 def _still(p, acts, harmonics, state, w) -> bool:
-    """Return whether the omitted motion would stay within its share of the tolerances for all time.
+    """Return whether the motion omitted at rest would stay within its share of the tolerances forever.
 
     If so, the head is set to its equilibrium.
     """
@@ -111,7 +111,7 @@ def _lay_out(p, acts, harmonics, rest, state, w, span, penetrating) -> bool:
 
 @kernel()
 def _settle(p, acts, harmonics, state, w) -> bool:
-    """Check whether the head is at rest, and if so set it to its equilibrium; return whether it is."""
+    """Check whether the head is at rest, and if so set it to its equilibrium; return whether it is at rest."""
     if not (state.at_rest == 1 and _still_as_before(p, acts, harmonics, state, w)):
         if not _still(p, acts, harmonics, state, w):
             return False

@@ -37,19 +37,21 @@ from plow_twin.solve.support import (
     start_frame,
 )
 
-#: A term has vanished if it is below this share of the admissible size of the last order.
+#: A term of a series counts as vanished if it is below this share of the admissible size of the last order's term.
 _VANISHED = 0.4
-#: Permutations of the state's lanes, for its rates. `_turned` gives the components that are multiplied by omega (in
-#: lanes 4 and 7 by S1 instead), `_rates_of` the components that are rates of other components.
+#: Permutations of the state's components (lanes of a SIMD vector) for its rates. `_turned` gives the components that
+#: are multiplied by omega (in lanes 4 and 7 by the harmonic load S1 instead), `_rates_of` the components that are rates
+#: of other components.
 _turned = permutation(Y, X, VY, VX, COS, SIN, COS, SIN)
 _rates_of = permutation(VX, VY, VX, VY, OMEGA, COS, SIN, OMEGA)
 
 
 @kernel(fast=True)
 def expand_harmonics(harmonics, second, t, alpha, beta, order, w) -> None:
-    """Write the series of S1, S2 and M to `w.load`.
+    """Write the series of the harmonic loads (S1 and S2 along two directions, moment M) to `w.load`.
 
-    The series of sine and cosine in sigma give each other:  (k+1) sin_{k+1} = omega (alpha cos_k + beta cos_{k-1}).
+    The series of sine and cosine in sigma follow from each other: (k+1) sin_{k+1} = omega (alpha cos_k + beta
+    cos_{k-1}).
     """
     load = w.load
     for k in range(order + 1):
@@ -110,7 +112,8 @@ def _multiply(a, b, k):
 def _raise(w, k, penetration, touching, exponent):
     """Write order k of penetration^exponent of the acting pairs to `w.power[0]`, and return it.
 
-    Row BASE of `w.per_pair` is 1 / d, or half of the root of 1 / d for the exponent 1.5; it is zero for other pairs.
+    Row BASE of `w.per_pair` is 1 / d of the acting pairs, or half of the square root of 1 / d for the exponent 1.5; it
+    is zero for the other pairs.
     """
     if exponent == 1.5:
         # d^1.5 is computed as d times its root, which is less work than the general recurrence
@@ -139,7 +142,7 @@ def _raise(w, k, penetration, touching, exponent):
 
 @kernel(fast=True, inline="code")
 def _damp(p, elastic, w, k, elastic_k, rate, viscous, hysteretic, ramp):
-    """Return order k of the force from order k of d^n:  K d^n (1 + lambda d')  or  K d^n + C psi d'."""
+    """Return order k of K d^n (1 + lambda d') or of K d^n + C psi d', where psi is the acting share of C."""
     force = row(w.per_pair, ACTS) * elastic_k
     if ramp is not None:
         _ramp(p, w, k)
@@ -152,7 +155,7 @@ def _damp(p, elastic, w, k, elastic_k, rate, viscous, hysteretic, ramp):
 
 @kernel(fast=True, inline="code")
 def _ramp(p, w, k) -> None:
-    """Write order k of the acting share of C to `w.ramp[2]`; it is constant for pairs beyond the ramp."""
+    """Write order k of the share of C that acts (the ramp) to `w.ramp[2]`; beyond the ramp it is constant."""
     set_row(w.ramp[0], k, _multiply(w.penetration, w.penetration, k))
     set_row(w.ramp[1], k, _multiply(w.ramp[0], w.penetration, k))
     within = row(w.per_pair, RAMPS)
@@ -265,7 +268,8 @@ def _applied(p, along_x, along_y, torque):
 def _drag(p, w, k, c, s, x, y, om, dc, ds, dx, dy):
     """Return order k of the accelerations by friction (`_applied`, `model.friction`).
 
-    With r = s' / v_s and tau = tanh(r):  k tau_k = sum_j j r_j (1 - tau^2)_{k-j}.
+    With the slip rate s', the regularisation speed v_s, r = s' / v_s and tau = tanh(r): k tau_k = sum_j j r_j (1 -
+    tau^2)_{k-j}.
     """
     weighted, tau, rest, drag, arm = w.slip[1], w.slip[2], w.slip[3], w.slip[4], w.slip[5]
     rate = rolled(p, row_values(p.slip_rows, dc, ds, dx, dy), om) * (1.0 / p.slip_speed)
@@ -328,7 +332,7 @@ def _slide(p, w, k, om, dc, ds, dx, dy) -> None:
 def _run_in(p, state, w, rubbed, k) -> None:
     """Write order k of `rubbed` times the factor of running-in, 1 + a e, to `w.rub[5]`.
 
-    With e = exp(-h / h0):  k e_k = -(1 / h0) sum_j j h_j e_{k-j}.
+    With the wear depth h and e = exp(-h / h0): k e_k = -(1 / h0) sum_j j h_j e_{k-j}.
     """
     growth, left = w.rub[3], w.rub[4]
     if k == 0:
@@ -405,9 +409,9 @@ def _turn_frame(w, k, there, c, s):
 def _seen_rates(w, k, there, turned, om, turning):
     """Return order k of the rates of the head's cosine, sine and place relative to the frame.
 
-    `turned` is the result of `_turn_frame`: R^T u and R^T w for the frame's displacement u and velocity w. The rate of
-    R^T u is R^T w plus omega times R^T u turned by -90 degrees. `turning` has the rates of the head's place relative to
-    the ground.
+    `turned` is the result of `_turn_frame`: R^T u and R^T w, the frame's displacement u and velocity w in head axes (R
+    rotates from head to world axes). The rate of R^T u is R^T w plus omega times R^T u turned by -90 degrees. `turning`
+    has the rates of the head's place relative to the ground.
     """
     relative = om - lane(there, SPIN)
     left = pack(om, om, relative, relative, 0.0, 0.0, 0.0, 0.0)
@@ -458,7 +462,7 @@ def _turn_of_axes(p):
 
 @kernel(fast=True, inline="code")
 def _size(p, w, k, penetrating, sigma_limit, wear, support, sliding, running_in):
-    """Return the size of order k > 0 as a velocity."""
+    """Return the size of the terms of order k > 0 as a velocity."""
     here = w.series[k]
     size = abs(here[VX]) + abs(here[VY]) + p.radius * abs(here[OMEGA]) + p.weight * (abs(here[COS]) + abs(here[SIN]))
     if support is not None:
@@ -561,7 +565,7 @@ def expand(
             set_row(w.arm, k, arm)
             force = _push(p, state, w, k, penetration, rate, *law_terms)
             set_row(w.force, k, force)
-            # the rows for X and Y are minus the walls' inward normals
+            # the penetration's rows for X and Y are minus the walls' inward normals
             torque = _join(w.arm, w.force, k, arm, force)
             pushed = _applied(
                 p, row(p.penetration_rows, 2) * force * -1.0, row(p.penetration_rows, 3) * force * -1.0, torque

@@ -1,9 +1,10 @@
 """Rest under harmonics: a check that the motion of a head held by its contacts stays below the tolerance for all time.
 
-About its equilibrium such a head obeys  e'' + C e' + K e = r.  Here e is its distance from the linear response to the
+About its equilibrium such a head obeys e'' + C e' + K e = r. Here e is its distance from the linear response to the
 harmonics, with the angle times the radius of gyration as third place, and r is the remainder of the linearisation. The
 response is known in closed form, resonance included. Let s and c be the least eigenvalues of K and C, and S the largest
-eigenvalue of C. With eps at most c / 2, s / (10 S) and sqrt(s) / 10,
+eigenvalue of C. With eps at most c / 2, s / (10 S) and sqrt(s) / 10, the Lyapunov function V and the squared size W of
+the motion obey
 
     V = (e'e' + e K e) / 2 + eps (e e' + e C e / 2),  V' <= -eps W + r (1 + eps / sqrt(s)) sqrt(W),  W = e'e' + e K e
 
@@ -91,7 +92,7 @@ def _dynamic_stiffness(p, w, omega, i, j):
 
 @kernel()
 def _answer(p, one, w, gyration):
-    """Return the amplitudes of |x| in m (over all places) and of sqrt(x K x) of the linear response x to a harmonic."""
+    """Return the amplitudes of |x| in m and of sqrt(x K x), where x is the linear response to a harmonic."""
     om = one.omega
     a, b, c = _dynamic_stiffness(p, w, om, 0, 0), _dynamic_stiffness(p, w, om, 0, 1), _dynamic_stiffness(p, w, om, 0, 2)
     d, e, f = _dynamic_stiffness(p, w, om, 1, 0), _dynamic_stiffness(p, w, om, 1, 1), _dynamic_stiffness(p, w, om, 1, 2)
@@ -114,7 +115,7 @@ def _answer(p, one, w, gyration):
 
 @kernel()
 def _left_out(p, state, w, reach, rate, gyration) -> float:
-    """Return an upper bound of r for distances up to `reach` and rates up to `rate`.
+    """Bound r, the remainder in the module's docstring, for distances up to `reach`, rates up to `rate`.
 
     The remainder r is due to the curvature of the pairs' forces and to their turning with the head.
     """

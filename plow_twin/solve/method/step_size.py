@@ -14,7 +14,8 @@ from plow_twin.solve.method.series import expand, expand_harmonics, one_by_one
 from plow_twin.solve.modes import penetration_and_rate
 from plow_twin.solve.state import CLIPPED, ON
 
-#: The search for a pair's parting reaches over this many steps of the last size, and uses a series of this order.
+#: `PARTING_REACH`: how far ahead a pair's parting from its wall is searched, as a number of steps of the last size.
+#: `PARTING_ORDER`: order of the series that is used for this search.
 PARTING_REACH, PARTING_ORDER = 1.3, 6
 #: Value of `PARTING_REACH` under friction with stick, whose guards make steps shorter.
 _PARTING_REACH_STICK = 8.0
@@ -30,7 +31,7 @@ _SHORTER, _SHORT_ENOUGH = 20, 0.9
 
 @kernel()
 def accurate_step(p, w, order, sigma_limit):
-    """Return the sigma over which the series meets its share of the tolerance; NaN if it is not finite.
+    """Return the sigma over which the series meets its share of the tolerance; NaN if a term is not finite.
 
     Term k may be as large as `threshold[k]`, which falls geometrically with k to the admissible error at the last order
     (the root test of Jorba and Zou, sec. 3.2). Single orders can vanish, so the last `lacuna` orders are all checked.
@@ -55,9 +56,9 @@ def accurate_step(p, w, order, sigma_limit):
 def before_sticking(p, state, w, order, sigma) -> float:
     """Return `sigma`, or the smaller value up to which the series of tanh r converges well enough.
 
-    Far from sticking tanh r is constant to the last bit, so its coefficients do not show its poles at r = +-i pi/2. If
-    |r - r_0| is at most theta times the distance of r_0 from the poles, the remainder of the series is below
-    theta^order.
+    Here r is the slip rate divided by the regularisation speed. Far from sticking tanh r is constant to the last bit,
+    so its coefficients do not show its poles at r = +-i pi/2. If |r - r_0| is at most theta times the distance of r_0
+    from the poles, the remainder of the series is below theta^order.
     """
     theta = (p.threshold[p.order] / p.threshold[0]) ** (1.0 / order)
     within = sigma
