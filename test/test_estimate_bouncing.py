@@ -74,7 +74,8 @@ def test_the_deviate_of_a_path_is_normal_for_a_right_model_and_large_for_a_wrong
 
 
 def test_a_method_that_disagrees_widens_the_interval() -> None:
-    fitted = replace(known()[0][1], horizontal=Interval.normal(0.03, 3e-5), vertical=Interval.normal(0.02, 3e-5))
+    values = {"horizontal": Interval.normal(0.03, 3e-5), "vertical": Interval.normal(0.02, 3e-5)}
+    fitted = replace(known()[0][1], **values, apparent=None)
     told, zero, deviation = np.array([0.03003, 0.0204]), np.zeros(3), np.full(2, 4e-5)
     bounced = Bounced(told, deviation, zero, zero, (-7.0, 0.1), (0.0, 0.1), zero, 0.2, 0.0, 0.0, -np.inf)
     both = with_bounced(fitted, bounced, 0)

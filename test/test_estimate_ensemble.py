@@ -66,7 +66,8 @@ def test_members_are_drawn_with_the_estimate_s_correlation() -> None:
     stiffness = np.log([scene.contact.stiffness for scene in scenes])
     # clearance and stiffness are correlated: a member with a smaller clearance has a softer contact
     assert np.corrcoef(clearance, stiffness)[0, 1] == pytest.approx(0.8, abs=0.04)
-    ends = drawn.horizontal.p05, drawn.horizontal.p95
+    assert drawn.apparent is not None  # members have exactly the scene's frame
+    ends = drawn.apparent[0].p05, drawn.apparent[0].p95
     assert np.quantile(clearance, [0.05, 0.95]) == pytest.approx(ends, abs=0.05 * (ends[1] - ends[0]))
     assert gains.shape == (2000, 3)
 
