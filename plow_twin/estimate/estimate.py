@@ -273,17 +273,16 @@ def _searched(
         return summarise_bounced(unknowns, poses, bounced, lost, spent + forward.work), ()
     if found is None:
         return under_uncertain_load(_without_fit(unknowns, poses, lost), unknowns, forward.load, poses, period), ()
-    verdict = judge(*found, period)
-    plain, repeated = found, verdict.figures.get("repeated", math.inf) > tuning.MOST_RATIO
+    verdict, plain = judge(*found, period), found
     behind = behind_low_pass(*searched) if searched and _fails(found[1], verdict) and not verdict.broken else None
     if behind is not None:
         again = refine(forward.renewed(), unknowns, poses, period, behind.shared, behind.noise, drift, LOW_PASS)
         if again and again[1].loss < found[1].loss:
             found, verdict = again, judge(*again, period)
     found, verdict = _with_differences(found, verdict, period)
-    if bounced is None and _fails(found[1], verdict) and not verdict.sensor and repeated:
-        # residuals of a load that lacks harmonics repeat with the load; those of a low pass or of a change of the
-        # machine may too, so harmonics are tried only after the differences
+    if bounced is None and _fails(found[1], verdict) and not verdict.sensor:
+        # a low pass or a change of the machine can look like harmonics, so harmonics are tried only after the
+        # differences
         found, verdict = with_harmonics(*plain, forward.load, period) or (found, verdict)
     result = summarise(*found, verdict, lost, forces if bounced is None else None)
     if bounced is None and _fails(found[1], verdict) and not verdict.broken:
