@@ -101,7 +101,7 @@ def one_month(seed: int, day_m: float) -> dict[str, Any]:
         load, poses = visit(one, worn, rng)
         found = estimate(one.believed, load, poses)
         if State.ESTIMATED is found.horizontal_state is found.vertical_state:
-            told = [[value.mean, value.deviation] for value in found.apparent or (found.horizontal, found.vertical)]
+            told = [[value.mean, value.deviation] for value in found.in_scene_frame()]
             rows.append((float(day), told, clearances(worn, depth)[:2]))
             under = under_load(with_estimate(one.believed, found.as_dict())[0], found, load)
     days, values, true = (np.array([row[i] for row in rows]) for i in range(3))

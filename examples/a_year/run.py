@@ -115,7 +115,7 @@ for day in np.linspace(0.0, DAYS, VISITS, endpoint=False):
         print("  " + "; ".join(found.reasons))
         continue
     # an error of the frame is the same at each visit, so the growth is known as well as the apparent clearances
-    seen = found.apparent or (found.horizontal, found.vertical)
+    seen = found.in_scene_frame()
     mean, deviation = (np.array([getattr(value, name) for value in seen]) for name in ("mean", "deviation"))
     history.append((float(day), mean, deviation))
     if len(history) < 2:

@@ -365,7 +365,7 @@ def with_bounced(result: Estimate, bounced: Bounced, spent: int) -> Estimate:
         if state is State.ESTIMATED and deviation < tuning.OBSERVED
         else value
         for value, state, mean, deviation in zip(
-            _apparent(result),
+            result.in_scene_frame(),
             (result.horizontal_state, result.vertical_state),
             bounced.clearance.tolist(),
             bounced.clearance_deviation.tolist(),
@@ -375,16 +375,11 @@ def with_bounced(result: Estimate, bounced: Bounced, spent: int) -> Estimate:
     return replace(_with_apparent(result, apparent), figures=figures)
 
 
-def _apparent(result: Estimate) -> tuple[Interval, Interval]:
-    """Return the clearances of a machine that has exactly the scene's frame."""
-    return result.apparent or (result.horizontal, result.vertical)
-
-
 def _with_apparent(result: Estimate, apparent: tuple[Interval, ...]) -> Estimate:
     """Return an estimate with other apparent clearances, and with the same uncertainty of the frame beside them."""
     horizontal, vertical = (
         Interval.normal(new.mean, math.hypot(new.deviation, math.sqrt(max(value.deviation**2 - old.deviation**2, 0.0))))
-        for value, old, new in zip((result.horizontal, result.vertical), _apparent(result), apparent, strict=True)
+        for value, old, new in zip((result.horizontal, result.vertical), result.in_scene_frame(), apparent, strict=True)
     )
     return replace(
         result,
@@ -764,7 +759,7 @@ def _with_forces(result: Estimate, problem: Problem, fit: Fit, forces: ContactFo
     states = result.horizontal_state, result.vertical_state
     apparent = tuple(
         new if state is State.ESTIMATED else old
-        for state, old, new in zip(states, _apparent(result), (normal[GX], normal[GY]), strict=True)
+        for state, old, new in zip(states, result.in_scene_frame(), (normal[GX], normal[GY]), strict=True)
     )
     return replace(
         _with_apparent(result, apparent),

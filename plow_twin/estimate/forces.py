@@ -175,7 +175,7 @@ def draw_scenes(scene: Scene, found: Estimate, members: int, rng: np.random.Gene
         white = white @ np.linalg.cholesky(np.array(found.correlation) + 1e-9 * np.eye(len(CORRELATED))).T
     horizontal, vertical = (
         np.maximum(_normal(value, white[:, index]), _LEAST_SHARE * value.mean)
-        for index, value in enumerate(found.apparent or (found.horizontal, found.vertical))
+        for index, value in enumerate(found.in_scene_frame())
     )
     stiffness = np.exp(_normal(_logarithm(found.stiffness), -white[:, SOFTNESS]))
     restitution = scene.contact.restitution is not None

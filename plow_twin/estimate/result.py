@@ -280,6 +280,10 @@ class Estimate:
         reasons = "".join(f"<p>{escape(reason)}</p>" for reason in self.reasons)
         return f"<table><caption>{title}</caption><tr>{heads}</tr>{body}</table>{reasons}"
 
+    def in_scene_frame(self) -> tuple[Interval, Interval]:
+        """Return the clearances of a machine that has exactly the scene's frame: `apparent` if it is known."""
+        return self.apparent or (self.horizontal, self.vertical)
+
     def values(self) -> dict[str, Interval]:
         """Return all estimated values by the names of `QUANTITIES`."""
         every = ((quantity.name, getattr(self, quantity.name)) for quantity in QUANTITIES)

@@ -104,7 +104,7 @@ CORRELATED: Final = tuple("softness" if place == SOFTNESS else QUANTITIES[place]
 #: Guard: smallest and largest simulated penetration in m under the reference force. Contacts with a smaller penetration
 #: give the same motion; contacts with a larger penetration let the head through the wall.
 _HARDEST, _SOFTEST = 3e-5, 0.12
-#: Guard: smallest clearance in m that is simulated; a smaller estimate is none, because no motion was compared with it.
+#: Guard: smallest clearance in m that is simulated; no motion supports a smaller estimate.
 LEAST_CLEARANCE: Final = 5e-4
 
 
