@@ -85,7 +85,7 @@ def work() -> str:
         ["an hour of the bench scene", f"{1e-3 * (hours['kv'].wall_ms or 0.0):.1f} s"],
         *([f"an hour {name}", f"{row.wall_ms:.2g} ms"] for name, row in hours.items() if "rest" in name),
         ["first start of a live twin, with compiling", f"{1e-3 * (starts[0] or 0.0):.0f} s"],
-        ["later starts", f"{1e-3 * (starts[1] or 0.0):.1f} s"],
+        ["later starts", f"{starts[1] or 0.0:.0f} ms"],
     ]
     return "\n".join(f"- {name}: {value}" for name, value in lines)
 

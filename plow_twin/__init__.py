@@ -51,6 +51,7 @@ if _TYPE_CHECKING:
     from plow_twin.run.twin_sensitivity import TwinSensitivity as TwinSensitivity
     from plow_twin.scene_file import dump_scene as dump_scene
     from plow_twin.scene_file import load_scene as load_scene
+    from plow_twin.view.motion import plot_motion as plot_motion
 
 #: Public names by the module that defines them. A module is imported when one of its names is first used, so that
 #: Ctrl-C stops a command from its first moment on, and scenes built in Python do not need the YAML reader.
@@ -95,10 +96,11 @@ _NAMES = {
     "plow_twin.run.twin": ("Status", "Twin"),
     "plow_twin.run.twin_sensitivity": ("TwinSensitivity",),
     "plow_twin.scene_file": ("dump_scene", "load_scene"),
+    "plow_twin.view.motion": ("plot_motion",),
 }
 _HOMES = {name: module for module, names in _NAMES.items() for name in names}
-#: Names for a star import, which must work without the libraries that recordings need.
-__all__ = [name for name, module in _HOMES.items() if not module.startswith("plow_twin.record")]
+#: Names for a star import, which must work without the libraries that recordings and figures need.
+__all__ = [name for name, module in _HOMES.items() if not module.startswith(("plow_twin.record", "plow_twin.view"))]
 
 
 def __getattr__(name: str) -> object:

@@ -43,7 +43,7 @@ SUBPACKAGES = {
     "cli": CORE
     | {"build", "scene_file", "stream", "estimate", "record", "view", "study", "live", "ros", "dashboard", "demo"}
     | {"telemetry"},
-    "__init__": CORE | {"scene_file", "record"},
+    "__init__": CORE | {"scene_file", "record", "view"},
     "__main__": {"cli"},
 }
 #: Parts of scipy that may be imported only where they are used. The package scipy itself is always imported, by numba.
@@ -247,8 +247,8 @@ def test_every_public_name_is_found_and_imported_on_first_use() -> None:
     assert {name for name in dir(plow_twin) if not name.startswith("_")} >= names
     for name in names:
         assert getattr(plow_twin, name) is not None
-    # these two names need libraries of an extra, so `__all__` lacks them
-    assert set(plow_twin.__all__) == names - {"Recording", "read_recording"}
+    # these names need libraries of an extra, so `__all__` lacks them
+    assert set(plow_twin.__all__) == names - {"Recording", "read_recording", "plot_motion"}
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
         plow_twin.nonsense  # noqa: B018
     code = (

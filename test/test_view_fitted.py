@@ -12,7 +12,7 @@ from figure_checks import check_figure
 from rerun.chunk import RrdReader
 from scenes import preset
 
-from plow_twin import simulate
+from plow_twin import plot_motion, simulate
 from plow_twin.estimate.estimate import priors
 from plow_twin.estimate.result import Motion
 from plow_twin.estimate.unknowns import QUANTITIES
@@ -89,7 +89,7 @@ def test_a_notebook_shows_an_estimate_with_intervals_and_states() -> None:
 
 def test_a_notebook_shows_a_motion_and_scripts_write_it(tmp_path: Path) -> None:
     result = simulate(preset("paper"), 1.0)
-    figure = result.plot()
+    figure = plot_motion(result)
     check_figure(figure)
     position, angle, force = figure.axes
     np.testing.assert_array_equal(position.lines[1].get_ydata(), 1e3 * result.q[:, 1])
@@ -98,4 +98,4 @@ def test_a_notebook_shows_a_motion_and_scripts_write_it(tmp_path: Path) -> None:
     assert largest == result.force.max() / 1e3 and force.get_ylabel() == "contact force [kN]"
     assert figure._repr_png_()[:4] == b"\x89PNG"  # a notebook can show the figure without pyplot
     figure.savefig(tmp_path / "motion.png")
-    assert result.plot("of mine").get_suptitle() == "of mine"
+    assert plot_motion(result, "of mine").get_suptitle() == "of mine"

@@ -8,9 +8,8 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from importlib import import_module
 from numbers import Real
-from typing import TYPE_CHECKING, Any, Final, Literal, get_args
+from typing import Any, Final, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,9 +24,6 @@ from plow_twin.run.sensitivity import Sensitivity, sensitivity_of
 from plow_twin.solve.compiled_scene import CompiledScene, compile_scene, options
 from plow_twin.solve.energy_balance import new_balance
 from plow_twin.solve.state import EVENT, OFF, Status, Totals, Work, new_work
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 Method = Literal["events", "rk4", "euler"]
 Array = NDArray[np.float64]
@@ -92,28 +88,6 @@ class Result:
     energy_balance: EnergyBalance | None = None
     sensitivity: Sensitivity | None = None
     frame: Array | None = None
-
-    def plot(self, title: str = "") -> Figure:
-        """Draw pose and contact forces over time.
-
-        Parameters
-        ----------
-        title : str
-            Title of the figure; by default it states the length of the motion and the number of contact changes.
-
-        Returns
-        -------
-        matplotlib.figure.Figure
-            Notebooks show the figure, and `savefig` writes it.
-
-        Raises
-        ------
-        ModuleNotFoundError
-            matplotlib (extra `view` or `study`) is not installed.
-        """
-        # imported by name, so that a simulation does not import the drawing code
-        drawn: Figure = import_module("plow_twin.view.motion").plot_motion(self, title)
-        return drawn
 
     def _repr_html_(self) -> str:
         """Return the statistics of the contacts as an HTML table for notebooks."""

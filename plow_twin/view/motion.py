@@ -1,18 +1,16 @@
-"""Picture of a simulated motion, as `Result.plot` returns it."""
+"""Figure of a simulated motion."""
 
 from __future__ import annotations
 
 import io
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from matplotlib.figure import Figure
 
 from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.run.simulate import Result
 from plow_twin.view.figures import legend_beside
 from plow_twin.view.section import PAIR_COLORS
-
-if TYPE_CHECKING:
-    from plow_twin.run.simulate import Result
 
 
 class NotebookFigure(Figure):
@@ -25,7 +23,22 @@ class NotebookFigure(Figure):
 
 
 def plot_motion(result: Result, title: str = "") -> Figure:
-    """Return a figure of the pose and the contact forces over time."""
+    """Draw pose and contact forces over time.
+
+    Needs matplotlib (extra `view` or `study`).
+
+    Parameters
+    ----------
+    result : Result
+        The motion that `simulate` returned.
+    title : str
+        Title of the figure; by default it states the length of the motion and the number of contact changes.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Notebooks show the figure, and `savefig` writes it.
+    """
     figure = NotebookFigure(figsize=(11.0, 7.5), layout="constrained")
     position, angle, force = (axes := figure.subplots(3, 1, sharex=True, height_ratios=(2, 1, 2)))
     for place, name in enumerate(("x", "y")):
