@@ -12,25 +12,23 @@ import click
 
 from plow_twin.cli.console import say_error
 from plow_twin.cli.outlet import Outlet
+from plow_twin.live.part import Part
 
 _LEVELS = ("OK", "WARN", "ERROR")
 
-#: Level, message and values of a status, of the alarms or of a part of the diagnostics.
-Part = tuple[int, str, dict[str, str]]
-
 
 class Report:
-    """Report status and alarms when they change, and with `lines` all parts as JSON lines.
+    """Reports status and alarms when they change, and with `lines` all parts as JSON lines.
 
-    An alarm is reported when it is raised and when it is acknowledged, not each time its quantity passes a threshold.
-    A hanging reader does not delay the twin, because lines are dropped and counted.
+    An alarm is reported when it is raised and when it is acknowledged. A hanging reader does not delay the twin: lines
+    are dropped and counted.
 
     Parameters
     ----------
     lines, quiet : bool
         Whether to write JSON lines to standard output, and whether to write no text for a person.
     stamp_ns
-        Function that returns the stamp that the twin has reached [ns].
+        Returns the stamp that the twin has reached [ns].
     """
 
     def __init__(self, *, lines: bool, quiet: bool, stamp_ns: Callable[[], int]) -> None:
@@ -43,7 +41,7 @@ class Report:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is not None:  # the caller closes both outputs itself, unless an error has ended the run
+        if kind is not None:  # otherwise the caller has closed both outputs
             with suppress(BrokenPipeError):
                 self.close_lines()
             self.close()
@@ -54,7 +52,7 @@ class Report:
         return self._out.lost
 
     def error(self, text: str) -> None:
-        """Report an error; may be called from any thread."""
+        """Report an error, perhaps from another thread."""
         self._errors.put(f"plow-twin: {text}")
 
     def close_lines(self) -> bool:
@@ -62,7 +60,7 @@ class Report:
         return self._out.close()
 
     def close(self) -> bool:
-        """End the lines for a person; return False if the terminal or its reader hangs."""
+        """Write the last lines for a person; return False if their reader hangs."""
         return self._errors.close()
 
     def say(self, name: str, part: Part) -> None:
@@ -85,7 +83,7 @@ class Report:
 
 
 def _typed(value: str) -> int | float | str:
-    """Return the text of a number as a number, any other text unchanged."""
+    """Return the text of a finite number as a number, any other text unchanged."""
     for kind in (int, float):
         try:
             found = kind(value)
@@ -96,7 +94,7 @@ def _typed(value: str) -> int | float | str:
 
 
 def _printed(line: str) -> bool:
-    """Print a line; return False if standard output fails, as on a full disk, so that the twin continues."""
+    """Print a line; return False if standard output fails, as on a full disk."""
     try:
         click.echo(line)
         sys.stdout.flush()

@@ -1,4 +1,4 @@
-"""Health in words: the latched `status` and the parts of `/diagnostics`, from the counters of a running node."""
+"""The `status` of a twin and the parts of its diagnostics, made from its counters."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 OK, WARN, ERROR = 0, 1, 2
 
-#: Parts of /diagnostics with their keys and their meanings.
+#: Keys of each part of `/diagnostics` and their meanings.
 KEYS: Final[dict[str, dict[str, str]]] = {
     "state": {
         "lifecycle": "unconfigured, inactive, active or finalized",
@@ -144,7 +144,6 @@ STATUS_KEYS: Final[dict[str, str]] = {
     **{f"publishers_{topic}": "number of publishers that the node is connected to" for topic in TOPICS},
 }
 
-
 #: Keys of the part `source`, which a connection to an OPC UA server adds, and their meanings.
 SOURCE_KEYS: Final[dict[str, str]] = {
     "server": "address",
@@ -240,7 +239,7 @@ def summary(lifecycle: str, reason: str, runtime: Runtime | None, preparing: boo
 
 
 def failures(runtime: Runtime) -> list[str]:
-    """Describe how many advances of the model failed, the newest failure, and how the model continued."""
+    """Describe the failed advances of the model, and how it continued."""
     failed = runtime.driver.failed
     if not failed.count:
         return []
@@ -255,7 +254,7 @@ def failures(runtime: Runtime) -> list[str]:
 
 
 class Health:
-    """The parts of `/diagnostics`; it keeps the counters of the last report, from which differences are computed."""
+    """The parts of `/diagnostics`; it keeps the last report's counters, from which it computes what is new."""
 
     def __init__(self) -> None:
         self._before: dict[str, int] = {}
@@ -314,19 +313,17 @@ class Health:
             "queue_peak": str(peak),
             "queue_wait_ms": _ms(wait_s),
             "messages_lost": str(inputs.lost),
-            "travel_used": str(inputs.travel.used),
-            "travel_dropped": str(inputs.travel.arrived - inputs.travel.used),
-            "travel_implausible": str(inputs.travel.counts[Verdict.IMPLAUSIBLE]),
-            "head_pose_implausible": str(inputs.head_pose.counts[Verdict.IMPLAUSIBLE]),
-            "head_pose_used": str(inputs.head_pose.used),
-            "gaps_used": str(inputs.gaps.used),
-            "gaps_dropped": str(inputs.gaps.arrived - inputs.gaps.used),
-            "gaps_implausible": str(inputs.gaps.counts[Verdict.IMPLAUSIBLE]),
-            "head_pose_dropped": str(inputs.head_pose.arrived - inputs.head_pose.used),
             "head_pose_residual": "" if residual is None else "{:.6g} {:.6g} {:.6g}".format(*residual),
             "refused_publishers": str(inputs.refused_publishers),
-            **{f"{topic}_not_followed": str(one.ignored) for topic, one in inputs.optional.items()},
         }
+        for topic, one in inputs.optional.items():
+            intake: Intake = getattr(inputs, topic)
+            values |= {
+                f"{topic}_used": str(intake.used),
+                f"{topic}_dropped": str(intake.arrived - intake.used),
+                f"{topic}_implausible": str(intake.counts[Verdict.IMPLAUSIBLE]),
+                f"{topic}_not_followed": str(one.ignored),
+            }
         more = {
             "samples_lost": inputs.senders.lost,
             "samples_not_followed": inputs.senders.ignored,
@@ -344,7 +341,7 @@ class Health:
         return (WARN if grown else OK), "; ".join(grown) or "no trouble since the last report", values
 
     def output(self, runtime: Runtime) -> Part:
-        """Return the part `output`: numbers of published messages, their latency and their age."""
+        """Return the part `output`: the published messages, their latency and their age."""
         latency, age = runtime.publishing.latency, runtime.publishing.age
         values = {
             "published": str(runtime.publishing.published),
@@ -365,7 +362,7 @@ class Health:
         return (WARN if missed else OK), missed or "publishing", values
 
     def _note_periods(self, runtime: Runtime, values: dict[str, str]) -> str:
-        """Add the statistics of the loop's periods to `values`; return the faults found."""
+        """Add the statistics of the loop's periods to `values`; return the fault found."""
         keys = ("periods_missed", "period_mean_ms", "period_deviation_ms", "period_max_ms")
         values |= dict.fromkeys(keys, "")
         if runtime.periods is None:
@@ -377,7 +374,7 @@ class Health:
         return f"{new} periods left out since the last report" if 0 < runtime.settings.missed_periods <= new else ""
 
     def estimate(self, runtime: Runtime) -> Part:
-        """Return the part `estimate`: the state of the estimate."""
+        """Return the part `estimate`."""
         values = dict.fromkeys(KEYS["estimate"], "")
         found = runtime.estimation
         if found is None:
@@ -420,7 +417,7 @@ class Health:
         return OK, "following", values
 
     def recorder(self, runtime: Runtime) -> Part:
-        """Return the part `recorder`: the state of the recording; lost data are an error."""
+        """Return the part `recorder`; lost data are an error."""
         values = dict.fromkeys(KEYS["recorder"], "")
         if runtime.recording is None:
             return OK, "not recording", values
@@ -444,6 +441,7 @@ class Health:
         return grown
 
 
+#: Counters of the part `input` whose growth is a warning.
 _TROUBLE: Final = (
     "dropped_unstamped",
     "dropped_non_finite",
@@ -474,7 +472,6 @@ _TROUBLE: Final = (
 
 
 def _refused(intake: Intake) -> int:
-    """Return the number of unused messages, except messages that came before the node could use them."""
     away = intake.counts[Verdict.INACTIVE] + intake.counts[Verdict.NO_CLOCK]
     return intake.arrived - intake.used - away
 

@@ -1,39 +1,22 @@
-"""Limits on the files that parameters may name, because anybody on the ROS graph may set parameters."""
+"""Limits on the files that parameters may name: anybody on the ROS graph may set parameters."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 from plow_twin.errors import Problem
 from plow_twin.scene_file.presets import PRESETS
+
+if TYPE_CHECKING:
+    from plow_twin.live.parameters import Settings
 
 #: Parameters that name files or folders.
 FILES: Final = ("scene", "record_path", "wear_state_path")
 
 
-class Named(Protocol):
-    """The parameters that name files, and the folder that bounds them."""
-
-    @property
-    def file_root(self) -> str:
-        """Folder within which the files must be; empty: anywhere."""
-
-    @property
-    def scene(self) -> str:
-        """Scene file or preset."""
-
-    @property
-    def record_path(self) -> str:
-        """Folder of the recording."""
-
-    @property
-    def wear_state_path(self) -> str:
-        """Folder of the wear."""
-
-
-def outside(settings: Named) -> list[Problem]:
-    """Return a problem for each parameter that names a file outside `file_root`; symbolic links are followed."""
+def outside(settings: Settings) -> list[Problem]:
+    """Return a problem for each parameter that names a file outside `file_root`, after symbolic links."""
     if not settings.file_root:
         return []
     root = Path(settings.file_root).resolve()
@@ -45,8 +28,8 @@ def outside(settings: Named) -> list[Problem]:
     ]
 
 
-def refused_changes(before: Named, after: Named) -> list[str]:
-    """Return why parameters that name files cannot be changed so after the start; presets are allowed."""
+def refused_changes(before: Settings, after: Settings) -> list[str]:
+    """Return why parameters that name files cannot be changed after the start; presets can."""
     if after.file_root:
         return [str(problem) for problem in outside(after)]
     changed = [name for name in FILES if getattr(before, name) != getattr(after, name)]

@@ -1,4 +1,4 @@
-"""Markers for RViz (walls of the cavity, frame, worn pads and forces), and the head's pose on /tf."""
+"""Markers for RViz: walls of the cavity, frame, worn pads and forces; and the head's pose on /tf."""
 
 from __future__ import annotations
 
@@ -31,25 +31,15 @@ _ARROW: Final = 0.5
 
 
 class Markers:
-    """Publisher of the markers.
+    """Publisher of the markers, all in the frame `frame_id`.
 
-    Namespaces are `frame`, `cavity`, `pads` (each at the depth of its wear behind the wall) and `forces` (on the head).
-    All are in the frame `frame_id`.
-
-    Parameters
-    ----------
-    node
-        The node.
-    settings
-        Parameters of the node.
-    scene
-        The scene.
+    Namespaces are `frame`, `cavity`, `pads` (each behind the wall by the depth of its wear) and `forces` (on the head).
     """
 
     def __init__(self, node: Node, settings: Settings, scene: Scene) -> None:
         self._node, self._settings, self._scene = node, settings, scene
         self._publisher = node.create_publisher(MarkerArray, "markers", 1)
-        self._transforms = _transforms(node) if settings.tf else None
+        self._transforms = _Transforms(node) if settings.tf else None
         corners_x, corners_y = corner_positions(scene)
         self._corners = np.stack([corners_x, corners_y], axis=1)
         self._walls, self._radius = wall_distances(scene), corner_radius(scene)
@@ -71,7 +61,7 @@ class Markers:
         normal = np.stack([NORMAL_X, NORMAL_Y], axis=1)
         along = np.stack([-NORMAL_Y, NORMAL_X], axis=1) * 0.1 * self._scale
         side = -1.0 if self._scene.head.carries == "corners" else 1.0  # sign of the force on the head
-        # a pad is drawn at the place where its corner meets the wall
+        # a pad is drawn where its corner meets the wall
         for pair in range(PAIR_COUNT):
             depth, force = float(row["wear_depth"][pair]), float(row["force"][pair])
             foot = self._corners[pair] + normal[pair] * (self._walls[pair] - normal[pair] @ self._corners[pair])
@@ -112,11 +102,13 @@ class Markers:
 
 
 class _Transforms:
-    """The head's pose on /tf, from `frame_id` to `child_frame_id`."""
+    """The head's pose on /tf, from `frame_id` to `child_frame_id`; needs tf2_msgs."""
 
-    def __init__(self, node: Node, message: Any) -> None:
-        self._message = message
-        self.publisher = node.create_publisher(message, "/tf", 100)
+    def __init__(self, node: Node) -> None:
+        from tf2_msgs.msg import TFMessage
+
+        self._message: Any = TFMessage
+        self.publisher = node.create_publisher(TFMessage, "/tf", 100)
 
     def __call__(self, settings: Settings, stamp_ns: int, q: Array) -> None:
         from geometry_msgs.msg import TransformStamped
@@ -127,13 +119,6 @@ class _Transforms:
         found.transform.translation = Vector3(x=float(q[0]), y=float(q[1]))
         found.transform.rotation.z, found.transform.rotation.w = float(np.sin(q[2] / 2)), float(np.cos(q[2] / 2))
         self.publisher.publish(self._message(transforms=[found]))
-
-
-def _transforms(node: Node) -> _Transforms:
-    """Return the sender of transforms; raise `ModuleNotFoundError` if tf2_msgs is not installed."""
-    from tf2_msgs.msg import TFMessage
-
-    return _Transforms(node, TFMessage)
 
 
 def placed(points: Array, q: Array) -> Array:

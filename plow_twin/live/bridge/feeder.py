@@ -1,4 +1,8 @@
-"""Messages of a bridge, turned into inputs of a live twin by the mapping."""
+"""Messages of a bridge as inputs of a live twin.
+
+A mapping gives each value in a message its role, such as the excitation. Some senders number their messages; the feeder
+counts lost messages by these numbers, and continues the numbers for a sender that does not send them.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +15,7 @@ from numpy.typing import NDArray
 
 from plow_twin.live.bridge.source import Messages
 from plow_twin.live.bridge.table import Table
+from plow_twin.live.inputs import OPTIONAL
 from plow_twin.live.load_model import LoadModel
 from plow_twin.live.publishing import Outgoing
 from plow_twin.live.runtime import Runtime
@@ -22,26 +27,23 @@ from plow_twin.record.sources import Arrived
 from plow_twin.stream.driver import Arrival
 from plow_twin.stream.intake import Intake, Verdict
 
-#: A sender counts as restarted if its message number jumps by more than this and the next message number continues from
-#: there.
+#: A jump of the message number by more than this means that the sender has restarted, if the next number confirms it.
 _RESTART = 1000
-#: Largest number of samples lost between two messages: a day at 10 kHz.
+#: Largest number of samples that count as lost between two messages: a day at 10 kHz.
 _MOST_LOST = 10**9
-#: After at least this many messages, the number 0 or 1 is taken as a restart of the sender; before that, it is taken as
-#: the number of a late message.
+#: After at least this many messages, the number 0 or 1 means that the sender has restarted, not that a message is late.
 _FIRST = 10
-#: A change of the load's deviation is journalled if it exceeds this share of the larger of the old and the new
-#: deviation.
+#: Relative change of the load's standard deviation above which the new deviation is journalled.
 _NOTABLE = 0.02
 
 
 class Feeder:
-    """Reads messages as the mapping says and passes them to the runtime of a live twin.
+    """Passes messages to the runtime of a live twin.
 
     Parameters
     ----------
     roles
-        The mapping; roles that a live twin does not use are ignored.
+        The mapping. Roles that a live twin does not use are ignored.
     runtime
         The live twin.
     send
@@ -63,35 +65,29 @@ class Feeder:
         self._by_topic: dict[str, list[tuple[str, Role]]] = {}
         for name, role in roles.items():
             self._by_topic.setdefault(role.topic, []).append((name, role))
-        #: newest stamp of a source that has its own time [ns]; a single stamp far ahead of the others does not count
+        #: newest stamp of a source that has its own time [ns], except for a single stamp far ahead of the others
         self.newest_ns = 0
         self._far_ahead_ns: int | None = None
-        #: reason why the first unreadable load was refused; empty if every load could be read
+        #: why the first unreadable load was refused
         self.unfit = ""
         self._number = 0
-        #: `_assumed`: count of messages without a number since the last message with one; each is assumed to have the
-        #: next number
-        #: `_unnumbered`: count of these assumptions that proved wrong, since the numbers of this sender began
-        self._assumed = self._unnumbered = 0
-        #: number of the newest message if this number does not continue the earlier numbers; otherwise None
+        #: number of messages without a number since the last message with a number
+        self._assumed = 0
+        #: number of messages to which the feeder has given a number that the sender then used again
+        self._unnumbered = 0
+        #: number of the newest message if it does not continue the earlier numbers
         self._odd: int | None = None
-        #: whether the sender numbers its messages
         self._counts = False
         self._sender = 0
         self._source = next((role.topic for name, role in roles.items() if name in ("excitation", "drive")), "")
         inputs = runtime.inputs
-        #: whether many samples may be used in one call: they carry their own time, and no motion is sent
         self._at_once = runtime.reads_at_once
-        self._optional: dict[str, Intake] = {
-            "travel": inputs.travel,
-            "head_pose": inputs.head_pose,
-            "gaps": inputs.gaps,
-        }
+        self._optional: dict[str, Intake] = {topic: getattr(inputs, topic) for topic in OPTIONAL}
         inputs.senders.start([self._name])
         inputs.senders.alive([self._name])
 
     def begin(self, messages: Iterable[Arrived]) -> None:
-        """Set the start time of a source with its own time: the first stamp not followed by a jump back."""
+        """Set the start time of a source with its own time: the first stamp that no jump back follows."""
         read = (role.read(arrived) for arrived in messages for _, role in self._by_topic.get(arrived.topic, ()))
         stamps = (found[0] for found in read if found is not None)
         back_ns = round(self._runtime.settings.jump_back * 1e9)
@@ -128,7 +124,7 @@ class Feeder:
             self._send(topic, message)
 
     def _feed_table(self, table: Table) -> bool:
-        """Process lines as a table; return False, without any effect, if the load cannot be read so."""
+        """Process lines of a file as arrays; return False, without any effect, if they must be read one by one."""
         roles, inputs = self._by_topic.get(table.topic, []), self._runtime.inputs
         role = next((role for name, role in roles if name == "excitation"), None)
         if role is None or role.sequence or not (self._at_once and inputs.active):
@@ -151,7 +147,7 @@ class Feeder:
         return True
 
     def _follow_times(self, stamps: NDArray[np.int64]) -> None:
-        """Advance the source's time to the stamps of samples, as `_follow_time` does for each sample."""
+        """Do the same as `_follow_time` for each stamp."""
         newest = np.maximum.accumulate(np.append(self.newest_ns, stamps))
         jump_ns = round(self._runtime.settings.jump_forward * 1e9)
         if self.newest_ns and self._far_ahead_ns is None and (stamps <= newest[:-1] + jump_ns).all():
@@ -161,7 +157,7 @@ class Feeder:
             self._follow_time(stamp_ns)
 
     def _follow_time(self, stamp_ns: int) -> None:
-        """Advance to the stamp of a sample; a stamp far ahead counts only if the next is far ahead too."""
+        """Advance the source's time; a stamp far ahead counts only if the next stamp is far ahead too."""
         jump_ns = round(self._runtime.settings.jump_forward * 1e9)
         far_ns, self._far_ahead_ns = self._far_ahead_ns, None
         if far_ns is not None and stamp_ns >= far_ns - jump_ns:
@@ -203,18 +199,17 @@ class Feeder:
         wrench, deviation = load
         absurd = intake.limits is not None and intake.limits.exceeded(wrench)
         if absurd or not all(map(math.isfinite, (*wrench, *deviation))):
-            return [(stamp_ns, wrench)]  # the sample will be refused, so its deviation must not be used either
+            return [(stamp_ns, wrench)]  # the intake will refuse this sample, so its deviation is not journalled
         if any(abs(new - old) > _NOTABLE * max(new, old) for new, old in zip(deviation, self._deviation, strict=True)):
             self._deviation = deviation
             self._runtime.driver.spread(stamp_ns, deviation)
         return [(stamp_ns, wrench)]
 
     def _numbered(self, role: Role, arrived: Arrived) -> tuple[bytes, int, bool]:
-        """Return sender, message number (counted here if missing), and whether the message is repeated."""
+        """Return the sender, the message's number, and whether the message is repeated."""
         number = role.number(arrived) if role.sequence else None
         if number is None:
-            # a message without a readable number is assumed to have the next number; the next message with a number
-            # shows whether this assumption was right
+            # the next message with a number shows whether the sender counted this message
             self._assumed += 1
             self._number += 1
             return self._name, self._number + self._unnumbered, False
@@ -231,26 +226,25 @@ class Feeder:
             return self._name, number, True
         elif self._goes_on(number):
             self._odd = None
-        else:  # assume the next number for now; the message after this one shows which of both numbers is right
+        else:  # the next message shows whether the numbers jump or this number is wrong
             self._odd, number = number, self._number + 1
         again, self._number = number == self._number, number
         return self._name, number + self._unnumbered, again
 
     def _goes_on(self, number: int) -> bool:
-        """Return whether a number continues the earlier numbers, or the single odd number before it."""
+        """Return whether a number continues the earlier numbers, or those that begin with the odd number before it."""
         odd, before = self._odd, self._number
         if odd is not None and abs(number - odd) < abs(number - before):
             if not before < odd <= before + _MOST_LOST:
                 self._begin_anew()
-                senders = self._runtime.inputs.senders
-                senders.hear(self._name, odd)
+                self._runtime.inputs.senders.hear(self._name, odd)
                 if odd <= _RESTART:
                     self._runtime.inputs.lost_at_first(self._name, max(odd - 1, 0))
             return True
         return abs(number - before) <= _RESTART and not number <= 1 < before - _FIRST
 
     def _begin_anew(self) -> None:
-        """Treat the following messages as the messages of a new sender, with a count of their own."""
+        """Treat the following messages as those of a new sender."""
         self._sender += 1
         self._assumed = self._unnumbered = 0
         self._runtime.inputs.senders.start([self._name])
@@ -262,8 +256,7 @@ class Feeder:
         if found is None:
             intake.refuse(Verdict.MALFORMED)
         elif arrived.retained and name != "travel":
-            # of the values that a broker has retained only a speed is used, because a speed applies until the next
-            # speed
+            # a broker's retained speed still applies, a retained pose or gap does not
             intake.refuse(Verdict.INACTIVE, found[0], tuple(found[1].values()))
         elif not role.plausible(found[1]):
             intake.refuse(Verdict.IMPLAUSIBLE, found[0], tuple(found[1].values()))

@@ -1,4 +1,4 @@
-"""CSV or JSON lines from standard input or files, and Parquet files; files are read once, or followed as they grow."""
+"""Tables in files or on standard input: CSV, JSON lines or Parquet, read once or followed while they grow."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from plow_twin.scene_file.parquet_lines import ParquetLines, is_parquet
 
 #: Largest number of bytes that are read from a source at once.
 _BLOCK: Final = 1 << 18
-#: Number of bytes last read that are remembered, to recognise whether a file was rewritten.
+#: Number of bytes, the last ones read, by which a rewritten file is recognised.
 _REMEMBERED: Final = 256
 #: Interval at which a followed file is read [s].
 _LOOK_S: Final = 0.02
@@ -36,24 +36,24 @@ STDIN_TOPIC: Final = "stdin"
 
 @dataclass
 class _Tail:
-    """One file, read to its present end; a file that was cut or replaced is read again from its beginning."""
+    """A file. If it is cut or replaced, reading starts again at its beginning."""
 
     path: Path
-    #: topic of the file's rows; by default the file's name without its ending
+    #: topic of the rows; by default the file's name without its ending
     topic: str = ""
     lines: Lines = field(default_factory=Lines)
     rows: Rows = field(default_factory=Rows)
     _file: Any = None
-    #: the last bytes that were read; if the file has other bytes at this place now, it was rewritten
+    #: the last bytes that were read
     _newest: bytes = b""
-    #: number of lines that were never completed because the file was cut or replaced
+    #: number of lines that stayed incomplete because the file was cut or replaced
     left: int = 0
 
     def __post_init__(self) -> None:
         self.topic = self.topic or self.path.stem
 
     def columns(self, *, grows: bool) -> list[str] | None:
-        """Return the columns in the first line, which must be complete if the file `grows`; None without a line."""
+        """Return the columns in the first line, or None without a line; a line of a file that `grows` may be cut."""
         rows = Rows()
         try:
             with _readable(self.path), _open(self.path) as stream:
@@ -71,16 +71,15 @@ class _Tail:
         return rows.columns
 
     def read(self) -> list[Arrived]:
-        """Return the messages of the next block."""
         data = self._block()
         lines = [None] * self.left + (self.lines.add(data) if data else [])
         self.left = 0
-        return messages(self.topic, lines, self.rows)
+        return list(Table(self.topic, lines, self.rows))
 
     def _block(self) -> bytes:
         if self._file is None or self._is_another():
             rest = b"" if self._file is None or self._is_anew() else self._read()
-            if rest:  # these bytes are the rest of a file that was moved away
+            if rest:  # the end of a file that was moved away
                 return rest
             try:
                 with _readable(self.path):
@@ -90,7 +89,7 @@ class _Tail:
             self.close()
             self._file, self._newest = file, b""
             self.rows = self.rows.of_another_file()
-            # the incomplete last line of the previous file is not used, because a number in it may have been cut
+            # the incomplete last line of the old file is not used, because a number in it may have been cut
             self.left += self.lines.begun
             self.lines = Lines()
         return self._read()
@@ -102,18 +101,17 @@ class _Tail:
         return data
 
     def _is_anew(self) -> bool:
-        """Return whether the file was cut, even if it has since grown beyond its old size."""
+        """Return whether the file was rewritten, even if it has grown beyond its old size since then."""
         begin = self._file.tell() - len(self._newest)
         return os.pread(self._file.fileno(), len(self._newest), begin) != self._newest
 
     def _is_another(self) -> bool:
-        """Return whether the file was rewritten, or another file is at its path."""
-        if isinstance(self._file, ParquetLines):  # a Parquet file is read once, so it is not looked at again
+        if isinstance(self._file, ParquetLines):  # a Parquet file is read only once
             return False
         try:
             found = self.path.stat()
         except FileNotFoundError:
-            return False  # a file that was moved away may still grow until a new file has its path
+            return False  # until a new file has this path, the file that was moved away may still grow
         ours = os.fstat(self._file.fileno())
         return (found.st_dev, found.st_ino) != (ours.st_dev, ours.st_ino) or self._is_anew()
 
@@ -129,13 +127,12 @@ class _Tail:
 
 
 def _open(path: Path) -> Any:
-    """Open a text file, or a Parquet file whose rows are read as lines."""
     return ParquetLines(path) if is_parquet(path) else path.open("rb")
 
 
 @contextmanager
 def _readable(path: Path) -> Iterator[None]:
-    """Raise a `BridgeError` if a file turns out not to be a table."""
+    """Turn an error of the table's form into a `BridgeError`."""
     try:
         yield
     except csv.Error as error:
@@ -143,10 +140,10 @@ def _readable(path: Path) -> Iterator[None]:
 
 
 class _Dated:
-    """The files that match a name pattern, read as one topic with the pattern's name.
+    """The files that match a pattern of names, as one topic.
 
-    When the files are followed, the topic begins with the newest file and continues with each new file. The previous
-    file is then still read beside the newest file.
+    When files are followed, the topic begins with the newest file and continues with each new file; the file before the
+    newest file is still read.
     """
 
     def __init__(self, pattern: Path) -> None:
@@ -157,20 +154,16 @@ class _Dated:
 
     @property
     def path(self) -> Path:
-        """Return the newest file that is read, or the pattern while there is no file."""
         return self._tails[-1].path if self._tails else self._pattern
 
     def columns(self, *, grows: bool) -> list[str] | None:
-        """Return the columns of the newest file, as `_Tail.columns` does."""
         there = self.files()
         return _Tail(max(there, key=_changed_ns)).columns(grows=grows) if there else None
 
     def files(self) -> list[Path]:
-        """Return the files that match the pattern, sorted by the numbers in their names."""
         return sorted(self._pattern.parent.glob(self._pattern.name), key=_numbered)
 
     def read(self) -> list[Arrived]:
-        """Return the messages in the next block of each file."""
         found = [arrived for tail in self._tails for arrived in tail.read()]
         if found or time.monotonic() < self._look_s:
             return found
@@ -197,24 +190,13 @@ class _Dated:
 def _changed_ns(path: Path) -> tuple[int, Any]:
     try:
         return path.stat().st_mtime_ns, _numbered(path)
-    except FileNotFoundError:  # the file was removed after it had been found
+    except FileNotFoundError:  # the file has been removed in the meantime
         return 0, _numbered(path)
 
 
 def _numbered(path: Path) -> list[tuple[int, str]]:
-    """Return a key that sorts names by the numbers in them: load_9 before load_10."""
+    """Return a key that sorts names by the numbers in them, load_9 before load_10."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]
-
-
-def messages(topic: str, lines: list[bytes | None], rows: Rows) -> list[Arrived]:
-    """Return the messages in whole lines, with the present time as their receive time."""
-    now_ns = time.time_ns()
-    found = []
-    for line in lines:
-        content = rows.read(line)
-        if content is not False:
-            found.append(Arrived(topic, now_ns, content))
-    return found
 
 
 class Files(SourceState):
@@ -223,10 +205,9 @@ class Files(SourceState):
     Parameters
     ----------
     paths
-        The files, or patterns of file names; if files are read once, their messages are sorted by the stamps in them.
+        Files or patterns. The messages of files that are read once are sorted by their stamps.
     follow
-        Whether to wait at the end of a file for lines that are appended later, and to wait for a file that is not there
-        yet.
+        Whether to wait for files that do not exist yet, and for lines that are appended.
 
     Raises
     ------
@@ -236,7 +217,7 @@ class Files(SourceState):
 
     def __init__(self, paths: list[Path], *, follow: bool) -> None:
         super().__init__(ends=not follow, connected=True)
-        self._tails = [_Dated(path) if is_pattern(path) else _Tail(path) for path in paths]
+        self._tails = [_Dated(path) if _is_pattern(path) else _Tail(path) for path in paths]
         for tail in self._tails:
             if self.ends and not (tail.files() if isinstance(tail, _Dated) else tail.path.is_file()):
                 raise BridgeError(f"{tail.path}: no such file")
@@ -245,14 +226,12 @@ class Files(SourceState):
             if not tail.path.parent.is_dir():
                 raise BridgeError(f"{tail.path.parent}: no such folder")
         self._merged: Iterator[Arrived] | None = None
-        #: the messages of the source if it has a single topic
         self._tables: Iterator[Messages] | None = None
-        #: `_size`: total size of the files that are read once [B]
-        #: `_done`: how much of this total has been read [B]
+        #: total size of the files that are read once, and how much of it has been read [B]
         self._size = self._done = 0
 
     def topics(self) -> dict[str, TopicType]:
-        """Return the columns of each topic from the first line of its file; wait for the line of a followed file."""
+        """Return the columns of each topic; wait for the first line of a followed file."""
         found: dict[str, TopicType] = {}
         for tail in self._tails:
             columns = tail.columns(grows=not self.ends)
@@ -297,7 +276,7 @@ class Files(SourceState):
 
     @property
     def share(self) -> float:
-        """Share of the files that has been read, 0..1; 0 for followed files."""
+        """Share of the files that has been read, from 0 to 1; 0 for followed files."""
         return self._done / self._size if self._size else 0.0
 
     def _next(self) -> Messages:
@@ -306,7 +285,6 @@ class Files(SourceState):
         return list(islice(self._merged or (), BATCH))
 
     def _all(self, tail: _Tail | _Dated) -> Iterator[Messages]:
-        """Yield all messages of a file that is read once, or of the files of a pattern one after the other."""
         if isinstance(tail, _Dated):
             for file in tail.files():
                 with closing(_Tail(file, tail.topic)) as part:
@@ -321,7 +299,9 @@ class Files(SourceState):
             while begin < len(lines):
                 end = begin + (BATCH if tail.rows.columns is not None else 1)
                 here, rows = lines[begin:end], tail.rows
-                found = Table(tail.topic, here, rows) if rows.under_header else messages(tail.topic, here, rows)
+                found: Messages = Table(tail.topic, here, rows)
+                if not rows.under_header:
+                    found = list(found)
                 if len(found):
                     yield found
                 begin = end
@@ -334,18 +314,17 @@ class Files(SourceState):
             tail.close()
 
 
-def is_pattern(path: Path) -> bool:
-    """Return whether a path is a pattern of names."""
+def _is_pattern(path: Path) -> bool:
     return any(sign in path.name for sign in "*?[") and not path.exists()
 
 
 def _sent_ns(row: Arrived, stamp_ns: StampOf[Arrived] | None) -> int | None:
-    """Return the stamp in a row; None without a stamp, because the time of reading cannot replace it."""
+    """Return the stamp in a row, or None; the time at which a row is read says nothing about the order of rows."""
     return None if stamp_ns is None else stamp_ns(Arrived(row.topic, NO_TIME, row.content))
 
 
 class StandardInput(SourceState):
-    """Lines from standard input or another file descriptor, until the end of the input.
+    """Lines from standard input or another file descriptor, until its end.
 
     Raises
     ------
@@ -387,7 +366,7 @@ class StandardInput(SourceState):
             raise BridgeError(f"-: standard input cannot be read: {error.strerror}") from error
         self.finished = not data
         lines = self._lines.add(data) if data else self._lines.end()
-        return messages(STDIN_TOPIC, lines, self._rows)
+        return list(Table(STDIN_TOPIC, lines, self._rows))
 
     def close(self) -> None:
         """Do nothing, because the caller owns the descriptor."""

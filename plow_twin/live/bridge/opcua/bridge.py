@@ -1,4 +1,7 @@
-"""Samples from an OPC UA server: from a subscription, and from the server's history where values are missing."""
+"""Samples from an OPC UA server: from a subscription, and after a break from the server's history.
+
+The server sends single values, each with a node and a stamp; `Samples` combines them into samples.
+"""
 
 from __future__ import annotations
 
@@ -31,19 +34,17 @@ from plow_twin.record.sources import Arrived, TopicType
 #: Largest number of samples that wait to be read; further samples are counted as lost, except samples of the history.
 _QUEUE: Final = 100_000
 _PORTS: Final = {"opc.tcp": 4840}
-#: Longest wait [s] for all values with the same stamp. These values come in one message or in two successive messages;
-#: the wait has a margin for a busy machine.
+#: Longest wait [s] for all values with the same stamp, which come in one or two messages; the rest is a margin.
 _WAIT_S: Final = 5e-3 * PUBLISHING_MS
 #: The history is read in pieces of this length [ns].
 _PIECE_NS: Final = 10_000_000_000
 #: Longest assumed delay of one node's values behind the values of another node [ns].
 _OVERLAP_NS: Final = 1_000_000_000
-#: A value whose stamp is further ahead of the system's time than this [ns] is passed on alone, and is ignored in the
-#: search for gaps.
+#: A value whose stamp is further ahead of the system's time than this [ns] is not used in the search for gaps.
 _AHEAD_NS: Final = 86_400_000_000_000
-#: Longest assumed delay [s] until a value that the server has sent is also in the server's history.
+#: Longest assumed delay [s] until a value that was sent is also in the history.
 _HISTORY_LAG_S: Final = 5.0
-#: Longest wait for the first values of a subscription [s]; a server sends these values at once.
+#: Longest wait for the first values of a subscription [s], which a server sends at once.
 _FIRST_VALUES_S: Final = 10.0
 #: First wait before another attempt to connect [s].
 _FIRST_WAIT_S: Final = 1.0
@@ -52,21 +53,20 @@ _LONGEST_WAIT_S: Final = 30.0
 
 
 class OpcUa(SourceState):
-    """A subscription to the nodes of a mapping; the subscription outlives a broken connection.
+    """A subscription to the nodes of a mapping, which is renewed after a break.
 
     Parameters
     ----------
     access
         The server.
     roles
-        The mapping, in which each role is a topic and its fields are nodes.
+        The mapping. Each role is a topic, and its fields are nodes.
     rate_hz
         Expected rate of the samples [Hz]; 0: unknown, so that the server's fastest sampling is requested.
     connect_s
         Longest wait for the first connection [s].
     waits
-        Whether `start` returns without waiting for the first connection, which is then attempted repeatedly like later
-        connections.
+        Whether `start` returns before there is a connection.
     on_arrival
         Called, from another thread, when samples have arrived.
 
@@ -99,7 +99,7 @@ class OpcUa(SourceState):
         self._samples = {
             topic: Samples(sorted(set(role.fields.values())), _WAIT_S) for topic, role in self._roles.items()
         }
-        #: for each node, by its number: the topics that use the node
+        #: the topics that use each node, by the node's number
         self._topics_of = [
             [topic for topic, role in self._roles.items() if node in role.fields.values()] for node in self._nodes
         ]
@@ -116,12 +116,12 @@ class OpcUa(SourceState):
         self._loop: asyncio.AbstractEventLoop | None = None
         self._task: asyncio.Task[None] | None = None
         self._link: Link | None = None
-        #: values that have come while the history is read, each list with a flag that earlier values were lost; None if
-        #: values are used at once
+        #: values that came while the history was read, each list with a flag for lost earlier values; None if values
+        #: are used at once
         self._held_back: list[tuple[list[tuple[int, Any]], bool]] | None = None
-        #: time of the steady clock at which the connection broke [s]; None while there is a connection
+        #: steady time at which the connection broke [s]; None while there is a connection
         self._broken_s: float | None = None
-        #: why the history of this connection cannot be read; empty if it can
+        #: why the history cannot be read
         self._no_history = ""
         logging.getLogger("asyncua").addHandler(logging.NullHandler())
 
@@ -179,7 +179,7 @@ class OpcUa(SourceState):
             asyncio.run(self._serve())
 
     async def _serve(self) -> None:
-        """Connect again and again until a stop is requested."""
+        """Connect again after each break until a stop is requested."""
         self._loop, self._task = asyncio.get_running_loop(), asyncio.current_task()
         wait_s = _FIRST_WAIT_S
         while not self._stop.is_set():
@@ -202,7 +202,6 @@ class OpcUa(SourceState):
             wait_s = min(2.0 * wait_s, _LONGEST_WAIT_S)
 
     async def _follow(self, link: Link) -> None:
-        """Receive values over one connection until it breaks or a stop is requested."""
         self._held_back, self._no_history, self._link = [], "", link
         self._revised = await link.open()
         self._uris = self._uris or link.uris
@@ -219,14 +218,13 @@ class OpcUa(SourceState):
             self.trouble = f"the connection broke: {link.trouble}; reconnecting"
 
     async def _first_values(self) -> list[tuple[int, Any]]:
-        """Wait for and return the first values of the new subscription; the history is read up to them."""
+        """Return the first values of the new subscription, up to which the history is read."""
         give_up = time.monotonic() + _FIRST_VALUES_S
         while not self._held_back and time.monotonic() < give_up:
             await asyncio.sleep(0.01)
         return self._held_back[0][0] if self._held_back else []
 
     async def _release(self) -> None:
-        """Use the values that came while the history was read."""
         while self._held_back:
             waiting, self._held_back = self._held_back, []
             for values, lost in waiting:
@@ -234,7 +232,7 @@ class OpcUa(SourceState):
         self._held_back = None
 
     async def _take(self, values: list[tuple[int, Any]], lost: bool) -> None:
-        """Use values of the subscription; if values before them were lost, first read the history."""
+        """Use values; if values before them were lost, read the history first."""
         if self._held_back is not None:
             self._held_back.append((values, lost))
             return
@@ -255,19 +253,15 @@ class OpcUa(SourceState):
             self._add(number, value, now_s)
         self._pass_on(now_s)
 
-    def _is_new(self, number: int, value: Any) -> bool:
-        """Return whether a value is newer than all earlier values of its node."""
+    def _stamp_ns(self, number: int, value: Any) -> int:
+        """Return the stamp of a value, or 0 without a stamp."""
         found = reading(value, self._by_server(number), Counts())
-        return found is not None and found[0] > self._newest_ns(number)
-
-    def _is_before(self, number: int, value: Any, end_ns: int) -> bool:
-        found = reading(value, self._by_server(number), Counts())
-        return found is not None and found[0] <= end_ns
+        return 0 if found is None else found[0]
 
     def _is_known(self, number: int, value: Any) -> bool:
-        """Return whether the history had this value; a much older value is new (server clock set back)."""
-        found = reading(value, self._by_server(number), Counts())
-        return found is not None and 0 <= self._newest_ns(number) - found[0] < _PIECE_NS
+        """Return whether the history had this value; a much older value is new, as the server's clock was set back."""
+        stamp_ns = self._stamp_ns(number, value)
+        return stamp_ns > 0 and 0 <= self._newest_ns(number) - stamp_ns < _PIECE_NS
 
     def _by_server(self, number: int) -> bool:
         return self._roles[self._topics_of[number][0]].stamp == SERVER_STAMP
@@ -289,12 +283,12 @@ class OpcUa(SourceState):
                     samples.begin(node, *found)
 
     async def _fill(self, up_to: list[tuple[int, Any]]) -> bool:
-        """Fill the gap before these values from the history; return whether the whole gap is filled."""
+        """Fill the gap before these values from the history; return whether nothing is missing."""
         ends_ns: dict[int, int] = {}
         for number, value in up_to:
-            found = reading(value, self._by_server(number), Counts())
-            if found is not None and found[0] < time.time_ns() + _AHEAD_NS:
-                ends_ns.setdefault(number, found[0])
+            stamp_ns = self._stamp_ns(number, value)
+            if 0 < stamp_ns < time.time_ns() + _AHEAD_NS:
+                ends_ns.setdefault(number, stamp_ns)
         if not self._no_history:
             try:
                 await self._read_history(ends_ns)
@@ -308,7 +302,7 @@ class OpcUa(SourceState):
         return False
 
     async def _read_history(self, ends_ns: Mapping[int, int]) -> None:
-        """Read the history in pieces, until each node has a value as new as its time in `ends_ns`."""
+        """Read the history until each node has a value as new as its time in `ends_ns`."""
         end_ns = max(ends_ns.values(), default=time.time_ns())
         reached_ns, found = 0, 0
         give_up = time.monotonic() + _HISTORY_LAG_S
@@ -330,24 +324,22 @@ class OpcUa(SourceState):
             self._no_history = "the server's history is empty"
 
     async def _take_piece(self, begin_ns: int, end_ns: int) -> int:
-        """Use the history's values between two stamps [ns]; return the number of new values."""
+        """Use the history's new values between two stamps [ns]; return their number."""
         assert self._link is not None
         values = await self._link.history(begin_ns, end_ns)
-        new = [item for item in values if self._is_new(*item)]
-        asked = [item for item in new if self._is_before(*item, end_ns + _OVERLAP_NS)]
+        new = [item for item in values if self._stamp_ns(*item) > self._newest_ns(item[0])]
+        asked = [item for item in new if self._stamp_ns(*item) <= end_ns + _OVERLAP_NS]
         self._counts.history_strays += len(new) - len(asked)
-        new = asked
-        self._counts.values_filled += len(new)
+        self._counts.values_filled += len(asked)
         now_s = time.monotonic()
-        for number, value in new:
+        for number, value in asked:
             self._add(number, value, now_s)
         self._pass_on(float("-inf"))
         while len(self._queue) > _QUEUE // 2:
             await asyncio.sleep(0.01)
-        return len(new)
+        return len(asked)
 
     def _pass_on(self, now_s: float) -> None:
-        """Queue the complete samples."""
         log_ns = time.time_ns()
         for topic, samples in self._samples.items():
             for stamp_ns, values in samples.take(now_s):
