@@ -1,1 +1,1 @@
-"""The live twin apart from its transport: session, recording, wear, alarms, health; inputs without ROS."""
+"""The live twin apart from ROS: session, recording, wear, alarms, diagnostics, and inputs without ROS."""

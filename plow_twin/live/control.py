@@ -1,4 +1,4 @@
-"""A local socket through which a twin that runs without ROS offers the node's services.
+"""A local socket by which a twin that runs without ROS offers the services of the node.
 
 A request and its answer are one datagram each, so that no client can hold up the twin.
 """
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from plow_twin.live.services import Services
 
 _LARGEST: Final = 65536
-#: Largest number of requests that are answered in one call of `Control.turn`.
+#: Largest number of requests that a call of `Control.turn` answers.
 _MOST: Final = 8
 #: How long a client waits for the answer [s].
 _PATIENCE_S: Final = 5.0
-#: Time between two calls of `Control.turn` [s].
+#: Period of the calls of `Control.turn` [s].
 TURN_S: Final = 0.1
 
 
@@ -31,7 +31,7 @@ class ControlError(PlowTwinError):
 
 
 class Control:
-    """Context manager of a twin's socket: only the twin's user may connect; the exit removes the socket.
+    """Context manager of a twin's socket, to which only the twin's user may connect.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ class Control:
 
 
 def call(path: Path, service: str, text: str | None = None) -> tuple[bool, str]:
-    """Ask the twin behind a socket for a service; return whether the service was done, and the twin's answer.
+    """Request a service from the twin behind a socket; return whether it was done, and the answer.
 
     Raises
     ------
@@ -110,7 +110,7 @@ def call(path: Path, service: str, text: str | None = None) -> tuple[bool, str]:
         kind = "a folder" if path.is_dir() else "a file" if path.exists() else "nothing there"
         raise ControlError(f"{path}: got {kind}, expected the socket that plow-twin live --control has opened")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as client:
-        client.bind("")  # the client's name is chosen by the system and is outside the file system
+        client.bind("")  # the system chooses a name outside the file system
         client.settimeout(_PATIENCE_S)
         try:
             client.connect(str(path))
@@ -124,7 +124,7 @@ def call(path: Path, service: str, text: str | None = None) -> tuple[bool, str]:
 
 
 def _answers(path: Path) -> bool:
-    """Return whether a process holds a socket open."""
+    """Return whether a process holds the socket open."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as client:
         try:
             client.connect(str(path))

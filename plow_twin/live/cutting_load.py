@@ -1,7 +1,6 @@
 """A cutting load along the face: Gamma-distributed, correlated in space, drawn anew for each pass.
 
-The fluctuation depends on the place along the face and on the pass: at one place and pass, the same seed gives the same
-load at any sampling rate and speed.
+The fluctuation depends on the pass and the place along the face, but not on the sampling rate or the speed.
 
 References
 ----------
@@ -25,8 +24,7 @@ from plow_twin.scene_file.validation import Schema, validate
 
 Array = NDArray[np.float64]
 
-#: Grid points of the random field per correlation length; linear interpolation between the points loses 1 % of the
-#: field's variance.
+#: Grid points per correlation length; the linear interpolation between them loses 1 % of the field's variance.
 _POINTS: Final = 25
 
 
@@ -53,7 +51,7 @@ _SCHEMA: Final[Schema] = {
 
 @dataclass(frozen=True)
 class Face:
-    """The face and the motion of the plough along it: one way at `speed_m_s`, a turn of `turn_s`, and back."""
+    """The face, and the plough's motion along it: one way at `speed_m_s`, a turn of `turn_s`, and back."""
 
     length_m: float = 250.0
     speed_m_s: float = 2.0
@@ -62,11 +60,9 @@ class Face:
     def travel(self, t: Array) -> tuple[Array, Array, NDArray[np.int64]]:
         """Return position [m], signed speed [m/s] and number of the pass at times `t` >= 0 (n,) [s].
 
-        In a turn the speed falls linearly to zero and rises in the other direction. The first half of a turn belongs to
-        the pass before it, the second half to the pass after it.
+        In a turn the speed falls linearly to zero and rises in the other direction. The pass changes in its middle.
         """
-        # when a turn begins, the head is still within the face; it reaches the end of the face in the middle of the
-        # turn
+        # the head reaches the end of the face in the middle of a turn
         steady = (self.length_m - 0.5 * self.speed_m_s * self.turn_s) / self.speed_m_s
         period = steady + self.turn_s
         number = np.floor(t / period).astype(np.int64)
@@ -107,7 +103,7 @@ class CuttingLoad:
     Raises
     ------
     ArgumentError
-        A number is out of range; the message names it.
+        A number is out of range.
     """
 
     face: Face
@@ -127,7 +123,7 @@ class CuttingLoad:
             raise ArgumentError(f"turn_s: got {face.turn_s!r}, expected less than two passes of {face.length_m:g} m")
 
     def at(self, t: Array) -> Array:
-        """Return Fx, Fy [N], M [N m] at times `t` (n,) [s], shape (n, 3); they scale with the speed."""
+        """Return Fx, Fy [N], M [N m] at times `t` (n,) [s], shape (n, 3), in proportion to the speed."""
         position, speed, number = self.face.travel(t)
         force = np.zeros((len(t), 2))
         for one in np.unique(number):
@@ -139,7 +135,7 @@ class CuttingLoad:
         return np.column_stack([force, x * force[:, 1] - y * force[:, 0]])
 
     def _fields(self, number: int, position: Array) -> tuple[Array, Array]:
-        """Return the cutting force divided by its mean, and the lateral force divided by its deviation, in one pass."""
+        """Return cutting force over its mean, and lateral force over its deviation, in the pass `number`."""
         step = self.correlation_m / _POINTS
         grid = np.arange(math.ceil(self.face.length_m / step) + 2) * step
         rho = math.exp(-1.0 / _POINTS)

@@ -1,4 +1,4 @@
-"""Link of a live twin to the estimate in another process; imported only where estimates are made."""
+"""The estimates of a live twin, which another process computes."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ from plow_twin.stream.journal import (
 )
 from plow_twin.stream.session import Series, Session
 
-#: Base names of the published topics.
+#: Base names of the topics.
 ESTIMATE, WINDOW_FORCES, FORECAST = ESTIMATES
-#: For each unit of a forecast that is not an SI unit: the SI unit in which the number is published.
+#: The published unit of a forecast in place of its other unit.
 _SI: Final = {"hours": "seconds", "km": "metres"}
-#: Rate of checks for a finished estimate [Hz].
+#: Rate at which a finished estimate is looked for [Hz].
 RATE_HZ: Final = 10.0
 
 
 class Estimation:
-    """The estimate of one live twin: its inputs, and the use of its results."""
+    """The estimates of a live twin: their inputs, and the use of their results."""
 
     def __init__(self, settings: Settings, scene: Scene) -> None:
         self._frame_id, self._follows = settings.frame_id, settings.follows != "off"
@@ -51,38 +51,36 @@ class Estimation:
         self.worker = Worker(scene, windows, asked)
         sent = {ESTIMATE: True, WINDOW_FORCES: bool(asked.members), FORECAST: asked.plan is not None}
         self._topics = [topic for topic, wanted in sent.items() if wanted]
-        #: stamp [ns] at which other pads were set, until empty messages have withdrawn the old estimate; otherwise None
+        #: stamp [ns] at which other pads were set, until the old estimate is withdrawn by empty messages
         self._set_ns: int | None = None
-        #: origin of each clearance according to the newest estimate
+        #: state of each clearance in the newest estimate
         self.states = {"horizontal": State.PRIOR, "vertical": State.PRIOR}
-        #: trust in model and sensor according to the newest estimate
+        #: trust in model and sensor in the newest estimate
         self.trust = {"model": "", "sensor": ""}
         self.reasons: tuple[str, ...] = ()
-        #: `count`: number of estimates
-        #: `skipped`: number of windows skipped because a newer window came
+        #: number of estimates, and of windows that a newer window replaced before they were estimated
         self.count = self.skipped = 0
         #: time that the newest estimate took [s]
         self.wall_s = 0.0
         self.end_ns: int | None = None
-        #: the newest forecast
+        #: the newest forecast, or the reason why there is none
         self.forecast: dict[str, Any] | None = None
-        #: reason why there is no forecast
         self.forecast_error = "nothing has been estimated yet"
-        #: the newest estimate, which is journalled again in a new journal
+        #: the newest estimate, which a new journal needs again
         self.entry: Estimated | None = None
 
     @property
     def done(self) -> bool:
-        """Whether the estimation is over: the last window is done, or the process has failed."""
+        """Whether the last window is done, or the process has failed."""
         return self.worker.ended is not None or bool(self.worker.error)
 
     @property
     def shortage(self) -> str:
-        """Why no estimate was made; empty if an estimate was made or the source has not ended."""
+        """Why no estimate was made, once the source has ended; otherwise empty."""
         return "" if self.count else self.worker.ended or ""
 
     def add(self, entry: Entry) -> None:
-        """Pass an entry that the session has accepted to the estimate."""
+        """Pass an entry of the journal to the estimate."""
         match entry:
             case Sample(stamp_ns, wrench):
                 self.worker.add_load(stamp_ns, wrench)
@@ -101,7 +99,7 @@ class Estimation:
                 self.trust, self.reasons = dict.fromkeys(self.trust, ""), ()
                 self.forecast, self.forecast_error = None, "nothing has been estimated since the pads were set"
             case SetModel():
-                # the clearances have been replaced, so an older estimate no longer applies
+                # these clearances replace those of an older estimate
                 self.worker.restart()
                 self._forget()
             case Reset():
@@ -115,9 +113,9 @@ class Estimation:
             self.worker.add_load(stamp_ns, tuple(wrench))
 
     def poll(self, session: Session) -> dict[str, plain.JointState]:
-        """Pass a finished estimate to the session and return its messages by topic, empty without an estimate.
+        """Apply a finished estimate to the session; return its messages by topic, empty without an estimate.
 
-        After other pads have been set, empty messages replace the latched messages of the old estimate.
+        After other pads have been set, empty messages replace the old estimate's latched messages.
         """
         found = self.worker.poll()
         stamp_ns, self._set_ns = self._set_ns, None
@@ -150,8 +148,8 @@ class Estimation:
 def entry_of(found: Found, session: Session, before: Estimated | None) -> Estimated:
     """Return the journal's entry of an estimate.
 
-    A clearance that is not observable keeps its last estimate, with an interval that widens like the wear's prior; a
-    withdrawn clearance has the model's value.
+    A clearance that is not observable keeps its last estimate, with an interval that widens like the wear's prior. A
+    withdrawn clearance gets the model's value.
     """
     model = session.outputs.modelled(session.wear_depth)
     shift = np.array(before.shift) if before is not None else np.zeros(6)
@@ -169,7 +167,7 @@ def entry_of(found: Found, session: Session, before: Estimated | None) -> Estima
 
 
 def message_of(found: Found, frame_id: str) -> plain.JointState:
-    """Return the message of an estimate, stamped with the end of its window; empty if the estimate is withdrawn."""
+    """Return the message of an estimate, stamped with the end of its window; empty if it is withdrawn."""
     result = found.estimate
     names: list[str] = []
     numbers: list[float] = []
@@ -181,7 +179,7 @@ def message_of(found: Found, frame_id: str) -> plain.JointState:
 
 
 def forces_message(found: Found, frame_id: str) -> plain.JointState:
-    """Return the message of the forces at a window's end, in the form of `contact_peaks`; empty without forces."""
+    """Return the message of a window's forces, in the form of `contact_peaks`; empty without forces."""
     names: list[str] = []
     peaks: list[float] = []
     impulses: list[float] = []
@@ -195,10 +193,7 @@ def forces_message(found: Found, frame_id: str) -> plain.JointState:
 
 
 def forecast_message(found: Found, frame_id: str) -> plain.JointState:
-    """Return the message of a forecast: seconds, metres, passes and shifts to the limit.
-
-    Limits that are not reached within the horizon are left out.
-    """
+    """Return the message of a forecast: seconds, metres, passes and shifts to each limit that is reached."""
     forecast = found.also["forecast"] or {}
     names: list[str] = []
     numbers: list[float] = []
@@ -216,7 +211,7 @@ def forecast_message(found: Found, frame_id: str) -> plain.JointState:
 
 
 def asked_of(settings: Settings) -> Asked:
-    """Return which results besides the estimate the parameters ask for."""
+    """Return which results the parameters request besides the estimate."""
     horizontal, vertical = settings.forecast_limits
     plan = None
     if horizontal or vertical:
@@ -226,12 +221,12 @@ def asked_of(settings: Settings) -> Asked:
 
 
 def scenarios_of(settings: Settings) -> tuple[Scenario, ...]:
-    """Return the scenarios that the parameters name; raise LifeError if they cannot be read."""
+    """Return the scenarios of the parameters; raise LifeError if they cannot be read."""
     return tuple(Scenario.parse(text) for text in settings.forecast_scenarios.split(";") if text.strip())
 
 
 def problems(settings: Settings, scene: Scene) -> list[Problem]:
-    """Return contradictions among the parameters of the estimate, and between them and the scene."""
+    """Return contradictions among the parameters of the estimate, or with the scene."""
     found = []
     if settings.excitation_source == "scene":
         found.append(Problem("estimate", True, "false with excitation_source scene: no load arrives"))

@@ -1,4 +1,4 @@
-"""The live twin without ROS: a bridge feeds the twin, and one function receives its reports."""
+"""The live twin without ROS: a bridge feeds the twin, and a function receives its reports."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ from plow_twin.stream.outputs import Published
 from plow_twin.stream.topics import TOPICS
 
 NAME: Final = "/plow_twin"
-#: Longest wait for a message [s]; a request to stop is noticed within this time.
+#: Longest wait for a message, and thus for the response to a stop request [s].
 _POLL_S: Final = 0.1
 _REPORT_S: Final = 1.0
-#: Share of unused samples above which the report names a likely cause.
+#: Share of unused samples above which a likely cause is reported.
 _MANY: Final = 0.01
 
-#: Receives `status`, `alarms` or a part of the diagnostics by name, with level, message and values.
+#: Receives `status`, `alarms` or a part of the diagnostics: its name, and its level, message and values.
 Say = Callable[[str, Part], None]
 
 
@@ -63,9 +63,9 @@ class BridgeFront:
     settings, prepared
         As in `Runtime`.
     say
-        Receives status and alarms on change, and the diagnostics once a second.
+        Receives status and alarms when they change, and the diagnostics once a second.
     on_error
-        Receives errors in words; may be called from another thread.
+        Receives errors, perhaps from another thread.
     units
         Units by name (fx, ..., t), which replace the units of the mapping.
 
@@ -106,14 +106,14 @@ class BridgeFront:
         self.runtime = Runtime(self, settings, prepared)
         self._feeder = Feeder(self.roles, self.runtime, self.send, model if "drive" in self.roles else None)
         self._health = diagnostics.Health()
-        #: work that is done between the messages while the source is read
+        #: calls between the messages
         self.timers: list[Timer] = []
         self._watchers: list[Watcher] = []
         #: further parts of the diagnostics, by name
         self.more_parts: dict[str, Callable[[], Part]] = {}
 
     def attach(self, watcher: Watcher) -> None:
-        """Add an observer."""
+        """Add a watcher."""
         self._watchers.append(watcher)
         self.runtime.publishing.watch = self._published
 
@@ -122,12 +122,11 @@ class BridgeFront:
             watcher.publication(published)
 
     def now_ns(self) -> int:
-        """Return the system's time, or the samples' own time [ns]."""
-        # the time is at least 1, because 0 would mean that there is no time yet
+        """Return the system's time, or the samples' own time [ns]; 0 would mean that there is no time yet."""
         return (self._feeder.newest_ns or 1) if self.follows_samples else time.time_ns()
 
     def send(self, topic: str, message: memoryview | Message) -> None:
-        """Report an alarm, or an estimate with its forecast and peak forces; the motion is only recorded."""
+        """Report alarms and estimates; messages of the motion are only recorded."""
         if isinstance(message, DiagnosticStatus):
             self._tell(topic, (message.level, message.message, dict(message.values)))
         elif isinstance(message, JointState):
@@ -151,7 +150,7 @@ class BridgeFront:
         """Do nothing: `say` gets the alarms."""
 
     def time_text(self, stamp_ns: int) -> str:
-        """Return a stamp in words, in the form in which the input states its stamps."""
+        """Return a stamp as text, in the form that the input has."""
         return time_text(stamp_ns, own_start=True)
 
     def changed(self) -> None:
@@ -165,7 +164,7 @@ class BridgeFront:
         self.runtime.record_status(DiagnosticStatus(level, self.name, message, head, tuple(values.items())))
 
     def run(self, stop_asked: Callable[[], bool], seconds: float = float("inf")) -> list[str]:
-        """Feed the twin until the source ends, a stop is requested, or time is up; return the losses in words."""
+        """Feed the twin until the source ends, a stop is requested, or time is up; return the losses."""
         runtime, bridge = self.runtime, self._bridge
         lost: list[str] = []
         broken = ""
@@ -182,7 +181,7 @@ class BridgeFront:
         return [*([broken] if broken else []), *self._not_read(stop_asked()), *diagnostics.failures(runtime), *lost]
 
     def _not_read(self, stopped: bool) -> list[str]:
-        """Return in words which input never came or was not read."""
+        """Describe input that never came or was not read."""
         if self._settings.excitation_source != "excitation":
             return []
         intake, topic = self.runtime.driver.intake, self.roles["drive" if "drive" in self.roles else "excitation"].topic
@@ -198,7 +197,7 @@ class BridgeFront:
         return []
 
     def causes(self) -> list[str]:
-        """Describe silences, and likely causes of samples that were not used or that reset the motion."""
+        """Describe silences, and likely causes of unused samples and of resets."""
         counts, found = self.runtime.driver.intake.counts, []
         many = _MANY * max(1, sum(counts.values()))
         if self._feeder.unfit:
@@ -269,21 +268,20 @@ class BridgeFront:
                 watcher.part(name, part)
 
     def _messages(self, timeout_s: float) -> Messages:
-        """Return the next messages; first come the messages that were already read for the check of units."""
         if not self._first:
             return self._bridge.poll(timeout_s)
         return self._first.popleft()
 
     def _report(self) -> None:
         self.changed()
-        # the twin itself sends alarms only when a level changes, so each report sends their present values
+        # the twin sends alarms only when a level changes
         self.send(ALARMS, alarms_message(self.runtime.alarms, self.name, self._settings.hardware_id))
         for name, part in self.parts().items():
             self._tell(name, part)
 
 
 def _first_messages(bridge: Bridge) -> Iterator[Messages]:
-    """Yield the first messages of the source, from which the check of units judges the numbers."""
+    """Yield the first messages, which the check of units reads."""
     count = 0
     while count < CHECKED and len(found := bridge.poll(0.0)):
         count += len(found)
@@ -315,7 +313,7 @@ def roles_of(
     if ("drive" in roles) != modelled or {"drive", "excitation"} <= roles.keys():
         raise BridgeError("mapping: expected drive and load_model together, and no excitation beside them")
     if source == "excitation" and not {"drive", "excitation"} & roles.keys():
-        # the types are cut to 120 characters, because the content may not be text
+        # the content may not be text, so the types are cut
         there = "; ".join(f"{topic} ({str(kind)[:120]})" for topic, kind in (topics or {}).items())
         setup = "" if topics is None else "; plow-twin setup FILE writes a mapping"
         raise BridgeError(

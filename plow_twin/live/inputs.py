@@ -1,4 +1,4 @@
-"""The inputs of a live twin from any transport: choice of the sender, counts of messages, checks of optional inputs."""
+"""The inputs of a live twin from any transport: choice of the sender, counts, and checks of the optional inputs."""
 
 from __future__ import annotations
 
@@ -20,61 +20,55 @@ if TYPE_CHECKING:
 
 #: The inputs, by the names of their topics.
 TOPICS: Final = ("excitation", "tool_forces", "travel", "head_pose", "gaps")
-#: Inputs besides the load.
+#: The inputs besides the load.
 OPTIONAL: Final = ("travel", "head_pose", "gaps")
-#: Time [ns] for which another sender counts as present after its last sample.
+#: Another sender counts as present for this time after its last sample [ns].
 _OTHER_SENDER_NS: Final = 3_000_000_000
-#: Time [ns] without a message after which an optional input counts as silent, if it was heard before.
+#: An optional input that was heard counts as silent after this time without a message [ns].
 _SILENT_NS: Final = 10_000_000_000
 
 
 class Inputs:
-    """The inputs of a live twin, without their transport.
+    """The inputs of a live twin.
 
     Parameters
     ----------
     front
         Gives the time and the present senders.
     source
-        The input of the excitation.
+        The input that gives the load.
     depth
-        Length of the queue of the excitation.
+        Length of the queue of the load.
     late_span_s
-        Largest delay of a measured pose or gap with which it is still used [s].
+        Largest delay with which a measured pose or gap is still used [s].
     journaled
         Whether unused messages are collected for the journal.
     intake
-        Settings of the intake that judges the excitation, as in `Intake`.
+        Arguments of the `Intake` that judges the load.
     """
 
     def __init__(
         self, front: Front, source: str, depth: int, late_span_s: float, *, journaled: bool, **intake: Any
     ) -> None:
         self._front, self._source = front, source
-        #: judges the samples of the load, and counts the samples that it refuses
         self.intake = Intake(on_unused=self._sample_unused, **intake)
-        #: messages that are not used, for the journal
         self.unused = UnusedMessages(journaled)
-        #: topic and sender of the message being processed; empty if the message comes from the selected source
+        #: topic and sender of the message being processed, unless the selected source has sent it
         self.arriving = ("", b"")
         self._poses, self._gap_stamps = RecentStamps(late_span_s), RecentStamps(late_span_s)
         self.depth = depth
-        #: whether samples are taken
         self.active = False
-        #: whether the source has ended
         self.ended = False
-        #: whether the journal is open: it opens once there is a clock, or with the first sample
+        #: whether the journal is open
         self.started = False
-        #: senders of the selected source
         self.senders = Senders()
-        #: senders of the optional inputs
         self.optional = {topic: OneSender() for topic in OPTIONAL}
         self._queue_peak = (0, 0.0)
-        #: longest wait of a sample in the queue since the last report [s]
+        #: longest wait of a sample since the last report [s]
         self.wait_s = 0.0
         self._heard_ns: dict[str, int] = {}
         self._other_heard_ns: dict[str, int] = {}
-        #: number of messages that could not be read, if the transport counts them
+        #: number of messages that could not be read
         self.lost = 0
         self.travel, self.head_pose, self.gaps = (Intake(on_unused=self._unused) for _ in OPTIONAL)
         self._gap_limits: Limits | None = None
@@ -88,25 +82,25 @@ class Inputs:
         self.publishers = dict.fromkeys(TOPICS, 0)
 
     def set_limits(self, travel: Limits, pose: Limits, gap: Limits) -> None:
-        """Set the limits of speeds along the face [m/s], of poses (x, y [m], theta [rad]) and of gaps [m]."""
+        """Set the limits of speed [m/s], pose (x, y [m], theta [rad]) and gap [m]."""
         self.travel.limits, self.head_pose.limits, self._gap_limits = travel, pose, gap
 
     def other_senders(self) -> list[str]:
-        """Return the inputs on which another sender than the followed sender is present."""
+        """Return the inputs on which a sender that is not followed sends too."""
         if not self._other_heard_ns:
             return []
         now_ns = time.monotonic_ns()
         return [topic for topic, heard_ns in self._other_heard_ns.items() if now_ns - heard_ns < _OTHER_SENDER_NS]
 
     def silent(self) -> list[str]:
-        """Return the optional inputs that were heard before and have become silent."""
+        """Return the optional inputs that have become silent."""
         if self.ended:
             return []
         now_ns = time.monotonic_ns()
         return [topic for topic, heard_ns in self._heard_ns.items() if now_ns - heard_ns > _SILENT_NS]
 
     def waited(self, messages: int, longest_s: float) -> None:
-        """Record how many messages waited in the queue, and how long the first message waited [s]."""
+        """Record how many messages waited, and how long the first of them waited [s]."""
         self.wait_s = max(self.wait_s, longest_s)
         most, before_s = self._queue_peak
         if messages > most or longest_s > before_s:
@@ -118,7 +112,7 @@ class Inputs:
         return peak
 
     def wanted(self, sender: bytes, number: int, stamp_ns: int, values: Sequence[float], fits: bool = True) -> bool:
-        """Register message `number` (from 1) of a sender; if it is not used, count it and return False.
+        """Register message `number` (from 1) of a sender; if it cannot be used, count it and return False.
 
         `fits` states whether the message can be read as a sample; `values` are all its numbers.
         """
@@ -137,7 +131,7 @@ class Inputs:
         return False
 
     def lost_at_first(self, sender: bytes, more: int) -> bool:
-        """Count `more` samples of a sender as lost before its first sample; False unless this sender is followed."""
+        """Count `more` samples before a sender's first sample as lost; return False unless it is followed."""
         if sender != self.senders.followed:
             return False
         self.senders.lost += more
@@ -145,14 +139,13 @@ class Inputs:
         return True
 
     def _other_heard(self, topic: str, sender: bytes, stamp_ns: int, values: Sequence[float]) -> None:
-        """Count a message from a sender that is not the followed sender."""
         if topic not in self.other_senders():
             self._front.look_for_senders(topic)
         self._other_heard_ns[topic] = time.monotonic_ns()
         self.unused.note(topic, sender, "not_followed", stamp_ns, values)
 
     def _follows(self, topic: str, stamp_ns: int, values: Sequence[float]) -> bool:
-        """Return whether a message on an optional input comes from the followed sender; count it if it does not."""
+        """Return whether a message on an optional input comes from the followed sender; count other senders."""
         sender = self.arriving[1]
         followed = self.optional[topic].hear(sender, time.monotonic_ns())
         if not followed:
@@ -160,20 +153,20 @@ class Inputs:
         return followed
 
     def uses_travel(self, stamp_ns: int, speed_m_s: float) -> bool:
-        """Add a speed along the face; return whether it is used."""
+        """Judge a speed along the face; return whether it is used."""
         if not self._follows("travel", stamp_ns, (speed_m_s,)):
             return False
         return self._judged("travel", self.travel, stamp_ns, (speed_m_s,)).used
 
     def uses_pose(self, stamp_ns: int, pose: tuple[float, float, float], deviation: tuple[float, ...] = ()) -> bool:
-        """Add a measured pose: x, y [m], theta [rad], and their standard deviations where they are known.
+        """Judge a measured pose x, y [m], theta [rad] and its standard deviations; return whether it is used.
 
-        A component that was not measured is NaN; a pose of three NaN is refused. Return whether the pose is used.
+        A component that was not measured is NaN; a pose of three NaN is refused.
         """
         if not self._follows("head_pose", stamp_ns, (*pose, *deviation)):
             return False
         missing = [math.isnan(value) for value in pose]
-        # a component that was not measured cannot exceed the limits
+        # a component that was not measured cannot exceed its limit
         judged = pose if all(missing) else _filled(pose, self._newest_pose)
         verdict = self._judged("head_pose", self.head_pose, stamp_ns, (*judged, *deviation), self._poses)
         if verdict.used and verdict is not Verdict.WORKED_IN:
@@ -183,7 +176,7 @@ class Inputs:
         return verdict.used
 
     def uses_gaps(self, stamp_ns: int, gaps: Mapping[int, float]) -> bool:
-        """Add measured gaps [m] by number of their pairs; return whether they are used."""
+        """Judge measured gaps [m] by number of their pairs; return whether they are used."""
         values = tuple(gaps.values())
         if not self._follows("gaps", stamp_ns, values):
             return False
@@ -196,10 +189,10 @@ class Inputs:
         return verdict.used
 
     def _is_implausible(self, stamp_ns: int, gaps: Mapping[int, float]) -> bool:
-        """Return whether a gap is impossibly large, or has changed impossibly fast since the newest gap of its pair."""
+        """Return whether a gap is too large, or has changed too fast since the newest gap of its pair."""
         limits = self._gap_limits
         if limits is None or not all(map(math.isfinite, gaps.values())):
-            return False  # a value that is not a number is refused for a reason of its own
+            return False  # the intake refuses a value that is not finite
         for pair, gap in gaps.items():
             before_ns, before = self._newest_gaps.get(pair, (stamp_ns, gap))
             passed_s = (stamp_ns - before_ns) * 1e-9
@@ -237,11 +230,11 @@ class Inputs:
         if self.measured is None:
             return None
         x, y, theta = (float(model) - data for model, data in zip(q, self.measured, strict=True))
-        # a quaternion and its negative are the same turn
+        # angles that differ by a full turn are the same
         return x, y, math.remainder(theta, 2.0 * math.pi)
 
 
 def _filled(pose: tuple[float, float, float], newest: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Return a pose whose unmeasured components are replaced by those of the newest pose."""
+    """Return a pose whose missing components are those of the newest pose."""
     x, y, theta = (before if math.isnan(value) else value for value, before in zip(pose, newest, strict=True))
     return x, y, theta

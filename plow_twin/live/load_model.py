@@ -1,11 +1,11 @@
-"""The load on the head with its interval, computed from signals of the drive if the wrench is not measured.
+"""The load on the head with its standard deviation, computed from signals of the drive.
 
-The drive pulls the chain with C = efficiency P / v (or C is measured). Subtracting the drag of chain and plough gives
-the cutting force along the face, Z = C - idle. The coal gives a second value: Z = specific_force * depth *
-resistance(position). The mean of the two is weighted by their inverse variances. The force into the face is Fx =
-push_ratio Z, and the lateral force is Fy = lateral_ratio Z; both act at one point of the head, so that M = x Fy - y Fx.
-All coefficients have a standard deviation, which propagates to the result. The coefficients are measured at a machine,
-by idle runs and weighing, and have no defaults, because the paper publishes no values.
+The drive pulls the chain with C = efficiency P / v, unless C is measured. Without the drag of chain and plough, the
+cutting force along the face remains: Z = C - idle. The coal gives a second value, Z = specific_force * depth *
+resistance(position). The mean of both is weighted by the inverse variances. The force into the face is Fx = push_ratio
+Z, the lateral force Fy = lateral_ratio Z; both act at one point of the head, so that M = x Fy - y Fx. All coefficients
+have a standard deviation, which propagates to the result. They are measured at a machine, by idle runs and weighing;
+the paper publishes none.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 
 from plow_twin.record.map_file import LOAD_MODEL, map_error, read_map_file
 
-#: Smallest speed [m/s] at which the force of the chain is computed from the power.
+#: Smallest speed at which the chain's force is computed from the power [m/s].
 SLOWEST_M_S: Final = 0.1
 
 Number = tuple[float, float]
@@ -62,7 +62,7 @@ class LoadModel:
         """Return mean and deviation of the cutting force [N], or None if the signals do not suffice.
 
         `drive` has some of `power` [W], `chain_force` [N], `speed` [m/s], `depth` and `position` [m]; NaN counts as
-        missing. Without travel the force is zero.
+        missing. The force is zero at a standstill.
         """
         known = {name: value for name, value in drive.items() if math.isfinite(value)}
         if abs(known.get("speed", math.inf)) < SLOWEST_M_S and "chain_force" not in known:
@@ -71,8 +71,7 @@ class LoadModel:
         if not opinions:
             return None
         deviations = [max(deviation, 1.0) for _, deviation in opinions]
-        # weights are relative to the smallest deviation, so that huge numbers, which a later check refuses, do not
-        # overflow here
+        # weights relative to the smallest deviation do not overflow; a later check refuses huge numbers
         smallest = min(deviations)
         shares = [smallest / deviation for deviation in deviations]
         total = sum(share * share for share in shares)
@@ -121,12 +120,12 @@ class LoadModel:
 
 
 def read_load_model(path: Path | None) -> LoadModel | None:
-    """Return the load model of a mapping file, or None if it has no load model.
+    """Return the load model in a mapping file, or None.
 
     Raises
     ------
     MapError
-        The load model cannot be used; the message names key, value got and value expected.
+        The load model cannot be used.
     """
     entry = None if path is None else read_map_file(path).get(LOAD_MODEL)
     if path is None or entry is None:

@@ -18,7 +18,6 @@ from plow_twin.live.part import Part
 if TYPE_CHECKING:
     from prometheus_client.metrics_core import Metric
 
-#: Characters that must not occur in the name of a metric.
 _OTHER: Final = re.compile(r"[^a-zA-Z0-9_]")
 #: Largest number of readers at once.
 _READERS: Final = 16
@@ -31,9 +30,9 @@ class MetricsError(PlowTwinError):
 
 
 class Metrics:
-    """A page of metrics on the loopback address, which Prometheus reads, as a context manager that closes the page.
+    """Context manager of a page of metrics on the loopback address, which Prometheus reads.
 
-    Each number of each part is a gauge `plow_twin_<part>_<key>`, as of the newest report; texts are left out.
+    Each number of each part in the newest report is a gauge `plow_twin_<part>_<key>`; texts are left out.
 
     Parameters
     ----------
@@ -65,7 +64,7 @@ class Metrics:
         self._thread.join()
 
     def update(self, name: str, part: Part) -> None:
-        """Keep a part of the diagnostics; the page is computed when it is read."""
+        """Take a part of the diagnostics."""
         self._parts = {**self._parts, name: part}
 
     def collect(self) -> Iterator[Metric]:
@@ -79,7 +78,7 @@ class Metrics:
 
 
 def _bound(server: Any) -> None:
-    """Make a server close readers beyond `_READERS`, and silent readers; each reader takes a thread and a file."""
+    """Refuse readers beyond `_READERS` and close silent readers, since each reader takes a thread and a file."""
     free = threading.BoundedSemaphore(_READERS)
     start, serve = server.process_request, server.process_request_thread
     handler = server.RequestHandlerClass
@@ -105,7 +104,6 @@ def _gauge(name: str, meaning: str, value: float) -> GaugeMetricFamily:
 
 
 def _number(text: str) -> float | None:
-    """Return a finite number, or None."""
     try:
         found = float(text)
     except ValueError:

@@ -1,4 +1,4 @@
-"""Table of the node's parameters: the source of defaults, checks, ROS descriptors and config/twin.yaml."""
+"""Table of the node's parameters, from which defaults, checks, ROS descriptors and config/twin.yaml follow."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ESTIMATES: Final = names_of(Cadence.ESTIMATE)
 
 
 class Effect(Enum):
-    """The time at which a changed value takes effect, in words."""
+    """When a changed value takes effect."""
 
     START = "at start (read only)"
     CONFIGURE = "on configure; can be changed while unconfigured"
@@ -131,14 +131,7 @@ class Settings:
     estimate_window: float = _number(
         32.0, "s", 1.0, 600.0, Effect.CONFIGURE, "length of the window of an estimate; ten load periods are enough"
     )
-    estimate_interval: float = _number(
-        10.0,
-        "s",
-        0.5,
-        3600.0,
-        Effect.CONFIGURE,
-        "time between the ends of two windows",
-    )
+    estimate_interval: float = _number(10.0, "s", 0.5, 3600.0, Effect.CONFIGURE, "time between the ends of two windows")
     estimate_forces: int = _number(
         0,
         "twins",
@@ -258,12 +251,7 @@ class Settings:
         60.0, "s", 0.0, 86400.0, Effect.NOW, "silence beyond the timeout after which the model stops"
     )
     limit_force: float = _number(
-        0.0,
-        "N",
-        0.0,
-        1e300,
-        Effect.NOW,
-        "largest plausible force component; 0: ten times the scene's loads and weight",
+        0.0, "N", 0.0, 1e300, Effect.NOW, "largest plausible force component; 0: ten times the scene's loads and weight"
     )
     limit_moment: float = _number(
         0.0, "N m", 0.0, 1e300, Effect.NOW, "largest plausible moment; 0: derived from the scene's loads and weight"
@@ -356,12 +344,7 @@ class Settings:
         "standard deviation of the excitation: Fx, Fy, M; 0: not known",
     )
     alarm_force: tuple[float, ...] = _number(
-        (0.0, 0.0),
-        "N",
-        0.0,
-        1e12,
-        Effect.CONFIGURE,
-        "forces that raise a warning and an error; 0: never",
+        (0.0, 0.0), "N", 0.0, 1e12, Effect.CONFIGURE, "forces that raise a warning and an error; 0: never"
     )
     alarm_clearance: tuple[float, ...] = _number(
         (0.0, 0.0),
@@ -372,12 +355,7 @@ class Settings:
         "values of the larger clearance that raise a warning and an error; 0: never",
     )
     alarm_wear_rate: tuple[float, ...] = _number(
-        (0.0, 0.0),
-        "m/s",
-        0.0,
-        1.0,
-        Effect.CONFIGURE,
-        "wear rates of a pad that raise a warning and an error; 0: never",
+        (0.0, 0.0), "m/s", 0.0, 1.0, Effect.CONFIGURE, "wear rates of a pad that raise a warning and an error; 0: never"
     )
     alarm_clearance_rate: tuple[float, ...] = _number(
         (0.0, 0.0),
@@ -410,11 +388,11 @@ class Settings:
 
     @property
     def follows(self) -> str:
-        """The effective value of `follow`: `off` without an estimate."""
+        """`follow`, or `off` without an estimate."""
         return self.follow if self.estimate else "off"
 
 
-#: Parameters that change the running model, with their keys in the scene file.
+#: Parameters that change the running model, by their keys in the scene file.
 MODEL: Final[Mapping[str, str]] = {
     "clearance_horizontal": "clearance.horizontal_m",
     "clearance_vertical": "clearance.vertical_m",
@@ -424,10 +402,9 @@ MODEL: Final[Mapping[str, str]] = {
     "wear_coefficient": "wear.coefficient_m2_n",
 }
 SPECS: Final[Mapping[str, Field[Any]]] = {spec.name: spec for spec in fields(Settings)}
-#: Pattern of a number. YAML 1.1, which ROS launch files use, reads a number such as 1e-9 as a text, because its
-#: mantissa has no point.
+#: A number, also in a form like 1e-9 that YAML 1.1, which ROS launch files use, reads as a text.
 _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
-#: Longest text [characters]; no path on Linux is longer.
+#: Longest text [characters], which is the longest path on Linux.
 _LONGEST: Final = 4096
 #: One line without control characters, which a terminal would obey.
 _ONE_LINE: Final = r"^[^\x00-\x1f\x7f-\x9f]*\Z"
@@ -436,10 +413,9 @@ _FOREIGN: Final = ("use_sim_time", "start_type_description_service")
 
 
 def coerce(name: str, value: Any) -> Any:
-    """Return the value in the type of the parameter if the conversion is exact.
+    """Return the value in the parameter's type, or unchanged if the conversion would not be exact.
 
-    Integers become doubles, sequences become tuples, and texts such as `1e-9`, which YAML 1.1 reads as texts, become
-    numbers.
+    Integers and texts like `1e-9`, which YAML 1.1 does not read as numbers, become doubles; sequences become tuples.
     """
     default = SPECS[name].default
     if isinstance(default, tuple):
@@ -460,7 +436,7 @@ def _is_list(value: Any) -> bool:
 
 
 def expected(spec: Field[Any]) -> str:
-    """Return the values that a parameter can have, in words."""
+    """Return in words which values a parameter can have."""
     if "choices" in spec.metadata:
         return f"one of {', '.join(spec.metadata['choices'])}"
     if isinstance(spec.default, tuple):
@@ -475,7 +451,7 @@ def _range(kind: str, spec: Field[Any]) -> str:
 
 
 def problems(values: Mapping[str, Any]) -> list[Problem]:
-    """Return every problem of the given values; unknown names are ignored."""
+    """Return the problems of values; unknown names are ignored."""
     from plow_twin.scene_file.validation import validate
 
     known = {name: coerce(name, value) for name, value in values.items() if name in SPECS}
@@ -506,7 +482,7 @@ def _property(spec: Field[Any]) -> dict[str, Any]:
 
 
 def settings(values: Mapping[str, Any]) -> Settings:
-    """Return the settings with the given values in place of defaults.
+    """Return the settings with given values in place of defaults.
 
     Raises
     ------
@@ -526,7 +502,7 @@ def settings(values: Mapping[str, Any]) -> Settings:
 
 
 def services_off(given: Settings) -> frozenset[str]:
-    """Return the names of the services that these settings switch off."""
+    """Return the services that the settings switch off."""
     return frozenset(name.strip() for name in given.services_off.split(",") if name.strip())
 
 
@@ -538,7 +514,6 @@ def _unknown_services(given: Settings) -> list[Problem]:
 
 
 def _swapped_thresholds(given: Settings) -> list[Problem]:
-    """Return a problem for each alarm whose error threshold is below its warning threshold."""
     alarms = {name: getattr(given, name) for name in SPECS if name.startswith("alarm_")}
     return [
         Problem(name, list(pair), "the warning's threshold, then the larger one of the error")
@@ -554,7 +529,7 @@ def model_changes(given: Settings) -> dict[str, float]:
 
 
 def read_parameters(path: Path) -> dict[str, Any]:
-    """Return the parameters in a YAML file: under `ros__parameters`, as for a ROS node, or by plain names.
+    """Return the parameters in a YAML file, by plain names or under `ros__parameters` as for a ROS node.
 
     Raises
     ------
@@ -575,7 +550,7 @@ def read_parameters(path: Path) -> dict[str, Any]:
 
 
 def read_value(text: str) -> Any:
-    """Return a value read as YAML; a text that is not YAML stays a text."""
+    """Return a value read as YAML; other text stays text."""
     from plow_twin.scene_file.yaml_text import load_yaml
 
     value, found = load_yaml(text, "value", "a value")
@@ -595,13 +570,13 @@ def _yaml_value(value: Any) -> str:
     if isinstance(value, tuple):
         return f"[{', '.join(map(_yaml_value, value))}]"
     if isinstance(value, float):
-        # YAML 1.1 reads 1e-09 as a text, so the mantissa needs a point
+        # YAML 1.1 needs a point in the mantissa
         return f"{value!r}" if "e" not in repr(value) else f"{value:.1e}"
     return f'"{value}"' if isinstance(value, str) else str(value)
 
 
 def yaml_text() -> str:
-    """Return the parameter file with all defaults, each one explained."""
+    """Return a parameter file with all defaults and their meanings."""
     lines = ["# Parameters of the node plow_twin, all at their defaults.", "/**:", "  ros__parameters:"]
     for spec in SPECS.values():
         doc, effect = spec.metadata["doc"], spec.metadata["effect"].value

@@ -1,4 +1,4 @@
-"""One part of `/diagnostics`."""
+"""The form of a part of `/diagnostics`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From publications to messages: sending, recording, alarms and counters."""
+"""Messages of a live twin: sending, recording, alarms and counters."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from plow_twin.stream.session import Series
 if TYPE_CHECKING:
     from plow_twin.live.recording import Recording
 
-#: Base name of the topic, and the message; a message made from the record of a publication is bytes.
+#: Base name of the topic, and the message; a message of the motion is the bytes of its buffer.
 Outgoing = tuple[str, memoryview | Message]
 
 
 class Front(Protocol):
-    """The source of the samples and receiver of the messages.
+    """The side of a live twin that faces the transport: it brings the samples and sends the messages.
 
     Attributes
     ----------
@@ -35,10 +35,9 @@ class Front(Protocol):
     topics : mapping
         Resolved names of the outputs by their base names.
     follows_samples : bool
-        Whether only samples advance the time, as with `/clock` or a file; then the twin does not continue during a
-        silence.
+        Whether only samples advance the time, as with `/clock` or a file, so that a silence does not.
     sends_motion : bool
-        Whether messages of the motion are sent; otherwise they are at most recorded.
+        Whether messages of the motion are sent, and not only recorded.
     """
 
     name: str
@@ -47,7 +46,7 @@ class Front(Protocol):
     sends_motion: bool
 
     def now_ns(self) -> int:
-        """Return the present time [ns] on the clock of the stamps."""
+        """Return the time [ns] on the clock of the stamps; 0 if there is none yet."""
 
     def send(self, topic: str, message: memoryview | Message) -> None:
         """Send a message on the topic with a base name."""
@@ -62,13 +61,13 @@ class Front(Protocol):
         """Take notice that the state of the stream may have changed."""
 
     def time_text(self, stamp_ns: int) -> str:
-        """Return a stamp in words, in the form in which the input states its stamps."""
+        """Return a stamp as text, in the form that the input has."""
 
     def say_alarm(self, level: int, text: str) -> None:
         """Log an alarm that has been raised to a level."""
 
     def say_error(self, text: str) -> None:
-        """Log an error; may be called from another thread."""
+        """Log an error, perhaps from another thread."""
 
 
 class Publishing:
@@ -83,11 +82,11 @@ class Publishing:
     alarms
         The alarms.
     recording
-        Receives the sent messages, if the run is recorded.
+        Records the messages.
     on_alarm
         Receives a text when an alarm is latched.
     catch_up
-        Computes a publication's intervals after its forces have been sent, if intervals are sent later.
+        Computes the intervals of a publication after its forces have been sent; None: they are computed before.
     """
 
     def __init__(
@@ -109,43 +108,38 @@ class Publishing:
             self._messages = Messages(*frames, intervals=settings.follows == "full")
         self.latency = DurationHistogram()
         self.age = DurationHistogram()
-        #: `published`: number of publications that were sent
-        #: `withheld`: number of publications that were not sent because a number was not finite
+        #: number of publications, and of those not sent because a number was not finite
         self.published = self.withheld = 0
-        #: `held_frames`: number of publications computed without a sample
-        #: `corrected_frames`: number of publications that correct earlier publications because of late samples
+        #: number of publications computed without a sample, and of those that correct earlier ones by late samples
         self.held_frames = self.corrected_frames = 0
-        #: steady time at which the samples of the next publication were received [ns]; 0 means that it has no samples
+        #: steady time at which the samples of the next publication were received [ns]; 0 without samples
         self.received_ns = 0
-        #: stamp [ns] of the sample that changed the alarms, set only while the alarms of a series of samples are
-        #: reported
+        #: stamp of the sample that changed the alarms within a series [ns]
         self.series_ns: int | None = None
         self._newest: Rows | None = None
         self._catch_up = catch_up
-        #: receives each publication, if there is an observer
         self.watch: Callable[[Published], object] | None = None
 
     @property
     def q(self) -> NDArray[np.float64] | None:
-        """Newest pose that was published: x, y [m], theta [rad]."""
+        """Newest published pose: x, y [m], theta [rad]."""
         return None if self._newest is None else self._newest["q"][0]
 
     @property
     def newest(self) -> Rows | None:
-        """Newest published row, shape (1,); the next publication overwrites it."""
+        """Newest published row, shape (1,), which the next publication overwrites."""
         return self._newest
 
     @property
     def memory(self) -> Mapping[str, memoryview]:
-        """The buffer of each sent message of the motion, by base name of its topic."""
+        """The buffer of each message of the motion, by base name of its topic."""
         return {} if self._messages is None else self._messages.memory
 
     def messages(self, published: Published) -> Iterator[Outgoing]:
-        """Yield the messages of a publication of at most one row, forces first; no message when a number is not finite.
+        """Yield the messages of a publication of at most one row, or nothing if a number is not finite.
 
-        The intervals come last, because `catch_up` first advances many twins for them.
-
-        Between forces and intervals, latency and age are counted, alarms are judged, and the publication is recorded.
+        The forces come first, the intervals last, because many twins must first be advanced for them. In between, the
+        publication is counted, recorded and judged by the alarms.
         """
         rows, _ = published
         if not len(rows):
@@ -180,10 +174,7 @@ class Publishing:
             yield from self.alarms_changed(stamp_ns)
 
     def series(self, series: Series, journal: Callable[[Series], object]) -> Iterator[Outgoing]:
-        """The intervals come last, because `catch_up` must first advance many twins to compute them.
-
-        No messages of the motion are sent.
-        """
+        """Journal and record samples that were applied together; yield only the alarms that they change."""
         published, begin = series.published, 0
         if not len(published.rows):
             journal(series)
@@ -207,7 +198,7 @@ class Publishing:
                 self.recording.publications(series.published)
 
     def alarms_changed(self, stamp_ns: int) -> Iterator[Outgoing]:
-        """Yield the alarms if a level has changed."""
+        """Yield the alarms, and report those that were raised."""
         yield self.alarms_now(stamp_ns)
         if self.alarms.raised:
             self._on_alarm(f"alarm: {', '.join(self.alarms.raised)}")

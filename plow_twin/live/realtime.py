@@ -1,4 +1,4 @@
-"""Requests for the priority, processors and locked memory of this process; if refused, the process warns."""
+"""Priority, processors and locked memory of this process; a refusal by the system is only a warning."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import Final
 
 from plow_twin.live.parameters import Settings
 
-#: Flags of `mlockall` for present and for future pages.
+#: Flags of `mlockall`: present pages, future pages.
 _MCL_CURRENT: Final = 1
 _MCL_FUTURE: Final = 2
 
 
 def apply_realtime(settings: Settings) -> list[str]:
-    """Request the settings; return in words which the system refused."""
+    """Request the settings; return the refusals."""
     refused = []
     if settings.priority:
         try:

@@ -1,4 +1,4 @@
-"""Link between the node and the recorder; imported only when a run is recorded."""
+"""The recording of a live twin; imported only when a run is recorded."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _QUEUE_SIZE: Final = 20_000
 
 
 class Recording:
-    """The recording of one configured node.
+    """The recording of a configured node.
 
     Parameters
     ----------
@@ -38,9 +38,9 @@ class Recording:
     topics
         Resolved names of the outputs by their base names.
     clock
-        Returns the node's ROS time [ns] when the node runs under `/clock`; None: the system's time.
+        Returns the time [ns] on `/clock`; None: the system's time.
     on_error
-        Called, from the recorder's thread, with the reason when recording stops early.
+        Called from the recorder's thread with the reason when recording stops early.
     """
 
     def __init__(
@@ -78,12 +78,12 @@ class Recording:
             now_ns=clock or time.time_ns,
             on_error=on_error,
         )
-        #: for each sample of the newest series, the sequence number of the journal entry that precedes its publication
+        #: for each sample of the newest series, the number of the last journal entry before its publication
         self._series = np.zeros(0, np.int64)
         self.recorder = in_free_folder(Path(settings.record_path), make)
 
     def publication(self, published: Published, sent: Mapping[str, bytes]) -> None:
-        """Take the messages of a sent publication; `sent` has their bytes, if there are any."""
+        """Record a sent publication; `sent` has the bytes of its messages, if there are any."""
         wanted = self._decimation.select(published)
         if wanted is not None:
             self.recorder.publication(wanted, sent if wanted is published else {})
@@ -93,11 +93,11 @@ class Recording:
                 self.message(topic, stamp_ns, message)
 
     def series(self, series: Series) -> None:
-        """Take the journal of samples that were applied together."""
+        """Journal samples that were applied together."""
         self._series = self.recorder.series(series)
 
     def publications(self, published: Published) -> None:
-        """Take the publications after each sample of the newest series."""
+        """Record the publications after each sample of the newest series."""
         if self._decimation.keeps_all:
             self.recorder.publications(published, self._series)
             return
@@ -107,7 +107,7 @@ class Recording:
                 self.recorder.publications(wanted, np.array([sequence]))
 
     def message(self, topic: str, stamp_ns: int, message: Message) -> None:
-        """Take another message that was sent on the topic with a base name."""
+        """Record another message, by base name of its topic."""
         self.recorder.output(self._topics[topic], stamp_ns, message)
 
     @property
@@ -116,7 +116,7 @@ class Recording:
         return self.recorder.counters.queued > _QUEUE_SIZE // 2
 
     def renew(self, session: Session) -> bool:
-        """If entries were lost and there is room again, journal a snapshot; return whether this was done."""
+        """Journal a snapshot if entries were lost and there is room again; return whether this was done."""
         wanted = self.recorder.snapshot_wanted
         if wanted:
             self.recorder.journal(session.renew())

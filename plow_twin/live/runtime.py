@@ -1,6 +1,6 @@
-"""A live twin without its transport, and the path of a sample through it: intake, twin, publication, recording.
+"""A live twin without its transport, and the way of a sample through it: intake, twin, publication, recording.
 
-A front, either the ROS node or `plow-twin live`, brings samples and sends messages; this module depends on neither.
+A front, either the ROS node or `plow-twin live`, brings samples and sends messages.
 """
 
 from __future__ import annotations
@@ -46,13 +46,12 @@ _CATCH_UP_S: Final = 0.002
 _LOOK_FOR_CLOCK_HZ: Final = 20.0
 #: Rate at which unused messages are journalled [Hz].
 _UNUSED_HZ: Final = 5.0
-#: The twins that follow measurements are too slow if samples wait longer than `_LONGEST_WAIT_S` in each of
-#: `_WAITING_SECONDS` successive seconds.
+#: Following twins are too slow if samples wait longer than `_LONGEST_WAIT_S` in each of `_WAITING_SECONDS` seconds.
 _LONGEST_WAIT_S, _WAITING_SECONDS = 0.5, 5
 
 
 class Runtime:
-    """A configured twin: made on configure, closed on cleanup.
+    """A configured twin, made on configure and closed on cleanup.
 
     Parameters
     ----------
@@ -61,7 +60,7 @@ class Runtime:
     settings
         The parameters.
     prepared
-        Scene and twin, with the solver compiled; the twin belongs to this runtime alone.
+        Scene and twin, which belongs to this runtime alone.
     kept_wear
         Wear of earlier runtimes of this process, by the scene's identity.
 
@@ -85,22 +84,21 @@ class Runtime:
         self.scene = prepared.scene
         #: time that compiling or loading the solver took [s]
         self.compile_s = prepared.compile_s
-        #: periods of the loops at a fixed rate or on the clock; None if the samples determine when the twin advances
+        #: periods of the loop at a fixed rate or on the clock; None if the samples advance the twin
         self.periods = _periods(settings)
-        #: state of the clock: `waiting` until the first message on `/clock`, then `paused` or `running`
+        #: `waiting` until the first message on `/clock`, then `paused` or `running`
         self.clock = "running"
-        #: whether another node publishes under the names of this twin's outputs
+        #: whether another node publishes on this twin's topics
         self.others_publish = False
-        #: whether the twins were too slow, so that only the parameters follow the measurements
+        #: whether only the parameters still follow the measurements, because the twins were too slow
         self.reduced = False
         self._waiting_seconds = 0
         self._clock_before_ns = 0
-        #: whether services are refused because the journal still waits for a clock
+        #: whether the journal still waits for a clock, so that services are refused
         self.waits_for_clock = True
         self._early: list[Arrival] = []
         self._seen: tuple[Any, ...] = ()
         self.wear_keeper: WearKeeper | None = None
-        #: identity of the scene, under which its wear is kept
         self.identity = scene_identity(self.scene)
         kept = kept_wear.get(self.identity)
         depth = kept.depth_m if kept else None
@@ -108,7 +106,7 @@ class Runtime:
         if misplaced:
             raise ParameterError(misplaced)
         self.alarms = alarms_of(asdict(settings))
-        # a change of the model that is impossible is refused here, before samples come
+        # an impossible change of the model is refused before samples come
         changed_twin(prepared.twin, prepared.scene, model_changes(settings))
         with ExitStack() as made:
             if settings.wear_state_path:
@@ -149,7 +147,7 @@ class Runtime:
         self._set_limits(settings)
 
     def start(self) -> None:
-        """Open the journal, once the front can no longer fail; without a clock, the first sample opens the journal."""
+        """Open the journal; without a clock, the first sample opens it."""
         self.waits_for_clock = self.without_clock
         self.inputs.started = not self.waits_for_clock
         self.clock = "waiting" if self.waits_for_clock else "running"
@@ -158,7 +156,7 @@ class Runtime:
             self.driver.set_model(self.stamp_ns, model_changes(self.settings))
 
     def refusals(self, settings: Settings) -> list[str]:
-        """Return why parameters cannot be taken while the twin runs."""
+        """Return why the running twin cannot take parameters."""
         try:
             self.driver.session.check_model(model_changes(settings))
         except ArgumentError as error:
@@ -172,23 +170,23 @@ class Runtime:
 
     @property
     def without_clock(self) -> bool:
-        """Whether the node uses `/clock` and no message on it has arrived."""
+        """Whether the node uses `/clock`, on which nothing has come."""
         return self._front.now_ns() == 0
 
     def kept_wear(self) -> KeptWear:
-        """Return the wear for the next runtime of this process; to be called after the close."""
+        """Return the wear for the next runtime of this process, after `close`."""
         depth = self.driver.session.wear_depth
         return self.wear_keeper.kept(depth) if self.wear_keeper else KeptWear(tuple(depth.tolist()))
 
     @property
     def follower(self) -> Follower | None:
-        """The twin if it follows measurements, otherwise None."""
+        """The twin, if it follows measurements."""
         found: Follower | None = cast(Any, self.driver.session.following)
         return found
 
     @property
     def reads_at_once(self) -> bool:
-        """Whether many samples may be used in one call: they carry their own time, and no motion is sent."""
+        """Whether many samples may be used in one call: they have their own time, and no motion is sent."""
         return self._front.follows_samples and not self._front.sends_motion
 
     @property
@@ -200,22 +198,22 @@ class Runtime:
         return "trouble" if found.error or found.lost else "recording"
 
     def residual(self) -> tuple[float, float, float] | None:
-        """Return model minus newest measured pose: x, y [m], theta [rad], or None without a measurement."""
+        """Return model minus newest measured pose: x, y [m], theta [rad], or None."""
         q = self.publishing.q
         return self.inputs.residual(q) if q is not None else None
 
     def newest_sample_age_s(self) -> float | None:
-        """Return the present time minus the stamp of the newest sample used [s]; None before the first sample."""
+        """Return the time since the stamp of the newest sample used [s], or None."""
         newest_ns = self.driver.newest_ns
         return None if newest_ns is None else (self._front.now_ns() - newest_ns) * 1e-9
 
     def estimate_age_s(self) -> float | None:
-        """Return the present time minus the end of the newest estimate's window [s]; None before the first estimate."""
+        """Return the time since the end of the newest estimate's window [s], or None."""
         end_ns = self.estimation.end_ns if self.estimation else None
         return None if end_ns is None else (self._front.now_ns() - end_ns) * 1e-9
 
     def look_at_clock(self) -> None:
-        """Check, at intervals, whether the clock under which the samples arrive still advances."""
+        """Check, at intervals, whether the clock advances."""
         now_ns = self._front.now_ns()
         if self._front.follows_samples:
             stands = now_ns == self._clock_before_ns
@@ -223,7 +221,7 @@ class Runtime:
         self._clock_before_ns = now_ns
 
     def time_text(self, stamp_ns: int) -> str:
-        """Return a stamp in words, as the front does."""
+        """Return a stamp as text."""
         return self._front.time_text(stamp_ns)
 
     def send_alarms(self) -> None:
@@ -231,7 +229,7 @@ class Runtime:
         self._send([self.publishing.alarms_now(self.stamp_ns)])
 
     def mark(self, text: str) -> tuple[bool, str]:
-        """Write a text to the journal, and write the recorder's ring to the disk if there is a ring."""
+        """Write a text to the journal, and the recorder's ring to the disk; return success and an answer."""
         if (problem := mark_problem(text)) is not None:
             return False, problem
         self.driver.mark(self.stamp_ns, text)
@@ -244,7 +242,7 @@ class Runtime:
         return True, f"the ring in memory goes to {folder}"
 
     def record_status(self, status: DiagnosticStatus) -> None:
-        """Write a published status to the recording."""
+        """Record a published status."""
         if self.recording and not self.waits_for_clock:
             self.recording.message("status", self.stamp_ns, status)
 
@@ -262,7 +260,7 @@ class Runtime:
         self._journal_unused()
 
     def close(self) -> list[str]:
-        """Save the wear, end journal and recording; return the losses in words."""
+        """Save the wear, end journal and recording; return the losses."""
         self.deactivate()
         lost = []
         if self.estimation:
@@ -277,10 +275,7 @@ class Runtime:
         return lost
 
     def periodic(self) -> list[tuple[float, Callable[[], float | None]]]:
-        """Return the calls that the front makes while the twin is active, each with its rate [Hz] on a steady clock.
-
-        Each call returns as in `Timer`.
-        """
+        """Return the calls to make while the twin is active, each with its rate [Hz]; they return as in `Timer`."""
         settings = self.settings
         periodic: list[tuple[float, Callable[[], float | None]]] = []
         if settings.excitation_source == "scene":
@@ -312,7 +307,7 @@ class Runtime:
         for intake in (self.driver.intake, self.driver.clock):
             intake.jump_back_s, intake.jump_forward_s = settings.jump_back, settings.jump_forward
         if self.waits_for_clock:
-            return  # `start` will open the journal with the settings that hold then
+            return  # `start` opens the journal with the settings that hold then
         if name in MODEL:
             self.driver.set_model(self.stamp_ns, model_changes(settings))
             self._front.changed()
@@ -320,7 +315,6 @@ class Runtime:
             self.driver.parameter(name, value)
 
     def _set_limits(self, settings: Settings) -> None:
-        """Set the limits of the inputs besides the load."""
         pose = pose_limits(self.scene, settings.limit_pose, settings.limit_pose_rate)
         travel = value_limits(settings.limit_travel, settings.limit_travel_rate)
         scene = changed_scene(self.scene, model_changes(settings))
@@ -335,7 +329,7 @@ class Runtime:
         if self.waits_for_clock:
             self.start()
         if self.waits_for_clock:
-            # samples are kept until the clock comes, because a player of a recording may start the clock a little later
+            # a player of a recording may start the clock after the samples, so they wait
             room = self.settings.input_depth - len(self._early)
             self._early += arrived[:room]
             for stamp_ns, wrench in arrived[max(room, 0) :]:
@@ -349,10 +343,9 @@ class Runtime:
         self._advanced(len(arrived))
 
     def step_series(self, stamps: NDArray[np.int64], wrench: NDArray[np.float64]) -> Iterator[Outgoing]:
-        """Use many samples of a source with its own time, like `step`; stamps [ns], shape (n,), wrenches (n, 3)."""
+        """Do the same as `step` for many samples with their own time: stamps [ns], shape (n,), wrenches (n, 3)."""
         if self.waits_for_clock or self.publishing.watch is not None or self.settings.record_ring:
-            # samples are used one by one if an observer must get each sample, or if a ring needs the state right after
-            # the sample that raises its alarm
+            # a watcher gets each sample, and a ring needs the state right after the sample that raises its alarm
             yield from self.step(list(zip(stamps.tolist(), map(tuple, wrench.tolist()), strict=True)))
             return
         self.publishing.received_ns = now_ns = time.monotonic_ns()
@@ -374,11 +367,10 @@ class Runtime:
             self._front.send(topic, message)
 
     def silence(self) -> float:
-        """Continue without samples once they are overdue; return the time [s] before which they cannot be overdue."""
+        """Continue without samples once they are overdue; return the time [s] until they can be overdue."""
         holds, now_ns = self.driver.holds, time.monotonic_ns()
         published = self.driver.silence(now_ns)
         if len(published.rows) or self.driver.holds != holds:
-            # the next publication has no samples
             self.publishing.received_ns = 0
             self._send(self.publishing.messages(published))
             self._advanced()
@@ -422,7 +414,6 @@ class Runtime:
         return Estimation(self.settings, self.scene)
 
     def _journal(self) -> Callable[[Entry], object]:
-        """Return the receiver of each entry: the recording, the estimate, both or neither."""
         recording, estimation = self.recording, self.estimation
         if estimation is None:
             return recording.recorder.journal if recording else _ignore
@@ -436,12 +427,12 @@ class Runtime:
         return both
 
     def add_travel(self, stamp_ns: int, speed_m_s: float) -> None:
-        """Take a speed along the face."""
+        """Use a speed along the face."""
         if self.inputs.uses_travel(stamp_ns, speed_m_s):
             self.driver.travel(stamp_ns, speed_m_s)
 
     def add_pose(self, stamp_ns: int, pose: tuple[float, float, float], deviation: tuple[float, ...] = ()) -> None:
-        """Take a measured pose, as `Inputs.uses_pose` does."""
+        """Use a measured pose, as `Inputs.uses_pose` describes it."""
         if not self.inputs.uses_pose(stamp_ns, pose, deviation):
             return
         known = tuple(index for index, value in enumerate(pose) if math.isfinite(value))
@@ -453,7 +444,7 @@ class Runtime:
             self._send(self.publishing.alarms_changed(stamp_ns))
 
     def add_gaps(self, stamp_ns: int, gaps: Mapping[int, float]) -> None:
-        """Take measured gaps [m] by number of their pairs."""
+        """Use measured gaps [m] by number of their pairs."""
         if self.inputs.uses_gaps(stamp_ns, gaps):
             self.driver.session.apply(Gaps(stamp_ns, tuple(gaps), tuple(gaps.values())))
 
@@ -481,7 +472,6 @@ class Runtime:
             self._send(self.step([]))
 
     def _journal_unused(self) -> None:
-        """Journal the unused messages, once there is a journal."""
         if not self.waits_for_clock:
             for entry in self.inputs.unused.pop_all(self._front.sender_name):
                 self.driver.session.emit(entry)
@@ -493,7 +483,7 @@ class Runtime:
 
     @property
     def stamp_ns(self) -> int:
-        """Return the time that the model has reached, or the present time before the first sample [ns]."""
+        """The time that the model has reached [ns], or the present time before the first sample."""
         stamp_ns = self.publishing.series_ns or self.driver.session.stamp_ns
         return self._front.now_ns() if stamp_ns is None else stamp_ns
 
@@ -501,8 +491,7 @@ class Runtime:
         if self.recording and self.recording.recorder.snapshot_wanted:
             self._renew_recording()
         if self._front.follows_samples:
-            # a source with its own time has no deadline, so a pause, bounded by the number of samples, lets recorder
-            # and estimate catch up
+            # a source with its own time has no deadline, so recorder and estimate may catch up, in bounded time
             while count and self._behind:
                 time.sleep(_CATCH_UP_S)
                 count -= 1
@@ -520,8 +509,7 @@ class Runtime:
         assert self.recording is not None
         renewed = self.recording.renew(self.driver.session)
         if renewed and self.estimation and self.estimation.entry and self.driver.session.following is None:
-            # the snapshot of a twin that follows measurements contains the estimate; other snapshots do not, so the
-            # estimate is journalled again
+            # only the snapshot of a following twin contains the estimate
             self.recording.recorder.journal(self.estimation.entry)
 
 
@@ -532,12 +520,12 @@ def _periods(settings: Settings) -> Periods | None:
 
 
 def policy(settings: Settings) -> Policy:
-    """Return the part of the settings about silence and failures."""
+    """Return the parameters about silence and failures."""
     return Policy(settings.excitation_timeout, settings.hold_policy, settings.hold_limit, settings.failure_limit)
 
 
 def limits(settings: Settings, scene: Scene) -> Limits:
-    """Return the limits of a measured load."""
+    """Return the limits of the load."""
     return excitation_limits(
         scene, settings.limit_force, settings.limit_moment, settings.limit_force_rate, settings.limit_moment_rate
     )

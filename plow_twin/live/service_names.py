@@ -1,4 +1,4 @@
-"""Names of the services of a live twin, each a method of `Services`, and the texts that a mark may have."""
+"""Names of a live twin's services, which are the methods of `Services`, and the check of a mark's text."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MOST_MARK: Final = 200
 
 
 def mark_problem(text: str) -> str | None:
-    """Return the fault in the text of a mark, or None."""
+    """Return what is wrong with the text of a mark, or None."""
     if not text.strip() or len(text) > MOST_MARK:
         return f"text of a mark: got {len(text.strip())} characters, expected 1 to {MOST_MARK}"
     if not text.isprintable():

@@ -1,4 +1,4 @@
-"""Services of a live twin for an operator: each answers with success or failure, and a text."""
+"""Services of a live twin, each answered by success and a text."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Services:
         self._kept: Snapshot | None = None
 
     def call(self, name: str, text: str | None = None) -> tuple[bool, str]:
-        """Carry out the service `name`, unless the parameter `services_off` names it; `text` belongs to a mark."""
+        """Do the service `name`, unless `services_off` names it; `text` belongs to a mark."""
         if name in services_off(self._runtime.settings):
             return False, f"{name}: switched off by the parameter services_off"
         if name == "mark":
@@ -37,17 +37,17 @@ class Services:
         return done
 
     def mark(self, text: str | None = None) -> tuple[bool, str]:
-        """Write a text (by default the parameter `mark`) to the journal, and write the ring if there is a ring."""
+        """Write a text, by default the parameter `mark`, to the journal, and the recorder's ring to the disk."""
         return self._runtime.mark((self._runtime.settings.mark or "service") if text is None else text)
 
     def reset(self) -> tuple[bool, str]:
-        """Reset the motion to its initial state; return whether this was done, and a text for the caller."""
+        """Reset the motion to its initial state."""
         self._runtime.driver.reset(self._runtime.stamp_ns, "service")
         self._changed()
         return True, "initial motion restored, the wear stays; the next sample is model time 0"
 
     def snapshot(self) -> tuple[bool, str]:
-        """Journal the exact state and keep it for `restore`."""
+        """Journal the exact state, and keep it for `restore`."""
         self._kept = self._runtime.driver.snapshot()
         return True, f"the state at {self._kept.stamp_ns} ns is kept and journalled"
 

@@ -1,4 +1,4 @@
-"""Scene and solver prepared beside the executor, so that the node answers while the compiler works."""
+"""Preparation of scene and solver in a thread, so that the node answers while the compiler works."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class StartAbandoned(PlowTwinError):
 
 @dataclass(frozen=True)
 class Prepared:
-    """A scene, its twin with every kernel compiled or loaded, and the seconds that this took."""
+    """A scene, its twin with all kernels compiled or loaded, and the time that this took [s]."""
 
     scene: Scene
     twin: Driven
@@ -37,10 +37,7 @@ class Prepared:
 
 
 class Preparation:
-    """A twin that is being prepared in its own thread.
-
-    `warm_up` compiles the other kernels in the same thread.
-    """
+    """A twin that a thread prepares; `warm_up` compiles further kernels in the same thread."""
 
     def __init__(self, settings: Settings, warm_up: Callable[[], None] = lambda: None) -> None:
         self.key = key(settings)
@@ -63,7 +60,7 @@ class Preparation:
         SceneError, OSError
             The scene cannot be used.
         StartAbandoned
-            A stop was requested; the compiler cannot be interrupted and still works.
+            A stop was requested; the compiler, which cannot be interrupted, still works.
         """
         while not wait((self._future,), _LOOK_S).done:
             if stop_asked():
@@ -72,7 +69,7 @@ class Preparation:
 
 
 def key(settings: Settings) -> tuple[object, ...]:
-    """Return the settings on which a prepared twin depends; a scene file that was rewritten counts as another scene."""
+    """Return the settings on which a prepared twin depends; a rewritten scene file is another scene."""
     try:
         found = os.stat(scene_path(settings.scene))
     except (OSError, PlowTwinError):
@@ -103,8 +100,8 @@ def _prepare(settings: Settings, warm_up: Callable[[], None]) -> Prepared:
 
 
 def leave(code: int, *, at_once: bool = False) -> int:
-    """Return the exit code; end the process here if `at_once` is set or an abandoned compiler would delay the end."""
-    if at_once:  # a stream without a reader can no longer be flushed, so the process ends without a flush
+    """Return the exit code, or end the process here `at_once`, or if an abandoned compiler would delay the end."""
+    if at_once:  # a stream without a reader cannot be flushed
         os._exit(code)
     if all(future.done() for future in _started):
         return code

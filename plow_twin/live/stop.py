@@ -8,20 +8,17 @@ from typing import Self
 
 
 class StopRequested(BaseException):
-    """The process was asked to stop while it could not check a flag, as during a long start."""
+    """The process was asked to stop while it could not check a flag."""
 
 
 def stop_signals() -> list[signal.Signals]:
-    """Return the signals that ask for a stop: SIGHUP, when the terminal closes, unless it is ignored, as by `nohup`."""
+    """Return the signals that ask for a stop; SIGHUP, which a closing terminal sends, unless it is ignored."""
     ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     return [signal.SIGINT, signal.SIGTERM, *([] if ignored else [signal.SIGHUP])]
 
 
 class StopSignals:
-    """SIGINT, SIGTERM and SIGHUP set a flag, or raise `StopRequested` while `interrupt` is set (a long start).
-
-    It is a context manager, which restores the signals' handlers on exit.
-    """
+    """Context manager in which stop signals set a flag, or raise `StopRequested` while `interrupt` is set."""
 
     def __init__(self) -> None:
         self.stopped = False
@@ -36,10 +33,10 @@ class StopSignals:
             signal.signal(number, handler)
 
     def ignore(self) -> None:
-        """Ignore the signals, at the end of a program.
+        """Ignore the signals at the end of a program.
 
-        The interpreter restores their default handlers while it ends. A second signal, as when terminal and launch both
-        send one, would then end the process with an error after its work is done.
+        The interpreter restores their default handlers while it ends, and a second signal, sent by terminal and launch
+        alike, would turn success into an error.
         """
         for number in self._before:
             signal.signal(number, signal.SIG_IGN)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 
 class Timer:
-    """Call `do` every `period_s`; calls that were missed are not made up for, and later calls keep their phase.
+    """Calls `do` every `period_s`; missed calls are left out, and later calls keep their phase.
 
     `do` may return the time [s] before which it need not be called.
     """
@@ -17,7 +17,7 @@ class Timer:
         self.restart()
 
     def restart(self) -> None:
-        """Restart the timer: the next call is due after one period."""
+        """Make the next call due after one period."""
         self.due = time.monotonic() + self._period_s
 
     def look(self) -> None:

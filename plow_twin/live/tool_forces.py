@@ -1,4 +1,4 @@
-"""Measured forces of the tools, each along the direction of a load of the scene, as one wrench."""
+"""Measured forces of the tools as one wrench."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ Wrench = tuple[float, float, float]
 class ToolForces:
     """The wrench of measured forces along the directions of the scene's loads.
 
-    A force of 1 N along a load's own direction, at its point of action, gives a fixed wrench about the centre; the
-    effort of a pure moment is in N m. A table, or a constant of zero, has no direction of its own and cannot be
-    measured in this way; a message may name such a load, but the effort is ignored.
+    An effort of 1 N along a load's direction, at its point of action, gives a fixed wrench about the centre; the effort
+    of a pure moment is in N m. A table and a constant of zero have no direction: messages may name them, but their
+    effort is ignored.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -35,7 +35,7 @@ class ToolForces:
         return tuple(self._directions)
 
     def wrench(self, names: Sequence[str], efforts: Sequence[float]) -> Wrench | None:
-        """Return the total wrench, or None when the names do not give each measurable load exactly once."""
+        """Return the total wrench, or None unless the names give each measurable load exactly once."""
         named = set(names)
         if len(efforts) != len(names) or len(named) != len(names):
             return None

@@ -1,4 +1,4 @@
-"""Messages that were not used, for the journal: sender, reason, stamp and values."""
+"""Messages that were not used, collected for the journal."""
 
 from __future__ import annotations
 
@@ -8,27 +8,19 @@ from typing import Final
 
 from plow_twin.stream.journal import Unused
 
-#: Largest number of messages that a journal entry holds in full; further messages are only counted.
+#: Largest number of messages whose stamps and values an entry holds.
 _MOST: Final = 500
 
 
 @dataclass
 class _Pending:
-    """Unused messages with the same input, sender and reason, since the last journal entry about them."""
-
     count: int = 0
     stamps_ns: list[int] = field(default_factory=list)
     values: list[tuple[float, ...]] = field(default_factory=list)
 
 
 class UnusedMessages:
-    """Collect unused messages, so that many messages give few entries of the journal.
-
-    Parameters
-    ----------
-    wanted
-        Whether there is a journal.
-    """
+    """Collects unused messages, so that many messages give few entries of the journal; does nothing unless `wanted`."""
 
     def __init__(self, wanted: bool) -> None:
         self._wanted = wanted
@@ -45,12 +37,12 @@ class UnusedMessages:
             pending.values.append(tuple(map(float, values)))
 
     def note_lost(self, topic: str, sender: bytes, count: int) -> None:
-        """Note messages that were sent and have not arrived; a negative `count` means that they did arrive later."""
+        """Note messages that have not arrived; a negative `count` takes back messages that arrived late."""
         if self._wanted and count:
             self._pending.setdefault((topic, sender, "lost"), _Pending()).count += count
 
     def pop_all(self, name_of: Callable[[str, bytes], str]) -> list[Unused]:
-        """Return the collected entries and start a new collection; `name_of` names a sender of an input."""
+        """Return the collected entries; `name_of` names a sender of an input."""
         pending, self._pending = self._pending, {}
         return [
             Unused(topic, name_of(topic, sender), reason, found.count, tuple(found.stamps_ns), tuple(found.values))

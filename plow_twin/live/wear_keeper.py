@@ -1,4 +1,4 @@
-"""The pads' wear kept on disk while the node runs: saved at intervals beside the executor, and at the stop."""
+"""The pads' wear, saved at intervals by a thread while the node runs, and at the stop."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from plow_twin.record.wear_state import (
 
 @dataclass(frozen=True)
 class KeptWear:
-    """Wear that an earlier runtime of this process has left for the next runtime.
+    """Wear that an earlier runtime of this process has left.
 
     Attributes
     ----------
     depth_m
         Depths [m].
     older_files
-        Contents of the files that should have been replaced by these depths, but could not be replaced.
+        Contents of the files that these depths should have replaced but could not.
     """
 
     depth_m: tuple[float, ...]
@@ -43,15 +43,15 @@ class KeptWear:
 class WearKeeper:
     """The wear of one head in one scene, in a folder.
 
-    Only a file that this keeper has read or written is replaced. Any other file, such as a file put there by hand, may
-    hold wear that no twin has used yet, so it is kept.
+    Only a file that this keeper has read or written is replaced. Another file, put there by hand, may hold wear that no
+    twin has used yet.
 
     Parameters
     ----------
     folder
         Folder in which the wear is kept.
     head
-        Serial of the head.
+        Serial number of the head.
     scene
         The scene of the head.
 
@@ -66,16 +66,14 @@ class WearKeeper:
         self._claim: int | None = claim_folder(folder)
         self._identity = scene_identity(scene)
         self._saved: tuple[float, ...] | None = None
-        self._own: tuple[bytes, ...] = ()  # contents that the file may have: those that were read or written last
+        self._own: tuple[bytes, ...] = ()  # contents that the file may have, as last read or written
         self._writer = ThreadPoolExecutor(1, thread_name_prefix="wear")
         self._writing: Future[None] | None = None
-        #: why the wear could not be saved the last time; empty if it was saved
+        #: why the wear could not be saved the last time
         self.error = ""
 
     def load(self, kept: KeptWear | None = None) -> tuple[float, ...] | None:
-        """Return the depths [m] to continue with, or None.
-
-        The depths come from the file, unless `kept` depths could not replace that file.
+        """Return the depths [m] to continue with, or None: `kept` if the file could not be replaced by them.
 
         Raises
         ------
@@ -89,11 +87,11 @@ class WearKeeper:
         return kept.depth_m if kept is not None and found in (None, *kept.older_files) else self._saved
 
     def kept(self, depth: NDArray[np.float64]) -> KeptWear:
-        """Return the depths [m] as the wear for the next runtime of this process; to be called after `close`."""
+        """Return the depths [m] as the wear for the next runtime, after `close`."""
         return KeptWear(tuple(depth.tolist()), self._own if self.error else ())
 
     def save(self, depth: NDArray[np.float64]) -> None:
-        """Save depths [m] unless they are saved already; does not wait for the disk."""
+        """Save depths [m] unless they are saved already; do not wait for the disk."""
         if self._writing is not None and not self._writing.done():
             return
         values = tuple(depth.tolist())
@@ -117,8 +115,7 @@ class WearKeeper:
     def _save(self, values: tuple[float, ...]) -> None:
         try:
             if not self._is_claimed():
-                # the folder was moved, removed or hidden by a mount, so another twin may have claimed the folder that
-                # now has its name
+                # the folder was moved, removed or hidden by a mount
                 self.release()
                 self._claim = claim_folder(self.folder)
             found = read_wear(self.folder)
@@ -138,7 +135,7 @@ class WearKeeper:
             self._saved, self.error = values, ""
 
     def _is_claimed(self) -> bool:
-        """Return whether the folder of that name is still the folder that this twin has claimed."""
+        """Return whether the folder of that name is still the claimed folder."""
         try:
             return self._claim is not None and os.path.samestat(os.fstat(self._claim), self.folder.stat())
         except FileNotFoundError:

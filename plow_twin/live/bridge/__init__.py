@@ -1,1 +1,1 @@
-"""Inputs of a live twin without ROS: files, standard input and MQTT, read by the same mapping as recordings."""
+"""Inputs of a live twin without ROS: files, standard input, MQTT and OPC UA. A mapping gives each value its role."""

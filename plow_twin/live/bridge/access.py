@@ -50,7 +50,7 @@ def host_and_port(access: Access, ports: Mapping[str, int], *, has_path: bool = 
     Raises
     ------
     BridgeError
-        The address is invalid; or it contains a user, a password, or a path that `has_path` does not allow.
+        The address is invalid, or contains a user, a password, or (without `has_path`) a path.
     """
     expected = " or ".join(f"{scheme}://HOST:PORT" for scheme in ports)
     try:
@@ -66,27 +66,17 @@ def host_and_port(access: Access, ports: Mapping[str, int], *, has_path: bool = 
 
 
 def password(path: Path | None, source: str) -> str:
-    """Return the password in a file, or in the environment variable PLOW_TWIN_`source`_PASSWORD.
-
-    Raises
-    ------
-    InputError
-        The first line of the file is not a password.
-    OSError
-        The file cannot be read.
-    """
+    """Return the first line of a file, or without a file the environment variable PLOW_TWIN_`source`_PASSWORD."""
     return os.environ.get(f"PLOW_TWIN_{source}_PASSWORD", "") if path is None else read_secret(path)
 
 
 def read_access(url: str, path: Path | None) -> Access:
-    """Return the access to an OPC UA server; paths in the credentials file (YAML) start at its folder.
+    """Return the access to an OPC UA server with the credentials of a YAML file; its paths are relative to the file.
 
     Raises
     ------
-    InputError
-        The file is not YAML or exceeds the reader's limits, or a key or value is not expected.
-    OSError
-        The YAML file or the password's file cannot be read.
+    InputError, OSError
+        The YAML file or the password's file cannot be used.
     """
     if path is None:
         return Access(url, password=password(None, "OPCUA"))

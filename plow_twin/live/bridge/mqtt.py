@@ -29,7 +29,7 @@ _PORTS: Final = {"mqtt": 1883, "mqtts": 8883}
 
 
 class Mqtt(SourceState):
-    """A session with a broker that outlives a broken connection: messages of QoS 1 sent in a break arrive later.
+    """A session that a broker keeps while the connection is broken; messages of QoS 1 then arrive later.
 
     Parameters
     ----------
@@ -53,8 +53,7 @@ class Mqtt(SourceState):
         #: whether messages marked as retained are older than the subscription
         self._from_before = True
         self._queue: deque[tuple[str, bytes, int, bool]] = deque()
-        #: `_came`: total size of the payloads that entered the queue [B]; only the thread that adds them changes it
-        #: `_left`: total size of the payloads that left the queue [B]; only the thread that takes them changes it
+        #: total sizes [B] of the payloads that entered and left the queue, each changed by one thread only
         self._came = self._left = 0
         self._arrived = threading.Event()
         self._answer = threading.Event()
@@ -115,7 +114,7 @@ class Mqtt(SourceState):
             self.trouble = f"refused: {refused}"
             self._answer.set()
             return
-        # in a resumed session, brokers may also mark as retained the messages that they kept for the session
+        # in a resumed session, the mark `retained` can also be on messages that were kept for the session
         resumed = is_resumed(flags)
         self._from_before = not resumed
         if self._subscribed and resumed:
@@ -135,7 +134,7 @@ class Mqtt(SourceState):
         self.trouble = self.trouble or f"the connection broke: {end_of(*facts)}; reconnecting"
 
     def _on_message(self, client: Any, data: Any, message: Any) -> None:
-        # a payload that is too long is emptied, so that it counts as unreadable
+        # a payload that is too long is emptied and counts as unreadable
         payload = message.payload if len(message.payload) <= LONGEST else b""
         if len(self._queue) >= _QUEUE or self._came - self._left + len(payload) > _QUEUED_BYTES:
             self.lost += 1
@@ -146,7 +145,6 @@ class Mqtt(SourceState):
 
 
 def _address(access: Access) -> tuple[str, int, bool]:
-    """Return host, port and whether TLS is used."""
     scheme, host, port = host_and_port(access, _PORTS)
     tls = scheme == "mqtts"
     if not tls and not access.plain and not is_loopback(host):

@@ -1,4 +1,4 @@
-"""MQTT clients by paho 1.6 and 2, whose callbacks get the same facts in different forms."""
+"""MQTT clients by paho 1.6 and paho 2, whose callbacks get the same facts in different forms."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import Any, Final
 
 #: Longest wait before another attempt to connect [s].
 LONGEST_WAIT_S: Final = 30
-#: Smallest answer that means a refused subscription, if answers are numbers (paho 1.6).
+#: Smallest number with which a broker refuses a subscription (paho 1.6).
 _REFUSED: Final = 0x80
 
 
 def make_client(client_id: str, *, clean: bool) -> Any:
-    """Return a client of MQTT 3.1.1 that connects again at growing intervals; `clean`: without a lasting session."""
+    """Return a client of MQTT 3.1.1 that connects again after a break; `clean`: without a lasting session."""
     from paho.mqtt import client as paho
 
     interface = getattr(paho, "CallbackAPIVersion", None)  # this exists from paho 2.0 on
@@ -41,13 +41,13 @@ def use_tls(client: Any, ca: Path | str | None, certificate: Path | str | None, 
 
 
 def is_resumed(flags: Any) -> bool:
-    """Return whether the broker has kept the session, from the flags that `on_connect` gets."""
+    """Return whether the broker has kept the session, by the flags that `on_connect` gets."""
     found = flags["session present"] if isinstance(flags, dict) else flags.session_present
     return bool(found)
 
 
 def refusal(reason: Any) -> str:
-    """Return in words why a connection was refused; empty if it was accepted."""
+    """Return why a connection was refused; empty if it was accepted."""
     if isinstance(reason, int):
         from paho.mqtt.client import connack_string
 
@@ -56,14 +56,14 @@ def refusal(reason: Any) -> str:
 
 
 def subscription_refusal(reason: Any) -> str:
-    """Return in words why a subscription was refused; empty if it was accepted."""
+    """Return why a subscription was refused; empty if it was accepted."""
     if isinstance(reason, int):
         return "not authorized, or no such topic" if reason >= _REFUSED else ""
     return str(reason) if reason.is_failure else ""
 
 
 def end_of(*facts: Any) -> str:
-    """Return in words why a connection has ended, from the further arguments of `on_disconnect`."""
+    """Return why a connection has ended, by the further arguments of `on_disconnect`."""
     if len(facts) == 1:
         from paho.mqtt.client import error_string
 

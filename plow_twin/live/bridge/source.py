@@ -1,4 +1,4 @@
-"""Interface of sources of messages, and parsing of lines and payloads."""
+"""Interface of the sources of messages, and parsers of lines and JSON payloads."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ LONGEST: Final = 65536
 
 
 class BridgeError(PlowTwinError):
-    """A source cannot be opened or has failed for good; the message names it and the reason."""
+    """A source cannot be opened or has failed for good."""
 
 
 class Messages(Protocol):
-    """Messages in order of arrival; some sources parse them only during iteration."""
+    """Messages in order of arrival, which some sources parse only during iteration."""
 
     def __len__(self) -> int: ...
     def __iter__(self) -> Iterator[Arrived]: ...
@@ -36,7 +36,7 @@ class Bridge(Protocol):
     Attributes
     ----------
     ends : bool
-        Whether the source has an end and its own time, as a file that is read once has.
+        Whether the source has an end and its own time, like a file that is read once.
     finished : bool
         Whether the source has ended.
     connected : bool
@@ -56,17 +56,17 @@ class Bridge(Protocol):
         """Return the type of each topic, or None if the mapping may name any topic."""
 
     def start(self, topics: list[str], stamp_ns: StampOf[Arrived] | None = None) -> None:
-        """Subscribe to these topics; messages of files that are read once are ordered by `stamp_ns`."""
+        """Subscribe to topics; a file that is read once orders its messages by `stamp_ns`."""
 
     def poll(self, timeout_s: float) -> Messages:
-        """Return the messages that have come, waiting `timeout_s` at most; unreadable content is None."""
+        """Return messages after `timeout_s` at most; the content of an unreadable message is None."""
 
     def close(self) -> None:
         """Close the source."""
 
 
 class SourceState:
-    """Base class with the attributes of a `Bridge`, and their values before the bridge is started."""
+    """Base class with the attributes of a `Bridge`."""
 
     def __init__(self, *, ends: bool = False, connected: bool = False) -> None:
         self.ends, self.finished, self.connected = ends, False, connected
@@ -78,11 +78,11 @@ class Reporting(Protocol):
     """A source with its own part of the diagnostics."""
 
     def part(self) -> Part:
-        """Return level, message and values for the part `source` of the diagnostics."""
+        """Return the part `source` of the diagnostics."""
 
 
 def read_json(data: bytes) -> dict[str, Any] | None:
-    """Return the object in a JSON text, or None if the text is too long or is not a JSON object."""
+    """Return the object in a JSON text; None if the text is too long or is no object."""
     if len(data) > LONGEST:
         return None
     try:
@@ -93,7 +93,7 @@ def read_json(data: bytes) -> dict[str, Any] | None:
 
 
 class Lines:
-    """Splits bytes into whole lines, with None for a line that is too long."""
+    """Splits bytes into lines; a line that is too long becomes None."""
 
     def __init__(self) -> None:
         self._rest = b""
@@ -122,37 +122,36 @@ class Lines:
 
 
 class Rows:
-    """Parser of lines; the first line shows whether they are CSV under a header, or JSON objects."""
+    """Parses lines; the first line shows whether they are JSON objects or CSV under a header."""
 
     def __init__(self) -> None:
         #: names of the columns, or keys of the first object; None before the first line
         self.columns: list[str] | None = None
         self._json = False
-        #: the delimiter that the header shows
         self.delimiter = ","
-        #: columns of the previous file, if this file has replaced another file
+        #: columns of the file that this file has replaced
         self._before: list[str] | None = None
 
     @property
     def under_header(self) -> bool:
-        """Whether the lines to come are CSV of known columns."""
+        """Whether further lines are CSV of known columns."""
         return self.columns is not None and not self._json
 
     def header(self, source: str) -> Columns:
-        """Return the columns of `source`; raise the errors of `columns_of`."""
+        """Return the columns; raise the errors of `columns_of`, which name the `source`."""
         return columns_of(source, self.columns or ())
 
     def of_another_file(self) -> Rows:
-        """Return a parser for the next file; if that file has no header, the present header applies."""
+        """Return a parser for the next file, to which the present header applies if it has no header."""
         rows = Rows()
         rows._before = self.columns
         return rows
 
     def read(self, line: bytes | None) -> dict[str, Any] | bool | None:
-        """Return the content of a line: None if it is unreadable, False for a header or an empty line."""
+        """Return the content of a line; None if it is unreadable, False if it is empty or a header."""
         if line is None:
             return None
-        line = line.strip(b"\r \xef\xbb\xbf")  # tabs are kept, because they may separate empty cells
+        line = line.strip(b"\r \xef\xbb\xbf")  # a tab may separate empty cells, so it is kept
         if not line.strip() or line.startswith(b"#"):
             return False
         if self.columns is None and (self._json or line.startswith(b"{")):

@@ -1,4 +1,4 @@
-"""Lines of a CSV file that is read once: many lines at a time, with the numbers of a role as arrays."""
+"""Lines of a CSV file as arrays, many lines at a time."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from plow_twin.record.times import OF_NUMBERS, TIMES, times_ns
 
 
 class Table:
-    """Some lines of a file with a header, to be read as single messages, or as the numbers of a role in all lines.
+    """Lines of a file, read as single messages, or as the numbers of a role in all lines.
 
     Parameters
     ----------
     topic
         Topic of the messages.
     lines
-        Whole lines, None for a line that is too long.
+        Whole lines; None for a line that is too long.
     rows
-        Parser of the lines, which knows the header.
+        Parser of the lines.
     """
 
     def __init__(self, topic: str, lines: Sequence[bytes | None], rows: Rows) -> None:
@@ -35,7 +35,6 @@ class Table:
         return len(self._lines)
 
     def __iter__(self) -> Iterator[Arrived]:
-        """Yield the message of each line that contains a message."""
         now_ns = time.time_ns()
         for line in self._lines:
             content = self._rows.read(line)
@@ -45,8 +44,8 @@ class Table:
     def read(self, role: Role) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
         """Return stamps [ns], shape (n,), and numbers (n, k) of a role as `Role.read` does.
 
-        The result is None if the lines must be read one by one, because a line is not a row, or a number is missing or
-        not plain decimal.
+        The result is None if a line is not a row, or a number is missing or not plain decimal. Then the lines must be
+        read one by one.
         """
         names = self._rows.columns or []
         stamp = next((name for name in TIMES if name in names), None) if role.stamp == "header" else role.stamp
@@ -58,12 +57,12 @@ class Table:
         found = [number for number in numbers if number is not None]
         if stamps is None or len(found) < len(numbers):
             return None
-        with np.errstate(all="ignore"):  # a number out of range becomes infinite and is dropped
+        with np.errstate(all="ignore"):  # a number out of range becomes infinite, and its sample is dropped
             values = np.stack([role.in_si(name, number) for name, number in zip(role.fields, found, strict=True)], 1)
         return stamps + role.clock_offset_ns, values
 
     def _columns(self) -> list[tuple[bytes, ...]] | None:
-        """Return the cells of each column; None if lines differ in their number of cells."""
+        """Return the cells of each column, or None if the lines differ in their number of cells."""
         if self._cells is None:
             comma = self._rows.delimiter.encode()
             whole = [line for line in self._lines if line is not None]

@@ -1,4 +1,4 @@
-"""A connection to an OPC UA server: one subscription, and the history, which fills gaps after breaks."""
+"""A connection to an OPC UA server, with one subscription and access to the history."""
 
 from __future__ import annotations
 
@@ -23,8 +23,7 @@ from plow_twin.live.bridge.source import BridgeError
 PUBLISHING_MS: Final = 10.0
 #: Number of values of a node that the server is asked to keep between two messages: 1 s at 10 kHz.
 _QUEUE: Final = 10_000
-#: Keep-alive interval [s]: a server without new values sends a message once in this interval; after three intervals
-#: without a message the server counts as gone.
+#: Interval in which a server without new values sends one message [s]; three silent intervals mean that it is gone.
 _KEEPALIVE_S: Final = 2.0
 #: Time for which the server keeps a subscription without its client [s].
 _LIFETIME_S: Final = 60.0
@@ -43,13 +42,13 @@ _MOST_HISTORY: Final = 1_000_000
 #: Sequence numbers begin again at 1 after this number.
 _LAST_NUMBER: Final = 2**32 - 1
 
-#: Function that takes pairs of node number and value, and a flag that is true if values before these pairs were lost.
+#: Takes pairs of node number and value, and whether values before these pairs were lost.
 Take = Callable[[list[tuple[int, Any]], bool], Awaitable[None]]
 
 
 @dataclass(frozen=True)
 class Revised:
-    """The intervals [ms] that the server grants, and the number of values that it keeps between two messages."""
+    """The intervals [ms] and the queue length that the server grants."""
 
     publishing_ms: float
     sampling_ms: float
@@ -74,13 +73,13 @@ class Link:
     nodes
         Identifiers of the nodes.
     uris
-        Namespaces of the server to which the namespace numbers in `nodes` refer; empty: the present namespaces.
+        Namespaces to which the namespace numbers in `nodes` refer; empty: the server's present namespaces.
     sampling_ms
         Requested sampling interval [ms]; 0: the server's fastest.
     take
         Receives the values.
     counts
-        Receives losses.
+        Receives the losses.
     """
 
     def __init__(
@@ -97,7 +96,7 @@ class Link:
         #: namespaces of the server, by number
         self.uris = list(uris)
         self._sampling_ms, self._take, self._counts = sampling_ms, take, counts
-        # the watchdog waits for three intervals, because a late answer does not mean that the server has gone
+        # a late answer does not mean that the server has gone, so the watchdog waits for three intervals
         self._client = Client(access.url, timeout=_ANSWER_S, watchdog_intervall=3.0 * _KEEPALIVE_S)
         _bound(self._client)
         if access.user:
@@ -137,7 +136,7 @@ class Link:
             self._client.disconnect_socket()
 
     def _placed(self, node: ua.NodeId, uris: Sequence[str]) -> ua.NodeId:
-        """Return a node's identifier with the present number of its namespace, which may change with a restart."""
+        """Return a node's identifier with its namespace's present number, which a restart of the server may change."""
         uri = getattr(node, "NamespaceUri", None)
         if uri is None:
             uri = uris[node.NamespaceIndex] if node.NamespaceIndex < len(uris) else None
@@ -207,7 +206,7 @@ class Link:
         granted = await self._client.uaclient.create_subscription(asked, self._on_publish)
         self._subscription = granted.SubscriptionId
         self._keepalive_s = granted.RevisedPublishingInterval * granted.RevisedMaxKeepAliveCount * 1e-3
-        # an unchanged value with a new stamp is reported too, because a sample is made of values with the same stamp
+        # an unchanged value with a new stamp is reported too, because it belongs to a sample of its own
         by_stamp = ua.DataChangeFilter(Trigger=ua.DataChangeTrigger.StatusValueTimestamp)
         results = await self._monitor(range(len(self._nodes)), by_stamp)
         refused = [
@@ -263,7 +262,7 @@ class Link:
         await self._take_message(message, lost=lost > 0)
 
     def _missing(self, number: int) -> range:
-        """Return the sequence numbers of the messages that are missing before the message `number`."""
+        """Return the sequence numbers that are missing before the message `number`."""
         expected = self._next_number
         if expected is not None and number == expected - 1:  # the server has sent the newest message again
             return range(0)
@@ -289,7 +288,7 @@ class Link:
 
 
 def _bound(client: Client) -> None:
-    """Make a client disconnect from a server that sends oversized messages, since asyncua itself accepts any size."""
+    """Make a client disconnect from a server that sends oversized messages, which asyncua accepts."""
     connection = client.uaclient
     make = connection._make_protocol
 

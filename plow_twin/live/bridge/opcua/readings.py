@@ -1,4 +1,4 @@
-"""Values of OPC UA as numbers with a stamp, and the counts of values that are not used."""
+"""Values of OPC UA as numbers with a stamp."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import Any, Final
 from plow_twin.live.bridge.opcua.samples import NOT_MEASURED, Value
 
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
-#: A time beyond this [ns] counts as missing, because servers without a time may send a date in 9999.
+#: A later time [ns] counts as missing, because servers without a time send a date in 1601 or 9999.
 _FARTHEST_NS: Final = 4_000_000_000_000_000_000
 _MICROSECOND: Final = timedelta(microseconds=1)
 _SEVERITY: Final = 0xC0000000
 _UNCERTAIN: Final = 0x40000000
-#: Bits of a status which mean that the server's queue dropped values before this one.
+#: Bits of a status by which the server says that its queue dropped values before this value.
 _OVERFLOW: Final = 0x00000480
 
 
@@ -27,9 +27,9 @@ class Counts:
     uncertain: int = 0
     not_numbers: int = 0
     unstamped: int = 0
-    #: messages that are missing in the server's numbering, and were not sent again
+    #: messages that are missing in the server's numbers and could not be sent again
     notifications_lost: int = 0
-    #: values that the server marked because its queue overflowed before them
+    #: values before which the server's queue overflowed
     overflows: int = 0
     breaks: int = 0
     breaks_filled: int = 0
@@ -46,10 +46,10 @@ def overflowed(value: Any) -> bool:
 
 
 def reading(data: Any, by_server: bool, counts: Counts) -> tuple[int, Value] | None:
-    """Return stamp [ns] and value of a `DataValue`, or None for a value without a stamp.
+    """Return stamp [ns] and value of a `DataValue`, or None without a stamp.
 
-    A value whose status is Bad or Uncertain, or that is not a number, counts as not measured. Without a source
-    timestamp the server timestamp is used.
+    A value that is no number, or whose status is Bad or Uncertain, counts as not measured. The server's timestamp
+    replaces a missing source timestamp.
     """
     counts.values += 1
     stamp_ns = None if by_server else _stamp_ns(data.SourceTimestamp, data.SourcePicoseconds)
@@ -71,12 +71,12 @@ def reading(data: Any, by_server: bool, counts: Counts) -> tuple[int, Value] | N
 
 
 def _stamp_ns(time: datetime | None, picoseconds: int | None) -> int | None:
-    """Return a time [ns]: OPC UA gives it in units of 100 ns, and the remainder in units of 10 ps."""
+    """Return a time [ns]; `picoseconds` is what is left below OPC UA's unit of 100 ns."""
     if time is None:
         return None
     time = time if time.tzinfo else time.replace(tzinfo=UTC)
     stamp_ns = (time - _EPOCH) // _MICROSECOND * 1000 + (picoseconds or 0) // 100
-    return stamp_ns if 0 < stamp_ns < _FARTHEST_NS else None  # servers without a time send a date in 1601 or 9999
+    return stamp_ns if 0 < stamp_ns < _FARTHEST_NS else None
 
 
 def date_of(stamp_ns: int) -> datetime:

@@ -6,7 +6,7 @@ from bisect import insort
 from collections.abc import Sequence
 from typing import Final
 
-#: Marks a value that the twin does not use; it counts as not measured.
+#: A value that was not measured, or that the twin does not use.
 NOT_MEASURED: Final = ""
 Value = float | str
 #: Largest number of stamps that wait for values.
@@ -14,32 +14,31 @@ _MOST_WAITING: Final = 10_000
 
 
 class Samples:
-    """Samples of one role; a sample is the values of the role's nodes at one stamp.
+    """Samples of a role: the values of the role's nodes at one stamp.
 
-    A server does not resend an unchanged value, so a node without a value at a stamp is assumed to keep its last value.
-    A stamp is complete when each node has a value at this stamp or at a later stamp. An incomplete stamp waits for
-    `wait_s`.
+    A server does not send an unchanged value again, so a node keeps its last value. A stamp is complete when each node
+    has a value at this stamp or at a later stamp.
 
     Parameters
     ----------
     nodes
         The nodes of the role.
     wait_s
-        Longest time between the arrivals of values with one stamp [s].
+        Longest wait for a complete stamp [s].
     """
 
     def __init__(self, nodes: Sequence[str], wait_s: float) -> None:
         self._wait_s = wait_s
         self._stamps_ns: list[int] = []
-        #: for each stamp, the time at which its first value arrived [s], and its values by node
+        #: for each stamp: the arrival of its first value [s], and the values by node
         self._waiting: dict[int, tuple[float, dict[str, Value]]] = {}
-        #: stamp of the newest value of each node [ns]
+        #: stamp of each node's newest value [ns]
         self.newest_ns = dict.fromkeys(nodes, 0)
         self._held: dict[str, Value] = {}
-        #: nodes whose only value so far is from before the first sample
+        #: nodes whose only value is older than the first sample
         self._begun: set[str] = set()
         self._released_ns = 0
-        #: samples with impossible stamps (too far ahead of the system's time), by stamp
+        #: values by stamp, as in `_waiting`, with stamps too far ahead of the system's time
         self._strays: dict[int, tuple[float, dict[str, Value]]] = {}
         #: number of late stamps that were dropped because values were missing
         self._incomplete = 0
@@ -48,7 +47,7 @@ class Samples:
         """Add a value; a second value of the same node at the same stamp is ignored."""
         if stamp_ns == self.newest_ns[node]:
             return
-        # a starting server may stamp the first value by another clock, so later values may have older stamps
+        # the first value of a starting server may be stamped by another clock, so that later values have older stamps
         self.newest_ns[node] = stamp_ns if node in self._begun else max(stamp_ns, self.newest_ns[node])
         self._begun.discard(node)
         if stamp_ns not in self._waiting:
@@ -57,17 +56,17 @@ class Samples:
         self._waiting[stamp_ns][1].setdefault(node, value)
 
     def add_stray(self, node: str, stamp_ns: int, value: Value, now_s: float) -> None:
-        """Add a value with an impossible stamp; its sample is passed on separately, to be counted."""
+        """Add a value with an impossible stamp, which is passed on apart and counted."""
         self._strays.setdefault(stamp_ns, (now_s, {}))[1].setdefault(node, value)
 
     def begin(self, node: str, stamp_ns: int, value: Value) -> None:
-        """Store the value that a node had before the first sample; it completes the first sample."""
+        """Store the value that a node had before the first sample, which it completes."""
         self.newest_ns[node] = stamp_ns
         self._begun.add(node)
         self._held[node] = value
 
     def take(self, now_s: float) -> list[tuple[int, dict[str, Value]]]:
-        """Return the stamps [ns] that no longer wait at `now_s`, in order, each with all nodes' values."""
+        """Return the stamps [ns] that wait no longer at `now_s`, in order, each with the values of all nodes."""
         found = []
         while self._stamps_ns and self._is_due(self._stamps_ns[0], now_s):
             stamp_ns = self._stamps_ns.pop(0)
@@ -75,12 +74,11 @@ class Samples:
             values = self._waiting.pop(stamp_ns)[1] if late else self._with_held(stamp_ns)
             if len(values) == len(self.newest_ns):
                 found.append((stamp_ns, values))
-            else:  # a sample that lacks values at the start is not a loss
+            else:  # at the start, a sample that lacks values is no loss
                 self._incomplete += late
         return found + self._take_strays(now_s)
 
     def _take_strays(self, now_s: float) -> list[tuple[int, dict[str, Value]]]:
-        """Return the samples with impossible stamps that no longer wait at `now_s`."""
         due = sorted(
             stamp_ns
             for stamp_ns, (arrived_s, values) in self._strays.items()
@@ -94,7 +92,7 @@ class Samples:
         return found
 
     def take_incomplete(self) -> int:
-        """Return how many late stamps were dropped since the last call because values were missing."""
+        """Return the number of incomplete late stamps since the last call."""
         found, self._incomplete = self._incomplete, 0
         return found
 
@@ -106,7 +104,7 @@ class Samples:
         return stamp_ns > self._released_ns and all(self.newest_ns[node] > stamp_ns for node in missing)
 
     def _with_held(self, stamp_ns: int) -> dict[str, Value]:
-        """Return the values at a stamp, completed by the unchanged values of the stamp before."""
+        """Return the values at a stamp, and the last values of the other nodes."""
         self._held |= self._waiting.pop(stamp_ns)[1]
         self._released_ns = stamp_ns
         return dict(self._held)

@@ -1,4 +1,4 @@
-"""Certificates of a connection to an OPC UA server."""
+"""Certificates for a connection to an OPC UA server."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from cryptography.exceptions import InvalidSignature
 from plow_twin.live.bridge.access import Access
 from plow_twin.live.bridge.source import BridgeError
 
-#: Policies that are used, the strongest first.
+#: Accepted policies, the strongest first.
 _POLICIES: Final = (
     security_policies.SecurityPolicyAes256Sha256RsaPss,
     security_policies.SecurityPolicyAes128Sha256RsaOaep,
@@ -26,7 +26,7 @@ _MODE: Final = ua.MessageSecurityMode.SignAndEncrypt
 
 
 async def secure(client: Client, access: Access, host: str) -> None:
-    """Have a client sign and encrypt, with the strongest policy that the server offers.
+    """Have a client sign and encrypt by the strongest policy that the server offers.
 
     Raises
     ------
@@ -72,7 +72,7 @@ async def identify(client: Client, access: Access) -> None:
 
 
 def _first(chain: bytes) -> bytes:
-    """Return the server's certificate, the first in a chain (DER, long form of the length)."""
+    """Return the first certificate of a chain, which is the server's own (DER, long form of the length)."""
     return chain[: int.from_bytes(chain[2:4], "big") + 4]
 
 
@@ -85,7 +85,7 @@ def _read(path: Path) -> x509.Certificate:
 
 
 def _check_trust(server: x509.Certificate, trusted: x509.Certificate, host: str, access: Access) -> None:
-    """Raise a `BridgeError` unless the trusted certificate is the server's own, or has issued it for this host."""
+    """Refuse a server whose certificate is neither the trusted one nor issued by it for this host."""
     now = datetime.now(UTC)
     if not server.not_valid_before_utc <= now <= server.not_valid_after_utc:
         raise BridgeError(
@@ -119,7 +119,7 @@ def _hosts(certificate: x509.Certificate) -> list[str]:
 
 
 def _application_uri(certificate: x509.Certificate, otherwise: str) -> str:
-    """Return the application URI in the certificate; servers compare it with the URI of the client."""
+    """Return the application URI in the certificate, which must be the client's."""
     names = _names(certificate)
     uris = names.get_values_for_type(x509.UniformResourceIdentifier) if names else []
     return uris[0] if uris else otherwise
