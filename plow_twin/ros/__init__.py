@@ -1,1 +1,1 @@
-"""The twin as a ROS 2 node: parameters, messages, QoS and diagnostics, without computations."""
+"""The twin as a ROS 2 node: parameters, messages, quality of service and diagnostics, without computations."""

@@ -1,8 +1,7 @@
-"""The publishers and subscribers that share a node's topics, from the ROS graph.
+"""The publishers and subscribers on a node's topics, looked up in the ROS graph.
 
-The middleware offers events for this purpose. The node requests none, because rmw_fastrtps can deadlock: it takes two
-locks in one order when an event is requested or taken, and in the other order when an event arises
-(ros2/rmw_fastrtps#890).
+The middleware could report them by events, but rmw_fastrtps can deadlock then: it takes two locks in one order when an
+event is requested or taken, and in the other order when an event arises (ros2/rmw_fastrtps#890).
 """
 
 from __future__ import annotations
@@ -28,16 +27,15 @@ from rosgraph_msgs.msg import Clock
 LOOK_S: Final = 0.2
 #: Name of a node whose topics are discovered before the node itself (rmw_dds_common sends both in separate messages).
 _UNNAMED: Final = "_NODE_NAME_UNKNOWN_"
-#: Period of the warning about a wrong time on `/clock` [s].
+#: Shortest time between two warnings about the time on `/clock` [s].
 _SAY_AGAIN_S: Final = 5.0
-#: Numbers that ROS gives to the types of parameters.
 _TYPES: Final = frozenset(kind.value for kind in Parameter.Type)
 
 
 class WithoutEvents(Node):
-    """A node that asks for no events of the middleware, neither for its own topics nor for topics that rclpy makes.
+    """A node without events of the middleware, also for the topics that rclpy makes.
 
-    A time before 0 on `/clock`, and parameters that rclpy cannot read, would end the program; this node refuses them.
+    It refuses a time before 0 on `/clock`, and parameters that rclpy cannot read, at which rclpy would end the program.
     """
 
     def create_service(self, srv_type: Any, srv_name: str, callback: Callable[..., Any], **options: Any) -> Service:
@@ -47,14 +45,14 @@ class WithoutEvents(Node):
         return super().create_service(srv_type, srv_name, callback, **options)
 
     def create_publisher(self, *arguments: Any, **options: Any) -> Publisher:
-        """Create a publisher as rclpy does, but without events."""
+        """Create a publisher as rclpy does, without events."""
         events = PublisherEventCallbacks(use_default_callbacks=False)
         return super().create_publisher(*arguments, **{"event_callbacks": events, **options})
 
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Callable[[Any], None], *arguments: Any, **options: Any
     ) -> Subscription:
-        """Create a subscription as rclpy does, but without events; times on `/clock` are checked first."""
+        """Create a subscription as rclpy does, without events; times on `/clock` are checked first."""
         if msg_type is Clock:
             callback = partial(self._take_clock, callback)
         events = SubscriptionEventCallbacks(use_default_callbacks=False)
@@ -71,7 +69,7 @@ class WithoutEvents(Node):
 
 
 def _set_parameters(callback: Callable[..., Any], request: Any, response: Any) -> Any:
-    """Answer a request to set parameters; a request that rclpy cannot read is refused as a whole."""
+    """Answer a request to set parameters, or refuse it if rclpy cannot read it."""
     wrong = [f"{one.name}: got type {one.value.type}" for one in request.parameters if one.value.type not in _TYPES]
     reason = f"{'; '.join(wrong)}; expected one of {min(_TYPES)} to {max(_TYPES)}"
     if not wrong:
@@ -88,13 +86,7 @@ def _set_parameters(callback: Callable[..., Any], request: Any, response: Any) -
 
 
 class Connections:
-    """The peers on a node's topics; each peer that cannot connect is reported once.
-
-    Parameters
-    ----------
-    node
-        The node.
-    """
+    """Finds the peers on a node's topics, and reports each peer that cannot connect once."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
@@ -102,7 +94,7 @@ class Connections:
         self._unnamed: set[tuple[str, bytes]] = set()
 
     def publishers(self, subscription: Subscription) -> tuple[list[Any], int]:
-        """Return the publishers that can connect to a subscription, and the number of new publishers that cannot."""
+        """Return the publishers that can connect to a subscription, and the number of new ones that cannot."""
         topic, found = subscription.topic_name, []
         kind, refused = type_name(subscription.msg_type), 0
         for publisher in self._node.get_publishers_info_by_topic(topic):
@@ -114,7 +106,7 @@ class Connections:
         return found, refused
 
     def look_for_subscribers(self, publishers: Iterable[Publisher]) -> None:
-        """Report the subscribers that cannot connect to the topics that this node publishes."""
+        """Report the subscribers that cannot connect to this node's publishers."""
         for publisher in publishers:
             topic, kind = publisher.topic_name, type_name(publisher.msg_type)
             for subscriber in self._node.get_subscriptions_info_by_topic(topic):
@@ -127,7 +119,7 @@ class Connections:
         if key in self._said:
             return False
         if other.node_name == _UNNAMED and key not in self._unnamed:
-            self._unnamed.add(key)  # the next look-up finds the name, if the node has a name
+            self._unnamed.add(key)  # the next look-up may find the name
             return False
         self._said.add(key)
         self._node.get_logger().warning(f"{topic}: {text}")
@@ -141,7 +133,7 @@ def type_name(message_class: Any) -> str:
 
 
 def _in_full(own: QoSProfile) -> QoSProfile:
-    """Return the profile of a publisher or subscription of this node, with its defaults resolved as in the graph."""
+    """Return a profile of this node with its defaults resolved, as in the graph."""
     return QoSProfile(
         depth=own.depth,
         reliability=own.reliability,

@@ -1,4 +1,4 @@
-"""The live twin on ROS 2: the topics, timers and services of a runtime."""
+"""The live twin on ROS 2: topics, timers and services of a runtime."""
 
 from __future__ import annotations
 
@@ -34,10 +34,8 @@ class RosFront:
 
     Parameters
     ----------
-    node
-        The node.
-    settings
-        Parameters of the node.
+    node, settings
+        The node and its parameters.
     changed
         Called when the state of the stream may have changed.
     prepared, kept_wear
@@ -63,7 +61,7 @@ class RosFront:
         self.follows_samples: bool = node.get_parameter("use_sim_time").value
         self.sends_motion = True
         self._changed = changed
-        #: only one thread at a time may use the twin, and threads take turns
+        #: the lock of the twin, for which threads take turns
         self.turns = Turns()
         self._lost: list[str] = []
         self._server: OpcUaInput | None = None
@@ -72,13 +70,13 @@ class RosFront:
             self._made = made.pop_all()
 
     def _make(self, settings: Settings, prepared: Prepared, kept_wear: Mapping[str, KeptWear], made: ExitStack) -> None:
-        """Make everything on the node; each part is registered for release, also after an error."""
+        """Make everything; each part is registered for its release, also after an error."""
         node = self._node
         self.runtime = runtime = Runtime(self, settings, prepared, kept_wear)
         made.callback(lambda: self._lost.extend(runtime.close()))
         wanted = (settings.estimate, settings.estimate_forces, any(settings.forecast_limits))
         without = [topic for topic, one in zip(ESTIMATES, wanted, strict=True) if not (settings.estimate and one)]
-        # `status` is left out, because the node publishes it whether it is configured or not
+        # the node itself publishes `status`, configured or not
         if settings.follows != "full":
             without += FOLLOWED_TOPICS
         self._publishers = OutputPublishers(node, ["status", *without], runtime.publishing.memory)
@@ -103,7 +101,7 @@ class RosFront:
         loop.start()
 
     def _draw(self, settings: Settings, made: ExitStack) -> None:
-        """Publish markers, if requested; only then their message types are imported."""
+        """Publish markers; only then are their message types imported."""
         from plow_twin.ros.markers import Markers
 
         markers = Markers(self._node, settings, self.runtime.scene)
@@ -154,11 +152,11 @@ class RosFront:
 
     @property
     def error(self) -> Exception | None:
-        """The error that ended the input thread; None while it runs."""
+        """The error that ended the input thread, or None."""
         return self._loop.error
 
     def look_for_others(self) -> None:
-        """Check whether another node publishes on this twin's topics, and check the connection to a server."""
+        """Check whether another node publishes on this twin's topics, and the connection to a server."""
         if self._server is not None:
             with self.turns:
                 self._server.look()
@@ -181,14 +179,14 @@ class RosFront:
         self._loop.run_timers(False)
 
     def answer(self, name: str) -> tuple[bool, str]:
-        """Execute the service of that name; return success and a text for the caller."""
+        """Do the service `name`; return success and an answer."""
         with self.turns:
             if self.runtime.waits_for_clock:
                 return False, "use_sim_time is set and nothing has come on /clock yet"
             return self._services.call(name)
 
     def close(self) -> list[str]:
-        """Release everything in reverse order; return a text that names the losses."""
+        """Release everything in reverse order; return the losses."""
         self.deactivate()
         self._made.close()
         return self._lost

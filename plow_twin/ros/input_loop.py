@@ -1,7 +1,7 @@
 """A thread that empties the input queues as messages arrive, and runs timers by a steady clock.
 
-An executor of rclpy makes a task of each message, and rclpy's events executor checks its timers only when no message
-waits. At 10 kHz, 95 % of its tasks found a queue that an earlier task had emptied, and nothing was published.
+An executor of rclpy makes a task of each message, and the events executor looks at its timers only when no message
+waits. At 10 kHz, nothing was published, and 95 % of its tasks found a queue that an earlier task had emptied.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from typing import Any, Final, Protocol
 
 from plow_twin.live.timer import Timer
 
-#: Largest number of messages taken at once; timers and waiting threads run between two such batches.
+#: Largest number of messages taken at once; timers and other threads run between two batches.
 _MOST: Final = 200
-#: Period at which all queues are polled [s], even without a notification.
+#: Period at which all queues are read even without a notification [s].
 _LOOK_S: Final = 0.1
 
 
@@ -63,40 +63,37 @@ class Receiver(Protocol):
 
 
 class InputLoop:
-    """The thread of a node's inputs. It holds `turns` while it works.
+    """The thread of a node's inputs, which holds `turns` while it works.
 
     Parameters
     ----------
     turns
         Lock that keeps this thread apart from the executor's thread.
     on_error
-        Called with the error that ended the thread; `error` keeps the error too.
+        Called with the error that ended the thread, which `error` keeps.
     """
 
     def __init__(self, turns: Turns, on_error: Callable[[Exception], None]) -> None:
         self._turns, self._on_error = turns, on_error
-        #: timers; the first timer polls all queues and always runs
         self._queues: dict[int, tuple[Queue, Receiver, str]] = {}
         #: the first timer, which looks at all queues, always runs
         self._timers = [Timer(_LOOK_S, self._look_at_all)]
         self._active = self._stopped = False
-        #: time at which the next timer is due
         self._due = 0.0
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._signs = [self._wake]
         self._thread = threading.Thread(target=self._run, name="plow_twin_inputs", daemon=True)
-        #: the error that ended the thread; None while it runs and after `stop`
         self.error: Exception | None = None
 
     def add(self, queue: Queue, receiver: Receiver, topic: str) -> None:
-        """Pass the messages in the queue of a topic to its receiver from now on, and close the queue at the end."""
+        """Pass messages from the queue of a topic to its receiver; the loop closes the queue at its end."""
         with self._turns:
             self._queues[queue.fd] = queue, receiver, topic
             self._signs.append(queue.fd)
         self._look_again()
 
     def every(self, period_s: float, do: Callable[[], float | None]) -> None:
-        """Call a function every `period_s` seconds while the timers run; call this method before `start`."""
+        """Call a function every `period_s` seconds while the timers run; to be called before `start`."""
         self._timers.append(Timer(period_s, do))
 
     def start(self) -> None:
@@ -123,7 +120,7 @@ class InputLoop:
         os.close(self._wake)
 
     def flush(self) -> None:
-        """Pass on the messages that are in the queues now."""
+        """Pass on the messages that wait now."""
         with self._turns:
             for fd in self._queues:
                 while self._receive(fd, all_there_are=True):
@@ -147,12 +144,12 @@ class InputLoop:
                     left = [fd for fd in ready if self._receive(fd)]
                     if time.monotonic() >= self._due:
                         self._look_at_timers()
-        except Exception as error:  # the error is reported, since a thread that ended unnoticed would stop the twin
+        except Exception as error:  # a thread that ended unnoticed would stop the twin
             self.error = error
             self._on_error(error)
 
     def _receive(self, fd: int, *, all_there_are: bool = False) -> bool:
-        """Take messages from a queue and pass them on; return whether more messages are waiting."""
+        """Pass on messages of a queue; return whether more are waiting."""
         queue, receiver, topic = self._queues[fd]
         batch, more = queue.pop(_MOST, all_there_are=all_there_are)
         if batch:

@@ -1,7 +1,7 @@
 """The queue of one input, read in batches; each message has its publisher and the publisher's sequence number.
 
-The C interface below rclpy gives both, and signals new messages through an eventfd, which needs neither executor nor
-interpreter. The subscription is removed from `Node._subscriptions`, so that no executor takes from the queue as well.
+Both come from the C interface below rclpy, which also signals new messages through an eventfd without executor and
+interpreter. The subscription is removed from `Node._subscriptions`, so that no executor takes from its queue.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Taken(NamedTuple):
 
 
 class _Info(ctypes.Structure):
-    """`rmw_message_info_t`, with spare bytes at the end, because other versions of ROS have more fields."""
+    """`rmw_message_info_t`, with room at the end for the fields of other versions of ROS."""
 
     _fields_ = [
         ("source_ns", ctypes.c_int64),
@@ -44,20 +44,16 @@ class _Info(ctypes.Structure):
     ]
 
 
-#: Layout of `_Info`: times of sending and reception, sequence number, publisher.
-#: Layout of the address and the length in `SerializedMessage`.
+#: Layouts of `_Info` (times of sending and reception, sequence number, publisher), and of the address and length in
+#: `SerializedMessage`.
 _INFO, _PLACE = struct.Struct("=qqQ16x16s"), struct.Struct("=QQ")
-#: Return code of rcl for an empty queue.
+#: Answer of rcl for an empty queue.
 _NOTHING_TAKEN: Final = 401
 
 
 @cache
 def _count_up() -> ctypes.c_void_p:
-    """Return `eventfd_write(fd, count)` as a callback of rcl.
-
-    rcl passes the user data, which is the descriptor of the eventfd, and the number of new messages: exactly the
-    arguments of `eventfd_write`.
-    """
+    """Return `eventfd_write` as a callback of rcl, which passes the eventfd as user data and the number of messages."""
     return ctypes.cast(ctypes.CDLL(None).eventfd_write, ctypes.c_void_p)
 
 
@@ -71,14 +67,14 @@ def _new_buffer() -> SerializedMessage:
 
 
 class InputQueue:
-    """Take a subscription away from the executor, and signal arrivals by a file descriptor.
+    """A queue that is taken away from the executor and signals arrivals by a file descriptor.
 
     Parameters
     ----------
     node
         The node of the subscription. Both must be made in the thread of its executor.
     subscription
-        The subscription; its own callback is never called.
+        The subscription, whose own callback is never called.
 
     Attributes
     ----------
@@ -94,7 +90,6 @@ class InputQueue:
         self._places = ctypes.byref(self._buffer), ctypes.byref(self._info)
         self._signs = 0
         self.fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
-        # the executor must not take from this queue as well
         node._subscriptions.remove(subscription)
         with subscription.handle:
             self._listen(subscription.handle.pointer, _count_up(), self.fd)
@@ -102,17 +97,17 @@ class InputQueue:
     def pop(self, most: int, *, all_there_are: bool = False) -> tuple[list[Taken], bool]:
         """Return up to `most` waiting messages in order of arrival, and whether there are more.
 
-        The method takes as many messages as were signalled, or up to `most` with `all_there_are`. It does not try to
-        read further messages, because reading an empty queue costs a fifth of the time of a sample.
+        Only signalled messages are taken, unless `all_there_are`: reading an empty queue takes a fifth of the time of a
+        sample.
         """
         try:
             signs = os.eventfd_read(self.fd)
-        except BlockingIOError:  # no notification has come, but the queue is polled
+        except BlockingIOError:
             signs = 0
         self._signs += signs
         wanted = most if all_there_are else min(most, self._signs)
         taken = self._taken(wanted)
-        # if the queue has overflowed, there were more signals than messages
+        # a queue that has overflowed had more signals than messages
         self._signs = max(0, self._signs - len(taken)) if len(taken) == wanted else 0
         return taken, self._signs > 0 or (all_there_are and len(taken) == most)
 

@@ -18,7 +18,7 @@ _SPIN_S: Final = 0.1
 
 
 def make_executor() -> Executor:
-    """Return the events executor, which does a third of the work per message, if rclpy has it."""
+    """Return the events executor, which needs a third of the time per message, if rclpy has it."""
     try:
         from rclpy.experimental.events_executor import EventsExecutor
     except ImportError:
@@ -29,7 +29,7 @@ def make_executor() -> Executor:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the node until it is asked to stop; return 0, or 2 when its arguments or parameters cannot be used."""
+    """Run the node until it is asked to stop; return 0, or 2 when arguments or parameters cannot be used."""
     _parser().parse_known_args(arguments)
     stop = StopSignals()
     try:
@@ -41,7 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    """Return the parser of `--help`; all other arguments belong to ROS 2."""
+    """Return the parser of `--help`; other arguments belong to ROS 2."""
     return argparse.ArgumentParser(
         "twin",
         usage="twin [--help] [--ros-args -p NAME:=VALUE ... --params-file FILE -r FROM:=TO ...]",
@@ -52,8 +52,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(arguments: Sequence[str] | None, stop: StopSignals) -> int:
-    # these modules are imported after the handlers are set, because a stop during the imports must not end in a
-    # traceback
+    # imported after the signal handlers are set, so that a stop during the imports ends without a traceback
     import rclpy.utilities
 
     from plow_twin.live.parameters import ParameterError

@@ -13,14 +13,12 @@ from std_msgs.msg import Header
 from plow_twin.record import messages as plain
 from plow_twin.stream.intake import NS_PER_S
 
-#: Stamp [ns] and numbers of a message, whether the numbers are a load, and whether the message has a non-zero
-#: out-of-plane component.
+#: Stamp [ns], numbers, whether they are a load, and whether an out-of-plane component is not zero.
 Read = tuple[int, tuple[float, ...], bool, bool]
 #: A message that cannot be read.
 UNREADABLE: Final[Read] = (0, (), False, False)
 
-#: Layouts in big endian and in little endian. Each pair has a layout of the stamp and of the length of the frame's
-#: name, and a layout of force and torque.
+#: Layouts in big and in little endian: stamp and length of the frame's name; force and torque.
 _WRENCH_LAYOUTS: Final = tuple((struct.Struct(f"{order}iII"), struct.Struct(f"{order}6d")) for order in "><")
 
 
@@ -32,8 +30,7 @@ def stamp_ns(header: Header) -> int:
 def deviations(covariance: Sequence[float]) -> tuple[float, ...]:
     """Return the standard deviations of x, y [m] and theta [rad] of a covariance, row-major 6 x 6.
 
-    A negative variance gives NaN, so that the message is not used. The result is empty if all variances are 0, which
-    means unknown.
+    A negative variance gives NaN, so that the message is refused. Variances of 0 mean unknown: the result is empty.
     """
     variances = [float(covariance[7 * axis]) for axis in (0, 1, 5)]
     found = tuple(math.sqrt(variance) if variance >= 0.0 else math.nan for variance in variances)
@@ -46,14 +43,11 @@ def set_stamp(header: Header, stamp: int) -> None:
 
 
 def read_wrench(data: bytes) -> Read:
-    """Decode the CDR bytes of a `WrenchStamped`: Fx, Fy [N] and M [N m].
-
-    This takes a tenth of the time of rclpy's own message objects.
-    """
+    """Decode the CDR bytes of a `WrenchStamped` to Fx, Fy [N] and M [N m], ten times as fast as rclpy."""
     try:
         start, numbers = _WRENCH_LAYOUTS[data[1] & 1]
         seconds, nanoseconds, length = start.unpack_from(data, 4)
-        # numbers of 8 bytes begin at multiples of 8 bytes, counted from the end of the 4 bytes of encapsulation
+        # numbers are aligned to 8 bytes, counted from the end of the encapsulation of 4 bytes
         fx, fy, fz, mx, my, mz = numbers.unpack_from(data, 4 + (start.size + length + 7) // 8 * 8)
     except (struct.error, IndexError):
         return UNREADABLE

@@ -1,4 +1,4 @@
-"""The lifecycle node `plow_twin`: transitions, status and diagnostics; the work is in `front`."""
+"""The lifecycle node `plow_twin`: transitions, status and diagnostics; `RosFront` does the work."""
 
 from __future__ import annotations
 
@@ -33,16 +33,15 @@ from plow_twin.ros.messages import ros_status
 from plow_twin.ros.parameter_server import ParameterServer
 from plow_twin.ros.qos import DIAGNOSTICS, OUTPUTS
 
-#: Number of reports between two log lines about a lasting problem.
+#: A lasting problem is logged once in this number of reports.
 _SAY_AGAIN: Final = 5
 
 
 class TwinNode(WithoutEvents, LifecycleNode):
     """The twin on ROS 2.
 
-    Takes the keyword arguments of `rclpy.node.Node`, so that several nodes can share a process and an executor. Code
-    that creates a node calls `start`, as the program does with `autostart`. `stop_asked` is polled while the solver is
-    compiled.
+    Several nodes can share a process and an executor; `options` are those of `rclpy.node.Node`. Code that makes a node
+    calls `start`. `stop_asked` is polled while the solver is compiled.
 
     Raises
     ------
@@ -60,7 +59,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
         self.lifecycle = "unconfigured"
         #: why the last configure failed
         self.reason = ""
-        #: wear of the scenes configured so far, which outlives cleanup
+        #: wear of all scenes so far, which outlives cleanup
         self._kept_wear: dict[str, KeptWear] = {}
         self._preparation: Preparation | None = None
         self._health = diagnostics.Health()
@@ -71,9 +70,9 @@ class TwinNode(WithoutEvents, LifecycleNode):
         self._status = self.create_publisher(DiagnosticStatus, "status", OUTPUTS["status"])
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", DIAGNOSTICS)
         for name in SERVICES:
-            # the services are never destroyed: a waiting request to a destroyed service would end rclpy's executor
+            # never destroyed, because a waiting request to a destroyed service would end rclpy's executor
             self.create_service(Trigger, f"~/{name}", partial(self._answer, name))
-        # timers use a steady clock, so that reports continue while /clock is paused
+        # reports continue while /clock is paused
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(1.0, self._publish_diagnostics, clock=steady)
         self.create_timer(LOOK_S, self._look_for_publishers, clock=steady)
@@ -92,7 +91,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
         return self._table.settings.autostart
 
     def prepare(self) -> None:
-        """Start a thread that compiles the solver for the present parameters, unless it is compiled already."""
+        """Compile the solver for the present parameters in a thread, unless this has been done."""
         settings = self._table.settings
         if self.runtime is None and (self._preparation is None or self._preparation.key != key(settings)):
             self.get_logger().info(f"scene {settings.scene}: preparing the solver (the first time it is compiled)")
@@ -100,7 +99,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
 
     @property
     def prepared(self) -> bool:
-        """Whether the solver is compiled, so that configuring does not wait."""
+        """Whether configuring need not wait for the solver."""
         return self._preparation is None or self._preparation.done
 
     def _take_preparation(self) -> Preparation:
@@ -109,12 +108,12 @@ class TwinNode(WithoutEvents, LifecycleNode):
         return preparation
 
     def start(self) -> bool:
-        """Configure and activate; return False if either fails (log, status and diagnostics give the reason)."""
+        """Configure and activate; return False if either fails."""
         done = TransitionCallbackReturn.SUCCESS
         return self.trigger_configure() == done and self.trigger_activate() == done
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Load the scene, compile the solver, open the recording, make all topics; on failure `reason` states why."""
+        """Load the scene, open the recording, make all topics; on failure `reason` states why."""
         settings = self._table.settings
         try:
             self.prepare()
@@ -122,7 +121,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
             self._front = RosFront(self, settings, self._publish_status, prepared, self._kept_wear)
         except (PlowTwinError, OSError, ModuleNotFoundError) as error:
             self.reason = f"scene {settings.scene!r}, record_path {settings.record_path!r}: {error}"
-        except Exception:  # rclpy would hide any other error, so its traceback becomes the reason
+        except Exception:  # rclpy would hide the traceback
             self.reason = traceback.format_exc()
         else:
             self.get_logger().info(f"scene {settings.scene}: solver ready in {prepared.compile_s:.2f} s")
@@ -134,37 +133,37 @@ class TwinNode(WithoutEvents, LifecycleNode):
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Take samples from now on."""
         super().on_activate(state)
-        # the present objects live long, so the garbage collector need not visit them while samples arrive
+        # the garbage collector need not visit the present objects while samples arrive
         gc.collect()
         gc.freeze()
         self._configured().activate()
         return self._entered("active")
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Take no samples; the state of the model is kept."""
+        """Take no more samples; the state of the model is kept."""
         super().on_deactivate(state)
         gc.unfreeze()
         self._configured().deactivate()
         return self._entered("inactive")
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Release all that on_configure made and close the recording."""
+        """Release all that configure made, and close the recording."""
         self.release()
         return self._entered("unconfigured")
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Release everything, as cleanup does."""
+        """Do the same as cleanup."""
         self.release()
         return self._entered("finalized")
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Release everything, so that the node can be configured again."""
+        """Do the same as cleanup, so that the node can be configured again."""
         self.release()
         return self._entered("unconfigured")
 
     def release(self) -> None:
-        """Release everything and close the recording; the call is allowed in any state."""
-        # the runtime is part of reference cycles, so it would never be freed while its objects are frozen
+        """Release everything and close the recording, in any state."""
+        # the runtime is part of reference cycles, which are not freed while its objects are frozen
         gc.unfreeze()
         front, self._front = self._front, None
         if front is None:
@@ -195,7 +194,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
         return TransitionCallbackReturn.SUCCESS
 
     def _turn(self) -> AbstractContextManager[None]:
-        """Return the lock that keeps the input thread away from the runtime."""
+        """Return the lock of the runtime."""
         return nullcontext() if self._front is None else self._front.turns
 
     def _refusals(self, settings: Settings) -> list[str]:
@@ -244,12 +243,11 @@ class TwinNode(WithoutEvents, LifecycleNode):
     def _publish_diagnostics(self) -> None:
         if self._front is not None:
             if self._front.error is not None:
-                raise self._front.error  # this ends the program with the reason, like an error of any callback
+                raise self._front.error  # this ends the program, like an error of any callback
             self._connections.look_for_subscribers(self.publishers)
             self._front.look_for_others()
         elif self.lifecycle == "unconfigured" and not self.reason:
-            # the solver is prepared now, so that a manager that configures later, perhaps with another scene, need not
-            # wait for the compiler
+            # a manager that configures later need not wait for the compiler then
             self.prepare()
         runtime = self.runtime
         if runtime is not None and runtime.without_clock and self._reports % _SAY_AGAIN == 0:

@@ -22,18 +22,18 @@ from plow_twin.record.sources import Arrived
 
 
 class OpcUaInput:
-    """The nodes of a server, as the queue of some inputs and the receiver of these inputs.
+    """The nodes of a server, as both the queue and the receiver of some inputs.
 
     It waits for the server at the start and after a break.
 
     Parameters
     ----------
     runtime
-        The live twin; its parameters name server, mapping and credentials.
+        The live twin, whose parameters name server, mapping and credentials.
     front
         Sends the resulting messages.
     warn
-        Called with a text for each problem of the connection.
+        Receives a text for each problem of the connection.
 
     Raises
     ------
@@ -74,7 +74,7 @@ class OpcUaInput:
         self._feeder.feed(batch)
 
     def look(self) -> None:
-        """Update the losses and the state of the connection; the front calls this method at intervals."""
+        """Update losses and state of the connection, at intervals."""
         bridge = self._bridge
         self._inputs.lost += bridge.lost - self._lost
         self._lost = bridge.lost

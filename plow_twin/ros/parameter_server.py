@@ -1,4 +1,4 @@
-"""The table of parameters on a ROS node: declared with descriptors, checked, kept up to date."""
+"""The table of parameters on a ROS node."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from plow_twin.live.parameters import SPECS, Effect, Settings
 
 
 def descriptor(spec: Field[Any]) -> ParameterDescriptor:
-    """Return the ROS descriptor of one parameter: its meaning, unit, range, and when it takes effect."""
+    """Return the ROS descriptor of a parameter."""
     unit = f" [{spec.metadata['unit']}]" if "unit" in spec.metadata else ""
     message = ParameterDescriptor(
         name=spec.name,
@@ -34,9 +34,9 @@ def descriptor(spec: Field[Any]) -> ParameterDescriptor:
 
 
 def _converted(parameter: Parameter) -> Parameter:
-    """Return a parameter with its value converted to the type in the table, if possible.
+    """Return a parameter with its value in the type of the table, if possible.
 
-    An empty list is not converted: without its type rclpy would take it for bytes and refuse it.
+    Without a type, rclpy would take an empty list for bytes, so it is not converted.
     """
     if parameter.name not in SPECS or parameter.type_ is Parameter.Type.NOT_SET:
         return parameter
@@ -46,21 +46,21 @@ def _converted(parameter: Parameter) -> Parameter:
 
 
 class ParameterServer:
-    """Declare all parameters on a node and hold their current values in `settings`.
+    """Declares all parameters on a node and holds their current values in `settings`.
 
-    The node must have `automatically_declare_parameters_from_overrides=True`: the given values are then read before any
-    type check, so that a double can be given as an integer, and one message can name all bad values.
+    The node must have `automatically_declare_parameters_from_overrides=True`, so that the given values are read before
+    any type check: a double can then be given as an integer, and one message can name all bad values.
 
     Parameters
     ----------
     node
         The node.
     unconfigured
-        Function that returns whether the node is unconfigured, so that parameters for configure may change.
+        Returns whether parameters for configure may change.
     changed
-        Called with name and value of each parameter that has changed at run time and takes effect at once.
+        Receives name and value of each changed parameter that takes effect at once.
     refusals
-        Returns why a combination of valid values cannot be accepted now.
+        Returns why settings cannot be accepted now.
 
     Raises
     ------
@@ -95,7 +95,7 @@ class ParameterServer:
         node.add_post_set_parameters_callback(self._after)
 
     def _before(self, asked: list[Parameter]) -> list[Parameter]:
-        """Convert integers to doubles, and name all bad values in one message; rclpy's checks stop at the first one."""
+        """Convert integers to doubles, and log all bad values, since rclpy's checks stop at the first."""
         found = parameters.problems({parameter.name: parameter.value for parameter in asked})
         if found:
             self._node.get_logger().warning(str(parameters.ParameterError(found, "parameters refused")))
@@ -105,7 +105,7 @@ class ParameterServer:
         values = {parameter.name: parameter.value for parameter in asked}
         reasons = [str(problem) for problem in parameters.problems(values)]
         if not self._unconfigured():
-            # a value that does not change, as in a file that sets all parameters, is not refused
+            # a file may set all parameters, so an unchanged value is not refused
             reasons += [
                 f"{name}: takes effect {Effect.CONFIGURE.value}"
                 for name, value in values.items()

@@ -16,7 +16,6 @@ from plow_twin.ros.qos import OUTPUTS
 from plow_twin.ros.rcl import Sender
 from plow_twin.stream.topics import JOINT_STATE, ODOMETRY, STATUS, TOPICS
 
-#: Class of each type of message.
 CLASSES: Final[dict[str, type]] = {JOINT_STATE: JointState, ODOMETRY: Odometry, STATUS: DiagnosticStatus}
 
 

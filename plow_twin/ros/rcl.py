@@ -1,6 +1,6 @@
-"""The public, stable C interface below rclpy for serialised messages, which is used for each sample.
+"""The public, stable C interface below rclpy for serialised messages.
 
-rclpy delivers messages one by one, without the publisher's identity, and checks the type of each message sent.
+rclpy delivers messages one by one without the publisher's identity, and checks the type of each message sent.
 """
 
 from __future__ import annotations
@@ -44,19 +44,19 @@ def libraries() -> tuple[ctypes.CDLL, ctypes.CDLL]:
 
 @cache
 def _publish() -> Any:
-    # PyDLL keeps the interpreter's lock, as rclpy does, because releasing and taking the lock takes longer than sending
+    # PyDLL keeps the interpreter's lock, because releasing and taking it takes longer than sending
     publish = ctypes.PyDLL("librcl.so").rcl_publish_serialized_message
     publish.argtypes = [ctypes.c_void_p] * 3
     return publish
 
 
 class Sender:
-    """Sends what a fixed buffer contains at the time of the call, on one topic.
+    """Sends the bytes that a buffer contains at the time of the call.
 
     Parameters
     ----------
     publisher
-        A publisher of rclpy; nothing is sent once it is destroyed.
+        A publisher of rclpy; once it is destroyed, nothing is sent.
     data
         Contiguous writable bytes: a CDR message.
     """
@@ -68,6 +68,6 @@ class Sender:
         self._publish = _publish()
 
     def send(self) -> None:
-        """Send the bytes as they are now."""
+        """Send the bytes."""
         if self._publish(*self._arguments):
             self._publisher.publish(bytes(self._data))  # this raises an error with the reason

@@ -34,13 +34,7 @@ def start_ros(arguments: Sequence[str] | None) -> None:
 
 
 def without_ros(arguments: Sequence[str]) -> list[str]:
-    """Return the arguments of a command line that are the program's own.
-
-    Raises
-    ------
-    RosArgumentsError
-        The arguments for ROS cannot be used.
-    """
+    """Return the program's own arguments of a command line; raise RosArgumentsError if those for ROS cannot be used."""
     from rclpy.utilities import remove_ros_args
 
     with _said_plainly():
@@ -50,7 +44,7 @@ def without_ros(arguments: Sequence[str]) -> list[str]:
 
 @contextmanager
 def _said_plainly() -> Iterator[None]:
-    """Turn rclpy's exception about arguments into an error without locations in rcl's sources."""
+    """Turn rclpy's exception into an error without places in rcl's sources."""
     try:
         yield
     except RuntimeError as error:

@@ -1,4 +1,4 @@
-"""The subscriptions, which turn messages in their queues into plain numbers for the runtime."""
+"""The subscriptions of a node, whose messages become plain numbers for the runtime."""
 
 from __future__ import annotations
 
@@ -25,10 +25,9 @@ from plow_twin.ros.qos import OVERRIDABLE, sensor_input
 from plow_twin.stream.driver import Arrival
 from plow_twin.stream.intake import Intake, Verdict
 
-#: Depth of the optional inputs' queues.
+#: Depth of the queues of the optional inputs.
 _SLOW_DEPTH: Final = 200
-#: Largest number of publishers whose sequence numbers are remembered; when there are more, the oldest publisher is
-#: forgotten.
+#: Largest number of publishers that are remembered.
 _MOST_PUBLISHERS: Final = 256
 #: Number of samples from which a publisher's rate is estimated.
 _RATE_KNOWN: Final = 20
@@ -49,7 +48,7 @@ class Subscriptions:
     loop, turns
         The thread that takes the messages, and the lock that keeps it apart from the executor's thread.
     elsewhere
-        Inputs that come from a server and therefore have no subscription.
+        Inputs that come from a server and have no subscription.
     """
 
     def __init__(
@@ -66,16 +65,15 @@ class Subscriptions:
         self._inputs, self._intake = runtime.inputs, runtime.driver.intake
         self._connections = Connections(node)
         self._taken_from: dict[str, Subscription] = {}
-        #: publishers of each input when they were last looked up
+        #: publishers of each input at the last look-up
         self._found: dict[str, list[bytes]] = {}
         self._tool_forces = ToolForces(runtime.scene)
         self._source, depth = runtime.settings.excitation_source, self._inputs.depth
         self._names: dict[tuple[str, bytes], str] = {}
-        #: sequence number expected next, by topic and publisher
+        #: next sequence number by topic and publisher
         self._following: dict[tuple[str, bytes], int] = {}
-        self._since_ns = time.time_ns()  # time at which the excitation was subscribed to
-        #: for each publisher of the excitation that was unknown when the subscription began: its first message, and the
-        #: losses counted before this message
+        self._since_ns = time.time_ns()  # when the excitation was subscribed to
+        #: first message of each publisher that appeared after the subscription, and the losses counted before it
         self._appeared: dict[bytes, tuple[Taken, int]] = {}
         self._before: frozenset[bytes] = frozenset()
         with_covariance = runtime.settings.head_pose_type == "pose_with_covariance"
@@ -87,7 +85,7 @@ class Subscriptions:
         self._subscribe(JointState, "gaps", _SLOW_DEPTH)
 
     def look(self) -> None:
-        """Look up the publishers of the inputs; to be called without the lock, for which samples would have to wait."""
+        """Look up the publishers of the inputs, without the lock, for which samples would have to wait."""
         found = {topic: self._connections.publishers(taken) for topic, taken in self._taken_from.items()}
         present = {topic: self._noted(topic, publishers) for topic, (publishers, _) in found.items()}
         refused = sum(count for _, count in found.values())
@@ -98,9 +96,8 @@ class Subscriptions:
             self._inputs.refused_publishers += refused
             self._inputs.publishers |= {topic: len(publishers) for topic, publishers in present.items()}
             for topic in present:
-                self.look_for_senders(
-                    topic
-                )  # the look-up is repeated, because messages may have been taken since the publishers were counted
+                # messages may have been taken since the publishers were counted
+                self.look_for_senders(topic)
         self._front.changed()
 
     def look_for_senders(self, topic: str) -> None:
@@ -113,7 +110,6 @@ class Subscriptions:
             self._inputs.optional[topic].alive(self._present(topic))
 
     def _present(self, topic: str) -> list[bytes]:
-        """Return the present publishers of an input."""
         return self._noted(topic, self._node.get_publishers_info_by_topic(self._node.resolve_topic_name(topic)))
 
     def _noted(self, topic: str, publishers: list[Any]) -> list[bytes]:
@@ -127,7 +123,7 @@ class Subscriptions:
         return present
 
     def name_of(self, topic: str, sender: bytes) -> str:
-        """Return node and identity of a publisher, or only the identity if it vanished before it was looked up."""
+        """Return node and identity of a publisher, or only the identity if it was never looked up."""
         if topic in self._elsewhere:
             return sender.decode(errors="replace")
         if (topic, sender) not in self._names:
@@ -140,7 +136,7 @@ class Subscriptions:
         subscription = self._node.create_subscription(
             kind,
             topic,
-            lambda message: None,  # this is never called, because the input queue delivers the messages
+            lambda message: None,  # the input queue delivers the messages
             sensor_input(depth),
             qos_overriding_options=OVERRIDABLE,
             raw=True,
@@ -152,10 +148,7 @@ class Subscriptions:
         self._loop.add(InputQueue(self._node, subscription), self, topic)
 
     def receive(self, topic: str, batch: list[Taken]) -> None:
-        """Receive the messages in the queue of an input; every message passes here.
-
-        Gaps in the publishers' numbers are counted first.
-        """
+        """Receive messages of an input; gaps in the publishers' numbers are counted first."""
         inputs, following = self._inputs, self._following
         for message in batch:
             key, number = (topic, message.sender), message.number
@@ -192,8 +185,8 @@ class Subscriptions:
     def _count_before_first(self, batch: list[Taken]) -> None:
         """Count messages that were sent after the subscription but before their publisher's first received message.
 
-        Discovery takes time, so a publisher that is new to the node may have been sending for a long time. Its rate
-        shows whether it began before the subscription.
+        Discovery takes time, and a publisher that is new to the node may have been sending for long. Its rate shows
+        whether it began before the subscription.
         """
         newest = {message.sender: message for message in batch}
         for sender, (first, counted) in list(self._appeared.items()):
@@ -209,7 +202,6 @@ class Subscriptions:
                 del self._appeared[sender]
 
     def _samples(self, topic: str, batch: list[Taken]) -> None:
-        """Receive the messages that were in the queue of the selected source."""
         inputs = self._inputs
         inputs.waited(len(batch), (time.time_ns() - batch[0].received_ns) * 1e-9)
         arrived: list[Arrival] = []
@@ -218,7 +210,7 @@ class Subscriptions:
             stamp, values, fits, out_of_plane = self._read(topic, message.data)
             wanted = inputs.wanted(message.sender, message.number, stamp, values, fits)
             if inputs.senders.followed != followed:
-                # the followed sender has changed, and the samples collected so far came from another publisher
+                # the samples collected so far came from another publisher
                 self._step(arrived)
                 arrived, followed = [], inputs.senders.followed
             if wanted:
@@ -228,7 +220,6 @@ class Subscriptions:
         self._step(arrived)
 
     def _step(self, arrived: list[Arrival]) -> None:
-        """Step the twin by the samples, and send the resulting messages."""
         if arrived:
             for topic, message in self._runtime.step(arrived):
                 self._front.send(topic, message)
@@ -240,7 +231,6 @@ class Subscriptions:
             self._intake.refuse(Verdict.NOT_SELECTED, stamp, values)
 
     def _read(self, topic: str, data: bytes) -> Read:
-        """Decode the bytes of a load."""
         return read_wrench(data) if topic == "excitation" else self._read_tool_forces(data)
 
     def _read_tool_forces(self, data: bytes) -> Read:
@@ -269,7 +259,7 @@ class Subscriptions:
             with_covariance = self._pose is PoseWithCovarianceStamped
             pose = message.pose.pose if with_covariance else message.pose
             turn, stamp = pose.orientation, stamp_ns(message.header)
-            # z and w are both zero if the sender never filled the field, or if the head is upside down
+            # z and w are zero if the sender never filled the field, or if the head is upside down
             if turn.z == turn.w == 0.0:
                 self._inputs.head_pose.refuse(Verdict.MALFORMED, stamp, (pose.position.x, pose.position.y))
                 continue
@@ -278,7 +268,7 @@ class Subscriptions:
             self._runtime.add_pose(stamp, (pose.position.x, pose.position.y, theta), deviation)
 
     def _messages(self, topic: str, kind: type, intake: Intake, batch: list[Taken]) -> Iterator[Any]:
-        """Yield the messages of an input other than the load; count unreadable ones."""
+        """Yield the messages of an optional input, and count unreadable messages."""
         for taken in batch:
             self._inputs.arriving = (topic, taken.sender)
             message = _message(taken.data, kind)
@@ -289,7 +279,7 @@ class Subscriptions:
 
 
 def _message(data: bytes, kind: type) -> Any | None:
-    """Decode CDR bytes into a message; None if they cannot be read."""
+    """Decode CDR bytes; return None if they cannot be read."""
     try:
         return deserialize_message(data, kind)
     except (RuntimeError, UnicodeDecodeError):

@@ -1,4 +1,4 @@
-"""`plow-twin record`: records the received bytes of any topics with their message definitions, beside a twin's run."""
+"""Recorder of the received bytes of any topics, beside a twin's run: `plow-twin record`."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def message_class(message_type: str) -> type:
 
 
 class TopicRecorder:
-    """Record topics as they appear.
+    """Records topics as they appear.
 
     Parameters
     ----------
@@ -63,20 +63,20 @@ class TopicRecorder:
     writer
         Takes the messages.
     wanted
-        Returns whether a topic is to be recorded.
+        Returns whether to record a topic.
     """
 
     def __init__(self, node: Node, writer: BagWriter, wanted: Callable[[str], bool]) -> None:
         self._node, self._writer, self._wanted = node, writer, wanted
-        #: for each topic: its type, its number in the file, and the subscribed qualities of service
+        #: type, number in the file, and subscribed qualities of service of each topic
         self._topics: dict[str, tuple[str, int, set[_Quality]]] = {}
-        #: for each known publisher, the quality of service of the subscription that takes its messages
+        #: quality of service of the subscription that takes a publisher's messages
         self._taken_as: dict[tuple[str, bytes], _Quality] = {}
         self._turns = Turns()
         self._loop = InputLoop(self._turns, lambda error: None)
-        #: for each topic that is not recorded, the reason
+        #: why topics are not recorded
         self.skipped: dict[str, str] = {}
-        #: number of messages that were sent but never received, from the publishers' sequence numbers
+        #: number of messages that were never received, by the publishers' sequence numbers
         self.missed: dict[str, int] = {}
         self._newest: dict[tuple[str, bytes], int] = {}
         self._loop.every(_FLUSH_S, writer.flush)
@@ -102,7 +102,7 @@ class TopicRecorder:
                     self.skipped[name] = f"{', '.join(types)}: {error}"
 
     def _subscribe(self, name: str, types: Sequence[str], publishers: Sequence[Any]) -> None:
-        """Subscribe with each quality of service that the publishers of a topic offer, when a publisher appears."""
+        """Subscribe with each quality of service that the publishers of a topic offer."""
         if name not in self._topics:
             if len(types) != 1:
                 raise LookupError("expected one type")
@@ -149,8 +149,7 @@ class TopicRecorder:
         """Write messages of a subscription, each message once."""
         for message in taken:
             key = (name, message.sender)
-            # the topic's weaker subscription also gets the messages of a stronger publisher, which must be recorded
-            # only once
+            # the topic's weaker subscription gets the messages of a stronger publisher too
             if self._taken_as.setdefault(key, quality) != quality:
                 continue
             before = self._newest.get(key, message.number - 1)
@@ -166,14 +165,14 @@ class TopicRecorder:
 
 
 class _Subscription(NamedTuple):
-    """A subscription of a recorder: its quality of service, and the topic's number in the file."""
+    """A subscription: its quality of service, and the topic's number in the file."""
 
     recorder: TopicRecorder
     quality: _Quality
     number: int
 
     def receive(self, topic: str, batch: list[Taken]) -> None:
-        """Receive the messages that were in the queue."""
+        """Receive messages."""
         self.recorder.add(topic, self.quality, self.number, batch)
 
 
@@ -190,16 +189,16 @@ def record_topics(
 ) -> Mapping[str, Any]:
     """Record topics to a new folder until `stopped`; return the counts written, lost and skipped by topic.
 
-    `complete` is True if nothing was lost and every topic requested by name was recorded.
+    `complete` is true if nothing was lost and every topic requested by name was recorded.
 
     Parameters
     ----------
     folder
-        Folder that is made for the recording; `<folder>_2`, ... if it exists and is not empty.
+        Folder that is made for the recording, or `<folder>_2`, ... if it exists and is not empty.
     topics
         Names; a relative name is in the root namespace.
     every
-        Record all topics except hidden topics, topics in `but`, and topics that match `exclude`.
+        Whether to record all topics except hidden ones, those in `but`, and those that match `exclude`.
     """
     named = {name if name.startswith("/") else f"/{name}" for name in topics}
     left_out = {*but, "/parameter_events"}
@@ -242,9 +241,7 @@ def record_topics(
 
 
 def schema_of(message_type: str) -> str:
-    """Return the `ros2msg` text of a type and of the types that it uses.
-
-    The texts come from the type's package, or, if it is not installed, from ROS 2 Jazzy.
+    """Return the `ros2msg` text of a type and of the types that it uses, from their packages or from ROS 2 Jazzy.
 
     Raises
     ------
@@ -275,7 +272,7 @@ _BUILT_IN: Final = re.compile(r"(bool|byte|char|float32|float64|u?int(8|16|32|64
 
 
 def _used(text: str, package: str) -> list[str]:
-    """Return those types of a message's fields that are message types."""
+    """Return the message types among the types of a message's fields."""
     used = []
     for line in text.splitlines():
         kind = line.split("#")[0].strip().partition(" ")[0].partition("[")[0]
