@@ -21,11 +21,11 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     if os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
         sys.exit("plow-twin: NUMBA_DISABLE_JIT is set, expected it unset, as the solver is compiled")
     with _ending_at_once():
-        # Ctrl-C ends the process at once here, because an interrupted import may raise another error instead
+        # an interrupted import may raise another error
         try:
             import plow_twin.run.twin  # noqa: F401
             from plow_twin.cli.app import main as run
-        except (ImportError, OSError, MemoryError) as error:  # a library is missing, or memory is short
+        except (ImportError, OSError, MemoryError) as error:
             newer = (
                 "" if sys.version_info < (3, 13) else f"; this is Python 3.{sys.version_info[1]}, expected 3.11 or 3.12"
             )
@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
 
 
 def _open_what_is_closed() -> None:
-    """Open /dev/null for standard streams that are closed at the start, so that no file gets their descriptors."""
+    """Open /dev/null for closed standard streams, so that no file gets their descriptors."""
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
         pass
     os.close(descriptor)
@@ -47,13 +47,13 @@ def _open_what_is_closed() -> None:
 
 @contextmanager
 def _ending_at_once() -> Iterator[None]:
-    """End the process on Ctrl-C without a traceback while no work has begun."""
+    """End the process on Ctrl-C without a traceback; no work has begun."""
 
     def end(*_: object) -> None:
         os.write(2, b"plow-twin: interrupted\n")
         os._exit(1)
 
-    # whether the caller neither ignores nor handles Ctrl-C
+    # a caller may ignore or handle Ctrl-C
     ours = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     if not ours or threading.current_thread() is not threading.main_thread():
         yield

@@ -85,13 +85,13 @@ def analyse(
 
 
 def found_recordings(recordings: Sequence[Path], out: Path | None = None) -> tuple[list[Path], tuple[Path, ...]]:
-    """Return the recordings at paths and in folders; report the items in folders that are not recordings."""
+    """Return the recordings at paths and in folders; report other items in the folders."""
     from plow_twin.study.analysis.analyse import counted_once, expand, left_out
 
     for path in recordings:
         if not path.exists():
             raise click.BadParameter(f"{path}: does not exist", param_hint="RUN...")
-    # folders with results of an earlier analysis are not reported as left out
+    # results of an earlier analysis are not reported as left out
     results_before = () if out is None else (out.resolve(), (out / "run").resolve())
     left = {item: path for path in recordings for item in left_out(path, results_before)}
     left = {item: path for item, path in left.items() if item.resolve() not in results_before}
@@ -120,7 +120,7 @@ def _alone(task: Any, quiet: bool) -> dict[str, Any]:
 
 
 def _run(tasks: list[Any], workers: int, dask: str | None, quiet: bool) -> list[dict[str, Any]]:
-    """Analyse on all cores or a cluster; existing results are kept, so that an interrupted call can be continued."""
+    """Analyse on all cores or a cluster; existing results are kept, so that the command can be continued."""
     from plow_twin.study.analysis.many import run_many
 
     with progress("analysing", quiet) as on_progress:
@@ -128,7 +128,7 @@ def _run(tasks: list[Any], workers: int, dask: str | None, quiet: bool) -> list[
 
 
 def _watch(task: Any, every: float, as_json: bool, quiet: bool) -> dict[str, Any]:
-    """Analyse a run repeatedly while it is recorded, until it ends or the command is interrupted."""
+    """Analyse a run while it is recorded, until it ends or the command is interrupted."""
     import time
 
     from plow_twin.cli.interruption import interruptible
@@ -152,7 +152,7 @@ def _watch(task: Any, every: float, as_json: bool, quiet: bool) -> dict[str, Any
             sys.stdout.flush()
         else:
             _show([facts], False, False, quiet)
-        # this pause is at least nine times as long as the summing up, which therefore takes at most a tenth of the time
+        # summing up takes at most a tenth of the time
         due = time.monotonic() + max(every, 9.0 * (time.monotonic() - begin))
 
     with interruptible() as stopped:
@@ -174,9 +174,9 @@ def _watch(task: Any, every: float, as_json: bool, quiet: bool) -> dict[str, Any
 
 
 def _show_contacts(console: Console, results: Sequence[dict[str, Any]]) -> None:
-    """Print the contacts that the model computed, runs side by side."""
+    """Print the computed contacts, runs side by side."""
     shown = table("Contacts computed", "run", "time [s]", "impacts [1/min]", "largest force [kN]", "at")
-    # a long name of a run continues on the next line
+    # a long name of a run is wrapped
     shown.columns[0].no_wrap, shown.columns[0].overflow = False, "fold"
     for facts in results:
         loads = facts["loads"]

@@ -33,7 +33,7 @@ from plow_twin.cli.telemetry import telemetry
 from plow_twin.cli.view import view
 from plow_twin.errors import ExcessError, InputError, PlowTwinError, RunInterrupted, UnitError
 
-#: For each module, the extra of the package that installs it.
+#: The extra of the package that installs each module.
 EXTRA_OF_MODULE: Final = {
     "rclpy": "ros",
     "rcl_interfaces": "ros",
@@ -66,7 +66,7 @@ EXTRA_OF_MODULE: Final = {
     "distributed": "dask",
 }
 
-#: Longest message [characters]; a message may list names to choose from, of which a file may have a million.
+#: Longest message [characters]; a message may list names, of which a file may have a million.
 _LONGEST: Final = 16_000
 
 
@@ -116,15 +116,14 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run the command line and leave with its exit code."""
     code = run(arguments)
     if threading.current_thread() is threading.main_thread():
-        # the work is done, so further signals are ignored: a terminal and a launch may each send a signal, and the
-        # second one would change the exit code
+        # a terminal and a launch may each send a signal, and the second would change the exit code
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, signal.SIG_IGN)
     try:
         if sys.stdout is not None:  # standard output is None if it was closed at the start
             sys.stdout.flush()
     except BrokenPipeError:
-        # the reader is gone, and Python must not report this at exit
+        # Python must not report at exit that the reader is gone
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     sys.exit(code)
 
@@ -141,7 +140,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
     except RunInterrupted as error:
         return _fail(str(error))
     except (click.Abort, KeyboardInterrupt) as error:
-        # click replaces every KeyboardInterrupt by an Abort, whose cause is the original exception
+        # click replaces a KeyboardInterrupt by an Abort, whose cause it is
         stopped = error.__cause__
         return _fail(str(stopped) if isinstance(stopped, RunInterrupted) else "interrupted")
     except (InputError, UnitError, ExcessError) as error:

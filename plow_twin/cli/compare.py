@@ -133,7 +133,7 @@ def _show(found: Comparison) -> None:
     console.print(_KEY, highlight=False)
 
 
-#: The sign that a table shows for each cause of a change, and the explanation of the signs.
+#: The sign of each cause of a change, and the explanation of the signs.
 _SIGNS: Final = {"chance": "", "machine": "M", "load": "L", "load or machine": "?"}
 _KEY: Final = (
     "M: the machine changed, L: the load changed, ?: either; no letter: may be chance. All numbers of a table are "
@@ -142,7 +142,7 @@ _KEY: Final = (
 
 
 def _text(change: Change | None) -> str:
-    """Return a change in percent and the sign of its cause, short enough for a table of 80 columns."""
+    """Return a change in percent with the sign of its cause."""
     if change is None:
         return "-"
     percent = round(100.0 * change.share, 1) + 0.0

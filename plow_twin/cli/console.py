@@ -1,4 +1,4 @@
-"""Common parts of the verbs: exit codes, consoles, progress, checked numbers."""
+"""Common parts of the verbs: exit codes, consoles, progress, tables, sentences about losses."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ FAILED: Final = 1
 WRONG_INPUT: Final = 2
 DONE_WITH_LOSS: Final = 3
 
-#: Function that is called with the share of the work that is done (0 to 1).
+#: Receives the share of the work that is done, from 0 to 1.
 OnProgress = Callable[[float], None]
 
 
@@ -49,7 +49,7 @@ class PlainConsole(Console):
         super().__init__(markup=False, emoji=False, **options)
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
-        """Yield the parts to show, without control characters except the control codes of the console itself."""
+        """Yield the parts to show; only the console's own control characters remain."""
         for part in super().render(renderable, options):
             yield part if part.control else Segment(printable(part.text), part.style)
 
@@ -60,13 +60,11 @@ def output_console() -> Console:
 
 
 def error_console() -> Console:
-    """Return the console for progress, which never mixes with results."""
+    """Return the console for progress, apart from results."""
     return PlainConsole(stderr=True)
 
 
 class _RateColumn(ProgressColumn):
-    """Column with the share of the work that is done per second."""
-
     def render(self, task: Task) -> Text:
         """Return the text for a task."""
         return Text("" if not task.speed else f"{100.0 * task.speed:.2g} %/s")
@@ -74,7 +72,7 @@ class _RateColumn(ProgressColumn):
 
 @contextmanager
 def progress(title: str, quiet: bool) -> Iterator[OnProgress]:
-    """Show a progress bar on standard error while the work reports the share done."""
+    """Show a progress bar on standard error while the work reports its progress."""
     with progress_bar(title, quiet) as update, _interruption() as interrupted:
 
         def on_progress(share: float) -> None:
@@ -87,7 +85,7 @@ def progress(title: str, quiet: bool) -> Iterator[OnProgress]:
 
 @contextmanager
 def progress_bar(title: str, quiet: bool) -> Iterator[OnProgress]:
-    """Show a progress bar on standard error; signals are left alone."""
+    """Show a progress bar on standard error without a change of the handlers of signals."""
     columns = (
         TextColumn("{task.description}"),
         BarColumn(bar_width=30),
@@ -104,7 +102,7 @@ def progress_bar(title: str, quiet: bool) -> Iterator[OnProgress]:
 
 @contextmanager
 def _interruption() -> Iterator[Callable[[], bool]]:
-    """Note Ctrl-C in addition to its exception, which is lost if it is raised in a destructor."""
+    """Note Ctrl-C beside its exception, which is lost in a destructor."""
     before, asked = signal.getsignal(signal.SIGINT), False
 
     def note(number: int, frame: FrameType | None) -> None:
@@ -133,7 +131,7 @@ def busy(title: str, quiet: bool) -> Iterator[None]:
 
 
 def table(title: str, *columns: str) -> Table:
-    """Return a table with a text column and columns of numbers."""
+    """Return a table whose first column is text, and whose other columns are numbers."""
     result = Table(title=title, title_justify="left")
     for index, name in enumerate(columns):
         result.add_column(name, justify="left" if index == 0 else "right", no_wrap=index == 0)
@@ -141,7 +139,7 @@ def table(title: str, *columns: str) -> Table:
 
 
 def show_facts(console: Console, facts: Mapping[Any, Any], indent: int = 0) -> None:
-    """Print one fact per line, with the facts of a mapping indented below its name; long texts are not wrapped."""
+    """Print a fact per line, with the facts of a mapping indented below its name; long texts are not wrapped."""
     for key, value in facts.items():
         name = " " * indent + str(key)
         if isinstance(value, Mapping) and value:
@@ -162,12 +160,12 @@ def _plain(value: Any) -> str:
 
 
 def counts(found: Mapping[str, int]) -> str:
-    """Return counts as one line of text, each with its name."""
+    """Return counts with their names as a line of text."""
     return ", ".join(f"{name}: {count}" for name, count in found.items())
 
 
 def say_end(recording: object, status: str) -> None:
-    """Print on standard error that a recording has no proper end, and which verb completes it."""
+    """Print that a recording has no proper end, and which verb completes it."""
     from plow_twin.record.reader import FileStatus
 
     if status not in (FileStatus.COMPLETE.value, FileStatus.UNREAD.value):
@@ -177,7 +175,7 @@ def say_end(recording: object, status: str) -> None:
 
 
 def say_lost(recording: object, lost: Mapping[str, int]) -> None:
-    """Print the losses of a recording, including an early end, on standard error."""
+    """Print the losses of a recording, including an early end."""
     from plow_twin.record.reader import FileStatus
 
     ends = {status.value for status in FileStatus}
@@ -188,5 +186,5 @@ def say_lost(recording: object, lost: Mapping[str, int]) -> None:
 
 
 def kilonewton(force_n: float) -> str:
-    """Return a force in N as text in kN."""
+    """Return a force [N] as text in kN."""
     return f"{force_n / 1e3:.2f}"

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def access_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add `--listen` and `--token-file`, which arrive as the parameters `listen` and `token_file`."""
+    """Add the options `--listen` and `--token-file`."""
     for option in (
         click.option(
             "--token-file",
@@ -44,7 +44,7 @@ dashboard_option = click.option("--dashboard", is_flag=True, help="Show the run 
 
 
 def access_of(options: dict[str, Any]) -> PageAccess:
-    """Return the access that the options request; raises the errors of `PageAccess.of` and `listening`."""
+    """Return the access that the options request; raise the errors of `PageAccess.of` and `listening`."""
     from plow_twin.dashboard.access import PageAccess, listening
 
     access = PageAccess.of(options["listen"], options["token_file"])
@@ -53,7 +53,7 @@ def access_of(options: dict[str, Any]) -> PageAccess:
 
 
 def access_if_shown(options: dict[str, Any]) -> PageAccess | None:
-    """Return the access to the screen, or None without `--dashboard`, when other options of the screen are refused."""
+    """Return the access to the screen, or None without `--dashboard`, which its other options need."""
     if options["dashboard"]:
         return access_of(options)
     context = click.get_current_context()
@@ -98,7 +98,7 @@ def dashboard(
     access = access_of(options)
     with interruptible() as stopped:
         if run is None:
-            # the folder of the message definitions if ROS was installed from wheels
+            # where wheels of ROS have the message definitions
             os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)
             from plow_twin.dashboard.node import show_node
 

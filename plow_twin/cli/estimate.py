@@ -151,7 +151,7 @@ def estimate(
 
 @dataclass(frozen=True)
 class _Task:
-    """An estimate to compute: `run` returns it with further facts. Its times count from `first_ns`, if known."""
+    """An estimate to compute; `first_ns` is the stamp of the measurements' time 0, if known."""
 
     scene: Scene
     load: Load
@@ -162,7 +162,7 @@ class _Task:
 
 @dataclass(frozen=True)
 class _Given:
-    """All measurements, and the number of rows that could not be used."""
+    """All measurements, and the number of unusable rows."""
 
     measured: Measured
     load: Load
@@ -172,7 +172,6 @@ class _Given:
 
 
 def _measured(source: Path, scene: Path | None, mapping: Path | None, folder: bool) -> _Given:
-    """Return all measurements."""
     from plow_twin.estimate.gaps import Gaps
     from plow_twin.estimate.measurements import Load, Poses
     from plow_twin.record.measured import read_measured, read_recording
@@ -187,7 +186,6 @@ def _measured(source: Path, scene: Path | None, mapping: Path | None, folder: bo
 
 
 def _given(source: Path, scene: Path | None, mapping: Path | None, folder: bool) -> _Task:
-    """Return the computation of an estimate from all measurements."""
     from plow_twin.estimate.estimate import estimate as run
 
     given = _measured(source, scene, mapping, folder)
@@ -206,19 +204,19 @@ def _given(source: Path, scene: Path | None, mapping: Path | None, folder: bool)
 
 
 def _followed(given: _Given, members: int, dt: float | None) -> tuple[list[str], Any]:
-    """Return column names, and rows with forces, clearances and their intervals at each time."""
+    """Return column names and rows: forces, clearances and their intervals at each time."""
     from plow_twin.estimate import followed as offline
 
     stretch = offline.follow(given.measured.scene, given.load, given.poses, members, dt, gaps=given.gaps)
     return offline.table(stretch.rows)
 
 
-#: Advice to a user whose numbers are in another unit.
+#: Advice to a user whose numbers have another unit.
 _REMEDY: Final = "convert the file, or state the unit in a mapping (--map)"
 
 
 def _check_units(source: Path, measured: Measured) -> None:
-    """Refuse impossible poses; warn about a load that seems to be in another unit."""
+    """Refuse impossible poses; warn about a load in what seems to be another unit."""
     from plow_twin.record.unit_check import unit_doubts
 
     values = {("excitation", name): measured.load[:, 1 + place] for place, name in enumerate(("fx", "fy", "m"))}
@@ -230,7 +228,7 @@ def _check_units(source: Path, measured: Measured) -> None:
 
 
 def _repeated(source: Path) -> _Task | None:
-    """Return the computation that repeats the newest estimate of a live node, or None without an estimate."""
+    """Return the computation of a live node's newest estimate, or None without an estimate."""
     from plow_twin.estimate.answer import answer
     from plow_twin.live.estimation import asked_of
     from plow_twin.live.parameters import settings
@@ -260,7 +258,7 @@ def _repeated(source: Path) -> _Task | None:
 
 
 def _title(source: Path, scene: Path | None, task: _Task) -> str:
-    """Return the first line of the picture's title: the measurements, the scene and the date."""
+    """Return the first line of the picture's title: measurements, scene and date."""
     from datetime import UTC, datetime
 
     from plow_twin.view.figures import date_text
@@ -271,7 +269,6 @@ def _title(source: Path, scene: Path | None, task: _Task) -> str:
 
 
 def _plot(task: _Task, result: Estimate, path: Path, title: str) -> None:
-    """Draw the fit."""
     from plow_twin.estimate.estimate import priors
     from plow_twin.view.estimate import estimate_picture
     from plow_twin.view.fitted_file import write_fit_picture
@@ -281,7 +278,7 @@ def _plot(task: _Task, result: Estimate, path: Path, title: str) -> None:
 
 
 def _labels(scene: Scene) -> dict[str, str]:
-    """Return name and unit of each quantity."""
+    """Return each quantity's name with its unit."""
     from plow_twin.estimate.unknowns import QUANTITIES
 
     labels = {one.name: one.label for one in QUANTITIES}
@@ -292,7 +289,7 @@ def _labels(scene: Scene) -> dict[str, str]:
 
 
 def _forces(task: _Task, result: Estimate, members: int) -> Forces | None:
-    """Return the forces under the measured load, or None without an estimate from which twins can be drawn."""
+    """Return the forces under the measured load, or None if no twins can be drawn from the estimate."""
     from plow_twin.estimate.forces import forces_of
     from plow_twin.estimate.result import State
 
@@ -311,7 +308,6 @@ def _show_forces(forces: Forces) -> None:
 
 
 def _show_live(live: dict[str, Any]) -> None:
-    """Print the window of the estimate, with times from its first sample."""
     same = "the same bit for bit" if live["repeated"] else "not the same"
     window = f"{1e-9 * live['start_ns']:.3f} s to {1e-9 * live['end_ns']:.3f} s"
     text = (

@@ -40,7 +40,6 @@ def export(recording: Path, kind: str, out: Path, quiet: bool) -> int:
 
 
 def _tables(out: Path, kind: str) -> list[Path]:
-    """Return the files of all tables that an export may write into the folder."""
     from plow_twin.record.recording import COLUMNS
 
     return [out / f"{name}.{kind}" for name in COLUMNS]

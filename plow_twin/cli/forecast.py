@@ -19,8 +19,7 @@ if TYPE_CHECKING:
     from plow_twin.model.scene import Scene
 
 
-#: A limit below this share of the clearance was probably given in m instead of mm, which makes it a thousandth of the
-#: intended limit.
+#: A limit below this share of the clearance was probably given in m instead of mm.
 _METRES: Final = 1e-2
 
 
@@ -138,7 +137,7 @@ def forecast(
 
 
 def _check_limits(limits_m: tuple[float, float], scene: Scene) -> None:
-    """Refuse limits that seem to be in m, and report a clearance that has already passed its limit."""
+    """Refuse limits that seem to be in m, and report a clearance that has passed its limit."""
     import numpy as np
 
     from plow_twin.stream.outputs import clearances
@@ -154,7 +153,7 @@ def _check_limits(limits_m: tuple[float, float], scene: Scene) -> None:
 
 
 def _scene(name: str) -> tuple[Scene, dict[str, Any] | None, dict[str, int]]:
-    """Return the scene (for a run, at its end), the newest estimate of its pads, and the losses of the journal."""
+    """Return the scene (of a run: at its end), the newest estimate of its pads, and the journal's losses."""
     from plow_twin.record.estimated import left_by
     from plow_twin.record.reader import RunReader, own_run
     from plow_twin.scene_file import load_scene
@@ -169,7 +168,7 @@ def _scene(name: str) -> tuple[Scene, dict[str, Any] | None, dict[str, int]]:
 
 
 def _estimate(path: Path) -> Any:
-    """Return the unchecked content of the JSON file of an estimate."""
+    """Return the content of the JSON file of an estimate, which is not checked."""
     try:
         facts = json.loads(path.read_text(encoding="utf-8-sig"))
     except (ValueError, RecursionError) as error:
@@ -180,13 +179,7 @@ def _estimate(path: Path) -> Any:
 
 
 def _history(path: Path) -> History:
-    """Read a history.
-
-    Raises
-    ------
-    RecordingError, LifeError
-        The history cannot be used.
-    """
+    """Read a history; raise RecordingError or LifeError if it cannot be used."""
     from plow_twin.estimate.coefficient import History
     from plow_twin.estimate.life import LifeError
     from plow_twin.record.sources import read_columns

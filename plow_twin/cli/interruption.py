@@ -1,4 +1,4 @@
-"""End of a verb by Ctrl-C, SIGTERM or SIGHUP in bounded time, even while it waits in the code of a library."""
+"""End of a verb by a signal in bounded time, even while it waits in the code of a library."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Final
 
 from plow_twin.live.stop import stop_signals
 
-#: Time within which an interrupted verb must end by itself [s].
+#: Time that an interrupted verb has to end by itself [s].
 PATIENCE_S: Final = 3.0
 
 
@@ -19,15 +19,15 @@ PATIENCE_S: Final = 3.0
 def interruptible(on_overdue: Callable[[], object] = lambda: None) -> Iterator[Callable[[], bool]]:
     """Yield a function that returns whether the process was asked to end.
 
-    If the block runs for more than `PATIENCE_S` after the request, `on_overdue` is called and the process ends with
-    exit code 1, because a library that waits for a viewer cannot be interrupted in another way.
+    If the block has not ended after `PATIENCE_S`, `on_overdue` is called and the process ends with exit code 1, because
+    a library that waits for a viewer cannot be interrupted in another way.
     """
     asked, done = threading.Event(), threading.Event()
     receive, send = os.pipe()
     os.set_blocking(send, False)
 
     def watch() -> None:
-        # the signal handler writes a byte, which this thread reads independently of the main thread
+        # the handler of a signal writes a byte, for which this thread waits apart from the main thread
         os.read(receive, 1)
         asked.set()
         if not done.wait(PATIENCE_S):

@@ -39,9 +39,8 @@ if TYPE_CHECKING:
     from plow_twin.live.stop import StopSignals
     from plow_twin.telemetry.access import WayOut
 
-#: Time between two updates of the progress bar [s].
 _PROGRESS_S = 0.2
-#: Pattern that the names of counters of unused input match.
+#: Names of the counters of unused input.
 _LOST = re.compile(r"dropped_.*|.*_dropped|.*_lost")
 
 
@@ -162,7 +161,7 @@ def _live(
 
 
 def _say_what_differs(front: BridgeFront, settings: Settings) -> None:
-    """Report where the recording is if its folder was in use, and which thresholds seem wrong."""
+    """Report where the recording is if its folder was in use, and thresholds that seem wrong."""
     from plow_twin.record.unit_check import small_thresholds
 
     recording = front.runtime.recording
@@ -174,7 +173,7 @@ def _say_what_differs(front: BridgeFront, settings: Settings) -> None:
 
 
 def _say_pace(settings: Settings, quiet: bool) -> None:
-    """Say, before a file is read, why reading takes long and which setting is faster."""
+    """Say, before a file is read, why reading takes long."""
     if settings.follows == "full" and not quiet:
         say_error(
             f"plow-twin: {settings.follow_members} twins follow the machine, which takes about as long as the "
@@ -183,7 +182,7 @@ def _say_pace(settings: Settings, quiet: bool) -> None:
 
 
 def _also_metrics(say: Say, port: int | None, opened: ExitStack) -> Say:
-    """Return the receiver of a twin's reports: `say`, together with the page of metrics if it is requested."""
+    """Return the receiver of a twin's reports, which also updates the page of metrics."""
     if port is None:
         return say
     from plow_twin.live.metrics import Metrics
@@ -208,7 +207,6 @@ def _answer_on(control: Control, front: BridgeFront) -> None:
 
 
 def _screen(front: BridgeFront, access: PageAccess, source: str) -> Screen:
-    """Open the screen of a twin."""
     from plow_twin.dashboard.live import open_screen
 
     screen = open_screen(front, access, source)
@@ -217,14 +215,12 @@ def _screen(front: BridgeFront, access: PageAccess, source: str) -> Screen:
 
 
 def _open_way(front: BridgeFront, way: WayOut, rate_hz: float, source: str) -> AbstractContextManager[object]:
-    """Open an output of a twin."""
     from plow_twin.telemetry.live import open_way
 
     return open_way(front, way, rate_hz, source)
 
 
 def _show_progress(front: BridgeFront, bridge: Bridge, update: OnProgress) -> None:
-    """Show how much of a finite source has been read."""
     from plow_twin.live.bridge.files import Files
     from plow_twin.live.timer import Timer
 
@@ -233,7 +229,6 @@ def _show_progress(front: BridgeFront, bridge: Bridge, update: OnProgress) -> No
 
 
 def _control(path: Path | None) -> AbstractContextManager[Control | None]:
-    """Return the requested socket, which is removed when the context ends."""
     if path is None:
         return nullcontext()
     from plow_twin.live.control import Control
@@ -242,7 +237,6 @@ def _control(path: Path | None) -> AbstractContextManager[Control | None]:
 
 
 def _show_estimate(front: BridgeFront) -> None:
-    """Print the newest estimate, if there is one."""
     estimation = front.runtime.estimation
     if estimation is None or estimation.entry is None:
         return
@@ -253,7 +247,7 @@ def _show_estimate(front: BridgeFront) -> None:
 
 
 def _settings(options: dict[str, Any]) -> Settings:
-    """Return the parameters of the file, overridden by --set and then by the options of single parameters."""
+    """Return the parameters of the file, overridden by --set and then by other options."""
     from plow_twin.live import parameters
 
     values = parameters.read_parameters(options["params"]) if options["params"] else {}
@@ -317,7 +311,7 @@ def _bridge(source: str, options: dict[str, Any], rate_hz: float) -> Bridge:
 
 
 def _tables(folder: Path, *, growing: bool) -> list[Path]:
-    """Return the tables of a folder, without Parquet files if files are read while they grow."""
+    """Return the tables of a folder; Parquet files cannot grow."""
     from plow_twin.scene_file.csv_rows import tables
     from plow_twin.scene_file.parquet_lines import is_parquet
 

@@ -26,12 +26,12 @@ map_option = click.option(
 
 
 def wait_option(text: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Return the option `--wait` with its help text; it arrives as the parameter `wait` [s]."""
+    """Return the option `--wait` [s] with a help text."""
     return click.option("--wait", type=click.FloatRange(0.0), default=10.0, show_default=True, help=text)
 
 
 def node_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options that name a running node: `--namespace`, `--name` and `--scene`."""
+    """Add the options that name a running node."""
     for option in (
         click.option("--scene", help="Scene of the node, if the node's path to it cannot be read here."),
         click.option("--name", default="plow_twin", show_default=True, help="Name of the node."),
@@ -42,7 +42,7 @@ def node_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def unit_option(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add `--unit NAME=UNIT`, which arrives as the parameter `units`: units by name."""
+    """Add `--unit NAME=UNIT`, whose parameter `units` has the units by name."""
 
     def parsed(context: click.Context, parameter: click.Parameter, given: tuple[str, ...]) -> dict[str, str]:
         units = dict(text.partition("=")[::2] for text in given)
@@ -63,7 +63,7 @@ class PositiveNumber(click.ParamType):  # type: ignore[type-arg]  # generic from
     name = "number"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """Return the number, or fail with the value got and the value expected."""
+        """Return the number."""
         try:
             number = float(value)
         except ValueError:

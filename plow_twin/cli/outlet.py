@@ -1,4 +1,4 @@
-"""Lines for a reader that may be slow or hang; the writer never waits for it."""
+"""Lines for a reader that may be slow or hang, and that the writer does not wait for."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ from collections import deque
 from collections.abc import Callable
 from typing import Final
 
-#: Largest number of lines that wait for the reader; the oldest are dropped first.
+#: Largest number of lines that wait for the reader; the oldest are dropped.
 MOST_WAITING: Final = 1000
-#: Longest time [s] that the end waits for a reader that takes no line.
+#: Longest wait at the end for a reader that takes no line [s].
 _PATIENCE_S: Final = 2.0
 
 
 class Outlet:
-    """Write lines in order, in a separate thread.
+    """Writes lines in order, in a thread of its own.
 
     Parameters
     ----------
     write
-        Function that writes a line and returns whether it was taken.
+        Writes a line and returns whether it was taken.
     on_loss
-        Called once, when the first line is dropped.
+        Called when the first line is dropped.
     """
 
     def __init__(self, write: Callable[[str], bool], on_loss: Callable[[], object] = lambda: None) -> None:
@@ -30,7 +30,7 @@ class Outlet:
         self._news = threading.Condition()
         self._thread: threading.Thread | None = None
         self._closed = self._broken = False
-        #: number of lines that were not taken or were dropped
+        #: number of lines that were dropped or not taken
         self.lost = 0
 
     def put(self, line: str) -> None:
@@ -51,7 +51,7 @@ class Outlet:
             self._thread.start()
 
     def close(self) -> bool:
-        """Wait as long as the reader reads; return False if it hangs, and raise the errors of `put`."""
+        """Wait as long as the reader takes lines; return False if it hangs, and raise the errors of `put`."""
         with self._news:
             self._closed = True
             self._news.notify()
@@ -59,7 +59,7 @@ class Outlet:
             left = len(self._waiting)
             self._thread.join(_PATIENCE_S)
             if self._thread.is_alive() and len(self._waiting) == left:
-                self.lost += left + 1  # this count includes the line that is being written
+                self.lost += left + 1  # and the line that is being written
                 return False
         if self._broken:
             raise BrokenPipeError

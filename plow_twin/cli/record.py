@@ -41,7 +41,7 @@ def record(
         raise click.BadParameter(
             f"got {exclude!r}, expected a regular expression: {error}", param_hint="--exclude"
         ) from None
-    # if ROS was installed from wheels, this folder has the message definitions
+    # where wheels of ROS have the message definitions
     os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)
     from plow_twin.cli.interruption import interruptible
     from plow_twin.record.reader import RunReader

@@ -12,7 +12,7 @@ from plow_twin.stream.journal import Failed
 
 
 def read_recording(path: Path) -> tuple[dict[str, Any], bool]:
-    """Read a recording from front to back; return its facts, and whether it has losses or failed advances.
+    """Return the facts of a recording, and whether it has losses or failed advances.
 
     Raises
     ------

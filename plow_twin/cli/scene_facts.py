@@ -16,7 +16,7 @@ Fact = dict[str, Any]
 
 
 def numbers(scene: Scene) -> list[Fact]:
-    """Return key, value, unit, mark and source of every number of a scene; list items are separate numbers."""
+    """Return key, value, unit, mark and source of every number of a scene, also of each item of a list."""
     rows = [row for key in SECTIONS for row in _numbers_of(getattr(scene, key), key, scene)]
     for index, load in enumerate(scene.loads):
         rows += _numbers_of(load, f"loads[{index}]", scene)
@@ -44,7 +44,7 @@ def _numbers_of(part: Any, path: str, scene: Scene) -> Iterator[Fact]:
 
 
 def damping_unit(scene: Scene) -> str:
-    """Return the unit of `contact.damping`, which is C of an additive law and lambda of all other laws."""
+    """Return the unit of `contact.damping`: of C in an additive law, of lambda in others."""
     return "N s/m" if LAWS[scene.contact.law].additive else "s/m"
 
 

@@ -61,7 +61,7 @@ def setup(file: Path, scene: str | None, given: tuple[str, ...], units: dict[str
 
 
 def _check_sizes(guess: Guess, scene: Scene, stated: dict[str, str]) -> None:
-    """Refuse loads that are too large for the scene; only warn if the user states their unit."""
+    """Refuse loads that are too large for the scene, unless the user has stated their unit."""
     from plow_twin.record.unit_check import large_loads
 
     large = large_loads(guess.values, guess.units, scene)

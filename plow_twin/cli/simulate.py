@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from plow_twin.run.sensitivity import Sensitivity
     from plow_twin.run.simulate import Result
 
-#: Largest number of rows; a row takes some 200 B.
+#: Largest number of rows, of some 200 B each.
 MOST_ROWS: Final = 10_000_000
 
 
@@ -105,7 +105,7 @@ def simulate(
 def _run(
     scene: str, quiet: bool, t_end: float, *settings: Any, **limits: Any
 ) -> tuple[Result, LimitError | RunInterrupted | None]:
-    """Run the scene; after Ctrl-C or at a limit, return the motion so far and the reason for the end."""
+    """Run the scene; at a limit or after Ctrl-C, return the motion so far and the reason."""
     from plow_twin.errors import LimitError, RunInterrupted, SceneError, ToleranceWarning
     from plow_twin.run.simulate import simulate as run
     from plow_twin.scene_file import load_scene
@@ -114,7 +114,6 @@ def _run(
     try:
         title = f"simulating {t_end:g} s (the first run compiles)"
         with progress(title, quiet) as on_progress, warnings.catch_warnings():
-            # the warning is printed with the results
             warnings.simplefilter("ignore", ToleranceWarning)
             return run(model, t_end, *settings, **limits, on_progress=on_progress), None
     except (LimitError, RunInterrupted) as stop:
@@ -144,7 +143,7 @@ def _check_rows(t_end: float, output_dt: float | None) -> None:
 
 
 def write_samples(result: Result, path: Path) -> None:
-    """Write the samples in one step as .csv (exact numbers of 17 digits) or .npz (with all contact events)."""
+    """Write the samples at once as .csv (numbers of 17 digits) or .npz (with all contact events)."""
     from plow_twin.record.durable import whole_file
 
     with whole_file(path) as stream:
@@ -183,7 +182,7 @@ def _write_npz(result: Result, stream: BinaryIO) -> None:
 
 
 def as_plain(result: Result, scene: str, t_end: float) -> dict[str, Any]:
-    """Return the result without its samples as plain numbers, texts and mappings, for JSON."""
+    """Return the result, without its samples, as plain numbers, texts and mappings for JSON."""
     return {
         "scene": scene,
         "t_end": t_end,
@@ -198,7 +197,7 @@ def as_plain(result: Result, scene: str, t_end: float) -> dict[str, Any]:
 
 
 def balance_of(balance: EnergyBalance) -> dict[str, Any]:
-    """Return the balance as plain numbers and lists, with the imbalance as a share of the turnover."""
+    """Return the balance as plain numbers and lists, with the imbalance relative to the turnover."""
     from dataclasses import asdict
 
     import numpy as np

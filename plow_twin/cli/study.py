@@ -26,10 +26,7 @@ def study() -> None:
 
 
 def paper_command() -> click.Command:
-    """Return the verb `paper` of the package `plow_twin_paper`, installed or beside this package in a clone.
-
-    Without this package, the verb says how to install it.
-    """
+    """Return the verb `paper` of the package `plow_twin_paper`, installed or in a clone; else a verb that says how."""
     if CLONE.is_dir() and str(CLONE) not in sys.path:
         sys.path.append(str(CLONE))
     try:
@@ -53,7 +50,6 @@ def _absent_paper() -> click.Command:
     return paper
 
 
-# each verb of this package has its own module, plow_twin/cli/study_<verb>.py
 _VERBS: tuple[click.Command, ...] = (sweep, calibrate, paper_command())
 for _verb in _VERBS:
     study.add_command(_verb)

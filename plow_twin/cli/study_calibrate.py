@@ -104,9 +104,9 @@ def calibrate(
 
 
 def _merged(proposed: Sequence[str], given: Sequence[str]) -> tuple[str, ...]:
-    """Return the unknowns of the target file, replaced by given unknowns of the same parameter.
+    """Return the unknowns of the target file, replaced by given ones of the same parameter.
 
-    A given `contact.damping` also replaces `contact.restitution`, and the reverse; `PATH=fixed` removes an unknown.
+    Damping and restitution count as one parameter; `PATH=fixed` removes an unknown.
     """
     paths = {text.partition("=")[0] for text in given}
     if paths & {"contact.damping", "contact.restitution"}:
@@ -124,7 +124,6 @@ def _check_plot(plot: Path, options: dict[str, Any]) -> None:
 
 
 def _plot(fit: Fit, space: Space, objective: Objective, title: str, path: Path) -> None:
-    """Draw the fit."""
     from plow_twin.study.calibration.objective import RecordingObjective
     from plow_twin.study.calibration.picture import draw_motion, draw_targets
 
@@ -149,7 +148,7 @@ def _check_options(options: dict[str, Any]) -> None:
 def _objective(
     scene: str, settings: Sequence[str], options: dict[str, Any]
 ) -> tuple[Scene, Objective, str, tuple[str, ...]]:
-    """Return the scene, the objective, its name, and the unknowns that the target file proposes."""
+    """Return the scene, the objective, its name, and the unknowns of the target file."""
     from dataclasses import replace
 
     from plow_twin.record.unit_check import check_poses

@@ -32,13 +32,7 @@ def usage_errors() -> Iterator[None]:
 
 
 def study_scene(name: str, settings: Sequence[str]) -> Scene:
-    """Load a scene and make the changes of `--set`.
-
-    Raises
-    ------
-    StudyError, SceneError
-        The scene or a setting cannot be used.
-    """
+    """Load a scene and make the changes of `--set`; raise StudyError or SceneError if one cannot be used."""
     from plow_twin.scene_file import load_scene
     from plow_twin.study.parameters import parse_settings, with_parameters
 

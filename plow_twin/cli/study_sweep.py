@@ -18,10 +18,9 @@ if TYPE_CHECKING:
     from plow_twin.study.store import Store
     from plow_twin.study.sweep.table import Axis, Table
 
-#: Largest number of rows of a table on the terminal; longer tables are cut or thinned out, and files have all rows.
+#: Largest number of rows of a table on the terminal; files have all rows.
 MOST_ROWS: Final = 24
-#: Width of a column of numbers [characters].
-#: Width of the first column with its frame [characters].
+#: Widths of a column of numbers, and of the first column with its frame [characters].
 _COLUMN, _FIRST_COLUMN = 12, 8
 
 
@@ -93,7 +92,7 @@ def sweep(
 
 
 def _list_failed(result: Table) -> None:
-    """Report the failed members by reason; the Parquet file has all failures."""
+    """Report the failed members by reason; the Parquet file has all."""
     reasons: dict[str, list[str]] = {}
     for member in result.failed:
         values = ", ".join(f"{path}={_text(value)}" for path, value in result.sweep.values(member).items())

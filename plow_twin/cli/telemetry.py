@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def telemetry_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add `--mqtt-out`, `--sparkplug`, `--influx`, `--opcua`, and the options of all outputs."""
+    """Add the options of the outputs."""
     for option in (
         click.option(
             "--out-access",
@@ -53,7 +53,7 @@ def telemetry_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def ways_of(options: dict[str, Any]) -> list[WayOut]:
-    """Return the outputs that the options request; raises the errors of `telemetry.access`."""
+    """Return the outputs that the options request; raise the errors of `telemetry.access`."""
     if options["sparkplug"] and not options["mqtt_out"]:
         raise click.UsageError("--sparkplug: expected --mqtt-out with the broker")
     if not any(options[name] for name in ("mqtt_out", "influx", "opcua")):
@@ -88,7 +88,7 @@ def telemetry(namespace: str, name: str, scene: str | None, wait: float, **optio
     from plow_twin.live.stop import StopRequested, StopSignals
 
     with StopSignals() as stop:
-        # the folder of the message definitions if ROS was installed from wheels
+        # where wheels of ROS have the message definitions
         os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)
         from plow_twin.telemetry.node import send_node
 

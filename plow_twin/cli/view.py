@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from plow_twin.view.rrd import ViewSummary
 
 
-#: Largest factor by which the drawing enlarges the clearance; a larger factor would draw the cavity far from the frame.
+#: Largest factor by which the drawing enlarges the clearance, so that the cavity stays near the frame.
 _MOST_EXAGGERATED = 1e4
 
 
@@ -123,7 +123,7 @@ def view(
 
 
 def _check_still(option: str, *, moving: bool, exaggerate: float | None, others: tuple[str, ...]) -> None:
-    """Refuse options that do not apply to a picture of a whole run."""
+    """Refuse options that a picture of a whole run does not have."""
     if moving:
         raise click.UsageError(
             f"{option} cannot be combined with --out, --web or --follow: it is a picture of a whole run"
@@ -135,7 +135,7 @@ def _check_still(option: str, *, moving: bool, exaggerate: float | None, others:
 
 
 def _still(run: Path, png: Path | None, html: Path | None) -> tuple[FileStatus, dict[str, int], int]:
-    """Write the picture or the page of a run; return the run's status, losses and number of failed advances."""
+    """Write the picture or the page of a run; return the run's status, losses and failed advances."""
     if png is not None:
         from plow_twin.view.picture import to_png
 
@@ -150,7 +150,7 @@ def _still(run: Path, png: Path | None, html: Path | None) -> tuple[FileStatus, 
 def _made_run(
     recording: Path, scene: str | None, mapping: Path | None, units: dict[str, str], quiet: bool
 ) -> Iterator[tuple[Path, bool]]:
-    """Yield the run that the model makes of another recording, and whether some of the recording could not be used."""
+    """Yield the run that the model makes of another recording, and whether some of it could not be used."""
     from tempfile import TemporaryDirectory
 
     from plow_twin.study.analysis.analyse import analyse
@@ -167,7 +167,6 @@ def _made_run(
 
 
 def _scenes(files: tuple[str, ...]) -> dict[str, Scene]:
-    """Return the scenes by short names."""
     from plow_twin.scene_file import load_scene
     from plow_twin.scene_file.presets import scene_path
 
@@ -188,7 +187,7 @@ def _show(recording: Path, out: object, summary: ViewSummary, quiet: bool) -> in
 
 
 def _print_losses(recording: Path, status: FileStatus, lost: Mapping[str, int], failed: int) -> bool:
-    """Print the losses and failed advances of a recording; return whether it has any."""
+    """Print the losses and failed advances of a recording; return whether there are any."""
     from plow_twin.record.reader import FileStatus
 
     whole = status in (FileStatus.COMPLETE, FileStatus.UNREAD)
@@ -208,8 +207,8 @@ def _serve(file: Path, port: int) -> int:
     command = [program, str(file), "--serve-web", "--bind", LOOPBACK, "--port", str(data_port)]
     click.echo(f"serving until interrupted: {page_address(port, data_port)}")
     sys.stdout.flush()
-    # the program replaces this process, so that signals reach the server; it logs only errors, because otherwise it
-    # would print the address of the light theme, in which labels cannot be read
+    # the program replaces this process, so that signals reach it; it logs errors only, and not the address of the light
+    # theme, whose labels cannot be read
     os.execve(program, [*command, "--web-viewer-port", str(port)], {"RUST_LOG": "error", **os.environ})
 
 
@@ -246,8 +245,7 @@ def _follow(
                 summary = show(file.attach, lambda: stopped() or file.failed)
         code = _show(run, out or run, summary, quiet)
         sys.stdout.flush()
-        while (
-            viewer is not None and viewer.process.poll() is None and not stopped()
-        ):  # the run has ended, but the viewer stays open
+        # the run has ended, but the viewer stays open
+        while viewer is not None and viewer.process.poll() is None and not stopped():
             time.sleep(0.2)
     return code
