@@ -9,8 +9,7 @@ from typing import Any
 
 from plow_twin.model.contact_laws import LAWS
 from plow_twin.model.friction import painleve_coefficients
-from plow_twin.model.scene import OPTIONAL_PARTS, Harmonic, Scene, Table
-from plow_twin.scene_file.schema import SECTIONS
+from plow_twin.model.scene import OPTIONAL_PARTS, SECTIONS, Harmonic, Scene, Table
 
 Fact = dict[str, Any]
 

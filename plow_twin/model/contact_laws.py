@@ -1,9 +1,10 @@
-"""Contact laws, each defined with its equation and its source.
+"""Contact laws, each with its equation and its source.
 
-Most laws have the form  F = K d^n (1 + lambda d')  with penetration d and its rate d', positive inward. They differ in
-the damping number  D = lambda v0  that they derive from the restitution e, where v0 is the speed at first touch. The
-other laws add C d' to K d^n, either fully from the start (Kelvin-Voigt) or ramped in. A new law needs one entry in
-`_LAWS`, or a call of `add_law` from outside the package; solvers read only its options and its damping number.
+Most laws have the form F = K d^n (1 + lambda d') with the penetration d and its rate d', positive inward. They differ
+in the damping number D = lambda v0 that they derive from the restitution e, where v0 is the speed at first touch. The
+additive laws add C d' to K d^n, from the first touch (Kelvin-Voigt) or over a ramp. A new law needs an entry in
+`_LAWS`, or a call of `add_law` from outside the package. The solver reads only the options of a law and its damping
+number.
 """
 
 from __future__ import annotations
@@ -16,17 +17,18 @@ from typing import Final
 
 from plow_twin.errors import ArgumentError
 
-#: Value of 1 - e below which rounding dominates the exact law's residual, so that two terms of D's series replace it.
+#: Below this value of 1 - e, rounding dominates the residual of the exact law. D is then computed from the first two
+#: terms of its series.
 _NEARLY_ELASTIC: Final = 1e-5
-#: Largest D = lambda v0 used; as the restitution goes to 0 the damping would grow without bound.
+#: Largest D = lambda v0. Without a limit, D would be infinite at a restitution of 0.
 DAMPING_NUMBER_CAP: Final = 1e3
 
 
 def exact_damping_number(restitution: float) -> float:
-    """Return the D that gives exactly the restitution e:  D (1 + e) = ln((1 + D) / (1 - D e)).
+    """Return the D that gives exactly the restitution e: D (1 + e) = ln((1 + D) / (1 - D e)).
 
-    The equation is valid for F = K d^n (1 + lambda d') with any K, n and mass. D is 0 at e = 1 and grows without bound
-    as e goes to 0. Source: first integral of the free impact; cf. Hunt and Crossley, J. Appl. Mech. 42 (1975) 440.
+    The equation is valid for F = K d^n (1 + lambda d') with any K, any n and any mass. It is the first integral of the
+    free impact; cf. Hunt and Crossley, J. Appl. Mech. 42 (1975) 440.
     """
     if restitution >= 1.0:
         return 0.0
@@ -37,16 +39,16 @@ def exact_damping_number(restitution: float) -> float:
         return 1.5 * lost * (1.0 + lost)
 
     def residual(damping: float) -> float:
-        # the equation is divided by D; its trivial root D = 0 is therefore no root of the residual
+        # division by D removes the trivial root D = 0
         return (1.0 + restitution) - (math.log1p(damping) - math.log1p(-damping * restitution)) / damping
 
-    # the positive root lies below 1/e, and is about 3 (1 - e) / 2 near e = 1
+    # the root is less than 1/e, and about 3 (1 - e) / 2 near e = 1
     lower, upper = 0.5 * lost, 1.0 / restitution
     while upper * restitution >= 1.0:
         upper = math.nextafter(upper, 0.0)
     if residual(upper) > 0.0:
         return upper
-    from scipy.optimize import brentq  # imported here, since it takes 0.25 s that only scenes with this law need
+    from scipy.optimize import brentq  # this import takes 0.25 s, which only scenes with this law need
 
     root: float = brentq(residual, lower, upper, xtol=1e-300, rtol=1e-15)
     return root
@@ -63,22 +65,22 @@ class ContactLaw:
     source : str
         Its equation, and where it was published.
     number_of : callable, optional
-        Function of the restitution e that returns the damping number D = lambda v0 [1]; None if the law cannot be given
-        by a restitution.
+        Function of the restitution e that returns the damping number D = lambda v0 [1]. A law without it takes no
+        restitution.
     takes_damping : bool
         Whether a scene can give the damping itself.
     exponent : float, optional
         The only exponent that the law admits; None if it admits any.
     additive : bool
-        Whether the damping is a term C d' added to K d^n (Kelvin-Voigt) instead of a factor of K d^n.
+        Whether the damping is a term C d' beside K d^n instead of a factor of K d^n.
     ramped : bool
         Whether C grows from 0 over the penetration `ramp_m`.
 
     Raises
     ------
     ArgumentError
-        For contradictory options: a ramp without additive damping, a restitution with additive damping, or an additive
-        law without a ramp whose exponent is not 1.
+        The options contradict each other: a ramp without additive damping, a restitution with additive damping, or an
+        additive law without a ramp whose exponent is not 1.
     """
 
     title: str
@@ -182,16 +184,15 @@ LAWS: Final[Mapping[str, ContactLaw]] = MappingProxyType(_LAWS)
 
 
 def add_law(name: str, law: ContactLaw) -> None:
-    """Add a law of your own, which scenes can then name and every solver runs as fast as the built-in laws.
+    """Add a law of your own. Scenes can then name it, and the solver runs it as fast as the built-in laws.
 
-    Only this process knows the law. Commands, with the processes that they start, learn it by `--laws`.
+    Only this process knows the law. Commands and their child processes learn it by `--laws`.
 
     Parameters
     ----------
     name : str
         The name in scenes: letters, digits and _.
     law : ContactLaw
-        The options of the law, and the damping that it derives from a restitution.
 
     Raises
     ------

@@ -1,27 +1,27 @@
 """Geometry of the guide: the place of each frame corner in head axes, its penetration, and the arm of its force.
 
-The head's state is kept in *body coordinates* of its centre of mass G:
+The state of the head is kept in *body coordinates* of its centre of mass G:
 
     X, Y     position of G, VX, VY its velocity, both resolved in head axes,
     omega    angular velocity,  c, s = cos(theta), sin(theta),  theta.
 
-In these coordinates every penetration and every arm is linear. A frame corner C = (Cx, Cy) is seen from the cavity's
-centre at p = R(theta)^T (C - (x, y)) (paper, eq. 1, inverted), that is
+In these coordinates every penetration and every arm is linear. Seen from the centre of the cavity, a frame corner C =
+(Cx, Cy) is at p = R(theta)^T (C - (x, y)) (paper, eq. 1, inverted), that is
 
     p_x =  c Cx + s Cy - X + rx        p_y = -s Cx + c Cy - Y + ry
 
-with (rx, ry) the offset of G from the cavity's centre in head axes. The penetration past a wall with outward normal n
-at distance H is n . p - H; its rate is n . dp/dt, positive inward.
+where (rx, ry) is the offset of G from the centre of the cavity in head axes. The penetration past a wall with outward
+normal n at distance H is n . p - H. Its rate is n . dp/dt, positive inward.
 
 A head that carries corners (`carries: corners`) is a block in a fixed cavity. Its state is kept in world axes. Its
-corner c = (cx, cy) lies at
+corner c = (cx, cy) is at
 
     p_x = X + c cx - s cy              p_y = Y + s cx + c cy
 
-so penetrations and arms are linear again, and the equations are the same with other coefficients.
+so the equations are the same with other coefficients.
 
-For a rounded corner C is the centre of its arc, and its walls are moved towards the cavity's centre by the radius.
-Friction acts at the touching point itself, one radius from the arc's centre (`roll`).
+For a rounded corner, C is the centre of its arc, and the radius is subtracted from the distance of each wall. Friction
+acts at the touching point itself, one radius from the centre of the arc (`roll`).
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ from plow_twin.model.pairs import CORNER_X, CORNER_Y, NORMAL_X, NORMAL_Y
 if TYPE_CHECKING:
     from plow_twin.model.scene import Scene
 
-#: Number of components of the body-coordinate state: X, Y, VX, VY, omega, c, s, theta.
+#: Number of components of the state: X, Y, VX, VY, omega, c, s, theta.
 STATE_SIZE = 8
-#: 1 for pairs whose wall has its normal along x (first array) or along y (second array), otherwise 0, shape (8,) each.
+#: 1 for pairs whose wall has its normal along x (first array) or y (second array), otherwise 0; shape (8,) each.
 _ALONG_X, _ALONG_Y = np.abs(NORMAL_X), np.abs(NORMAL_Y)
 
 
 def corner_positions(scene: Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return Cx and Cy of each pair's corner (if rounded, of its arc's centre) in m, world axes, shape (8,) each."""
+    """Return Cx and Cy of each pair in m, world axes, shape (8,) each."""
     radius = corner_radius(scene)
     return (0.5 * scene.frame.width_m - radius) * CORNER_X, (0.5 * scene.frame.height_m - radius) * CORNER_Y
 
@@ -84,37 +84,39 @@ def outline(sides: NDArray[np.float64], radius: float) -> NDArray[np.float64]:
 
 
 def roll(scene: Scene) -> float:
-    """Return how far a rounded corner's touching point moves along the wall per angle of the head [m/rad].
+    """Return how far the touching point of a rounded corner moves along the wall per angle of the head [m/rad].
 
-    The distance is positive along the wall's tangent (`slip_rows`). It shortens the arm of a friction force
-    (`slip_arm_rows`).
+    The distance is positive along the tangent of the wall (`slip_rows`). It shortens the arm of friction.
     """
     return corner_radius(scene) * (1.0 if scene.head.carries == "corners" else -1.0)
 
 
 def wall_distances(scene: Scene) -> NDArray[np.float64]:
-    """Return the distance of each pair's unworn wall from the cavity's centre in m, shape (8,)."""
+    """Return the distance of each pair's unworn wall from the centre of the cavity in m, shape (8,)."""
     half_width = 0.5 * (scene.frame.width_m + scene.clearance.horizontal_m)
     half_height = 0.5 * (scene.frame.height_m + scene.clearance.vertical_m)
     return _ALONG_X * half_width + _ALONG_Y * half_height
 
 
-def penetration_rows(scene: Scene) -> NDArray[np.float64]:
-    """Return the coefficients of each penetration n . p - H before wear, shape (5, 8): rows for c, s, X, Y and 1.
-
-    The module's docstring gives p for a head that carries walls and for a head that carries corners.
-    """
+def _along_normal(scene: Scene) -> NDArray[np.float64]:
+    """Return n . p of each pair without its constant, as coefficients of c, s, X, Y, for a head that carries walls."""
     corner_x, corner_y = corner_positions(scene)
-    rows = np.array(
-        [
-            NORMAL_X * corner_x + NORMAL_Y * corner_y,
-            NORMAL_X * corner_y - NORMAL_Y * corner_x,
-            -NORMAL_X,
-            -NORMAL_Y,
-            penetrations_at_centre(scene),
-        ]
+    return np.array(
+        [NORMAL_X * corner_x + NORMAL_Y * corner_y, NORMAL_X * corner_y - NORMAL_Y * corner_x, -NORMAL_X, -NORMAL_Y]
     )
-    return _of_places(scene, rows)
+
+
+def _along_tangent(scene: Scene) -> NDArray[np.float64]:
+    """Return t . p of each pair without its constant, as coefficients of c, s, X, Y, for a head that carries walls."""
+    corner_x, corner_y = corner_positions(scene)
+    return np.array(
+        [NORMAL_X * corner_y - NORMAL_Y * corner_x, -NORMAL_Y * corner_y - NORMAL_X * corner_x, NORMAL_Y, -NORMAL_X]
+    )
+
+
+def penetration_rows(scene: Scene) -> NDArray[np.float64]:
+    """Return the coefficients of each penetration n . p - H before wear, shape (5, 8): rows for c, s, X, Y and 1."""
+    return _of_places(scene, np.vstack([_along_normal(scene), penetrations_at_centre(scene)]))
 
 
 def penetrations_at_centre(scene: Scene) -> NDArray[np.float64]:
@@ -124,9 +126,9 @@ def penetrations_at_centre(scene: Scene) -> NDArray[np.float64]:
 
 
 def _of_places(scene: Scene, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Adapt rows made for a head that carries walls to the scene's head, and return them.
+    """Adapt rows, made for a head that carries walls, to the head of the scene, and return them.
 
-    For a head that carries corners R takes the place of R^T, and the head's position has the opposite sign.
+    For a head that carries corners, R replaces R^T, and the position of the head has the opposite sign.
     """
     if scene.head.carries == "corners":
         rows[1:4] *= -1.0
@@ -134,9 +136,9 @@ def _of_places(scene: Scene, rows: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _of_arms(scene: Scene, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Adapt rows of an arm about G, made for a head that carries walls, to the scene's head, and return them.
+    """Adapt rows of an arm about G, made for a head that carries walls, to the head of the scene, and return them.
 
-    The arm of a head that carries corners does not depend on the head's position.
+    The arm of a head that carries corners does not depend on the position of the head.
     """
     if scene.head.carries == "corners":
         rows[0] *= -1.0
@@ -145,54 +147,21 @@ def _of_arms(scene: Scene, rows: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def arm_rows(scene: Scene) -> NDArray[np.float64]:
-    """Return the coefficients of each force's arm about G, shape (4, 8): rows for c, s, X, Y.
-
-    The force of a pair acts at the corner along n, so its arm is (p - r) x n with r = (rx, ry).
-    """
-    corner_x, corner_y = corner_positions(scene)
-    rows = np.array(
-        [
-            NORMAL_Y * corner_x - NORMAL_X * corner_y,
-            NORMAL_Y * corner_y + NORMAL_X * corner_x,
-            -NORMAL_Y,
-            NORMAL_X,
-        ]
-    )
-    return _of_arms(scene, rows)
+    """Return the coefficients of the arm (p - r) x n of each force about G, shape (4, 8): rows for c, s, X, Y."""
+    return _of_arms(scene, -_along_tangent(scene))
 
 
 def slip_rows(scene: Scene) -> NDArray[np.float64]:
     """Return the coefficients of each corner's place t . p along its wall, shape (4, 8): rows for c, s, X, Y.
 
-    The constant of t . p is left out. The tangent t is the wall's outward normal turned by +90 degrees.
+    The constant of t . p is left out. The tangent t is the outward normal n of the wall, turned by +90 degrees.
     """
-    corner_x, corner_y = corner_positions(scene)
-    rows = np.array(
-        [
-            -NORMAL_Y * corner_x + NORMAL_X * corner_y,
-            -NORMAL_Y * corner_y - NORMAL_X * corner_x,
-            NORMAL_Y,
-            -NORMAL_X,
-        ]
-    )
-    return _of_places(scene, rows)
+    return _of_places(scene, _along_tangent(scene))
 
 
 def slip_arm_rows(scene: Scene) -> NDArray[np.float64]:
-    """Return the coefficients of the arm about G of a force along t at each corner, shape (4, 8): rows for c, s, X, Y.
-
-    The arm is (p - r) x t with r = (rx, ry).
-    """
-    corner_x, corner_y = corner_positions(scene)
-    rows = np.array(
-        [
-            NORMAL_X * corner_x + NORMAL_Y * corner_y,
-            NORMAL_X * corner_y - NORMAL_Y * corner_x,
-            -NORMAL_X,
-            -NORMAL_Y,
-        ]
-    )
-    return _of_arms(scene, rows)
+    """Return the coefficients of the arm (p - r) x t of each friction force about G, shape (4, 8), as `arm_rows`."""
+    return _of_arms(scene, _along_normal(scene))
 
 
 def body_state(
@@ -200,7 +169,7 @@ def body_state(
     v: tuple[float, float, float] | NDArray[np.float64],
     com_offset: tuple[float, float],
 ) -> NDArray[np.float64]:
-    """Convert pose and rate of the cavity's centre, shape (3,) each, to body coordinates of G, shape (8,)."""
+    """Convert pose and rate of the centre of the cavity, shape (3,) each, to body coordinates of G, shape (8,)."""
     x, y, theta = (float(value) for value in q)
     vx, vy, omega = (float(value) for value in v)
     c, s = math.cos(theta), math.sin(theta)
@@ -220,7 +189,7 @@ def body_state(
 
 
 def body_states(states: NDArray[np.float64], offset: tuple[float, float]) -> NDArray[np.float64]:
-    """Convert poses and rates, shape (s, 6), to body coordinates, shape (s, 8) (`body_state`, row by row)."""
+    """Convert poses and rates, shape (s, 6), to body coordinates, shape (s, 8), as `body_state`."""
     x, y, theta, vx, vy, omega = states.T
     c, s = np.cos(theta), np.sin(theta)
     rx, ry = offset
@@ -234,7 +203,7 @@ def body_states(states: NDArray[np.float64], offset: tuple[float, float]) -> NDA
 
 
 def tumbles(scene: Scene) -> bool:
-    """Return whether the head may turn beyond 45 degrees; only a square block without wear may: its corners match."""
+    """Return whether the head may turn beyond 45 degrees: a square block without wear, whose corners are alike."""
     alike = scene.frame.width_m == scene.frame.height_m and scene.wear is None
     return scene.head.carries == "corners" and alike
 
@@ -244,10 +213,10 @@ def state_of(
     q: tuple[float, float, float] | NDArray[np.float64],
     v: tuple[float, float, float] | NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Convert pose and rate of the cavity's or the block's centre, shape (3,) each, to the solver's state, shape (8,).
+    """Convert pose and rate of the centre of the cavity or block, shape (3,) each, to the solver's state, shape (8,).
 
-    The state of a head that carries walls is its body coordinates. The state of a head that carries corners has place
-    and velocity in world axes, and cosine and sine of the angle less the quarter turns of a tumbling block.
+    A head that carries walls has body coordinates. A head that carries corners has place and velocity in world axes; if
+    it tumbles, c and s are those of the angle without whole quarter turns.
     """
     if scene.head.carries == "walls":
         return body_state(q, v, scene.head.com_offset_m)
@@ -259,17 +228,14 @@ def state_of(
 
 
 def states_of(scene: Scene, states: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Convert poses and rates, shape (s, 6), to the solver's states, shape (s, 8) (`state_of`, row by row)."""
+    """Convert poses and rates, shape (s, 6), to the solver's states, shape (s, 8), as `state_of`."""
     if scene.head.carries == "walls":
         return body_states(states, scene.head.com_offset_m)
     return np.array([state_of(scene, row[:3], row[3:]) for row in states]).reshape(-1, STATE_SIZE)
 
 
 def largest_angle(scene: Scene) -> float:
-    """Return the largest angle in rad to which the frame can turn in an unworn cavity, at most 45 degrees.
-
-    The width and height of the turned frame are measured to its corners, or to the arcs of rounded corners.
-    """
+    """Return the largest angle in rad to which the frame can turn in an unworn cavity, at most 45 degrees."""
     radius = corner_radius(scene)
     sides = np.array([[scene.frame.width_m], [scene.frame.height_m]])
     angles = np.linspace(0.0, 0.25 * math.pi, 4096)
@@ -283,12 +249,12 @@ def largest_angle(scene: Scene) -> float:
 def length_scale(scene: Scene) -> float:
     """Return the length in m to which tolerances are relative: the smallest clearance that is not negligible.
 
-    Clearances below 1e-4 of the frame's diagonal are negligible. If both are, the scale is this share of the diagonal.
+    A clearance below 1e-4 of the frame's diagonal is negligible. If both are, the scale is this share of the diagonal.
     """
     floor = 1e-4 * math.hypot(scene.frame.width_m, scene.frame.height_m)
     return min((c for c in (scene.clearance.horizontal_m, scene.clearance.vertical_m) if c > floor), default=floor)
 
 
 def half_diagonal(scene: Scene) -> float:
-    """Return the distance of a frame corner from the frame's centre in m, by which angles are converted to lengths."""
+    """Return half the diagonal of the frame in m. It converts angles to lengths."""
     return 0.5 * math.hypot(scene.frame.width_m, scene.frame.height_m)

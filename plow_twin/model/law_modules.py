@@ -1,4 +1,4 @@
-"""Python modules that define contact laws; only the user of a command can name them, never a file."""
+"""Python modules that define contact laws. Only the user of a command can name such a module, never a file."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _loaded: list[str] = []
 
 
 def load_laws(names: Iterable[str]) -> None:
-    """Import modules that call `add_law`, so that this process knows their laws; a loaded module is not loaded again.
+    """Import modules that call `add_law`, so that this process knows their laws.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ def load_laws(names: Iterable[str]) -> None:
         before = set(LAWS)
         try:
             _import_file(Path(key)) if name.endswith(".py") else importlib.import_module(name)
-        except Exception as error:  # an imported module can raise any exception
+        except Exception as error:  # a module can raise any exception
             raise InputError([Problem("module", name, f"a module that can be imported ({error})")], "--laws") from error
         if set(LAWS) == before:
             raise InputError([Problem("module", name, "a module that calls plow_twin.add_law")], "--laws")
@@ -43,7 +43,7 @@ def load_laws(names: Iterable[str]) -> None:
 
 
 def loaded_laws() -> tuple[str, ...]:
-    """Return the names of the modules that `load_laws` has imported, for child processes to import too."""
+    """Return the names of the imported modules, for child processes to import them too."""
     return tuple(_loaded)
 
 

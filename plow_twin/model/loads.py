@@ -1,7 +1,7 @@
-"""Loads of a scene as the solver needs them: harmonics grouped by frequency, and one list of linear pieces.
+"""Loads of a scene as the solver needs them: harmonics by frequency, and one list of linear pieces.
 
-A load (Fx, Fy) at the constant arm (x, y) in world axes has the moment M = x Fy - y Fx about the cavity's centre in
-every pose (paper, section 2). Gravity is not a load.
+The load (Fx, Fy) at the constant arm (x, y) in world axes has the moment M = x Fy - y Fx about the centre of the cavity
+in every pose (paper, section 2). Gravity is not a load.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ Array = NDArray[np.float64]
 class Pieces:
     """A piecewise linear wrench: `start + slope (t - knots[i])` on [knots[i], knots[i + 1]); the last piece has no end.
 
-    `knots` [s] has shape (n,) and increases strictly; before the first knot the wrench is the first row of `start`.
-    `start` and `slope` have shape (n, 3): Fx, Fy in N and M in N m, and their rates per second.
+    `knots` [s], shape (n,), increases strictly. Before the first knot, the wrench is the first row of `start`. `start`
+    has shape (n, 3): Fx, Fy in N and M in N m. `slope` has the rates of `start` per second.
     """
 
     knots: Array
@@ -72,7 +72,7 @@ class LoadSet:
         return wrench if self.pieces is None else wrench + self.pieces.at(t)[0]
 
     def largest(self) -> Array:
-        """Return an upper bound of |Fx|, |Fy| [N] and |M| [N m] at any time, shape (3,)."""
+        """Return an upper bound of |Fx|, |Fy| [N] and |M| [N m], shape (3,)."""
         amplitude: Array = np.abs(self.constant) + np.hypot(self.sine, self.cosine).sum(axis=0)
         return amplitude if self.pieces is None else amplitude + np.abs(self.pieces.start).max(axis=0)
 
@@ -83,7 +83,7 @@ def wrench_of(force: tuple[float, float], moment: float, at: tuple[float, float]
 
 
 def load_direction(load: Harmonic | Constant) -> Array:
-    """Return the load's wrench per N of its force, or per N m of its moment if it has no force, shape (3,)."""
+    """Return the wrench of a load per N of its force, shape (3,), or per N m of its moment if it has no force."""
     size = float(np.hypot(*load.force_n)) or abs(load.moment_n_m) or 1.0
     return wrench_of(load.force_n, load.moment_n_m, load.at_m) / size
 

@@ -1,7 +1,7 @@
-"""The eight corner/wall pairs of the guide, in their fixed order.
+"""The eight pairs of a corner and a wall, in their fixed order.
 
-The corners are the frame's (the slide's), seen from the front: top left, top right, bottom right, bottom left. Each
-corner can touch two walls of the head's cavity; its pair at the horizontal wall precedes its pair at the vertical wall.
+The corners are those of the frame (the slide), seen from the front: top left, top right, bottom right, bottom left.
+Each corner can touch two walls of the head's cavity. Its pair at the horizontal wall comes first.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ PAIR_COUNT: Final = len(PAIR_NAMES)
 
 CORNER_NAMES: Final[tuple[str, ...]] = ("top_left", "top_right", "bottom_right", "bottom_left")
 
-#: Side of the frame on which each pair's corner lies, shape (8,): -1 left, +1 right.
+#: Side of each pair's corner, shape (8,): -1 left, +1 right.
 CORNER_X: Final[NDArray[np.float64]] = np.array([-1.0, -1.0, 1.0, 1.0, 1.0, 1.0, -1.0, -1.0])
-#: Side of the frame on which each pair's corner lies, shape (8,): -1 bottom, +1 top.
+#: Side of each pair's corner, shape (8,): -1 bottom, +1 top.
 CORNER_Y: Final[NDArray[np.float64]] = np.array([1.0, 1.0, 1.0, 1.0, -1.0, -1.0, -1.0, -1.0])
 #: Outward normal of each pair's wall in head axes, shape (8,) each.
 NORMAL_X: Final[NDArray[np.float64]] = np.array([0.0, -1.0, 0.0, 1.0, 0.0, 1.0, 0.0, -1.0])
 NORMAL_Y: Final[NDArray[np.float64]] = np.array([1.0, 0.0, 1.0, 0.0, -1.0, 0.0, -1.0, 0.0])
 
-#: Pairs whose force on the head turns it clockwise, so that they stop a counter-clockwise swing.
+#: Pairs whose force turns the head clockwise, and so stops a counter-clockwise swing.
 STOPS_COUNTER_CLOCKWISE: Final[NDArray[np.bool_]] = CORNER_X * NORMAL_Y - CORNER_Y * NORMAL_X < 0.0
 
 
 def corner_of(pair: int) -> str:
-    """Return the name of the corner of pair number `pair`."""
+    """Return the name of a pair's corner."""
     return CORNER_NAMES[pair // 2]

@@ -1,13 +1,13 @@
-"""Running-in: a new pad wears faster, by an excess that falls with the wear depth h as exp(-h / h0).
+"""Running-in: a new pad wears faster, by an excess that decreases with the wear depth h as exp(-h / h0).
 
-The wear coefficient is k_s (1 + (r - 1) exp(-h / h0)). If a pad's depth with k_s alone is z, its depth h is
+The wear coefficient is k_s (1 + (r - 1) exp(-h / h0)). If the depth of a pad with k_s alone is z, its depth h is
 
     h = z + h0 ln(r - (r - 1) exp(-z / h0))        z = h + h0 ln((1 + (r - 1) exp(-h / h0)) / r)
 
-In the end the pad is h0 ln r deeper than with k_s alone. Under a constant force F, z grows with the sliding distance s
-as z = k_s F s / A, and the coefficient approaches k_s as exp(-s / s0) with s0 = h0 A / (k_s F), the exponential
-transient of Queener, Smith and Mitchell, Wear 8 (1965) 391. The coefficient depends on the depth alone, so no further
-state is needed: running-in continues from a saved depth, and starts again with new pads.
+In the end, the pad is h0 ln r deeper than with k_s alone. Under a constant force F, z grows with the sliding distance s
+as z = k_s F s / A. The coefficient approaches k_s as exp(-s / s0) with s0 = h0 A / (k_s F), the exponential transient
+of Queener, Smith and Mitchell, Wear 8 (1965) 391. The coefficient depends only on the depth, so running-in continues
+from a saved depth and starts again with new pads.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 
 def without_running_in(wear: Wear, depth: Array) -> Array:
-    """Return the depth z [m] that the pad would have with the steady coefficient alone; z(0) = 0."""
+    """Return the depth z [m] that a pad of depth h [m] would have with k_s alone."""
     if wear.running_in_depth_m is None or wear.running_in_ratio == 1.0:
         return depth
     ratio, h0 = wear.running_in_ratio, wear.running_in_depth_m

@@ -1,7 +1,7 @@
-"""The constants of one head in one guide, as plain frozen dataclasses in SI units.
+"""The constants of one head in one guide, as frozen dataclasses in SI units.
 
-The field names are the keys of the scene file. The `metadata` of a field has its unit, its meaning and its admissible
-range; the checks here, the file's schema and the documentation are made from them.
+The field names are the keys of the scene file. The metadata of a field gives its unit, its meaning and its range. The
+checks in this module, the schema of the file and the documentation are made from the metadata.
 """
 
 from __future__ import annotations
@@ -52,11 +52,10 @@ class Provenance:
     Attributes
     ----------
     mark : Mark
-        Where the number comes from.
     source : str
         The source, in words.
     deviation : float, optional
-        Standard deviation, in the unit of the number; None if it is not stated.
+        Standard deviation, in the unit of the number.
     """
 
     mark: Mark
@@ -65,7 +64,7 @@ class Provenance:
 
 
 def _quantity(unit: str, doc: str, default: Any = ..., **bounds: float) -> Any:
-    """Declare a field for a number or a tuple of numbers, with its unit, meaning and range (`gt`, `ge`, `lt`, `le`)."""
+    """Declare a field for numbers with its unit, its meaning and its range (`gt`, `ge`, `lt`, `le`)."""
     metadata = {"unit": unit, "doc": doc, **bounds}
     return field(metadata=metadata) if default is ... else field(default=default, metadata=metadata)
 
@@ -77,7 +76,7 @@ def _choice(doc: str, choices: Collection[str], default: Any = ...) -> Any:
 
 @dataclass(frozen=True)
 class Head:
-    """The moving body: a plough head with a rectangular cavity about the frame, or a block inside a fixed cavity."""
+    """The moving body: a plough head whose cavity surrounds the frame, or a block inside a fixed cavity."""
 
     mass_kg: float = _quantity("kg", "mass", gt=0.0)
     inertia_kg_m2: float = _quantity("kg m^2", "moment of inertia about the centre of mass", gt=0.0)
@@ -100,12 +99,12 @@ class Head:
 
 @dataclass(frozen=True)
 class Frame:
-    """The slide: a rectangle inside the head's cavity, fixed unless the scene has a `Support`.
+    """The slide, a rectangle inside the cavity of the head. It is fixed unless the scene has a `Support`.
 
     Attributes
     ----------
     labels : mapping of str to str
-        Letters for corners, e.g. a: bottom_right; empty unless given.
+        Letters for corners, e.g. a: bottom_right.
     """
 
     width_m: float = _quantity("m", "horizontal side", gt=0.0)
@@ -118,7 +117,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Clearance:
-    """Total clearances, cavity size minus frame size; if negative (interference), both walls touch from the start."""
+    """The cavity's size minus the frame's size. With a negative clearance, both walls touch from the start."""
 
     horizontal_m: float = _quantity("m", "cavity width minus frame width")
     vertical_m: float = _quantity("m", "cavity height minus frame height")
@@ -126,25 +125,24 @@ class Clearance:
 
 @dataclass(frozen=True)
 class Contact:
-    """Normal contact, with one law and one set of parameters for all pairs.
+    """Normal contact: one law, whose parameters all pairs share.
 
-    Exactly one of `damping` and `restitution` must be given, or neither for a law without damping. Impacts with the
-    default law have exactly the given restitution.
+    A scene gives either `damping` or `restitution`, or neither for a law without damping. An impact under the default
+    law has exactly the given restitution.
 
-    The restitution can fall with the impact speed w = v (m' / m)^p, where v is the speed of approach, m' the head's
-    effective mass at the corner, m its mass and p the `restitution_mass_power`. If w exceeds the
-    `restitution_speed_m_s` v1, the restitution is multiplied by (w / v1)^-q with the `restitution_fall` q. Then
+    The restitution can decrease with the impact speed w = v (m' / m)^p. Here v is the speed of approach, m' the
+    effective mass of the head at the corner, m the mass of the head, and p the `restitution_mass_power`. If w exceeds
+    the `restitution_speed_m_s` v1, the restitution is multiplied by (w / v1)^-q with the `restitution_fall` q. Then
     `restitution_fall_along_s_m` times the speed of the centre of mass along the wall is subtracted.
 
     References
     ----------
-    Fall with the speed (v^-1/4 in plastic contact): Johnson, Contact Mechanics, 1985, sec. 11.5. The falls with the
-    effective mass and with the speed along the wall were found in measured impacts (docs/measured.md).
+    Decrease with the speed (v^-1/4 in plastic contact): Johnson, Contact Mechanics, 1985, sec. 11.5. The dependence on
+    the effective mass and on the speed along the wall was found in measured impacts (docs/measured.md).
     """
 
     law: str = _choice("contact law", LAWS, "exact_restitution")
-    # a scene must give the stiffness: the default NaN is not admissible, and exists only because dataclasses demand a
-    # default after a field with a default
+    # a dataclass demands a default here; NaN is not admissible, so a scene must give the stiffness
     stiffness: float = _quantity("N/m^exponent", "K in F = K d^n (...)", math.nan, gt=0.0)
     exponent: float = _quantity("1", "n in F = K d^n (...)", 1.0, ge=1.0, le=4.0)
     damping: float | None = _quantity(
@@ -172,7 +170,7 @@ class Contact:
     )
 
 
-#: Fields of `Contact` that make the restitution depend on the impact; if the restitution is constant, all are absent.
+#: Fields of `Contact` by which the restitution depends on the impact.
 FALL_NAMES: Final = (
     "restitution_fall",
     "restitution_speed_m_s",
@@ -185,9 +183,9 @@ FALL_NAMES: Final = (
 class Friction:
     """Tangential friction of all pairs, by one of two laws.
 
-    Without `stick_stiffness_n_m` friction is regularised Coulomb, T = mu N tanh(slip rate / regularisation speed),
-    under which bodies creep. With it, friction is Coulomb's law with stick: a spring and a damper hold a corner to the
-    wall up to static mu N, then the corner slips with T = mu N.
+    Without `stick_stiffness_n_m`, friction is regularised Coulomb friction, T = mu N tanh(slip rate / regularisation
+    speed). A body that this friction holds creeps. With `stick_stiffness_n_m`, a spring and a damper hold a corner to
+    the wall up to static mu N; beyond this force the corner slips with T = mu N.
 
     References
     ----------
@@ -210,10 +208,10 @@ class Friction:
 
 @dataclass(frozen=True)
 class Support:
-    """The frame as a body with mass on springs and dampers to ground. In a scene without a support the frame is fixed.
+    """Springs and dampers between the frame and the ground, which make the frame a body with mass.
 
-    The frame starts at rest in its equilibrium without contact, where its weight is carried, and its displacement is
-    measured from there. As in a scene without a support, q is the head's displacement from the frame.
+    The frame starts at rest in its equilibrium without contact. Its displacement is measured from this equilibrium. The
+    pose q of the head remains relative to the frame.
     """
 
     mass_kg: float = _quantity("kg", "mass of the frame and of the parts that move with it", gt=0.0)
@@ -230,7 +228,7 @@ class Support:
 
 @dataclass(frozen=True)
 class Gravity:
-    """Gravity, and for `rotation: paper` its constant moment about the cavity's centre, which is -m g times the arm."""
+    """Gravity. With `rotation: paper` it adds the constant moment -m g arm about the centre of the cavity."""
 
     acceleration_m_s2: float = _quantity("m/s^2", "acceleration along -y", 9.81)
     arm_m: float = _quantity("m", "arm of the constant moment, positive to the right", 0.0)
@@ -272,10 +270,9 @@ class Constant:
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """A load given by samples; before the first and after the last sample it keeps that sample's value.
+    """A load given by samples. Before the first and after the last sample, the load is that of this sample.
 
-    If `hold` is `linear`, the samples are joined by straight lines; if it is `zero`, each value is kept until the next
-    sample.
+    With `hold: linear`, straight lines join the samples; with `hold: zero`, each value lasts until the next sample.
 
     Attributes
     ----------
@@ -299,7 +296,7 @@ Load = Harmonic | Constant | Table
 
 @dataclass(frozen=True)
 class Initial:
-    """State at t = 0: pose of the cavity's centre relative to the frame's centre, and its rate."""
+    """State at t = 0: pose of the centre of the cavity relative to the centre of the frame, and its rate."""
 
     q: tuple[float, float, float] = _quantity("m, m, rad", "x, y, theta", (0.0, 0.0, 0.0))
     v: tuple[float, float, float] = _quantity("m/s, m/s, rad/s", "rates of q", (0.0, 0.0, 0.0))
@@ -309,9 +306,9 @@ class Initial:
 class Wear:
     """Archard wear of the eight pads by the travel along the face: dh/dt = k_s F v / A.
 
-    With `sliding: total` the corner's speed over its pad, sqrt(v^2 + s'^2), takes the place of v; s' is its speed in
-    the plane of the section. With `running_in_ratio` r and `running_in_depth_m` h0 the coefficient of a pad that is
-    worn by h is k_s (1 + (r - 1) exp(-h / h0)).
+    With `sliding: total`, v is replaced by sqrt(v^2 + s'^2), where s' is the speed of the corner over its pad in the
+    plane of the section. Running-in multiplies k_s by 1 + (r - 1) exp(-h / h0) for a pad that is worn by h, with the
+    `running_in_ratio` r and the `running_in_depth_m` h0.
 
     References
     ----------
@@ -349,17 +346,15 @@ class Scene:
     loads : tuple of Harmonic, Constant or Table
         Loads on the head, apart from gravity and contact.
     initial : Initial
-        State at t = 0.
     locked : tuple of str
         Locked degrees of freedom: any of x, y, theta.
     pairs : tuple of str
-        The pairs that can touch, by default all.
+        The pairs that can touch.
     wear : Wear or None
     friction : Friction or None
     support : Support or None
-        Springs under the frame; without it the frame is fixed.
     marks : mapping of str to Provenance
-        Provenance of numbers by their path; not compared by ==.
+        Provenance of numbers by their path. Comparison by == ignores the marks.
 
     Raises
     ------
@@ -389,25 +384,23 @@ class Scene:
             raise SceneError(problems)
 
 
-_PARTS: Final[Mapping[str, type]] = {
+#: Parts that every scene has.
+SECTIONS: Final[Mapping[str, type]] = {
     "head": Head,
     "frame": Frame,
     "clearance": Clearance,
     "contact": Contact,
     "gravity": Gravity,
     "initial": Initial,
-    "wear": Wear,
-    "friction": Friction,
-    "support": Support,
 }
-
-
-#: Optional parts of a scene.
+#: Parts that a scene may lack.
 OPTIONAL_PARTS: Final[Mapping[str, type]] = {"wear": Wear, "friction": Friction, "support": Support}
+#: All parts of a scene that are dataclasses.
+PARTS: Final[Mapping[str, type]] = {**SECTIONS, **OPTIONAL_PARTS}
 
 
 def check(scene: Scene) -> Iterator[Problem]:
-    """Yield every problem of a scene: wrong types, ranges and choices; if there are none, conflicts between fields."""
+    """Yield every problem of a scene. Conflicts between fields are looked for only if each field is valid."""
     found = list(_check_fields(scene, ""))
     yield from found
     if not found:
@@ -435,7 +428,7 @@ def _check_fields(part: Any, path: str) -> Iterator[Problem]:
     for spec in fields(part):
         value = getattr(part, spec.name)
         key = f"{path}{spec.name}"
-        kind = _PARTS.get(spec.name) if isinstance(part, Scene) else None
+        kind = PARTS.get(spec.name) if isinstance(part, Scene) else None
         if kind is not None:
             if isinstance(value, kind):
                 yield from _check_fields(value, f"{key}.")
@@ -494,7 +487,7 @@ def _check_choice(key: str, value: Any, spec: Field[Any]) -> Iterator[Problem]:
 
 
 def must_be_given(spec: Field[Any]) -> bool:
-    """Return whether a scene must give the field, since it has no default or its default is NaN."""
+    """Return whether a scene must give the field, because the field has no default or its default is NaN."""
     if spec.default is MISSING:
         return spec.default_factory is MISSING
     return isinstance(spec.default, float) and math.isnan(spec.default)
@@ -507,7 +500,8 @@ def describe(spec: Field[Any]) -> str:
     return f"a finite number {' and '.join(bounds)}".rstrip() + f" [{spec.metadata['unit']}]"
 
 
-#: Largest damping factor in s/m that a scene can give: the lambda in 1 + lambda d'.
+#: Largest damping factor lambda in 1 + lambda d' [s/m] that a scene can give. A larger factor would stop a head within
+#: sqrt(2 m / (K lambda)), a depth so small that few of its digits remain in double precision.
 MOST_DAMPING_FACTOR: Final = 1e9
 
 
@@ -526,7 +520,7 @@ def _check_wear(wear: Wear, contact: Contact) -> Iterator[Problem]:
 def fastest_travel(wear: Wear | None, contact: Contact) -> float:
     """Return the largest speed along the face in m/s, A / (k_s C) with the damping C; inf without C or without wear.
 
-    Above this speed a force wears the pad faster than it moves the head, so that no contact can last.
+    Above this speed, a force wears the pad faster than it moves the head, so no contact can last.
     """
     if wear is None or not LAWS[contact.law].additive:
         return math.inf
@@ -578,8 +572,6 @@ def _check_contact(contact: Contact) -> Iterator[Problem]:
     if law.exponent is not None and contact.exponent != law.exponent:
         yield Problem("contact.exponent", contact.exponent, f"{law.exponent:g} for {contact.law}")
     if not law.additive and contact.damping is not None and contact.damping > MOST_DAMPING_FACTOR:
-        # a larger factor would stop a head within sqrt(2 m / (K lambda)), a depth so small that few of its digits are
-        # left in double precision
         expected = f"at most {MOST_DAMPING_FACTOR:g} s/m for {contact.law}; a restitution gives at most 1e6"
         yield Problem("contact.damping", contact.damping, expected)
     if law.ramped != (contact.ramp_m is not None):
@@ -648,7 +640,7 @@ def _check_loads(loads: tuple[Load, ...]) -> Iterator[Problem]:
             yield from _check_table(f"loads[{index}]", load)
 
 
-#: Shortest time between two samples of a table in s; the solver cannot step between closer samples.
+#: Shortest time between two samples of a table in s; the solver needs steps of at least this size.
 LEAST_SPACING_S: Final = 1e-100
 
 

@@ -1,7 +1,6 @@
 """Scene files: conversion from YAML to `Scene` and back.
 
-Numbers are read by the YAML 1.2 core schema: `9.6975e6` is a number, and `on` is a text; integers are read as doubles.
-A `SceneError` lists all problems of a file.
+Numbers are read by the YAML 1.2 core schema: `9.6975e6` is a number, `on` is a text.
 """
 
 from plow_twin.scene_file.reader import load_scene as load_scene

@@ -1,4 +1,4 @@
-"""Reader of CSV files in the formats of spreadsheets in many countries, and of Parquet files as the same rows."""
+"""Rows of CSV files, as spreadsheets of many countries write them, and of Parquet files."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from plow_twin.scene_file.parquet_lines import SUFFIX, ParquetLines, is_parquet
 
 #: Longest row [characters].
 LONGEST_ROW: Final = 2**20
-#: Largest number of columns; the export of a plant historian has some hundred columns.
+#: Largest number of columns. The export of a plant historian has some hundred columns.
 MOST_COLUMNS: Final = 10_000
 
 
 def open_csv(path: Path) -> IO[str]:
-    """Open a text file without the byte order mark that spreadsheets write, or a Parquet file as text.
+    """Open a CSV file as text without its byte order mark, or a Parquet file as lines of CSV.
 
     Raises
     ------
     OSError
         The file cannot be opened.
-        csv.Error, ExcessError
-            As for `check_text` and `ParquetLines`.
+    csv.Error, ExcessError
+        As for `check_text` and `ParquetLines`.
     """
     if is_parquet(path):
         return io.TextIOWrapper(io.BufferedReader(ParquetLines(path)), encoding="utf-8", errors="replace", newline="")
@@ -41,12 +41,12 @@ def open_csv(path: Path) -> IO[str]:
 
 
 def tables(folder: Path) -> list[Path]:
-    """Return a folder's CSV and Parquet files, sorted by name; if a file exists as both, only the CSV file."""
+    """Return the CSV and Parquet files of a folder, sorted by name; of two files with one name, only the CSV file."""
     found = {path.stem: path for ending in (SUFFIX, ".csv") for path in folder.glob(f"*{ending}")}
     return [found[name] for name in sorted(found)]
 
 
-#: First bytes of each kind of file that may be mistaken for CSV.
+#: First bytes of files that may be mistaken for CSV.
 _OTHERS: Final = {
     b"\xff\xfe": "UTF-16 text",
     b"\xfe\xff": "UTF-16 text",
@@ -56,7 +56,7 @@ _OTHERS: Final = {
 
 
 def check_text(begin: bytes) -> None:
-    """Refuse a file whose first bytes show that it is not CSV.
+    """Check that a file that begins with these bytes can be CSV.
 
     Raises
     ------
@@ -69,14 +69,14 @@ def check_text(begin: bytes) -> None:
 
 
 def delimiter_of(header: str) -> str:
-    """Return a header line's delimiter: the most frequent of comma, semicolon and tab outside quotes."""
+    """Return the delimiter of a header line: the most frequent of comma, semicolon and tab outside quotes."""
     return max(",;\t", key=re.sub(r'"[^"]*"', "", header).count)
 
 
 def csv_rows(stream: IO[str], comment: str = "") -> Iterator[tuple[int, list[str]]]:
-    """Yield line numbers and rows, the header first; empty rows are skipped.
+    """Yield line numbers and rows that are not empty, the header first.
 
-    The delimiter is taken from the header. With semicolons or tabs, decimal commas become points. Lines that begin with
+    The header determines the delimiter. With semicolons or tabs, decimal commas become points. Lines that begin with
     `comment` are skipped.
 
     Raises

@@ -1,4 +1,4 @@
-"""Parquet files as equivalent lines of CSV, which every reader of CSV can read within its bounds."""
+"""Parquet files as lines of CSV, for every reader of CSV."""
 
 from __future__ import annotations
 
@@ -14,14 +14,13 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 SUFFIX: Final = ".parquet"
-#: Largest number of rows that are converted at once.
+#: Number of rows that are converted at once.
 _ROWS: Final = 4096
-#: Largest number of rows per byte of a file, since a few bytes can encode any number of rows.
+#: Largest number of rows per byte of a file. Compression lets a few bytes hold any number of rows.
 _MOST_PER_BYTE: Final = 100
 #: Number of rows that a file of any size may have.
 _ALWAYS: Final = 1_000_000
-#: Largest unpacked column of a row group [B], since a whole column is held in memory. Writers make row groups of 128
-#: MB.
+#: Largest unpacked column of a row group [B]. A whole column is held in memory; writers make row groups of 128 MB.
 _LARGEST_COLUMN: Final = 2**29
 #: Largest number of columns.
 _MOST_COLUMNS: Final = 10_000
@@ -30,29 +29,28 @@ _LONGEST_TEXT: Final = 2**24
 
 
 def is_parquet(path: Path) -> bool:
-    """Return whether a file's name has the ending of Parquet."""
+    """Return whether the name of a file has the ending of Parquet."""
     return path.suffix.lower() == SUFFIX
 
 
 class ParquetLines(io.RawIOBase):
     """A Parquet file, read as UTF-8 text: a line of names, then a line for each row.
 
-    Numbers have as many digits as they need, times are dates in UTC (times without a zone are unchanged), and a cell
-    without a value is empty. Columns of lists, structures or bytes are left out.
+    Numbers keep all their digits. Times are written in UTC, times without a zone as they are. A cell without a value is
+    empty. Columns of lists, structures or bytes are left out.
 
     Parameters
     ----------
     path
-        The file.
 
     Raises
     ------
     OSError
         The file cannot be opened.
-        csv.Error
-            The file is not Parquet, or is damaged; reading raises this too.
-        ExcessError
-            The unpacked file would exceed this module's bounds for columns, rows or the size of a column.
+    csv.Error
+        The file is not Parquet, or is damaged; reading raises this error too.
+    ExcessError
+        The unpacked file would exceed the bounds of this module.
     """
 
     def __init__(self, path: Path) -> None:
@@ -78,7 +76,6 @@ class ParquetLines(io.RawIOBase):
         self._rest = memoryview(b"")
 
     def _check(self) -> None:
-        """Raise an `ExcessError` if the unpacked file is too large."""
         facts = self._file.metadata
         if facts.num_columns > _MOST_COLUMNS:
             raise ExcessError(f"{self.name}: got {facts.num_columns} columns, expected at most {_MOST_COLUMNS}")
@@ -98,7 +95,7 @@ class ParquetLines(io.RawIOBase):
             )
 
     def readable(self) -> bool:
-        """Return True, because the stream can be read."""
+        """Return True."""
         return True
 
     def readinto(self, buffer: Any) -> int:
@@ -113,7 +110,7 @@ class ParquetLines(io.RawIOBase):
         return count
 
     def tell(self) -> int:
-        """Return the number of bytes of the file read so far, estimated from the share of rows read."""
+        """Return the number of bytes read so far, estimated from the share of rows read."""
         return round(self._size * self._done / self._rows) if self._rows else self._size
 
     def close(self) -> None:
@@ -154,7 +151,7 @@ def _is_plain(kind: pa.DataType) -> bool:
 
 
 def _as_text(batch: pa.RecordBatch) -> pa.RecordBatch:
-    """Return columns as text: instants in UTC, durations in seconds, numbers exactly."""
+    """Return columns that CSV can hold: instants in UTC, durations in seconds, numbers exactly."""
     import pyarrow as pa
 
     columns = []

@@ -20,7 +20,7 @@ def config_folder() -> Path:
     package = Path(__file__).resolve().parent.parent
     if (package.parent / "package.xml").is_file():
         return package.parent / "config"
-    # pip, colcon and user installations have lib/pythonX.Y/site-packages/plow_twin, and share/ beside lib/
+    # an installation has lib/pythonX.Y/site-packages/plow_twin, and share/ beside lib/
     unresolved = Path(__file__).absolute().parent.parent
     for prefix in (*package.parents, *unresolved.parents):
         folder = prefix / "share" / "plow_twin" / "config"

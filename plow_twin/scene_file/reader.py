@@ -13,6 +13,7 @@ from plow_twin.errors import Problem, SceneError
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.model.scene import (
     OPTIONAL_PARTS,
+    SECTIONS,
     Clearance,
     Contact,
     Frame,
@@ -24,13 +25,13 @@ from plow_twin.model.scene import (
     Table,
 )
 from plow_twin.scene_file.presets import PRESETS, scene_path
-from plow_twin.scene_file.schema import LOAD_KINDS, SECTIONS, scene_schema
+from plow_twin.scene_file.schema import LOAD_KINDS, scene_schema
 from plow_twin.scene_file.table import read_table, sample_table
 from plow_twin.scene_file.validation import Schema, validate
 from plow_twin.scene_file.yaml_text import load_yaml, read_yaml
 
 _SECTIONS: Final = "the sections of a scene"
-#: Valid parts that replace parts with problems, so that the other parts can be checked against each other.
+#: Valid parts that stand in for parts with problems, so that the other parts can be checked against each other.
 _SOUND: Final[Mapping[str, Any]] = MappingProxyType(
     {
         "head": Head(1.0, 1.0),
@@ -52,7 +53,6 @@ def load_scene(path: str | Path) -> Scene:
     Returns
     -------
     Scene
-        The scene, with the provenance marks of its numbers.
 
     Raises
     ------
@@ -74,8 +74,7 @@ def loads_scene(text: str, base: str | Path | None = ".", *, source: str = "scen
     text : str
         The scene as YAML.
     base : str or Path, optional
-        Folder to which the paths of load tables are relative; the working directory by default. With None, tables in
-        files are refused.
+        Folder to which the paths of load tables are relative. With None, tables in files are refused.
     source : str
         Name of the scene in messages.
 
@@ -93,7 +92,7 @@ def _schema() -> Schema:
 
 
 def _scene(raw: Any, problems: list[Problem], base: Path | None, source: str) -> Scene:
-    """Return the scene of a document, or raise a `SceneError` with `problems` and all further problems."""
+    """Return the scene of a document, or raise a `SceneError` with all problems."""
     if raw is None and problems:
         raise SceneError(problems, source)
     problems += validate(raw, _schema(), "scene")
@@ -129,7 +128,7 @@ def _read_parts(
 
 
 def _arguments(part: type, raw: Mapping[str, Any], path: str, marks: dict[str, Provenance]) -> dict[str, Any]:
-    """Return the keyword arguments of a dataclass, with numbers as floats; the numbers' marks are put into `marks`."""
+    """Return the keyword arguments of a dataclass, and put the marks of its numbers into `marks`."""
     specs = {spec.name: spec for spec in fields(part)}
     return {
         key: _number(value, f"{path}.{key}", marks) if "unit" in specs[key].metadata else value
@@ -139,16 +138,12 @@ def _arguments(part: type, raw: Mapping[str, Any], path: str, marks: dict[str, P
 
 def _number(raw: Any, path: str, marks: dict[str, Provenance]) -> float | tuple[float, ...]:
     if isinstance(raw, dict):
-        marks[path] = Provenance(Mark(raw["mark"]), raw.get("source", ""), _deviation(raw))
+        deviation = float(raw["deviation"]) if "deviation" in raw else None
+        marks[path] = Provenance(Mark(raw["mark"]), raw.get("source", ""), deviation)
         raw = raw["value"]
     if isinstance(raw, list):
-        # each item of a list may have a mark of its own
         return tuple(float(_number(item, f"{path}[{index}]", marks)) for index, item in enumerate(raw))  # type: ignore[arg-type]
     return float(raw)
-
-
-def _deviation(raw: Mapping[str, Any]) -> float | None:
-    return float(raw["deviation"]) if "deviation" in raw else None
 
 
 def _read_loads(
@@ -184,7 +179,7 @@ def _samples(raw: Mapping[str, Any], path: str, base: Path | None) -> tuple[Any,
 
 
 def _problems_across(parts: Mapping[str, Any]) -> tuple[Problem, ...]:
-    """Return the problems between parts; each part that has problems of its own is replaced by a valid part."""
+    """Return the conflicts between the parts that have no problems of their own."""
     try:
         Scene(**{**_SOUND, **parts})
     except SceneError as error:
@@ -193,7 +188,7 @@ def _problems_across(parts: Mapping[str, Any]) -> tuple[Problem, ...]:
 
 
 def _as_written(problem: Problem, raw: Mapping[str, Any]) -> Problem:
-    """Return the problem with its key in the file, where a load's kind precedes its numbers (`loads[0].harmonic`)."""
+    """Return the problem with the key that the file has: there, the kind of a load precedes its numbers."""
     head, _, rest = problem.key.partition("].")
     index = head.removeprefix("loads[")
     if index == head or not index.isdigit() or rest.startswith(("name", "at_m")):

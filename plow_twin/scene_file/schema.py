@@ -1,6 +1,6 @@
-"""JSON Schema of the scene file, made from the dataclasses of `plow_twin.model.scene` so that both agree.
+"""JSON Schema of the scene file, made from the dataclasses of `plow_twin.model.scene`.
 
-A number or a list of numbers is either plain or `{value, mark, source}`. Samples of a table load are plain.
+Numbers and lists of numbers are plain or `{value, mark, source}`. The samples of a table are plain.
 """
 
 from __future__ import annotations
@@ -11,14 +11,9 @@ from typing import Any, Final
 from plow_twin.model.scene import (
     OPTIONAL_PARTS,
     SCENE_VERSION,
-    Clearance,
+    SECTIONS,
     Constant,
-    Contact,
-    Frame,
-    Gravity,
     Harmonic,
-    Head,
-    Initial,
     Load,
     Mark,
     Scene,
@@ -28,18 +23,6 @@ from plow_twin.model.scene import (
 )
 from plow_twin.scene_file.validation import Schema, choice, mapping
 
-#: Sections of the file, each described by one dataclass.
-SECTIONS: Final[dict[str, type]] = {
-    "head": Head,
-    "frame": Frame,
-    "clearance": Clearance,
-    "contact": Contact,
-    "gravity": Gravity,
-    "initial": Initial,
-}
-#: Required sections.
-REQUIRED_SECTIONS: Final = ("head", "frame", "clearance", "contact")
-#: Kinds of load; each load has exactly one kind.
 LOAD_KINDS: Final[dict[str, type[Load]]] = {"harmonic": Harmonic, "constant": Constant, "table": Table}
 #: Columns of a load file unless `columns` names others: time, Fx, Fy, M.
 TABLE_COLUMNS: Final = ("t", "fx", "fy", "m")
@@ -68,7 +51,7 @@ def scene_schema() -> Schema:
         "type": "object",
         "description": "a mapping with the sections of a scene",
         "properties": properties,
-        "required": ["version", *REQUIRED_SECTIONS],
+        "required": ["version", *(key for key in SECTIONS if must_be_given(described[key]))],
         "additionalProperties": False,
     }
 
@@ -152,7 +135,7 @@ def _load() -> Schema:
 
 
 def _table(plain: Schema) -> Schema:
-    """Return the schema of a table, which is in a file (`file`, `columns`) or in the scene (`t`, `wrench`)."""
+    """Return the schema of a table: a file with columns, or samples in the scene."""
     columns = {
         "type": "array",
         "items": {"type": "string", "description": "the name of a column"},

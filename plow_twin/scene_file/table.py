@@ -1,4 +1,4 @@
-"""Samples of a table load, from a csv file or from the scene itself."""
+"""Samples of a table load, from a CSV file or from the scene itself."""
 
 from __future__ import annotations
 
@@ -14,17 +14,18 @@ from numpy.typing import NDArray
 from plow_twin.errors import Problem, SceneError
 from plow_twin.scene_file.csv_rows import csv_rows, open_csv
 from plow_twin.scene_file.schema import TABLE_COLUMNS
+from plow_twin.scene_file.validation import is_number
 
 Samples = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 def read_table(path: Path, columns: Sequence[str] | None = None, key: str = "file") -> Samples:
-    """Read times, shape (n,) [s], and wrenches, shape (n, 3) [N, N, N m], from a csv file with a header line.
+    """Read times, shape (n,) [s], and wrenches, shape (n, 3) [N, N, N m], from a CSV file with a header line.
 
     Parameters
     ----------
     path : Path
-        The file, read by `csv_rows`; lines that start with `#` are skipped.
+        The file; lines that start with `#` are skipped.
     columns : sequence of str, optional
         Column names of time, Fx, Fy and M; by default `t` (or `time`), `fx`, `fy`, `m`.
     key : str
@@ -66,18 +67,14 @@ def _parse(rows: list[tuple[int, list[str]]], places: list[int], key: str) -> Sa
 def sample_table(t: list[Any], wrench: list[Any], key: str) -> Samples:
     """Return the samples in a scene as arrays, or raise a `SceneError` that names each bad row."""
     problems = [
-        Problem(f"{key}.t[{index}]", value, "a number [s]") for index, value in enumerate(t) if not _is_number(value)
+        Problem(f"{key}.t[{index}]", value, "a number [s]") for index, value in enumerate(t) if not is_number(value)
     ]
     problems += [
         Problem(f"{key}.wrench[{index}]", row, "3 numbers: Fx, Fy, M [N, N, N m]")
         for index, row in enumerate(wrench)
-        if not isinstance(row, list) or len(row) != 3 or not all(map(_is_number, row))
+        if not isinstance(row, list) or len(row) != 3 or not all(map(is_number, row))
     ]
     if problems:
         raise SceneError(problems)
     flat = np.fromiter(chain.from_iterable(wrench), dtype=float, count=3 * len(wrench))
     return np.array(t, dtype=float), flat.reshape(-1, 3)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 2**1024

@@ -1,12 +1,11 @@
-"""Check of plain data against a JSON schema, with readable messages: key, value got, value expected.
+"""Check of plain data against a JSON schema. A message names the key, the value got and the value expected.
 
-Scenes, parameters, mappings of recordings, load models and targets are checked here. A message gives the `description`
-of a schema as the value expected.
+The value expected is the `description` of a schema.
 """
 
 from __future__ import annotations
 
-import math
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from functools import cache
@@ -27,7 +26,7 @@ NUMBER: Final[Schema] = {"type": "number", "description": "a finite number"}
 
 
 def mapping(properties: Mapping[str, Schema], required: Sequence[str] = ()) -> Schema:
-    """Return the schema of a mapping that may have only the keys of `properties`."""
+    """Return the schema of a mapping that has no keys other than those of `properties`."""
     return {
         "type": "object",
         "properties": dict(properties),
@@ -43,7 +42,7 @@ def choice(choices: Sequence[str]) -> Schema:
 
 
 class _Shown:
-    """Words that a message shows instead of a value."""
+    """Words that replace a value in a message."""
 
     def __init__(self, text: str) -> None:
         self.text = text
@@ -52,20 +51,18 @@ class _Shown:
         return self.text
 
 
-#: Shown as the value of a missing key.
+#: The value of a missing key.
 NOTHING: Final = _Shown("nothing")
 #: Longest value and longest name that are printed [characters].
 _LONGEST: Final = 200
-#: Largest number of problems that are listed; it is limited because the search for the nearest known key takes time for
-#: each problem.
+#: Largest number of problems listed. The search for the nearest known key takes time for each problem.
 MOST_PROBLEMS: Final = 50
 
 
 def validate(raw: Any, schema: Schema, name: str) -> list[Problem]:
     """Return the problems of plain data in the order of the schema; messages call the whole data `name`."""
     problems = (problem for error in _validator(schema).iter_errors(raw) for problem in _explain(error, name))
-    # jsonschema reports a mapping once for each missing key, and `_explain` lists all missing keys each time, so
-    # duplicates are dropped
+    # jsonschema reports a mapping once for each missing key, and `_explain` each time yields all missing keys
     unique: dict[str, Problem] = {}
     for problem in islice(map(_brief, problems), 2 * MOST_PROBLEMS):
         unique[str(problem)] = problem
@@ -82,7 +79,7 @@ def _validator_class() -> Callable[[Schema], Validator]:
     """Return a validator for which NaN, infinity and integers beyond float64 are no numbers, and 1.0 is no integer."""
     checker = Draft202012Validator.TYPE_CHECKER.redefine_many(
         {
-            "number": lambda _, value: _is_number(value),
+            "number": lambda _, value: is_number(value),
             "integer": lambda _, value: isinstance(value, int) and not isinstance(value, bool),
             "array": lambda _, value: isinstance(value, list | tuple),
         }
@@ -90,13 +87,9 @@ def _validator_class() -> Callable[[Schema], Validator]:
     return cast("Callable[[Schema], Validator]", extend(Draft202012Validator, type_checker=checker))  # type: ignore[no-untyped-call]
 
 
-def _is_number(value: Any) -> bool:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return False
-    try:
-        return math.isfinite(float(value))
-    except OverflowError:
-        return False
+def is_number(value: Any) -> bool:
+    """Return whether a value is a finite number within the range of float64."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
 def _explain(error: ValidationError, whole: str) -> Iterator[Problem]:
@@ -115,14 +108,14 @@ def _explain(error: ValidationError, whole: str) -> Iterator[Problem]:
     elif error.validator == "anyOf":
         yield from _closest_branch(key or whole, error, whole)
     elif error.validator == "oneOf":
-        if isinstance(instance, dict):  # a value of any other type is reported as a problem of its own
+        if isinstance(instance, dict):  # a value of another type is a problem of its own
             yield Problem(key or whole, sorted(map(str, instance)), schema["description"])
     else:
         yield Problem(key or whole, instance, schema.get("description", error.message))
 
 
 def _closest_branch(key: str, error: ValidationError, whole: str) -> Iterator[Problem]:
-    """Yield the problems of the `anyOf` branch that fits the value's type, or one problem of the key."""
+    """Yield the problems of the `anyOf` branch that fits the type of the value, or one problem of the key."""
     branches: dict[Any, list[ValidationError]] = {}
     for inner in error.context or ():
         branches.setdefault(inner.schema_path[0], []).append(inner)
@@ -141,7 +134,7 @@ def _is_misfit(error: ValidationError) -> bool:
 
 
 def _brief(problem: Problem) -> Problem:
-    """Return the problem, with a value that is too long to print replaced by words."""
+    """Return the problem with words in place of a value that is too long to print."""
     got = problem.got
     if isinstance(got, list | tuple | dict) and len(repr(got)) > _LONGEST:
         shown = _Shown(f"a {'mapping' if isinstance(got, dict) else 'list'} of {len(got)}")

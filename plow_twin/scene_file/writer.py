@@ -4,31 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import MISSING, fields
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
 from plow_twin.model.pairs import PAIR_NAMES
-from plow_twin.model.scene import OPTIONAL_PARTS, SCENE_VERSION, Load, Provenance, Scene, Table
-from plow_twin.scene_file.schema import LOAD_KINDS, SECTIONS
+from plow_twin.model.scene import OPTIONAL_PARTS, SCENE_VERSION, SECTIONS, Load, Provenance, Scene, Table
+from plow_twin.scene_file.schema import LOAD_KINDS
 from plow_twin.scene_file.yaml_text import dump_yaml
-
-#: The sections of a scene file, in the order in which they are written.
-_ORDER: Final = (
-    "version",
-    "head",
-    "frame",
-    "clearance",
-    "contact",
-    "gravity",
-    "loads",
-    "initial",
-    "locked",
-    "pairs",
-    "wear",
-    "friction",
-    "support",
-)
 
 
 def dump_scene(scene: Scene) -> str:
@@ -37,27 +20,26 @@ def dump_scene(scene: Scene) -> str:
     Parameters
     ----------
     scene : Scene
-        The scene; its tables are written into the text.
 
     Returns
     -------
     str
-        The text, including the provenance marks.
+        The text, including tables and provenance marks.
     """
-    raw: dict[str, Any] = {"version": SCENE_VERSION}
-    for key in SECTIONS:
-        raw[key] = _plain(getattr(scene, key), key, scene.marks)
+    raw: dict[str, Any] = {key: _plain(getattr(scene, key), key, scene.marks) for key in SECTIONS}
     raw["loads"] = [_plain_load(load, f"loads[{index}]", scene.marks) for index, load in enumerate(scene.loads)]
     raw["locked"] = list(scene.locked)
     raw["pairs"] = "all" if scene.pairs == PAIR_NAMES else list(scene.pairs)
     for key in OPTIONAL_PARTS:
         part = getattr(scene, key)
         raw[key] = "none" if part is None else _plain(part, key, scene.marks)
-    return dump_yaml({key: raw[key] for key in _ORDER})
+    # the sections are written in the order of the scene's fields
+    sections = {spec.name: raw[spec.name] for spec in fields(Scene) if spec.name in raw}
+    return dump_yaml({"version": SCENE_VERSION, **sections})
 
 
 def _plain(part: Any, path: str, marks: Mapping[str, Provenance], without: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Return a dataclass as plain lists, mappings and numbers, with the provenance marks put back."""
+    """Return a dataclass as plain lists, mappings and numbers with their provenance marks."""
     plain: dict[str, Any] = {}
     for spec in fields(part):
         value = getattr(part, spec.name)

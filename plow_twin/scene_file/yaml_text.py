@@ -1,4 +1,4 @@
-"""YAML of untrusted files, read safely and within bounds, with numbers by the YAML 1.2 core schema and exact floats.
+"""YAML of untrusted files, read within bounds, with numbers by the YAML 1.2 core schema and exact floats.
 
 The events of the parser are counted before a document is built, because libyaml recurses in C for nested collections,
 and a few lines of aliases can expand to any number of values.
@@ -17,27 +17,26 @@ import yaml
 
 from plow_twin.errors import Problem
 
-try:  # libyaml, if PyYAML includes it, is ten times as fast on recorded tables
+try:  # libyaml is ten times as fast on recorded tables, but PyYAML may lack it
     from yaml import CSafeDumper as _Dumper
     from yaml import CSafeLoader as _Loader
 except ImportError:
     from yaml import SafeDumper as _Dumper  # type: ignore[assignment]
     from yaml import SafeLoader as _Loader  # type: ignore[assignment]
 
-#: Largest file [B]. A table of 200,000 rows fits and takes ten seconds to read; longer tables belong in CSV.
+#: Largest file [B]. A table of 200,000 rows fits; longer tables belong in CSV.
 LARGEST_FILE: Final = 64 * 2**20
-#: Largest number of values in a file; a table of 200,000 rows fits.
+#: Largest number of values in a file.
 MOST_VALUES: Final = 1_000_000
 #: Deepest nesting of collections; a scene has six levels.
 DEEPEST: Final = 20
-#: Largest number of keys of a document; a scene has some hundred keys, and the `metadata.yaml` of a recording of 1,000
-#: parts has 20,000.
+#: Largest number of keys of a document. The `metadata.yaml` of a recording of 1,000 parts has 20,000 keys.
 MOST_KEYS: Final = 50_000
 #: Largest number of values to which all aliases of a document expand.
 MOST_REPEATED: Final = 50_000
 
 _FLOAT: Final = re.compile(r"^(?:[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?|[-+]?\.inf|\.nan)$", re.I)
-# each line has a tag, a pattern, and the possible first characters; the first line that matches decides
+# tag, pattern and possible first characters; the first line that matches decides
 _CORE_SCHEMA: Final = (
     ("tag:yaml.org,2002:null", re.compile(r"^(?:~|null|Null|NULL|)$"), ["~", "n", "N", ""]),
     ("tag:yaml.org,2002:bool", re.compile(r"^(?:true|True|TRUE|false|False|FALSE)$"), list("tTfF")),
@@ -50,12 +49,12 @@ _CORE_SCHEMA: Final = (
 class SceneLoader(_Loader):
     """Safe loader with the scalars of the YAML 1.2 core schema."""
 
-    # PyYAML's own table is for YAML 1.1, in which 1e6 is a text, `on` is a bool, 010 is eight and 1:30 is ninety
+    # the table of PyYAML is that of YAML 1.1, in which 1e6 is a text, `on` a bool, 010 eight and 1:30 ninety
     yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012
 
 
 class SceneDumper(_Dumper):
-    """Safe dumper that quotes all texts that YAML 1.1 or 1.2 would read as another type."""
+    """Safe dumper that quotes every text that YAML 1.1 or 1.2 would read as another type."""
 
     def ignore_aliases(self, data: Any) -> bool:
         """Write no aliases."""
@@ -69,7 +68,9 @@ SceneDumper.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+.01
 
 
 def read_yaml(path: Path, name: str, sections: str) -> tuple[Any, list[Problem]]:
-    """Return the document and problems of a YAML file, as `load_yaml` does, within `LARGEST_FILE` and `MOST_VALUES`."""
+    """Return the document and the problems of a YAML file, as `load_yaml` does, within `LARGEST_FILE` and
+    `MOST_VALUES`.
+    """
     try:
         with path.open("rb") as stream:
             data = stream.read(LARGEST_FILE + 1)
@@ -83,7 +84,7 @@ def read_yaml(path: Path, name: str, sections: str) -> tuple[Any, list[Problem]]
 
 
 def load_yaml(text: str, name: str, sections: str, *, most_values: float = math.inf) -> tuple[Any, list[Problem]]:
-    """Return the document (None if it is unreadable) and its problems; messages call the document `name`."""
+    """Return a document (None if it is unreadable) and its problems; messages call the document `name`."""
     try:
         excess = _excess(text, most_values)
         if excess is not None:
@@ -102,13 +103,13 @@ def load_yaml(text: str, name: str, sections: str, *, most_values: float = math.
         return None, [Problem(_place(mark) if mark else name, str(error.problem), "YAML")]
     except yaml.YAMLError as error:
         return None, [Problem(name, " ".join(str(error).split()), "YAML")]
-    except ValueError as error:  # an integer may have thousands of digits
+    except ValueError as error:  # Python refuses integers of thousands of digits
         return None, [Problem(name, str(error), "numbers")]
 
 
 @dataclass
 class _Size:
-    """Size of a node with its children; an alias has the size of the node that it repeats."""
+    """Size of a node and its children. An alias has the size of the node that it repeats."""
 
     values: int = 1
     keys: int = 0
@@ -119,9 +120,9 @@ def _excess(text: str, most_values: float) -> Problem | None:
     """Return the problem of a document whose events exceed a bound, or None; YAML errors are raised."""
     scalar = _Size()
     values = repeated = 0
-    sizes: dict[str, _Size | None] = {}  # size of each anchored node by anchor; None until the node ends
+    sizes: dict[str, _Size | None] = {}  # by anchor; None until the node ends
     outer, is_mapping, anchor = _Size(), False, None
-    stack: list[tuple[_Size, bool, str | None]] = []  # size, kind and anchor of the collections around the event
+    stack: list[tuple[_Size, bool, str | None]] = []  # size, kind and anchor of the outer collections
     event: Any
     for event in yaml.parse(text, SceneLoader):
         kind = type(event)
@@ -143,7 +144,7 @@ def _excess(text: str, most_values: float) -> Problem | None:
                 sizes[anchor] = outer
             outer, is_mapping, anchor = stack.pop()
         elif kind is yaml.AliasEvent:
-            known = sizes.get(event.anchor, scalar)  # a missing anchor is reported later, by the composer
+            known = sizes.get(event.anchor, scalar)  # the composer reports a missing anchor
             if known is None:
                 return Problem(_place(event.start_mark), "an alias to itself", "an alias to an earlier node")
             node = known
@@ -161,7 +162,7 @@ def _excess(text: str, most_values: float) -> Problem | None:
         if is_mapping:
             outer.keys += 1
         outer.keys += node.keys
-        if outer.keys > 2 * MOST_KEYS:  # `keys` counts both the key and the value of each item, so the limit is doubled
+        if outer.keys > 2 * MOST_KEYS:  # `keys` counts the key and the value of each item
             return _above(event, (outer.keys + 1) // 2, MOST_KEYS, "keys")
         if outer.depth <= node.depth:
             outer.depth = node.depth + 1
@@ -177,9 +178,9 @@ def _place(mark: Any) -> str:
 
 
 def dump_yaml(data: Any, *, flow: bool = True) -> str:
-    """Return plain data as YAML text, with floats by repr so that reading them gives the same bits.
+    """Return plain data as YAML text. Floats are written by repr, so reading them gives the same bits.
 
-    With `flow`, collections that contain only scalars are written in brackets.
+    With `flow`, collections of scalars are written in brackets.
     """
     style = None if flow else False
     return yaml.dump(data, Dumper=SceneDumper, sort_keys=False, default_flow_style=style, allow_unicode=True, width=120)
@@ -187,7 +188,7 @@ def dump_yaml(data: Any, *, flow: bool = True) -> str:
 
 def _repeated_keys(node: yaml.Node, path: str) -> Iterator[Problem]:
     if isinstance(node, yaml.SequenceNode):
-        # scalars have no keys and are skipped, so that a row of a long table is read quickly
+        # scalars have no keys; skipping them makes long tables fast
         for index, item in enumerate(node.value):
             if not isinstance(item, yaml.ScalarNode):
                 yield from _repeated_keys(item, f"{path}[{index}]")
