@@ -12,16 +12,15 @@ from plow_twin.model.geometry import half_diagonal
 from plow_twin.scene_file import load_scene
 
 ROOT = Path(__file__).resolve().parent.parent
-#: Folder of a reference on a 1 ms grid. The folder is not part of the project and is used only if it exists.
+#: Folder of a reference on a 1 ms grid, outside the project and used only if it exists.
 FINE_REFERENCE = ROOT.parent / "shared" / "reference"
 NAMES = ("kv", "hc")
 T_END = 20.0
-#: `SPARSE` and `DENSE` are the intervals between rows in s of the two output grids.
+#: Intervals between rows of the two output grids [s].
 SPARSE, DENSE = 0.1, 1e-3
 
 
 def bench_scene(name: str) -> Scene:
-    """Return the bench scene `kv` or `hc`."""
     return load_scene(ROOT / "config" / f"bench_{name}.yaml")
 
 
@@ -48,14 +47,9 @@ def on_grid(name: str, output_dt: float) -> tuple[Array, int]:
 
 
 def constants(scene: Scene) -> Array:
-    """Return the 15 constants of a bench scene.
+    """Return the 15 constants of a bench scene, whose load must be one harmonic in phase with sin.
 
     They are width, height, gx, gy, mass, inertia, gravity, arm, K, exponent, C or lambda, Fx, Fy, M, omega.
-
-    Raises
-    ------
-    ValueError
-        The loads are not exactly one harmonic in phase with sin.
     """
     if len(scene.loads) != 1 or not isinstance(scene.loads[0], Harmonic) or scene.loads[0].phase_rad != 0.0:
         raise ValueError(f"loads: got {scene.loads!r}, expected one Harmonic without phase")

@@ -3,7 +3,7 @@
     python benchmark/beside.py COMMIT [--rounds 5]
 
 Each round starts a process in a worktree of the commit and a process in this checkout, in alternating order. A process
-warms up, repeats each case and reports its fastest time. The table with the medians over the rounds and their ratio is
+warms up, repeats each case and reports its fastest time. The medians over the rounds and their ratio are written to
 benchmark/results/beside.md.
 """
 
@@ -18,10 +18,11 @@ import sys
 import tempfile
 from pathlib import Path
 
+import cases
+
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "benchmark" / "results" / "beside.md"
-#: Program that is run in its own process for each of the two commits. It repeats the runs of README, and uses only
-#: features that both commits have.
+#: Work of a process: the runs of README, with features that both commits have.
 _WORK = """
 import json, sys, time
 import numpy as np
@@ -71,16 +72,15 @@ def measure(tree: Path, cache: str) -> dict[str, float]:
 
 def table(commit: str, now: list[dict[str, float]], before: list[dict[str, float]]) -> str:
     """Return the medians and their ratio as a table."""
-    lines = [f"Beside commit `{commit}`, {len(now)} rounds in turn:", ""]
-    lines += [f"| work | `{commit}` | this | ratio |", "|---|---|---|---|"]
+    lines = []
     for case in now[0]:
         old, new = (1e3 * statistics.median(times[case] for times in rounds) for rounds in (before, now))
-        lines.append(f"| {case} | {old:.3g} ms | {new:.3g} ms | {old / new:.2f} |")
-    return "\n".join(lines)
+        lines.append([case, f"{old:.3g} ms", f"{new:.3g} ms", f"{old / new:.2f}"])
+    medians = cases.table(["work", f"`{commit}`", "this", "ratio"], lines)
+    return f"Beside commit `{commit}`, {len(now)} rounds in turn:\n\n{medians}"
 
 
 def main() -> None:
-    """Measure and write the table."""
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     arguments.add_argument("commit")
     arguments.add_argument("--rounds", type=int, default=5)
@@ -95,7 +95,7 @@ def main() -> None:
             for number in range(chosen.rounds):
                 print(f"round {number + 1} of {chosen.rounds}", file=sys.stderr)
                 both = (before, tree, "before"), (now, ROOT, "now")
-                # the order alternates, because the second process of a round runs on the warmer machine
+                # the second process of a round runs on a warmer machine
                 for times, place, cache in both if number % 2 == 0 else reversed(both):
                     times.append(measure(place, f"{folder}/{cache}"))
         finally:

@@ -32,7 +32,7 @@ class Sample:
 
 @dataclass
 class Row:
-    """One line of the table, with the median and the smallest time of `runs` runs in ms; cells may be empty."""
+    """One line of the table, with the median and the least time of `runs` runs in ms; cells may be empty."""
 
     section: str
     scene: str
@@ -47,19 +47,17 @@ class Row:
     steps: int | None = None
     evaluations: int | None = None
     events: int | None = None
-    #: the figure that the case's section compares. Depending on the section it is the number of members beyond the
-    #: listed error, a multiple of real time, a share of a core, an error in tolerances, a ratio of times, or a number
-    #: of compiled kernels
+    #: the figure of the row's section: number of members beyond the listed error, multiple of real time, share of a
+    #: core, error in tolerances, ratio of times, or number of compiled kernels
     value: float | None = None
-    #: factor by which a small displacement at t = 0 grows; only the sections of random scenes and of the ensemble have
-    #: this figure
+    #: factor by which a small displacement at t = 0 grows, in the random scenes and the ensemble
     amplification: float | None = None
     status: str = "ok"
 
 
 @dataclass
 class Case:
-    """A row to be measured; `prepare` builds and compiles the work, and returns the function whose time is measured."""
+    """A row to be measured. `prepare` builds and compiles the work, and returns the function that is timed."""
 
     row: Row
     prepare: Callable[[], Callable[[], Sample]]
@@ -67,11 +65,11 @@ class Case:
     samples: list[Sample] = field(default_factory=list)
 
 
-#: A case is repeated only while its runs have together taken less than this time.
+#: A case is repeated until its runs have taken this time together.
 TIME_PER_CASE_S = 1.0
-#: A first run shorter than this is a warm-up and is discarded; in a longer run warm-up makes no difference.
+#: A first run shorter than this is a warm-up and does not count.
 WARM_UP_BELOW_S = 0.05
-#: Cases whose first run is shorter than this are repeated even if they were not chosen.
+#: Cases with a shorter first run are repeated even if they were not chosen.
 SHORT_S = 0.02
 Choose = Callable[[Sequence[Row]], set[int]]
 
@@ -81,8 +79,8 @@ def measure(
 ) -> list[Row]:
     """Run every case once, then the chosen cases in turn, up to `repeats` runs each.
 
-    Runs in turn spread a change of the machine's speed evenly over the cases. `choose` returns the indices of the cases
-    on which a figure depends; without it all cases are chosen.
+    Runs in turn spread a change of the machine's speed over all cases. `choose` returns the indices of the cases on
+    which a figure depends; without it, all cases are chosen.
     """
     rows = [case.row for case in cases]
     ready: dict[int, Callable[[], Sample]] = {}
@@ -145,8 +143,13 @@ def pose_error(reference: Array, scale: Sequence[float]) -> Callable[[Array], fl
     return error
 
 
+def table(head: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
+    """Return a Markdown table."""
+    body = ["| " + " | ".join(line) + " |" for line in (head, *lines)]
+    return "\n".join([body[0], "|" + "---|" * len(head), *body[1:]])
+
+
 def write_csv(path: Path, rows: Iterable[Row]) -> None:
-    """Write the table, with six digits of each number."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
@@ -157,7 +160,6 @@ def write_csv(path: Path, rows: Iterable[Row]) -> None:
 
 
 def read_rows(path: Path) -> list[Row]:
-    """Read a table that `write_csv` has written."""
     with path.open(newline="", encoding="utf-8") as file:
         lines = list(csv.DictReader(file))
     return [Row(**{spec.name: _value(spec, line[spec.name]) for spec in fields(Row)}) for line in lines]
@@ -177,7 +179,7 @@ def _text(value: Any) -> str:
 
 
 def machine_name() -> str:
-    """Return a name made only of the CPU's model and the number of cores."""
+    """Return a name made of the CPU's model and the number of cores."""
     facts: dict[str, str] = {}
     try:
         for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").split("\n\n")[0].splitlines():
@@ -186,6 +188,6 @@ def machine_name() -> str:
     except OSError:
         pass
     name = facts.get("model name", "unknown cpu")
-    # virtual machines often hide the number in the model's name
+    # virtual machines often hide the number of the model
     known = name if re.search(r"\d", name) else f"{name} f{facts.get('cpu family', 0)}m{facts.get('model', 0)}"
     return re.sub(r"[^a-z0-9]+", "_", f"{known} {os.cpu_count()}core".lower()).strip("_")

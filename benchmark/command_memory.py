@@ -1,7 +1,7 @@
 """Largest memory of the commands that read a recording: `python benchmark/command_memory.py [MINUTES ...]`.
 
-The paper's head with wear is recorded at 1 kHz in a temporary folder (0.43 MB/s), with a measured pose at 100 Hz. Then
-each command runs in a separate process. One line of JSON is printed for each command and length.
+The paper's head with wear is recorded at 1 kHz in a temporary folder, with a measured pose at 100 Hz. Then each command
+runs in a process. One line of JSON is printed for each command and length.
 """
 
 from __future__ import annotations
@@ -64,7 +64,6 @@ def run(folder: Path, *words: str) -> tuple[float, float]:
 
 
 def main() -> None:
-    """Print the memory and the processor time of each command."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("minutes", type=int, nargs="*", default=[10, 60])
     scene = replace(load_scene(scene_path("paper")), wear=Wear(1e-14, pad_area_m2=0.02, travel_speed_m_s=0.5))

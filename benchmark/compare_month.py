@@ -3,7 +3,7 @@
 With `--hours 0.5 --rate 100 --verb analyse` it measures `analyse` over many short runs.
 
 Ten minutes are computed once, and each day's run repeats them with its own stamps. The memory depends on the number of
-windows, which is the same as in a month at any sampling rate.
+windows, which does not depend on the sampling rate.
 """
 
 from __future__ import annotations

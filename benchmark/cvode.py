@@ -30,7 +30,6 @@ def program() -> str:
 
 
 def version() -> str:
-    """Return the version of SUNDIALS that the program was compiled with."""
     return subprocess.run([program(), "--version"], capture_output=True, text=True, check=True).stdout.strip()
 
 

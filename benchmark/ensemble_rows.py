@@ -1,4 +1,4 @@
-"""Runs of many clearance pairs at once, compared with the solver's own run at the tightest tolerance."""
+"""Runs of many clearance pairs at once, compared with our own run at the tightest tolerance."""
 
 from __future__ import annotations
 
@@ -22,15 +22,13 @@ LANES_SECTION = "ensemble_hc"
 BATCH = f"{HEYOKA}, batch"
 COLUMNS, ROWS = 40, 25
 PAIRS = f"kv, {COLUMNS * ROWS} clearance pairs"
-#: Tolerances from loose to tight. The loosest tolerance at which the error of every pair is within `LISTED` is timed
-#: repeatedly.
+#: Tolerances from loose to tight; the first at which every pair is within `LISTED` is timed repeatedly.
 TOLERANCES = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5, 3e-6, 1e-6)
 _BATCH_TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
 EXACT = 1e-12
-#: Error, as a multiple of the clearance, beyond which a pair is listed.
+#: Error in clearances beyond which a pair is listed.
 LISTED = 1e-4
-#: Size of the displacement at t = 0 by whose growth amplification is measured, as a multiple of the clearance. It is
-#: large compared with rounding.
+#: Displacement at t = 0 in clearances, much larger than rounding, whose growth is the amplification.
 PERTURBATION = 1e-8
 
 
@@ -77,7 +75,7 @@ def ensemble_rows(columns: int, rows: int, lean_steps: Sequence[float], repeats:
 def lanes_rows(columns: int, rows: int, repeats: int, notify: Notify) -> Iterator[Row]:
     """Yield rows of HC pairs on one core, in lanes and by the loop of a single scene in turns.
 
-    The tolerance is the first from 1e-4 on at which all pairs are accurate enough. The value is the ratio of the times.
+    The tolerance is the first from 1e-4 on at which all pairs are within `LISTED`. The value is the ratio of the times.
     """
     scenes = clearance_pairs(columns, rows, "hc")
     name = f"hc, {len(scenes)} clearance pairs"
@@ -107,13 +105,13 @@ def lanes_rows(columns: int, rows: int, repeats: int, notify: Notify) -> Iterato
 
 
 def core_row(rows: Sequence[Row]) -> Row | None:
-    """Return the row of one core at the tolerance that all pairs need, which is the last such row."""
+    """Return the last row of one core, which is at the tolerance that all pairs need."""
     own = [row for row in rows if row.section == SECTION and row.solver == OURS and row.setting.endswith(", threads=1")]
     return own[-1] if own else None
 
 
 def batch_row(rows: Sequence[Row]) -> Row | None:
-    """Return the row of heyoka in batches at the tolerance that all pairs need, if there is such a tolerance."""
+    """Return the row of heyoka in batches at the tolerance that all pairs need, if there is one."""
     found = [row for row in rows if row.section == SECTION and row.solver == BATCH and row.error is not None]
     return next((row for row in found if (row.error or 0.0) <= LISTED), None)
 
@@ -159,7 +157,7 @@ def _member_row(scene: Scene, tol: float, error: float, growth: float) -> Row:
 
 
 def _heyoka_rows(name: str, scenes: Sequence[Scene], exact: Array, notify: Notify) -> Iterator[Row]:
-    """Yield rows of heyoka in batches from loose to tight tolerances, until all pairs are accurate enough."""
+    """Yield rows of heyoka in batches from loose to tight tolerances, until all pairs are within `LISTED`."""
     pairs = np.array([[scene.clearance.horizontal_m, scene.clearance.vertical_m] for scene in scenes])
     for tol in _BATCH_TOLERANCES:
         notify(f"ensemble heyoka in batches tol={tol:g}")

@@ -1,8 +1,8 @@
 """Exudyn on the bench scenes.
 
 Exudyn has no connector with this contact law. So each frame corner is a rigid-body spring-damper without stiffness, and
-its force is a *symbolic* user function (compiled, no Python in the loop) of the corner's place and velocity in head
-axes. The loads are symbolic user functions of time.
+its force is a *symbolic* user function (compiled, no Python in the loop) of the place and the velocity of the corner in
+head axes. The loads are symbolic user functions of time.
 """
 
 from __future__ import annotations
@@ -43,8 +43,6 @@ def _force_function(sx: int, sy: int, p: Array, esym: Any) -> Callable[..., Any]
 
 
 def _load_function(amplitude: float, constant: float, omega: float, esym: Any) -> Callable[..., Any]:
-    """Return amplitude sin(omega t) + constant as a function of symbolic time."""
-
     def function(mbs, t, load):  # type: ignore[no-untyped-def]
         return amplitude * esym.sin(omega * t) + constant
 

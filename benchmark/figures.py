@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import re
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -16,23 +15,18 @@ import month
 import targets
 import tuning_sensitivity
 from bench_scenes import ROOT
-from cases import Row, read_rows
+from cases import Row, read_rows, table
 from ensemble_rows import core_row
+from estimate import load_rows
 from levels import OWN, PEERS, fastest
 from work_precision import OURS_BARE, OURS_CALL
 
 RESULTS = ROOT / "benchmark" / "results"
-#: File that names the machine of the newest complete run; the pages quote the figures of this run.
+#: File that names the machine of the newest complete run, which the pages quote.
 NEWEST = RESULTS / "newest.txt"
 _PEERS = (
     "CVODE from C", "CVODE from C, rootfinding", "heyoka", "best of SciPy and scikit-sundae", "lean jitted RK4",
 )  # fmt: skip
-
-
-def table(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    """Return a Markdown table."""
-    body = ["| " + " | ".join(line) + " |" for line in (head, *lines)]
-    return "\n".join([body[0], "|" + "---|" * len(head), *body[1:]])
 
 
 def solver_rows() -> list[Row]:
@@ -41,7 +35,7 @@ def solver_rows() -> list[Row]:
 
 
 def speed() -> str:
-    """Return the table of times for 20 s of impacts at three errors, with the peers' times as multiples."""
+    """Return times for 20 s of impacts at three errors, with the times of the peers as multiples."""
     rows = solver_rows()
     lines = []
     for level in (1e-3, 1e-6, 1e-9):
@@ -52,7 +46,7 @@ def speed() -> str:
 
 
 def located() -> str:
-    """Return the table of times with output every 0.1 s, beside the two peers that locate every change of contact."""
+    """Return times with output every 0.1 s, beside the two peers that locate every change of contact."""
     rows = solver_rows()
     lines = []
     for scene in ("kv", "hc"):
@@ -67,7 +61,6 @@ def located() -> str:
 
 
 def work() -> str:
-    """Return the list of work that one core can do."""
     rows = solver_rows()
     (one,) = [row for row in rows if row.section == "sampled_load" and "256" not in row.scene]
     many = [row for row in rows if row.section == "sampled_load" and "256" in row.scene]
@@ -91,7 +84,7 @@ def work() -> str:
 
 
 def missed() -> str:
-    """Return the table of the solver's missed targets; targets relative to the same peer share a line."""
+    """Return the missed targets of the solver; targets relative to the same peer share a line."""
     groups: dict[tuple[str, str], list[targets.Verdict]] = {}
     for verdict in targets.verdicts(solver_rows()):
         if not verdict.reached:
@@ -105,7 +98,7 @@ def missed() -> str:
 
 
 def random_scenes() -> str:
-    """Return a sentence for each tolerance with the largest error of the random scenes that amplify little."""
+    """Return for each tolerance the largest error of the random scenes that amplify little."""
     rows = [verdict for verdict in targets.verdicts(solver_rows()) if "random scenes" in verdict.work]
     asked = [re.search(r"tol=([\d.e-]+)", row.work) for row in rows]
     texts = [row.measured.replace("worst", "largest").replace(" 0 failed", " no scene failed") for row in rows]
@@ -124,13 +117,11 @@ def stored(name: str) -> Callable[[], str]:
 
 
 def measured_sum() -> str:
-    """Return the table of errors of the drops over two bounces, without scores."""
     _, *rows = estimate_pages.narrowed(measured_pages.measured_drops(), (0, 1, 2, 4))
     return table(["block", "error over one bounce", "over two", "inside the 90 % band after one"], rows)
 
 
 def replay() -> str:
-    """Return the list of a recording's sizes and of replay speeds."""
     with (RESULTS / "replay.csv").open(newline="", encoding="utf-8") as file:
         _, *rows = csv.reader(file)
     unit = ", times real time"
@@ -138,13 +129,11 @@ def replay() -> str:
 
 
 def life_table() -> str:
-    """Return the table of forecasts of synthetic lives."""
-    return lives.summary(_lines("lives.jsonl"))
+    return lives.summary(load_rows(RESULTS / "lives.jsonl"))
 
 
 def life_sum() -> str:
-    """Return the forecasts of synthetic lives in two sentences."""
-    rows = _lines("lives.jsonl")
+    rows = load_rows(RESULTS / "lives.jsonl")
     parts = [[row for row in rows if row["share"] == share] for share in lives.SHARES]
 
     def held(own: list[dict[str, Any]], inner: int) -> str:
@@ -160,8 +149,7 @@ def life_sum() -> str:
 
 
 def month_table() -> str:
-    """Return the table of forecasts after a month of measurements, by travel per day."""
-    rows = _lines("month.jsonl")
+    rows = load_rows(RESULTS / "month.jsonl")
     days = list(dict.fromkeys(row["day_m"] for row in rows))
     tables = [month.summary([row for row in rows if row["day_m"] == day]).splitlines() for day in days]
     head = [f"| km a day {tables[0][0]}", f"|---{tables[0][1]}"]
@@ -169,18 +157,16 @@ def month_table() -> str:
 
 
 def follow_table() -> str:
-    """Return the table of how well a twin follows its machine."""
-    return follow.as_markdown(_lines("follow.jsonl"))
+    return follow.as_markdown(load_rows(RESULTS / "follow.jsonl"))
 
 
 def follow_sum() -> str:
-    """Return the table of `follow_table` without clearances and cost."""
     _, *rows = estimate_pages.narrowed(follow_table(), range(6))
     return table(["group", "truths", "forces, RMS", "largest force", "impulse", "coverage of these three"], rows)
 
 
 def siconos() -> str:
-    """Return the table that compares this solver with two references of Siconos for the slider of the literature."""
+    """Return this solver beside two references of Siconos for the slider of the literature."""
     with (RESULTS / "siconos.csv").open(newline="", encoding="utf-8") as file:
         rows = [row for row in csv.DictReader(file) if row["quantity"] != "largest gap function error"]
     names = [name for name in dict.fromkeys(row["reference"] for row in rows) if " against " not in name]
@@ -236,7 +222,3 @@ def _times(rows: Sequence[Row], scene: str, output_s: float, level: float, peer:
 def _short(verdict: targets.Verdict) -> str:
     ratio = re.search(r"\*\*([\d.]+x)\*\*", verdict.measured)
     return ratio[1] if ratio else verdict.measured
-
-
-def _lines(name: str) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in (RESULTS / name).read_text(encoding="utf-8").splitlines() if line]

@@ -1,9 +1,8 @@
 """Rows per second that `plow-twin live` reads from a complete CSV file, without and with a recording.
 
-python benchmark/file_rate.py [--rows N]
+    python benchmark/file_rate.py [--rows N]
 
-Prints one line of JSON for each case, with the rows per second of CPU time and of elapsed time. The time of the
-process's start is subtracted.
+Prints a line of JSON for each case: the rows per second of CPU time and of elapsed time, without the start.
 """
 
 from __future__ import annotations
@@ -19,8 +18,7 @@ import time
 from pathlib import Path
 from typing import Final
 
-#: Number of rows of the short file. Its time is subtracted from that of the long file, so that the start does not
-#: count.
+#: Number of rows of a short file, whose time is that of the start.
 FEW: Final = 1000
 
 
@@ -43,7 +41,6 @@ def measure(path: Path, *options: str) -> tuple[float, float]:
 
 
 def main() -> None:
-    """Print the rates."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--rows", type=int, default=1_000_000)
     rows = parser.parse_args().rows
@@ -51,7 +48,7 @@ def main() -> None:
         few, many = Path(folder, "few.csv"), Path(folder, "many.csv")
         write_load(few, FEW)
         write_load(many, rows)
-        measure(few)  # this run compiles the solver if necessary
+        measure(few)  # may compile the solver
         for outputs in ("", "none", "all"):
             options = ["--set", f"record_outputs={outputs}", "--record"] if outputs else []
             start = measure(few, *options, *[f"{folder}/few_{outputs}"][: len(options)])

@@ -3,9 +3,9 @@
     python benchmark/filter_peers.py --truths 5 --seed 5000 --group plain
 
 The state of both filters has the pose, its rate, the clearances, softness, damping, load gains, and the sensor's bias
-and delay. Both filters use the project's solver as process model, know the sensor's noise, and begin at the nominal
-scene with the prior of the estimate. Rows are appended to `results/filter_peers.jsonl`; truths in the file are not run
-again.
+and delay. The solver of this project is their process model. Both know the noise of the sensor, and begin at the
+nominal scene with the prior of the estimate. Rows are appended to `results/filter_peers.jsonl`; truths in the file are
+not run again.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from plow_twin.estimate.estimate import thinned
 from plow_twin.estimate.result import NORMAL_P95
 from plow_twin.estimate.unknowns import DAMPING, GX, GY, SIZE, SOFTNESS, Unknowns
 from plow_twin.kernel.compiler import kernel
+from plow_twin.model.geometry import body_states
 from plow_twin.model.scene import Clearance
 from plow_twin.solve.compiled_scene import compile_scene, inertias
 from plow_twin.solve.loop import advance_rows
@@ -51,12 +52,11 @@ RESULTS = Path(__file__).resolve().parent / "results"
 
 TOLERANCE = 1e-4
 MEMBERS = 128
-#: Index of the estimate's first unknown in the filters' state; pose and rates come before it.
+#: Index of the first unknown of the estimate in the filters' state; pose and rates come before it.
 _FIRST = 6
-#: Process noise of x, y [m], theta [rad] and their rates in each step, set by hand with trials on seeds 200 and 201
-#: only.
+#: Process noise of x, y [m], theta [rad] and their rates in each step, set by trials on seeds 200 and 201.
 _STATE_NOISE = np.array([1e-5, 1e-5, 4e-5, 3e-3, 3e-3, 1e-2])
-#: Process noise of the unknowns in each step, as a share of the prior's standard deviation; set with the same trials.
+#: Process noise of the unknowns in each step, as a share of the prior's standard deviation, set by the same trials.
 _UNKNOWN_NOISE = 3e-4
 
 
@@ -84,7 +84,7 @@ class Members:
         self._params = new_records(PARAMS, count)
         self._params[:] = compiled.params
         clearance = scene.clearance
-        # the penetrations' rows are linear in the clearances, so two other clearances give the slopes of these rows
+        # the rows of the penetrations are linear in the clearances, so two other clearances give the slopes
         self._rows = np.array(compiled.params["penetration_rows"])
         wider = (
             Clearance(clearance.horizontal_m + 1e-3, clearance.vertical_m),
@@ -108,18 +108,14 @@ class Members:
         self._params["penetration_rows"] = rows
         self._params["stiffness"] = [self.unknowns.stiffness_of(psi) for psi in unknown[:, SOFTNESS]]
         states = new_records(STATE, len(out))
-        x, y, theta, vx, vy, omega = out[:, :_FIRST].T
-        c, s = np.cos(theta), np.sin(theta)
-        states["y"] = np.stack(
-            [c * x + s * y, -s * x + c * y, c * vx + s * vy, -s * vx + c * vy, omega, c, s, theta], 1
-        )
+        states["y"] = body_states(out[:, :_FIRST], (0.0, 0.0))
         states["damping_factor"] = np.exp(np.clip(unknown[:, DAMPING], -6.0, 6.0))[:, None]
         states["step_start"] = states["time"] = start
         ends = np.stack([np.interp([start, end], self.load.t, column) for column in self.load.wrench.T], axis=1)
         wrench = ends * unknown[:, None, 4:7] / self._masses
         result = np.zeros((len(out), 1), ROW)
         pace = new_record(PACE)
-        pace.slice = 2**62  # so large that all work is done in one slice
+        pace.slice = 2**62  # all work is one slice
         move(
             self._params, self._parts, states, new_records(STATE, 1), self._work, self._totals, np.array([end]), wrench,
             result, pace,
@@ -137,7 +133,7 @@ class Members:
 
 
 def seen(point: Array) -> Array:
-    """Return the pose that the sensor would show at a state, with the state's delay and bias."""
+    """Return the pose that the sensor would show at a state."""
     unknown = point[_FIRST:]
     pose: Array = point[:3] + unknown[7:10] - point[3:6] * unknown[10]
     return pose
@@ -184,7 +180,6 @@ class Enkf(EnsembleKalmanFilter):  # type: ignore[misc]
 
 
 def run_one(name: str, method: str, seed: int) -> dict[str, Any]:
-    """Run one filter over one truth, and return its errors at the end as a row."""
     truth = draw(GROUPS[name], seed)
     begin = time.process_time()
     one: Any = Ukf(truth) if method == "ukf" else Enkf(truth, seed)
@@ -196,7 +191,7 @@ def run_one(name: str, method: str, seed: int) -> dict[str, Any]:
     try:
         for t, q in zip(truth.poses.t[1:], truth.poses.q[1:], strict=True):
             one.predict(float(t) - one.now)
-            # a component that was not measured gets a noise so large that it has no effect
+            # a component that was not measured gets so much noise that it has no effect
             there = np.isfinite(q)
             one.update(np.where(there, q, 0.0), np.diag(np.where(there, noise, 1e3) ** 2))
     except np.linalg.LinAlgError as error:
@@ -216,7 +211,6 @@ def run_one(name: str, method: str, seed: int) -> dict[str, Any]:
 @click.option("--seed", default=5000, show_default=True)
 @click.option("--out", type=click.Path(path_type=Path), default=RESULTS / "filter_peers.jsonl", show_default=True)
 def main(groups: tuple[str, ...], truths: int, seed: int, out: Path) -> None:
-    """Run both filters on truths of the groups."""
     rows = load_rows(out)
     done = {(row["group"], row["method"], row["seed"]) for row in rows}
     for number in range(seed, seed + truths):

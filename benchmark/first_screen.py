@@ -1,8 +1,8 @@
 """Time of an operator's steps from an empty virtual environment to a screen that shows a growing CSV file.
 
-python benchmark/first_screen.py [FOLDER]
+    python benchmark/first_screen.py [FOLDER]
 
-Prints the time of each step in s as JSON.
+Prints the time of each step of docs/how_to_screen.md in s as JSON.
 """
 
 from __future__ import annotations
@@ -39,11 +39,10 @@ def grow(path: Path, stop: threading.Event) -> None:
 
 
 def main() -> None:
-    """Take the steps of docs/how_to_screen.md, and print the time of each."""
     folder = Path(sys.argv[1] if len(sys.argv) > 1 else tempfile.mkdtemp())
     took: dict[str, Any] = {}
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-    # the cache is empty, so that compiled code of another installation is not used
+    # an empty cache, so that no other installation has compiled the code
     environment["NUMBA_CACHE_DIR"] = environment["PLOW_TWIN_CACHE"] = str(folder / "cache")
 
     def step(name: str) -> None:
@@ -59,14 +58,7 @@ def main() -> None:
     writer.start()
     before = time.monotonic()
     time.sleep(0.5)
-    options = [
-        "--follow",
-        "--scene",
-        "paper",
-        "--dashboard",
-        "--listen",
-        f"127.0.0.1:{PORT}",
-    ]
+    options = ["--follow", "--scene", "paper", "--dashboard", "--listen", f"127.0.0.1:{PORT}"]
     twin = subprocess.Popen(
         list(map(str, [folder / "venv/bin/plow-twin", "live", folder / "load.csv", *options])),
         env=environment,

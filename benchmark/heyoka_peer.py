@@ -1,10 +1,9 @@
 """heyoka, the most similar peer: compiled Taylor series with event detection, called from Python.
 
 The modes of the eight pairs are parameters of the equations. Python callbacks of two terminal events for each pair set
-its mode: the first event is a change of sign of its penetration, the second is the point at which its force would pull.
-The Hunt-Crossley force d^1.5 has no Taylor series at a touch. So here the force begins at a small penetration, where it
-is negligible, and the steps grow from there. The batch integrator computes as many scenes at once as a SIMD vector has
-lanes.
+its mode: the penetration changes sign, or the force would begin to pull. The Hunt-Crossley force d^1.5 has no Taylor
+series at a touch, so here the force begins at a small penetration, where it is negligible. The batch integrator
+computes as many scenes at once as a SIMD vector has lanes.
 """
 
 from __future__ import annotations
@@ -18,10 +17,9 @@ import numpy as np
 from bench_scenes import T_END
 from cases import Array, Sample, timed
 
-#: Time [s] after an event during which heyoka ignores the same event; with heyoka's default it would miss the next
-#: touch.
+#: Time [s] after an event during which heyoka ignores the same event; its default would miss the next touch.
 _COOLDOWN = 1e-7
-#: Indices of the clearances in heyoka's parameters. The modes of the pairs come before the clearances.
+#: Indices of the clearances in heyoka's parameters, after the modes of the pairs.
 _GX, _GY = 8, 9
 
 
@@ -57,8 +55,7 @@ def _equations(p: Array, begin: float) -> tuple[list[tuple[Any, Any]], list[tupl
             force = hy.par[i] * law
         else:
             law = 1.0 + p[10] * rate
-            # if the pair does not act, the base of the power is 1, because a negative penetration has no real power
-            # with a fractional exponent
+            # a negative penetration has no real power, so the base is 1 if the pair does not act
             force = hy.par[i] * p[8] * (hy.par[i] * d + (1.0 - hy.par[i])) ** p[9] * law
             d = d - begin
         fx, fy, torque = fx + along_x * force, fy + along_y * force, torque + arm * force
@@ -109,7 +106,7 @@ def _events(guards: list[tuple[Any, Any]], inside: Array, event: Any) -> list[An
 
 @cache
 def _integrator(numbers: tuple[float, ...], tol: float) -> Any:
-    """Return an integrator, which is compiled once for both outputs, and the array of pairs inside their walls."""
+    """Return an integrator, compiled once for both outputs, and the array of pairs inside their walls."""
     import heyoka as hy
 
     p = np.array(numbers)
@@ -122,7 +119,6 @@ def _integrator(numbers: tuple[float, ...], tol: float) -> Any:
 
 
 def prepare(p: Array, tol: float, output_dt: float) -> Callable[[], Sample]:
-    """Prepare a run of a bench scene; compiling is not timed."""
     integrator, inside = _integrator(tuple(p.tolist()), tol)
     grid = np.arange(round(T_END / output_dt) + 1) * output_dt
 
@@ -157,7 +153,7 @@ def prepare_batch(p: Array, clearances: Array, tol: float, output_dt: float) -> 
     grid = np.arange(round(T_END / output_dt) + 1) * output_dt
     grids = np.ascontiguousarray(np.repeat(grid[:, None], width, axis=1))
     groups = -(-len(clearances) // width)
-    # the last batch is filled up with copies of the last pair
+    # copies of the last pair fill the last batch
     filled = np.concatenate([clearances, np.repeat(clearances[-1:], groups * width - len(clearances), axis=0)])
     poses = np.zeros((len(grid), 3, len(filled)))
 

@@ -26,7 +26,7 @@ SHOWN = 24
 
 
 def _collect() -> None:
-    """Keep the object code of every library, whether it is compiled or read from the cache."""
+    """Keep the object code of every library, compiled or read from the cache."""
     kind: Any = codegen.JITCodeLibrary
     fresh, cached = kind._finalize_specific, kind._unserialize.__func__
 
@@ -59,7 +59,6 @@ def _write_map() -> None:
 
 
 def main() -> None:
-    """Run a bench scene repeatedly under perf, and print each kernel's share."""
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     arguments.add_argument("scene")
     arguments.add_argument("tol", type=float)

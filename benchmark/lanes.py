@@ -24,7 +24,6 @@ def _in_lanes(scene: Scene, count: int, tol: float) -> Callable[[], object]:
 
 
 def main() -> None:
-    """Print the milliseconds of a run and their ratios to the loop, for laws with exponents 1 and 1.5."""
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     arguments.add_argument("--tol", type=float, default=1e-6)
     arguments.add_argument("--rounds", type=int, default=9)

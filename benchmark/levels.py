@@ -14,7 +14,7 @@ LEVELS = (1e-2, 1e-3, 1e-6, 1e-9)
 OUTPUTS = (0.1, 1e-3)
 Member = Callable[[str], bool]
 
-#: Groups of peers. At each level of error, only the fastest member of a group is compared.
+#: Groups of peers; at each level of error, the fastest member of a group counts.
 PEERS: dict[str, Member] = {
     "CVODE from C": lambda solver: solver.startswith("CVODE") and solver.endswith("(C)"),
     "CVODE from C, rootfinding": lambda solver: "rootfinding" in solver,
@@ -26,8 +26,8 @@ PEERS: dict[str, Member] = {
     "our RK4": lambda solver: solver == OURS_RK4,
 }
 OWN: dict[str, Member] = {name: name.__eq__ for name in (OURS_BARE, OURS, OURS_CALL)}
-#: A solver that takes more than this many times as long as the fastest solver of its group is not measured again. The
-#: same holds for a setting compared with the fastest setting of its solver.
+#: A solver that takes this many times as long as the fastest of its group is not measured again, nor is a setting that
+#: takes this many times as long as the fastest of its solver.
 _NEAR = 1.4
 
 
@@ -52,8 +52,8 @@ def ladders(rows: Sequence[Row], scene: str, output_s: float, member: Member) ->
 def reach(ladder: Sequence[Row], level: float) -> Reached | None:
     """Return the least time for an error of at most `level`, of one setting or interpolated between two.
 
-    The interpolation is linear in the logarithms of time and error, and only between neighbouring settings of which the
-    looser misses the level and the tighter reaches it.
+    The interpolation is linear in the logarithms of time and error, between neighbouring settings of which the looser
+    misses the level and the tighter reaches it.
     """
     done = [row for row in ladder if row.status == "ok" and row.error is not None and row.wall_ms is not None]
     times = [Reached(_wall(row), row.solver, row.setting) for row in done if _error(row) <= level]

@@ -1,14 +1,17 @@
 """The live node under load: loss, share of a core and age at a subscriber, compared with a bare rclpy echo.
 
 `python benchmark/live_load.py [--seconds N] [--repeats N]` runs every case once in each repeat, prints a line of JSON
-for each case with the medians of the repeats, and then the targets with the results. `--minutes N` instead runs the
-node with its recorder at 1 kHz (or `--rate`) for N minutes, and prints a line every ten seconds, the growth of each
-figure, and whether each message sent was used or counted. `--beside` runs the echo, the node and a recording node at
-once under the same samples; other programs disturb all of them alike, so that their ratios are valid even on a busy
-machine. `--estimate` runs the node without and with the estimate and its 256 twins in turn, under the paper's load and
-a synthetic pose at 100 Hz, `--repeats` times each, for `--seconds` after the first window has been formed. `--opcua`
-runs `plow-twin live` beside an OPC UA server for `--minutes` (10) instead: see `opcua_load.py`. Publisher, node and
-subscriber share the machine, so only figures of the same run can be compared.
+for each case, then the medians and the targets. Other options replace these cases:
+
+    --minutes N   the node with its recorder at 1 kHz (or `--rate`) for N minutes; prints a line every ten seconds, the
+                  growth of each figure, and whether each message sent was used or counted
+    --beside      the echo, the node and a recording node at once under the same samples; other programs disturb all
+                  of them alike, so the ratios are valid on a busy machine too
+    --estimate    the node without and with the estimate and its 256 twins in turn, under the paper's load and a
+                  synthetic pose at 100 Hz, for `--seconds` after the first window has been formed
+    --opcua       `plow-twin live` beside an OPC UA server for `--minutes` (10): see `opcua_load.py`
+
+Publisher, node and subscriber share the machine, so only figures of the same run can be compared.
 """
 
 from __future__ import annotations
@@ -32,12 +35,12 @@ from typing import Any, NamedTuple
 ROOT = Path(__file__).resolve().parent.parent
 NS_PER_S = 1_000_000_000
 PERIOD_S = 10.0
-#: Time [s] after the first published message by which the first window of an estimate has been formed.
+#: Time from the first published message until the first window of an estimate has been formed [s].
 FORMED_S = 34.0
 
 
 class Case(NamedTuple):
-    """A case: publish mode of the node (or `echo`, `raw_echo`), rate of the samples [Hz], whether the node records."""
+    """Publish mode of the node (or `echo`, `raw_echo`), rate of the samples [Hz], whether the node records."""
 
     mode: str
     rate_hz: float
@@ -53,8 +56,8 @@ CASES = (ECHO, RAW_ECHO, ON_SAMPLE, RECORDED, FIXED, FIXED_RECORDED, Case("fixed
 def echo(raw: bool = False, namespace: str = "live_load") -> None:
     """Answer each sample with three messages as large as those of the node.
 
-    With `raw` the messages are serialised in advance, and only the sample's stamp is written into their bytes, which is
-    the least work that an rclpy node can do.
+    With `raw`, the messages are serialised in advance, and only the stamp of the sample is written into their bytes:
+    the least work of an rclpy node.
     """
     import rclpy
     from geometry_msgs.msg import WrenchStamped
@@ -94,7 +97,7 @@ def echo(raw: bool = False, namespace: str = "live_load") -> None:
 
 
 def send(rate_hz: float, seconds: float) -> None:
-    """Publish samples that are stamped with the time of sending."""
+    """Publish samples stamped with the time of sending."""
     import rclpy
     from geometry_msgs.msg import WrenchStamped
 
@@ -158,7 +161,7 @@ class Probe:
 
 @contextmanager
 def running(answerer: list[str]) -> Iterator[tuple[Probe, int]]:
-    """Start an answering process and wait for its first answer; yields a probe and the process id."""
+    """Start an answering process and wait for its first answer; yield a probe and the process id."""
     probe = Probe()
     process = subprocess.Popen(answerer, env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
@@ -173,7 +176,6 @@ def running(answerer: list[str]) -> Iterator[tuple[Probe, int]]:
 
 
 def source(rate_hz: float, seconds: float) -> subprocess.Popen[bytes]:
-    """Start the publisher."""
     return subprocess.Popen([sys.executable, __file__, "--role", "send", str(rate_hz), str(seconds)], env=environment())
 
 
@@ -183,38 +185,36 @@ def measure(answerer: list[str], rate_hz: float, seconds: float) -> dict[str, fl
         sender, ages, figures = source(rate_hz, seconds), probe.ages, probe.figures
         try:
             probe.spin(lambda: bool(ages) or figures.get("samples_used", "0") != "0", 30.0)
-            busy, begin = _cpu_s(process_id), time.monotonic()
+            busy, begin = cpu_s(process_id), time.monotonic()
             probe.spin(lambda: False, 1.0)
             first_s = max(ages, default=0.0)
             probe.spin(lambda: sender.poll() is not None, seconds + 30.0)
-            share = (_cpu_s(process_id) - busy) / (time.monotonic() - begin)
+            share = (cpu_s(process_id) - busy) / (time.monotonic() - begin)
         finally:
-            sender.kill()  # otherwise it would send to the subscriber of the next case
+            sender.kill()  # otherwise it would send to the next case
             sender.wait()
         figures.pop("samples_used", None)
         if "published" in figures:
             probe.spin(lambda: "samples_used" in figures, 5.0)
-    ages.sort()
     return {
         "sent": round(rate_hz * seconds),
         "used": int(figures.get("samples_used", len(ages))),
         "lost": int(figures.get("samples_lost", 0)),
         "messages": len(ages),
         "core": round(share, 3),
-        "age_p50_ms": round(ages[len(ages) // 2], 3) if ages else math.nan,
-        "age_p99_ms": round(ages[len(ages) * 99 // 100], 3) if ages else math.nan,
+        **_quantiles(ages),
         "age_max_of_first_second_ms": round(first_s, 3),
     }
 
 
+def _quantiles(ages: list[float], without: Any = math.nan) -> dict[str, Any]:
+    """Return the median and the 99 % point of ages, or `without` if there are none."""
+    found = sorted(ages)
+    return {f"age_p{p}_ms": round(found[len(found) * p // 100], 3) if found else without for p in (50, 99)}
+
+
 def environment() -> dict[str, str]:
-    """Return the environment variables of the processes."""
     return os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
-
-
-def _cpu_s(process_id: int) -> float:
-    fields = Path(f"/proc/{process_id}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _twin(mode: str, folder: str, namespace: str = "/live_load", given: dict[str, str] | None = None) -> list[str]:
@@ -248,23 +248,21 @@ def _one_estimating(on: bool, seconds: float) -> dict[str, float]:
             probe.spin(lambda: False, FORMED_S)
             probe.ages.clear()
             beside = _children(process_id)
-            busy = [_exact_cpu_s(process_id), sum(map(_exact_cpu_s, beside))]
+            busy = [cpu_s(process_id), sum(map(cpu_s, beside))]
             begin = time.monotonic()
             probe.spin(lambda: False, seconds)
             passed_s = time.monotonic() - begin
-            share = (_exact_cpu_s(process_id) - busy[0]) / passed_s
-            estimate_share = (sum(map(_exact_cpu_s, beside)) - busy[1]) / passed_s
+            share = (cpu_s(process_id) - busy[0]) / passed_s
+            estimate_share = (sum(map(cpu_s, beside)) - busy[1]) / passed_s
         finally:
             sender.kill()
             sender.wait()
-        ages = sorted(probe.ages)
         return {
-            "messages": len(ages),
+            "messages": len(probe.ages),
             "core": round(share, 3),
             "core_of_the_estimate": round(estimate_share, 3),
             "estimates": int(probe.figures.get("estimates") or 0),
-            "age_p50_ms": round(ages[len(ages) // 2], 3),
-            "age_p99_ms": round(ages[len(ages) * 99 // 100], 3),
+            **_quantiles(probe.ages),
         }
 
 
@@ -284,7 +282,7 @@ def compare(seconds: float, repeats: int) -> None:
                 command = answerer if case in (ECHO, RAW_ECHO) else _twin(case.mode, path)
                 found = measure(command, case.rate_hz, seconds)
                 print(json.dumps(case._asdict() | found), flush=True)
-                if found["messages"]:  # a case without an answer has no age; it is reported below
+                if found["messages"]:  # a case without an answer is reported below
                     runs[case].append(found)
     if not all(runs.values()):
         sys.exit("a case was never answered: no medians")
@@ -297,7 +295,7 @@ def compare(seconds: float, repeats: int) -> None:
 
 
 def _targets(rows: dict[Case, dict[str, float]]) -> Iterator[tuple[str, float, float]]:
-    """Yield for each target its description, the result and the limit."""
+    """Yield the description, the result and the limit of each target."""
     bare = rows[ECHO]
     for case, how in ((ON_SAMPLE, ""), (RECORDED, ", recording")):
         row = rows[case]
@@ -309,7 +307,7 @@ def _targets(rows: dict[Case, dict[str, float]]) -> Iterator[tuple[str, float, f
 
 
 def beside(seconds: float) -> None:
-    """Print CPU time, ages and ratios of the echo, the node and a recording node, which get the same samples."""
+    """Print CPU time, ages and ratios of the echo, the node and a recording node under the same samples."""
     from sensor_msgs.msg import JointState
 
     probe, cases = Probe(), {"echo": ECHO, "on_sample": ON_SAMPLE, "recording": RECORDED}
@@ -332,12 +330,12 @@ def beside(seconds: float) -> None:
             for ages in heard.values():
                 ages.clear()
             while sender.poll() is None:
-                before, begin = {name: _exact_cpu_s(process.pid) for name, process in running.items()}, time.monotonic()
+                before, begin = {name: cpu_s(process.pid) for name, process in running.items()}, time.monotonic()
                 probe.spin(lambda: sender.poll() is not None, 2.0)
                 passed_s = time.monotonic() - begin
                 if passed_s > 1.9:
                     for name, process in running.items():
-                        shares[name].append((_exact_cpu_s(process.pid) - before[name]) / passed_s)
+                        shares[name].append((cpu_s(process.pid) - before[name]) / passed_s)
         finally:
             for process in running.values():
                 process.terminate()
@@ -345,12 +343,11 @@ def beside(seconds: float) -> None:
                 process.wait(20.0)
             probe.close()
     for name, ages in heard.items():
-        ages.sort()
         ratios = [one / echo_s for one, echo_s in zip(shares[name], shares["echo"], strict=True)]
         print(json.dumps({
             "case": name, "messages": len(ages),
             "core": round(median(shares[name]), 3), "x_echo": round(median(ratios), 3),
-            "age_p50_ms": round(ages[len(ages) // 2], 3), "age_p99_ms": round(ages[len(ages) * 99 // 100], 3),
+            **_quantiles(ages),
         }))  # fmt: skip
 
 
@@ -359,14 +356,14 @@ def _append_age(ages: list[float], data: bytes) -> None:
     ages.append((time.time_ns() - sec * NS_PER_S - nanosec) * 1e-6)
 
 
-def _exact_cpu_s(process_id: int) -> float:
+def cpu_s(process_id: int) -> float:
     """Return the CPU time of all threads in s from the scheduler, which is finer than the 10 ms ticks of `stat`."""
     tasks = Path(f"/proc/{process_id}/task").iterdir()
     return sum(int((task / "schedstat").read_text().split()[0]) for task in tasks) * 1e-9
 
 
 def soak(minutes: float, rate_hz: float) -> bool:
-    """Run the node with its recorder; print its memory and figures, their growth in the last half, and the account.
+    """Run the node with its recorder; print its figures, their growth in the last half, and the account.
 
     Return whether each sent message was used, dropped for a reason or counted as lost.
     """
@@ -374,17 +371,16 @@ def soak(minutes: float, rate_hz: float) -> bool:
     with tempfile.TemporaryDirectory() as folder, running(_twin("on_sample", f"{folder}/soak")) as (probe, process_id):
         sender, begin = source(rate_hz, 60.0 * minutes), time.monotonic()
         while sender.poll() is None:
-            count, busy = len(probe.ages), _cpu_s(process_id)
+            count, busy = len(probe.ages), cpu_s(process_id)
             probe.spin(lambda: sender.poll() is not None, PERIOD_S)
-            ages, figures = sorted(probe.ages[count:]), probe.figures
+            ages, figures = probe.ages[count:], probe.figures
             rows.append({
                 "minute": round((time.monotonic() - begin) / 60.0, 2),
                 "rss_mib": round(_status(process_id, "VmRSS") / 1024.0, 2),
                 "threads": _status(process_id, "Threads"),
                 "files": len(os.listdir(f"/proc/{process_id}/fd")),
-                "core": round((_cpu_s(process_id) - busy) / PERIOD_S, 3),
-                "age_p50_ms": round(ages[len(ages) // 2], 3) if ages else None,  # without a clock there are no ages
-                "age_p99_ms": round(ages[len(ages) * 99 // 100], 3) if ages else None,
+                "core": round((cpu_s(process_id) - busy) / PERIOD_S, 3),
+                **_quantiles(ages, None),  # without a clock there are no ages
                 "queued": int(figures.get("queued") or 0),
                 **_account(figures),
             })  # fmt: skip
@@ -409,8 +405,8 @@ def soak(minutes: float, rate_hz: float) -> bool:
 def _growth(minutes: list[float], sizes: list[float]) -> tuple[float, float]:
     """Return the slope per hour after the first quarter, and the half-width of its 95 % interval.
 
-    The slope is fitted to the means of six blocks, because memory grows in steps and neighbouring samples are not
-    independent.
+    Memory grows in steps, and neighbouring samples depend on each other, so the slope is fitted to the means of six
+    blocks.
     """
     import numpy as np
 
@@ -439,7 +435,6 @@ def _status(process_id: int, key: str) -> int:
 
 
 def main() -> None:
-    """Run the measurement that the options choose."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--seconds", type=float, default=5.0)
     parser.add_argument("--repeats", type=int, default=5)

@@ -75,8 +75,7 @@ def _many_twins(scene: Scene, t: Array, wrench: Array, samples: int) -> float:
     return timed(run)[0]
 
 
-#: Program that prepares a live twin. It prints how long import and preparation take, how many kernels numba compiles,
-#: and how many it reads from its cache.
+#: Program that prepares a live twin and prints how long this takes, and how many kernels it compiles or reads.
 _START = """
 import json, sys, time
 begin = time.perf_counter()

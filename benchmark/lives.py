@@ -6,8 +6,8 @@ The wear coefficient of each life is drawn from the prior, and the forecast does
 clearances are measured with noise at each visit. The true wear is computed in steps a quarter as long as the
 forecast's.
 
-Alpha-lambda accuracy and prognostic horizon are defined in Saxena et al., Int. J. Prognostics Health Management 1
-(2010) 1, and the CRPS in Gneiting and Raftery, J. Am. Stat. Assoc. 102 (2007) 359.
+Alpha-lambda accuracy and prognostic horizon: Saxena et al., Int. J. Prognostics Health Management 1 (2010) 1. CRPS:
+Gneiting and Raftery, J. Am. Stat. Assoc. 102 (2007) 359.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from typing import Any
 
 import click
 import numpy as np
+from estimate import RESULTS, load_rows
 from numpy.typing import NDArray
 
 from plow_twin import Clearance, Scene, Wear, load_scene
@@ -28,17 +29,14 @@ from plow_twin.estimate.forecast import HOUR_S, Plan, forecast, with_clearances
 from plow_twin.model.scene import Harmonic
 
 Array = NDArray[np.float64]
-RESULTS = Path(__file__).resolve().parent / "results"
-#: 5 % and 95 % points [m^2/N] of the prior. The true coefficient is drawn from this prior.
+#: 5 % and 95 % points [m^2/N] of the prior, from which the true coefficient is drawn.
 PRIOR = (1e-15, 1e-14)
-#: `GROWTH` [m] is the growth of a clearance that ends a life.
-#: `NOISE` [m] is the standard deviation of an estimated clearance.
-#: `VISITS` is the number of visits in a life.
-#: `SHARES` are the shares of the life at which it is forecast.
+#: Growth of a clearance that ends a life [m], standard deviation of an estimated clearance [m], visits in a life,
+#: shares of the life at which it is forecast.
 GROWTH, NOISE, VISITS, SHARES = 3e-3, 5e-5, 20, (0.3, 0.5, 0.7)
-#: Quantiles that bound the inner 80 % and the inner 90 % of a distribution.
+#: Quantiles of the inner 80 % and 90 % of a distribution.
 _INNER, _INNER_90 = (0.1, 0.9), (0.05, 0.95)
-#: A forecast counts as right if its relative error is at most this.
+#: Largest relative error of a right forecast.
 ALPHA = 0.2
 
 
@@ -108,7 +106,6 @@ def one_life(seed: int) -> list[dict[str, Any]]:
 
 
 def summary(rows: list[dict[str, Any]]) -> str:
-    """Return the table of the page."""
     lines = [
         f"| share of the life | lives | within {100 * ALPHA:.0f} % | 80 % interval holds | its width / "
         "time left | 90 % interval holds | its width / time left | CRPS / life | coefficient within 1.3 |",
@@ -142,7 +139,7 @@ def summary(rows: list[dict[str, Any]]) -> str:
 @click.option("--out", type=click.Path(path_type=Path), default=RESULTS / "lives.jsonl", show_default=True)
 def main(lives: int, seed: int, out: Path) -> None:
     """Run the lives; each is written as soon as it is done, and lives in the file are not run again."""
-    rows = [json.loads(line) for line in out.read_text(encoding="utf-8").splitlines()] if out.exists() else []
+    rows = load_rows(out)
     for number in range(seed, seed + lives):
         if any(row["seed"] == number for row in rows):
             continue

@@ -1,8 +1,8 @@
 """DOP853 compiled by numba, which locates every change of contact on its dense output and restarts there.
 
-This is the solver that an expert on the machine would write. It uses Hairer's method and step control with SciPy's
-coefficients (Hairer, Norsett and Wanner, Solving ODEs I, sec. II.5 and II.6). Contact modes are frozen within a step,
-and rows are read from the dense output.
+This is the solver that an expert would write. It uses the method and the step control of Hairer, Norsett and Wanner,
+Solving ODEs I, sec. II.5 and II.6, with SciPy's coefficients. Contact modes are frozen within a step, and rows are read
+from the dense output.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ _A = np.ascontiguousarray(table.A)
 _B, _C = np.ascontiguousarray(table.B), np.ascontiguousarray(table.C)
 _E3, _E5, _D = np.ascontiguousarray(table.E3), np.ascontiguousarray(table.E5), np.ascontiguousarray(table.D)
 _ROWS = len(_C)
-#: Absolute tolerances divided by rtol. Each is a tenth of the usual size: poses are about 1e-2, velocities about 1.
+#: Absolute tolerances divided by rtol, a tenth of the usual size of poses (1e-2) and velocities (1).
 _ATOL = np.array([1e-3, 1e-3, 1e-3, 1e-1, 1e-1, 1e-1])
 _OFF, _ON, _CLIPPED = 0, 1, 2
-#: A step is divided into this number of equal parts, and guards are checked at the end of each part.
+#: Guards are checked at the end of each of this number of equal parts of a step.
 _LOOKS = 4
 _AT_ONE_INSTANT = 64
 
@@ -84,7 +84,7 @@ def _guards(y: Array, mode: Indexes, p: Array, out: Array) -> None:
 
 @fast
 def _dense(f: Array, y: Array, x: float, out: Array) -> None:
-    """Write the state at the share x of a step, from the step's seven interpolation terms, shape (7, 6)."""
+    """Write the state at the share x of a step, from its seven interpolation terms, shape (7, 6)."""
     for j in range(6):
         value = 0.0
         for i in range(6, -1, -1):
@@ -159,7 +159,7 @@ def _first_change(y: Array, f: Array, mode: Indexes, p: Array, at: Array, guards
 
 @compiled
 def integrate(p: Array, rtol: float, output_dt: float, q: Array) -> tuple[int, int, int]:
-    """Integrate from rest at the origin and fill the rows of q; return the numbers of steps, evaluations and events."""
+    """Integrate from rest at the origin into the rows of q; return the numbers of steps, evaluations and events."""
     k, f = np.zeros((_ROWS, 6)), np.zeros((7, 6))
     y, new, trial, at, guards = np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(16)
     mode = np.zeros(8, np.int64)
@@ -216,7 +216,6 @@ def integrate(p: Array, rtol: float, output_dt: float, q: Array) -> tuple[int, i
 
 
 def prepare(p: Array, rtol: float, output_dt: float) -> Callable[[], Sample]:
-    """Prepare a run; compiling is not timed."""
     q = np.zeros((round(T_END / output_dt) + 1, 3))
     integrate(p, 1e-3, 1.0, np.zeros((1, 3)))
 

@@ -6,7 +6,7 @@
     python benchmark/measured.py --only table    height of the table by the estimate of each drop
     python benchmark/measured.py --plot     pictures of it in docs/images
 
-Parameters are fitted to each half of the data, and errors are computed on the other half.
+Parameters are fitted to each half of the data; errors are those on the other half.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ FOLDER = Path(__file__).resolve().parent
 DATA = FOLDER / "data" / "measured"
 RESULTS = FOLDER / "results" / "measured.json"
 IMAGES = FOLDER.parent / "docs" / "images"
-#: Step by which a fit first changes each unknown.
+#: First step of a fit in each unknown.
 STEPS = {"tilt": 0.004, "fall": 0.1, "fall_along": 0.05, "slip_speed": 0.05, "restitution": 0.05, "friction": 0.03}
 PLAIN = replace(ELLIPSE, fall=0.0, fall_along=0.0, tilt=0.0, restitution=0.54)
 FRICTIONS: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
@@ -147,11 +147,11 @@ def rigid_impact(before: np.ndarray, model: Any, e: float, mu: float) -> np.ndar
 
 
 def routh(slip, rate, tt, nn, tn, e, mu, bit=2e-3, energetic=False):  # type: ignore[no-untyped-def]
-    """Return impulses by Routh's method, which applies Coulomb's friction to each increment of the normal impulse.
+    """Return impulses by Routh's method: Coulomb's friction acts on each increment of the normal impulse.
 
-    The end of the impact is determined by Poisson's restitution (ratio of impulses) or by Stronge's (ratio of the
-    normal force's work). Routh, Dynamics of a system of rigid bodies, 1860; Wang and Mason, J. Appl. Mech. 59 (1992)
-    635; Mirtich, thesis, Berkeley 1996.
+    Poisson's restitution (ratio of impulses) or Stronge's (ratio of the normal force's work) determines the end. Routh,
+    Dynamics of a system of rigid bodies, 1860; Wang and Mason, J. Appl. Mech. 59 (1992) 635; Mirtich, thesis, Berkeley
+    1996.
     """
     along, away, end = np.zeros_like(slip), np.zeros_like(slip), np.full_like(slip, np.inf)
     work, least = np.zeros_like(slip), np.zeros_like(slip)
@@ -173,7 +173,6 @@ def routh(slip, rate, tt, nn, tn, e, mu, bit=2e-3, energetic=False):  # type: ig
 
 
 def mirtich(slip, rate, tt, nn, tn, e, mu):  # type: ignore[no-untyped-def]
-    """Return impulses by Routh's method with Stronge's restitution."""
     return routh(slip, rate, tt, nn, tn, e, mu, energetic=True)  # type: ignore[no-untyped-call]
 
 
@@ -186,8 +185,8 @@ def drumwright_shell(slip, rate, tt, nn, tn, e, mu):  # type: ignore[no-untyped-
     away, along = (tn * slip - tt * rate) / determinant, (tn * rate - nn * slip) / determinant
     slides = np.abs(along) > mu * away
     side = np.sign(along)
-    # the impulse lies on the edge of the friction cone, along (side mu, 1): it leaves the least energy, or is the
-    # larger impulse that stops the approach
+    # on the edge of the friction cone, along (side mu, 1), the impulse leaves the least energy or stops the approach,
+    # whichever is larger
     least = -(side * mu * slip + rate) / (tt * mu**2 + 2.0 * side * mu * tn + nn)
     stopped = -rate / (nn + tn * mu * side)
     away = np.where(slides, np.maximum(least, stopped), away)
@@ -231,7 +230,7 @@ RIGID = {
 
 
 def by_law(impacts: Impacts) -> dict[str, Any]:
-    """Return the errors of each law with each friction, with all parameters fitted, and of extensions of one law."""
+    """Return the errors of each law with each friction, all parameters fitted, and of extensions of one law."""
     found: dict[str, Any] = {"any impulse at the point": impacts.floor()}
     for name, model in RIGID.items():
         found[f"rigid: {name}"] = impacts.rigid(model)
@@ -276,7 +275,7 @@ def sharp() -> np.ndarray:
 
 
 def without_drag() -> np.ndarray:
-    """Return a block without drag and with constant friction, whose outline is that of the preset `measured_square`."""
+    """Return a block with the outline of the preset `measured_square`, without drag, with constant friction."""
     frame, block = load_scene("measured_square").frame, SQUARE.copy()
     block["radius"] = frame.corner_radius_m
     block["half"] = 0.5 * frame.width_m - float(block["radius"])
@@ -285,21 +284,21 @@ def without_drag() -> np.ndarray:
     return block
 
 
-#: Parameters of the block that are fitted together with the marker's. Stiffness and gravity are not fitted.
+#: Parameters of the block that are fitted together with the marker's.
 FITTED = (
     "half", "radius", "gyration", "table", "restitution", "restitution_fall", "friction", "friction_fall", "mass_power",
     "tangential", "tangential_damping", "drag", "spin_drag",
 )  # fmt: skip
 
 
-#: Parameters of the preset `measured_square` that are fitted to motions.
+#: Fitted parameters of the preset `measured_square`.
 PRESET_FITTED = (
     "gyration", "stiffness", "restitution", "restitution_fall", "mass_power", "friction", "tangential",
     "tangential_damping", "gravity",
 )  # fmt: skip
-#: Largest differences at which two first flights count as nearly the same: angle [rad], rates [m/s, m/s, rad/s].
+#: Largest differences between first flights that count as nearly the same: angle [rad], rates [m/s, m/s, rad/s].
 NEAR_TWINS = (0.05, 0.15, 0.15, 1.5)
-#: Two corners hit at the same time if at most this time in s lies between their touches.
+#: Two corners hit at the same time if their touches are at most this far apart [s].
 TWO_AT_ONCE_S = 1e-3
 
 
@@ -310,7 +309,7 @@ class Square:
         self.drops, self.usable = drops, np.array(drops.usable())
         self.first = drops.flight_rows[self.usable] - 1
         bounces = [drops.bounces[i] for i in self.usable]
-        #: number of rows from the end of the first flight to each bounce, 0 if there is no such bounce, shape (n, 3)
+        #: number of rows from the end of the first flight to each of the next bounces, 0 without such a bounce, (n, 3)
         self.rows = np.array(
             [
                 [its[k] - first if k < len(its) else 0 for k in (1, 2, 3)]
@@ -320,9 +319,8 @@ class Square:
         self.flights = np.array([fit_flight(drops.pose[i, : drops.flight_rows[i]]).state for i in self.usable])
 
     def errors(self, block: np.ndarray, marker: Marker, chosen: np.ndarray, bounces: int) -> np.ndarray:
-        """Return the mean distance in m and angle in rad over `bounces` bounces, shape (k, 2).
-
-        Only drops with as many bounces are included.
+        """Return the mean distance in m and angle in rad over `bounces` bounces, shape (k, 2), of drops with as many
+        bounces.
         """
         enough = chosen[self.rows[chosen, bounces - 1] > 0]
         states = marker.state_of_block(self.flights[enough])
@@ -339,10 +337,9 @@ class Square:
         return np.array(found)
 
     def against_rigid(self) -> dict[str, Any]:
-        """Return the errors over one bounce of rigid and of compliant impacts.
+        """Return the errors over one bounce of rigid and of compliant impacts: all, two corners at once, the others.
 
-        They are given for all drops, and for drops in which two corners hit at the same time. Both kinds of impact have
-        the marker, the rounded corners and the drag; e and mu of the rigid impacts are fitted to all drops.
+        Both have the marker, the rounded corners and the drag; e and mu of the rigid impacts are fitted to all drops.
         """
         every = np.flatnonzero(self.rows[:, 0] > 0)
         states, rows = MARKER.state_of_block(self.flights[every]), int(self.rows[every, 0].max()) + 1
@@ -386,7 +383,7 @@ class Square:
             distance = sum(share * (d / (1.0 + d / 0.02)).mean() for share, d in ((1.0, one), (0.3, two)))
             return float(1e3 * distance + 0.3 * np.minimum(angle, 1.0).mean())
 
-        # the marker's initial values come from the angles and heights at rest
+        # the first values of the marker come from the angles and heights at rest
         x = np.array([-0.0335, 3.4e-4, 5.2e-4, *(float(start[name]) for name in names)])
         step = np.array([0.005, 3e-4, 3e-4, *(0.12 * abs(float(start[name])) + 1e-4 for name in names)])
         for turn in range(rounds):
@@ -395,7 +392,7 @@ class Square:
         return numbers(x)
 
     def of_preset(self) -> dict[str, Any]:
-        """Return the errors of the preset `measured_square` over 1, 2, 3 bounces, each drop simulated in one run."""
+        """Return the errors of the preset `measured_square` over 1, 2, 3 bounces."""
         scene, far = load_scene("measured_square"), []
         for bounces in (1, 2, 3):
             chosen, poses = np.flatnonzero(self.rows[:, bounces - 1] > 0), []
@@ -410,11 +407,11 @@ class Square:
     def near_twins(self) -> dict[str, Any]:
         """Return the distance over one bounce between measured drops with nearly the same first flight.
 
-        The drops are compared from the time when the centre is 50 mm above the table, after removal of the difference
-        in x and of whole quarter turns.
+        The drops are compared from the time when the centre is 50 mm above the table. Differences in x and whole
+        quarter turns are removed.
         """
         gravity, height = float(SQUARE["gravity"]), 0.05
-        # time that the centre needs after the flight's last row to fall to a height of 50 mm
+        # time from the last row of the flight until the centre is 50 mm above the table
         z, fall = self.flights[:, 1], self.flights[:, 4]
         shift = (fall + np.sqrt(np.maximum(fall**2 + 2.0 * gravity * (z - height), 0.0))) / gravity
         turned = self.flights[:, 2] + shift * self.flights[:, 5]
@@ -462,16 +459,13 @@ def of_drops(drops: Drops) -> dict[str, Any]:
         "rounded corners, falling restitution and friction, marker": (SQUARE, MARKER),
         "sharp corners, constant restitution and friction": (sharp(), Marker()),
     }
+    square = Square(drops)
+    every = np.arange(len(square.usable))
     for name, (block, marker) in kinds.items():
-        far: list[list[tuple[float, float]]] = [[], [], []]
-        inside: list[list[np.ndarray]] = [[], [], []]
+        inside: list[list[np.ndarray]] = [[], []]
         scores = []
-        for index in drops.usable():
+        for index in square.usable:
             pose, given, lows = drops.pose[index], int(drops.flight_rows[index]), drops.bounces[index]
-            flight = fit_flight(pose[:given], block)
-            begin = marker.state_of_block(flight.state[None])
-            rows = marker.measured(toss(begin, len(pose), np.array([block], block.dtype)))[0]
-            start = given - 1
             until = drops.until(index, 2) + 1
             members = ensemble(
                 pose[:given], until, members=200, seed=index, block=block, scatter=SCATTER, marker=marker
@@ -479,19 +473,10 @@ def of_drops(drops: Drops) -> dict[str, Any]:
             low, high = np.quantile(members, [0.05, 0.95], axis=0)
             holds = (pose[:until] >= low) & (pose[:until] <= high)
             scores.append(crps(members[:, given:], pose[given:until]).mean(axis=0))
-            edges = [start, *lows[1:3]]
-            for bounce, (first, last) in enumerate(pairwise(edges)):
-                off = rows[: last - start, :3] - pose[start:last]
-                # a distance is a mean from the end of the flight to this bounce, so it includes the earlier bounces
-                far[bounce].append((float(np.hypot(off[:, 0], off[:, 1]).mean()), float(np.abs(off[:, 2]).mean())))
+            for bounce, (first, last) in enumerate(pairwise([given - 1, *lows[1:3]])):
                 inside[bounce].append(holds[first:last].mean(axis=0))
-            if len(lows) > 3:
-                off = rows[: lows[3] - start, :3] - pose[start : lows[3]]
-                far[2].append((float(np.hypot(off[:, 0], off[:, 1]).mean()), float(np.abs(off[:, 2]).mean())))
         found[name] = {
-            "drops": [len(one) for one in far],
-            "distance_mm": [round(1e3 * float(np.median([d for d, _ in one])), 1) for one in far],
-            "angle_rad": [round(float(np.median([a for _, a in one])), 2) for one in far],
+            **medians([square.errors(block, marker, every, bounces) for bounces in (1, 2, 3)]),
             "coverage": [np.round(np.mean(one, axis=0), 3).tolist() for one in inside if one],
             "crps_mm_mm_rad": np.round(np.mean(scores, axis=0) * [1e3, 1e3, 1.0], 2).tolist(),
             "crps_median": np.round(np.median(scores, axis=0) * [1e3, 1e3, 1.0], 2).tolist(),
@@ -530,7 +515,7 @@ def of_table(drops: Drops) -> dict[str, Any]:
 
 
 def of_heights(drops: Drops) -> dict[str, Any]:
-    """Return how much the table's height differs from drop to drop, by the heights at rest and at impacts."""
+    """Return how much the height of the table differs between drops, by the heights at rest and at impacts."""
     square, t = load_scene("measured_square"), np.arange(drops.pose.shape[1]) / RATE_HZ
     nothing = Load(t[[0, -1]], np.zeros((2, 3)))
     places, rests, hits = [], [], []

@@ -1,4 +1,4 @@
-"""Tables of the comparison with measurements, for `docs/measured.md`, from `benchmark/results/measured.json`."""
+"""Tables of `docs/measured.md`, from `benchmark/results/measured.json`."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from bench_scenes import ROOT
+from cases import table
 
 RESULTS = ROOT / "benchmark" / "results" / "measured.json"
 _FRICTIONS = ("regularised", "spring", "spring and damper")
@@ -17,12 +18,8 @@ def _part(name: str) -> dict[str, Any]:
     return found
 
 
-def _lines(head: list[str], rows: list[list[str]]) -> str:
-    return "\n".join("| " + " | ".join(row) + " |" for row in (head, ["---"] * len(head), *rows))
-
-
 def measured_laws() -> str:
-    """Return the table of RMS and median errors in m/s of each law with each friction."""
+    """Return RMS and median errors in m/s of each law with each friction."""
     found = _part("ellipse")
 
     def figures(name: str) -> str:
@@ -31,11 +28,11 @@ def measured_laws() -> str:
     laws = [name.removesuffix(", regularised") for name in found if name.endswith(", regularised")]
     rows = [[f"`{law}`" if " " not in law else law, *(figures(f"{law}, {one}") for one in _FRICTIONS)] for law in laws]
     single = [name for name in found if not name.endswith(_FRICTIONS)]
-    return _lines(["RMS / median [m/s]", *_FRICTIONS], rows + [[name, figures(name), "", ""] for name in single])
+    return table(["RMS / median [m/s]", *_FRICTIONS], rows + [[name, figures(name), "", ""] for name in single])
 
 
 def measured_drops() -> str:
-    """Return the table of distances, angles, coverage and scores of the drops."""
+    """Return distances, angles, coverage and scores of the drops."""
     rows = []
     for name, one in _part("square").items():
         coverage = ["x {:.2f}, z {:.2f}, theta {:.2f}".format(*each) for each in one["coverage"]]
@@ -52,11 +49,11 @@ def measured_drops() -> str:
         rows.insert(place, [name, *(f"{mm:.1f} mm, {rad:.2f} rad" for mm, rad in pairs), "", "", ""])
     counts = next(iter(_part("square").values()))["drops"]
     head = ["block", *(f"error over {n} ({count} drops)" for n, count in zip((1, 2, 3), counts, strict=True))]
-    return _lines([*head, "inside after bounce 1", "after bounce 2", "median CRPS of x, z, theta"], rows)
+    return table([*head, "inside after bounce 1", "after bounce 2", "median CRPS of x, z, theta"], rows)
 
 
 def measured_rigid() -> str:
-    """Return the table of errors of rigid and compliant impacts, with and without two corners that hit at once."""
+    """Return errors of rigid and compliant impacts, with and without two corners that hit at once."""
     found = _part("square_rigid")
     e, mu = found["e, mu"]
     names = {
@@ -64,11 +61,11 @@ def measured_rigid() -> str:
         "compliant": "compliant",
     }
     rows = [[text, *(f"{mm:.1f} mm" for mm in found[name])] for name, text in names.items()]
-    return _lines(["over one bounce", "all", f"two corners at once ({found['two_at_once']} drops)", "the others"], rows)
+    return table(["over one bounce", "all", f"two corners at once ({found['two_at_once']} drops)", "the others"], rows)
 
 
 def measured_table() -> str:
-    """Return the list of errors of the estimated height of the drop table."""
+    """Return errors of the estimated height of the drop table."""
     found = _part("table")
     rows = {
         "estimated": f"{found['estimated']} of {found['drops']} drops",

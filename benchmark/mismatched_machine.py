@@ -1,7 +1,7 @@
 """A machine with properties that a scene lacks: its own equations, integrated with fixed Runge-Kutta steps.
 
-It does not use the solver. The walls may differ in stiffness, the corners may be round, the pads may be displaced, the
-frame may stand on a spring, and the corners may rub. Only heads with `rotation: paper` are modelled.
+It does not use the solver. Walls may differ in stiffness, corners may be round and rub, pads may be displaced, and the
+frame may stand on a spring. Only heads with `rotation: paper` are modelled.
 """
 
 from __future__ import annotations
@@ -18,11 +18,9 @@ from plow_twin.model.scene import Scene
 
 Array = NDArray[np.float64]
 
-#: `_STEPS_A_PERIOD` is the number of steps in the shortest period of a contact's oscillation.
-#: `_LONGEST_STEP` is the longest step in s.
+#: Steps in the shortest period of a contact's oscillation, and longest step [s].
 _STEPS_A_PERIOD, _LONGEST_STEP = 60.0, 1e-4
-#: `_FRAME_MASS` is the mass in kg of a frame that stands on a spring.
-#: `_FRAME_DAMPING` is the damping ratio of this frame.
+#: Mass [kg] and damping ratio of a frame that stands on a spring.
 _FRAME_MASS, _FRAME_DAMPING = 500.0, 0.1
 #: Speed in m/s below which friction is viscous.
 _CREEP = 0.005
@@ -30,24 +28,17 @@ _CREEP = 0.005
 
 @dataclass(frozen=True)
 class Machine:
-    """Properties of the machine that a scene lacks.
+    """Properties of the machine that a scene lacks."""
 
-    Attributes
-    ----------
-    stiffness_share, depth : ndarray, shape (8,)
-        Stiffness of each pair relative to the contact's, and distance in m by which its wall lies farther out.
-    radius : float
-        Radius of the corners in m.
-    friction : float
-        Coefficient of friction.
-    spring : float
-        Stiffness in N/m of the spring under the frame, along x and along y; 0 for a fixed frame.
-    """
-
+    #: stiffness of each pair relative to the contact's, shape (8,)
     stiffness_share: Array
+    #: distance by which the wall of each pair lies farther out [m], shape (8,)
     depth: Array
+    #: radius of the corners [m]
     radius: float = 0.0
+    #: coefficient of friction
     friction: float = 0.0
+    #: stiffness of the spring under the frame, along x and along y [N/m]; 0 for a fixed frame
     spring: float = 0.0
 
 

@@ -1,9 +1,9 @@
 """The wear coefficient after a simulated month: `python benchmark/month.py --truths 20`.
 
-A head works for a month under a broad-band load. On some days its pose is measured over ten load periods by a noisy,
-biased and late sensor, together with a load that is 5 % off. `estimate` finds the clearances from these data, and their
-growth gives the coefficient. The true wear is computed in steps a quarter as long as the estimate's, with means over
-four times as many periods.
+A head works for a month under a broad-band load. On some days, a noisy, biased and late sensor measures its pose over
+ten load periods; the given load is 5 % off. `estimate` finds the clearances from these data, and their growth gives the
+coefficient. The true wear is computed in steps a quarter as long as the estimate's, with means over four times as many
+periods.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any
 
 import click
 import numpy as np
+from estimate import RESULTS, load_rows
 from estimate_truths import PERIOD, cutting
 from numpy.typing import NDArray
 
@@ -30,20 +31,17 @@ from plow_twin.model.loads import compile_loads
 from plow_twin.stream.outputs import clearances
 
 Array = NDArray[np.float64]
-RESULTS = Path(__file__).resolve().parent / "results"
 #: Days on which the pose is measured.
 DAYS = np.linspace(0.0, 30.0, 7)
 SPEED_M_S, PAD_AREA_M2 = 2.0, 0.06
-#: 5 % and 95 % points [m^2/N] of the prior. The true coefficient is drawn from this prior.
+#: 5 % and 95 % points [m^2/N] of the prior, from which the true coefficient is drawn.
 PRIOR = (3e-16, 3e-15)
-#: The estimated wear coefficient should be right within this factor.
+#: The coefficient should be right within this factor.
 FACTOR = 1.3
-#: `_FINE`, `_LOAD_STEP` and `_POSE_STEP` are the sampling intervals [s] of the true load, of the given load and of the
-#: pose.
+#: Sampling intervals [s] of the true load, of the given load and of the pose.
 _FINE, _LOAD_STEP, _POSE_STEP = 1e-3, 2e-3, 1e-2
 _SPAN = 10.0 * PERIOD
-#: `_BROAD` is the standard deviation of the load's broad-band part [N, N, N m].
-#: `_NOISE` is the standard deviation of the sensor's noise [m, m, rad].
+#: Standard deviations of the broad-band part of the load [N, N, N m] and of the sensor's noise [m, m, rad].
 _BROAD, _NOISE = np.array([8e3, 4e3, 1.1e4]), np.array([5e-4, 5e-4, 2e-3])
 
 
@@ -60,7 +58,6 @@ class Machine:
 
 
 def machine(rng: np.random.Generator) -> Machine:
-    """Draw a machine."""
     low, high = np.log(PRIOR)
     known = float(np.exp(rng.normal(0.5 * (low + high), (high - low) / 3.2897)))
     believed = replace(load_scene("paper"), wear=Wear(1e-15, PAD_AREA_M2, SPEED_M_S, prior_m2_n=PRIOR))
@@ -77,7 +74,7 @@ def load_of(one: Machine, rng: np.random.Generator, span: float) -> tuple[Array,
 
 
 def visit(one: Machine, worn: Scene, rng: np.random.Generator) -> tuple[Load, Poses]:
-    """Return the measurements of a worn machine: the load given to the estimate, and the sensor's poses."""
+    """Return the measurements of a worn machine: the load given to the estimate, and the poses of the sensor."""
     t, believed = load_of(one, rng, _SPAN)
     motion = simulate(replace(worn, loads=(Table("cutting", t, believed * one.gain),)), _SPAN, _FINE, 1e-6)
     at = np.arange(0.0, _SPAN, _POSE_STEP)
@@ -119,7 +116,7 @@ def one_month(seed: int, day_m: float) -> dict[str, Any]:
 
 
 def true_path(one: Machine, rng: np.random.Generator, day_m: float) -> life.Path:
-    """Return the path of the true wear over the month, computed in finer steps and with longer means than estimates."""
+    """Return the path of the true wear over the month."""
     jump, periods = tuning.JUMP, tuning.MEAN_PERIODS
     tuning.JUMP, tuning.MEAN_PERIODS = (jump[0] / 4.0, jump[1]), (periods[0], 4 * periods[1])
     try:
@@ -132,7 +129,6 @@ def true_path(one: Machine, rng: np.random.Generator, day_m: float) -> life.Path
 
 
 def summary(rows: list[dict[str, Any]]) -> str:
-    """Return the table of the page."""
     ratio = np.array([[row[key] for key in ("p05_ratio", "p50_ratio", "p90_ratio", "p95_ratio")] for row in rows])
     near = (np.abs(np.log(ratio)) <= np.log(FACTOR)).sum(axis=0)
     held = int(((ratio[:, 0] <= 1.0) & (ratio[:, 3] >= 1.0)).sum())
@@ -154,8 +150,7 @@ def summary(rows: list[dict[str, Any]]) -> str:
 @click.option("--out", type=click.Path(path_type=Path), default=RESULTS / "month.jsonl", show_default=True)
 def main(truths: int, seed: int, day_km: float, out: Path) -> None:
     """Run the months; each is written as soon as it is done, and months in the file are not run again."""
-    rows = [json.loads(line) for line in out.read_text(encoding="utf-8").splitlines()] if out.exists() else []
-    rows = [row for row in rows if row["day_m"] == 1e3 * day_km]
+    rows = [row for row in load_rows(out) if row["day_m"] == 1e3 * day_km]
     for number in range(seed, seed + truths):
         if any(row["seed"] == number for row in rows):
             continue

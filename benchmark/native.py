@@ -18,13 +18,7 @@ class NotInstalled(Exception):
 
 
 def compile_c(source: str, libraries: Sequence[str], flags: Sequence[str] = FLAGS) -> str:
-    """Compile the file `source` of this folder, and return the path of the program.
-
-    Raises
-    ------
-    NotInstalled
-        The compiler, a header or a library is missing.
-    """
+    """Compile the file `source` of this folder, and return the path of the program, or raise `NotInstalled`."""
     compiler = shutil.which("gcc")
     if compiler is None:
         raise NotInstalled("no gcc on PATH")

@@ -1,8 +1,8 @@
 """`plow-twin live` on an OPC UA server that writes three values at 1 kHz: loss, share of a core, age at the twin.
 
-`python benchmark/live_load.py --opcua [--minutes 10]` first connects a bare asyncua client to the server for a tenth of
-the time, to measure the age that the server and the loopback connection cause alone. Both processes ask for SCHED_FIFO,
-so that other programs do not delay them; the load of the machine is printed with the figures.
+`python benchmark/live_load.py --opcua [--minutes 10]` first connects a bare asyncua client for a tenth of the time. It
+shows the age that the server and the loopback connection cause alone. Both processes ask for SCHED_FIFO, so that other
+programs do not delay them. The load of the machine is printed with the figures.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parent.parent
+from live_load import ROOT, cpu_s
+
 NODES = ("Load.Fx", "Load.Fy", "Load.M")
 NAMESPACE = 2
-#: The bare client requests this publishing interval [ms] and this queue length, as the twin does.
+#: Publishing interval [ms] and queue length that the bare client requests, as the twin does.
 PUBLISHING_MS, QUEUE = 10.0, 10_000
-#: The bare client ends when it has received no value for this time [s].
+#: Time without a value after which the bare client ends [s].
 SILENCE_S = 3.0
 MAP = "excitation: {fx: {node: ns=2;s=Load.Fx}, fy: {node: ns=2;s=Load.Fy}, m: {node: ns=2;s=Load.M}}\n"
-#: `MOST_AGE_MS` is the target for the 99th percentile of the age [ms].
-#: `MOST_CORE` is the target for the share of a core.
+#: Targets: 99th percentile of the age [ms], share of a core.
 MOST_AGE_MS, MOST_CORE = 15.0, 0.5
 
 
@@ -45,7 +45,7 @@ def at_once() -> bool:
 
 
 async def serve(port: int, rate_hz: float, seconds: float) -> None:
-    """Serve three nodes; when a client subscribes, write values whose source timestamp is the time of writing."""
+    """Serve three nodes; when a client subscribes, write values stamped with the time of writing."""
     from asyncua import ua
     from asyncua.server.server import Server
     from asyncua.ua.status_codes import StatusCodes
@@ -140,11 +140,11 @@ def _live(
         cwd=folder, env=os.environ | {"PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     assert server.stdout is not None and twin.stdout is not None
-    time.sleep(0.2 * seconds)  # the start of the process is not measured
-    begin, busy, machine = time.monotonic(), _cpu_s(twin.pid), _machine_s() - _cpu_s(server.pid)
+    time.sleep(0.2 * seconds)  # the start is not measured
+    begin, busy, machine = time.monotonic(), cpu_s(twin.pid), _machine_s() - cpu_s(server.pid)
     time.sleep(0.6 * seconds)
-    passed_s, used_s = time.monotonic() - begin, _cpu_s(twin.pid) - busy
-    load = (_machine_s() - _cpu_s(server.pid) - machine - used_s) / passed_s
+    passed_s, used_s = time.monotonic() - begin, cpu_s(twin.pid) - busy
+    load = (_machine_s() - cpu_s(server.pid) - machine - used_s) / passed_s
     assert server.stdout.readline() == "written\n"
     time.sleep(SILENCE_S)
     twin.terminate()
@@ -166,7 +166,7 @@ def _live(
 
 @contextmanager
 def _server(rate_hz: float, seconds: float) -> Iterator[tuple[subprocess.Popen[str], int]]:
-    """Run a server in a separate process; yields the process and the server's port."""
+    """Run a server in a process; yield the process and the port of the server."""
     with socket.socket() as found:
         found.bind(("127.0.0.1", 0))
         port = int(found.getsockname()[1])
@@ -182,11 +182,6 @@ def _server(rate_hz: float, seconds: float) -> Iterator[tuple[subprocess.Popen[s
         process.communicate()
 
 
-def _cpu_s(process_id: int) -> float:
-    fields = Path(f"/proc/{process_id}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-
 def _machine_s() -> float:
     """Return the busy time of all processors in s."""
     fields = list(map(int, Path("/proc/stat").read_text().splitlines()[0].split()[1:9]))
@@ -194,7 +189,6 @@ def _machine_s() -> float:
 
 
 def main() -> None:
-    """Run the server or the bare client."""
     role, port, *numbers = sys.argv[1:]
     at_once()
     logging.disable()

@@ -14,7 +14,7 @@ from cases import Row
 from matplotlib.ticker import LogLocator, NullFormatter
 from work_precision import OURS, SECTION
 
-#: Colour and marker of each solver that is drawn, in the order of the legend.
+#: Colour and marker of each solver, in the order of the legend.
 STYLES: dict[str, tuple[str, str]] = {
     OURS: ("#d62728", "o"),
     "heyoka (Taylor, events)": ("#111111", "*"),
@@ -31,7 +31,7 @@ STYLES: dict[str, tuple[str, str]] = {
     "MuJoCo RK4": ("#8c510a", ">"),
     "Exudyn RK44": ("#dfa526", "h"),
 }
-#: Engines that have only rows 1 ms apart; their points are drawn together with the sparse rows of the other solvers.
+#: Engines that have only rows 1 ms apart, drawn together with the sparse rows of the other solvers.
 _DENSE_ONLY = ("MuJoCo", "Exudyn")
 
 

@@ -18,14 +18,14 @@ from lives import SHARES
 
 from plow_twin.estimate.result import NORMAL_P95, State
 
-#: Groups that are drawn, in the order of the legend, with their colours.
+#: Colours of the groups, in the order of the legend.
 STYLES = {
     "plain": "#1f4e9c", "sensor": "#5aae61", "stochastic": "#dfa526", "middle": "#8c510a", "firm": "#35978f",
     "hard": "#d62728", "hard_sensor": "#9970ab",
 }  # fmt: skip
 #: First seed that no tuning used.
 _FRESH = 50_000
-#: Limit of the error axis [mm]; larger errors lie outside the picture.
+#: Limit of the error axis [mm].
 _MOST_MM = 0.5
 
 
@@ -59,7 +59,7 @@ def _draw_errors(panel: Any, rows: Sequence[dict[str, Any]], axis: str, color: s
     bars = np.array([1e3 * NORMAL_P95 * row[f"{axis}_sd_m"] for row in known])
     panel.errorbar(stiffness, errors, bars, fmt=".", color=color, label=title, linewidth=0.8, markersize=4)
     unknown = [row["stiffness"] for row in rows if row[f"{axis}_state"] != State.ESTIMATED.value]
-    # a truth without an estimate is drawn as a tick at the lower edge
+    # a truth without an estimate is a tick at the lower edge
     panel.plot(unknown, [-0.98 * _MOST_MM] * len(unknown), "|", color=color, markersize=9)
 
 
@@ -89,7 +89,6 @@ def _draw_lives(panel: Any, lives: Sequence[dict[str, Any]]) -> None:
 
 
 def main() -> None:
-    """Draw the results."""
     path = RESULTS.parent.parent / "docs" / "images" / "estimate.png"
     draw(fresh(load_rows(RESULTS / "estimate.jsonl")), load_rows(RESULTS / "lives.jsonl"), path)
 

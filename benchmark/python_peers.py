@@ -10,7 +10,7 @@ from bench_scenes import T_END
 from cases import Array, Sample, timed
 from lean import rhs_into
 
-#: Absolute tolerances divided by rtol. Each is a tenth of the usual size: poses are about 1e-2, velocities about 1.
+#: Absolute tolerances divided by rtol, a tenth of the usual size of poses (1e-2) and velocities (1).
 _ATOL = np.array([1e-3, 1e-3, 1e-3, 1e-1, 1e-1, 1e-1])
 
 
@@ -34,7 +34,6 @@ def _rhs(p: Array) -> Rhs:
 
 
 def prepare_solve_ivp(p: Array, method: str, rtol: float, output_dt: float) -> Callable[[], Sample]:
-    """Prepare `scipy.integrate.solve_ivp`."""
     from scipy.integrate import solve_ivp
 
     solve = partial(
@@ -69,7 +68,6 @@ def prepare_odeint(p: Array, rtol: float, output_dt: float) -> Callable[[], Samp
 
 
 def prepare_sundae(p: Array, method: str, rtol: float, output_dt: float) -> Callable[[], Sample]:
-    """Prepare CVODE through scikit-sundae, whose right-hand side writes into an array."""
     from sksundae.cvode import CVODE
 
     grid = _grid(output_dt)

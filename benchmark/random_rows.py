@@ -12,8 +12,8 @@ from work_precision import OURS_BARE, prepare_bare
 from plow_twin import Scene, SolverError
 
 TOLERANCES = (1e-3, 1e-6, 1e-9)
-#: If a displacement at t = 0 grows by more than this factor, no step control can keep a tolerance, so the scene is
-#: listed separately.
+#: Growth of a displacement at t = 0 above which no step control can keep a tolerance; such scenes are listed
+#: separately.
 AMPLIFIES = 1e4
 QUICK_COUNT = 10
 
@@ -21,7 +21,7 @@ QUICK_COUNT = 10
 def random_rows(few: bool, notify: Callable[[str], None]) -> Iterator[Row]:
     """Yield a row for each random scene with its error in tolerances (`value`) and its amplification.
 
-    With `few` only scenes are run that use the kernel of the KV bench scene.
+    With `few`, only scenes are run that use the kernel of the KV bench scene.
     """
     saved = random_scenes.load()
     chosen = [index for index, scene in enumerate(saved.scenes) if not few or _is_plain(scene)]

@@ -1,11 +1,14 @@
-"""Seeded random scenes and their reference trajectories, made by `reference.c` in extended precision."""
+"""Seeded random scenes and their reference trajectories, made by `reference.c` in extended precision.
+
+`python benchmark/random_scenes.py` draws the scenes and runs the references again; it needs gcc with libquadmath.
+"""
 
 from __future__ import annotations
 
 import json
 import os
 import subprocess
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +17,7 @@ from typing import Any
 import numpy as np
 from native import FLAGS, compile_c
 from numpy.typing import NDArray
+from rich.progress import track
 
 from plow_twin import Clearance, Contact, Frame, Gravity, Harmonic, Head, Initial, Scene
 from plow_twin.model.contact_laws import LAWS
@@ -23,10 +27,10 @@ HERE = Path(__file__).resolve().parent
 DATA = HERE / "data" / "random_scenes.npz"
 COUNT, SEED = 200, 20150419
 T_END, OUTPUT_DT = 1.0, 0.02
-#: Tolerance of a step and longest step in contact, for two reference runs in each arithmetic. The two runs must agree.
+#: Tolerance of a step and longest step in contact, for two reference runs in each arithmetic.
 LONG_DOUBLE = (1e-16, 0.6), (1e-15, 1.0)
 QUAD = (1e-21, 0.6), (1e-19, 1.0)
-#: If the two runs differ by more than this multiple of the clearance, both are run again in 113-bit arithmetic.
+#: If the two runs differ by more than this multiple of the clearance, both are repeated in 113-bit arithmetic.
 AGREED = 1e-11
 PERTURBATION = 1e-12
 _KINDS = {"kelvin_voigt": 0, "hunt_crossley": 1, "exact_restitution": 2}
@@ -47,8 +51,8 @@ class ReferenceRun:
 class RandomScenes:
     """The scenes with reference poses `q` (n, rows, 3) at the times `t` (rows,).
 
-    `disagreement` (n,) is the largest distance between the two reference runs in clearances (see `distance`), and
-    `amplification` (n,) is the largest growth of a displacement of 1e-12 clearances at t = 0.
+    `disagreement` (n,) is the largest distance between the two reference runs in clearances (see `distance`).
+    `amplification` (n,) is the growth of a displacement of 1e-12 clearances at t = 0.
     """
 
     scenes: Sequence[Scene]
@@ -70,7 +74,7 @@ def distance(scene: Scene, q: NDArray[np.float64], reference: NDArray[np.float64
 
 
 def draw_scene(rng: np.random.Generator) -> Scene:
-    """Draw geometry, mass, law, stiffness, loads and initial velocity; draw again if the contact is too soft."""
+    """Draw a scene whose contact is not too soft."""
     while True:
         parameters = _draw(rng)
         head, frame, contact = parameters["head"], parameters["frame"], parameters["contact"]
@@ -149,7 +153,7 @@ def reference_run(
     *,
     quad: bool = False,
 ) -> ReferenceRun:
-    """Run the reference program on one scene, in arithmetic with a mantissa of 64 bits, or of 113 bits if `quad`."""
+    """Run the reference program on one scene, with a mantissa of 64 bits, or of 113 bits if `quad`."""
     program = (
         compile_c("reference.c", ["-lquadmath", "-lm"], (*FLAGS, "-DQUAD"))
         if quad
@@ -164,7 +168,7 @@ def reference_run(
     return ReferenceRun(numbers[5:].reshape(rows, 3), status == 0, steps, evaluations, events)
 
 
-def make(progress: Callable[[], None] = lambda: None) -> None:
+def make() -> None:
     """Draw the scenes, run their references and save both to `DATA`."""
     rng = np.random.default_rng(SEED)
     scenes = [draw_scene(rng) for _ in range(COUNT)]
@@ -178,13 +182,12 @@ def make(progress: Callable[[], None] = lambda: None) -> None:
         )
         if not (fine.finished and coarse.finished) or distance(scene, coarse.q, fine.q) > AGREED:
             fine, coarse = (reference_run(scene, T_END, OUTPUT_DT, setting, quad=True) for setting in QUAD)
-        progress()
         if not (fine.finished and coarse.finished):
             return np.full((rows, 3), np.nan), np.nan, amplification, fine.events
         return fine.q, distance(scene, coarse.q, fine.q), amplification, fine.events
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        runs = list(pool.map(one, scenes))
+        runs = list(track(pool.map(one, scenes), "references", COUNT))
     q, disagreement, amplification, events = (np.array(column) for column in zip(*runs, strict=True))
     lines = [reference_line(scene, T_END, OUTPUT_DT) for scene in scenes]
     restitution = [scene.contact.restitution for scene in scenes]
@@ -222,3 +225,7 @@ def _scene_of(line: str, restitution: float | None) -> Scene:
         loads=tuple(loads),
         initial=Initial((n[17], n[18], n[19]), (n[20], n[21], n[22])),
     )
+
+
+if __name__ == "__main__":
+    make()

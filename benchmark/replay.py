@@ -1,12 +1,12 @@
 """Speed of replay and of reading the same file, and size of a recording: `python benchmark/replay.py [SECONDS]`.
 
-The paper's head is recorded at 1 kHz with all outputs. The program prints the size, the speed of replay as a multiple
-of real time (of all messages, and of digests alone), and its upper bounds (the motion alone, decompression alone). It
-also prints the speed of a drawing that is thinned like the drawing of an hour, and of reading the file with `mcap` and
-`rosbags`. Times are processor times of one thread, the least of some runs.
+The paper's head is recorded at 1 kHz with all outputs. The program prints the size; the speed of replay as a multiple
+of real time, of all messages and of digests alone; its upper bounds, the motion alone and decompression alone; and the
+speed of a drawing thinned like that of an hour, and of reading the file with `mcap` and `rosbags`. Times are processor
+times of one thread, the least of some runs.
 
-The start of a replay (scene, twin, loading of compiled code) has its own row. Each time includes it, the last column
-does not. The start is negligible for an hour; for 100 s it is a tenth of a replay by digests alone.
+The start of a replay (scene, twin, loading of compiled code) has its own row. The other times include it; the last
+column does not.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _AMPLITUDE = np.array([32_000.0, -11_000.0, -45_495.0])
 _START_NS = 1_800_000_000_000_000_000
 _REPEATS = 5
 _BATCH = 8192
-#: Length [s] of a recording so short that replaying it takes hardly longer than starting a replay.
+#: Length of a recording whose replay is hardly more than its start [s].
 _SHORT_S = 0.1
 
 
@@ -74,7 +74,6 @@ def least(work: Callable[[], object]) -> float:
 
 
 def _wrenches(index: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the loads of samples, shape (n, 3)."""
     wrenches: NDArray[np.float64] = np.sin(2e-3 * index)[:, None] * _AMPLITUDE
     return wrenches
 
@@ -90,20 +89,17 @@ def move(seconds: float, rows: bool) -> None:
 
 
 def decompress_all(path: Path) -> None:
-    """Decompress every chunk and check it."""
     for _ in ChunkReader(path):
         pass
 
 
 def read_mcap(path: Path) -> None:
-    """Read all messages with the `mcap` library."""
     with path.open("rb") as stream:
         for _ in make_reader(stream).iter_messages(log_time_order=False):
             pass
 
 
 def read_rosbags(folder: Path) -> None:
-    """Read all messages with `rosbags`, without decoding them."""
     with Reader(folder) as reader:
         for _ in reader.messages():
             pass
@@ -119,7 +115,7 @@ def main(seconds: float) -> None:
             size = record(folder, seconds, outputs)
             print(f"{folder.name:8} {size / seconds / 1e3:8.1f} kB/s {size / seconds * 3.6e-3:8.0f} MB/h")
         record(short, _SHORT_S, True)
-        replay(short)  # the first replay compiles
+        replay(short)  # compiles
         replay(short, digests_only=True)
         start = least(lambda: replay(short))
         print(f"{'start of a replay':26} {start:8.3f} s")
@@ -134,7 +130,7 @@ def main(seconds: float) -> None:
             "read with mcap": lambda: read_mcap(full / "full_0.mcap"),
             "read with rosbags": lambda: read_rosbags(full),
         }
-        to_rrd(full, Path(name) / "full.rrd")  # the first drawing compiles
+        to_rrd(full, Path(name) / "full.rrd")  # compiles
         for title, work in works.items():
             spent = least(work)
             apart = f", {seconds / (spent - start):.0f} x without its start" if title.startswith("replay") else ""

@@ -1,4 +1,4 @@
-"""Nominal restitution of each contact law, compared with the restitution of a free impact that our solver computes.
+"""Nominal restitution of each contact law, compared with that of a free impact that our solver computes.
 
 `python benchmark/restitution.py` writes `benchmark/results/restitution.csv`, the picture `docs/images/restitution.png`
 and the measured part of `benchmark/results/restitution.md`.
@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from cases import table
 
 from plow_twin import Clearance, Contact, Frame, Gravity, Head, Initial, Scene, simulate
 from plow_twin.model.contact_laws import LAWS
@@ -23,21 +24,21 @@ PICTURE = ROOT / "docs" / "images" / "restitution.png"
 PAGE = ROOT / "benchmark" / "results" / "restitution.md"
 BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
 
-#: Nominal restitutions for which the CSV file has rows.
+#: Nominal restitutions in the CSV file.
 ASKED = tuple(round(0.01 * k, 2) for k in range(101))
-#: Nominal restitutions that the page shows.
+#: Nominal restitutions on the page.
 SHOWN = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0)
 #: Damping ratios C / (2 sqrt(K m)) of the Kelvin-Voigt table.
 RATIOS = (0.0, 0.01, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 2.0)
-#: Ramp lengths of the ramped law, as multiples of the depth v sqrt(m/K) of the undamped impact.
+#: Lengths of the ramp, as multiples of the depth v sqrt(m/K) of the undamped impact.
 RAMPS = (0.001, 0.01, 0.1, 0.3, 1.0, 3.0, 10.0)
-#: A law is valid where the delivered restitution differs from the nominal restitution by at most this share.
+#: Largest relative difference between delivered and nominal restitution of a valid law.
 VALID = 0.05
 
 MASS_KG, SPEED_M_S, STIFFNESS, EXPONENT = 2.0, 1.0, 1e9, 1.5
-#: Stiffness [N/m] for the laws that add C d' to a linear spring.
+#: Stiffness of the laws that add C d' to a linear spring [N/m].
 LINEAR_STIFFNESS = 1e6
-#: Floor of the impact speed for the damping [m/s], so low that all restitutions below 1 share compiled kernels.
+#: Floor of the impact speed [m/s], so low that all restitutions below 1 share compiled kernels.
 FLOOR = 1e-6
 
 
@@ -45,8 +46,8 @@ FLOOR = 1e-6
 class Row:
     """One free impact.
 
-    `asked` is a restitution, or a damping ratio for laws that add C d'; `ramp` is the length of the ramped law's ramp,
-    divided by the depth of the undamped impact.
+    `asked` is a restitution, or a damping ratio for laws that add C d'. `ramp` is the length of the ramp, divided by
+    the depth of the undamped impact.
     """
 
     law: str
@@ -56,7 +57,7 @@ class Row:
 
 
 def free_impact(contact: Contact, mass: float = MASS_KG, speed: float = SPEED_M_S) -> float:
-    """Return the ratio of the speeds after and before the impact of a point mass on a wall, without any load."""
+    """Return the ratio of the speeds after and before the impact of a point mass on a wall."""
     scene = Scene(
         head=Head(mass, 1.0),
         frame=Frame(0.2, 0.2),
@@ -67,8 +68,7 @@ def free_impact(contact: Contact, mass: float = MASS_KG, speed: float = SPEED_M_
         locked=("x", "theta"),
         pairs=("top_left_top",),
     )
-    # at 1 m/s the mass needs 5 ms to reach the wall and, with D at its largest value, some 50 ms to rebound, so 0.2 s
-    # are enough
+    # at 1 m/s the mass reaches the wall after 5 ms and, with D at its largest, rebounds within some 50 ms
     result = simulate(scene, 0.2 / speed, output_dt=0.2 / speed, tol=1e-11)
     if result.penetration[-1, 0] > 0.0 or result.statistics["top_left_top"]["makes"] != 1:
         raise RuntimeError(f"{contact}: not one whole impact")
@@ -99,7 +99,6 @@ def measure(law: str, asked: Iterable[float], ramp: float = 0.0) -> list[Row]:
 
 
 def restitution_laws() -> list[str]:
-    """Return the laws that take a restitution, in the order of their definition."""
     return [name for name, law in LAWS.items() if law.takes_restitution]
 
 
@@ -114,43 +113,37 @@ def valid_ranges(rows: Sequence[Row]) -> str:
     return ", ".join(parts)
 
 
-def page_table(rows: Sequence[Row]) -> list[str]:
-    """Return the Markdown table of delivered restitutions, with a line for each law."""
-    lines = ["| law | " + " | ".join(f"{e:g}" for e in SHOWN) + " |", "|---|" + "---|" * len(SHOWN)]
+def page_table(rows: Sequence[Row]) -> str:
+    lines = []
     for law in restitution_laws():
         found = {row.asked: row.delivered for row in rows if row.law == law}
-        lines.append(f"| `{law}` | " + " | ".join(f"{found[e]:.4f}" for e in SHOWN) + " |")
-    return lines
+        lines.append([f"`{law}`", *(f"{found[e]:.4f}" for e in SHOWN)])
+    return table(["law", *(f"{e:g}" for e in SHOWN)], lines)
 
 
-def laws_table(rows: Sequence[Row]) -> list[str]:
-    """Return the Markdown table of equations, sources and validity."""
-    lines = ["| law | equation; source | within 5 % for e | at e = 0 | at e = 1 |", "|---|---|---|---|---|"]
+def laws_table(rows: Sequence[Row]) -> str:
+    lines = []
     for law in restitution_laws():
         own = [row for row in rows if row.law == law]
-        ends = f"{own[0].delivered:.4f} | {own[-1].delivered:.4f}"
-        lines.append(f"| {LAWS[law].title} | {LAWS[law].source} | {valid_ranges(own)} | {ends} |")
-    return lines
+        ends = f"{own[0].delivered:.4f}", f"{own[-1].delivered:.4f}"
+        lines.append([LAWS[law].title, LAWS[law].source, valid_ranges(own), *ends])
+    return table(["law", "equation; source", "within 5 % for e", "at e = 0", "at e = 1"], lines)
 
 
-def ratio_table(rows: Sequence[Row]) -> list[str]:
-    """Return the Markdown table of Kelvin-Voigt by damping ratio."""
+def ratio_table(rows: Sequence[Row]) -> str:
     own = [row for row in rows if row.law == "kelvin_voigt"]
-    return [
-        "| C / (2 sqrt(K m)) | " + " | ".join(f"{row.asked:g}" for row in own) + " |",
-        "|---|" + "---|" * len(own),
-        "| restitution | " + " | ".join(f"{row.delivered:.4f}" for row in own) + " |",
-    ]
+    delivered = ["restitution", *(f"{row.delivered:.4f}" for row in own)]
+    return table(["C / (2 sqrt(K m))", *(f"{row.asked:g}" for row in own)], [delivered])
 
 
-def ramp_table(rows: Sequence[Row]) -> list[str]:
-    """Return the Markdown table of the ramped law: columns are damping ratios, lines are lengths of the ramp."""
+def ramp_table(rows: Sequence[Row]) -> str:
+    """Return delivered restitutions of the ramped law by damping ratio (columns) and length of the ramp."""
     ratios = [row.asked for row in rows if row.law == "kelvin_voigt"]
-    lines = [f"| ramp over v sqrt(m/K) | {' | '.join(f'{z:g}' for z in ratios)} |", "|---|" + "---|" * len(ratios)]
+    lines = []
     for ramp in RAMPS:
         found = {row.asked: row.delivered for row in rows if row.law == "ramped_damping" and row.ramp == ramp}
-        lines.append(f"| {ramp:g} | " + " | ".join(f"{found[z]:.4f}" for z in ratios) + " |")
-    return lines
+        lines.append([f"{ramp:g}", *(f"{found[z]:.4f}" for z in ratios)])
+    return table(["ramp over v sqrt(m/K)", *(f"{z:g}" for z in ratios)], lines)
 
 
 def draw(rows: Sequence[Row], path: Path) -> None:
@@ -184,11 +177,10 @@ def draw(rows: Sequence[Row], path: Path) -> None:
 
 
 def write_csv(rows: Sequence[Row], path: Path) -> None:
-    """Write one line for each impact."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["law", "asked", "ramp", "delivered"])
-        # nine digits are written, because these are the same on every machine
+        # nine digits are the same on every machine
         writer.writerows([row.law, f"{row.asked:g}", f"{row.ramp:g}", f"{row.delivered:.9f}"] for row in rows)
 
 
@@ -196,14 +188,13 @@ def write_page(rows: Sequence[Row], path: Path) -> None:
     """Replace the text of the page between `BEGIN` and `END`."""
     before, _, rest = path.read_text(encoding="utf-8").partition(BEGIN)
     _, _, after = rest.partition(END)
-    parts = ["## Delivered", "", *page_table(rows), "", "## Validity", "", *laws_table(rows), ""]
-    parts += ["## Kelvin-Voigt by damping ratio", "", *ratio_table(rows), ""]
-    parts += ["## Ramped damping by damping ratio and ramp", "", *ramp_table(rows)]
+    parts = ["## Delivered", "", page_table(rows), "", "## Validity", "", laws_table(rows), ""]
+    parts += ["## Kelvin-Voigt by damping ratio", "", ratio_table(rows), ""]
+    parts += ["## Ramped damping by damping ratio and ramp", "", ramp_table(rows)]
     path.write_text("\n".join([before + BEGIN, "", *parts, "", END + after]), encoding="utf-8")
 
 
 def main() -> None:
-    """Measure all laws, and write the CSV file, the picture and the page."""
     rows = [row for law in restitution_laws() for row in measure(law, ASKED)]
     rows += measure("kelvin_voigt", RATIOS) + measure("hertz", (1.0,))
     rows += [row for ramp in RAMPS for row in measure("ramped_damping", RATIOS, ramp)]

@@ -1,6 +1,6 @@
 """The square as a rigid body whose corners hit one at a time: Routh's impacts with Poisson's restitution.
 
-Flights, rounded corners and marker are the same as for the compliant block, so that only the contact differs.
+Flights, rounded corners and marker are those of the compliant block, so that only the contact differs.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 
 from plow_twin.study.measured.square import RATE_HZ
 
-#: Time step in s. In one step a corner moves at most 0.5 mm.
+#: Time step in s, in which a corner moves at most 0.5 mm.
 STEP = 2e-4
 #: Increment of the normal impulse per mass in Routh's integration, in m/s.
 BIT = 5e-3

@@ -6,13 +6,12 @@ python benchmark/screen_load.py [SECONDS]
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
+from live_load import cpu_s
 
 from plow_twin.dashboard.access import PageAccess
 from plow_twin.dashboard.facts import facts_of
@@ -33,14 +32,8 @@ threading.Event().wait()
 """
 
 
-def cpu_s(pid: int) -> float:
-    """Return the CPU time of a process so far in s."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-
 def measured(pages: int, seconds: float) -> dict[str, float]:
-    """Return the shares of one core [%] that the twin's feed and the server take."""
+    """Return the shares of one core [%] that the feed of the twin and the server take."""
     rows = np.zeros(1, ROW)
     with Screen(PageAccess("127.0.0.1", 0), facts_of(load_scene(scene_path("paper")), {}, "")) as screen:
         screen.feed._load = lambda: np.zeros(3)

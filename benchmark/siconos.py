@@ -1,15 +1,14 @@
 """A slider with clearance in its guide, compared with the reference data of Siconos.
 
 The slider is that of Flores, Leine and Glocker, Multibody Syst. Dyn. 23 (2010) 165, table 1. Siconos computes it with
-rigid contact and time stepping. Its reference data are in github.com/siconos/siconos-tutorials,
-examples/mechanics/SliderCrank/*.ref (Apache-2.0, INRIA) and are not a part of this project. The command `python
-benchmark/siconos.py FOLDER` compares the `.ref` files of a copy of that folder and writes
-`benchmark/results/siconos.csv`.
+rigid contact and time stepping. Its reference data are github.com/siconos/siconos-tutorials,
+examples/mechanics/SliderCrank/*.ref (Apache-2.0, INRIA), and not a part of this project. `python benchmark/siconos.py
+FOLDER` compares the `.ref` files of a copy of that folder and writes `benchmark/results/siconos.csv`.
 
-Both models have four corners in a guide. The slider of Siconos is driven by a crank and a rod; our slider is a free
-body under loads. The mechanism therefore acts on our slider as a load m a(t), where a(t) is the slider's acceleration
-across the guide without contact, in the state that the reference has at that time. Our solver then computes touches,
-restitution and rests.
+Both models have four corners in a guide. The slider of Siconos is driven by a crank and a rod, ours is a free body
+under loads. So the mechanism acts on our slider as a load m a(t). Here a(t) is the acceleration of the slider across
+the guide without contact, in the state of the reference at that time. Our solver then computes touches, restitution and
+rests.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ _TIME, _TURNS, _ROD, _RATES, _HEIGHT, _IMPULSES = 0, 1, 2, slice(4, 6), 12, slic
 
 
 def gaps(y: Array, theta: Array) -> Array:
-    """Return the paper's gap functions g1 .. g4 of the slider's corners, shape (n, 4), in m."""
+    """Return the gap functions g1 .. g4 of the source, shape (n, 4), in m."""
     s, c = HALF_LENGTH * np.sin(theta), HALF_HEIGHT * np.cos(theta)
     half = HALF_HEIGHT + GAP
     return np.stack([half - (y - s + c), half - (y + s + c), half + (y - s - c), half + (y + s - c)], axis=-1)
@@ -65,7 +64,7 @@ def inertia_and_force(angles: Array, rates: Array) -> tuple[Array, Array]:
 
 
 def across(angles: Array) -> Array:
-    """Return the derivatives of the slider's height with respect to the angles, shape (2,)."""
+    """Return the derivatives of the slider's height by the angles, shape (2,)."""
     return np.array([CRANK * math.cos(angles[0]), ROD * math.cos(angles[1])])
 
 
@@ -81,7 +80,7 @@ def free_acceleration(angles: Array, rates: Array) -> tuple[float, float]:
 def rigid_motion(t_end: float, impacts: int) -> tuple[Array, Array, list[float]]:
     """Integrate the mechanism with rigid, frictionless impacts that are located in time.
 
-    Returns times (n,), states (n, 4) of angles and rates, and the times of the first impacts.
+    Return times (n,), states (n, 4) of angles and rates, and the times of the first impacts.
     """
 
     def rate(_: float, state: Array) -> Array:
@@ -107,16 +106,16 @@ def rigid_motion(t_end: float, impacts: int) -> tuple[Array, Array, list[float]]
             row = across(state[:2])
             weight = np.linalg.solve(mass, row)
             state[2:] -= weight * (1.0 + RESTITUTION) * (row @ state[2:]) / (row @ weight)
-            # the rates jump, so a second row follows just after the impact
+            # the rates jump, so a second row follows the impact
             times.append(math.nextafter(time, math.inf))
             states.append(state)
     return np.array(times), np.array(states), found
 
 
 def our_slider(t: Array, angles: Array, rates: Array, stiffness: float, output_dt: float) -> Result:
-    """Simulate our head in the guide under the mechanism's load at given `angles` and `rates`, (n, 2) each.
+    """Simulate our head in the guide under the load of the mechanism at `angles` and `rates`, (n, 2) each.
 
-    Our head is a cavity that moves about a fixed block, so its height is minus the slider's height.
+    Our head is a cavity that moves about a fixed block, so its height is minus that of the slider.
     """
     free = np.array([free_acceleration(q, v)[0] for q, v in zip(angles, rates, strict=True)])
     wrench = np.stack([np.zeros_like(free), -free, np.zeros_like(free)], axis=1)
@@ -131,7 +130,7 @@ def our_slider(t: Array, angles: Array, rates: Array, stiffness: float, output_d
 
 @dataclass(frozen=True)
 class Comparison:
-    """One quantity of one reference, with its value by Siconos (`theirs`) and by our solver (`ours`)."""
+    """One quantity of one reference, by Siconos (`theirs`) and by our solver (`ours`)."""
 
     reference: str
     quantity: str
@@ -140,15 +139,15 @@ class Comparison:
     unit: str
 
 
-def phases(touching: NDArray[np.bool_], t: Array, shortest: float = 1e-3) -> list[tuple[float, float]]:
-    """Return begin and end of each rest, which is contact without a break for at least `shortest` s."""
+def phases(touching: NDArray[np.bool_], t: Array) -> list[tuple[float, float]]:
+    """Return begin and end of each rest, a contact of at least 1 ms without a break."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], touching.astype(int), [0]]))).reshape(-1, 2)
     whole = [(float(t[first]), float(t[last - 1])) for first, last in edges.tolist()]
-    return [(begin, end) for begin, end in whole if end - begin >= shortest]
+    return [(begin, end) for begin, end in whole if end - begin >= 1e-3]
 
 
 def compare(name: str, data: Array) -> list[Comparison]:
-    """Compare one reference with our slider under the load of the reference's mechanism."""
+    """Compare one reference with our slider under the load of its mechanism."""
     t, angles, rates = data[:, _TIME], np.c_[2.0 * np.pi * data[:, _TURNS], data[:, _ROD]], data[:, _RATES]
     ours = our_slider(t, angles, rates, 1e9, 1e-4)
     theirs = GAP * data[:, _HEIGHT]
@@ -174,7 +173,6 @@ def compare(name: str, data: Array) -> list[Comparison]:
 
 
 def main() -> None:
-    """Compare all references of a folder."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="a copy of siconos-tutorials/examples/mechanics/SliderCrank")
     files = sorted(path for path in parser.parse_args().folder.glob("*.ref") if path.stat().st_size)

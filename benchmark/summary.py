@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 import targets
-from cases import Row
+from cases import Row, table
 from levels import LEVELS, OUTPUTS, OWN, PEERS, Reached, fastest
 from random_rows import AMPLIFIES, exponent_of
 from work_precision import OURS_BARE, SECTION
@@ -16,7 +16,6 @@ _WORDS = {0.1: "output each 0.1 s", 1e-3: "output each 1 ms"}
 
 
 def text(rows: Sequence[Row], machine: str, versions: dict[str, str]) -> str:
-    """Return all measurements of a run as Markdown tables."""
     blocks = [
         f"Machine: `{machine}`; " + ", ".join(f"{name} {version}" for name, version in versions.items()) + ".",
         _target_table(rows), *_ratio_tables(rows), _random_table(rows), _amplifying_table(rows), _ensemble_table(rows),
@@ -26,10 +25,8 @@ def text(rows: Sequence[Row], machine: str, versions: dict[str, str]) -> str:
 
 
 def _table(title: str, head: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
-    body = ["| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines]
-    if not body:
-        return ""
-    return "\n".join([f"**{title}**", "", "| " + " | ".join(head) + " |", "|" + "---|" * len(head), *body])
+    body = [[cell.replace("|", "\\|") for cell in line] for line in lines]
+    return f"**{title}**\n\n{table(head, body)}" if body else ""
 
 
 def _target_table(rows: Sequence[Row]) -> str:

@@ -15,7 +15,7 @@ from workloads import HOUR_S
 
 @dataclass(frozen=True)
 class Verdict:
-    """One line of the table of targets: the work, the measured figure, the target, and whether it was reached."""
+    """One line of the table of targets."""
 
     work: str
     measured: str
@@ -60,7 +60,7 @@ RATIOS = (
 )
 ENSEMBLE_S, WITHIN, REAL_TIME, CORE_SHARE = 0.5, 10.0, 1000.0, 0.25
 BATCH_TIMES = 5.0
-#: Computing an hour almost without events may cost at most this share of the cost of an hour of the driven scene.
+#: Largest cost of an hour almost without events, as a share of an hour of the driven scene.
 IDLE_SHARE = 0.01
 
 

@@ -3,8 +3,8 @@
     python benchmark/tuning_sensitivity.py                     # runs that results/tuning.jsonl lacks
     python benchmark/tuning_sensitivity.py --number HUBER
 
-For each truth only the numbers that its estimate reads are varied. The truths have four load periods and seeds that no
-tuning used; `tools/pages.py` makes the table of `benchmark/results/tuning.md` from the result.
+For each truth, only the numbers that its estimate reads are varied. The truths have four load periods and seeds that no
+tuning used. `tools/pages.py` makes the table of `benchmark/results/tuning.md`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ from plow_twin.estimate import tuning
 from plow_twin.estimate.estimate import estimate, warm_up
 from plow_twin.estimate.result import NORMAL_P95, State
 
-#: Groups from which one truth each is drawn.
 CASES = ("plain", "shift", "exponent", "forces", "hard", "firm")
 SEED, PERIODS = 990100, 4.0
 FACTORS = (0.5, 2.0)
@@ -44,7 +43,7 @@ class _Watched(ModuleType):
 
 
 def scaled(value: tuning.Value, factor: float, unit: str) -> tuning.Value:
-    """Return a number, or all numbers of a tuple, times a factor; for a quantile, the distance from 1 is scaled."""
+    """Return a number, or all numbers of a tuple, times a factor; of a quantile, the distance from 1 is scaled."""
     if isinstance(value, tuple):
         return tuple(scaled(part, factor, unit) for part in value)
     if unit == "quantiles":
@@ -77,7 +76,6 @@ def run(truth: Truth) -> dict[str, Any]:
 
 
 def known(row: dict[str, Any], axis: str) -> bool:
-    """Return whether a clearance was estimated."""
     return axis in row and row[axis][3] in (State.ESTIMATED.value, State.ROUGH.value)
 
 
@@ -89,8 +87,9 @@ def verdict(row: dict[str, Any]) -> list[Any]:
 def summary(name: str, factor: float, rows: list[dict[str, Any]]) -> str:
     """Return the effect of one variation on the clearances and verdicts.
 
-    They are the largest change of a clearance in its standard deviations, the RMSE relative to that with the chosen
-    value, the number of known clearances whose interval contains the truth, and the number of changed verdicts.
+    The parts are the largest change of a clearance in its standard deviations, the RMSE and the width relative to those
+    of the chosen value, the number of known clearances whose interval contains the truth, and the number of changed
+    verdicts.
     """
     base = {row["group"]: row for row in rows if row["name"] == ""}
     own = [row for row in rows if row["name"] == name and row["factor"] == factor]
@@ -118,7 +117,7 @@ def summary(name: str, factor: float, rows: list[dict[str, Any]]) -> str:
 
 
 def table() -> str:
-    """Return the table of all tuned numbers with their meaning, the data on which they were set, and their effect."""
+    """Return all tuned numbers with their meaning, the data on which they were set, and their effect."""
     rows = load_rows(FILE)
     count = {group: sum(row["group"] == group and row["name"] != "" for row in rows) for group in CASES}
     varied_in = ", ".join(f"`{group}` {number}" for group, number in count.items() if number)
@@ -173,7 +172,6 @@ def watched(truth: Truth) -> tuple[dict[str, Any], list[str]]:
 
 
 def write(out: Path, row: dict[str, Any]) -> None:
-    """Append a row to the file."""
     with out.open("a", encoding="utf-8") as file:
         file.write(json.dumps(row) + "\n")
 

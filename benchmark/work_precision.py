@@ -36,15 +36,14 @@ def _decades(loosest: int, tightest: int, per_decade: int = 2) -> tuple[float, .
 
 
 TOLERANCES = _decades(1, 12)
-#: Tolerances of --quick.
 QUICK_TOLERANCES = (1e-3, 1e-6, 1e-9, 1e-12)
 FIXED_STEPS = (1e-3, 5e-4, 2e-4, 1e-4, 5e-5, 2e-5, 1e-5)
 LEAN_STEPS = (*FIXED_STEPS, 5e-6, 2e-6, 1e-6)
 _LADDER = _decades(2, 13)
-#: Tolerances of CVODE in C, down to the tolerance at which it breaks down.
+#: Tolerances of CVODE in C, down to the one at which it breaks down.
 _C_LADDER = _decades(2, 14)
-#: Tolerances of `solve_ivp`. Its loop in Python is slow, so it is run with sparse output only. Radau and BDF take
-#: seconds, so they are run only at whole decades.
+#: Tolerances of `solve_ivp`, whose loop in Python is run with sparse output only. Radau and BDF take seconds, so they
+#: have whole decades only.
 _SOLVE_IVP = {"LSODA": _decades(3, 12), "DOP853": _decades(3, 12), "Radau": _decades(3, 8, 1), "BDF": _decades(3, 8, 1)}
 _MUJOCO = {"Euler": (1e-3, 5e-4, 2e-4, 1e-4), "implicitfast": (1e-3, 5e-4), "RK4": (1e-3, 5e-4, 2e-4)}
 _EXUDYN = {"VelocityVerlet": (1e-3, 5e-4, 2e-4, 1e-4), "RK44": (1e-3, 5e-4, 2e-4), "RK67": (1e-3, 5e-4)}
@@ -71,9 +70,9 @@ def prepare_simulate(
     sensitivity: bool | tuple[str, ...] = False,
     whole_call: bool = False,
 ) -> Callable[[], Sample]:
-    """Prepare `simulate` with all its outputs: poses, rates, forces, penetrations, events, statistics.
+    """Prepare `simulate` with all its outputs.
 
-    The time is the run's time as reported by `simulate`, or with `whole_call` the time from call to return.
+    The time is the one that `simulate` reports, or with `whole_call` the time from call to return.
     """
     method: Method = "events" if dt is None else "rk4"
 
@@ -81,7 +80,7 @@ def prepare_simulate(
         return simulate(scene, end, output_dt, tol, method, dt, energy_balance, sensitivity=sensitivity)
 
     if sensitivity or whole_call:
-        call(output_dt or t_end)  # the first call compiles
+        call(output_dt or t_end)  # compiles
 
     def run() -> Sample:
         wall, result = timed(lambda: call(t_end))
@@ -94,7 +93,7 @@ def prepare_simulate(
 
 
 def prepare_bare(scene: Scene, output_dt: float, tol: float, t_end: float = T_END) -> Callable[[], Sample]:
-    """Prepare the compiled loop alone, with poses and rates as its only outputs, like those of the peers."""
+    """Prepare the compiled loop alone, whose only outputs are poses and rates, as those of the peers."""
     compiled, work, times = compile_scene(scene, tol), new_work(), output_times(t_end, output_dt)
 
     def solve() -> tuple[int, Motion]:
@@ -108,9 +107,8 @@ def prepare_bare(scene: Scene, output_dt: float, tol: float, t_end: float = T_EN
         state = motion.state
         return Sample(wall, motion.q, int(state.steps), int(state.evaluations), int(motion.totals.logged))
 
-    # this call compiles
     nothing = Motion.start(compiled, np.zeros((1, 3)), np.zeros((1, 3)))
-    run_events(compiled, nothing, np.zeros(1), 0.0, work, BUDGET)
+    run_events(compiled, nothing, np.zeros(1), 0.0, work, BUDGET)  # compiles
     return run
 
 
@@ -127,7 +125,6 @@ def _prepare_lean(p: Array, dt: float, output_dt: float) -> Callable[[], Sample]
 
 
 def own_cases(scene_name: str) -> Iterator[Case]:
-    """Yield cases of the project's own solvers."""
     scene = bench_scene(scene_name)
     for output_dt in (SPARSE, DENSE):
         for tol in TOLERANCES:
@@ -145,7 +142,7 @@ def own_cases(scene_name: str) -> Iterator[Case]:
 
 
 def quick_cases() -> Iterator[Case]:
-    """Yield a few cases of the project's solver that need only one compiled kernel."""
+    """Yield a few cases of our solver that need only one compiled kernel."""
     scene = bench_scene("kv")
     for output_dt in (SPARSE, DENSE):
         for tol in QUICK_TOLERANCES:
@@ -154,7 +151,6 @@ def quick_cases() -> Iterator[Case]:
 
 
 def lean_cases(scene_name: str) -> Iterator[Case]:
-    """Yield cases of the plain RK4 of `lean`."""
     p = constants(bench_scene(scene_name))
     for output_dt in (SPARSE, DENSE):
         for dt in LEAN_STEPS:
@@ -162,7 +158,6 @@ def lean_cases(scene_name: str) -> Iterator[Case]:
 
 
 def cvode_cases(scene_name: str) -> Iterator[Case]:
-    """Yield cases of CVODE called from C, with and without its rootfinding."""
     p = constants(bench_scene(scene_name))
     for output_dt, method, roots, rtol in product((SPARSE, DENSE), ("adams", "bdf"), (False, True), _C_LADDER):
         name = "Adams" if method == "adams" else "BDF"
@@ -173,7 +168,6 @@ def cvode_cases(scene_name: str) -> Iterator[Case]:
 
 
 def python_cases(scene_name: str) -> Iterator[Case]:
-    """Yield cases of solvers called from Python."""
     p = constants(bench_scene(scene_name))
     for output_dt in (SPARSE, DENSE):
         for rtol in _LADDER:
@@ -193,7 +187,6 @@ def python_cases(scene_name: str) -> Iterator[Case]:
 
 
 def heyoka_cases(scene_name: str) -> Iterator[Case]:
-    """Yield cases of heyoka."""
     p = constants(bench_scene(scene_name))
     for output_dt, tol in product((SPARSE, DENSE), _LADDER):
         prepare = partial(heyoka_peer.prepare, p, tol, output_dt)
@@ -201,7 +194,6 @@ def heyoka_cases(scene_name: str) -> Iterator[Case]:
 
 
 def located_cases(scene_name: str) -> Iterator[Case]:
-    """Yield cases of DOP853 compiled by numba with located events."""
     p = constants(bench_scene(scene_name))
     for output_dt, rtol in product((SPARSE, DENSE), _LADDER):
         prepare = partial(located_dop853.prepare, p, rtol, output_dt)

@@ -63,7 +63,7 @@ def swaying_scene() -> Scene:
     scene = bench_scene("kv")
     load = _harmonic(scene)
     omega = 20.0
-    # x = -(F / (m omega^2)) sin(omega t) is the motion without drift, and these are its initial rates
+    # initial rates of the motion without drift, x = -(F / (m omega^2)) sin(omega t)
     force = (200.0, 50.0)
     mass, inertia = scene.head.mass_kg, scene.head.inertia_kg_m2
     v = (-force[0] / (mass * omega), -force[1] / (mass * omega), -10.0 / (inertia * omega))
@@ -86,7 +86,6 @@ def horizon_cases(longest: float) -> Iterator[Case]:
 
 
 def add_steps_per_hour(rows: Sequence[Row]) -> None:
-    """Fill `value` of the machine-time rows with the steps per hour."""
     for row in rows:
         if row.steps is not None and row.simulated_s:
             row.value = row.steps * HOUR_S / row.simulated_s
@@ -110,7 +109,6 @@ def _event_case(name: str, scene: Scene) -> Case:
 
 
 def add_steps_per_event(rows: Sequence[Row]) -> None:
-    """Fill `value` of the contact-event rows with the steps per event."""
     for row in rows:
         if row.steps is not None and row.events:
             row.value = row.steps / row.events
@@ -133,7 +131,7 @@ def feature_cases() -> Iterator[Case]:
 
 
 def _shared_load_scene() -> Scene:
-    """Return the KV scene with its load split into six parts, so that there are ten parameters for derivatives."""
+    """Return the KV scene with its load split into six parts, which has ten parameters for derivatives."""
     scene = bench_scene("kv")
     load = _harmonic(scene)
     x, y = load.force_n
@@ -142,7 +140,7 @@ def _shared_load_scene() -> Scene:
 
 
 def add_ratios(rows: Sequence[Row]) -> None:
-    """Fill `value` of the feature rows with the time divided by that of the first row."""
+    """Fill `value` of the feature rows with the time relative to the first row."""
     plain = rows[0].wall_ms
     for row in rows:
         if plain and row.wall_ms is not None:
