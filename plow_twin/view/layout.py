@@ -32,14 +32,12 @@ AGE: Final = ("quality/sample_age_ms",)
 INTERVAL: Final = ("quality/sample_interval_ms",)
 TOTAL: Final = tuple(f"clearance/{name}" for name in CLEARANCE_NAMES if not name.startswith("pad_"))
 GROWTH: Final = tuple(f"growth/{name}" for name in CLEARANCE_NAMES if not name.startswith("pad_"))
-#: Areas between the bounds of a clearance: each area is a curve that alternates between the bounds. The names of the
-#: areas sort before the names of the clearances, so that the clearances are drawn above the bands.
+#: Areas between the bounds of a clearance, whose names sort before those of the clearances, so that they lie below.
 BAND: Final = tuple(f"{group}/band/{way}" for group in ("clearance", "growth") for way in ("horizontal", "vertical"))
 RESIDUAL: Final = ("residual/x", "residual/y", "residual/theta")
 WEAR: Final = tuple(f"wear/{name}" for name in CLEARANCE_NAMES if name.startswith("pad_"))
 
-#: Contents of a view that hides the bounds at first, because bands already show the clearances' bounds, and because a
-#: legend shows at most eight names.
+#: Contents of a view without bounds, which the bands show already; a legend shows at most eight names.
 _WITHOUT_BOUNDS: Final = (
     "$origin/**",
     *(f"- $origin/{name}" for name in CLEARANCE_NAMES if name.endswith(("/p05", "/p95"))),
@@ -57,8 +55,7 @@ _WHAT_IF_COLORS: Final = (
     (204, 121, 167),
     (240, 228, 66),
 )
-#: Opacity of a band's stroke, at most 255. Several strokes overlap at each pixel, so wide and faint strokes give an
-#: even area without stripes.
+#: Opacity of a band's stroke, at most 255: several wide, faint strokes at each pixel give an even area without stripes.
 _BAND_ALPHA: Final = 10
 _BAND_WIDTH: Final = 6.0
 _CLEARANCE_COLORS: Final = {"horizontal": (86, 180, 233), "vertical": (240, 160, 60)}
@@ -67,10 +64,10 @@ _CLEARANCE_COLORS: Final = {"horizontal": (86, 180, 233), "vertical": (240, 160,
 def blueprint(
     section: Section, exaggerate: float, what_if: bool = False, followed: bool = False, *, title: str = ""
 ) -> rrb.Blueprint:
-    """Return the arrangement: cross-sections beside the curves, with events and data quality below.
+    """Return the arrangement of the views.
 
-    If `what_if` is true, the view of other scenes is in front; if `followed` is true, there is also a view of the
-    forces with their 90 % intervals. `title` is appended to the name of the view of the forces.
+    With `what_if`, the view of other scenes is in front; with `followed`, there is a view of the forces with their 90 %
+    intervals. `title` is appended to the name of the view of the forces.
     """
     half_x, half_y = (float(half) for half in section.half_view)
     picture = rrb.Spatial2DView(
@@ -101,7 +98,7 @@ def blueprint(
         active_tab=0,
     )
     curves = rrb.Vertical(
-        # the title stands in the widest view, because a narrower view would cut it off
+        # a narrower view would cut the title off
         _plot("force", f"Largest contact force [kN]{title and '; '}{title}"),
         rrb.StateTimelineView(origin=ENTITY, name="Corners that carry force"),
         _plot("load", "Load on the head"),
@@ -116,7 +113,7 @@ def blueprint(
             _plot("wear", "Wear [mm]", rrb.Corner2D.LeftTop, _WITHOUT_BOUNDS),
             active_tab=0,
         ),
-        # with these shares the lane of the contact sets fits even in a window 600 pixels high
+        # with these shares the contact sets fit even in a window 600 pixels high
         row_shares=[4.7, 2.2, 2.7, 3.4],
     )
     return rrb.Blueprint(
@@ -135,50 +132,50 @@ def _plot(
     legend: rrb.Corner2D = rrb.Corner2D.RightTop,
     contents: Sequence[str] = ("$origin/**",),
 ) -> rrb.TimeSeriesView:
-    # rerun can put a legend only into a corner inside the plot
+    # rerun puts a legend only into a corner inside the plot
     return rrb.TimeSeriesView(origin=origin, contents=list(contents), name=name, plot_legend=legend)
 
 
 def style_curves(stream: rr.RecordingStream) -> None:
-    """Give the curves colours, names, and a reduction that keeps peaks when many points share a pixel."""
+    """Give the curves colours, names, and a reduction that keeps peaks where many points share a pixel."""
     for entities in (FORCE, FORCE_AT_STAMP, PENETRATION):
         for entity, name, color in zip(entities, PAIR_NAMES, PAIR_COLORS, strict=True):
-            _style(stream, entity, name, color, AggregationPolicy.MinMax)
+            _style(stream, entity, name, color)
     style_load(stream, (0.0, 0.0, 0.0))
     for entity, name, color in zip((*AGE, *INTERVAL), ("age of a sample", "time between two"), _QUALITY, strict=True):
-        _style(stream, entity, name, color, AggregationPolicy.MinMax)
+        _style(stream, entity, name, color)
     for entity in FORCE_BOUNDS:
         _, pair, point = entity.split("/")
         shade = tuple(round(0.6 * part) for part in PAIR_COLORS[PAIR_NAMES.index(pair)])
-        _style(stream, entity, f"{pair} {point}", shade, AggregationPolicy.MinMax, 1.0)
+        _style(stream, entity, f"{pair} {point}", shade, 1.0)
     for entity, measured, name, color in zip(POSE, MEASURED, _RESIDUAL_NAMES, _LOAD_COLORS, strict=True):
-        _style(stream, entity, name, color, AggregationPolicy.MinMax)
+        _style(stream, entity, name, color)
         shade = tuple(round(0.6 * part) for part in color)
-        _style(stream, measured, f"{name}, measured", shade, AggregationPolicy.MinMax, 1.0)
+        _style(stream, measured, f"{name}, measured", shade, 1.0)
     for entity, name, color in zip(RESIDUAL, _RESIDUAL_NAMES, _LOAD_COLORS, strict=True):
-        _style(stream, entity, name, color, AggregationPolicy.MinMax)
+        _style(stream, entity, name, color)
     for entity in BAND:
-        _style(stream, entity, "90 % interval", None, AggregationPolicy.MinMax, _BAND_WIDTH)
-    # the lines of a value's bounds are thinner than the line of the value itself
+        _style(stream, entity, "90 % interval", None, _BAND_WIDTH)
+    # the lines of bounds are thinner and darker
     for entity in (*TOTAL, *GROWTH, *WEAR):
         base, _, bound = entity.partition("/")[2].partition("/")
         base = base.removeprefix("pad_")
         color = _CLEARANCE_COLORS.get(base) or PAIR_COLORS[PAIR_NAMES.index(base)]
         shade = tuple(round(0.6 * part) for part in color) if bound else color
-        _style(stream, entity, f"{base} {bound}".strip(), shade, AggregationPolicy.MinMax, 1.0 if bound else 2.5)
+        _style(stream, entity, f"{base} {bound}".strip(), shade, 1.0 if bound else 2.5)
 
 
 def band_colors(entity: str) -> list[tuple[int, ...]]:
-    """Return the colours of a band: of its first stroke, which the legend shows too, and of the other strokes."""
+    """Return the colours of a band: of its first stroke, which the legend shows too, and of the others."""
     color = _CLEARANCE_COLORS[entity.rpartition("/")[2]]
     return [(*(part // 2 for part in color), 255), (*color, _BAND_ALPHA)]
 
 
 def style_load(stream: rr.RecordingStream, largest: Iterable[float]) -> None:
-    """Put the largest values into the names of the load curves: a low plot labels only powers of ten."""
+    """Put the largest values into the names of the load curves, since a low plot labels only powers of ten."""
     for entity, name, unit, color, value in zip(LOAD, *_LOAD_NAMES, _LOAD_COLORS, largest, strict=True):
         named = f"{name}, to {value:.3g} {unit}" if value else f"{name} [{unit}]"
-        _style(stream, entity, named, color, AggregationPolicy.MinMax)
+        _style(stream, entity, named, color)
 
 
 def what_if_curves(stream: rr.RecordingStream, names: Sequence[str]) -> tuple[str, ...]:
@@ -186,30 +183,25 @@ def what_if_curves(stream: rr.RecordingStream, names: Sequence[str]) -> tuple[st
     entities = tuple(f"what_if/{number}" for number in range(len(names) + 1))
     for number, (entity, name) in enumerate(zip(entities, ("the run", *names), strict=True)):
         color = _WHAT_IF_COLORS[number % len(_WHAT_IF_COLORS)]
-        _style(stream, entity, name, color, AggregationPolicy.MinMax, 2.0 if number == 0 else 1.2)
+        _style(stream, entity, name, color, 2.0 if number == 0 else 1.2)
     return entities
 
 
 def _style(
-    stream: rr.RecordingStream,
-    entity: str,
-    name: str,
-    color: tuple[int, ...] | None,
-    policy: AggregationPolicy,
-    width: float = 1.5,
+    stream: rr.RecordingStream, entity: str, name: str, color: tuple[int, ...] | None, width: float = 1.5
 ) -> None:
     lines = rr.SeriesLines(
         colors=None if color is None else [color],
         names=[name],
         widths=[width],
-        aggregation_policy=policy,
+        aggregation_policy=AggregationPolicy.MinMax,
         interpolation_mode=InterpolationMode.Linear,
     )
     stream.log(entity, lines, static=True)
 
 
 def about(scene: Scene, header: RunHeader, source: Path) -> str:
-    """Return a description of the run and of the picture in Markdown."""
+    """Return a description of the run and the picture in Markdown."""
     contact = scene.contact
     frame = "fixed frame" if scene.support is None else "frame, on springs, to which this picture is fixed,"
     return f"""# {source.name}

@@ -1,4 +1,4 @@
-"""Picture of the first seconds of a user's file: load, pose and speed as the mapping reads them."""
+"""Picture of the first seconds of a user's file, as the mapping reads them."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from typing import Final
 import numpy as np
 
 from plow_twin.record.column_guess import Guess
+from plow_twin.view.figures import write_png
 
 _SHOWN_S: Final = 10.0
-#: SI prefixes of newtons, each with its factor.
+#: SI prefixes of newtons.
 _PREFIXES: Final = (("M", 1e6), ("k", 1e3))
 
 
 def draw_own_file(guess: Guess, path: Path) -> Path:
     """Draw the first ten seconds into a PNG; return its path."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     load = [("excitation", name) for name in ("fx", "fy", "m")]
@@ -40,6 +40,5 @@ def draw_own_file(guess: Guess, path: Path) -> Path:
         axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=8)
     axes[-1].set_xlabel("time since the first row [s]")
     figure.suptitle(f"{guess.path.name}, its first ten seconds as they are read")
-    with path.open("wb") as stream:
-        FigureCanvasAgg(figure).print_png(stream)  # type: ignore[no-untyped-call]
+    write_png(figure, path)
     return path
