@@ -1,4 +1,4 @@
-"""Rows collected into columns, because rerun logs 20,000 rows at once in the time that it needs for one row."""
+"""Rows collected into columns: rerun logs 20,000 rows at once in the time of one row."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from plow_twin.record.template import compiled
 Array = NDArray[np.float64]
 Indexes = NDArray[np.int64]
 
-#: Number of rows that are kept in memory before they are sent.
+#: Number of rows that are collected before they are sent.
 BLOCK_ROWS: Final = 20_000
 ROS_TIME: Final = "ros_time"
 STEP: Final = "step"
-#: Name of the timeline that counts from the first stamp.
+#: Timeline that counts from the first stamp.
 RUN_TIME: Final = "run_time"
 
 
 class TimeAxis:
-    """The timelines of all curves; the run's time counts from the stamp `first_ns`."""
+    """The timelines of all curves; the run's time counts from `first_ns`."""
 
     def __init__(self) -> None:
         self.first_ns: int | None = None
 
     def columns(self, stamps: Indexes, steps: Indexes) -> list[rr.TimeColumn]:
-        """Return the timelines of some rows."""
+        """Return the timelines of rows."""
         since = (stamps - (self.first_ns or 0)).astype("timedelta64[ns]")
         return [
             rr.TimeColumn(ROS_TIME, timestamp=stamps.astype("datetime64[ns]")),
@@ -39,11 +39,10 @@ class TimeAxis:
 
 
 class Curves:
-    """Curves with common times: one entity for each column of the rows.
+    """Curves with common times, each an entity of its own.
 
-    If `span_ns` is not 0, a curve keeps only the least and the largest value in each span of stamps, so that no peak is
-    lost. `rows` is the number of rows added, and `sent` is the number of values of the first curve that were sent. At a
-    gap, a row without values ends the lines.
+    With `span_ns`, a curve keeps only the least and the largest value in each span of stamps, so that no peak is lost.
+    `rows` counts the rows added, and `sent` the values of the first curve that were sent.
     """
 
     def __init__(self, stream: rr.RecordingStream, axis: TimeAxis, entities: Sequence[str], span_ns: int = 0) -> None:
@@ -52,13 +51,13 @@ class Curves:
         self.span_ns = span_ns
         self.entities = tuple(entities)
         self._parts: list[tuple[Indexes, Indexes, Array]] = []
-        self._ends: list[NDArray[np.bool_]] = []  # for each part, whether the lines end at each of its rows
+        self._ends: list[NDArray[np.bool_]] = []  # whether the lines end at each row of a part
         self._last: tuple[Indexes, Indexes] | None = None
         self._waiting = self.rows = self.sent = 0
 
     @property
     def thinned(self) -> bool:
-        """Whether the curves keep only the least and the largest value in each span."""
+        """Whether the curves are thinned to the extremes of spans."""
         return self.span_ns > 0
 
     def add(self, stamps: Indexes, steps: Indexes, values: Array) -> None:
@@ -72,7 +71,7 @@ class Curves:
             self.flush()
 
     def end(self) -> None:
-        """End the lines; the next row begins new lines."""
+        """End the lines; the next row begins new ones."""
         if self._last is not None:
             self._append(*self._last, np.zeros((1, len(self.entities))), ends=True)
         self._last = None
@@ -102,7 +101,7 @@ class Curves:
             rr.send_columns(entity, indexes, columns, recording=self._stream)
 
     def _spans(self, stamps: Indexes, ends: NDArray[np.bool_]) -> Indexes:
-        """Return the number of each row's span; a row at which a line ends has its own span."""
+        """Return the number of each row's span; a row that ends a line has a span of its own."""
         spans = stamps // self.span_ns
         after = np.concatenate(([False], ends[:-1]))
         changes: Indexes = np.cumsum((np.diff(spans, prepend=spans[0]) != 0) | ends | after)
@@ -111,7 +110,7 @@ class Curves:
 
 @compiled
 def extremes(spans, values):  # type: ignore[no-untyped-def]
-    """Mark the first smallest and first largest value of each column, (n, k), in each run of equal `spans`, (n,)."""
+    """Mark the first least and the first largest value of each column, (n, k), in each run of equal `spans`, (n,)."""
     count, columns = values.shape
     kept = np.zeros((count, columns), np.bool_)
     for k in range(columns):
@@ -128,7 +127,7 @@ def extremes(spans, values):  # type: ignore[no-untyped-def]
 
 
 class Batches:
-    """An entity whose rows hold several instances each, such as the arrows at one instant."""
+    """An entity with several instances in each row, such as the arrows at one instant."""
 
     def __init__(
         self, stream: rr.RecordingStream, axis: TimeAxis, entity: str, archetype: Any, fields: Sequence[str]
@@ -144,7 +143,7 @@ class Batches:
         self._lengths: list[int] = []
 
     def add(self, stamp_ns: int, step: int, **values: Sequence[Any] | Array) -> None:
-        """Add a row; all fields have the same number of instances."""
+        """Add a row, with as many instances in each field."""
         lengths = {name: len(values[name]) for name in self._fields}
         if len(set(lengths.values())) != 1:
             raise ValueError(f"{self._entity}: got {lengths} instances, expected as many in each")
@@ -168,7 +167,7 @@ class Batches:
 
 
 def buffers(*owners: object) -> Iterator[Curves | Batches]:
-    """Yield all curves and batches among the attributes of the owners."""
+    """Yield the curves and batches among the owners' attributes."""
     for owner in owners:
         for value in vars(owner).values():
             if isinstance(value, Curves | Batches):

@@ -1,4 +1,8 @@
-"""Sets of corners that carry force together, coloured by the sense of the rotation that they stop."""
+"""Sets of corners that carry force together, coloured by the rotation that they stop.
+
+A pair of corner and wall stops either a counter-clockwise (ccw) or a clockwise (cw) rotation of the head. A set is a
+bit mask of pairs.
+"""
 
 from __future__ import annotations
 
@@ -14,25 +18,24 @@ from plow_twin.view.columns import Array, Batches, Indexes, TimeAxis
 ENTITY: Final = "contact_set"
 FREE: Final = "free"
 Color = tuple[int, int, int]
-#: Colours of four states: no contact; contacts that stop counter-clockwise rotation; contacts that stop clockwise
-#: rotation; both kinds of contact.
+#: Colours of: no contact, contacts that stop a ccw rotation, contacts that stop a cw rotation, contacts of both kinds.
 _COLORS: Final[tuple[Color, ...]] = ((235, 235, 235), (86, 180, 233), (240, 160, 60), (204, 121, 167))
 _CCW_BITS: Final = int((STOPS_COUNTER_CLOCKWISE.astype(np.int64) << np.arange(PAIR_COUNT)).sum())
 
 
 def set_color(mask: int) -> Color:
-    """Return the colour of a set of pairs; `mask` has a bit for each pair."""
+    """Return the colour of a set of pairs."""
     return _COLORS[(1 if mask & _CCW_BITS else 0) + (2 if mask & ~_CCW_BITS else 0)]
 
 
 def masks_of(force: Array) -> Indexes:
-    """Return for each row a bit mask of the pairs that carry force, shape (n,), from forces (n, 8)."""
+    """Return the set of pairs that carry force for each row of forces (n, 8), shape (n,)."""
     masks: Indexes = ((force > 0.0) << np.arange(PAIR_COUNT)).sum(axis=1)
     return masks
 
 
 class ContactSets:
-    """Writes changes of the contact set; in a thinned run, the first change and last set of each span."""
+    """Writes changes of the contact set; in a thinned run, the first change and the last set of each span."""
 
     def __init__(self, stream: rr.RecordingStream, axis: TimeAxis, labels: tuple[str, ...], span_ns: int) -> None:
         self._names = tuple(label or name for label, name in zip(labels, CORNER_NAMES, strict=True))
@@ -41,7 +44,7 @@ class ContactSets:
         self._before: str | None = None
         self._at: int | None = None
         self._last: tuple[int, int] | None = None
-        #: newest set of the present span that has not been written yet, and the step of its row
+        #: newest set of the present span that has not been written, and the step of its row
         self._left: tuple[str, int] | None = None
         names: dict[str, Color] = {}
         for ccw, cw in product(range(16), range(16)):
@@ -52,7 +55,7 @@ class ContactSets:
 
     @staticmethod
     def _pairs(corners: int, ccw: bool) -> int:
-        """Return the pairs of these corners that stop a rotation of one sense."""
+        """Return the pairs of these corners that stop the rotation."""
         return sum(
             1 << pair
             for pair in range(PAIR_COUNT)
@@ -60,7 +63,7 @@ class ContactSets:
         )
 
     def name(self, mask: int) -> str:
-        """Return the name of a set of pairs: its corners by sense."""
+        """Return the name of a set of pairs: its corners by rotation."""
         parts = []
         for word, bits in (("ccw", mask & _CCW_BITS), ("cw", mask & ~_CCW_BITS)):
             corners = sorted(self._names[corner] for corner in range(4) if bits >> 2 * corner & 3)
@@ -86,7 +89,7 @@ class ContactSets:
             self._end_span(int(stamps[-1]))
 
     def _end_span(self, stamp_ns: int) -> None:
-        """Write the last set of the present span if the stamp lies beyond this span."""
+        """Write the last set of the present span, if the stamp lies beyond the span."""
         if self._left is None or self._at is None or stamp_ns // self._span_ns == self._at:
             return
         name, step = self._left
@@ -100,7 +103,7 @@ class ContactSets:
             self._end_span((self._at + 1) * self._span_ns)
 
     def end(self) -> None:
-        """End the lane, because the set is unknown from here on."""
+        """End the curve, because the set is unknown from here on."""
         if self._last is not None:
             self._states.add(*self._last, state=[])
         self._before = self._at = self._last = self._left = None

@@ -1,4 +1,4 @@
-"""Drawing of a recording, batch by batch: curves, instants of the cross-section, events."""
+"""Drawing of a recording, batch by batch: curves, cross-sections, events."""
 
 from __future__ import annotations
 
@@ -32,22 +32,21 @@ from plow_twin.view.residuals import Residuals
 from plow_twin.view.section import ARROW_MM_PER_N, LABEL_MM, LOAD_COLOR, PAIR_COLORS, Section
 from plow_twin.view.what_if import WhatIf
 
-#: Largest difference between a stamp and the recorder's clock [ns]; a larger difference is taken to mean that the stamp
-#: comes from another clock, and no age is drawn.
+#: Largest age of a sample that is drawn [ns]; beyond it, stamp and recorder's clock are not the same clock.
 _LARGEST_AGE_NS: Final = 3_600_000_000_000
 _GREY: Final = (150, 155, 165)
 _WHITE: Final = (235, 235, 235)
 _TOUCHING: Final = (240, 140, 40)
 _PADS: Final = np.array([name.startswith("pad_") for name in CLEARANCE_NAMES])
 _BEST_PADS: Final = np.array([name in PAD_NAMES for name in CLEARANCE_NAMES])
-#: Columns of the pads' depths, of their 5 % points, and of their 95 % points.
+#: Columns of the pads' depths, and of their 5 % and 95 % points.
 _PAD_POINTS: Final = [[CLEARANCE_NAMES.index(f"{name}{point}") for name in PAD_NAMES] for point in ("", "/p05", "/p95")]
 _BOUNDS: Final = [
     CLEARANCE_NAMES.index(f"{way}/{point}") for way in ("horizontal", "vertical") for point in ("p05", "p95")
 ]
-#: Number of rows of a band for each message of a clearance, unless curves are thinned.
+#: Number of rows of a band for each clearance message, unless curves are thinned.
 _BAND_ROWS: Final = 10
-#: Interval at which the chart of forces along the face is redrawn [ns].
+#: Shortest time between two charts of forces along the face [ns].
 _FACE_NS: Final = 1_000_000_000
 
 
@@ -69,7 +68,7 @@ class Drawing:
     exaggerate
         Factor by which the second cross-section widens the clearance; None: chosen by the size of the clearance.
     span_ns
-        Span of stamps in which a curve keeps its least and largest value [ns]; 0: it keeps every row.
+        Span in which a curve keeps its least and largest value [ns]; 0: every row is kept.
     others
         Other scenes, by name, whose forces under the load of the run are drawn too.
     """
@@ -123,8 +122,7 @@ class Drawing:
         self.pad_names = Batches(stream, axis, "exaggerated/pads/wear", rr.Points2D, ("positions", "labels"))
         self.events = Events(stream, axis)
         self.section_rows = 0
-        #: `step`: number of the newest advance
-        #: `stamp_ns`: stamp of the newest advance [ns]
+        #: number and stamp [ns] of the newest advance
         self.step, self.stamp_ns = -1, 0
         self._shown: int | None = None
         self._sample_ns: int | None = None
@@ -143,7 +141,6 @@ class Drawing:
         return self._axis.first_ns or 0
 
     def _draw_still(self, scene: Scene, source: Path) -> None:
-        """Draw the static parts."""
         layout.style_curves(self.stream)
         outline = self.section.frame_strip()
         self.stream.log("section/frame", rr.LineStrips2D([outline], colors=[_GREY], radii=[1.5]), static=True)
@@ -192,7 +189,7 @@ class Drawing:
         self._residuals = Residuals()
 
     def _hole(self, count: int, after: Batch) -> None:
-        """Write that entries are missing before a batch, and end all lines there."""
+        """Write that entries are missing before a batch."""
         self._sample_ns, self._wrench = None, np.full(3, np.nan)
         self.events.forget()
         if not isinstance(after.entries.others.get(0), Loss):  # a loss is drawn as an event
@@ -200,7 +197,7 @@ class Drawing:
             self.events.add(self.stamp_ns, max(self.step, 0), text, "ERROR")
 
     def _whole(self, batch: Batch) -> None:
-        """Draw a batch, or a part of one, in which no entry is missing."""
+        """Draw a batch in which no entry is missing."""
         entries = batch.entries
         advance = entries.sample.copy()
         advance[[index for index, entry in entries.others.items() if isinstance(entry, Hold | Unload)]] = True
@@ -216,7 +213,6 @@ class Drawing:
         bounds = np.maximum.accumulate(entries.sequence) if len(entries) else entries.sequence
 
         def places(rows: Rows) -> Indexes:
-            """Return the number of entries before each message."""
             return np.asarray(np.searchsorted(bounds, rows.sequence, side="right"), np.int64)
 
         steps_before = np.concatenate(([before[0]], steps))
@@ -256,7 +252,7 @@ class Drawing:
         for index in sorted(entries.others):
             self._back(samples[: np.searchsorted(samples, index)], stamps, steps)
             entry, stamp_ns = entries.others[index], int(stamps[index])
-            # an entry without a stamp is drawn at the stamp that the model had reached
+            # an entry without a stamp belongs to the stamp that the model had reached
             if not hasattr(entry, "stamp_ns"):
                 reached = np.flatnonzero(advance[:index])
                 stamp_ns = int(stamps[reached[-1]]) if reached.size else self.stamp_ns
@@ -269,7 +265,7 @@ class Drawing:
 
     @staticmethod
     def _loads(entries: Entries, advance: NDArray[np.bool_], before: Array) -> Array:
-        """Return the load at the end of each advance, (n, 3): sampled, held, zero, or NaN if unknown."""
+        """Return the load at the end of each advance, (n, 3): sampled, held or zero; NaN if unknown."""
         places = np.flatnonzero(advance)
         loads = np.where(entries.sample[places, None], entries.wrench[places], 0.0)
         for row in np.flatnonzero(~entries.sample[places]).tolist():
@@ -282,7 +278,6 @@ class Drawing:
             self.events.sample(int(stamps[samples[0]]), int(steps[samples[0]]))
 
     def _rows(self, name: str, rows: Rows, steps: Indexes) -> None:
-        """Draw the curves of one topic."""
         stamps, numbers = rows.stamp_ns, rows.numbers
         match name:
             case "contact_forces":
@@ -305,7 +300,7 @@ class Drawing:
                 self._pads(stamps, steps, numbers)
 
     def _poses(self, measured: Sequence[tuple[int, Pose]], steps: Indexes, head: Rows, at: Indexes) -> None:
-        """Draw the measured poses, if there are any, beside the poses of the model."""
+        """Draw the measured poses, if there are any, beside those of the model."""
         if not (measured or self.measured.rows):
             return
         theta = 2.0 * np.arctan2(head.numbers[:, 2], head.numbers[:, 3])
@@ -316,16 +311,16 @@ class Drawing:
             self.measured.add(np.array(stamps), np.array(places), 1e3 * np.array(poses))
 
     def _growth_m(self, numbers: Array) -> Array:
-        """Return the growth of the clearances by wear alone [m] with its interval, in the order of `layout.GROWTH`.
+        """Return the growth of the clearances by wear [m] with its interval, in the order of `layout.GROWTH`.
 
-        This growth is the wear of the pads; estimates and changed parameters do not affect it.
+        Estimates and changed parameters do not affect it.
         """
         new = clearances(self._scene, np.zeros(PAIR_COUNT))[:2]
         best, low, high = (clearances(self._scene, numbers[:, pads])[:, :2] - new for pads in _PAD_POINTS)
         return np.concatenate((best, np.stack((low, high), axis=2).reshape(len(numbers), 4)), axis=1)
 
     def _bands(self, stamps: Indexes, steps: Indexes, numbers: Array) -> None:
-        """Draw the areas between the bounds as curves that alternate between the bounds, row by row."""
+        """Draw the area between two bounds as a curve that alternates between them, row by row."""
         total = np.concatenate((1e3 * numbers[:, _BOUNDS], 1e6 * self._growth_m(numbers)[:, 2:]), axis=1)
         if self._band_end is not None and len(stamps) and self._band_end[0][0] < stamps[0]:
             ends = zip(self._band_end, (stamps, steps, total), strict=True)
@@ -345,7 +340,7 @@ class Drawing:
         self.band.add(stamps, steps, np.where(bound[:, None], sides[:, :, 1], sides[:, :, 0]))
 
     def _color_bands(self, stamps: Indexes, steps: Indexes) -> None:
-        """Colour the bands: the first stroke is opaque, and all others are faint."""
+        """Colour the bands: the first stroke, which the legend shows, is opaque, the others are faint."""
         behind = int(np.searchsorted(stamps, stamps[0] + 2 * self.band.span_ns))
         changes = [0, min(max(1, behind), len(stamps) - 1)]
         for entity in layout.BAND:
@@ -353,7 +348,6 @@ class Drawing:
             rr.send_columns(entity, self._axis.columns(stamps[changes], steps[changes]), colors, recording=self.stream)
 
     def _pads(self, stamps: Indexes, steps: Indexes, numbers: Array) -> None:
-        """Draw the wear of the pads in the second cross-section."""
         depth_mm = 1e3 * numbers[:, _BEST_PADS]
         for row in np.flatnonzero(np.diff(stamps // round(1e9 / min(self.section_hz, 1.0)), prepend=-1)).tolist():
             if depth_mm[row].any():
@@ -361,13 +355,13 @@ class Drawing:
                 self.pads.add(int(stamps[row]), int(steps[row]), centers=middles, half_sizes=halves)
                 labels = [f"{depth:.3g} mm" if depth >= 1.0 else f"{1e3 * depth:.3g} µm" for depth in depth_mm[row]]
                 self.pad_names.add(int(stamps[row]), int(steps[row]), positions=places, labels=labels)
-            elif self._worn:  # new pads were set, so the drawn wear is removed
+            elif self._worn:  # new pads were set
                 self.pads.add(int(stamps[row]), int(steps[row]), centers=[], half_sizes=[])
                 self.pad_names.add(int(stamps[row]), int(steps[row]), positions=[], labels=[])
             self._worn = bool(depth_mm[row].any())
 
     def _along_face(self, entries: Entries, rows: Rows, places: Indexes) -> None:
-        """Assign forces to places along the face by the speed at the time of each message."""
+        """Assign forces to places along the face."""
         largest, begin = rows.numbers[:, 2 * PAIR_COUNT :].max(axis=1), 0
         for index, entry in sorted(entries.others.items()):
             if isinstance(entry, Travel | Reset):
@@ -384,7 +378,7 @@ class Drawing:
             self._drawn_face_ns = self.stamp_ns
 
     def _section(self, contact: Rows, head: Rows, steps: Indexes, loads: Array) -> None:
-        """In each span, draw the first instant that has forces and pose of the same publication."""
+        """In each span, draw the first instant that has forces and pose of one publication."""
         at = np.minimum(np.searchsorted(contact.sequence, head.sequence), len(contact) - 1)
         spans = head.stamp_ns // round(1e9 / self.section_hz)
         for row in np.flatnonzero(contact.stamp_ns[at] == head.stamp_ns).tolist():
@@ -412,7 +406,7 @@ class Drawing:
         self.walls.add(stamp_ns, step, strips=list(walls), colors=shades)
 
     def _load(self, stamp_ns: int, step: int, pose: tuple[float, float, float], load: Array) -> None:
-        """Draw the name of the head and the sampled load at its centre; loads of the scene are not in the journal."""
+        """Draw the head's name, and at its centre the sampled load; the scene's own loads are not in the journal."""
         centre, name = self.section.head_points(pose)
         self.names.add(stamp_ns, step, positions=[name])
         fx, fy, moment = load.tolist()
@@ -422,7 +416,7 @@ class Drawing:
             self.load_arrow.add(stamp_ns, step, origins=[centre], vectors=[vector], labels=[label])
 
     def _statuses(self, batch: Batch) -> None:
-        """Write changes of status and alarms; changes before the first sample are written at that sample's stamp."""
+        """Write changes of status and alarms, at the earliest at the first sample."""
         topics = (self.header.topic("status"), self.header.topic(ALARMS))
         for part in batch.outputs:
             for channel in [number for number, (name, _) in part.topics.items() if name in topics]:
@@ -452,7 +446,7 @@ class Drawing:
             part.flush()
 
     def finish(self, reader: RunReader) -> None:
-        """Write how the recording ended and which parts are missing, and send the collected rows."""
+        """Write how the recording ended and what is missing, and send the collected rows."""
         self._write_statuses()
         self.face.draw(self.stamp_ns, max(self.step, 0))
         self.contact_sets.finish()

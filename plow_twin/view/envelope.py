@@ -1,4 +1,4 @@
-"""Curves of any length for a picture: every row, or the smallest and largest value in each bin of equal width."""
+"""Curves of any length for a picture: every row, or the extremes in bins of equal width."""
 
 from __future__ import annotations
 
@@ -10,18 +10,17 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Indexes = NDArray[np.int64]
 
-#: Largest number of rows of a curve that keeps every row.
+#: Largest number of rows that are kept as they are.
 MOST_ROWS: Final = 8000
-#: Largest number of bins, about one for each pixel of an axis: narrower bins would show beats with the load's period.
+#: Largest number of bins, about one for each pixel: narrower bins would show beats with the load's period.
 _MOST_BINS: Final = 700
 
 
 class Envelope:
     """Rows of `width` numbers over time, in bounded memory.
 
-    Up to `most_rows` rows are kept as they are. Beyond that, time is divided into bins of equal width over the whole
-    span, and each bin keeps the smallest and the largest value of each column, so that no peak is lost and old and new
-    rows look alike.
+    Beyond `most_rows`, time is divided into bins of equal width over the whole span, and a bin keeps the least and the
+    largest value of each column, so that no peak is lost. A segment is a line between two gaps.
     """
 
     def __init__(self, width: int, most_rows: int = MOST_ROWS, most_bins: int = _MOST_BINS) -> None:
@@ -29,8 +28,7 @@ class Envelope:
         self._segment = 0
         #: width of a bin [s]; 0 while every row is kept
         self._bin_s = 0.0
-        # for each row: its segment (its line between two gaps), shape (n,); its bin number, or its time [s] while every
-        # row is kept, (n,); its least and its largest values, (n, width)
+        # place: time [s] of a row, or number of its bin
         self._kept = _Rows(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, width)), np.zeros((0, width)))
         self._added: list[_Rows] = []
         self._added_rows = 0
@@ -48,19 +46,19 @@ class Envelope:
             self._merge()
 
     def break_line(self) -> None:
-        """End the lines here; the next rows begin new lines."""
+        """End the lines; the next rows begin new ones."""
         self._segment += 1
 
     @property
     def bin_s(self) -> float:
-        """Width of a bin [s]; 0 where every row is kept."""
+        """Width of a bin [s]; 0 while every row is kept."""
         self._merge()
         return self._bin_s
 
     def bands(self, column: int) -> tuple[Array, Array, Array]:
         """Return times [s], least and largest values of a column, shape (n,) each; NaN where a line ends.
 
-        The time of a bin is its middle; a single row has equal smallest and largest values.
+        The time of a bin is its middle.
         """
         self._merge()
         rows = self._kept
@@ -85,21 +83,20 @@ class Envelope:
             self._bin_s = max(2.0 * float(np.ptp(self._kept.place)) / self._most_bins, 1e-9)
             self._kept = self._kept.binned(self._bin_s)
         self._kept = self._kept.merged()
-        # rows of different segments are never merged, so the number of rows may stay above the limit
+        # rows of different segments are not merged, so their number may stay above the limit
         while len(self._kept.place) > self._most_bins and np.ptp(self._kept.place) > 1.0:
             self._bin_s *= 2.0
             self._kept = self._kept.binned(2.0).merged()
 
 
 class _Rows:
-    """Rows with their segment and their place: a time [s], or the number of a bin."""
+    """Rows by segment and place, which is a time [s] or the number of a bin."""
 
     def __init__(self, segment: Indexes, place: Array, least: Array, largest: Array) -> None:
         self.segment, self.place, self.least, self.largest = segment, place, least, largest
 
     @classmethod
     def joined(cls, parts: list[_Rows]) -> _Rows:
-        """Return the rows of all parts, one part after the other."""
         return cls(
             np.concatenate([part.segment for part in parts]),
             np.concatenate([part.place for part in parts]),
@@ -108,7 +105,7 @@ class _Rows:
         )
 
     def binned(self, width: float) -> _Rows:
-        """Return the rows with each place replaced by the number of its bin of this width."""
+        """Return the rows with the number of their bin as their place."""
         return _Rows(self.segment, np.floor(self.place / width), self.least, self.largest)
 
     def merged(self) -> _Rows:

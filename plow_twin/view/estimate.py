@@ -24,7 +24,7 @@ def estimate_picture(
     prior
         Prior interval of each quantity, by its name in `QUANTITIES`.
     poses
-        The measured poses; if there is no fitted motion, only these poses are drawn.
+        The measured poses, which are drawn alone if there is no fitted motion.
     labels
         Name with unit of each quantity.
     title

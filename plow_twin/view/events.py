@@ -1,4 +1,4 @@
-"""The event log, with a line for each touch, change of status, setting, silence and loss."""
+"""The event log: touches, changes of status, settings, silences, losses."""
 
 from __future__ import annotations
 
@@ -17,16 +17,14 @@ _LEVELS = ("INFO", "WARN", "ERROR", "WARN")
 
 
 class Events:
-    """Write the log; `count` is the number of its lines."""
+    """Writes the log."""
 
     def __init__(self, stream: rr.RecordingStream, axis: TimeAxis) -> None:
-        #: `count`: number of lines
-        #: `failed`: number of failed advances
+        #: number of lines, and of failed advances
         self.count = self.failed = 0
         self._lines = Batches(stream, axis, "events", rr.TextLog, ("text", "level"))
         self._makes_before: NDArray[np.float64] | None = None
         self._status: dict[str, tuple[int, str]] = {}
-        #: whether the load is held because no samples come
         self.silent = False
         self._speed_m_s: float | None = None
 
@@ -36,13 +34,13 @@ class Events:
         self._lines.add(stamp_ns, step, text=[text], level=[level])
 
     def sample(self, stamp_ns: int, step: int) -> None:
-        """Write that the excitation is back, if it was silent before this sample."""
+        """Write that the excitation is back, if it was silent."""
         if self.silent:
             self.add(stamp_ns, step, "excitation is back")
         self.silent = False
 
     def entry(self, stamp_ns: int, step: int, entry: Entry | Dropped, excitation_source: str) -> None:
-        """Write an entry of the journal that is an event."""
+        """Write an entry of the journal, if it is an event."""
         match entry:
             case Hold() | Unload():
                 if not self.silent and excitation_source != "scene":
@@ -50,7 +48,7 @@ class Events:
                     self.add(stamp_ns, step, f"excitation silent: {subject}", "WARN")
                     self.silent = True
             case Travel(_, speed):
-                # sensors repeat an unchanged speed many times a second, so only changes become events
+                # sensors repeat an unchanged speed many times a second
                 if speed != self._speed_m_s:
                     self.add(stamp_ns, step, f"travel along the face at {speed:g} m/s")
                 self._speed_m_s = speed
@@ -74,7 +72,7 @@ class Events:
                 self.add(stamp_ns, step, f"{count} messages on {topic} were not recorded before this", "ERROR")
 
     def peaks(self, stamps: Indexes, steps: Indexes, makes: Array, peak: Array) -> None:
-        """Write the touches in rows of `contact_peaks`: cumulative makes (n, 8) and largest forces [N] (n, 8)."""
+        """Write the touches in rows of `contact_peaks`: cumulative makes and largest forces [N], (n, 8) each."""
         if not len(stamps):
             return
         before = makes[:1] if self._makes_before is None else self._makes_before[None]
@@ -91,7 +89,7 @@ class Events:
         self._makes_before = None
 
     def status(self, stamp_ns: int, step: int, message: DiagnosticStatus) -> None:
-        """Write a status or the alarms when they have changed."""
+        """Write a status or the alarms if they have changed."""
         now = (message.level, message.message)
         if now != self._status.get(message.name):
             subject = "alarms" if message.name.endswith(f": {ALARMS}") else "status"

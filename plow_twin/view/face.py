@@ -1,4 +1,7 @@
-"""Chart of the largest contact force over the place along the face, pass by pass, redrawn during the run."""
+"""Chart of the largest contact force along the face, pass by pass.
+
+The chart divides the face into pieces of equal length, and each pass keeps the largest force in each piece.
+"""
 
 from __future__ import annotations
 
@@ -13,12 +16,10 @@ from numpy.typing import NDArray
 from plow_twin.stream.journal import Travel
 from plow_twin.view.columns import Array, Batches, Indexes, TimeAxis
 
-#: Width of the chart in the units of its view.
+#: Size of the chart in the units of its view.
 WIDTH: Final = 300.0
-#: Height of the chart in the units of its view.
 HEIGHT: Final = 90.0
-#: Initial length of the pieces into which the chart divides the face [m]; the length doubles when there are more than
-#: `_MOST_PIECES` pieces.
+#: First length of a piece [m], which doubles when a pass has more than `_MOST_PIECES` pieces.
 _PIECE_M: Final = 0.1
 _MOST_PIECES: Final = 600
 #: Number of passes drawn; the newest is bright.
@@ -29,10 +30,7 @@ _EARLIER: Final = (90, 110, 130)
 
 
 class FaceChart:
-    """Collects forces by place and draws them.
-
-    `known` is true once the run has had a speed along the face other than zero.
-    """
+    """Collects forces by place and draws them; `known` is true once the head has moved along the face."""
 
     def __init__(self, stream: rr.RecordingStream, axis: TimeAxis) -> None:
         self._lines = Batches(stream, axis, "face/force", rr.LineStrips2D, ("strips", "colors"))
@@ -46,19 +44,19 @@ class FaceChart:
         self._speed = self._place_m = 0.0
         self._direction = 0.0
         self._reached_ns: int | None = None
-        #: speeds whose stamps have not been reached, in order of the stamps
+        #: speeds whose stamps have not been reached, in order
         self._coming: list[Travel] = []
         self.known = False
 
     def travel(self, travel: Travel) -> None:
-        """Change the speed from the stamp of `travel` on."""
+        """Change the speed from its stamp on."""
         if self._reached_ns is not None and travel.stamp_ns > self._reached_ns:
             insort(self._coming, travel, key=lambda one: one.stamp_ns)
         else:
             self._set_speed(travel.speed_m_s)
 
     def _set_speed(self, speed_m_s: float) -> None:
-        """Change the speed; a new direction begins a new pass."""
+        """Change the speed; the other direction begins a new pass."""
         direction = math.copysign(1.0, speed_m_s) if speed_m_s else 0.0
         if direction and self._direction and direction != self._direction:
             self._passes.append({})
@@ -67,7 +65,7 @@ class FaceChart:
         self.known = self.known or bool(speed_m_s)
 
     def forces(self, stamps: Indexes, force: Array) -> None:
-        """Add forces [N], shape (n,), each with the speed at its time."""
+        """Add forces [N], shape (n,), each at the speed of its time."""
         while len(stamps) and self._coming and stamps[-1] > self._coming[0].stamp_ns:
             count = int(np.searchsorted(stamps, self._coming[0].stamp_ns, "right"))
             self._forces(stamps[:count], force[:count])
@@ -76,7 +74,6 @@ class FaceChart:
         self._forces(stamps, force)
 
     def _forces(self, stamps: Indexes, force: Array) -> None:
-        """Add forces with the present speed."""
         if not len(stamps):
             return
         last = int(stamps[0]) if self._reached_ns is None else self._reached_ns
@@ -95,7 +92,7 @@ class FaceChart:
             here = self._passes[-1]
 
     def restart(self) -> None:
-        """Continue after a reset: stamps may go back, and waiting speeds take effect now."""
+        """Continue after a reset: stamps may go back, so waiting speeds apply now."""
         for travel in self._coming:
             self._set_speed(travel.speed_m_s)
         self._coming, self._reached_ns = [], None
@@ -129,7 +126,7 @@ class FaceChart:
 
 
 def _halved(one: dict[int, float]) -> dict[int, float]:
-    """Return the largest forces of one pass for pieces that are twice as long."""
+    """Return a pass with pieces of twice the length."""
     found: dict[int, float] = {}
     for piece, force in one.items():
         found[piece // 2] = max(found.get(piece // 2, 0.0), force)

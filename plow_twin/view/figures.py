@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 
     from plow_twin.record.reader import RunReader
 
-#: The minus sign that matplotlib writes on its axes.
 MINUS: Final = "\N{MINUS SIGN}"
 
 
@@ -43,7 +42,7 @@ def legend_beside(axis: Any, **options: Any) -> None:
 
 
 def signed(value: float, form: str) -> str:
-    """Return a number as text with a proper minus sign."""
+    """Return a number with a proper minus sign, as on the axes of matplotlib."""
     return f"{value:{form}}".replace("-", MINUS)
 
 
@@ -51,13 +50,12 @@ def scene_and_date(reader: RunReader, first_ns: int | None = None) -> str:
     """Return scene and date of a recording for a title; `first_ns` is its first stamp, if known."""
     scene = reader.header.parameters.get("scene")
     parts = [f"scene {Path(scene).name}"] if isinstance(scene, str) and scene else []
-    # stamps that count from an arbitrary start have no date
     date = date_text(reader.began_ns() if first_ns is None else first_ns)
     return ", ".join([*parts, date or f"file of {date_text(reader.path.stat().st_mtime_ns)}"])
 
 
 def date_text(stamp_ns: int | None) -> str:
-    """Return the date of a stamp for a title; empty for a stamp that counts from an arbitrary start."""
+    """Return the date of a stamp; empty if stamps count from an arbitrary start."""
     if stamp_ns is None or stamp_ns < EPOCH_S * 1e9:
         return ""
     return datetime.fromtimestamp(stamp_ns // 10**9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")

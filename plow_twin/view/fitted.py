@@ -1,7 +1,4 @@
-"""The picture of a fit: the measured and the fitted motion, residuals, and values with intervals beside the prior.
-
-`plow_twin.view.fitted_file` writes it.
-"""
+"""The picture of a fit: measured and fitted motion, residuals, and values with intervals beside the prior."""
 
 from __future__ import annotations
 
@@ -21,12 +18,10 @@ Array = NDArray[np.float64]
 #: Factor from m and rad to mm and mrad.
 _SCALE: Final = 1e3
 _COMPONENTS: Final = (("x", "mm"), ("y", "mm"), ("θ", "mrad"))
-#: Largest number of characters in a line of the title.
 _LINE: Final = 150
-#: There is a gap between two rows if the time between them exceeds this multiple of the median time.
+#: Multiple of the median time between rows from which on there is a gap.
 _GAP: Final = 10.0
-#: Largest drawn distance from the prior's middle, in half widths of the prior; values farther away are drawn at this
-#: distance.
+#: Largest drawn distance from the prior's middle, in half widths of the prior.
 _FARTHEST: Final = 2.0
 
 
@@ -34,8 +29,7 @@ _FARTHEST: Final = 2.0
 class FittedValue:
     """A fitted value and its prior, each as middle, low, high in the unit of the label.
 
-    `prior` may be None; `note` is the state of the value, or another short word; `is_log` states whether the value's
-    place relative to the prior is measured on a logarithmic scale.
+    `note` is the state of the value or another short word. `is_log`: its scale is logarithmic.
     """
 
     label: str
@@ -60,7 +54,7 @@ class FittedValue:
         return " to ".join(signed(number, self.digits) for number in self.prior[1:])
 
     def places(self) -> Array:
-        """Return value, low and high on a scale on which the prior's low, middle and high are -1, 0 and 1."""
+        """Return value, low and high on a scale that puts the prior's low, middle and high at -1, 0 and 1."""
         if self.prior is None:
             return np.full(3, np.nan)
         scale = np.log if self.is_log else np.asarray
@@ -73,8 +67,8 @@ class FittedValue:
 class FittedPicture:
     """The content of the picture of a fit.
 
-    `noise` is the standard deviation of the measured x, y [m], theta [rad], if known. `prior_name` names the prior
-    beside each value, and `prior_meaning` explains it.
+    `noise` is the standard deviation of the measured x, y [m], theta [rad]. `prior_name` names the prior beside each
+    value, and `prior_meaning` explains it.
     """
 
     title: str
@@ -150,7 +144,7 @@ class FittedPicture:
 
 
 def _broken(t: Array, values: Array) -> tuple[Array, Array]:
-    """Return a curve with NaN in each interval far longer than the median, so that no line crosses it."""
+    """Return a curve that is interrupted by NaN at each gap."""
     there = np.isfinite(values)
     t, values = t[there], values[there]
     steps = np.diff(t)

@@ -1,4 +1,4 @@
-"""The picture of a fit as a PNG, or as a file for rerun: measured points, fitted motion, residuals, a table."""
+"""The picture of a fit as a PNG, or as a file for rerun."""
 
 from __future__ import annotations
 
@@ -17,13 +17,7 @@ _COMPONENTS: Final = (("x", "mm"), ("y", "mm"), ("theta", "mrad"))
 
 
 def write_fit_picture(picture: FittedPicture, path: Path) -> None:
-    """Write the PNG of a fit, or with the suffix .rrd a file for rerun.
-
-    Raises
-    ------
-    RecordingError
-        The file cannot be written.
-    """
+    """Write a PNG, or with the suffix .rrd a file for rerun; raise RecordingError if it cannot be written."""
     if path.suffix == ".rrd":
         _write_rrd(picture, path)
     else:
@@ -31,7 +25,6 @@ def write_fit_picture(picture: FittedPicture, path: Path) -> None:
 
 
 def _write_rrd(picture: FittedPicture, path: Path) -> None:
-    """Write the .rrd with its layout."""
     import rerun as rr
     import rerun.blueprint as rrb
 

@@ -1,4 +1,4 @@
-"""Picture of a forecast: the clearances over time, and when the first clearance reaches its limit."""
+"""Picture of a forecast: the clearances over time, and when the first of them reaches its limit."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ def draw_forecast(found: Forecast, path: FilePath, title: str) -> None:
     left, right = figure.subplots(1, 2)
     plan = found.plan
     reached = found.hours[np.isfinite(found.hours)]
-    # if the limits have already been reached, `last` is 0, and the whole horizon is shown
+    # the whole horizon is shown if the limits have been reached already
     last = 1.3 * float(np.quantile(reached, 0.95)) if len(reached) else 0.0
     end = min(plan.horizon_h, last) if last > 0.0 else plan.horizon_h
     hours = np.linspace(0.0, end, _MOMENTS)
     growing = 1e3 * found.clearances(hours)
     limits = (plan.limit_horizontal_m, plan.limit_vertical_m)
     for axis, (name, limit, colour) in enumerate(zip(("horizontal", "vertical"), limits, _COLOURS, strict=True)):
-        # a clearance is infinite if its limit has already been reached; then its median is not drawn
+        # a clearance whose limit has been reached is infinite
         low, middle, high = np.minimum(growing[:, :, axis], 1e3 * limit)
         middle[~np.isfinite(growing[1, :, axis])] = np.nan
         left.fill_between(hours, low, high, color=colour, alpha=0.2, linewidth=0.0)
@@ -54,7 +54,7 @@ def draw_forecast(found: Forecast, path: FilePath, title: str) -> None:
                 xytext=(offset, -10.0),
                 textcoords="offset points",
                 ha=side,
-                # the white box of this label covers the line of the other points
+                # this label covers the line of the other points
                 bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0},
             )
     if plan.stop_h is not None and plan.stop_h <= end:

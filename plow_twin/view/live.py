@@ -1,8 +1,4 @@
-"""A live view of a run while it is recorded, in a separate process that follows the file.
-
-The node does not depend on this process: a slow or closed viewer stops only this process. Curves are thinned to the
-least and the largest value of each span.
-"""
+"""A live view of a run by a process that follows its file, so that the node does not depend on the view."""
 
 from __future__ import annotations
 
@@ -16,12 +12,11 @@ from plow_twin.record.reader import RunReader
 from plow_twin.view.drawing import Drawing, Sink
 from plow_twin.view.rrd import ViewSummary
 
-#: A curve keeps two values in each span; rate of these spans [Hz]. An hour of all curves then takes some 200 MB in the
-#: viewer.
+#: Rate of the spans in which a curve keeps two values [Hz]; an hour of all curves takes some 200 MB in the viewer.
 CURVE_HZ: Final = 25.0
 #: Rate of the cross-section in a live view [Hz].
 SECTION_HZ: Final = 20.0
-#: Rate of the cross-section for the part that was recorded before the view started [Hz].
+#: The same for what was recorded before the view started.
 _SECTION_HZ_BEFORE: Final = 1.0
 
 
@@ -33,7 +28,7 @@ def follow(
     exaggerate: float | None = None,
     others: Mapping[str, Scene] | None = None,
 ) -> ViewSummary:
-    """Show a recording until its recorder closes it or ends, or `stop` returns true; options: `to_rrd`.
+    """Show a recording until its recorder ends or `stop` returns true; options as in `to_rrd`.
 
     Raises
     ------
@@ -47,7 +42,7 @@ def follow(
     for batch in reader.batches():
         if len(batch.entries) or batch.outputs:
             drawing.add(batch)
-        else:  # all that has been recorded so far is drawn, so the view is live from here on
+        else:  # the view is live from here on
             drawing.section_hz = SECTION_HZ
             drawing.flush()
             drawing.stream.flush()

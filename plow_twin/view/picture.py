@@ -1,4 +1,4 @@
-"""A recording as one picture, without a viewer: cross-section at the largest force, forces, load, clearance."""
+"""A recording as one picture: cross-section at the largest force, forces, load, clearance."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _LABEL_ROOM_MM: Final = 50.0
 #: Width of an upright label as a share of its axes.
 _LABEL_WIDTH: Final = 0.015
 _LOAD_NAMES: Final = ("Fx [kN]", "Fy [kN]", "M [kN m]")
-#: Words for the origin of a clearance, by its state; the operator's screen uses the same words.
+#: The state of a clearance in the words of the operator's screen.
 _STATES: Final = {
     "prior": "assumed",
     "estimated": "estimated",
@@ -39,10 +39,9 @@ _STATES: Final = {
 
 
 def to_png(path: Path, out: Path) -> tuple[FileStatus, dict[str, int], int]:
-    """Draw a recording into a PNG; return how the recording ended, counts of its losses, and failed advances.
+    """Draw a recording into a PNG; return how it ended, its losses, and the number of failed advances.
 
-    No line crosses missing entries or a reset. A long run is drawn as the envelope of its curves: the least and the
-    largest value in bins of equal width.
+    No line crosses missing entries or a reset. A long run is drawn as the envelope of its curves.
 
     Raises
     ------
@@ -57,13 +56,7 @@ def to_png(path: Path, out: Path) -> tuple[FileStatus, dict[str, int], int]:
 
 
 def run_figure(reader: RunReader, curves: RunCurves) -> Figure:
-    """Return the figure of a recording that has been read into curves.
-
-    Raises
-    ------
-    RecordingError
-        There is no row to draw.
-    """
+    """Return the figure of a recording; raise RecordingError if there is no row to draw."""
     from matplotlib.figure import Figure
 
     if not curves:
@@ -97,7 +90,7 @@ def run_figure(reader: RunReader, curves: RunCurves) -> Figure:
 
 
 def _meanings(curves: RunCurves) -> list[str]:
-    """Return the meanings of the shades and bands in the picture."""
+    """Return the meanings of shades and bands."""
     span = max(curves.force.bin_s, curves.load.bin_s)
     return [
         *(["grey: without samples"] if curves.held_s else []),
@@ -107,7 +100,7 @@ def _meanings(curves: RunCurves) -> list[str]:
 
 
 def _title(reader: RunReader, curves: RunCurves) -> str:
-    """Return run, scene, date, and how the recording ended; a second line states the losses."""
+    """Return run, scene, date and end of the recording, and in a second line the losses."""
     parts = ["/".join(reader.path.absolute().parent.parts[-2:])]
     parts.append(scene_and_date(reader, curves.first_ns))
     losses = [f"lost {name.replace('_', ' ')}: {count}" for name, count in reader.lost_parts.items()]
@@ -133,7 +126,6 @@ def _draw_instant(upper: Any, lower: Any, section: Section, curves: RunCurves) -
 
 
 def _note_absence(axis: Any, text: str) -> None:
-    """Write a text instead of a drawing."""
     axis.text(0.5, 0.5, text, ha="center", va="center", transform=axis.transAxes)
     axis.set(yticks=[])
 
@@ -152,7 +144,7 @@ def _draw_section(axis: Any, section: Section, instant: Instant, curves: RunCurv
             sideways = abs(vector[0]) > abs(vector[1])
             side = "center" if not sideways else "left" if vector[0] > 0.0 else "right"
             axis.annotate(text, origin + 1.1 * vector, color=color, ha=side, va="center", fontsize=8)
-        # annotations do not widen the limits of the axes, so points on both sides of each label are added to the limits
+        # annotations do not widen the axes, so points on both sides of each label do
         axis.update_datalim(
             np.concatenate([origins + 1.1 * vectors + side for side in (-_LABEL_ROOM_MM, _LABEL_ROOM_MM)])
         )
@@ -171,13 +163,13 @@ def _draw_section(axis: Any, section: Section, instant: Instant, curves: RunCurv
 
 
 def _y_upwards(axis: Any) -> None:
-    """Label y upwards: in the data of the section, as in the viewer, y points downwards."""
+    """Label y upwards, although y points downwards in the section."""
     axis.invert_yaxis()
     axis.yaxis.set_major_formatter(lambda y, _: signed(0.0 - y, "g"))
 
 
 def _draw_gaps(axis: Any, penetration: NDArray[np.float64]) -> None:
-    """Draw a bar for each pair: its gap to one side, or its penetration to the other side."""
+    """Draw a bar for each pair: its gap to one side, or its penetration to the other."""
     places = np.arange(len(PAIR_NAMES))
     colors = ["tab:orange" if value > 0.0 else "0.6" for value in penetration]
     bars = axis.barh(places, 1e3 * penetration, color=colors)
@@ -199,10 +191,9 @@ def _curves(
     only_largest: bool = False,
     gaps: Sequence[tuple[float, float]] = (),
 ) -> None:
-    """Draw curves; if the rows are in bins, draw the band from the least to the largest value of each bin.
+    """Draw curves, and if they are in bins, the band from the least to the largest value of each bin.
 
-    With `only_largest`, only the largest values are drawn; this is for forces, whose bands would all begin at zero. No
-    line crosses a gap; `gaps` contains the beginning and the end of each gap [s].
+    `only_largest` is for forces, whose bands would all begin at zero. No line crosses a gap (its begin and end [s]).
     """
     axis.set_ylabel(label)
     if not rows:
@@ -226,14 +217,13 @@ def _widest(times: NDArray[np.float64], begin: float, end: float) -> int:
 
 
 def _thresholds(axis: Any, thresholds: Thresholds, factor: float) -> None:
-    """Draw the thresholds of an alarm, if it has any, times a factor."""
     for value, color, name in ((thresholds.warn, "tab:orange", "warning"), (thresholds.error, "tab:red", "error")):
         if value > 0.0:
             axis.axhline(factor * value, color=color, ls="--", lw=1.0, label=f"{name} threshold")
 
 
 def _clearance(axis: Any, curves: RunCurves) -> None:
-    """Draw both clearances with their intervals, and mark changes that are not wear."""
+    """Draw the clearances with their intervals, and mark changes that are not wear."""
     axis.set_ylabel("clearance with its\n90 % interval [mm]")
     if not curves.clearance:
         _note_absence(axis, "not in the recording")
@@ -259,7 +249,7 @@ def _clearance(axis: Any, curves: RunCurves) -> None:
 
 
 def _with_interval(value: float, low: float, high: float) -> str:
-    """Return a clearance in mm: with three decimals if it has no interval, otherwise with two and the interval."""
+    """Return a clearance in mm, with two decimals and the interval if it has one, otherwise with three."""
     if high - low < 1e-3:
         return f"{value:.3f} mm"
     return f"{value:.2f} mm ({low:.2f} to {high:.2f})"

@@ -15,7 +15,7 @@ _SCALE = 1e3
 
 
 class Residuals:
-    """Compares measured poses with linearly interpolated model rows, once these reach the poses' stamps."""
+    """Compares measured poses with linearly interpolated poses of the model, once these reach the stamps."""
 
     def __init__(self) -> None:
         self._waiting: list[tuple[int, int, tuple[float, ...]]] = []
@@ -24,12 +24,8 @@ class Residuals:
     def compare(self, poses: Sequence[tuple[int, Pose]], steps: Indexes, head: Rows) -> tuple[Indexes, Indexes, Array]:
         """Return stamps, steps and residuals x, y [mm], theta [mrad], (n, 3), of the poses that can be compared now.
 
-        Parameters
-        ----------
-        poses
-            Each pose with its index among the journal entries; `steps` has an element for each entry.
-        head
-            Rows of `head_state`.
+        Each of the `poses` has its index among the journal's entries, whose `steps` are given. `head` has rows of
+        `head_state`.
         """
         self._waiting += [(pose.stamp_ns, max(int(steps[place]), 0), pose.pose) for place, pose in poses]
         predicted = np.column_stack((head.numbers[:, :2], 2.0 * np.arctan2(head.numbers[:, 2], head.numbers[:, 3])))

@@ -1,4 +1,4 @@
-"""A recording as a rerun file with its blueprint: `to_rrd`."""
+"""A recording as a rerun file with its blueprint."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from plow_twin.view.rrd_file import RrdFile
 MOST_ROWS: Final = 200_000
 #: Rate of the cross-section [Hz]; curves keep every row.
 SECTION_HZ: Final = 100.0
-#: Assumed size of a recording per row of its curves [B], from which the number of rows is estimated.
+#: Assumed size of a recording per row of its curves [B].
 _BYTES_PER_ROW: Final = 400
 
 
 @dataclass(frozen=True)
 class ViewSummary:
-    """Content of a .rrd: first stamp, rows of the curves, instants of the cross-section, events.
+    """Content of a .rrd: first stamp, rows of the curves, cross-sections, events.
 
-    `status` is how the recording ended. `lost` has the recorder's counts by topic, the counts of missing parts and of
-    parts of another run, and the count of samples that came too late for other scenes. `failed` is the number of failed
-    advances, which have no forces. `rows` is the number of rows of the force curves, of which `curve_rows` were sent.
+    `status` is how the recording ended. `lost` has the recorder's counts by topic, the missing and foreign parts, and
+    the samples that came too late for other scenes. Of the `rows` of the force curves, `curve_rows` were sent. `failed`
+    is the number of failed advances, which have no forces.
     """
 
     path: Path
@@ -114,6 +114,6 @@ def to_rrd(
 
 
 def _span_ns(reader: RunReader, duration_s: float, most_rows: int) -> int:
-    """Return the span [ns] of which a curve keeps two rows; 0 for a short run, which keeps every row."""
+    """Return the span of which a curve keeps two rows [ns]; 0 for a short run, which keeps all."""
     rows = reader.size() / _BYTES_PER_ROW
     return 0 if rows <= most_rows else max(1, round(2e9 * duration_s / most_rows))

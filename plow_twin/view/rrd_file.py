@@ -13,24 +13,19 @@ import rerun.blueprint as rrb
 
 from plow_twin.errors import RecordingError
 
-#: Largest number of bytes that are copied at once. A pipe holds fewer bytes, so each copy takes all waiting bytes.
+#: Largest number of bytes copied at once; a pipe holds fewer, so each copy takes all that wait.
 _CHUNK: Final = 1 << 20
 
 
 class RrdFile:
-    """Receives a stream through a pipe and writes it to a file; an incomplete file is removed.
+    """Writes a stream to a file through a pipe; an incomplete file is removed.
 
-    The SDK's own file sink (0.41) waits forever for a disk that is full: in `save`, `flush` or `disconnect`.
-
-    Parameters
-    ----------
-    path
-        The file to write; its folder is made if it does not exist.
+    The SDK's own file sink (0.41) waits forever for a disk that is full.
 
     Raises
     ------
     RecordingError
-        The file cannot be opened. `check` and the end of the context raise this error if the file cannot be written.
+        The file cannot be opened, or, from `check` and the end of the context, written.
     """
 
     def __init__(self, path: Path) -> None:
@@ -54,7 +49,7 @@ class RrdFile:
             self._stream.disconnect()
         os.close(self._inlet)
         self._writer.join()
-        if (kind is not None or self.failed) and self.path.is_file():  # the path is a file, not a device
+        if (kind is not None or self.failed) and self.path.is_file():  # not a device
             self.path.unlink()
         if kind is None:
             self.check()
@@ -84,5 +79,5 @@ class RrdFile:
                     shutil.copyfileobj(outlet, self._file, _CHUNK)
             except OSError as error:
                 self._error = error
-                while outlet.read(_CHUNK):  # reading goes on, because without a reader the stream would wait
+                while outlet.read(_CHUNK):  # otherwise the stream would wait for a reader
                     pass

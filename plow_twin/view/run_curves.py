@@ -1,4 +1,4 @@
-"""The curves of a whole recording, collected batch by batch for one picture."""
+"""The curves of a whole recording for one picture."""
 
 from __future__ import annotations
 
@@ -23,20 +23,19 @@ from plow_twin.view.envelope import Envelope
 
 Array = NDArray[np.float64]
 
-#: Columns of the horizontal clearance and of its 5 % and 95 % points, then of the same for the vertical clearance.
+#: Columns of each clearance with its 5 % and 95 % points.
 _CLEARANCE_COLUMNS: Final = np.array(
     [CLEARANCE_NAMES.index(f"{axis}{point}") for axis in ("horizontal", "vertical") for point in ("", "/p05", "/p95")]
 )
 _NS: Final = 1e-9
 #: States of a clearance whose value comes from measurements.
 _KNOWN_STATES: Final = ("estimated", "rough")
-#: Largest number of marks of each kind that are drawn (silent, held and failed intervals, changes of the clearance);
-#: more marks would cover the picture.
+#: Largest number of marks of each kind; more would cover the picture.
 _MOST_MARKS: Final = 40
 
 
 class Instant(NamedTuple):
-    """Pose x, y [m], theta [rad] of the head at a stamp [ns], forces [N] and penetrations [m] of the pairs."""
+    """Pose x, y [m], theta [rad] of the head at a stamp [ns]; forces [N] and penetrations [m] of the pairs."""
 
     stamp_ns: int
     pose: tuple[float, float, float]
@@ -48,10 +47,9 @@ class Instant(NamedTuple):
 class RunCurves:
     """Largest forces [kN], load [kN, kN m] and clearances [mm] over time, and the instant of the largest force.
 
-    Times [s] count from `first_ns`, the first stamp of a sample or message. `held_s` contains the intervals without
-    samples, which the hold policy or a straight line of the load bridges. `failed_s` contains the intervals of failed
-    advances, which have no forces; `failed` is the number of these advances. `changes` contains each instant at which
-    the clearance changed for a reason other than wear, with the reason.
+    Times [s] count from `first_ns`, the first stamp. `held_s` has the intervals without samples, which the hold policy
+    or a straight line bridges, and `failed_s` those of failed advances, whose number is `failed`. `changes` has each
+    change of the clearance that is not wear, with its reason.
     """
 
     first_ns: int | None = None
@@ -59,20 +57,20 @@ class RunCurves:
     load: Envelope = field(default_factory=lambda: Envelope(3))
     clearance: Envelope = field(default_factory=lambda: Envelope(len(_CLEARANCE_COLUMNS)))
     instant: Instant | None = None
-    #: largest peak of all pairs, at the stamps and between them [kN]; 0 without peaks
+    #: largest peak of all pairs [kN]; 0 without peaks
     peak: float = 0.0
     held_s: list[tuple[float, float]] = field(default_factory=list)
     failed_s: list[tuple[float, float]] = field(default_factory=list)
-    #: description of all stretches without samples
+    #: description of the intervals without samples
     silences: str = ""
     failed: int = 0
     changes: list[tuple[float, str]] = field(default_factory=list)
-    #: states of the newest clearances, as in the status of the twin
+    #: states of the newest clearances, as in the twin's status
     states: dict[str, str] = field(default_factory=lambda: {"horizontal": "prior", "vertical": "prior"})
     _estimated: bool = False
     _held_since_ns: int | None = None
     _newest_ns: int | None = None
-    #: sequence number and result of the newest `Estimated` entry
+    #: sequence number and result of the newest estimate
     _estimate: tuple[int, str] | None = None
     _clearance: Array | None = None
 
@@ -103,7 +101,7 @@ class RunCurves:
 
     @property
     def instant_s(self) -> float | None:
-        """Time of the instant of the largest force [s]; None if there is no such instant."""
+        """Time of the instant of the largest force [s]."""
         return None if self.instant is None else (self.instant.stamp_ns - (self.first_ns or 0)) * _NS
 
     def __bool__(self) -> bool:
@@ -134,7 +132,7 @@ class RunCurves:
                     self._newest_ns = stamp_ns
                 case Estimated(end_ns=end_ns, result=result):
                     if not self._estimated:
-                        # the estimate holds from its arrival on, so the samples before it are added first
+                        # the samples before the estimate came without it
                         self._samples(batch.entries.stamp_ns[samples[(samples >= done) & (samples < index)]])
                         done = index
                         self._change(end_ns if self._newest_ns is None else self._newest_ns, "first estimate")
@@ -152,7 +150,7 @@ class RunCurves:
         self._samples(batch.entries.stamp_ns[samples[samples >= done]])
 
     def _samples(self, stamps: NDArray[np.int64]) -> None:
-        """Add the stamps of samples; a sample after the load began to be held ends the hold, even if it is late."""
+        """Add the stamps of samples; the first sample beyond the begin of a hold ends the hold."""
         if not len(stamps):
             return
         behind = stamps[stamps > (self._held_since_ns or 0)]
@@ -168,14 +166,14 @@ class RunCurves:
         self._held_since_ns = None
 
     def _bridged(self, begin_ns: int, end_ns: int) -> None:
-        """End the lines at a silence without a journal entry, and mark the silence as long as there are few marks."""
+        """End the lines at a silence without a journal entry, and mark it as long as there are few marks."""
         if self._held_since_ns is None and len(self.held_s) < _MOST_MARKS:
             self._held_since_ns = begin_ns
             self._end_of_held(end_ns)
             self._break_lines()
 
     def _failed(self, stamp_ns: int, since_ns: int, advances: int) -> None:
-        """Add the first failed advance of a series or, when the series ends, all its other advances."""
+        """Add the first failed advance of a series or, at its end, all others."""
         first = self.first_ns or 0
         self.failed += advances
         if stamp_ns == since_ns:
@@ -189,7 +187,7 @@ class RunCurves:
             self.changes.append(((stamp_ns - self.first_ns) * _NS, reason))
 
     def _last_estimate(self) -> None:
-        """Add the clearances of an estimate that came after the last publication, at the last stamp."""
+        """Add the clearances of an estimate that came after the last publication."""
         if self._estimate is None or self._clearance is None or self._newest_ns is None:
             return
         result, values = json.loads(self._estimate[1]), self._clearance.copy()
@@ -211,7 +209,7 @@ class RunCurves:
             self.clearance.add(self._seconds(rows.stamp_ns), values)
             self._clearance = values[-1]
             if self._estimate is not None and rows.sequence[-1] > self._estimate[0]:
-                # the estimate is no longer shown beside these clearances: publications after an estimate include it
+                # publications after an estimate include it
                 self._estimate = None
         if "contact_forces" in found and "head_state" in found:
             for instant in _largest(found["contact_forces"], found["head_state"]):
@@ -220,7 +218,7 @@ class RunCurves:
 
 
 def _largest(contact: Rows, head: Rows) -> Iterator[Instant]:
-    """Yield the instant of the largest force among instants that have a pose of the same publication."""
+    """Yield the instant of the largest force, among those with a pose of the same publication."""
     at = np.minimum(np.searchsorted(contact.sequence, head.sequence), len(contact) - 1)
     both = np.flatnonzero(contact.stamp_ns[at] == head.stamp_ns)
     if not both.size:

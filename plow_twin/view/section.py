@@ -1,4 +1,4 @@
-"""The cross-section for rerun: in millimetres, with y downwards."""
+"""The cross-section of head and frame for a picture, in millimetres, with y downwards."""
 
 from __future__ import annotations
 
@@ -21,18 +21,17 @@ _MM: Final = 1000.0
 ARROW_MM_PER_N: Final = 7e-4
 #: Smallest force that is drawn [N].
 FAINT_N: Final = 500.0
-#: Distance of the body's drawn outline from the cavity [mm]; a scene states no outline.
+#: Distance of the body's drawn outline from the cavity [mm], since a scene states no outline.
 BODY_MARGIN_MM: Final = 60.0
 
-#: Depth at which a pad is drawn per depth of its wear [mm/mm].
+#: Drawn depth of a pad per depth of its wear [mm/mm].
 PAD_MM_PER_MM: Final = 200.0
 #: Drawn length of a pad [mm].
 _PAD_MM: Final = 60.0
 #: Distance of a label below its place [mm].
 LABEL_MM: Final = 16.0
 
-#: Hues of the corners; of a corner's two pairs, the pair that touches a vertical wall has the lighter colour (Okabe and
-#: Ito's palette).
+#: Hues of the corners; the pair at a vertical wall has the lighter colour (Okabe and Ito's palette).
 _HUES: Final = ((0, 114, 178), (230, 159, 0), (213, 94, 0), (0, 158, 115))
 _LIGHTER: Final = ((86, 180, 233), (240, 228, 66), (255, 158, 105), (110, 220, 185))
 PAIR_COLORS: Final = tuple(color for pair in zip(_HUES, _LIGHTER, strict=True) for color in pair)
@@ -46,16 +45,16 @@ _OUTWARDS: Final[Array] = np.stack((NORMAL_X, NORMAL_Y), axis=1)
 
 @dataclass(frozen=True)
 class Section:
-    """Sizes of the cross-section [mm], which are constant in a run.
+    """Sizes of the cross-section [mm].
 
-    A head that carries walls is drawn as the cavity that moves about the frame; a head that carries corners is drawn as
-    the block that moves in the cavity.
+    A head that carries walls is drawn as a cavity that moves about the frame, a head that carries corners as a block
+    that moves in the cavity.
     """
 
     frame: Array
     cavity: Array
     labels: tuple[str, ...]
-    #: name of the body that is drawn at rest; on a support this body moves, and the section is drawn in its axes
+    #: name of the body that is drawn at rest; on a support, the section is drawn in its axes
     frame_name: str = "frame (fixed)"
     is_block: bool = False
     #: radius of the corners of the frame or of the block
@@ -79,16 +78,15 @@ class Section:
         return 0.5 * self.cavity + BODY_MARGIN_MM + 70.0
 
     def frame_strip(self) -> Array:
-        """Outline of the frame, or of the cavity around a block, shape (5, 2); rounded corners have more points."""
+        """Outline of the frame, or of the cavity around a block, shape (n, 2)."""
         return (outline(self.cavity, 0.0) if self.is_block else outline(self.frame, self.radius)) * _FLIP
 
     def corners(self, pose: Iterable[float] = (0.0, 0.0, 0.0)) -> Array:
         """Corners of the frame, or of a block at a pose, in the order of `CORNER_NAMES`, shape (4, 2).
 
-        The corners of a block are named by their place, so their names change when the block has turned beyond 45
-        degrees.
+        A block's corners are named by their place, so they change their names when it has turned beyond 45 degrees.
         """
-        # distance along each axis from the point where the sides would meet to the middle of the corner's arc
+        # distance of the middle of a corner's arc from the point where the sides would meet, along each axis
         within = self.radius * (1.0 - math.sqrt(0.5))
         corners = ((0.5 * self.frame - within) * _SIGNS)[::2]
         if not self.is_block:
@@ -97,7 +95,7 @@ class Section:
         return np.roll(_placed(corners, (x, y, theta)), -round(theta / (0.5 * math.pi)), axis=0)
 
     def head_strips(self, pose: Iterable[float]) -> Array:
-        """Outlines of the head at a pose x, y [m], theta [rad]: cavity and body, shape (2, 5, 2); block: (1, n, 2)."""
+        """Outlines of the head at a pose x, y [m], theta [rad]: cavity and body (2, 5, 2), or block (1, n, 2)."""
         if self.is_block:
             return _placed(outline(self.frame, self.radius)[None], pose)
         sides = np.stack((self.cavity, self.cavity + 2.0 * BODY_MARGIN_MM))
@@ -111,24 +109,23 @@ class Section:
     def exaggerated(self, penetration: Array, factor: float) -> tuple[Array, NDArray[np.bool_]]:
         """Return the four walls with gaps `factor` times as wide, shape (4, 2, 2), and which of them touch.
 
-        The order of the walls is top, right, bottom, left. Each wall passes through two points at the frame's corners,
-        where it is displaced by the pad's wear, and ends at the next wall.
+        The order is top, right, bottom, left. A wall passes through two points at the frame's corners, displaced by the
+        pad's wear, and ends at the next wall.
         """
         places = (0.5 * self.frame * _SIGNS - _OUTWARDS * (_MM * factor * penetration)[:, None]) * _FLIP
         walls = np.array([(0, 2), (3, 5), (4, 6), (7, 1)])
         return _closed(places[walls]), (penetration[walls] > 0.0).any(axis=1)
 
     def pads(self, wear_depth_mm: Array) -> tuple[Array, Array, Array]:
-        """Return centres, half sizes and places of labels of the bars inside the frame that show the wear of its pads.
+        """Return centres, half sizes and places of labels, shape (8, 2) each, of bars that show the wear of the pads.
 
-        A bar lies along the wall that its pair touches, beginning at the corner. Each array has shape (8, 2).
+        A bar lies inside the frame along its pair's wall, from the corner on.
         """
         corners = 0.5 * self.frame * _SIGNS
         along = _SIGNS - _OUTWARDS
         depth = np.minimum(PAD_MM_PER_MM * wear_depth_mm, 0.25 * self.frame.min())[:, None]
         middles = (corners - 0.5 * depth * _OUTWARDS - (0.5 * _PAD_MM + 12.0) * along) * _FLIP
-        # labels are inside the frame, away from the walls; of the two labels at a corner, that of the vertical wall is
-        # nearer the centre
+        # of the two labels at a corner, that of the vertical wall is nearer the centre
         inwards = np.stack((np.full(PAIR_COUNT, 0.5), np.where(np.abs(_OUTWARDS[:, 0]) > 0.5, 0.26, 0.64)), axis=1)
         labels = corners * inwards * _FLIP - [0.0, LABEL_MM]
         return middles, 0.5 * (depth * np.abs(_OUTWARDS) + _PAD_MM * np.abs(along)), labels
@@ -141,9 +138,9 @@ class Section:
         return places
 
     def arrows(self, pose: tuple[float, float, float], force: Array) -> tuple[Array, Array, NDArray[np.intp]]:
-        """Origins and vectors of the forces on the head, shape (k, 2), and the pairs that they belong to, (k,)."""
+        """Origins and vectors of the forces on the head, shape (k, 2), and their pairs, (k,)."""
         drawn = np.flatnonzero(force >= FAINT_N)
-        # a frame corner pushes the wall of the head outwards; a wall pushes the corner of a block inwards
+        # a frame's corner pushes the wall of the head outwards, a wall pushes the corner of a block inwards
         theta = math.pi if self.is_block else pose[2]
         normal_x = math.cos(theta) * NORMAL_X[drawn] - math.sin(theta) * NORMAL_Y[drawn]
         normal_y = math.sin(theta) * NORMAL_X[drawn] + math.cos(theta) * NORMAL_Y[drawn]
@@ -152,13 +149,13 @@ class Section:
         return self.corners(pose)[drawn // 2], vectors, drawn
 
     def corner_radii(self, force: Array) -> Array:
-        """Radius of each corner's mark [mm], shape (4,): larger if the corner carries force."""
+        """Radius of each corner's mark [mm], shape (4,), larger where the corner carries force."""
         total = force.reshape(PAIR_COUNT // 2, 2).sum(axis=1)
         return np.where(total >= FAINT_N, 7.0, 3.0)
 
 
 def _closed(walls: Array) -> Array:
-    """Return walls (4, 2, 2), each extended to its neighbours unless they are parallel to it."""
+    """Return walls (4, 2, 2) extended to their neighbours, unless two are parallel."""
     along = walls[:, 1] - walls[:, 0]
     before, along_before = np.roll(walls, 1, axis=0), np.roll(along, 1, axis=0)
     across = _cross(along_before, along)

@@ -1,4 +1,4 @@
-"""rerun's viewer as a program, started on the loopback address and ended with the process that started it."""
+"""rerun's viewer as a program on the loopback address, which ends with the process that started it."""
 
 from __future__ import annotations
 
@@ -19,19 +19,13 @@ import rerun.blueprint as rrb
 from plow_twin.errors import RecordingError
 
 LOOPBACK: Final = "127.0.0.1"
-#: Memory limit of the viewer and of its server; above this limit they drop the oldest data.
+#: Memory limit of viewer and server, above which they drop the oldest data.
 _MEMORY: Final = "2GB"
 _START_S: Final = 60.0
 
 
 def viewer_program() -> str:
-    """Return rerun's program itself, not its wrapper of the same name, whose child would outlive the wrapper.
-
-    Raises
-    ------
-    RecordingError
-        The viewer is not installed.
-    """
+    """Return rerun's program itself, not its wrapper, whose child would outlive it; raise RecordingError without it."""
     found = find_spec("rerun_cli")
     beside = Path(found.origin).with_name("rerun") if found is not None and found.origin is not None else None
     program = str(beside) if beside is not None and beside.exists() else shutil.which("rerun")
@@ -42,7 +36,7 @@ def viewer_program() -> str:
 
 @dataclass(frozen=True)
 class Viewer:
-    """A running viewer; `url` receives data, `page` shows them in a browser (empty: a window)."""
+    """A running viewer: `url` receives data, `page` shows them in a browser (empty: a window)."""
 
     process: subprocess.Popen[bytes]
     url: str
@@ -53,13 +47,13 @@ class Viewer:
         stream.connect_grpc(self.url, default_blueprint=blueprint)
 
     def close(self) -> None:
-        """End the viewer, also when it is suspended."""
+        """End the viewer, even if it is suspended."""
         self.process.kill()
         self.process.wait()
 
 
 def start_viewer(*, web_port: int | None = None) -> Viewer:
-    """Start a viewer on the loopback address: a page on `web_port`, or a window.
+    """Start a viewer: a page on `web_port`, or a window.
 
     Raises
     ------
@@ -71,7 +65,7 @@ def start_viewer(*, web_port: int | None = None) -> Viewer:
     if web_port is not None:
         command += ["--serve-web", "--web-viewer-port", str(web_port), "--server-memory-limit", _MEMORY]
     bound = shutil.which("setpriv")
-    if bound is not None:  # the viewer is killed with this process
+    if bound is not None:  # the viewer ends with this process
         command = [bound, "--pdeathsig", "KILL", *command]
     environment = {"RUST_LOG": "warn", **os.environ}
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, env=environment)
@@ -90,10 +84,7 @@ def _address(port: int) -> str:
 
 
 def page_address(web_port: int, port: int) -> str:
-    """Return the address of the page that shows the data on a port.
-
-    The address requests the dark theme, because the labels of the light theme make the cross-section's names illegible.
-    """
+    """Return the address of the page for a port, in the dark theme, where the cross-section's names can be read."""
     return f"http://{LOOPBACK}:{web_port}/?url={quote(_address(port), safe='')}&theme=dark"
 
 
@@ -105,13 +96,7 @@ def free_port() -> int:
 
 
 def page_port(asked: int) -> int:
-    """Return the port for a page: the given port, or a free port for 0.
-
-    Raises
-    ------
-    RecordingError
-        Another program uses the port.
-    """
+    """Return a port for a page, any free port for 0; raise RecordingError if another program uses it."""
     if not asked:
         return free_port()
     with socket.socket() as probe:

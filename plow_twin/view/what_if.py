@@ -19,12 +19,12 @@ from plow_twin.view.columns import Array, Curves, Indexes, TimeAxis
 
 
 class WhatIf:
-    """Runs other scenes, each with a name, under the journal of a run, and draws their forces; idle without scenes.
+    """Runs other scenes under the journal of a run and draws their forces; does nothing without scenes.
 
     Raises
     ------
     RecordingError
-        The run was under the loads of its own scene, so its journal contains no load that another scene could take.
+        The run was under the loads of its own scene, so its journal has no load.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class WhatIf:
 
     @property
     def lost(self) -> dict[str, int]:
-        """Number of samples too late for the other scenes, by their key in `lost`."""
+        """Number of samples that came too late for the other scenes."""
         return {"samples_too_late": self._walk.late} if self._walk.late else {}
 
     def add(self, entries: Entries, stamps: Indexes, steps: Indexes) -> None:
