@@ -13,9 +13,9 @@ from urllib.parse import urlsplit
 from plow_twin.access import is_address, is_loopback, read_secret
 from plow_twin.errors import InputError, Problem
 
-#: Name of the environment variable with the token, which is used if there is no token file.
+#: Environment variable with the token, if there is no token file.
 TOKEN_VARIABLE: Final = "PLOW_TWIN_DASHBOARD_TOKEN"
-#: Smallest number of characters of a token.
+#: Smallest length of a token.
 _SHORTEST: Final = 16
 
 
@@ -28,7 +28,7 @@ class DashboardError(InputError):
 
 @dataclass(frozen=True)
 class PageAccess:
-    """Address of the screen, and its token; without a token everybody on this machine may look and acknowledge."""
+    """Address and token of the screen; without a token everybody on this machine may look and acknowledge."""
 
     host: str
     port: int
@@ -61,14 +61,14 @@ class PageAccess:
         return cls(host, port, token)
 
     def admits(self, token: object) -> bool:
-        """Return whether a token is right, in a time that does not depend on the number of right characters."""
+        """Return whether a token is right, in a time that does not depend on the token."""
         given = token if isinstance(token, str) else ""
         return hmac.compare_digest(given.encode("utf-8", "replace"), self.token.encode())
 
     def answers_to(self, host: str) -> bool:
-        """Return whether the page answers to a name in `Host`; the page refuses names that others may own.
+        """Return whether the page answers to a name in `Host`.
 
-        Otherwise the owner of a name could point it to this address and read the screen (DNS rebinding).
+        Somebody else's name could point to this address to read the screen (DNS rebinding).
         """
         try:
             name = urlsplit(f"//{host}").hostname or ""
@@ -79,18 +79,12 @@ class PageAccess:
         return not is_loopback(self.host) and (is_address(name) or name in (socket.gethostname(), socket.getfqdn()))
 
     def is_own(self, origin: str | None, host: str) -> bool:
-        """Return whether a connection comes from the page itself, or from a program other than a browser."""
+        """Return whether a connection comes from the page itself, or from no browser."""
         return origin is None or urlsplit(origin).netloc.lower() == host.lower()
 
 
 def listening(access: PageAccess) -> socket.socket:
-    """Return a socket that listens on the address.
-
-    Raises
-    ------
-    DashboardError
-        The address is in use, or belongs to another machine.
-    """
+    """Return a socket that listens; raise DashboardError if the address is in use or not this machine's."""
     try:
         family, kind, _, _, address = socket.getaddrinfo(access.host, access.port, type=socket.SOCK_STREAM)[0]
         found = socket.socket(family, kind)

@@ -1,4 +1,4 @@
-"""A process beside a twin, connected by a link; a fault of the process does not affect the twin."""
+"""A process beside a twin, whose faults do not affect the twin."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, Final, Self
 
 from plow_twin.dashboard.link import pair
 
-#: How long the process may take to end [s].
+#: Longest time that the process may take to end [s].
 END_S: Final = 3.0
 
 
@@ -19,9 +19,9 @@ class Beside:
     Parameters
     ----------
     module
-        Module that is run; its arguments are the descriptor of the link, then `descriptors`.
+        Module to run; its arguments are the descriptor of the link, then `descriptors`.
     first
-        First message to the process. It carries the secrets, because other users can read a command line.
+        First message, which carries the secrets: other users can read a command line.
     descriptors
         Further descriptors for the process.
     """
@@ -30,8 +30,7 @@ class Beside:
         self.link, theirs = pair()
         with theirs:
             numbers = (theirs.fileno(), *descriptors)
-            # the process gets a session of its own, so that Ctrl-C reaches only the twin, whose end also ends the
-            # process
+            # in its own session, the process gets no Ctrl-C; it ends with the twin
             self.process = subprocess.Popen(
                 [sys.executable, "-m", module, *map(str, numbers)],
                 stdin=subprocess.DEVNULL,

@@ -1,4 +1,4 @@
-"""State of the screen's server: the newest values, the last hour, and the updates that each page lacks."""
+"""State of the screen's server: the newest values, and the last hour."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import Any, Final
 
 from plow_twin.dashboard.history import History
 
-#: Largest number of events that are kept.
 _EVENTS: Final = 200
 
 
@@ -26,7 +25,7 @@ class Board:
         self._history = History()
         self._not_taken = 0
         self._updated_s = time.monotonic()
-        #: each update sets this event, and then replaces it by a new event
+        #: set by the next update, and then replaced
         self.news = asyncio.Event()
         self.pages = 0
 
@@ -52,7 +51,7 @@ class Board:
         news.set()
 
     def since(self, version: int) -> dict[str, Any]:
-        """Return the values newer than update `version`, the last that a page has received; 0: all values."""
+        """Return the values newer than update `version`, the last that a page has received; 0: all."""
         found: dict[str, Any] = {
             "version": self.version,
             "age": round(time.monotonic() - self._updated_s, 2),

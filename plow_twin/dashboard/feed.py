@@ -1,6 +1,6 @@
-"""The feed of a process beside a twin: it sums up publications and sends the sums at a fixed rate.
+"""The feed of a process beside a twin, which sums up publications and sends the sums at a fixed rate.
 
-An update for which there is no room is not queued: its peaks and all newest values go into the next update.
+The peaks and newest values of an update for which there is no room go into the next update.
 """
 
 from __future__ import annotations
@@ -24,30 +24,28 @@ Array = NDArray[np.float64]
 RATE_HZ: Final = 10.0
 #: Largest number of publications that wait to be summed up.
 _MOST: Final = 256
-#: Largest number of events that wait.
 _EVENTS: Final = 20
-#: Longest text that is passed on.
+#: Longest text that is passed on [characters].
 _LONGEST: Final = 1000
 #: Largest number of operators' requests that are handled at once.
 _MOST_ASKED: Final = 8
 _NO_LOAD: Final = np.full(3, np.nan)
-#: States of a clearance whose value comes from measurements, repeated here so that `estimate` need not be imported.
+#: States of a measured clearance, repeated here because `estimate` is not imported.
 _KNOWN_STATES: Final = ("estimated", "rough")
 
 
 class Motion:
-    """The newest motion, and the extremes since they were last cleared."""
+    """The newest motion, and the extremes since the last `clear`."""
 
     def __init__(self) -> None:
-        #: stamp reached [ns]; 0 means that nothing has been published yet
+        #: stamp reached [ns]; 0: none yet
         self.stamp_ns = 0
         self.pose = np.full(3, np.nan)
         self.penetration = np.full(PAIR_COUNT, np.nan)
         self.force = np.full(PAIR_COUNT, np.nan)
         self.clearance: Array | None = None
-        #: the newest estimate; it is emptied when newer clearances are published
+        #: the newest estimate, until newer clearances are published
         self.estimate: Mapping[str, str] = {}
-        #: the newest status
         self.status: Mapping[str, str] = {}
         self.load = _NO_LOAD
         self.held = False
@@ -68,7 +66,7 @@ class Motion:
         self.highest = np.fmax(self.highest, np.fmax.reduce(wrench))
 
     def add_peaks(self, peak: Array) -> None:
-        """Add the largest forces [N], each since the previous row, shape (n, 8)."""
+        """Add the largest forces since the previous row [N], shape (n, 8)."""
         self.peak = np.maximum(self.peak, peak.max(axis=0))
 
     def add_points(self, low: Array, high: Array) -> None:
@@ -78,7 +76,7 @@ class Motion:
 
     def add_rows(self, waiting: list[Published]) -> None:
         """Add publications of a twin."""
-        # each column is joined by itself, because numpy takes thirty times as long to join records
+        # joining records takes numpy thirty times as long as joining columns
         rows = [published.rows for published in waiting]
         newest = rows[-1][-1]
         self.stamp_ns = int(newest["stamp_ns"])
@@ -93,14 +91,11 @@ class Motion:
             self.set_clearance(slow["clearance"][-1])
 
     def set_clearance(self, values: Array) -> None:
-        """Add the clearances of a publication [m], in the order of `CLEARANCE_NAMES`."""
+        """Take the clearances of a publication [m], in the order of `CLEARANCE_NAMES`."""
         self.clearance, self.estimate = values, {}
 
     def _clearances(self, values: Array) -> dict[str, float | None]:
-        """Return the newest clearances by name: as published, or as in a later estimate.
-
-        An estimate may be the last message, if a file has ended or the machine has stopped.
-        """
+        """Return the newest clearances by name, as published or as in a later estimate."""
         found = {name: number(value) for name, value in zip(CLEARANCE_NAMES, values.tolist(), strict=True)}
         for axis in [axis for axis in ("horizontal", "vertical") if self.status.get(axis) in _KNOWN_STATES]:
             for name in (axis, f"{axis}/p05", f"{axis}/p95"):
@@ -139,16 +134,16 @@ class Feed:
     facts
         Facts about the machine (`facts.facts_of`).
     answer
-        Function that carries out an operator's request (`acknowledge` or `mark`, with a text) and returns whether it
-        succeeded and a text for the operator; None if operators cannot make requests.
+        Does an operator's request (`acknowledge` or `mark`, with a text), and returns success and an answer; None:
+        operators cannot make requests.
     load
-        Function that returns the load Fx, Fy [N], M [N m] at the newest publication, shape (3,).
+        Returns the load Fx, Fy [N], M [N m] at the newest publication, shape (3,).
     on_error
-        Function that is called with the reason when the feed has ended.
+        Called with the reason when the feed has ended.
     process, consequence
-        Name of the process, and what its end means for the user, both for the report of an error.
+        Name of the process, and what its end means for the user.
     by_second
-        Send an update for each second of stamps even if samples arrive faster than in real time, as from a file.
+        Whether to send an update for each second of stamps, even if samples arrive faster than in real time.
     """
 
     def __init__(
@@ -175,14 +170,12 @@ class Feed:
         self._waiting: list[Published] = []
         self._loads: list[Array] = []
         self.motion = Motion()
-        #: stamp of the newest publication in whole seconds
         self._second = 0
-        #: `taken`: number of updates that the server took
-        #: `not_taken`: number of updates for which it had no room
+        #: number of updates that the process took, and for which it had no room
         self.taken = self.not_taken = 0
 
     def publication(self, published: Published) -> None:
-        """Add a publication of at least one row, which is kept for the next update."""
+        """Add a publication of at least one row to the next update."""
         second = int(published.rows["stamp_ns"][-1]) // NS_PER_S
         if self._by_second and second != self._second and self._waiting:
             self.send()
@@ -194,24 +187,24 @@ class Feed:
             self._sum_up()
 
     def part(self, name: str, part: Part) -> None:
-        """Add a status, which replaces the previous status of that name."""
+        """Add a status, which replaces that of the same name."""
         level, message, values = part
-        # the diagnostics have a part of the same name as the topic; only that part has the key `estimates`
+        # a part of the diagnostics has the name of this topic; only it has the key `estimates`
         if name == "estimate" and "estimates" not in values:
-            self._sum_up()  # the publications that came before the estimate are summed up first
+            self._sum_up()  # publications before the estimate
             self.motion.estimate = values
         elif name == "status":
             self.motion.status = values
         self._parts[name] = level, message[:_LONGEST], {key: text[:_LONGEST] for key, text in values.items()}
 
     def event(self, kind: str, text: str, *, done: bool = True, stamp_ns: int | None = None) -> None:
-        """Add an event at `stamp_ns`, by default the stamp reached [ns]."""
+        """Add an event, by default at the stamp reached."""
         at_ns = self.motion.stamp_ns if stamp_ns is None else stamp_ns
         self._events.append({"t": at_ns * 1e-9, "kind": kind, "text": text[:_LONGEST], "done": done})
         del self._events[:-_EVENTS]
 
     def turn(self) -> None:
-        """Carry out operators' requests, and send an update; to be called at the rate of the updates."""
+        """Do operators' requests and send an update; to be called at the rate of the updates."""
         self.hear()
         self.send()
         if self._link.broken and not self._ended:
@@ -219,7 +212,7 @@ class Feed:
             self._on_error(self._end)
 
     def hear(self) -> None:
-        """Carry out operators' requests, and read reports of the process."""
+        """Do operators' requests, and read reports of the process."""
         for _ in range(_MOST_ASKED):
             asked = self._link.receive()
             if asked is None:
@@ -269,7 +262,7 @@ def _joined(rows: list[NDArray[np.void]], name: str) -> NDArray[Any]:
 
 
 def part_of(message: Message) -> Part:
-    """Return a status or named numbers in the form of the page; of forces, the peaks are returned."""
+    """Return a status or named numbers (of forces: the peaks) in the form of the page."""
     if isinstance(message, DiagnosticStatus):
         return message.level, message.message, dict(message.values)
     if not isinstance(message, JointState):

@@ -7,16 +7,15 @@ from typing import Any, Final
 
 #: Span of stamps that is kept [s].
 SPAN_S: Final = 3600
-#: The clearances of a second, in the order in which they are sent.
+#: The clearances of a second, in their order.
 _CLEARANCES: Final = tuple(f"{name}{point}" for name in ("horizontal", "vertical") for point in ("", "/p05", "/p95"))
 
 
 class History:
-    """The kept seconds, each a list of time [s], eight peaks, six extremes of load, six clearances and the hold flag.
+    """The kept seconds, each with the number of the update that changed it last, so that a page gets only newer ones.
 
-    Where intervals are known, the 5 % and 95 % points of the eight peaks follow.
-
-    Each second has the number of the update that changed it last, so that a page gets only newer values.
+    A second is a list: time [s], eight peaks, six extremes of load, six clearances, the hold flag, and where intervals
+    are known, the 5 % and 95 % points of the peaks.
     """
 
     def __init__(self) -> None:
@@ -51,7 +50,7 @@ class History:
         return stepped_back
 
     def since(self, version: int) -> list[list[Any]]:
-        """Return the seconds that changed after the update `version`, in order of time."""
+        """Return the seconds that changed after the update `version`."""
         count = 0
         for found in reversed(self._versions):
             if found <= version:
@@ -61,7 +60,7 @@ class History:
 
 
 def _joined(before: list[Any], now: list[Any]) -> list[Any]:
-    """Merge a second with later values of it: the extremes of peaks and loads, and the newest clearances."""
+    """Merge a second with later values: the extremes of peaks and loads, the newest clearances."""
     largest = [_extreme(max, *pair) for pair in zip(before[1:9], now[1:9], strict=True)]
     lowest = [_extreme(min, *pair) for pair in zip(before[9:12], now[9:12], strict=True)]
     highest = [_extreme(max, *pair) for pair in zip(before[12:15], now[12:15], strict=True)]

@@ -1,4 +1,4 @@
-"""The link between a twin and the screen's server: whole, bounded messages in both directions, without waiting."""
+"""The link between a twin and a process beside it: whole, bounded messages in both directions, without waiting."""
 
 from __future__ import annotations
 
@@ -10,18 +10,12 @@ from typing import Any, Final
 
 #: Largest message [B].
 LONGEST: Final = 1 << 16
-#: Room for messages that the other side has not yet received [B].
+#: Room for messages that wait for the other side [B].
 _ROOM: Final = 1 << 18
 
 
 class Link:
-    """One end of the link; each message is a JSON object.
-
-    Parameters
-    ----------
-    end
-        A socket of type SOCK_SEQPACKET.
-    """
+    """One end of the link, a socket of type SOCK_SEQPACKET; each message is a JSON object."""
 
     def __init__(self, end: socket.socket) -> None:
         end.setblocking(False)
@@ -35,7 +29,7 @@ class Link:
         return self._end.fileno()
 
     def send(self, message: dict[str, Any]) -> bool:
-        """Send a message; return False if there is no room or no receiver, or if the message is too long."""
+        """Send a message; return False if there is no room or no receiver, or the message is too long."""
         data = json.dumps(message, separators=(",", ":")).encode()
         if self.broken or len(data) > LONGEST:
             return False
@@ -64,7 +58,7 @@ class Link:
         return found
 
     def close(self) -> None:
-        """Close this end: the other end finds the link broken."""
+        """Close this end, so that the other end finds the link broken."""
         with suppress(OSError):
             self._end.close()
         self.broken = True
@@ -82,5 +76,5 @@ def number(value: float) -> float | None:
 
 
 def numbers(values: Any) -> list[float | None]:
-    """Return the numbers of an array for JSON, each as by `number`."""
+    """Return the numbers of an array as by `number`."""
     return [number(value) for value in values.tolist()]

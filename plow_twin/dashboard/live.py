@@ -15,7 +15,7 @@ from plow_twin.record.alarms import ALARMS, alarms_message
 
 
 def open_screen(front: BridgeFront, access: PageAccess, source: str) -> Screen:
-    """Return the screen of a twin that has not begun to run; the errors are those of `Screen`."""
+    """Open the screen of a twin that does not run yet; raise the errors of `Screen`."""
     runtime = front.runtime
     services = Services(runtime, front.changed)
 

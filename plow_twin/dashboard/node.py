@@ -1,4 +1,4 @@
-"""The screen of a node: a process beside it reads its topics and passes requests to its services."""
+"""The screen of a node: a process beside it reads its topics and calls its services."""
 
 from __future__ import annotations
 
@@ -43,10 +43,9 @@ _SHOWN: Final = (
     "scene", "hardware_id", "excitation_source", "forecast_limits", "alarm_force", "alarm_clearance",
     "alarm_clearance_rate", "alarm_wear_rate", "alarm_residual", "alarm_duration",
 )  # fmt: skip
-#: How long a service may take to answer [s].
+#: Longest time that a service may take to answer [s].
 _PATIENCE_S: Final = 5.0
-#: Queue depth of topics of which only the newest message is needed.
-#: Queue depth of topics of which all messages are needed.
+#: Queue depths of topics whose newest message is enough, and of which all messages are needed.
 _NEWEST, _ALL = 1, 1000
 
 
@@ -58,7 +57,7 @@ class NodeWatch:
     namespace, name
         Namespace and name of the node.
     wait_s
-        How long to wait for the node [s].
+        Longest wait for the node [s].
     stopped
         Returns whether to stop waiting.
 
@@ -92,11 +91,11 @@ class NodeWatch:
             waited += 0.1
 
     def spin(self) -> None:
-        """Process messages that have arrived, waiting a little."""
+        """Process messages, waiting a little for them."""
         self._executor.spin_once(timeout_sec=0.1)
 
     def facts(self, scene: str | None) -> dict[str, Any]:
-        """Return the facts of the node; `scene` replaces the node's scene where its name cannot be read here.
+        """Return the facts of the node; `scene` replaces its scene if it cannot be read here by its name.
 
         Raises
         ------
@@ -115,7 +114,7 @@ class NodeWatch:
         return facts_of(found, parameters, f"node {self.name}")
 
     def listen(self, feed: Feed) -> None:
-        """Pass messages from now on to a feed."""
+        """Pass messages to a feed from now on."""
         self.feed = feed
         best_effort = partial(QoSProfile, reliability=ReliabilityPolicy.BEST_EFFORT)
         self._subscribe(JointState, "contact_forces", best_effort(depth=_NEWEST), self._forces)
@@ -133,7 +132,7 @@ class NodeWatch:
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._diagnostics, DIAGNOSTICS)
 
     def answer(self, action: str, text: str) -> tuple[bool, str]:
-        """Call the service that an operator asks for."""
+        """Call the service for an operator's request."""
         service = "acknowledge_alarms" if action == "acknowledge" else "mark"
         if service == "mark":
             value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=text)
@@ -152,7 +151,7 @@ class NodeWatch:
         return future.result() if future.done() else None
 
     def _subscribe(self, kind: type, topic: str, quality: QoSProfile, take: Callable[[Any], None]) -> None:
-        """Subscribe to an output; its messages are converted to the form of a recording."""
+        """Subscribe to an output, whose messages take the form of a recording."""
         message_type = plain.JointState.TYPE if kind is JointState else plain.DiagnosticStatus.TYPE
         message_type = plain.Odometry.TYPE if kind is Odometry else message_type
         self.node.create_subscription(kind, topic, lambda data: take(decode(data, message_type)), quality, raw=True)
@@ -224,7 +223,7 @@ def show_node(
     stopped: Callable[[], bool],
     on_open: Callable[[Screen], object],
 ) -> None:
-    """Show a node until `stopped`; `scene` replaces the node's scene where its name cannot be read on this machine.
+    """Show a node until `stopped`; `scene` replaces its scene if it cannot be read here by its name.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The screen of a recording: live while it is written, and its last hour afterwards."""
+"""The screen of a recording, live while it is written; its last hour afterwards."""
 
 from __future__ import annotations
 
@@ -26,24 +26,14 @@ from plow_twin.stream.intake import NS_PER_S
 from plow_twin.stream.journal import Hold, Mark
 from plow_twin.stream.topics import Cadence, names_of
 
-#: The topics whose messages are decoded one by one.
+#: Topics whose messages are decoded one by one.
 _SLOW: Final = names_of(Cadence.ESTIMATE, Cadence.CHANGE)
-#: Longest wait of the feed for room [s]; a file may wait, unlike a live run.
+#: Wait of the feed for room [s], for which a live run has no time.
 _WAIT_S: Final = 2e-3
 
 
 class RunFeed:
-    """Passes a recording to a feed, one second of its stamps at a time.
-
-    Parameters
-    ----------
-    feed
-        The feed.
-    header
-        Header of the recording.
-    stopped
-        Returns whether to stop.
-    """
+    """Passes a recording to a feed, one second of its stamps at a time, unless it is `stopped`."""
 
     def __init__(self, feed: Feed, header: RunHeader, stopped: Callable[[], bool]) -> None:
         self._feed, self._stopped = feed, stopped
@@ -72,10 +62,10 @@ class RunFeed:
             self._feed.motion.was_held |= self._feed.motion.held
             while not (self._feed.send() or self._stopped()):
                 time.sleep(_WAIT_S)
-        self._say(batch)  # this comes last, because an estimate replaces the clearances published before it
+        self._say(batch)  # at the end, because an estimate replaces earlier clearances
 
     def _counted(self) -> dict[str, str]:
-        """Return the counts of the inputs so far, named as in the diagnostics of the twin."""
+        """Return the counts of the inputs so far, as in the twin's diagnostics."""
         others = self._inputs.facts()
         own = others.pop(self._inputs.source, {})
         counted = {"samples_used": own.pop("used", 0), "samples_lost": own.pop("lost", 0)}
@@ -123,18 +113,7 @@ def pose_of(numbers: Array) -> Array:
 
 
 def show_run(path: Path, access: PageAccess, stopped: Callable[[], bool], on_open: Callable[[Screen], object]) -> None:
-    """Show a recording until `stopped`, following it while it is written; a finished one is shown at once.
-
-    Parameters
-    ----------
-    path
-        The recording.
-    access
-        Address and token.
-    stopped
-        Returns whether to stop.
-    on_open
-        Called with the screen.
+    """Show a recording until `stopped`, also while it is written; `on_open` is called with the screen.
 
     Raises
     ------
@@ -151,7 +130,7 @@ def show_run(path: Path, access: PageAccess, stopped: Callable[[], bool], on_ope
         for batch in reader.batches():
             if len(batch.entries) or batch.outputs:
                 run.add(batch)
-            else:  # all that has been recorded so far has been read, so the feed only waits
+            else:  # the feed waits for more to be recorded
                 screen.feed.turn()
             if stopped() or screen.has_ended:
                 return

@@ -45,7 +45,6 @@ class Screen(Beside):
             port = int(page.getsockname()[1])
             super().__init__("plow_twin.dashboard.server", asdict(access), (page.fileno(),))
         host = f"[{access.host}]" if ":" in access.host else access.host
-        #: address of the page
         self.url = f"http://{host}:{port}/"
         self.feed = Feed(self.link, facts, answer, load, on_error, by_second=True)
 

@@ -1,7 +1,7 @@
 """The server of the screen, a process of its own: `python -m plow_twin.dashboard.server LINK SOCKET`.
 
-Each page gets newer values once it has received the last update: a slow page gets fewer updates, a frozen page gets no
-updates, and no page waits for another page.
+A page gets newer values once it has received the last update, so that a slow page gets fewer updates and no page waits
+for another.
 """
 
 from __future__ import annotations
@@ -30,16 +30,15 @@ from plow_twin.dashboard.board import Board
 from plow_twin.dashboard.link import Link
 
 PAGE: Final = Path(__file__).with_name("page")
-#: Largest number of pages at once; a further page is refused.
+#: Largest number of pages; a further page is refused.
 MOST_PAGES: Final = 50
-#: Time [s] after which a page is closed if it has not received an update or has not sent its token.
+#: Longest time for a page to receive an update or to send its token [s].
 _PATIENCE_S: Final = 20.0
-#: Longest time without a message to a page [s].
-#: Shortest time between two requests of a page [s].
+#: Longest time without a message to a page, and shortest time between two requests of a page [s].
 _WORD_S, _WISH_S = 1.0, 0.2
 #: Longest request of a page [B].
 _WISH: Final = 4096
-#: Increment of `nice`: the server has a lower priority than the twin.
+#: Increment of `nice`, which gives the twin priority.
 _NICE: Final = 10
 #: Reasons to close a page, as codes of the WebSocket protocol.
 TOO_MANY, NO_TOKEN, ENDED = 1013, 4401, 1001
@@ -52,7 +51,7 @@ _HEADERS: Final = {
 
 
 class Guard:
-    """Refuses requests under foreign host names, and requests from pages of other sites."""
+    """Refuses requests under foreign host names, and from pages of other sites."""
 
     def __init__(self, app: ASGIApp, access: PageAccess) -> None:
         self._app, self._access = app, access
@@ -81,17 +80,7 @@ class Guard:
 
 
 class Pages:
-    """The pages that show a board.
-
-    Parameters
-    ----------
-    board
-        Source of their values.
-    link
-        Receiver of their requests.
-    access
-        Rules for access to the pages.
-    """
+    """The pages that show a board; their requests go through a link."""
 
     def __init__(self, board: Board, link: Link, access: PageAccess) -> None:
         self._board, self._link, self._access = board, link, access
@@ -109,12 +98,12 @@ class Pages:
                 return
             await self._serve(socket)
         except (WebSocketDisconnect, TimeoutError, RuntimeError):
-            return  # the page has gone, or does not read its updates
+            return  # the page has gone, or does not read
         finally:
             self._board.pages -= 1
 
     async def _is_admitted(self, socket: WebSocket) -> bool:
-        """Ask for the token; after a wrong token, wait a second."""
+        """Ask for the token; wait a second after a wrong one."""
         wish = await asyncio.wait_for(_wish(socket), _PATIENCE_S)
         if self._access.admits(wish.get("token")):
             return True
@@ -133,7 +122,7 @@ class Pages:
             await asyncio.gather(*tasks, return_exceptions=True)
 
     async def _send_updates(self, socket: WebSocket) -> None:
-        """Send newer values to the page in a loop; count the updates that a slow page misses."""
+        """Send newer values to the page; count the updates that it misses."""
         board, version, skipped = self._board, 0, 0
         while not self._link.broken:
             news = board.news
@@ -165,7 +154,7 @@ async def _wish(socket: WebSocket) -> dict[str, Any]:
 
 
 def application(board: Board, link: Link, access: PageAccess) -> ASGIApp:
-    """Return the application, which serves the files and the data of the page."""
+    """Return the application, which serves the page and its data."""
     pages = Pages(board, link, access)
     routes = [WebSocketRoute("/data", pages.page), Mount("/", StaticFiles(directory=PAGE, html=True))]
     return Guard(Starlette(routes=routes), access)
@@ -198,7 +187,7 @@ async def serve(link: Link, listening: socket.socket, access: PageAccess) -> Non
 
 
 def main() -> None:
-    """Run the server on the two descriptors given; the first message names the address and the token."""
+    """Serve on the two descriptors that are the arguments; the first message has address and token."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(_NICE)
     end, listening = (socket.socket(fileno=int(number)) for number in sys.argv[1:3])

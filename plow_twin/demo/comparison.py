@@ -1,4 +1,4 @@
-"""The forces of the demo's synthetic machine, beside the twin's published forces and those of the nominal scene."""
+"""The forces of the demo's synthetic machine, beside those of the twin and of the nominal scene."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from plow_twin.stream.journal import Estimated
 
 Array = NDArray[np.float64]
 
-#: Length [s] of the part at the end of a run that is compared: a load period of the paper.
+#: Length of the compared end of a run [s]: a load period of the paper.
 COMPARED_S: Final = 3.2
 
 
@@ -28,14 +28,13 @@ class Comparison:
     Attributes
     ----------
     peaks : dict of str to ndarray, shape (8,)
-        Largest force of each pair in N, under the keys `nominal`, `followed` and `true`.
+        Largest force of each pair [N]: `nominal`, `followed` and `true`.
     error : dict of str to float
-        RMS of the difference from the true forces, divided by the RMS of the true forces, under the keys `nominal` and
-        `followed`.
+        RMS of the difference from the true forces over their RMS: `nominal` and `followed`.
     estimates_s : list of float
-        Times of the run in s at which an estimate was made.
+        Times of the run at which estimates were made [s].
     since_s : float
-        Time of the run in s from which on the forces are compared.
+        Time of the run from which on the forces are compared [s].
     """
 
     peaks: dict[str, Array]
@@ -45,14 +44,9 @@ class Comparison:
 
 
 def compare_forces(run: Path, wider_m: float) -> Comparison | None:
-    """Compare the forces of a run with those of a machine with larger clearances; return None if the run has no forces.
+    """Compare the forces of a run with those of a machine whose clearances are larger by `wider_m` [m].
 
-    Parameters
-    ----------
-    run : Path
-        The recording.
-    wider_m : float
-        Excess of the machine's clearances over the scene's in m.
+    The result is None if the run has no forces.
     """
     recording = read_recording(run)
     stamps, wrench = recording["excitation"].numpy()

@@ -29,22 +29,20 @@ from plow_twin.model.scene import Mark, Provenance, Wear
 from plow_twin.scene_file import dump_scene, load_scene
 
 DONE, FAILED, DONE_WITH_LOSS = 0, 1, 3
-#: Longest wait [s] for the estimate, and for a start that compiles the solver on a busy machine.
+#: Longest wait for the estimate, and for a solver that is compiled on a busy machine [s].
 _START_TIMEOUT_S: Final = 300.0
 _STOP_TIMEOUT_S: Final = 10.0
 _RATE_HZ: Final = 1000.0
-#: How much larger the clearance of the synthetic machine is than that of the scene [mm].
+#: Excess of the synthetic machine's clearance over that of the scene [mm].
 _SENSOR_MM: Final = 1.5
-#: Shortest length of a demo with an estimate [s].
-#: Length of the estimate's window [s].
-#: Time between the ends of two windows [s].
+#: Shortest demo with an estimate, length of its window, time between the ends of two windows [s].
 _ESTIMATED_S, _WINDOW_S, _INTERVAL_S = 15.0, 14.0, 3.0
-#: Time without progress after which the run counts as failed [s].
+#: Longest time without progress [s].
 _STUCK_S: Final = 30.0
 
 
 class DemoError(PlowTwinError):
-    """A process of the demo failed; the message has its name and its output."""
+    """A process of the demo failed; the message has its output."""
 
 
 @dataclass
@@ -55,7 +53,7 @@ class Watch:
     reports: int = 0
 
     def receive(self, message: Any) -> None:
-        """Process a DiagnosticArray."""
+        """Take a DiagnosticArray."""
         for status in message.status:
             part = status.name.partition(": ")[2]
             self.parts[part] = {value.key: value.value for value in status.values}
@@ -83,6 +81,8 @@ def run_demo(speed: str, seconds: float, out: Path, quiet: bool, screen: list[st
         Folder in which the run makes a new folder for recording, view and logs.
     quiet
         Print no progress and no table.
+    screen
+        Arguments of the operator's screen; None: no screen.
 
     Returns
     -------
@@ -111,16 +111,16 @@ def run_demo(speed: str, seconds: float, out: Path, quiet: bool, screen: list[st
 
 
 def _set_environment(folder: Path) -> None:
-    """Confine the demo's processes to this machine and to a domain of their own."""
+    """Confine the demo's processes to this machine and a domain of their own."""
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    # domains above 101 share their ports with outgoing connections, so the domain is between 1 and 100
+    # domains above 101 share their ports with outgoing connections
     os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
     os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)
     os.environ.setdefault("ROS_LOG_DIR", str((folder / "log").resolve()))
 
 
 def _worn_scene(folder: Path) -> Path:
-    """Write the paper's scene with wear switched on, so that the demo shows clearance growing."""
+    """Write the paper's scene with wear, so that the clearance grows."""
     wear = Wear(coefficient_m2_n=1e-14, pad_area_m2=0.015, travel_speed_m_s=2.0)
     assumed = Provenance(Mark.ASSUMED, "hard steel guide in coal dust, 1e-15 .. 1e-13 m^2/N; not in the paper")
     paper = load_scene("paper")
@@ -139,10 +139,10 @@ def _run(
     node = [
         *("plow_twin.ros.main", "--ros-args", "-p", f"scene:={_worn_scene(folder)}"),
         *("-p", f"record_path:={(folder / 'run').resolve()}", "-p", f"expected_rate:={_RATE_HZ}"),
-        # publisher and reader keep every sample of the run, so that no sample is lost when the machine is busy
+        # publisher and reader keep every sample, so that a busy machine loses none
         *("-p", "qos_overrides./excitation.subscription.reliability:=reliable"),
         *("-p", f"input_depth:={QUEUE}"),
-        # the timeout is long, so that the run stops after its last sample before the hold policy acts
+        # the run ends before the hold policy acts
         *("-p", "excitation_timeout:=60.0", "-p", f"use_sim_time:={str(speed == 'fast').lower()}"),
     ]
     publisher = ["plow_twin.demo.excitation_publisher", "--speed", speed, "--seconds", repr(seconds)]
@@ -202,7 +202,7 @@ def _follow(source: Child, twin: Child, watch: Watch, spin: Any, bar: Progress, 
         now = watch.number("state", "model_time_s")
         if now > reached:
             moved, reached = time.monotonic(), now
-        # before the first sample more patience is needed: the publisher is starting, which is slow on a busy machine
+        # the start of the publisher is slow on a busy machine
         elif time.monotonic() - moved > (patience := _STUCK_S if reached else _START_TIMEOUT_S):
             raise DemoError(f"no progress for {patience:g} s at model time {reached:g} s\n{twin.output()}")
         bar.update(task, completed=reached)
@@ -210,7 +210,7 @@ def _follow(source: Child, twin: Child, watch: Watch, spin: Any, bar: Progress, 
 
 
 def _until(name: str, reached: Any, spin: Any, twin: Child, timeout_s: float) -> None:
-    """Wait until `reached` is true; raise a `DemoError` with `name` after the time limit or when the twin has ended."""
+    """Wait until `reached` is true; raise `DemoError` after the time limit, or when the twin has ended."""
     give_up = time.monotonic() + timeout_s
     while not reached():
         spin()
@@ -220,7 +220,7 @@ def _until(name: str, reached: Any, spin: Any, twin: Child, timeout_s: float) ->
 
 
 class Child:
-    """A process of the demo; its output goes to a file."""
+    """A process of the demo, whose output goes to a file."""
 
     def __init__(self, arguments: list[str], log: Path) -> None:
         self._name = arguments[0]
@@ -228,7 +228,7 @@ class Child:
         self._stream: IO[bytes] = log.open("wb")
         command = [sys.executable, "-m", *arguments]
         bound = shutil.which("setpriv")
-        if bound is not None:  # the child ends with this process in any case
+        if bound is not None:  # the child ends with this process
             command = [bound, "--pdeathsig", "TERM", *command]
         self._process = subprocess.Popen(
             command, stdout=self._stream, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL
@@ -250,7 +250,7 @@ class Child:
             raise DemoError(f"{self._name} ended with code {code}\n{self.output()}")
 
     def stop(self) -> None:
-        """Ask for a clean stop; raise `DemoError` if the process does not stop cleanly."""
+        """Ask for a clean stop; raise `DemoError` if there is none."""
         if self.running:
             self._process.send_signal(signal.SIGINT)
         try:
@@ -282,7 +282,7 @@ def _process(arguments: list[str], log: Path) -> Iterator[Child]:
 
 @contextmanager
 def _watching() -> Iterator[tuple[Watch, Any]]:
-    """Listen to /diagnostics; yield the figures and a function that waits briefly for new messages."""
+    """Listen to /diagnostics; yield the figures, and a function that waits briefly for messages."""
     import rclpy.utilities
     from diagnostic_msgs.msg import DiagnosticArray
     from rclpy.signals import SignalHandlerOptions
@@ -324,7 +324,7 @@ def _view(folder: Path) -> Path | None:
 
 
 def _losses(watch: Watch, sent: int, summary: RunSummary) -> dict[str, int]:
-    """Return all counted loss of the run."""
+    """Return all counted losses of the run."""
     published, missed = int(watch.number("output", "published")), int(watch.number("input", "messages_lost"))
     return {
         "lost by the middleware": missed,
@@ -357,7 +357,7 @@ def _print(console: Console, watch: Watch, summary: RunSummary, sent: int, lost:
 
 
 def _print_clearances(console: Console, summary: RunSummary) -> None:
-    """Print the clearances estimated from the synthetic sensor, or those of the model with its prior."""
+    """Print the clearances, as estimated from the synthetic sensor or as in the model."""
     for name, (value, low, high) in summary.clearance.items():
         found = None if summary.estimate is None else summary.estimate[name]
         if found is None:
@@ -373,7 +373,7 @@ def _print_clearances(console: Console, summary: RunSummary) -> None:
 
 
 def _print_comparison(console: Console, beside: Comparison) -> None:
-    """Print the forces of the synthetic machine, the published forces and the forces of the nominal scene."""
+    """Print the forces of the synthetic machine, of the twin and of the nominal scene."""
     table = Table(title=f"Largest forces of the last {COMPARED_S:g} s in kN")
     table.add_column("pair", no_wrap=True)
     names = ("nominal", "followed", "true")
@@ -414,7 +414,7 @@ def program(name: str, module: str) -> str:
     beside = Path(sys.executable).with_name(name)
     path, arguments = (beside, []) if beside.exists() else (Path(sys.executable), ["-m", module])
     relative = os.path.relpath(path)
-    # the path gets a separator, because the shell would look for a bare name on PATH
+    # the shell would look for a bare name on PATH
     relative = relative if os.sep in relative else os.path.join(os.curdir, relative)
     return shlex.join([min(str(path), relative, key=len), *arguments])
 

@@ -1,12 +1,11 @@
 """The program `excitation_publisher`: a scene's load as samples on `excitation`, in real time or as fast as possible.
 
 With `--sensor` it publishes on `head_pose` the pose of a head in a wider guide with the noise of a sensor: a synthetic
-measurement of known truth.
+measurement of known truth. With `--cutting` it adds a stochastic cutting load and publishes the speed along the face on
+`travel`.
 
-With `--cutting` it adds a stochastic cutting load and publishes the speed along the face on `travel`.
-
-`real` sends each sample at its time on a grid of the steady clock; a late sample is sent at once, and no sample is left
-out. `fast` publishes `/clock`, and runs ahead of the twin's `contact_peaks` by a bounded number of samples.
+`real` sends each sample at its time on a grid of the steady clock; late samples are sent at once. `fast` publishes
+`/clock`, and runs ahead of the twin's `contact_peaks` by a bounded number of samples.
 """
 
 from __future__ import annotations
@@ -45,11 +44,11 @@ from plow_twin.run.twin import Twin
 from plow_twin.scene_file import load_scene
 from plow_twin.stream.intake import NS_PER_S
 
-#: Stamp of the first sample under /clock [ns]: zero would count as unstamped.
+#: Stamp of the first sample under /clock [ns], since zero means no stamp.
 FIRST_STAMP_NS: Final = NS_PER_S
-#: At the speed `fast`, largest number of samples that may wait for their answers.
+#: Largest number of samples that wait for their answers at the speed `fast`.
 WINDOW: Final = 200
-#: Number of samples by which a reliable reader may be late before samples are lost: 100 s at 1 kHz.
+#: Number of samples by which a reliable reader may be late: 100 s at 1 kHz.
 QUEUE: Final = 100_000
 #: Number of samples between two messages on /clock.
 _CLOCK_EVERY: Final = 10
@@ -59,7 +58,7 @@ _TRAVEL_S: Final = 0.1
 _POSE_HZ: Final = 100.0
 #: Noise of the synthetic sensor [m, m, rad].
 _POSE_NOISE: Final = np.array([5e-4, 5e-4, 2e-3])
-#: Time without an answer after which unanswered samples count as lost [s].
+#: Time without an answer after which samples count as lost [s].
 _STALL_S: Final = 2.0
 #: CDR of a message that begins with a stamp: 4 bytes of encapsulation, then sec and nanosec.
 _STAMP: Final = struct.Struct("<4xiI")
@@ -69,7 +68,7 @@ _STAMP: Final = struct.Struct("<4xiI")
 class Plan:
     """Samples to send: `wrench` (n, 3) Fx, Fy [N], M [N m], one row every `period_ns`; `speed` (n,) [m/s] of travel.
 
-    `pose` (m, 3) x, y [m], theta [rad] is the output of a synthetic sensor, one row with every `pose_every`-th sample.
+    `pose` (m, 3) x, y [m], theta [rad] of a synthetic sensor has one row with every `pose_every`-th sample.
     """
 
     wrench: NDArray[np.float64]
@@ -100,9 +99,9 @@ class ExcitationPublisher(WithoutEvents):
         self._twin_reads = False
         self._answered_ns = FIRST_STAMP_NS
         self.sent = 0
-        #: largest delay with which a sample was sent after its time on the grid [s]
+        #: largest delay of a sample [s]
         self.latest_s = 0.0
-        #: how often the twin did not answer within the time allowed
+        #: how often the twin did not answer in time
         self.stalls = 0
         self.create_subscription(DiagnosticStatus, "status", self._on_status, OUTPUTS["status"])
         self._answers = (
@@ -112,7 +111,7 @@ class ExcitationPublisher(WithoutEvents):
         )
 
     def wait_for_twin(self, timeout_s: float) -> bool:
-        """Wait until a twin is active and reads `excitation`; return False after the time limit or on a stop."""
+        """Wait until a twin reads `excitation`; return False after the time limit or on a stop."""
         give_up = time.monotonic() + timeout_s
         while not self._connected():
             if self._stop.stopped or time.monotonic() > give_up:
@@ -185,7 +184,7 @@ class ExcitationPublisher(WithoutEvents):
 
     def _on_status(self, message: DiagnosticStatus) -> None:
         values = {value.key: value.value for value in message.values}
-        # this process may see the connection before the twin does, so the status of the twin decides
+        # this process may see the connection before the twin does
         self._twin_reads = values.get("lifecycle") == "active" and values.get("publishers_excitation", "0") != "0"
 
     def _on_answer(self, data: bytes) -> None:
@@ -198,7 +197,7 @@ def plan(
 ) -> Plan:
     """Sample the loads of a scene without gravity, and add a cutting load.
 
-    With `sensor_mm` the plan has the noisy pose of a head whose clearances are larger by `sensor_mm`.
+    With `sensor_mm` the plan has the noisy pose of a head whose clearances are larger by as much.
 
     Raises
     ------
@@ -270,7 +269,7 @@ def _cutting(options: argparse.Namespace) -> CuttingLoad | None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Send a scene's load; return 0 if all was sent, 1 without a twin, 2 for wrong usage, 3 if answers were missing."""
+    """Send a scene's load; return 0 if all was sent, 1 without a twin, 2 for wrong usage, 3 if answers are missing."""
     import rclpy.utilities
 
     given = list(sys.argv if arguments is None else ["excitation_publisher", *arguments])

@@ -1,4 +1,4 @@
-"""Summary of a recorded run from its messages: forces per corner and sense, contact sets, clearance and wear."""
+"""Summary of a recorded run: forces per corner and sense, contact sets, clearance and wear."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from plow_twin.record.estimated import left_by
 from plow_twin.record.reader import RunReader
 from plow_twin.record.recording import read_recording
 
-#: For each sense of swing, the mask of the pairs that belong to it.
+#: The pairs of each sense of swing.
 SENSES: Final = {"ccw": STOPS_COUNTER_CLOCKWISE, "cw": ~STOPS_COUNTER_CLOCKWISE}
 
 
@@ -28,13 +28,11 @@ class RunSummary:
     Attributes
     ----------
     largest, mean_in_contact : ndarray, shape (8,)
-        Largest force, and impulse divided by the time in contact [N]; each touch makes that time uncertain by a sample
-        interval.
+        Largest force, and impulse over the time in contact [N], which each touch makes uncertain by a sample interval.
     makes : ndarray, shape (8,)
         Number of touches.
     contact_sets : dict
-        Share of the contact time in which exactly the corners of a set carry force, by sense of swing and by set of
-        corners.
+        Share of the contact time in which exactly the corners of a set carry force, by sense of swing and set.
     clearance : dict
         Newest value, 5 % and 95 % point [m] of `horizontal` and `vertical`.
     wear_depth : ndarray, shape (8,)
@@ -42,7 +40,7 @@ class RunSummary:
     frames : int
         Number of messages on contact_forces.
     estimate : dict or None
-        The newest estimate that the node has made, as `plow-twin estimate --json` prints it.
+        The newest estimate of the node, as `plow-twin estimate --json` prints it.
     """
 
     scene: Scene
@@ -63,13 +61,7 @@ def corner_letters(scene: Scene) -> dict[str, str]:
 
 
 def summarise(path: Path) -> RunSummary:
-    """Read a recording and return its figures.
-
-    Raises
-    ------
-    RecordingError
-        The file is not a recording of plow_twin.
-    """
+    """Return the figures of a recording; raise RecordingError if the file is none."""
     recording = read_recording(path)
     newest = left_by(RunReader(path))[1]
     stamps, peaks = recording["contact_peaks"].numpy()

@@ -1,1 +1,1 @@
-"""Outputs to a plant: the twin's results by MQTT, Sparkplug B, InfluxDB and OPC UA, each sent by a separate process."""
+"""Outputs to a plant: the twin's results by MQTT, Sparkplug B, InfluxDB and OPC UA, each from its own process."""

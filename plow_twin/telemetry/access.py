@@ -1,4 +1,4 @@
-"""Destinations of results and their credentials: addresses from options, secrets from files or the environment."""
+"""Outputs by address, and their credentials: secrets come from files or the environment."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from plow_twin.scene_file.validation import TEXT, mapping, validate
 from plow_twin.scene_file.yaml_text import read_yaml
 
 _PORTS: Final = {"mqtt": 1883, "mqtts": 8883, "opc.tcp": 4840, "http": 8086, "https": 443}
-#: Schema of the file of credentials.
 _CREDENTIALS: Final = mapping(
     {
         "mqtt": mapping(dict.fromkeys(("user", "password_file", "ca", "certificate", "key", "client_id"), TEXT)),
@@ -33,25 +32,24 @@ class AccessError(InputError):
         super().__init__([Problem(key, got, expected)], "telemetry")
 
 
-#: Characters that a topic name for publishing must not contain: wildcards, control characters, and `$` at the
-#: beginning.
+#: Wildcards, control characters and a `$` at the beginning, which the name of a topic must not have.
 _NO_TOPIC: Final = re.compile(r"[+#\x00-\x1f]|^\$")
 
 
 @dataclass(frozen=True)
 class WayOut:
-    """An output: its address, its modules, its options.
+    """An output.
 
     Attributes
     ----------
     name : str
-        Name of the output's part in the diagnostics.
+        Name of its part in the diagnostics.
     address : str
-        Address of the output, without credentials.
+        Its address, without credentials.
     modules : tuple of str
-        Python modules that the output's process needs.
+        Python modules that its process needs.
     first : dict
-        First message to the output's process, with the output's options.
+        First message to its process, with the options.
     may_acknowledge : bool
         Whether an operator at the destination may acknowledge alarms.
     """
@@ -65,23 +63,14 @@ class WayOut:
 
 @dataclass(frozen=True)
 class Credentials:
-    """Credentials by section (`mqtt`, `opcua`, `influx`); paths are relative to the credentials file."""
+    """Credentials by section (`mqtt`, `opcua`, `influx`); paths are relative to the file."""
 
     sections: Mapping[str, Mapping[str, Any]] = field(default_factory=dict, repr=False)
     folder: Path = Path()
 
     @classmethod
     def read(cls, path: Path | None) -> Credentials:
-        """Read a YAML file.
-
-        Raises
-        ------
-        InputError
-            The file is not YAML within the bounds of `read_yaml`, a section or key is not known, or a value is not a
-            text.
-        OSError
-            The file cannot be read.
-        """
+        """Read a YAML file; raise InputError or OSError if it cannot be used."""
         if path is None:
             return cls()
         data, found = read_yaml(path, "credentials", _CREDENTIALS["description"])
@@ -94,13 +83,7 @@ class Credentials:
         return str(self.sections.get(section, {}).get(key, otherwise))
 
     def file(self, section: str, key: str) -> str | None:
-        """Return the absolute path of a file, or None if the credentials do not name the file.
-
-        Raises
-        ------
-        AccessError
-            The file is not there.
-        """
+        """Return the absolute path of a file, or None if it is not given; raise AccessError if it is missing."""
         name = self.text(section, key)
         if not name:
             return None
@@ -110,7 +93,7 @@ class Credentials:
         return str(path)
 
     def secret(self, section: str, key: str, variable: str) -> str:
-        """Return the first line of the named file or, without it, the variable `PLOW_TWIN_<variable>`."""
+        """Return the first line of the given file, or the environment variable `PLOW_TWIN_<variable>`."""
         path = self.file(section, key)
         return os.environ.get(f"PLOW_TWIN_{variable}", "") if path is None else read_secret(Path(path))
 
@@ -118,7 +101,7 @@ class Credentials:
 def mqtt_out(url: str, credentials: Credentials, *, plain: bool, sparkplug: str = "") -> list[WayOut]:
     """Return the outputs to an MQTT broker, `mqtt[s]://HOST[:PORT]/PREFIX`.
 
-    `sparkplug` is `GROUP/NODE`, or empty. If it is set, plain JSON is also sent only if `url` has a prefix.
+    With `sparkplug`, GROUP/NODE, JSON is sent beside it only if `url` has a prefix.
 
     Raises
     ------
@@ -144,13 +127,7 @@ def mqtt_out(url: str, credentials: Credentials, *, plain: bool, sparkplug: str 
 
 
 def influx_out(url: str, credentials: Credentials, *, plain: bool) -> WayOut:
-    """Return the output to InfluxDB, `http[s]://HOST[:PORT]/ORG/BUCKET`.
-
-    Raises
-    ------
-    AccessError, OSError
-        The address or a file of the credentials cannot be used.
-    """
+    """Return the output to InfluxDB, `http[s]://HOST[:PORT]/ORG/BUCKET`; raise the errors of `mqtt_out`."""
     expected = "http[s]://HOST:PORT/ORG/BUCKET"
     host, port, path, encrypted = _address("--influx", url, ("http", "https"), expected, plain=plain)
     org, _, bucket = path.partition("/")
@@ -169,13 +146,7 @@ def influx_out(url: str, credentials: Credentials, *, plain: bool) -> WayOut:
 
 
 def opcua_out(url: str, credentials: Credentials, *, plain: bool, acknowledges: bool) -> WayOut:
-    """Return an OPC UA server as an output; the server listens on the address `url`, `opc.tcp://HOST:PORT`.
-
-    Raises
-    ------
-    AccessError, OSError
-        The address or a file of the credentials cannot be used.
-    """
+    """Return an OPC UA server that listens on `opc.tcp://HOST:PORT`; raise the errors of `mqtt_out`."""
     expected = "opc.tcp://HOST:PORT"
     files = {key: credentials.file("opcua", key) for key in ("certificate", "key", "trusted")}
     if bool(files["certificate"]) != bool(files["key"]) or (files["trusted"] and not files["key"]):
@@ -199,7 +170,6 @@ def opcua_out(url: str, credentials: Credentials, *, plain: bool, acknowledges: 
 
 
 def _broker_options(host: str, port: int, credentials: Credentials, *, tls: bool) -> dict[str, Any]:
-    """Return the options of `mqtt.Broker`."""
     files = {key: credentials.file("mqtt", key) for key in ("ca", "certificate", "key")}
     return {
         "host": host,

@@ -1,4 +1,4 @@
-"""Points sent to InfluxDB by its official client: a measurement for each group of values."""
+"""Results sent to InfluxDB by its official client: a measurement for each group of values."""
 
 from __future__ import annotations
 
@@ -16,16 +16,14 @@ from plow_twin.dashboard.link import Link
 from plow_twin.telemetry.values import Group, Newest
 from plow_twin.telemetry.way import State
 
-#: Largest number of points that wait for the database: ten minutes of all groups of numbers at 1 Hz; the oldest are
-#: dropped first.
+#: Largest number of points that wait: ten minutes of all groups of numbers at 1 Hz; the oldest are dropped.
 _WAITING: Final = 2000
-#: Largest number of points in one request.
+#: Largest number of points in a request.
 _AT_ONCE: Final = 500
 #: Longest wait for an answer [ms].
 _ANSWER_MS: Final = 5000
-#: Wait after the first failed attempt to write [s]; the wait doubles with each further failure.
+#: First and longest wait after a failed attempt to write [s]; the wait doubles with each failure.
 _FIRST_WAIT_S: Final = 1.0
-#: Longest wait between two attempts to write [s].
 _LONGEST_WAIT_S: Final = 30.0
 
 
@@ -39,7 +37,7 @@ class Influx:
     org, bucket, token
         Destination of the points, and the permission to write there.
     ca
-        File of the authority that certifies the database; None: the authorities that the system trusts.
+        File of the authority that certifies the database; None: those that the system trusts.
     """
 
     def __init__(self, url: str, org: str, bucket: str, token: str, ca: str | None) -> None:
@@ -63,7 +61,7 @@ class Influx:
             self.state.lost += 1
 
     async def turn(self) -> None:
-        """Write waiting lines, unless the wait after a failed attempt is not yet over."""
+        """Write waiting lines, unless a failed attempt was a short time ago."""
         while self._waiting and time.monotonic() >= self._again_s:
             lines = [self._waiting[index] for index in range(min(len(self._waiting), _AT_ONCE))]
             try:
@@ -76,7 +74,7 @@ class Influx:
             self.state.connected, self.state.trouble, self._wait_s = True, "", 0.0
 
     async def close(self, patience_s: float) -> None:
-        """Try once more to write the waiting lines, and count all lines that remain as lost."""
+        """Try once more to write the waiting lines; those that remain are lost."""
         if self.state.connected and patience_s:
             await self.turn()
         self.state.lost += len(self._waiting)
@@ -100,7 +98,7 @@ class Influx:
 
 
 def line_of(name: str, group: Group, head: str) -> str:
-    """Return a group as a line of InfluxDB's protocol, or an empty text if no value is known."""
+    """Return a group as a line of InfluxDB's protocol, empty if no value is known."""
     point = Point(f"plow_twin_{name}")
     if head:
         point = point.tag("head", head)

@@ -1,4 +1,4 @@
-"""JSON sent to an MQTT broker: a topic for each group of values."""
+"""Results sent to an MQTT broker as JSON: a topic for each group of values."""
 
 from __future__ import annotations
 
@@ -16,17 +16,16 @@ from plow_twin.live.bridge.paho_client import end_of, make_client, refusal, use_
 from plow_twin.telemetry.values import UNITS, Group, Newest
 from plow_twin.telemetry.way import State, TelemetryError
 
-#: Largest number of messages that wait for the broker: ten minutes of all groups of numbers at 1 Hz; the oldest are
-#: dropped first.
+#: Largest number of messages that wait: ten minutes of all groups of numbers at 1 Hz; the oldest are dropped.
 _WAITING: Final = 2000
-#: Largest number of messages that the broker has not yet acknowledged.
+#: Largest number of messages that the broker has not acknowledged.
 _UNACKNOWLEDGED: Final = 20
-#: Keep-alive interval [s]; a broker that is silent for 1.5 intervals counts as gone.
+#: Keep-alive interval [s]; 1.5 silent intervals mean that the broker has gone.
 _KEEPALIVE_S: Final = 10
 
 
 class Message(NamedTuple):
-    """A message; if it is retained, later subscribers receive it too."""
+    """A message; later subscribers receive it too if it is retained."""
 
     topic: str
     payload: bytes
@@ -35,22 +34,22 @@ class Message(NamedTuple):
 
 
 class Broker:
-    """A connection to a broker, which is restored after a break, with a bounded queue of waiting messages.
+    """A connection to a broker, restored after a break, with a queue of waiting messages.
 
     Parameters
     ----------
     host, port, client_id, user, password
         Address of the broker, and identity, name and password of this client.
     tls
-        Files `ca`, `certificate` and `key`, or None: not encrypted.
+        Files `ca`, `certificate` and `key`; None: not encrypted.
     will
         Returns the message that the broker sends when the next connection breaks.
     on_connected
-        Returns the messages to send before all waiting messages, once the broker has accepted the connection.
+        Returns the messages to send before waiting messages, once there is a connection.
     waiting
-        Largest number of messages that wait while the broker does not answer; the oldest are dropped and counted.
+        Largest number of messages that wait; the oldest are dropped and counted.
     keeps
-        Whether waiting messages are sent after a break; otherwise they are dropped and counted.
+        Whether waiting messages outlive a break; otherwise they are dropped and counted.
 
     Raises
     ------
@@ -77,7 +76,7 @@ class Broker:
         self._most, self._keeps = waiting, keeps
         self._waiting: deque[Message] = deque()
         self._unacknowledged: set[int] = set()
-        #: lock held while messages are numbered and queued, so that they are sent in order
+        #: held while messages are numbered and queued, so that they are sent in order
         self.lock = threading.RLock()
         self.client = make_client(client_id, clean=True)
         self._set_will()
@@ -162,12 +161,7 @@ class Broker:
 class MqttOut:
     """Sends JSON to `<prefix>/<group>`, retained except for `peaks`; `<prefix>/online` is true or false.
 
-    Parameters
-    ----------
-    prefix
-        Beginning of the topics.
-    options
-        As in `Broker`.
+    The `options` are those of `Broker`.
     """
 
     def __init__(self, prefix: str, **options: Any) -> None:
@@ -190,12 +184,11 @@ class MqttOut:
         """Do nothing, because the connection has its own thread."""
 
     async def close(self, patience_s: float) -> None:
-        """Send waiting messages, then the message that the twin is offline."""
+        """Send waiting messages, and that the twin is offline."""
         await self._broker.close(self._gone, patience_s)
 
 
 def _payload(name: str, group: Group) -> bytes:
-    """Return a group as JSON text."""
     unit = {"unit": UNITS[name]} if name in UNITS else {}
     found = {"t": group.time_s or None, **unit, "held": group.held, "values": group.values}
     return json.dumps(found, separators=(",", ":"), allow_nan=False).encode()

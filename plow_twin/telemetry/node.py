@@ -1,4 +1,4 @@
-"""Outputs of a ROS node: a separate process reads the node's topics and calls its acknowledge service."""
+"""Outputs of a ROS node, by a process that reads the node's topics and calls its service."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ def send_node(
     namespace, name
         Namespace and name of the node.
     scene
-        Scene of the node; needed if the scene that the node names cannot be read on this machine.
+        Scene of the node, if it cannot be read here by its name.
     ways
-        The outputs; each output has its own process and its own listener to the node's topics.
+        The outputs, each with its own process and listener.
     rate_hz
         Rate of updates [Hz].
     wait_s
-        How long to wait for the node [s].
+        Longest wait for the node [s].
     stopped
         Returns whether to end.
     on_error

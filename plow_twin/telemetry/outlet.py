@@ -1,4 +1,4 @@
-"""An output of a twin: its separate process, the feed to this process, and its part of the diagnostics."""
+"""An output of a twin: its process, the feed to it, and its part of the diagnostics."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from plow_twin.live.part import Part
 from plow_twin.telemetry.access import WayOut
 from plow_twin.telemetry.way import TelemetryError
 
-#: How long a process may take to open its output [s]; most of the time goes into the import of its library.
+#: Longest time to open an output, most of it for the import of its library [s].
 _START_S: Final = 60.0
 
 
 class Outlet(Beside):
-    """A running output; used as a context manager, it ends the output's process on exit.
+    """A running output, as a context manager that ends its process.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ class Outlet(Beside):
             raise TelemetryError(failed)
 
     def turn(self) -> None:
-        """Send an update, and report when the receiver has stopped or resumed taking messages."""
+        """Send an update, and report whether the receiver takes messages, if this has changed."""
         self.feed.turn()
         self._report()
 
@@ -96,7 +96,7 @@ class Outlet(Beside):
 
 
 def _is_there(name: str) -> bool:
-    """Return whether a module can be imported; only its parent packages are imported to find out."""
+    """Return whether a module can be imported, without its import."""
     try:
         return find_spec(name) is not None
     except ModuleNotFoundError:

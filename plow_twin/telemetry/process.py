@@ -1,7 +1,7 @@
 """The process of one output: `python -m plow_twin.telemetry.process LINK`; the first message names the output.
 
-The process takes the updates of the feed one by one. While the receiver does not answer, the output keeps as many
-updates as its bound allows and counts the updates that it drops; the twin is never delayed.
+While the receiver does not answer, the output keeps a bounded number of updates and counts those that it drops, so that
+the twin is never delayed.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ WAYS: Final = {
     "influx": ("plow_twin.telemetry.influx", "Influx"),
     "opcua": ("plow_twin.telemetry.opcua.server", "OpcUaServer"),
 }
-#: Increment of `nice`: the process has a lower priority than the twin.
+#: Increment of `nice`, which gives the twin priority.
 _NICE: Final = 5
-#: Longest wait before the process checks whether the output's state has changed and must be reported [s].
+#: Longest time without a look at the output's state, which is reported when it changes [s].
 _REPORT_S: Final = 0.5
-#: At the end, time for the receiver to take the waiting messages [s].
+#: Time at the end for the receiver to take the waiting messages [s].
 _END_S: Final = 2.0
 
 
@@ -82,7 +82,7 @@ async def _run(link: Link, first: dict[str, Any]) -> None:
 
 
 def main() -> None:
-    """Serve one output; the command-line argument is the file descriptor of the link to the twin."""
+    """Serve an output over the link whose descriptor is the argument."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(_NICE)
     end = socket.socket(fileno=int(sys.argv[1]))

@@ -1,7 +1,7 @@
 """Sparkplug B over MQTT: birth with all metrics, data with changed metrics, death, and rebirth on request.
 
-The messages have the format of `sparkplug_b.proto` of Eclipse Tahu. They are built from its published field numbers,
-because the file itself has another licence and is not included.
+The messages have the format of `sparkplug_b.proto` of Eclipse Tahu, built from its published field numbers, because the
+file itself has another licence.
 
 References
 ----------
@@ -24,7 +24,7 @@ from plow_twin.telemetry.values import UNITS, Group, Newest, Value
 _UINT64, _STRING, _UINT32, _BOOL = 4, 9, 13, 8
 _DOUBLE, _MESSAGE = 1, 11
 _OPTIONAL, _REPEATED = 1, 3
-#: Name, number and type of each field used, and the message type of a nested field.
+#: Name, number and type of each field, and the message type of a nested field.
 _FIELDS: Final = {
     "Payload": (
         ("timestamp", 1, _UINT64, ""), ("metrics", 2, _MESSAGE, "Metric"), ("seq", 3, _UINT64, ""),
@@ -38,15 +38,15 @@ _FIELDS: Final = {
     "PropertySet": (("keys", 1, _STRING, ""), ("values", 2, _MESSAGE, "PropertyValue")),
     "PropertyValue": (("type", 1, _UINT32, ""), ("string_value", 8, _STRING, "")),
 }  # fmt: skip
-#: Numbers of the data types of metrics.
+#: Numbers of the types of metrics.
 _INT32, _UINT64_TYPE, _DOUBLE_TYPE, _BOOLEAN, _TEXT = 3, 8, 10, 11, 12
-#: Names of the two metrics that Sparkplug requires.
+#: The two metrics that Sparkplug requires.
 BIRTH_NUMBER: Final = "bdSeq"
 REBIRTH: Final = "Node Control/Rebirth"
 
 
 def _messages() -> tuple[Any, Any]:
-    """Return the protobuf message classes `Payload` and `Metric`."""
+    """Return the protobuf classes `Payload` and `Metric`."""
     file = descriptor_pb2.FileDescriptorProto(name="sparkplug_b.proto", package="plow_twin.sparkplug", syntax="proto2")
     for name, fields in _FIELDS.items():
         message = file.message_type.add(name=name)
@@ -57,7 +57,7 @@ def _messages() -> tuple[Any, Any]:
                 added.type_name = f".plow_twin.sparkplug.{of}"
     pool = descriptor_pool.DescriptorPool()
     pool.Add(file)
-    # `GetMessageClass` has been a function since protobuf 4.22; before, a factory had the method `GetPrototype`
+    # protobuf before 4.22 has a factory instead of the function `GetMessageClass`
     class_of = getattr(message_factory, "GetMessageClass", None) or message_factory.MessageFactory(pool).GetPrototype
     return tuple(class_of(pool.FindMessageTypeByName(f"plow_twin.sparkplug.{name}")) for name in ("Payload", "Metric"))
 
@@ -66,27 +66,18 @@ Payload, Metric = _messages()
 
 
 class Sparkplug:
-    """An edge node whose metrics are `<group>/<name>`.
-
-    Parameters
-    ----------
-    group, node
-        Names of group and node in the topics.
-    options
-        As in `Broker`.
-    """
+    """An edge node whose metrics are `<group>/<name>`; the `options` are those of `Broker`."""
 
     def __init__(self, group: str, node: str, **options: Any) -> None:
         self._topic = f"spBv1.0/{group}/{{}}/{node}"
-        #: sequence number of the next message
         self._number = 0
-        #: number of the connection, which birth and death messages contain
+        #: number of the connection in birth and death messages
         self._connection = -1
         self._rebirth = False
         self._newest = Newest()
-        #: for each metric, the newest value that was sent
+        #: newest value that was sent of each metric
         self._sent: dict[tuple[str, str], Value] = {}
-        # messages that a break has delayed are dropped, because the next birth message has all newest values
+        # the next birth has all newest values, so messages that a break delayed are dropped
         self._broker = Broker(will=self._next_death, on_connected=self._born, keeps=False, **options)
         self._broker.client.on_message = self._asked
         self.state = self._broker.state
@@ -105,13 +96,13 @@ class Sparkplug:
                 self._broker.send(self._numbered("NDATA", payload))
 
     def _news(self, name: str, group: Group) -> Group:
-        """Return a group with only the values that differ from the values sent last; note them as sent."""
+        """Return a group with only the values that have changed; note them as sent."""
         values = {key: value for key, value in group.values.items() if self._sent.get((name, key), self) != value}
         self._sent |= {(name, key): value for key, value in values.items()}
         return group._replace(values=values)
 
     async def turn(self) -> None:
-        """Send the birth message again if a rebirth was requested."""
+        """Send the birth again if this was requested."""
         if self._rebirth:
             self._rebirth = False
             with self._broker.lock:
@@ -135,7 +126,7 @@ class Sparkplug:
         return self._numbered("NBIRTH", payload)
 
     def _next_death(self) -> Message:
-        """Return the death message of the next connection, which the broker receives before the birth message."""
+        """Return the death of the next connection, which the broker receives before the birth."""
         self._connection = (self._connection + 1) % 256
         return self._death()
 
@@ -171,7 +162,7 @@ def _payload(groups: Mapping[str, Group], *, with_units: bool) -> Any:
 
 
 def _typed(value: Value) -> tuple[int, str, Any]:
-    """Return the number of a value's data type, the field of the message that holds it, and the field's content."""
+    """Return the number of a value's type, and the field of the message with its content."""
     if value is None:
         return _DOUBLE_TYPE, "is_null", True
     if isinstance(value, str):

@@ -1,4 +1,4 @@
-"""Values of the outputs: the newest numbers and texts of a twin, in groups that have the same names on every output."""
+"""The newest numbers and texts of a twin, in groups that are the same on every output."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
-#: A value; None stands for a number that is not known.
+#: A value; None: not known.
 Value = float | int | str | None
 
 _POINTS: Final = ("", "/p05", "/p95")
@@ -20,7 +20,6 @@ _LIFE: Final = (
     *(f"{name}/{point}" for name in ("seconds", "metres", "passes", "shifts") for point in ("p10", "p50", "p90")),
     "not_reached_in_horizon", "probability_before_stop",
 )  # fmt: skip
-#: Unit of the numbers in each group.
 UNITS: Final = {"clearance": "m", "wear": "m", "peaks": "N"}
 
 
@@ -30,11 +29,11 @@ class Group(NamedTuple):
     Attributes
     ----------
     time_s : float
-        Stamp that the model had reached, in seconds since 1970; 0: no stamp yet.
+        Stamp that the model had reached [s since 1970]; 0: no stamp yet.
     values : mapping
-        Values by name; numbers in SI.
+        Values by name, in SI.
     held : bool
-        Whether the values were computed while the load had no new samples.
+        Whether the load had no new samples.
     """
 
     time_s: float
@@ -46,8 +45,8 @@ class Newest:
     """The newest values of all groups, from the updates of a feed.
 
     The groups are `clearance` [m] and `wear` [m] with their 5 % and 95 % points, `peaks` (largest forces [N] since the
-    last update), `life` (P10, P50 and P90 of the forecast), `flags`, `status` and `alarms`. Each group has all of its
-    names from the first update on, even while their values are unknown.
+    last update), `life` (P10, P50 and P90 of the forecast), `flags`, `status` and `alarms`. From the first update on,
+    each group has all of its names.
     """
 
     def __init__(self) -> None:
@@ -96,7 +95,7 @@ class Newest:
 
 
 def _unknown(names: list[str]) -> dict[str, dict[str, Value]]:
-    """Return all groups with all of their names, but with unknown values."""
+    """Return all groups with all of their names and unknown values."""
     by_pair: dict[str, Value] = {f"{name}{point}": None for point in _POINTS for name in names}
     axes: dict[str, Value] = {f"{axis}{point}": None for point in _POINTS for axis in ("horizontal", "vertical")}
     return {
@@ -111,7 +110,7 @@ def _unknown(names: list[str]) -> dict[str, dict[str, Value]]:
 
 
 def _part(name: str, level: int, message: str, values: Mapping[str, str]) -> dict[str, dict[str, Value]]:
-    """Return the groups whose values come from this part of the diagnostics; there may be none."""
+    """Return the groups that a part of the diagnostics gives."""
     if name == "status":
         return {
             "status": {"level": level, "message": message},
@@ -136,7 +135,6 @@ def _alarms(level: int, message: str, values: Mapping[str, str]) -> dict[str, Va
 
 
 def _number(text: str) -> float | None:
-    """Return the number in a text, or None if the text is not a finite number."""
     try:
         found = float(text)
     except ValueError:

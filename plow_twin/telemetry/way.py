@@ -11,7 +11,7 @@ from plow_twin.telemetry.values import Group, Newest
 
 
 class TelemetryError(PlowTwinError):
-    """An output cannot be opened; the message names the output and what was expected."""
+    """An output cannot be opened."""
 
 
 @dataclass
@@ -23,9 +23,9 @@ class State:
     connected : bool
         Whether the receiver answers.
     sent, lost : int
-        Number of messages (or points, or updates) that the receiver has taken, and number that were dropped.
+        Number of messages (or points, or updates) that the receiver has taken, and of those dropped.
     trouble : str
-        Why the receiver takes no messages; empty if it takes messages.
+        Why the receiver takes no messages; empty if it does.
     """
 
     connected: bool = False
@@ -40,13 +40,13 @@ class Way(Protocol):
     state: State
 
     async def open(self, link: Link, newest: Newest) -> None:
-        """Open the output for the machine that `newest.facts` describes; send operators' requests through `link`."""
+        """Open the output for the machine of `newest.facts`; operators' requests go through `link`."""
 
     async def send(self, changed: dict[str, Group], newest: Newest) -> None:
         """Send the groups that have changed."""
 
     async def turn(self) -> None:
-        """Do pending work; called at least twice a second."""
+        """Do pending work, at least twice a second."""
 
     async def close(self, patience_s: float) -> None:
         """Send waiting messages within `patience_s` [s], and close."""

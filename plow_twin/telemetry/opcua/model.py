@@ -1,4 +1,4 @@
-"""The information model: the type of a plough head's twin (a kind of mining equipment) and its instance."""
+"""The information model: the type of a plough head's twin, a kind of mining equipment, and its instance."""
 
 from __future__ import annotations
 
@@ -14,39 +14,32 @@ from asyncua.ua.object_ids import ObjectIds
 
 from plow_twin.telemetry.values import UNITS, Group
 
-#: Namespace of the types and the instance.
+#: Namespace of type and instance.
 NAMESPACE: Final = "https://plow-twin.readthedocs.io/opcua"
 _NODESETS: Final = Path(__file__).with_name("nodesets")
-#: Nodeset files, in an order in which each file depends only on earlier files.
+#: Nodeset files, each after those that it needs.
 _FILES: Final = ("Opc.Ua.Di", "Opc.Ua.Machinery", "Opc.Ua.Mining.General")
 _DI, _MINING = "http://opcfoundation.org/UA/DI/", "http://opcfoundation.org/UA/Mining/General/"
 _FUNCTIONAL_GROUP, _DEVICE_SET, _EQUIPMENT, _IDENTIFICATION = 1005, 5001, 1002, 1003
-#: UN/CEFACT code and name of each unit; OPC UA identifies a unit by the three characters of its code, read as one
-#: number.
+#: UN/CEFACT code and name of each unit; OPC UA reads the three characters of a code as a number.
 _UNITS: Final = {"m": ("MTR", "metre"), "N": ("NEW", "newton")}
 _POINTS: Final = ("p05", "p95")
 _TYPE: Final = "PloughHeadTwinType"
 
 
 class Model:
-    """The types and the instance of a server.
-
-    Parameters
-    ----------
-    server
-        A server that has been initialised.
-    """
+    """The types and the instance of a server, which has been initialised."""
 
     def __init__(self, server: Server) -> None:
         self._server = server
         self._index = 0
         self._di = 0
-        #: node of each value; the key is `<group>/<name>`
+        #: node of each value, by `<group>/<name>`
         self.nodes: dict[str, ua.NodeId] = {}
         self.device: Node
 
     async def build(self, groups: Mapping[str, Group], facts: Mapping[str, Any]) -> None:
-        """Make the types and the instance; each of the `groups` must already have all of its names."""
+        """Make types and instance; the `groups` must have all of their names."""
         for name in _FILES:
             await self._server.import_xml(str(_NODESETS / f"{name}.NodeSet2.xml"))
         self._index = await self._server.register_namespace(NAMESPACE)
@@ -77,7 +70,7 @@ class Model:
         return ua.QualifiedName(text, self._index)
 
     async def _interval_type(self) -> Node:
-        """Return a variable type whose value has a unit and also 5 % and 95 % points."""
+        """Return a variable type with a unit, and with 5 % and 95 % points."""
         analog = self._server.get_node(ua.NodeId(ObjectIds.AnalogUnitType))
         made = await analog.add_variable_type(
             self.node_id("IntervalType"), self._name("IntervalType"), ua.NodeId(ObjectIds.Double)
@@ -99,7 +92,7 @@ class Model:
             if name in UNITS and "/" not in key:
                 await instantiate(folder, interval, node_id, browse_name, instantiate_optional=False)
                 node = self._server.get_node(node_id)
-                # without a modelling rule, only the type would have the points, not its instances
+                # without a modelling rule, only the type would have the points
                 for point in _POINTS:
                     await self._server.get_node(self.node_id(f"{begin}.{key}.{point}")).set_modelling_rule(True)
                 await self._set_unit(node, UNITS[name])

@@ -1,4 +1,4 @@
-"""The OPC UA server: the twin's results as variables with stamp and status, which clients can read but not write."""
+"""The OPC UA server: the twin's results as variables with stamp and status, which clients can only read."""
 
 from __future__ import annotations
 
@@ -30,15 +30,14 @@ _POLICIES: Final = [
     ua.SecurityPolicyType.Aes128Sha256RsaOaep_SignAndEncrypt,
     ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt,
 ]
-#: Status of an unknown number.
 _UNKNOWN: Final = ua.StatusCode(StatusCodes.BadWaitingForInitialData)
-#: Status of a number computed while the load had no new samples.
+#: Status of a number computed without new samples of the load.
 _HELD: Final = ua.StatusCode(StatusCodes.UncertainLastUsableValue)
 _GOOD: Final = ua.StatusCode()
 
 
 class OneUser(UserManager):
-    """Admits the one named user or, if no user is named, every client that may connect."""
+    """Admits one named user or, without a name, every client."""
 
     def __init__(self, user: str, password: str) -> None:
         self._user, self._password = user, password
@@ -46,7 +45,7 @@ class OneUser(UserManager):
     def get_user(
         self, iserver: Any, username: str | None = None, password: str | None = None, certificate: Any = None
     ) -> User | None:
-        """Return the user, with permission to read, or None."""
+        """Return the user, who may read, or None."""
         given = zip((self._user, self._password), (username or "", password or ""), strict=True)
         right = all([hmac.compare_digest(own.encode(), found.encode("utf-8", "replace")) for own, found in given])
         return User(UserRole.User, username) if right or not self._user else None
@@ -62,9 +61,9 @@ class OpcUaServer:
     certificate, key
         Files that identify the server; with them all connections are signed and encrypted.
     trusted
-        Folder with certificates of the admitted clients or of their authorities; None: all clients.
+        Folder with certificates of the admitted clients or their authorities; None: all clients.
     user, password
-        Name and password of the only user; if they are empty, clients need no login.
+        The only user; empty: clients need no login.
     acknowledges
         Whether alarms may be acknowledged.
     """
@@ -151,7 +150,7 @@ class OpcUaServer:
 
 
 def _data(value: Value, group: Group) -> ua.DataValue:
-    """Return a value with its status, stamped with the time that the model had reached."""
+    """Return a value with its status, and with the time that the model had reached."""
     stamp = _EPOCH + timedelta(seconds=group.time_s) if group.time_s else datetime.now(UTC)
     if value is None:
         return ua.DataValue(ua.Variant(), _UNKNOWN, stamp, datetime.now(UTC))
