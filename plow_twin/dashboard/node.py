@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack, closing
 from functools import partial
 from typing import Any, Final
 
 import numpy as np
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import WrenchStamped
 from nav_msgs.msg import Odometry
@@ -16,7 +15,6 @@ from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.parameter import parameter_value_to_python
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
@@ -34,6 +32,7 @@ from plow_twin.ros.connections import WithoutEvents
 from plow_twin.ros.main import make_executor
 from plow_twin.ros.messages import UNREADABLE, read_wrench
 from plow_twin.ros.qos import DIAGNOSTICS, OUTPUTS, sensor_input
+from plow_twin.ros.start import ros
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.topics import Cadence, names_of
@@ -202,16 +201,6 @@ class NodeWatch:
                 values = {found.key: found.value for found in status.values}
                 known: Part = (int.from_bytes(status.level, "little"), status.message, values)
                 self.feed.part(part, known)
-
-
-@contextmanager
-def ros() -> Iterator[None]:
-    """Join the ROS graph, without ROS's own handling of signals."""
-    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-    try:
-        yield
-    finally:
-        rclpy.utilities.try_shutdown()
 
 
 def show_node(

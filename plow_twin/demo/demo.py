@@ -283,24 +283,20 @@ def _process(arguments: list[str], log: Path) -> Iterator[Child]:
 @contextmanager
 def _watching() -> Iterator[tuple[Watch, Any]]:
     """Listen to /diagnostics; yield the figures, and a function that waits briefly for messages."""
-    import rclpy.utilities
     from diagnostic_msgs.msg import DiagnosticArray
-    from rclpy.signals import SignalHandlerOptions
 
     from plow_twin.ros.connections import WithoutEvents
     from plow_twin.ros.main import make_executor
     from plow_twin.ros.qos import DIAGNOSTICS
+    from plow_twin.ros.start import ros
 
-    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-    try:
+    with ros():
         watch, node, executor = Watch(), WithoutEvents("plow_twin_demo"), make_executor()
         node.create_subscription(DiagnosticArray, "/diagnostics", watch.receive, DIAGNOSTICS)
         executor.add_node(node)
         yield watch, lambda: executor.spin_once(timeout_sec=0.1)
         executor.remove_node(node)
         node.destroy_node()
-    finally:
-        rclpy.utilities.try_shutdown()
 
 
 @contextmanager

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import socket
 import threading
@@ -13,7 +12,7 @@ from prometheus_client import CollectorRegistry, start_http_server
 from prometheus_client.core import GaugeMetricFamily
 
 from plow_twin.errors import PlowTwinError
-from plow_twin.live.part import Part
+from plow_twin.live.part import Part, number_of
 
 if TYPE_CHECKING:
     from prometheus_client.metrics_core import Metric
@@ -72,7 +71,7 @@ class Metrics:
         for name, (level, _, values) in self._parts.items():
             yield _gauge(f"{name}_level", "0 OK, 1 warning, 2 error", float(level))
             for key, text in values.items():
-                number = _number(text)
+                number = number_of(text)
                 if number is not None:
                     yield _gauge(f"{name}_{key}", f"{key} of the part {name} of the diagnostics", number)
 
@@ -101,11 +100,3 @@ def _bound(server: Any) -> None:
 
 def _gauge(name: str, meaning: str, value: float) -> GaugeMetricFamily:
     return GaugeMetricFamily(f"plow_twin_{_OTHER.sub('_', name)}", meaning, value)
-
-
-def _number(text: str) -> float | None:
-    try:
-        found = float(text)
-    except ValueError:
-        return None
-    return found if math.isfinite(found) else None

@@ -33,6 +33,18 @@ def start_ros(arguments: Sequence[str] | None) -> None:
         rclpy.init(args=None if arguments is None else list(arguments), signal_handler_options=SignalHandlerOptions.NO)
 
 
+@contextmanager
+def ros() -> Iterator[None]:
+    """Join the ROS graph; the program handles signals itself."""
+    import rclpy.utilities
+
+    start_ros([])
+    try:
+        yield
+    finally:
+        rclpy.utilities.try_shutdown()
+
+
 def without_ros(arguments: Sequence[str]) -> list[str]:
     """Return the program's own arguments of a command line; raise RosArgumentsError if those for ROS cannot be used."""
     from rclpy.utilities import remove_ros_args

@@ -5,17 +5,16 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-import rclpy
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.signals import SignalHandlerOptions
 
 from plow_twin.record.bag import BagWriter, Topic
 from plow_twin.record.cdr import schema_text
@@ -25,6 +24,7 @@ from plow_twin.ros.connections import WithoutEvents
 from plow_twin.ros.input_loop import InputLoop, Turns
 from plow_twin.ros.input_queue import InputQueue, Taken
 from plow_twin.ros.main import make_executor
+from plow_twin.ros.start import ros
 from plow_twin.scene_file.yaml_text import dump_yaml
 
 #: Number of messages of each topic that may wait for a slow disk.
@@ -210,10 +210,11 @@ def record_topics(
         excluded = exclude is not None and re.search(exclude, name) is not None
         return every and not hidden and not excluded and name not in left_out
 
-    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-    node = WithoutEvents("plow_twin_record", start_parameter_services=False, enable_rosout=False)
-    writer = in_free_folder(folder, partial(BagWriter, on_trouble=on_trouble))
-    try:
+    with ExitStack() as opened:
+        opened.enter_context(ros())
+        node = WithoutEvents("plow_twin_record", start_parameter_services=False, enable_rosout=False)
+        opened.callback(node.destroy_node)
+        writer = in_free_folder(folder, partial(BagWriter, on_trouble=on_trouble))
         recorder = TopicRecorder(node, writer, wanted)
         executor = make_executor()
         executor.add_node(node)
@@ -223,9 +224,6 @@ def record_topics(
         executor.remove_node(node)
         recorder.close()
         writer.close()
-    finally:
-        node.destroy_node()
-        rclpy.utilities.try_shutdown()
     lost = {name: writer.lost[name] + recorder.missed.get(name, 0) for name in {*writer.lost, *recorder.missed}}
     counted = {name: count for name, count in sorted(lost.items()) if count}
     silent = sorted(named - {*recorder.topics, *recorder.skipped})

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 
-from plow_twin.dashboard.node import NodeWatch, ros
+from plow_twin.dashboard.node import NodeWatch
 from plow_twin.live.timer import Timer
+from plow_twin.ros.start import ros
 from plow_twin.telemetry.access import WayOut
 from plow_twin.telemetry.outlet import Outlet
 

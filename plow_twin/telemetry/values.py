@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
+
+from plow_twin.live.part import number_of
 
 #: A value; None: not known.
 Value = float | int | str | None
@@ -119,24 +120,16 @@ def _part(name: str, level: int, message: str, values: Mapping[str, str]) -> dic
     if name == "alarms":
         return {"alarms": _alarms(level, message, values)}
     if name == "forecast":
-        return {"life": {point: _number(values.get(point, "")) for point in _LIFE}}
+        return {"life": {point: number_of(values.get(point, "")) for point in _LIFE}}
     return {}
 
 
 def _alarms(level: int, message: str, values: Mapping[str, str]) -> dict[str, Value]:
     found: dict[str, Value] = {"level": level, "message": message}
     for name in _ALARMS:
-        stamp = _number(values.get(f"{name}_stamp_ns", ""))
-        found[name] = _number(values.get(name, ""))
+        stamp = number_of(values.get(f"{name}_stamp_ns", ""))
+        found[name] = number_of(values.get(name, ""))
         found |= {f"{name}_{key}": values.get(f"{name}_{key}", "") for key in _ALARM_TEXTS}
-        found |= {f"{name}_{key}": _number(values.get(f"{name}_{key}", "")) for key in ("raised", "threshold")}
+        found |= {f"{name}_{key}": number_of(values.get(f"{name}_{key}", "")) for key in ("raised", "threshold")}
         found[f"{name}_time"] = None if stamp is None else stamp * 1e-9
     return found
-
-
-def _number(text: str) -> float | None:
-    try:
-        found = float(text)
-    except ValueError:
-        return None
-    return found if math.isfinite(found) else None
