@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from contextlib import AbstractContextManager, ExitStack, nullcontext
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +14,6 @@ import click
 from plow_twin.cli.console import (
     DONE,
     DONE_WITH_LOSS,
-    OnProgress,
     busy,
     error_console,
     output_console,
@@ -28,16 +27,12 @@ from plow_twin.cli.options import FILE, FOLDER, PLACE, POSITIVE, json_option, ma
 from plow_twin.cli.telemetry import telemetry_options, ways_of
 
 if TYPE_CHECKING:
-    from plow_twin.dashboard.access import PageAccess
-    from plow_twin.dashboard.screen import Screen
     from plow_twin.live.bridge.access import Access
     from plow_twin.live.bridge.source import Bridge
-    from plow_twin.live.control import Control
     from plow_twin.live.front import BridgeFront, Say
     from plow_twin.live.parameters import Settings
     from plow_twin.live.part import Part
     from plow_twin.live.stop import StopSignals
-    from plow_twin.telemetry.access import WayOut
 
 _PROGRESS_S = 0.2
 #: Names of the counters of unused input.
@@ -107,10 +102,16 @@ def _live(
     lines: bool,
     seconds: float | None,
 ) -> int:
+    from plow_twin.dashboard.live import open_screen
+    from plow_twin.live.bridge.files import Files
+    from plow_twin.live.control import TURN_S, Control
     from plow_twin.live.front import BridgeFront
     from plow_twin.live.realtime import apply_realtime
+    from plow_twin.live.services import Services
     from plow_twin.live.solver_start import Preparation, leave
     from plow_twin.live.stop import StopRequested
+    from plow_twin.live.timer import Timer
+    from plow_twin.telemetry.live import open_way
 
     report = Report(lines=lines, quiet=quiet, stamp_ns=lambda: front.runtime.stamp_ns)
     try:
@@ -123,18 +124,24 @@ def _live(
         with busy("preparing the solver", quiet or not error_console().is_terminal):
             prepared = Preparation(settings).result(lambda: stop.stopped)
 
-        with report, _control(options["control"]) as control, ExitStack() as opened:
+        with report, ExitStack() as opened:
+            control = opened.enter_context(Control(options["control"])) if options["control"] else None
             say = _also_metrics(report.say, options["metrics"], opened)
             front = BridgeFront(bridge, options["mapping"], settings, prepared, say, report.error, options["units"])
             _say_what_differs(front, settings)
             if control is not None:
-                _answer_on(control, front)
-            screen = opened.enter_context(_screen(front, access, source)) if access is not None else None
+                control.services = Services(front.runtime, front.changed)
+                front.timers.append(Timer(TURN_S, control.turn))
+            screen = None
+            if access is not None:
+                screen = opened.enter_context(open_screen(front, access, source))
+                say_where(screen, access)
             for way in ways:
-                opened.enter_context(_open_way(front, way, options["out_rate"], source))
-            if bridge.ends:
+                opened.enter_context(open_way(front, way, options["out_rate"], source))
+            if isinstance(bridge, Files) and bridge.ends:
                 _say_pace(settings, quiet)
-                _show_progress(front, bridge, opened.enter_context(progress_bar("reading", quiet or lines)))
+                update = opened.enter_context(progress_bar("reading", quiet or lines))
+                front.timers.append(Timer(_PROGRESS_S, lambda: update(bridge.share)))
             stop.interrupt = False
             lost = front.run(lambda: stop.stopped, seconds or float("inf"))
             if screen is not None and bridge.finished and not stop.stopped:
@@ -194,46 +201,6 @@ def _also_metrics(say: Say, port: int | None, opened: ExitStack) -> Say:
         say(name, part)
 
     return both
-
-
-def _answer_on(control: Control, front: BridgeFront) -> None:
-    """Let a running twin answer on a socket."""
-    from plow_twin.live.control import TURN_S
-    from plow_twin.live.services import Services
-    from plow_twin.live.timer import Timer
-
-    control.services = Services(front.runtime, front.changed)
-    front.timers.append(Timer(TURN_S, control.turn))
-
-
-def _screen(front: BridgeFront, access: PageAccess, source: str) -> Screen:
-    from plow_twin.dashboard.live import open_screen
-
-    screen = open_screen(front, access, source)
-    say_where(screen, access)
-    return screen
-
-
-def _open_way(front: BridgeFront, way: WayOut, rate_hz: float, source: str) -> AbstractContextManager[object]:
-    from plow_twin.telemetry.live import open_way
-
-    return open_way(front, way, rate_hz, source)
-
-
-def _show_progress(front: BridgeFront, bridge: Bridge, update: OnProgress) -> None:
-    from plow_twin.live.bridge.files import Files
-    from plow_twin.live.timer import Timer
-
-    if isinstance(bridge, Files):
-        front.timers.append(Timer(_PROGRESS_S, lambda: update(bridge.share)))
-
-
-def _control(path: Path | None) -> AbstractContextManager[Control | None]:
-    if path is None:
-        return nullcontext()
-    from plow_twin.live.control import Control
-
-    return Control(path)
 
 
 def _show_estimate(front: BridgeFront) -> None:

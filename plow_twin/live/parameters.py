@@ -39,6 +39,19 @@ def _number(default: float | tuple[float, ...], unit: str, low: float, high: flo
     return field(default=default, metadata={"unit": unit, "low": low, "high": high, "effect": effect, "doc": doc})
 
 
+def _limit(unit: str, doc: str, default: float = 0.0, high: float = 1e300) -> Any:
+    return _number(default, unit, 0.0, high, Effect.NOW, f"largest plausible {doc}")
+
+
+def _of_scene(unit: str, high: float, doc: str) -> Any:
+    return _number(-1.0, unit, -1.0, high, Effect.NOW, f"{doc}; -1: as in the scene")
+
+
+def _alarm(unit: str, high: float, doc: str) -> Any:
+    doc = f"{doc} that raise a warning and an error; 0: never"
+    return _number((0.0, 0.0), unit, 0.0, high, Effect.CONFIGURE, doc)
+
+
 def _choice(default: str, choices: tuple[str, ...], effect: Effect, doc: str) -> Any:
     return field(default=default, metadata={"choices": choices, "effect": effect, "doc": doc})
 
@@ -250,37 +263,18 @@ class Settings:
     hold_limit: float = _number(
         60.0, "s", 0.0, 86400.0, Effect.NOW, "silence beyond the timeout after which the model stops"
     )
-    limit_force: float = _number(
-        0.0, "N", 0.0, 1e300, Effect.NOW, "largest plausible force component; 0: ten times the scene's loads and weight"
+    limit_force: float = _limit("N", "force component; 0: ten times the scene's loads and weight")
+    limit_moment: float = _limit("N m", "moment; 0: derived from the scene's loads and weight")
+    limit_force_rate: float = _limit("N/s", "rate of a force; 0: limit_force in a millisecond")
+    limit_moment_rate: float = _limit("N m/s", "rate of the moment; 0: limit_moment in a millisecond")
+    limit_travel: float = _limit("m/s", "speed along the face", 10.0, 1000.0)
+    limit_travel_rate: float = _limit("m/s^2", "rate of this speed; 0: limit_travel in a millisecond")
+    limit_pose: float = _limit(
+        "m", "measured displacement; 0: half the larger side of the frame or clearance", high=1000.0
     )
-    limit_moment: float = _number(
-        0.0, "N m", 0.0, 1e300, Effect.NOW, "largest plausible moment; 0: derived from the scene's loads and weight"
-    )
-    limit_force_rate: float = _number(
-        0.0, "N/s", 0.0, 1e300, Effect.NOW, "largest plausible rate of a force; 0: limit_force in a millisecond"
-    )
-    limit_moment_rate: float = _number(
-        0.0, "N m/s", 0.0, 1e300, Effect.NOW, "largest plausible rate of the moment; 0: limit_moment in a millisecond"
-    )
-    limit_travel: float = _number(10.0, "m/s", 0.0, 1000.0, Effect.NOW, "largest plausible speed along the face")
-    limit_travel_rate: float = _number(
-        0.0, "m/s^2", 0.0, 1e300, Effect.NOW, "largest plausible rate of this speed; 0: limit_travel in a millisecond"
-    )
-    limit_pose: float = _number(
-        0.0,
-        "m",
-        0.0,
-        1000.0,
-        Effect.NOW,
-        "largest plausible measured displacement; 0: half the larger side of the frame or clearance",
-    )
-    limit_pose_rate: float = _number(
-        0.0, "m/s", 0.0, 1e300, Effect.NOW, "largest plausible rate of a displacement; 0: limit_pose in a millisecond"
-    )
-    limit_gap: float = _number(0.0, "m", 0.0, 1000.0, Effect.NOW, "largest plausible measured gap; 0: as limit_pose")
-    limit_gap_rate: float = _number(
-        0.0, "m/s", 0.0, 1e300, Effect.NOW, "largest plausible rate of a gap; 0: limit_gap in a millisecond"
-    )
+    limit_pose_rate: float = _limit("m/s", "rate of a displacement; 0: limit_pose in a millisecond")
+    limit_gap: float = _limit("m", "measured gap; 0: as limit_pose", high=1000.0)
+    limit_gap_rate: float = _limit("m/s", "rate of a gap; 0: limit_gap in a millisecond")
     set_wear: tuple[float, ...] = _number(
         (0.0,) * 8,
         "m",
@@ -290,27 +284,12 @@ class Settings:
         "wear depth of the eight pads for the service ~/set_wear; all 0: new pads",
     )
     mark: str = _plain("", Effect.NOW, "text that the service ~/mark puts into the journal")
-    clearance_horizontal: float = _number(
-        -1.0, "m", -1.0, 10.0, Effect.NOW, "horizontal clearance of unworn pads; -1: as in the scene"
-    )
-    clearance_vertical: float = _number(
-        -1.0, "m", -1.0, 10.0, Effect.NOW, "vertical clearance of unworn pads; -1: as in the scene"
-    )
-    stiffness: float = _number(
-        -1.0, "N/m^exponent", -1.0, 1e300, Effect.NOW, "stiffness of the contact law; -1: as in the scene"
-    )
-    damping: float = _number(
-        -1.0,
-        "as in the scene",
-        -1.0,
-        1e300,
-        Effect.NOW,
-        "damping of the contact law, if it has one; -1: as in the scene",
-    )
-    restitution: float = _number(
-        -1.0, "1", -1.0, 1.0, Effect.NOW, "restitution of the contact law, if it has one; -1: as in the scene"
-    )
-    wear_coefficient: float = _number(-1.0, "m^2/N", -1.0, 1.0, Effect.NOW, "wear coefficient; -1: as in the scene")
+    clearance_horizontal: float = _of_scene("m", 10.0, "horizontal clearance of unworn pads")
+    clearance_vertical: float = _of_scene("m", 10.0, "vertical clearance of unworn pads")
+    stiffness: float = _of_scene("N/m^exponent", 1e300, "stiffness of the contact law")
+    damping: float = _of_scene("as in the scene", 1e300, "damping of the contact law, if it has one")
+    restitution: float = _of_scene("1", 1.0, "restitution of the contact law, if it has one")
+    wear_coefficient: float = _of_scene("m^2/N", 1.0, "wear coefficient")
     max_evaluations: int = _number(
         0,
         "evaluations",
@@ -343,36 +322,11 @@ class Settings:
         Effect.CONFIGURE,
         "standard deviation of the excitation: Fx, Fy, M; 0: not known",
     )
-    alarm_force: tuple[float, ...] = _number(
-        (0.0, 0.0), "N", 0.0, 1e12, Effect.CONFIGURE, "forces that raise a warning and an error; 0: never"
-    )
-    alarm_clearance: tuple[float, ...] = _number(
-        (0.0, 0.0),
-        "m",
-        0.0,
-        10.0,
-        Effect.CONFIGURE,
-        "values of the larger clearance that raise a warning and an error; 0: never",
-    )
-    alarm_wear_rate: tuple[float, ...] = _number(
-        (0.0, 0.0), "m/s", 0.0, 1.0, Effect.CONFIGURE, "wear rates of a pad that raise a warning and an error; 0: never"
-    )
-    alarm_clearance_rate: tuple[float, ...] = _number(
-        (0.0, 0.0),
-        "m/s",
-        0.0,
-        1.0,
-        Effect.CONFIGURE,
-        "growth rates of the larger clearance, over 10 s, that raise a warning and an error; 0: never",
-    )
-    alarm_residual: tuple[float, ...] = _number(
-        (0.0, 0.0),
-        "m",
-        0.0,
-        10.0,
-        Effect.CONFIGURE,
-        "distances of head_pose from the model at the same stamp that raise a warning and an error; 0: never",
-    )
+    alarm_force: tuple[float, ...] = _alarm("N", 1e12, "forces")
+    alarm_clearance: tuple[float, ...] = _alarm("m", 10.0, "values of the larger clearance")
+    alarm_wear_rate: tuple[float, ...] = _alarm("m/s", 1.0, "wear rates of a pad")
+    alarm_clearance_rate: tuple[float, ...] = _alarm("m/s", 1.0, "growth rates of the larger clearance, over 10 s,")
+    alarm_residual: tuple[float, ...] = _alarm("m", 10.0, "distances of head_pose from the model at the same stamp")
     alarm_duration: float = _number(
         0.0, "s", 0.0, 3600.0, Effect.CONFIGURE, "time that a level must last before it raises an alarm"
     )
