@@ -104,7 +104,6 @@ def found_recordings(recordings: Sequence[Path], out: Path | None = None) -> tup
 
 
 def _watched(task: Any, every: float, as_json: bool, quiet: bool) -> int:
-    """Follow a run to its end, print the result, and return the exit code."""
     facts = _watch(task, every, as_json, quiet)
     if as_json:
         click.echo(json.dumps(facts, allow_nan=False))
@@ -128,7 +127,6 @@ def _run(tasks: list[Any], workers: int, dask: str | None, quiet: bool) -> list[
 
 
 def _watch(task: Any, every: float, as_json: bool, quiet: bool) -> dict[str, Any]:
-    """Analyse a run while it is recorded, until it ends or the command is interrupted."""
     import time
 
     from plow_twin.cli.interruption import interruptible
@@ -174,7 +172,6 @@ def _watch(task: Any, every: float, as_json: bool, quiet: bool) -> dict[str, Any
 
 
 def _show_contacts(console: Console, results: Sequence[dict[str, Any]]) -> None:
-    """Print the computed contacts, runs side by side."""
     shown = table("Contacts computed", "run", "time [s]", "impacts [1/min]", "largest force [kN]", "at")
     # a long name of a run is wrapped
     shown.columns[0].no_wrap, shown.columns[0].overflow = False, "fold"

@@ -66,7 +66,6 @@ def error_console() -> Console:
 
 class _RateColumn(ProgressColumn):
     def render(self, task: Task) -> Text:
-        """Return the text for a task."""
         return Text("" if not task.speed else f"{100.0 * task.speed:.2g} %/s")
 
 

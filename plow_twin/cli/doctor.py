@@ -38,7 +38,6 @@ def doctor(recording: Path, repair: bool, as_json: bool) -> int:
 
 
 def _shown(facts: dict[str, Any]) -> dict[str, Any]:
-    """Return the facts for the terminal, with parts by name and problems line by line."""
     parts = {part["file"]: {key: value for key, value in part.items() if key != "file"} for part in facts["parts"]}
     problems: dict[str, Any] = {
         key: dict(enumerate(facts[key], 1)) if facts[key] else None

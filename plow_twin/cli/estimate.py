@@ -204,7 +204,6 @@ def _given(source: Path, scene: Path | None, mapping: Path | None, folder: bool)
 
 
 def _followed(given: _Given, members: int, dt: float | None) -> tuple[list[str], Any]:
-    """Return column names and rows: forces, clearances and their intervals at each time."""
     from plow_twin.estimate import followed as offline
 
     stretch = offline.follow(given.measured.scene, given.load, given.poses, members, dt, gaps=given.gaps)
@@ -258,7 +257,6 @@ def _repeated(source: Path) -> _Task | None:
 
 
 def _title(source: Path, scene: Path | None, task: _Task) -> str:
-    """Return the first line of the picture's title: measurements, scene and date."""
     from datetime import UTC, datetime
 
     from plow_twin.view.figures import date_text
@@ -278,7 +276,6 @@ def _plot(task: _Task, result: Estimate, path: Path, title: str) -> None:
 
 
 def _labels(scene: Scene) -> dict[str, str]:
-    """Return each quantity's name with its unit."""
     from plow_twin.estimate.unknowns import QUANTITIES
 
     labels = {one.name: one.label for one in QUANTITIES}

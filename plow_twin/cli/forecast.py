@@ -191,7 +191,6 @@ def _history(path: Path) -> History:
 
 
 def _now(scene: Scene, facts: dict[str, Any] | None) -> tuple[Scene, tuple[float, float]]:
-    """Return the scene with the estimated clearances, and their standard deviations."""
     from plow_twin.estimate.forecast import with_estimate
     from plow_twin.estimate.life import LifeError
 

@@ -106,7 +106,6 @@ def _scene(target: str, as_json: bool) -> int:
 
 
 def _print_numbers(console: Console, target: str, rows: Sequence[dict[str, Any]]) -> None:
-    """Print the numbers by section, then the list of their sources."""
     sources = list(dict.fromkeys(row["source"] for row in rows if row["source"]))
     stated = table(f"{target}: what is stated", "number", "value", "unit", "mark, source")
     section = ""
@@ -133,7 +132,6 @@ def _recording(path: Path, as_json: bool) -> int:
 
 
 def _unused(path: Path, as_json: bool) -> int:
-    """Print the unused messages as CSV or JSON lines."""
     from plow_twin.record.unused import unused_messages
 
     table = csv.writer(sys.stdout, lineterminator="\n")

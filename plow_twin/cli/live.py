@@ -189,7 +189,6 @@ def _say_pace(settings: Settings, quiet: bool) -> None:
 
 
 def _also_metrics(say: Say, port: int | None, opened: ExitStack) -> Say:
-    """Return the receiver of a twin's reports, which also updates the page of metrics."""
     if port is None:
         return say
     from plow_twin.live.metrics import Metrics

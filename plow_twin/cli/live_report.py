@@ -18,17 +18,11 @@ _LEVELS = ("OK", "WARN", "ERROR")
 
 
 class Report:
-    """Reports status and alarms when they change, and with `lines` all parts as JSON lines.
+    """Reports status and alarms when they change, and with `lines` all parts as JSON lines; `quiet` leaves out the text
+    for a person.
 
     An alarm is reported when it is raised and when it is acknowledged. A hanging reader does not delay the twin: lines
     are dropped and counted.
-
-    Parameters
-    ----------
-    lines, quiet : bool
-        Whether to write JSON lines to standard output, and whether to write no text for a person.
-    stamp_ns
-        Returns the stamp that the twin has reached [ns].
     """
 
     def __init__(self, *, lines: bool, quiet: bool, stamp_ns: Callable[[], int]) -> None:
@@ -83,7 +77,6 @@ class Report:
 
 
 def _typed(value: str) -> int | float | str:
-    """Return the text of a finite number as a number, any other text unchanged."""
     for kind in (int, float):
         try:
             found = kind(value)

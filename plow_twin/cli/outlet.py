@@ -16,12 +16,7 @@ _PATIENCE_S: Final = 2.0
 class Outlet:
     """Writes lines in order, in a thread of its own.
 
-    Parameters
-    ----------
-    write
-        Writes a line and returns whether it was taken.
-    on_loss
-        Called when the first line is dropped.
+    `write` returns whether a line was taken, and `on_loss` is called when the first line is dropped.
     """
 
     def __init__(self, write: Callable[[str], bool], on_loss: Callable[[], object] = lambda: None) -> None:

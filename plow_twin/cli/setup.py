@@ -73,7 +73,6 @@ def _check_sizes(guess: Guess, scene: Scene, stated: dict[str, str]) -> None:
 
 
 def _write(guess: Guess, scene: str | None, out: Path) -> list[Path]:
-    """Write the mapping, the stub of a scene and the picture; return their paths."""
     from plow_twin.scene_file import dump_scene, load_scene
 
     out.mkdir(parents=True, exist_ok=True)

@@ -123,7 +123,6 @@ def view(
 
 
 def _check_still(option: str, *, moving: bool, exaggerate: float | None, others: tuple[str, ...]) -> None:
-    """Refuse options that a picture of a whole run does not have."""
     if moving:
         raise click.UsageError(
             f"{option} cannot be combined with --out, --web or --follow: it is a picture of a whole run"
@@ -135,7 +134,6 @@ def _check_still(option: str, *, moving: bool, exaggerate: float | None, others:
 
 
 def _still(run: Path, png: Path | None, html: Path | None) -> tuple[FileStatus, dict[str, int], int]:
-    """Write the picture or the page of a run; return the run's status, losses and failed advances."""
     if png is not None:
         from plow_twin.view.picture import to_png
 
@@ -176,7 +174,6 @@ def _scenes(files: tuple[str, ...]) -> dict[str, Scene]:
 
 
 def _show(recording: Path, out: object, summary: ViewSummary, quiet: bool) -> int:
-    """Print the content of the drawing and the losses; return the exit code."""
     lossy = _print_losses(recording, summary.status, summary.lost, summary.failed)
     if not quiet:
         thinned = "" if summary.curve_rows == summary.rows else f" of {summary.rows} read"
@@ -187,7 +184,6 @@ def _show(recording: Path, out: object, summary: ViewSummary, quiet: bool) -> in
 
 
 def _print_losses(recording: Path, status: FileStatus, lost: Mapping[str, int], failed: int) -> bool:
-    """Print the losses and failed advances of a recording; return whether there are any."""
     from plow_twin.record.reader import FileStatus
 
     whole = status in (FileStatus.COMPLETE, FileStatus.UNREAD)

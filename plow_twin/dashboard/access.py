@@ -38,12 +38,7 @@ class PageAccess:
     def of(cls, listen: str, token_file: Path | None) -> PageAccess:
         """Return the access for HOST:PORT, with the token in the first line of a file or in the environment.
 
-        Raises
-        ------
-        DashboardError
-            The address cannot be read, or other machines reach it and there is no token.
-        OSError
-            The file cannot be read.
+        Raises DashboardError if the address cannot be read, or other machines reach it and there is no token.
         """
         try:
             parts = urlsplit(f"//{listen}")

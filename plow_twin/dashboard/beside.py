@@ -16,14 +16,8 @@ END_S: Final = 3.0
 class Beside:
     """A running process and the link to it, as a context manager that ends the process.
 
-    Parameters
-    ----------
-    module
-        Module to run; its arguments are the descriptor of the link, then `descriptors`.
-    first
-        First message, which carries the secrets: other users can read a command line.
-    descriptors
-        Further descriptors for the process.
+    The arguments of the module are the descriptor of the link, then `descriptors`. The message `first` carries the
+    secrets, because other users can read a command line.
     """
 
     def __init__(self, module: str, first: dict[str, Any], descriptors: Sequence[int] = ()) -> None:

@@ -95,7 +95,6 @@ class Motion:
         self.clearance, self.estimate = values, {}
 
     def _clearances(self, values: Array) -> dict[str, float | None]:
-        """Return the newest clearances by name, as published or as in a later estimate."""
         found = {name: number(value) for name, value in zip(CLEARANCE_NAMES, values.tolist(), strict=True)}
         for axis in [axis for axis in ("horizontal", "vertical") if self.status.get(axis) in _KNOWN_STATES]:
             for name in (axis, f"{axis}/p05", f"{axis}/p95"):
@@ -134,8 +133,7 @@ class Feed:
     facts
         Facts about the machine (`facts.facts_of`).
     answer
-        Does an operator's request (`acknowledge` or `mark`, with a text), and returns success and an answer; None:
-        operators cannot make requests.
+        Does an operator's request (`acknowledge` or `mark`, with a text), and returns success and an answer.
     load
         Returns the load Fx, Fy [N], M [N m] at the newest publication, shape (3,).
     on_error

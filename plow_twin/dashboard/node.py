@@ -49,22 +49,7 @@ _NEWEST, _ALL = 1, 1000
 
 
 class NodeWatch:
-    """Listens to a node.
-
-    Parameters
-    ----------
-    namespace, name
-        Namespace and name of the node.
-    wait_s
-        Longest wait for the node [s].
-    stopped
-        Returns whether to stop waiting.
-
-    Raises
-    ------
-    DashboardError
-        There is no such node.
-    """
+    """Listens to a node, for which it waits until `stopped` or for `wait_s`; without it, DashboardError is raised."""
 
     def __init__(self, namespace: str, name: str, wait_s: float, stopped: Callable[[], bool]) -> None:
         self.node = WithoutEvents(
@@ -96,12 +81,7 @@ class NodeWatch:
     def facts(self, scene: str | None) -> dict[str, Any]:
         """Return the facts of the node; `scene` replaces its scene if it cannot be read here by its name.
 
-        Raises
-        ------
-        DashboardError
-            The node does not answer.
-        SceneError
-            The scene cannot be read.
+        Raises DashboardError if the node does not answer, and SceneError if the scene cannot be read.
         """
         answer = self._called(self._ask, GetParameters.Request(names=list(_SHOWN)))
         if answer is None:
@@ -212,15 +192,7 @@ def show_node(
     stopped: Callable[[], bool],
     on_open: Callable[[Screen], object],
 ) -> None:
-    """Show a node until `stopped`; `scene` replaces its scene if it cannot be read here by its name.
-
-    Raises
-    ------
-    DashboardError
-        The address cannot be used, or there is no such node.
-    SceneError
-        The scene cannot be read.
-    """
+    """Show a node until `stopped`; the errors are those of `NodeWatch`, `NodeWatch.facts` and `Screen`."""
     with ExitStack() as opened:
         opened.enter_context(ros())
         watch = opened.enter_context(closing(NodeWatch(namespace, name, wait_s, stopped)))

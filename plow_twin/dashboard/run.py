@@ -65,7 +65,6 @@ class RunFeed:
         self._say(batch)  # at the end, because an estimate replaces earlier clearances
 
     def _counted(self) -> dict[str, str]:
-        """Return the counts of the inputs so far, as in the twin's diagnostics."""
         others = self._inputs.facts()
         own = others.pop(self._inputs.source, {})
         counted = {"samples_used": own.pop("used", 0), "samples_lost": own.pop("lost", 0)}
@@ -113,15 +112,7 @@ def pose_of(numbers: Array) -> Array:
 
 
 def show_run(path: Path, access: PageAccess, stopped: Callable[[], bool], on_open: Callable[[Screen], object]) -> None:
-    """Show a recording until `stopped`, also while it is written; `on_open` is called with the screen.
-
-    Raises
-    ------
-    RecordingError
-        The path is not a recording.
-    DashboardError
-        The address cannot be used.
-    """
+    """Show a recording until `stopped`, also while it is written; `on_open` is called with the screen."""
     reader = RunReader(path, Tail(stopped))
     header = reader.header
     with Screen(access, facts_of(header.scene(reader.path), header.parameters, str(path))) as screen:

@@ -13,21 +13,9 @@ from plow_twin.dashboard.feed import Array, Feed
 
 
 class Screen(Beside):
-    """A running server and its feed, as a context manager that ends the server.
+    """A running server and its feed, as a context manager that ends the server; most arguments are those of `Feed`.
 
-    Parameters
-    ----------
-    access
-        Address and token.
-    facts, answer, load, on_error
-        As in `Feed`.
-
-    Raises
-    ------
-    DashboardError
-        The address cannot be used.
-    ModuleNotFoundError
-        The server's libraries are not installed.
+    Raises DashboardError if the address cannot be used, and ModuleNotFoundError if a library of the server is missing.
     """
 
     def __init__(

@@ -136,7 +136,6 @@ class Pages:
         await socket.close(ENDED, "the twin has ended")
 
     async def _listen(self, socket: WebSocket) -> None:
-        """Pass on the page's requests."""
         while True:
             wish = await _wish(socket)
             if wish.get("do") in ("acknowledge", "mark"):
@@ -145,7 +144,6 @@ class Pages:
 
 
 async def _wish(socket: WebSocket) -> dict[str, Any]:
-    """Return the next request of a page; empty if it cannot be read."""
     try:
         found = json.loads(await socket.receive_text())
     except (ValueError, KeyError):

@@ -69,25 +69,10 @@ class Watch:
 
 
 def run_demo(speed: str, seconds: float, out: Path, quiet: bool, screen: list[str] | None = None) -> int:
-    """Run the twin on the paper's load and print a summary.
+    """Run the twin on the paper's load and print a summary; return 0, 1 after a failure, or 3 after counted losses.
 
-    Parameters
-    ----------
-    speed
-        `real`: by the system's clock; `fast`: under /clock, as fast as possible.
-    seconds
-        Machine time to run [s].
-    out
-        Folder in which the run makes a new folder for recording, view and logs.
-    quiet
-        Print no progress and no table.
-    screen
-        Arguments of the operator's screen; None: no screen.
-
-    Returns
-    -------
-    int
-        0: done; 1: failed; 3: done, but with losses, which are counted.
+    At the speed `real` the run has the system's clock, at the speed `fast` it has /clock. `screen` has the arguments of
+    the operator's screen.
     """
     folder = out / datetime.now().strftime("%Y%m%d_%H%M%S_%f")
     folder.mkdir(parents=True)
@@ -194,7 +179,6 @@ def _run(
 
 
 def _follow(source: Child, twin: Child, watch: Watch, spin: Any, bar: Progress, task: TaskID) -> None:
-    """Show the model's time until the publisher has ended."""
     moved, reached = time.monotonic(), 0.0
     while source.running:
         spin()
@@ -307,7 +291,6 @@ def _progress(console: Console, quiet: bool) -> Iterator[Progress]:
 
 
 def _view(folder: Path) -> Path | None:
-    """Make the .rrd if rerun is installed."""
     try:
         from plow_twin.view import to_rrd
     except ModuleNotFoundError as error:
@@ -320,7 +303,6 @@ def _view(folder: Path) -> Path | None:
 
 
 def _losses(watch: Watch, sent: int, summary: RunSummary) -> dict[str, int]:
-    """Return all counted losses of the run."""
     published, missed = int(watch.number("output", "published")), int(watch.number("input", "messages_lost"))
     return {
         "lost by the middleware": missed,
@@ -353,7 +335,6 @@ def _print(console: Console, watch: Watch, summary: RunSummary, sent: int, lost:
 
 
 def _print_clearances(console: Console, summary: RunSummary) -> None:
-    """Print the clearances, as estimated from the synthetic sensor or as in the model."""
     for name, (value, low, high) in summary.clearance.items():
         found = None if summary.estimate is None else summary.estimate[name]
         if found is None:
@@ -369,7 +350,6 @@ def _print_clearances(console: Console, summary: RunSummary) -> None:
 
 
 def _print_comparison(console: Console, beside: Comparison) -> None:
-    """Print the forces of the synthetic machine, of the twin and of the nominal scene."""
     table = Table(title=f"Largest forces of the last {COMPARED_S:g} s in kN")
     table.add_column("pair", no_wrap=True)
     names = ("nominal", "followed", "true")

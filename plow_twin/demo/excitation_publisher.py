@@ -198,11 +198,6 @@ def plan(
     """Sample the loads of a scene without gravity, and add a cutting load.
 
     With `sensor_mm` the plan has the noisy pose of a head whose clearances are larger by as much.
-
-    Raises
-    ------
-    SceneError, OSError
-        The scene cannot be used.
     """
     period_ns = round(NS_PER_S / rate_hz)
     scene = load_scene(scene_name)

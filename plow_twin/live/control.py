@@ -33,20 +33,8 @@ class ControlError(PlowTwinError):
 class Control:
     """Context manager of a twin's socket, to which only the twin's user may connect.
 
-    Parameters
-    ----------
-    path
-        Where to put the socket.
-
-    Attributes
-    ----------
-    services : Services or None
-        The services that clients can request; None until the twin exists.
-
-    Raises
-    ------
-    ControlError
-        The path is taken or cannot be used.
+    `services` are those that clients can request, or None until the twin exists. A path that cannot be used raises
+    ControlError.
     """
 
     def __init__(self, path: Path) -> None:
@@ -101,10 +89,7 @@ class Control:
 def call(path: Path, service: str, text: str | None = None) -> tuple[bool, str]:
     """Request a service from the twin behind a socket; return whether it was done, and the answer.
 
-    Raises
-    ------
-    ControlError
-        There is no socket, or nobody answers.
+    Raises ControlError if there is no socket, or nobody answers.
     """
     if not path.is_socket():
         kind = "a folder" if path.is_dir() else "a file" if path.exists() else "nothing there"
@@ -124,7 +109,6 @@ def call(path: Path, service: str, text: str | None = None) -> tuple[bool, str]:
 
 
 def _answers(path: Path) -> bool:
-    """Return whether a process holds the socket open."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as client:
         try:
             client.connect(str(path))

@@ -87,7 +87,6 @@ class CuttingLoad:
 
     Parameters
     ----------
-    face : Face
     force_n : float
         Mean cutting force along x [N]; its sign gives the direction.
     lateral_n : float
@@ -98,12 +97,6 @@ class CuttingLoad:
         Coefficient of variation of the cutting force.
     correlation_m : float
         Distance along the face at which the correlation has fallen to 1/e [m].
-    seed : int
-
-    Raises
-    ------
-    ArgumentError
-        A number is out of range.
     """
 
     face: Face

@@ -34,7 +34,7 @@ from plow_twin.stream.session import Series, Session
 
 #: Base names of the topics.
 ESTIMATE, WINDOW_FORCES, FORECAST = ESTIMATES
-#: The published unit of a forecast in place of its other unit.
+#: SI unit in which a forecast is published, by the unit in which it is made.
 _SI: Final = {"hours": "seconds", "km": "metres"}
 #: Rate at which a finished estimate is looked for [Hz].
 RATE_HZ: Final = 10.0

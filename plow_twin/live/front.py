@@ -54,27 +54,12 @@ class Watcher(Protocol):
 class BridgeFront:
     """A live twin fed by a bridge.
 
-    Parameters
-    ----------
-    bridge
-        Source of the samples.
-    mapping
-        YAML file of the mapping; None: columns are recognised by name.
-    settings, prepared
-        As in `Runtime`.
-    say
-        Receives status and alarms when they change, and the diagnostics once a second.
-    on_error
-        Receives errors, perhaps from another thread.
-    units
-        Units by name (fx, ..., t), which replace the units of the mapping.
+    Without a mapping, columns are recognised by name; `units` (of fx, ..., t) replace those of the mapping. `say`
+    receives status and alarms when they change, and the diagnostics once a second; `on_error` may be called from
+    another thread.
 
-    Raises
-    ------
-    BridgeError
-        The source cannot be used, or the mapping gives no load.
-    RecordingError, WearStateError, OSError
-        The mapping, the recording or the saved wear cannot be used.
+    Raises BridgeError if the source cannot be used or gives no load, and RecordingError, WearStateError or OSError if
+    the mapping, the recording or the saved wear cannot be used.
     """
 
     def __init__(
@@ -181,7 +166,6 @@ class BridgeFront:
         return [*([broken] if broken else []), *self._not_read(stop_asked()), *diagnostics.failures(runtime), *lost]
 
     def _not_read(self, stopped: bool) -> list[str]:
-        """Describe input that never came or was not read."""
         if self._settings.excitation_source != "excitation":
             return []
         intake, topic = self.runtime.driver.intake, self.roles["drive" if "drive" in self.roles else "excitation"].topic
@@ -281,7 +265,6 @@ class BridgeFront:
 
 
 def _first_messages(bridge: Bridge) -> Iterator[Messages]:
-    """Yield the first messages, which the check of units reads."""
     count = 0
     while count < CHECKED and len(found := bridge.poll(0.0)):
         count += len(found)
@@ -297,10 +280,8 @@ def roles_of(
 ) -> dict[str, Role]:
     """Return the roles that a twin takes from a bridge.
 
-    Raises
-    ------
-    BridgeError, RecordingError
-        The mapping cannot be used, or lacks the load that `source`, the parameter `excitation_source`, requires.
+    Raises BridgeError or RecordingError if the mapping cannot be used, or lacks the load that `source`, the parameter
+    `excitation_source`, requires.
     """
     if source == "tool_forces":
         raise BridgeError("excitation_source: got 'tool_forces', expected 'excitation' or 'scene' without ROS")

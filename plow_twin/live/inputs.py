@@ -31,20 +31,9 @@ _SILENT_NS: Final = 10_000_000_000
 class Inputs:
     """The inputs of a live twin.
 
-    Parameters
-    ----------
-    front
-        Gives the time and the present senders.
-    source
-        The input that gives the load.
-    depth
-        Length of the queue of the load.
-    late_span_s
-        Largest delay with which a measured pose or gap is still used [s].
-    journaled
-        Whether unused messages are collected for the journal.
-    intake
-        Arguments of the `Intake` that judges the load.
+    `source` is the input that gives the load, `depth` the length of its queue, and `intake` has the arguments of the
+    `Intake` that judges it. `late_span_s` is the largest delay with which a measured pose or gap is still used. If
+    `journaled`, unused messages are collected for the journal.
     """
 
     def __init__(
@@ -235,6 +224,5 @@ class Inputs:
 
 
 def _filled(pose: tuple[float, float, float], newest: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Return a pose whose missing components are those of the newest pose."""
     x, y, theta = (before if math.isnan(value) else value for value, before in zip(pose, newest, strict=True))
     return x, y, theta

@@ -34,12 +34,10 @@ class LoadModel:
 
     Attributes
     ----------
-    push_ratio : tuple of float
-        Ratio of the force into the face to the cutting force.
+    push_ratio, lateral_ratio : tuple of float
+        Ratios of the force into the face and of the lateral force to the cutting force.
     at_m : tuple of float
         Point of action x, y [m] from the cavity's centre.
-    lateral_ratio : tuple of float
-        Ratio of the lateral force to the cutting force.
     efficiency : tuple of float, optional
         Ratio of the power at the chain to the motor power.
     idle_force_n : tuple of float
@@ -120,13 +118,7 @@ class LoadModel:
 
 
 def read_load_model(path: Path | None) -> LoadModel | None:
-    """Return the load model in a mapping file, or None.
-
-    Raises
-    ------
-    MapError
-        The load model cannot be used.
-    """
+    """Return the load model in a mapping file, or None; raise MapError if it cannot be used."""
     entry = None if path is None else read_map_file(path).get(LOAD_MODEL)
     if path is None or entry is None:
         return None

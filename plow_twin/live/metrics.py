@@ -29,19 +29,10 @@ class MetricsError(PlowTwinError):
 
 
 class Metrics:
-    """Context manager of a page of metrics on the loopback address, which Prometheus reads.
+    """Context manager of a page `http://127.0.0.1:PORT/metrics`, which Prometheus reads.
 
-    Each number of each part in the newest report is a gauge `plow_twin_<part>_<key>`; texts are left out.
-
-    Parameters
-    ----------
-    port
-        Port of the page, `http://127.0.0.1:PORT/metrics`.
-
-    Raises
-    ------
-    MetricsError
-        The port cannot be used.
+    Each number of each part in the newest report is a gauge `plow_twin_<part>_<key>`; texts are left out. A port that
+    cannot be used raises MetricsError.
     """
 
     def __init__(self, port: int) -> None:

@@ -436,13 +436,7 @@ def _property(spec: Field[Any]) -> dict[str, Any]:
 
 
 def settings(values: Mapping[str, Any]) -> Settings:
-    """Return the settings with given values in place of defaults.
-
-    Raises
-    ------
-    ParameterError
-        Some values cannot be used; the message lists them all.
-    """
+    """Return the settings with given values in place of defaults; raise ParameterError if some cannot be used."""
     found = problems(values)
     if found:
         raise ParameterError(found)
@@ -483,13 +477,7 @@ def model_changes(given: Settings) -> dict[str, float]:
 
 
 def read_parameters(path: Path) -> dict[str, Any]:
-    """Return the parameters in a YAML file, by plain names or under `ros__parameters` as for a ROS node.
-
-    Raises
-    ------
-    ParameterError
-        The file holds no mapping.
-    """
+    """Return the parameters in a YAML file, by plain names or under `ros__parameters` as for a ROS node."""
     from plow_twin.scene_file.yaml_text import read_yaml
 
     given, found = read_yaml(path, "parameter", "a mapping of names to values")

@@ -73,20 +73,8 @@ class Front(Protocol):
 class Publishing:
     """The output of a live twin.
 
-    Parameters
-    ----------
-    front
-        Receives the messages.
-    settings
-        Parameters of the twin.
-    alarms
-        The alarms.
-    recording
-        Records the messages.
-    on_alarm
-        Receives a text when an alarm is latched.
-    catch_up
-        Computes the intervals of a publication after its forces have been sent; None: they are computed before.
+    `on_alarm` receives a text when an alarm is latched. `catch_up` computes the intervals of a publication after its
+    forces have been sent; without it they are computed before.
     """
 
     def __init__(

@@ -29,18 +29,9 @@ _QUEUE_SIZE: Final = 20_000
 class Recording:
     """The recording of a configured node.
 
-    Parameters
-    ----------
-    settings, scene
-        Configuration of the node.
-    node_name
-        Fully qualified name of the node.
-    topics
-        Resolved names of the outputs by their base names.
-    clock
-        Returns the time [ns] on `/clock`; None: the system's time.
-    on_error
-        Called from the recorder's thread with the reason when recording stops early.
+    `topics` are the resolved names of the outputs by their base names. `clock` returns the time [ns] on `/clock`;
+    without it the system's time is used. `on_error` is called from the recorder's thread with the reason when recording
+    stops early.
     """
 
     def __init__(

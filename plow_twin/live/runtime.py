@@ -53,16 +53,8 @@ _LONGEST_WAIT_S, _WAITING_SECONDS = 0.5, 5
 class Runtime:
     """A configured twin, made on configure and closed on cleanup.
 
-    Parameters
-    ----------
-    front
-        Receives the messages.
-    settings
-        The parameters.
-    prepared
-        Scene and twin, which belongs to this runtime alone.
-    kept_wear
-        Wear of earlier runtimes of this process, by the scene's identity.
+    The `prepared` twin belongs to this runtime alone. `kept_wear` is the wear of earlier runtimes of this process, by
+    the scene's identity.
 
     Raises
     ------

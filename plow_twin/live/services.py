@@ -13,14 +13,8 @@ from plow_twin.stream.journal import Snapshot
 
 
 class Services:
-    """The services of a live twin, by the names of its methods.
-
-    Parameters
-    ----------
-    runtime
-        The twin.
-    changed
-        Called when the state of the stream may have changed.
+    """The services of a live twin, by the names of its methods; `changed` is called when the stream's state may have
+    changed.
     """
 
     def __init__(self, runtime: Runtime, changed: Callable[[], None]) -> None:

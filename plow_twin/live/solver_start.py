@@ -55,12 +55,8 @@ class Preparation:
     def result(self, stop_asked: Callable[[], bool]) -> Prepared:
         """Wait for the twin.
 
-        Raises
-        ------
-        SceneError, OSError
-            The scene cannot be used.
-        StartAbandoned
-            A stop was requested; the compiler, which cannot be interrupted, still works.
+        Raises SceneError or OSError if the scene cannot be used, and StartAbandoned if a stop was requested; the
+        compiler, which cannot be interrupted, then still works.
         """
         while not wait((self._future,), _LOOK_S).done:
             if stop_asked():

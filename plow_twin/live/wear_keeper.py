@@ -26,14 +26,9 @@ from plow_twin.record.wear_state import (
 
 @dataclass(frozen=True)
 class KeptWear:
-    """Wear that an earlier runtime of this process has left.
+    """Depths of wear that an earlier runtime of this process has left.
 
-    Attributes
-    ----------
-    depth_m
-        Depths [m].
-    older_files
-        Contents of the files that these depths should have replaced but could not.
+    `older_files` are contents of the file that the depths should have replaced but could not.
     """
 
     depth_m: tuple[float, ...]
@@ -44,21 +39,8 @@ class WearKeeper:
     """The wear of one head in one scene, in a folder.
 
     Only a file that this keeper has read or written is replaced. Another file, put there by hand, may hold wear that no
-    twin has used yet.
-
-    Parameters
-    ----------
-    folder
-        Folder in which the wear is kept.
-    head
-        Serial number of the head.
-    scene
-        The scene of the head.
-
-    Raises
-    ------
-    WearStateError
-        No file can be written to the folder, or another twin keeps its wear there.
+    twin has used yet. A folder to which no file can be written, or in which another twin keeps its wear, raises
+    WearStateError.
     """
 
     def __init__(self, folder: Path, head: str, scene: Scene) -> None:
@@ -73,12 +55,8 @@ class WearKeeper:
         self.error = ""
 
     def load(self, kept: KeptWear | None = None) -> tuple[float, ...] | None:
-        """Return the depths [m] to continue with, or None: `kept` if the file could not be replaced by them.
-
-        Raises
-        ------
-        WearStateError
-            As `parse_wear`.
+        """Return the depths [m] to continue with, or None: those `kept` if they could not replace the file, else the
+        file's.
         """
         found = read_wear(self.folder)
         if found is not None:
@@ -135,7 +113,6 @@ class WearKeeper:
             self._saved, self.error = values, ""
 
     def _is_claimed(self) -> bool:
-        """Return whether the folder of that name is still the claimed folder."""
         try:
             return self._claim is not None and os.path.samestat(os.fstat(self._claim), self.folder.stat())
         except FileNotFoundError:

@@ -145,7 +145,6 @@ def _in_full(own: QoSProfile) -> QoSProfile:
 
 
 def _reason(other: Any, kind: str, offered: Any, asked: Any) -> str:
-    """Return why a publisher and a subscriber cannot connect; empty if they can."""
     if other.topic_type != kind:
         return f"type: got {other.topic_type}, expected {kind}"
     compatibility, reason = qos_check_compatible(offered, asked)

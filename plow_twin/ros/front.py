@@ -32,19 +32,8 @@ if TYPE_CHECKING:
 class RosFront:
     """The topics, timers and services that configure makes around the runtime, and cleanup releases.
 
-    Parameters
-    ----------
-    node, settings
-        The node and its parameters.
-    changed
-        Called when the state of the stream may have changed.
-    prepared, kept_wear
-        As in `Runtime`.
-
-    Raises
-    ------
-    RecordingError, WearStateError, OSError
-        As `Runtime`.
+    `changed` is called when the state of the stream may have changed; `prepared`, `kept_wear` and errors are those of
+    `Runtime`.
     """
 
     def __init__(
@@ -70,7 +59,6 @@ class RosFront:
             self._made = made.pop_all()
 
     def _make(self, settings: Settings, prepared: Prepared, kept_wear: Mapping[str, KeptWear], made: ExitStack) -> None:
-        """Make everything; each part is registered for its release, also after an error."""
         node = self._node
         self.runtime = runtime = Runtime(self, settings, prepared, kept_wear)
         made.callback(lambda: self._lost.extend(runtime.close()))

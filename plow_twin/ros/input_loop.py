@@ -63,14 +63,10 @@ class Receiver(Protocol):
 
 
 class InputLoop:
-    """The thread of a node's inputs, which holds `turns` while it works.
+    """The thread of a node's inputs.
 
-    Parameters
-    ----------
-    turns
-        Lock that keeps this thread apart from the executor's thread.
-    on_error
-        Called with the error that ended the thread, which `error` keeps.
+    It holds `turns`, the lock that keeps it apart from the executor's thread, while it works. `on_error` is called with
+    the error that ended the thread, which `error` keeps.
     """
 
     def __init__(self, turns: Turns, on_error: Callable[[Exception], None]) -> None:
@@ -149,7 +145,6 @@ class InputLoop:
             self._on_error(error)
 
     def _receive(self, fd: int, *, all_there_are: bool = False) -> bool:
-        """Pass on messages of a queue; return whether more are waiting."""
         queue, receiver, topic = self._queues[fd]
         batch, more = queue.pop(_MOST, all_there_are=all_there_are)
         if batch:

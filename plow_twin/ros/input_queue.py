@@ -67,19 +67,9 @@ def _new_buffer() -> SerializedMessage:
 
 
 class InputQueue:
-    """A queue that is taken away from the executor and signals arrivals by a file descriptor.
+    """A queue that is taken away from the executor and signals arrivals: `fd` becomes readable.
 
-    Parameters
-    ----------
-    node
-        The node of the subscription. Both must be made in the thread of its executor.
-    subscription
-        The subscription, whose own callback is never called.
-
-    Attributes
-    ----------
-    fd : int
-        Becomes readable when a message has arrived.
+    Node and subscription must be made in the thread of the executor; the subscription's own callback is never called.
     """
 
     def __init__(self, node: Node, subscription: Subscription) -> None:

@@ -41,7 +41,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    """Return the parser of `--help`; other arguments belong to ROS 2."""
     return argparse.ArgumentParser(
         "twin",
         usage="twin [--help] [--ros-args -p NAME:=VALUE ... --params-file FILE -r FROM:=TO ...]",

@@ -41,12 +41,8 @@ class TwinNode(WithoutEvents, LifecycleNode):
     """The twin on ROS 2.
 
     Several nodes can share a process and an executor; `options` are those of `rclpy.node.Node`. Code that makes a node
-    calls `start`. `stop_asked` is polled while the solver is compiled.
-
-    Raises
-    ------
-    ParameterError
-        Some parameters given at start cannot be used; the message lists them all.
+    calls `start`. `stop_asked` is polled while the solver is compiled. Parameters that cannot be used at the start
+    raise ParameterError, which lists them all.
     """
 
     def __init__(
@@ -194,7 +190,6 @@ class TwinNode(WithoutEvents, LifecycleNode):
         return TransitionCallbackReturn.SUCCESS
 
     def _turn(self) -> AbstractContextManager[None]:
-        """Return the lock of the runtime."""
         return nullcontext() if self._front is None else self._front.turns
 
     def _refusals(self, settings: Settings) -> list[str]:

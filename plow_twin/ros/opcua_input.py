@@ -24,21 +24,9 @@ from plow_twin.record.sources import Arrived
 class OpcUaInput:
     """The nodes of a server, as both the queue and the receiver of some inputs.
 
-    It waits for the server at the start and after a break.
-
-    Parameters
-    ----------
-    runtime
-        The live twin, whose parameters name server, mapping and credentials.
-    front
-        Sends the resulting messages.
-    warn
-        Receives a text for each problem of the connection.
-
-    Raises
-    ------
-    BridgeError, RecordingError, InputError, OSError
-        Address, mapping or credentials cannot be used.
+    It waits for the server at the start and after a break, and `warn` receives a text for each problem of the
+    connection. Parameters name the server, the mapping and the credentials; BridgeError, RecordingError, InputError or
+    OSError say that one of them cannot be used.
     """
 
     def __init__(self, runtime: Runtime, front: Front, warn: Callable[[str], None]) -> None:

@@ -49,23 +49,10 @@ class ParameterServer:
     """Declares all parameters on a node and holds their current values in `settings`.
 
     The node must have `automatically_declare_parameters_from_overrides=True`, so that the given values are read before
-    any type check: a double can then be given as an integer, and one message can name all bad values.
+    any type check: a double can then be given as an integer, and one ParameterError can list all bad values.
 
-    Parameters
-    ----------
-    node
-        The node.
-    unconfigured
-        Returns whether parameters for configure may change.
-    changed
-        Receives name and value of each changed parameter that takes effect at once.
-    refusals
-        Returns why settings cannot be accepted now.
-
-    Raises
-    ------
-    ParameterError
-        Some of the values given at start cannot be used; the message lists them all.
+    `unconfigured` returns whether parameters for configure may change. `changed` receives name and value of each
+    changed parameter that takes effect at once. `refusals` returns why settings cannot be accepted now.
     """
 
     def __init__(

@@ -20,16 +20,9 @@ CLASSES: Final[dict[str, type]] = {JOINT_STATE: JointState, ODOMETRY: Odometry, 
 
 
 class OutputPublishers:
-    """Publishers of the outputs.
+    """Publishers of the outputs, except those `without`.
 
-    Parameters
-    ----------
-    node
-        The node.
-    without
-        Base names of outputs that are not published here.
-    memory
-        Buffers of the messages that are sent often, by base name of their topic.
+    `memory` has the buffers of messages that are sent often, by base name of their topic.
     """
 
     def __init__(self, node: Node, without: Collection[str], memory: Mapping[str, memoryview]) -> None:

@@ -51,14 +51,8 @@ def _publish() -> Any:
 
 
 class Sender:
-    """Sends the bytes that a buffer contains at the time of the call.
-
-    Parameters
-    ----------
-    publisher
-        A publisher of rclpy; once it is destroyed, nothing is sent.
-    data
-        Contiguous writable bytes: a CDR message.
+    """Sends the CDR message that a buffer contains at the time of the call; once the publisher is destroyed, nothing is
+    sent.
     """
 
     def __init__(self, publisher: Any, data: memoryview) -> None:

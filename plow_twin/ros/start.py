@@ -14,17 +14,8 @@ class RosArgumentsError(PlowTwinError):
 
 
 def start_ros(arguments: Sequence[str] | None) -> None:
-    """Make the default context of ROS; the program handles signals itself.
-
-    Parameters
-    ----------
-    arguments : sequence of str, optional
-        Arguments of the command line; None: those of the process.
-
-    Raises
-    ------
-    RosArgumentsError
-        The arguments cannot be used.
+    """Make the default context of ROS with the given arguments, or those of the process; the program handles signals
+    itself.
     """
     import rclpy
     from rclpy.signals import SignalHandlerOptions

@@ -35,21 +35,7 @@ _PAIR_NUMBERS: Final = {name: number for number, name in enumerate(PAIR_NAMES)}
 
 
 class Subscriptions:
-    """All subscriptions of a configured node.
-
-    Parameters
-    ----------
-    node
-        The node.
-    runtime
-        Takes the samples.
-    front
-        Sends the resulting messages.
-    loop, turns
-        The thread that takes the messages, and the lock that keeps it apart from the executor's thread.
-    elsewhere
-        Inputs that come from a server and have no subscription.
-    """
+    """All subscriptions of a configured node, except to inputs that come from `elsewhere`."""
 
     def __init__(
         self,
@@ -113,7 +99,6 @@ class Subscriptions:
         return self._noted(topic, self._node.get_publishers_info_by_topic(self._node.resolve_topic_name(topic)))
 
     def _noted(self, topic: str, publishers: list[Any]) -> list[bytes]:
-        """Return the identities of publishers, and remember their names."""
         present = [bytes(publisher.endpoint_gid) for publisher in publishers]
         for gid, publisher in zip(present, publishers, strict=True):
             space = publisher.node_namespace.rstrip("/")
@@ -268,7 +253,6 @@ class Subscriptions:
             self._runtime.add_pose(stamp, (pose.position.x, pose.position.y, theta), deviation)
 
     def _messages(self, topic: str, kind: type, intake: Intake, batch: list[Taken]) -> Iterator[Any]:
-        """Yield the messages of an optional input, and count unreadable messages."""
         for taken in batch:
             self._inputs.arriving = (topic, taken.sender)
             message = _message(taken.data, kind)
@@ -279,7 +263,6 @@ class Subscriptions:
 
 
 def _message(data: bytes, kind: type) -> Any | None:
-    """Decode CDR bytes; return None if they cannot be read."""
     try:
         return deserialize_message(data, kind)
     except (RuntimeError, UnicodeDecodeError):

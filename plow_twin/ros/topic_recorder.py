@@ -34,8 +34,6 @@ _FLUSH_S: Final = 1.0
 
 
 class _Quality(NamedTuple):
-    """The policies that decide whether a publisher and a subscriber connect."""
-
     reliable: bool
     latched: bool
 
@@ -54,17 +52,7 @@ def message_class(message_type: str) -> type:
 
 
 class TopicRecorder:
-    """Records topics as they appear.
-
-    Parameters
-    ----------
-    node
-        Makes the subscriptions.
-    writer
-        Takes the messages.
-    wanted
-        Returns whether to record a topic.
-    """
+    """Records topics as they appear, if `wanted` returns true for their names."""
 
     def __init__(self, node: Node, writer: BagWriter, wanted: Callable[[str], bool]) -> None:
         self._node, self._writer, self._wanted = node, writer, wanted
@@ -165,14 +153,11 @@ class TopicRecorder:
 
 
 class _Subscription(NamedTuple):
-    """A subscription: its quality of service, and the topic's number in the file."""
-
     recorder: TopicRecorder
     quality: _Quality
     number: int
 
     def receive(self, topic: str, batch: list[Taken]) -> None:
-        """Receive messages."""
         self.recorder.add(topic, self.quality, self.number, batch)
 
 
@@ -189,16 +174,9 @@ def record_topics(
 ) -> Mapping[str, Any]:
     """Record topics to a new folder until `stopped`; return the counts written, lost and skipped by topic.
 
-    `complete` is true if nothing was lost and every topic requested by name was recorded.
-
-    Parameters
-    ----------
-    folder
-        Folder that is made for the recording, or `<folder>_2`, ... if it exists and is not empty.
-    topics
-        Names; a relative name is in the root namespace.
-    every
-        Whether to record all topics except hidden ones, those in `but`, and those that match `exclude`.
+    If the folder exists and is not empty, `<folder>_2`, ... is made. With `every`, all topics are recorded except
+    hidden ones, those in `but`, and those that match `exclude`. `complete` is true if nothing was lost and every topic
+    requested by name was recorded.
     """
     named = {name if name.startswith("/") else f"/{name}" for name in topics}
     left_out = {*but, "/parameter_events"}
@@ -239,13 +217,7 @@ def record_topics(
 
 
 def schema_of(message_type: str) -> str:
-    """Return the `ros2msg` text of a type and of the types that it uses, from their packages or from ROS 2 Jazzy.
-
-    Raises
-    ------
-    LookupError
-        Neither source knows the type.
-    """
+    """Return the `ros2msg` text of a type and of the types that it uses, from their packages or from ROS 2 Jazzy."""
     from ament_index_python.packages import get_package_share_directory
 
     found: dict[str, str] = {}
@@ -270,7 +242,6 @@ _BUILT_IN: Final = re.compile(r"(bool|byte|char|float32|float64|u?int(8|16|32|64
 
 
 def _used(text: str, package: str) -> list[str]:
-    """Return the message types among the types of a message's fields."""
     used = []
     for line in text.splitlines():
         kind = line.split("#")[0].strip().partition(" ")[0].partition("[")[0]

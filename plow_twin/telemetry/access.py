@@ -38,20 +38,10 @@ _NO_TOPIC: Final = re.compile(r"[+#\x00-\x1f]|^\$")
 
 @dataclass(frozen=True)
 class WayOut:
-    """An output.
+    """An output: its part of the diagnostics by `name`, its address without credentials, the modules that its process
+    needs, and the first message to this process, with the options.
 
-    Attributes
-    ----------
-    name : str
-        Name of its part in the diagnostics.
-    address : str
-        Its address, without credentials.
-    modules : tuple of str
-        Python modules that its process needs.
-    first : dict
-        First message to its process, with the options.
-    may_acknowledge : bool
-        Whether an operator at the destination may acknowledge alarms.
+    `may_acknowledge` states whether an operator at the destination may acknowledge alarms.
     """
 
     name: str
@@ -101,12 +91,8 @@ class Credentials:
 def mqtt_out(url: str, credentials: Credentials, *, plain: bool, sparkplug: str = "") -> list[WayOut]:
     """Return the outputs to an MQTT broker, `mqtt[s]://HOST[:PORT]/PREFIX`.
 
-    With `sparkplug`, GROUP/NODE, JSON is sent beside it only if `url` has a prefix.
-
-    Raises
-    ------
-    AccessError, OSError
-        The address, a name or a file of the credentials cannot be used.
+    With `sparkplug`, GROUP/NODE, JSON is sent beside it only if `url` has a prefix. An address, name or file that
+    cannot be used raises AccessError or OSError.
     """
     expected = "mqtt[s]://HOST:PORT/PREFIX"
     host, port, prefix, tls = _address("--mqtt-out", url, ("mqtt", "mqtts"), expected, plain=plain)

@@ -30,14 +30,7 @@ _LONGEST_WAIT_S: Final = 30.0
 class Influx:
     """Writes lines `plow_twin_<group>,head=... name=value,... stamp` to a bucket of InfluxDB.
 
-    Parameters
-    ----------
-    url
-        Address of the database.
-    org, bucket, token
-        Destination of the points, and the permission to write there.
-    ca
-        File of the authority that certifies the database; None: those that the system trusts.
+    `ca` is the file of the authority that certifies the database, or None for those that the system trusts.
     """
 
     def __init__(self, url: str, org: str, bucket: str, token: str, ca: str | None) -> None:

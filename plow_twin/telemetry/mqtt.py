@@ -38,8 +38,6 @@ class Broker:
 
     Parameters
     ----------
-    host, port, client_id, user, password
-        Address of the broker, and identity, name and password of this client.
     tls
         Files `ca`, `certificate` and `key`; None: not encrypted.
     will
@@ -50,11 +48,6 @@ class Broker:
         Largest number of messages that wait; the oldest are dropped and counted.
     keeps
         Whether waiting messages outlive a break; otherwise they are dropped and counted.
-
-    Raises
-    ------
-    TelemetryError
-        A TLS file cannot be used.
     """
 
     def __init__(

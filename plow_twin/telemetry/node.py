@@ -24,22 +24,8 @@ def send_node(
 ) -> int:
     """Send the results of a node until `stopped`; return the number of messages that were lost on the way.
 
-    Parameters
-    ----------
-    namespace, name
-        Namespace and name of the node.
-    scene
-        Scene of the node, if it cannot be read here by its name.
-    ways
-        The outputs, each with its own process and listener.
-    rate_hz
-        Rate of updates [Hz].
-    wait_s
-        Longest wait for the node [s].
-    stopped
-        Returns whether to end.
-    on_error
-        Called with a text when the receiver of an output stops or resumes taking messages.
+    `scene` is needed if the node's scene cannot be read here by its name. `on_error` is called with a text when the
+    receiver of an output stops or resumes taking messages.
 
     Raises
     ------

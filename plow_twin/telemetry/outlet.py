@@ -19,23 +19,10 @@ _START_S: Final = 60.0
 
 
 class Outlet(Beside):
-    """A running output, as a context manager that ends its process.
+    """A running output, as a context manager that ends its process; `facts` and `answer` are those of `Feed`.
 
-    Parameters
-    ----------
-    way
-        The output.
-    facts, answer
-        As in `Feed`.
-    on_error
-        Called with a text when the receiver of the output stops or resumes taking messages.
-
-    Raises
-    ------
-    TelemetryError
-        The output cannot be opened.
-    ModuleNotFoundError
-        The output's library is not installed.
+    `on_error` is called with a text when the receiver of the output stops or resumes taking messages. An output that
+    cannot be opened raises TelemetryError, or ModuleNotFoundError if its library is missing.
     """
 
     def __init__(

@@ -60,7 +60,6 @@ async def serve(link: Link, way: Way, newest: Newest) -> None:
 
 
 async def _readable(link: Link) -> None:
-    """Wait for a message, or until a report is due."""
     loop, readable = asyncio.get_running_loop(), asyncio.Event()
     loop.add_reader(link.fileno(), readable.set)
     with suppress(TimeoutError):

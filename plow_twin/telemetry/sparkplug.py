@@ -46,7 +46,6 @@ REBIRTH: Final = "Node Control/Rebirth"
 
 
 def _messages() -> tuple[Any, Any]:
-    """Return the protobuf classes `Payload` and `Metric`."""
     file = descriptor_pb2.FileDescriptorProto(name="sparkplug_b.proto", package="plow_twin.sparkplug", syntax="proto2")
     for name, fields in _FIELDS.items():
         message = file.message_type.add(name=name)

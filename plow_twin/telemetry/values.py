@@ -25,16 +25,9 @@ UNITS: Final = {"clearance": "m", "wear": "m", "peaks": "N"}
 
 
 class Group(NamedTuple):
-    """Values that are sent together.
+    """Values in SI that are sent together; `held` states that the load had no new samples.
 
-    Attributes
-    ----------
-    time_s : float
-        Stamp that the model had reached [s since 1970]; 0: no stamp yet.
-    values : mapping
-        Values by name, in SI.
-    held : bool
-        Whether the load had no new samples.
+    `time_s` is the stamp that the model had reached [s since 1970], or 0 before the first stamp.
     """
 
     time_s: float
@@ -96,7 +89,6 @@ class Newest:
 
 
 def _unknown(names: list[str]) -> dict[str, dict[str, Value]]:
-    """Return all groups with all of their names and unknown values."""
     by_pair: dict[str, Value] = {f"{name}{point}": None for point in _POINTS for name in names}
     axes: dict[str, Value] = {f"{axis}{point}": None for point in _POINTS for axis in ("horizontal", "vertical")}
     return {
@@ -111,7 +103,6 @@ def _unknown(names: list[str]) -> dict[str, dict[str, Value]]:
 
 
 def _part(name: str, level: int, message: str, values: Mapping[str, str]) -> dict[str, dict[str, Value]]:
-    """Return the groups that a part of the diagnostics gives."""
     if name == "status":
         return {
             "status": {"level": level, "message": message},

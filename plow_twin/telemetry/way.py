@@ -18,14 +18,8 @@ class TelemetryError(PlowTwinError):
 class State:
     """State of an output.
 
-    Attributes
-    ----------
-    connected : bool
-        Whether the receiver answers.
-    sent, lost : int
-        Number of messages (or points, or updates) that the receiver has taken, and of those dropped.
-    trouble : str
-        Why the receiver takes no messages; empty if it does.
+    `sent` and `lost` count messages (or points, or updates) that the receiver has taken, and those dropped. `trouble`
+    is empty, or says why the receiver takes no messages.
     """
 
     connected: bool = False

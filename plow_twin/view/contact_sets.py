@@ -55,7 +55,6 @@ class ContactSets:
 
     @staticmethod
     def _pairs(corners: int, ccw: bool) -> int:
-        """Return the pairs of these corners that stop the rotation."""
         return sum(
             1 << pair
             for pair in range(PAIR_COUNT)

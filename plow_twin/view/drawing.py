@@ -57,20 +57,8 @@ Sink = Callable[[rr.RecordingStream, rrb.Blueprint], object]
 class Drawing:
     """Draws batches of a recording into a stream of the viewer.
 
-    Parameters
-    ----------
-    reader
-        Reader of the recording.
-    sink
-        Receives the stream and its blueprint, before anything is drawn.
-    section_hz
-        Rate of the cross-section [Hz].
-    exaggerate
-        Factor by which the second cross-section widens the clearance; None: chosen by the size of the clearance.
-    span_ns
-        Span in which a curve keeps its least and largest value [ns]; 0: every row is kept.
-    others
-        Other scenes, by name, whose forces under the load of the run are drawn too.
+    `sink` receives the stream and its blueprint, before anything is drawn. In a span of `span_ns`, a curve keeps its
+    least and largest value; 0 keeps every row. The other arguments are those of `to_rrd`.
     """
 
     def __init__(
@@ -189,7 +177,6 @@ class Drawing:
         self._residuals = Residuals()
 
     def _hole(self, count: int, after: Batch) -> None:
-        """Write that entries are missing before a batch."""
         self._sample_ns, self._wrench = None, np.full(3, np.nan)
         self.events.forget()
         if not isinstance(after.entries.others.get(0), Loss):  # a loss is drawn as an event
@@ -197,7 +184,6 @@ class Drawing:
             self.events.add(self.stamp_ns, max(self.step, 0), text, "ERROR")
 
     def _whole(self, batch: Batch) -> None:
-        """Draw a batch in which no entry is missing."""
         entries = batch.entries
         advance = entries.sample.copy()
         advance[[index for index, entry in entries.others.items() if isinstance(entry, Hold | Unload)]] = True
@@ -232,7 +218,6 @@ class Drawing:
         self._statuses(batch)
 
     def _entries(self, entries: Entries, stamps: Indexes, steps: Indexes, advance: NDArray[np.bool_]) -> None:
-        """Draw load, quality and events of the journal."""
         if self.header.excitation_source != "scene" and advance.any():
             loads = self._loads(entries, advance, self._wrench)
             finite = np.isfinite(loads[:, 0])
@@ -300,7 +285,6 @@ class Drawing:
                 self._pads(stamps, steps, numbers)
 
     def _poses(self, measured: Sequence[tuple[int, Pose]], steps: Indexes, head: Rows, at: Indexes) -> None:
-        """Draw the measured poses, if there are any, beside those of the model."""
         if not (measured or self.measured.rows):
             return
         theta = 2.0 * np.arctan2(head.numbers[:, 2], head.numbers[:, 3])
@@ -361,7 +345,6 @@ class Drawing:
             self._worn = bool(depth_mm[row].any())
 
     def _along_face(self, entries: Entries, rows: Rows, places: Indexes) -> None:
-        """Assign forces to places along the face."""
         largest, begin = rows.numbers[:, 2 * PAIR_COUNT :].max(axis=1), 0
         for index, entry in sorted(entries.others.items()):
             if isinstance(entry, Travel | Reset):

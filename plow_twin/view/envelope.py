@@ -105,7 +105,6 @@ class _Rows:
         )
 
     def binned(self, width: float) -> _Rows:
-        """Return the rows with the number of their bin as their place."""
         return _Rows(self.segment, np.floor(self.place / width), self.least, self.largest)
 
     def merged(self) -> _Rows:

@@ -15,20 +15,10 @@ from plow_twin.view.fitted import FittedPicture, FittedValue
 def estimate_picture(
     result: Estimate, prior: Mapping[str, Interval], poses: Poses, labels: Mapping[str, str], title: str
 ) -> FittedPicture:
-    """Return the picture of an estimate.
+    """Return the picture of an estimate; without a fitted motion, the measured `poses` are drawn alone.
 
-    Parameters
-    ----------
-    result
-        The estimate.
-    prior
-        Prior interval of each quantity, by its name in `QUANTITIES`.
-    poses
-        The measured poses, which are drawn alone if there is no fitted motion.
-    labels
-        Name with unit of each quantity.
-    title
-        First line of the title.
+    `prior` and `labels` have the interval of the prior and the name with unit of each quantity, by its name in
+    `QUANTITIES`.
     """
     states = {"horizontal": result.horizontal_state, "vertical": result.vertical_state}
     values = result.values()

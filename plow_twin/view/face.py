@@ -56,7 +56,6 @@ class FaceChart:
             self._set_speed(travel.speed_m_s)
 
     def _set_speed(self, speed_m_s: float) -> None:
-        """Change the speed; the other direction begins a new pass."""
         direction = math.copysign(1.0, speed_m_s) if speed_m_s else 0.0
         if direction and self._direction and direction != self._direction:
             self._passes.append({})
@@ -126,7 +125,6 @@ class FaceChart:
 
 
 def _halved(one: dict[int, float]) -> dict[int, float]:
-    """Return a pass with pieces of twice the length."""
     found: dict[int, float] = {}
     for piece, force in one.items():
         found[piece // 2] = max(found.get(piece // 2, 0.0), force)

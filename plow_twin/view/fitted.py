@@ -125,7 +125,6 @@ class FittedPicture:
         legend_beside(below)
 
     def _values(self, axis: Any) -> None:
-        """Draw each value on the scale of its prior, with its numbers beside it."""
         rows = range(len(self.values))
         axis.axvspan(-1.0, 1.0, color="0.9", lw=0.0, zorder=0)
         for row, value in zip(rows, self.values, strict=True):

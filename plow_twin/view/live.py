@@ -16,7 +16,7 @@ from plow_twin.view.rrd import ViewSummary
 CURVE_HZ: Final = 25.0
 #: Rate of the cross-section in a live view [Hz].
 SECTION_HZ: Final = 20.0
-#: The same for what was recorded before the view started.
+#: Rate of the cross-section for the part recorded before the view started [Hz].
 _SECTION_HZ_BEFORE: Final = 1.0
 
 
@@ -28,13 +28,7 @@ def follow(
     exaggerate: float | None = None,
     others: Mapping[str, Scene] | None = None,
 ) -> ViewSummary:
-    """Show a recording until its recorder ends or `stop` returns true; options as in `to_rrd`.
-
-    Raises
-    ------
-    RecordingError
-        The file is not a recording.
-    """
+    """Show a recording until its recorder ends or `stop` returns true; options as in `to_rrd`."""
     reader = RunReader(path, Tail(stop))
     drawing = Drawing(
         reader, sink, section_hz=_SECTION_HZ_BEFORE, exaggerate=exaggerate, span_ns=round(1e9 / CURVE_HZ), others=others

@@ -42,11 +42,6 @@ def to_png(path: Path, out: Path) -> tuple[FileStatus, dict[str, int], int]:
     """Draw a recording into a PNG; return how it ended, its losses, and the number of failed advances.
 
     No line crosses missing entries or a reset. A long run is drawn as the envelope of its curves.
-
-    Raises
-    ------
-    RecordingError
-        The file is not a recording, or `out` cannot be written.
     """
     reader = RunReader(path)
     curves = RunCurves.of(reader)
@@ -90,7 +85,6 @@ def run_figure(reader: RunReader, curves: RunCurves) -> Figure:
 
 
 def _meanings(curves: RunCurves) -> list[str]:
-    """Return the meanings of shades and bands."""
     span = max(curves.force.bin_s, curves.load.bin_s)
     return [
         *(["grey: without samples"] if curves.held_s else []),
@@ -100,7 +94,6 @@ def _meanings(curves: RunCurves) -> list[str]:
 
 
 def _title(reader: RunReader, curves: RunCurves) -> str:
-    """Return run, scene, date and end of the recording, and in a second line the losses."""
     parts = ["/".join(reader.path.absolute().parent.parts[-2:])]
     parts.append(scene_and_date(reader, curves.first_ns))
     losses = [f"lost {name.replace('_', ' ')}: {count}" for name, count in reader.lost_parts.items()]
@@ -249,7 +242,6 @@ def _clearance(axis: Any, curves: RunCurves) -> None:
 
 
 def _with_interval(value: float, low: float, high: float) -> str:
-    """Return a clearance in mm, with two decimals and the interval if it has one, otherwise with three."""
     if high - low < 1e-3:
         return f"{value:.3f} mm"
     return f"{value:.2f} mm ({low:.2f} to {high:.2f})"

@@ -20,12 +20,8 @@ _CHUNK: Final = 1 << 20
 class RrdFile:
     """Writes a stream to a file through a pipe; an incomplete file is removed.
 
-    The SDK's own file sink (0.41) waits forever for a disk that is full.
-
-    Raises
-    ------
-    RecordingError
-        The file cannot be opened, or, from `check` and the end of the context, written.
+    The SDK's own file sink (0.41) waits forever for a disk that is full; `check` and the end of the context raise
+    RecordingError.
     """
 
     def __init__(self, path: Path) -> None:

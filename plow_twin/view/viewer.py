@@ -53,13 +53,7 @@ class Viewer:
 
 
 def start_viewer(*, web_port: int | None = None) -> Viewer:
-    """Start a viewer: a page on `web_port`, or a window.
-
-    Raises
-    ------
-    RecordingError
-        The viewer is not installed or does not answer.
-    """
+    """Start a viewer, as a page on `web_port` or a window; raise RecordingError if it is missing or does not answer."""
     port, web_port = free_port(), None if web_port is None else page_port(web_port)
     command = [viewer_program(), "--bind", LOOPBACK, "--port", str(port), "--memory-limit", _MEMORY]
     if web_port is not None:

@@ -21,10 +21,7 @@ from plow_twin.view.columns import Array, Curves, Indexes, TimeAxis
 class WhatIf:
     """Runs other scenes under the journal of a run and draws their forces; does nothing without scenes.
 
-    Raises
-    ------
-    RecordingError
-        The run was under the loads of its own scene, so its journal has no load.
+    A run under the loads of its own scene has no load in its journal, and raises RecordingError.
     """
 
     def __init__(

@@ -26,10 +26,10 @@ _CREDENTIALS: Final = mapping(
 class Access:
     """Address and credentials.
 
-    `url` is `SCHEME://HOST:PORT`; a missing host means this machine. `user` and `password` may be empty. `ca` is the
-    file of the trusted authority's certificate, or of the broker's or server's own certificate. `certificate` and `key`
-    identify the twin; `user_certificate` and `user_key` identify its user instead of name and password. `plain` allows
-    a connection to another machine without encryption. `client_id` names the session at a broker.
+    `url` is `SCHEME://HOST:PORT`; a missing host means this machine. `ca` is the certificate of a trusted authority, or
+    the broker's or server's own. `certificate` and `key` identify the twin; `user_certificate` and `user_key` identify
+    its user, like `user` and `password`. `plain` allows an unencrypted connection to another machine. `client_id` names
+    the session at a broker.
     """
 
     url: str
@@ -47,10 +47,7 @@ class Access:
 def host_and_port(access: Access, ports: Mapping[str, int], *, has_path: bool = False) -> tuple[str, str, int]:
     """Return scheme, host and port of an address; `ports` are the default ports by scheme.
 
-    Raises
-    ------
-    BridgeError
-        The address is invalid, or contains a user, a password, or (without `has_path`) a path.
+    Raises BridgeError if the address is invalid, or contains a user, a password, or (without `has_path`) a path.
     """
     expected = " or ".join(f"{scheme}://HOST:PORT" for scheme in ports)
     try:
@@ -71,13 +68,7 @@ def password(path: Path | None, source: str) -> str:
 
 
 def read_access(url: str, path: Path | None) -> Access:
-    """Return the access to an OPC UA server with the credentials of a YAML file; its paths are relative to the file.
-
-    Raises
-    ------
-    InputError, OSError
-        The YAML file or the password's file cannot be used.
-    """
+    """Return the access to an OPC UA server with the credentials of a YAML file, to which its paths are relative."""
     if path is None:
         return Access(url, password=password(None, "OPCUA"))
     given, found = read_yaml(path, "credentials", _CREDENTIALS["description"])

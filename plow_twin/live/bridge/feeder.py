@@ -40,16 +40,8 @@ _NOTABLE = 0.02
 class Feeder:
     """Passes messages to the runtime of a live twin.
 
-    Parameters
-    ----------
-    roles
-        The mapping. Roles that a live twin does not use are ignored.
-    runtime
-        The live twin.
-    send
-        Sends each resulting message.
-    model
-        Model that computes the load from the drive's signals; None if the load itself is measured.
+    Roles of the mapping that a live twin does not use are ignored. `send` gets each resulting message. With a `model`,
+    the load is computed from the drive's signals.
     """
 
     def __init__(
@@ -147,7 +139,6 @@ class Feeder:
         return True
 
     def _follow_times(self, stamps: NDArray[np.int64]) -> None:
-        """Do the same as `_follow_time` for each stamp."""
         newest = np.maximum.accumulate(np.append(self.newest_ns, stamps))
         jump_ns = round(self._runtime.settings.jump_forward * 1e9)
         if self.newest_ns and self._far_ahead_ns is None and (stamps <= newest[:-1] + jump_ns).all():
@@ -206,7 +197,6 @@ class Feeder:
         return [(stamp_ns, wrench)]
 
     def _numbered(self, role: Role, arrived: Arrived) -> tuple[bytes, int, bool]:
-        """Return the sender, the message's number, and whether the message is repeated."""
         number = role.number(arrived) if role.sequence else None
         if number is None:
             # the next message with a number shows whether the sender counted this message
@@ -244,7 +234,6 @@ class Feeder:
         return abs(number - before) <= _RESTART and not number <= 1 < before - _FIRST
 
     def _begin_anew(self) -> None:
-        """Treat the following messages as those of a new sender."""
         self._sender += 1
         self._assumed = self._unnumbered = 0
         self._runtime.inputs.senders.start([self._name])

@@ -117,7 +117,6 @@ class _Tail:
 
     @property
     def place(self) -> int:
-        """Number of bytes of the file that have been read."""
         return 0 if self._file is None else int(self._file.tell())
 
     def close(self) -> None:
@@ -202,17 +201,8 @@ def _numbered(path: Path) -> list[tuple[int, str]]:
 class Files(SourceState):
     """Files as topics, named without the ending; the files of a pattern (`load_*.csv`) are one topic.
 
-    Parameters
-    ----------
-    paths
-        Files or patterns. The messages of files that are read once are sorted by their stamps.
-    follow
-        Whether to wait for files that do not exist yet, and for lines that are appended.
-
-    Raises
-    ------
-    BridgeError
-        A file cannot be read.
+    With `follow`, files may appear later and grow; otherwise their messages are sorted by their stamps. A file that
+    cannot be read raises BridgeError.
     """
 
     def __init__(self, paths: list[Path], *, follow: bool) -> None:
@@ -324,13 +314,7 @@ def _sent_ns(row: Arrived, stamp_ns: StampOf[Arrived] | None) -> int | None:
 
 
 class StandardInput(SourceState):
-    """Lines from standard input or another file descriptor, until its end.
-
-    Raises
-    ------
-    BridgeError
-        Standard input is closed.
-    """
+    """Lines from standard input or another file descriptor, until its end."""
 
     def __init__(self, descriptor: int = 0) -> None:
         if descriptor == 0 and sys.stdin is None:

@@ -31,17 +31,7 @@ _PORTS: Final = {"mqtt": 1883, "mqtts": 8883}
 class Mqtt(SourceState):
     """A session that a broker keeps while the connection is broken; messages of QoS 1 then arrive later.
 
-    Parameters
-    ----------
-    access
-        Address and credentials of the broker.
-    connect_s
-        Longest wait for the broker's answer [s].
-
-    Raises
-    ------
-    BridgeError
-        The address is invalid, no broker answers, or the broker refuses the connection.
+    Raises BridgeError if the address is invalid, no broker answers within `connect_s`, or it refuses the connection.
     """
 
     def __init__(self, access: Access, connect_s: float = 10.0) -> None:

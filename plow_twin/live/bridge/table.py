@@ -15,17 +15,7 @@ from plow_twin.record.times import OF_NUMBERS, TIMES, times_ns
 
 
 class Table:
-    """Lines of a file, read as single messages, or as the numbers of a role in all lines.
-
-    Parameters
-    ----------
-    topic
-        Topic of the messages.
-    lines
-        Whole lines; None for a line that is too long.
-    rows
-        Parser of the lines.
-    """
+    """Lines of a file (None: too long), read as single messages, or as the numbers of a role in all lines."""
 
     def __init__(self, topic: str, lines: Sequence[bytes | None], rows: Rows) -> None:
         self.topic, self._lines, self._rows = topic, lines, rows

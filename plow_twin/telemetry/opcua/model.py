@@ -70,7 +70,6 @@ class Model:
         return ua.QualifiedName(text, self._index)
 
     async def _interval_type(self) -> Node:
-        """Return a variable type with a unit, and with 5 % and 95 % points."""
         analog = self._server.get_node(ua.NodeId(ObjectIds.AnalogUnitType))
         made = await analog.add_variable_type(
             self.node_id("IntervalType"), self._name("IntervalType"), ua.NodeId(ObjectIds.Double)

@@ -54,18 +54,9 @@ class OneUser(UserManager):
 class OpcUaServer:
     """An output to which clients connect.
 
-    Parameters
-    ----------
-    endpoint
-        Address, `opc.tcp://HOST:PORT`.
-    certificate, key
-        Files that identify the server; with them all connections are signed and encrypted.
-    trusted
-        Folder with certificates of the admitted clients or their authorities; None: all clients.
-    user, password
-        The only user; empty: clients need no login.
-    acknowledges
-        Whether alarms may be acknowledged.
+    With `certificate` and `key`, all connections are signed and encrypted. `trusted` is a folder with certificates of
+    the admitted clients or their authorities; None admits all. `user` and `password` are those of the only user; if
+    they are empty, clients need no login.
     """
 
     def __init__(
@@ -150,7 +141,6 @@ class OpcUaServer:
 
 
 def _data(value: Value, group: Group) -> ua.DataValue:
-    """Return a value with its status, and with the time that the model had reached."""
     stamp = _EPOCH + timedelta(seconds=group.time_s) if group.time_s else datetime.now(UTC)
     if value is None:
         return ua.DataValue(ua.Variant(), _UNKNOWN, stamp, datetime.now(UTC))

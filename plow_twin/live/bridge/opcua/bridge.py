@@ -55,25 +55,12 @@ _LONGEST_WAIT_S: Final = 30.0
 class OpcUa(SourceState):
     """A subscription to the nodes of a mapping, which is renewed after a break.
 
-    Parameters
-    ----------
-    access
-        The server.
-    roles
-        The mapping. Each role is a topic, and its fields are nodes.
-    rate_hz
-        Expected rate of the samples [Hz]; 0: unknown, so that the server's fastest sampling is requested.
-    connect_s
-        Longest wait for the first connection [s].
-    waits
-        Whether `start` returns before there is a connection.
-    on_arrival
-        Called, from another thread, when samples have arrived.
+    Each role of the mapping is a topic, and its fields are nodes. `rate_hz` is the expected rate of the samples; 0
+    requests the server's fastest sampling. With `waits`, `start` returns before there is a connection. `on_arrival` is
+    called from another thread when samples have arrived.
 
-    Raises
-    ------
-    BridgeError
-        The address, a node's identifier or the set of certificates is invalid, or the connection is not encrypted.
+    Raises BridgeError if the address, a node's identifier or the set of certificates is invalid, or if the connection
+    is not encrypted.
     """
 
     def __init__(
@@ -179,7 +166,6 @@ class OpcUa(SourceState):
             asyncio.run(self._serve())
 
     async def _serve(self) -> None:
-        """Connect again after each break until a stop is requested."""
         self._loop, self._task = asyncio.get_running_loop(), asyncio.current_task()
         wait_s = _FIRST_WAIT_S
         while not self._stop.is_set():
@@ -254,7 +240,6 @@ class OpcUa(SourceState):
         self._pass_on(now_s)
 
     def _stamp_ns(self, number: int, value: Any) -> int:
-        """Return the stamp of a value, or 0 without a stamp."""
         found = reading(value, self._by_server(number), Counts())
         return 0 if found is None else found[0]
 

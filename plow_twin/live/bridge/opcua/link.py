@@ -66,20 +66,8 @@ class Revised:
 class Link:
     """A connection with its subscription.
 
-    Parameters
-    ----------
-    access, host
-        The server.
-    nodes
-        Identifiers of the nodes.
-    uris
-        Namespaces to which the namespace numbers in `nodes` refer; empty: the server's present namespaces.
-    sampling_ms
-        Requested sampling interval [ms]; 0: the server's fastest.
-    take
-        Receives the values.
-    counts
-        Receives the losses.
+    The namespace numbers in `nodes` refer to `uris`, or if these are empty, to the server's present namespaces. A
+    `sampling_ms` of 0 requests the server's fastest sampling. `take` receives the values, `counts` the losses.
     """
 
     def __init__(
@@ -112,12 +100,8 @@ class Link:
     async def open(self) -> Revised:
         """Connect and subscribe; return what the server grants.
 
-        Raises
-        ------
-        BridgeError
-            The certificate is not trusted, or a node cannot be subscribed to.
-        OSError, UaError, TimeoutError
-            There is no server, or it refuses the connection.
+        Raises BridgeError if the certificate is not trusted or a node cannot be subscribed to, and OSError, UaError or
+        TimeoutError if there is no server or it refuses the connection.
         """
         if self._access.certificate is not None:
             await secure(self._client, self._access, self._host)
@@ -159,10 +143,7 @@ class Link:
     async def history(self, begin_ns: int, end_ns: int) -> list[tuple[int, Any]]:
         """Return pairs of node number and value for all values between two stamps [ns], both included.
 
-        Raises
-        ------
-        UaError
-            The server keeps no history of some node, or its answers have no end.
+        Raises UaError if the server keeps no history of some node, or its answers have no end.
         """
         details = ua.ReadRawModifiedDetails(
             IsReadModified=False,
@@ -262,7 +243,6 @@ class Link:
         await self._take_message(message, lost=lost > 0)
 
     def _missing(self, number: int) -> range:
-        """Return the sequence numbers that are missing before the message `number`."""
         expected = self._next_number
         if expected is not None and number == expected - 1:  # the server has sent the newest message again
             return range(0)

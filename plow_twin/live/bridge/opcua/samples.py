@@ -17,14 +17,7 @@ class Samples:
     """Samples of a role: the values of the role's nodes at one stamp.
 
     A server does not send an unchanged value again, so a node keeps its last value. A stamp is complete when each node
-    has a value at this stamp or at a later stamp.
-
-    Parameters
-    ----------
-    nodes
-        The nodes of the role.
-    wait_s
-        Longest wait for a complete stamp [s].
+    has a value at this stamp or at a later stamp; it waits for `wait_s` at most.
     """
 
     def __init__(self, nodes: Sequence[str], wait_s: float) -> None:

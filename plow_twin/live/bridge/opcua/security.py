@@ -28,10 +28,7 @@ _MODE: Final = ua.MessageSecurityMode.SignAndEncrypt
 async def secure(client: Client, access: Access, host: str) -> None:
     """Have a client sign and encrypt by the strongest policy that the server offers.
 
-    Raises
-    ------
-    BridgeError
-        The server offers no secure channel, its certificate is not trusted, or a file cannot be read.
+    Raises BridgeError if the server offers no secure channel, its certificate is not trusted, or a file cannot be read.
     """
     assert access.certificate and access.key and access.ca, "checked with the address"
     endpoints = await client.connect_and_get_server_endpoints()
@@ -56,13 +53,7 @@ async def secure(client: Client, access: Access, host: str) -> None:
 
 
 async def identify(client: Client, access: Access) -> None:
-    """Have a client sign in as the user of a certificate.
-
-    Raises
-    ------
-    BridgeError
-        A file cannot be read.
-    """
+    """Have a client sign in as the user of a certificate; raise BridgeError if a file cannot be read."""
     assert access.user_key, "checked with the address"
     try:
         await client.load_client_certificate(str(access.user_certificate))
