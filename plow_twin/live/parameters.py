@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from plow_twin.errors import InputError, Problem
-from plow_twin.live.file_root import outside
 from plow_twin.live.service_names import SERVICES
+from plow_twin.scene_file.presets import PRESETS
 from plow_twin.stream.topics import Cadence, names_of
 
 #: Topics of the estimate and of results that follow from it.
@@ -355,6 +355,8 @@ MODEL: Final[Mapping[str, str]] = {
     "restitution": "contact.restitution",
     "wear_coefficient": "wear.coefficient_m2_n",
 }
+#: Parameters that name files or folders. Anybody on the ROS graph may set parameters, so these are limited.
+FILES: Final = ("scene", "record_path", "wear_state_path")
 SPECS: Final[Mapping[str, Field[Any]]] = {spec.name: spec for spec in fields(Settings)}
 #: A number, also in a form like 1e-9 that YAML 1.1, which ROS launch files use, reads as a text.
 _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
@@ -468,6 +470,35 @@ def _swapped_thresholds(given: Settings) -> list[Problem]:
         for name, pair in alarms.items()
         if isinstance(pair, tuple) and pair[0] > pair[1] > 0.0
     ]
+
+
+def outside(settings: Settings) -> list[Problem]:
+    """Return a problem for each parameter that names a file outside `file_root`, after symbolic links."""
+    if not settings.file_root:
+        return []
+    root = Path(settings.file_root).resolve()
+    named = {name: getattr(settings, name) for name in FILES}
+    return [
+        Problem(name, given, f"a path within file_root, {root}")
+        for name, given in named.items()
+        if _is_path(name, given) and not Path(given).resolve().is_relative_to(root)
+    ]
+
+
+def refused_changes(before: Settings, after: Settings) -> list[str]:
+    """Return why parameters that name files cannot be changed after the start; presets can."""
+    if after.file_root:
+        return [str(problem) for problem in outside(after)]
+    changed = [name for name in FILES if getattr(before, name) != getattr(after, name)]
+    return [
+        f"{name}: names a file, and is read-only without the parameter file_root"
+        for name in changed
+        if not (name == "scene" and getattr(after, name) in PRESETS)
+    ]
+
+
+def _is_path(name: str, given: str) -> bool:
+    return bool(given) and not (name == "scene" and given in PRESETS)
 
 
 def model_changes(given: Settings) -> dict[str, float]:

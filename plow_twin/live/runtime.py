@@ -18,9 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.errors import ArgumentError
-from plow_twin.live.file_root import outside
 from plow_twin.live.inputs import Inputs
-from plow_twin.live.parameters import MODEL, ParameterError, Settings, model_changes
+from plow_twin.live.parameters import MODEL, ParameterError, Settings, model_changes, outside
 from plow_twin.live.publishing import Front, Outgoing, Publishing
 from plow_twin.live.service_names import mark_problem
 from plow_twin.live.solver_start import Prepared

@@ -11,8 +11,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from plow_twin.live import parameters
-from plow_twin.live.file_root import refused_changes
-from plow_twin.live.parameters import SPECS, Effect, Settings
+from plow_twin.live.parameters import SPECS, Effect, Settings, refused_changes
 
 
 def descriptor(spec: Field[Any]) -> ParameterDescriptor:
