@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from plow_twin import Clearance, Contact, Frame, Gravity, Head, Initial, Scene
+from plow_twin import Clearance, Contact, Frame, Gravity, Harmonic, Head, Initial, Scene
 from plow_twin.model.geometry import penetration_rows
 from plow_twin.scene_file import load_scene
 
@@ -58,3 +59,16 @@ def wall_and_point(
         locked=("x", "theta"),
         pairs=pairs,
     )
+
+
+#: An inertia that no moment of the tests turns, and a harmonic moment for it.
+FIRM, TURNING_NOTHING = 1e18, Harmonic("turning nothing", (0.0, 0.0), 2.0, moment_n_m=1e3)
+
+
+def with_presets_terms(scene: Scene) -> Scene:
+    """Return a scene of the same motion with the terms of the presets, whose kernels are compiled already.
+
+    The head does not turn because of its inertia, not because its angle is locked. Under the harmonic moment, the
+    solver does not look for rest. Nothing may push the head sideways if x was locked.
+    """
+    return replace(scene, head=replace(scene.head, inertia_kg_m2=FIRM), loads=(TURNING_NOTHING,), locked=())

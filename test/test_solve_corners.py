@@ -182,9 +182,14 @@ def test_corners_that_turn_little_are_nearly_a_mirrored_head_with_walls() -> Non
     assert difference(1e-3) < 0.1 * 0.03
 
 
-def test_corners_move_the_same_by_fixed_steps_and_by_a_live_twin(falls) -> None:
+def test_corners_move_the_same_by_fixed_steps(falls) -> None:
     fixed = simulate(block(), t_end=0.2, output_dt=0.004, method="rk4", dt=1e-5)
     np.testing.assert_allclose(fixed.q, falls.q[:51], atol=2e-4)
+
+
+# test_solve_falling has a live twin of a block in the quick run
+@pytest.mark.stress
+def test_corners_move_the_same_by_a_live_twin(falls) -> None:
     twin = Twin(block())
     for t in falls.t[1:101]:
         now = twin.advance(float(t))
@@ -227,9 +232,8 @@ def test_estimate_refuses_a_block() -> None:
         Forward(block(), None)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(
-    "radius", [pytest.param(None, id="sharp"), pytest.param(0.01, id="rounded", marks=pytest.mark.stress)]
-)
+@pytest.mark.stress  # these twins compile kernels of their own
+@pytest.mark.parametrize("radius", [pytest.param(None, id="sharp"), pytest.param(0.01, id="rounded")])
 def test_twins_with_walls_and_with_corners_share_no_compiled_code(radius: float | None) -> None:
     """Both twins have the same terms; only the records of their constants differ."""
     walls = replace(mirrored(block()), frame=Frame(SIDE, SIDE))
@@ -242,6 +246,7 @@ def test_twins_with_walls_and_with_corners_share_no_compiled_code(radius: float 
         assert twins[0].signature != twins[1].signature
 
 
+@pytest.mark.stress  # this test compiles kernels of its own
 def test_strongly_damped_block_sinks_in_as_deep_as_its_weight_presses() -> None:
     """Two corners with overdamped contact creep to the static depth in implicit steps."""
     stiffness, start = 1e4, -WALL + 0.5 * SIDE

@@ -30,6 +30,7 @@ from plow_twin import (
 )
 from plow_twin.errors import ArgumentError
 from plow_twin.model.friction import painleve_coefficients
+from plow_twin.model.loads import compile_loads
 
 SIDE, RADIUS, MASS = 0.06, 0.01, 1.0
 INERTIA = MASS * SIDE**2 / 6.0
@@ -121,7 +122,7 @@ def pairings(*quick: str) -> pytest.MarkDecorator:
     return pytest.mark.parametrize(("carries", "friction"), parts)
 
 
-@pairings("corners, stick", "walls, regularised")
+@pairings("corners, stick")
 def test_rounded_corners_balance_energy_and_momentum(carries: str, friction: Friction) -> None:
     result = simulate(in_guide(carries, friction=friction), t_end=0.5, output_dt=0.01, energy_balance=True)
     balance = result.energy_balance
@@ -131,18 +132,26 @@ def test_rounded_corners_balance_energy_and_momentum(carries: str, friction: Fri
     assert np.abs(balance.momentum_imbalance).max() < 1e-8
 
 
-@pairings("corners, stick")
-def test_rounded_corners_move_the_same_by_fixed_steps_a_live_twin_and_a_batch(carries: str, friction: Friction) -> None:
+@pairings()
+def test_rounded_corners_move_the_same_by_fixed_steps(carries: str, friction: Friction) -> None:
     scene = in_guide(carries, friction=friction)
     run = simulate(scene, t_end=0.1, output_dt=0.01, energy_balance=True)
     fixed = simulate(scene, t_end=0.1, output_dt=0.01, method="rk4", dt=1e-5)
     # fixed steps notice a touch or a slip only at the end of a step, so the bound is wide
     np.testing.assert_allclose(fixed.q, run.q, atol=1e-3)
-    twin = Twin(scene)
-    np.testing.assert_allclose([twin.advance(float(t)).q for t in run.t[1:]], run.q[1:], atol=1e-9)
-    alone = Twin(scene, excitation="sampled").advance(0.1)
-    np.testing.assert_allclose(TwinBatch([scene, scene]).advance(0.1).q[:, 0], [alone.q] * 2, atol=1e-9)
-    assert np.abs(alone.q - run.q[-1]).max() > 1e-4
+
+
+@pairings()
+def test_rounded_corners_move_the_same_in_a_live_twin_and_a_batch(carries: str, friction: Friction) -> None:
+    scene = in_guide(carries, friction=friction)
+    run = simulate(scene, t_end=0.1, output_dt=0.01, energy_balance=True)
+    # between samples 10 us apart the loads differ from straight lines by 2e-6 of their size
+    times = np.arange(1, 10_001) * 1e-5
+    wrench = compile_loads(scene.loads).at(times)
+    twin = Twin(scene, excitation="sampled").advance_samples(times, wrench)
+    np.testing.assert_allclose(twin.q[999::1000], run.q[1:], atol=1e-7)
+    batch = TwinBatch([scene, scene]).advance_samples(times, wrench)
+    np.testing.assert_array_equal(batch.q, [twin.q] * 2)
 
 
 @pytest.mark.stress  # this test compiles four kernels of its own
