@@ -25,7 +25,8 @@ from plow_twin.record.measured import read_measured, read_recording
 from plow_twin.record.reader import FileStatus
 from plow_twin.record.replay import replay
 from plow_twin.record.sources import open_source
-from plow_twin.study.analysis.analyse import Analysis, analyse, expand
+from plow_twin.study.analysis.analyse import Analysis, analyse
+from plow_twin.study.analysis.recordings import expand
 from plow_twin.study.analysis.report import write_report
 
 COUNT = 300

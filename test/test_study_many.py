@@ -26,8 +26,8 @@ from plow_twin.scene_file import dump_scene, load_scene
 from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.journal import Entry
 from plow_twin.study.analysis import many
-from plow_twin.study.analysis.analyse import expand, left_out
 from plow_twin.study.analysis.many import run_many
+from plow_twin.study.analysis.recordings import expand, left_out
 from plow_twin.study.analysis.report import write_table_of_runs
 from plow_twin.study.analysis.task import Task, names_apart, run_task
 from plow_twin.study.parameters import StudyError

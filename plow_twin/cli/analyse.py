@@ -86,7 +86,7 @@ def analyse(
 
 def found_recordings(recordings: Sequence[Path], out: Path | None = None) -> tuple[list[Path], tuple[Path, ...]]:
     """Return the recordings at paths and in folders; report other items in the folders."""
-    from plow_twin.study.analysis.analyse import counted_once, expand, left_out
+    from plow_twin.study.analysis.recordings import counted_once, expand, left_out
 
     for path in recordings:
         if not path.exists():

@@ -189,7 +189,8 @@ def _run(
     quiet: bool,
 ) -> Fit:
     from plow_twin.study.calibration.calibrate import calibrate as fit_to
-    from plow_twin.study.calibration.fit import Fit, fitted_scene, objective_of, target_rows
+    from plow_twin.study.calibration.calibrate import objective_of
+    from plow_twin.study.calibration.fit import Fit, fitted_scene, target_rows
     from plow_twin.study.calibration.objective import TargetObjective
     from plow_twin.study.calibration.uniqueness import identifiability, near_optimal
 

@@ -1,5 +1,4 @@
 """Offline studies of many runs: sweeps of a scene, calibration to figures or recordings, analysis of recordings.
 
-The optional packages matplotlib, pyarrow, jinja2 and distributed (extras `study` and `dask`) are imported only where
-they are used.
+matplotlib, pyarrow, jinja2 and distributed (extras `study` and `dask`) are imported where they are used.
 """

@@ -1,4 +1,4 @@
-"""A Dask cluster: the connection to its scheduler, and its results as they arrive."""
+"""A Dask cluster: connection to its scheduler, and results in the order of their arrival."""
 
 from __future__ import annotations
 
@@ -13,20 +13,14 @@ if TYPE_CHECKING:
 
 #: Time to wait for a scheduler [s].
 CONNECT_TIMEOUT_S = 20.0
-#: Longest time that a cluster may be without a worker [s], at the start or later, after all its workers have left.
+#: Longest time that a cluster may be without a worker [s].
 WORKER_TIMEOUT_S = 300.0
-#: Interval [s] at which a cluster is checked for a worker while no result arrives.
+#: Interval of the checks for a worker while no result arrives [s].
 _LOOK_S: Final = 2.0
 
 
 def connect(address: str) -> Client:
-    """Return a client of the scheduler at `address`.
-
-    Raises
-    ------
-    StudyError
-        The scheduler does not answer.
-    """
+    """Return a client of the scheduler at `address`, or raise a `StudyError` if the scheduler does not answer."""
     from distributed import Client
 
     try:
@@ -36,13 +30,7 @@ def connect(address: str) -> Client:
 
 
 def completed(client: Client, futures: Iterable[Future[Any]]) -> Iterator[Future[Any]]:
-    """Yield futures as they end.
-
-    Raises
-    ------
-    StudyError
-        The cluster has had no worker for `WORKER_TIMEOUT_S`.
-    """
+    """Yield futures as they end, or raise a `StudyError` after `WORKER_TIMEOUT_S` without a worker."""
     from distributed import as_completed
 
     waiting: set[Any] = set(futures)

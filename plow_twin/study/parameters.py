@@ -1,4 +1,4 @@
-"""Parameters of a scene by path, such as `contact.stiffness`, `head.com_offset_m[0]`: numbers and words.
+"""Parameters of a scene, each a number or a word, named by paths such as `contact.stiffness`, `head.com_offset_m[0]`.
 
 A load is given by its name: `loads.fx1.phase_rad`. Four paths are settings of a study, not fields of a scene:
 
@@ -7,10 +7,9 @@ A load is given by its name: `loads.fx1.phase_rad`. Four paths are settings of a
     loads.<name>.scale      factor of the load's force and free moment
     clearance.scale         factor of both clearances: 1 for a total, 2 for a published clearance per side
 
-`frame.labels` takes one of eight words such as `bottom_right_ccw`, which means that corner a is at the bottom right,
-and corners b, c, d follow counter-clockwise. The four settings are applied after all other paths. Setting
-`contact.damping` replaces a restitution, and setting `contact.restitution` replaces a damping. A scene without friction
-also has the paths of `friction`; setting one of these paths switches friction on.
+These settings are applied after all other paths. `frame.labels` takes one of eight words: `bottom_right_ccw` means that
+corner a is at the bottom right, and that b, c, d follow counter-clockwise. Setting `contact.damping` removes a
+restitution, and the reverse. Setting a path of `friction` switches friction on.
 """
 
 from __future__ import annotations
@@ -24,29 +23,27 @@ from typing import Any, Final
 
 from plow_twin.errors import PlowTwinError, Problem, SceneError
 from plow_twin.model.contact_laws import LAWS
-from plow_twin.model.scene import Friction, Head, Scene, Table
+from plow_twin.model.scene import PARTS, Friction, Head, Scene, Table
 
-#: Value of a parameter: for the paths in `WORDS` a word, for all other paths a number.
+#: Value of a parameter: a word for the paths in `WORDS`, a number for all other paths.
 Value = float | str
 
-#: Paths whose values are words.
 WORDS: Final = ("contact.law", "head.rotation", "frame.labels")
 _CORNERS_CCW: Final = ("bottom_right", "top_right", "top_left", "bottom_left")
-_PARTS: Final = ("head", "frame", "clearance", "contact", "gravity", "initial", "wear", "friction", "support")
 _DERIVED: Final = ("sign", "arm_sign", "scale")
-#: Friction with a coefficient of 0. A study that varies friction starts from it if the scene has no friction.
+#: Start of a study that varies friction, if the scene has none.
 _NO_FRICTION: Final = Friction(0.0)
 _INDEX: Final = re.compile(r"(.+)\[(\d+)\]")
 
 
 class StudyError(PlowTwinError, ValueError):
-    """A study cannot be made or continued as requested; the message has the reason."""
+    """A study cannot be made or continued as requested."""
 
 
 def parameter_paths(scene: Scene) -> tuple[str, ...]:
     """Return every path that a study can set in the scene."""
     paths: list[str] = []
-    for name in _PARTS:
+    for name in PARTS:
         part = _part(scene, name)
         paths += [] if part is None else _paths_of(part, name)
     paths += ["clearance.scale", "frame.labels"]
@@ -74,13 +71,7 @@ def _paths_of(part: Any, path: str) -> list[str]:
 
 
 def check_path(scene: Scene, path: str) -> str:
-    """Return the path if the scene has it.
-
-    Raises
-    ------
-    StudyError
-        The scene does not have the path; the error has the nearest paths and all paths.
-    """
+    """Return the path if the scene has it; otherwise raise a `StudyError` with the nearest paths."""
     known = parameter_paths(scene)
     if path not in known:
         raise StudyError(f"parameter: got {path!r}, expected one of {', '.join(known)}{nearest_of(path, known)}")
@@ -88,16 +79,16 @@ def check_path(scene: Scene, path: str) -> str:
 
 
 def nearest_of(path: str, known: Iterable[str]) -> str:
-    """Return a hint with the nearest known paths, or an empty text if there are none."""
+    """Return a hint with the nearest known paths, empty if none is near."""
     near = get_close_matches(path, known, n=3, cutoff=0.6)
     return f"; nearest: {', '.join(near)}" if near else ""
 
 
 def parameter_of(scene: Scene, path: str) -> Value | None:
-    """Return the value at a path, or None for a damping or restitution that the scene does not specify."""
+    """Return the value at a path, or None for a damping or restitution that the scene does not give."""
     check_path(scene, path)
     if path == "frame.labels":
-        return next((word for word, labels in label_words().items() if labels == dict(scene.frame.labels)), None)
+        return next((word for word, labels in _label_words().items() if labels == dict(scene.frame.labels)), None)
     part, field_name = path.rsplit(".", 1)
     if path == "clearance.scale" or field_name == "scale":
         return 1.0
@@ -112,7 +103,7 @@ def parameter_of(scene: Scene, path: str) -> Value | None:
 
 
 def with_parameters(scene: Scene, values: Mapping[str, Value]) -> Scene:
-    """Return the scene with new values; a value that is set loses its mark in `Scene.marks`.
+    """Return the scene with new values. A number that is set loses its mark.
 
     Raises
     ------
@@ -128,9 +119,9 @@ def with_parameters(scene: Scene, values: Mapping[str, Value]) -> Scene:
         words = path in WORDS
         if words != isinstance(value, str):
             raise StudyError(f"{path}: got {value!r}, expected a {'word' if words else 'number'}")
-    parts: dict[str, Any] = {name: getattr(scene, name) for name in _PARTS}
+    parts: dict[str, Any] = {name: getattr(scene, name) for name in PARTS}
     loads = {load.name: load for load in scene.loads}
-    # fields are set first, because sign and scale act on the new values of the fields
+    # sign and scale act on the new values of the fields
     for path, value in sorted(values.items(), key=lambda item: item[0].rsplit(".", 1)[1] in _DERIVED):
         owner, field_name = path.rsplit(".", 1)
         if path == "frame.labels":
@@ -148,8 +139,8 @@ def with_parameters(scene: Scene, values: Mapping[str, Value]) -> Scene:
     return replace(scene, **parts, loads=tuple(loads.values()), marks=MappingProxyType(marks))
 
 
-def label_words() -> dict[str, dict[str, str]]:
-    """Return the eight assignments of letters to corners, each by its word such as `bottom_right_ccw`."""
+def _label_words() -> dict[str, dict[str, str]]:
+    """Return the eight assignments of letters to corners by their words such as `bottom_right_ccw`."""
     words = {}
     for turn, corners in (("ccw", _CORNERS_CCW), ("cw", _CORNERS_CCW[::-1])):
         for first in range(4):
@@ -159,15 +150,9 @@ def label_words() -> dict[str, dict[str, str]]:
 
 
 def check_word(path: str, word: str) -> str:
-    """Return the word if the path, one of `WORDS`, can have this word as its value.
-
-    Raises
-    ------
-    StudyError
-        The path cannot have this word; the error lists the possible words.
-    """
+    """Return the word if it is a value of the path, one of `WORDS`; otherwise raise a `StudyError`."""
     (rotation,) = (spec for spec in fields(Head) if spec.name == "rotation")
-    words = {"contact.law": LAWS, "head.rotation": rotation.metadata["choices"], "frame.labels": label_words()}[path]
+    words = {"contact.law": LAWS, "head.rotation": rotation.metadata["choices"], "frame.labels": _label_words()}[path]
     if word not in words:
         raise StudyError(f"{path}: got {word!r}, expected one of {', '.join(words)}")
     return word
@@ -183,7 +168,7 @@ def is_usable(scene: Scene, values: Mapping[str, Value]) -> bool:
 
 
 def _labelled(frame: Any, word: str) -> Any:
-    words = label_words()
+    words = _label_words()
     if word not in words:
         raise SceneError([Problem("frame.labels", word, f"one of {', '.join(words)}")])
     return replace(frame, labels=words[word])
@@ -225,13 +210,13 @@ def _vector(load: Any, field_name: str) -> tuple[float, ...]:
     if field_name == "arm_sign":
         return tuple(load.at_m)
     if isinstance(load, Table):
-        # a sampled load has the sign of its force component with the largest magnitude
+        # a table has the sign of its largest force component
         return (float(load.wrench[:, :2].flat[abs(load.wrench[:, :2]).argmax()]),)
     return tuple(load.force_n)
 
 
 def _times(vector: tuple[float, ...], factor: float) -> tuple[float, ...]:
-    # 0 becomes +0 and never -0, so that equal scenes have equal texts
+    # +0 instead of -0, so that equal scenes have equal texts
     return tuple(factor * x if x != 0.0 else 0.0 for x in vector)
 
 
@@ -246,7 +231,7 @@ def _load(scene: Scene, owner: str) -> Any:
 
 
 def _is_set(key: str, values: Mapping[str, Value], scene: Scene) -> bool:
-    """Return whether the values change the number at a `Scene.marks` key, which gives a load's index."""
+    """Return whether the values change the number at a key of `Scene.marks`."""
     match = re.match(r"loads\[(\d+)\]\.(.+)", key)
     path = f"loads.{scene.loads[int(match[1])].name}.{match[2]}" if match else key
     whole = path.partition("[")[0]
@@ -264,13 +249,7 @@ def _is_set(key: str, values: Mapping[str, Value], scene: Scene) -> bool:
 
 
 def parse_settings(scene: Scene, texts: Sequence[str]) -> dict[str, Value]:
-    """Read `PATH=VALUE` texts.
-
-    Raises
-    ------
-    StudyError
-        A text cannot be used; the message names the setting, the value got and the value expected.
-    """
+    """Read `PATH=VALUE` texts, or raise a `StudyError` that names the setting."""
     values: dict[str, Value] = {}
     for text in texts:
         path, _, rest = text.partition("=")

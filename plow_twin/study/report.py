@@ -20,19 +20,13 @@ if TYPE_CHECKING:
 
 
 def require(*modules: str) -> None:
-    """Raise `ModuleNotFoundError` if a module is missing; to be called before work that may take minutes."""
+    """Raise `ModuleNotFoundError` if a module is missing, before work that may take minutes."""
     for module in modules:
         import_module(module)
 
 
 def write_html(path: Path, template: str, context: Mapping[str, Any], package: str = "plow_twin.study") -> None:
-    """Fill `templates/<template>` of a package and write the page. In a template, the filter `image` embeds a PNG file.
-
-    Raises
-    ------
-    ModuleNotFoundError
-        jinja2 (extra `study`) is not installed.
-    """
+    """Fill `templates/<template>` of a package and write the page. The filter `image` embeds a PNG file."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(
@@ -48,7 +42,7 @@ def write_html(path: Path, template: str, context: Mapping[str, Any], package: s
 
 
 def embedded_figure(figure: Figure) -> str:
-    """Return a matplotlib figure as a data URL for an image in the page."""
+    """Return a matplotlib figure as the data URL of an image."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     stream = io.BytesIO()
@@ -61,7 +55,7 @@ def _embedded(png: bytes) -> str:
 
 
 def percent(share: float | None) -> str:
-    """Return a share as a signed percentage, such as +3.5 %, or an empty text for None."""
+    """Return a share as a signed percentage such as +3.5 %, or an empty text for None."""
     return "" if share is None else signed(100.0 * share, "+.1f") + " %"
 
 
@@ -82,7 +76,7 @@ def _plain(value: Any) -> Any:
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write rows with equal keys as CSV, with the keys as header."""
+    """Write rows with equal keys as CSV."""
     with whole_file(path) as stream, io.TextIOWrapper(stream, encoding="utf-8", newline="") as text:
         writer = csv.DictWriter(text, fieldnames=list(rows[0]))
         writer.writeheader()

@@ -1,7 +1,6 @@
 """A run as one self-contained HTML file with summary, picture, curves and tables.
 
-The file does not contain rerun's viewer, because its program for browsers is too large for a page
-(`docs/recording.md`).
+The viewer of rerun is too large for the file (`docs/recording.md`).
 """
 
 from __future__ import annotations
@@ -30,21 +29,19 @@ from plow_twin.view.run_curves import RunCurves
 
 Array = NDArray[np.float64]
 
-#: Largest number of rows of a table on the page; further rows are only counted.
+#: Largest number of rows of a table; further rows are only counted.
 _MOST_ROWS: Final = 200
 _PADS: Final = np.array([CLEARANCE_NAMES.index(name) for name in PAD_NAMES])
 _LOADS: Final = ("Fx", "Fy", "M")
 
 
 def write_run_page(path: Path, out: Path) -> tuple[FileStatus, dict[str, int], int]:
-    """Write the page of a run; return the recording's status, its losses, and the number of failed advances.
+    """Write the page of a run; return the status and the losses of the recording, and the number of failed advances.
 
     Raises
     ------
     RecordingError
         The file is not a recording, or has no row to draw.
-    ModuleNotFoundError
-        jinja2 or matplotlib (extra `study`) is not installed.
     """
     reader = RunReader(path)
     curves = RunCurves.of(reader)
@@ -70,13 +67,12 @@ def write_run_page(path: Path, out: Path) -> tuple[FileStatus, dict[str, int], i
 
 
 def _uplot(name: str) -> str:
-    """Return a file of the plotting library, which the operator's screen also uses."""
     return files("plow_twin").joinpath("dashboard", "page", name).read_text(encoding="utf-8")
 
 
 @dataclass
 class _Log:
-    """The events of a run, with times as texts."""
+    """The events of a run as texts."""
 
     samples: int = 0
     first_ns: int | None = None
@@ -118,7 +114,6 @@ class _Log:
 
 
 def _estimate_row(end_ns: int, facts: dict[str, Any]) -> dict[str, str]:
-    """Return a table row of an estimate as texts by column."""
     row = {"until": time_text(end_ns)}
     for name in ("horizontal", "vertical"):
         found = facts[name]
@@ -131,7 +126,6 @@ def _estimate_row(end_ns: int, facts: dict[str, Any]) -> dict[str, str]:
 
 
 def _summary(reader: RunReader, curves: RunCurves, log: _Log) -> dict[str, str]:
-    """Return the facts of a run in words."""
     header, scene = reader.header, reader.header.scene(reader.path)
     span = "" if log.first_ns is None or log.last_ns is None else f"{(log.last_ns - log.first_ns) * 1e-9:.3f} s"
     clearance, contact = scene.clearance, scene.contact
@@ -154,7 +148,6 @@ def _summary(reader: RunReader, curves: RunCurves, log: _Log) -> dict[str, str]:
 
 
 def _by_pad(recording: Recording) -> list[dict[str, str]]:
-    """Return the statistics of each pad over the whole run, as texts by column."""
     largest, impulse, touches = np.zeros(PAIR_COUNT), np.zeros(PAIR_COUNT), np.zeros(PAIR_COUNT)
     in_contact, rows, before = np.zeros(PAIR_COUNT), 0, None
     wear: Array | None = None
@@ -185,7 +178,7 @@ def _by_pad(recording: Recording) -> list[dict[str, str]]:
 
 
 def _plots(reader: RunReader, curves: RunCurves) -> list[dict[str, Any]]:
-    """Return title, names of curves, bands, thresholds and data columns of each plot."""
+    """Return the plots that have data."""
     alarms = alarms_of(reader.header.parameters).alarms
     force, clearance = alarms["force"].thresholds, alarms["clearance"].thresholds
     ways = ("horizontal", "vertical")
@@ -216,7 +209,7 @@ def _plots(reader: RunReader, curves: RunCurves) -> list[dict[str, Any]]:
 
 
 def _columns(rows: Envelope, chosen: list[tuple[int, int]]) -> list[list[float | None]]:
-    """Return times and, per (column, side), least (0) or largest (1) values; None where a line ends."""
+    """Return times, and for each (column, side) the least (0) or largest (1) values; None ends a line."""
     times: Array | None = None
     columns: list[list[float | None]] = []
     order = np.zeros(0, np.int64)

@@ -9,10 +9,9 @@
     events   steps            number of contact changes; number of steps of the solver
 
 Instead of `max` [N], a path may begin with `mean_in_contact` or `mean_over_time` [N], `impulse` [N s],
-`time_in_contact` [s], `makes` or `wear_depth` [m]. For several pairs, `max` and `wear_depth` are the largest values of
-all these pairs; impulses, times and touches are summed, and means are computed from the sums. A corner is named by the
-scene's letter or by its own name such as `top_left`; in a set, letters stand side by side (`ad`), and names are joined
-by `+`.
+`time_in_contact` [s], `makes` or `wear_depth` [m]. For several pairs, `max` and `wear_depth` are the largest value;
+impulses, times and touches are summed, and means are computed from the sums. A corner is named by its letter or by its
+own name such as `top_left`. In a set, letters stand side by side (`ad`), and names are joined by `+`.
 """
 
 from __future__ import annotations
@@ -33,14 +32,14 @@ from plow_twin.solve.state import Status
 from plow_twin.study.parameters import StudyError, nearest_of
 
 Array = NDArray[np.float64]
-#: Function that returns the statistic of each of m runs, shape (m,).
+#: Function that returns a statistic of m runs, shape (m,).
 Statistic = Callable[[Ensemble], Array]
 
 SENSES: Final = ("ccw", "cw")
 
 
 def _sum(array: Array, columns: list[int]) -> Array:
-    """Add columns one by one, because the last bit of numpy's sum depends on the number of rows."""
+    """Add columns one by one: the last bit of numpy's sum depends on the number of rows."""
     total = np.zeros(len(array))
     for column in columns:
         total = total + array[:, column]
@@ -68,7 +67,7 @@ UNITS: Final[Mapping[str, str]] = {
 
 
 def statistics_of(members: Ensemble, scenes: Sequence[Scene], paths: Sequence[str]) -> Array:
-    """Return statistics of runs, shape (m, paths), NaN for a failed run; corner letters may differ."""
+    """Return statistics of runs, shape (m, paths), NaN for a failed run."""
     result = np.full((len(scenes), len(paths)), np.nan)
     names = [spec.name for spec in fields(Ensemble) if spec.name != "t"]
     groups: dict[tuple[tuple[str, str], ...], list[int]] = {}
@@ -76,14 +75,13 @@ def statistics_of(members: Ensemble, scenes: Sequence[Scene], paths: Sequence[st
         groups.setdefault(tuple(sorted(scenes[index].frame.labels.items())), []).append(index)
     for rows in groups.values():
         part = replace(members, **{name: getattr(members, name)[rows] for name in names})
-        known = statistics_of_scene(scenes[rows[0]])
+        known = _statistics_of_scene(scenes[rows[0]])
         for column, path in enumerate(paths):
             result[rows, column] = (known.get(path) or statistic(scenes[rows[0]], path))(part)
     return result
 
 
-def statistics_of_scene(scene: Scene) -> Mapping[str, Statistic]:
-    """Return every statistic that a run of the scene has, by path."""
+def _statistics_of_scene(scene: Scene) -> Mapping[str, Statistic]:
     known: dict[str, Statistic] = {}
     for kind, reduce in _OF_PAIRS.items():
         for suffix, pairs in _groups(scene).items():
@@ -101,15 +99,9 @@ def statistics_of_scene(scene: Scene) -> Mapping[str, Statistic]:
 
 
 def statistic(scene: Scene, path: str) -> Statistic:
-    """Return the statistic of a path.
-
-    Raises
-    ------
-    StudyError
-        There is no such statistic; the error has the nearest paths and the existing kinds.
-    """
-    known = statistics_of_scene(scene)
-    # in a path the letters of a set may be in any order
+    """Return the statistic of a path, or raise a `StudyError` with the nearest paths and the kinds."""
+    known = _statistics_of_scene(scene)
+    # the letters of a set may be in any order
     head, _, last = path.rpartition(".")
     key = path if path in known else f"{head}.{''.join(sorted(last))}"
     if key not in known:
@@ -132,7 +124,7 @@ def _labels(scene: Scene) -> list[str]:
 
 
 def _groups(scene: Scene) -> dict[str, list[int]]:
-    """Return the groups of pairs by the end of a path: empty for all pairs, or e.g. `.ccw`, `.ccw.a`."""
+    """Return groups of pairs by the end of a path: empty for all pairs, or e.g. `.ccw`, `.ccw.a`."""
     ccw = [pair for pair in range(8) if STOPS_COUNTER_CLOCKWISE[pair]]
     cw = [pair for pair in range(8) if not STOPS_COUNTER_CLOCKWISE[pair]]
     groups: dict[str, list[int]] = {"": list(range(8)), ".ccw": ccw, ".cw": cw}

@@ -1,16 +1,16 @@
-"""The folder of a sweep: its arguments, and the part computed so far.
+"""The folder of a sweep.
 
     sweep.json          the arguments, and the number of members in a chunk
     chunks/00007.npz    status and statistics of the members of one chunk, and the build that computed them
 
-A chunk is first written to another file, which is synced and then renamed, so that a killed run loses only its
-unfinished chunk.
+Each chunk is written whole or not at all, so a killed run loses only its unfinished chunk.
 """
 
 from __future__ import annotations
 
 import json
 import re
+from io import BytesIO
 from pathlib import Path
 from typing import Any, Final
 from zipfile import BadZipFile
@@ -20,27 +20,19 @@ from numpy.typing import NDArray
 
 from plow_twin.record.durable import write_whole
 from plow_twin.study.parameters import StudyError
-from plow_twin.study.sweep.table import Sweep, Table, chunks_of
+from plow_twin.study.sweep.table import Sweep, Table
 
 Array = NDArray[np.float64]
 
 FORMAT: Final = 1
-#: Name of a chunk, or of an incomplete chunk that a killed process has left.
+#: Name of a chunk, or of the incomplete chunk of a killed process.
 _CHUNK_NAME: Final = re.compile(r"\d{5,}\.npz|\.\d{5,}\.npz\.\d+")
 
 
 class Store:
-    """Chunks of one sweep in a folder.
+    """The chunks of one sweep in a folder, which is made if it does not exist.
 
-    Parameters
-    ----------
-    folder : Path
-        Folder of the sweep; it is made if it does not exist.
-    sweep : Sweep
-    chunk : int
-        Number of members in a chunk. If the folder already has this sweep, the stored number is used.
-    fresh : bool
-        Whether to discard any sweep in the folder.
+    A chunk has `chunk` members; a sweep in the folder keeps its own number. `fresh` discards a sweep in the folder.
 
     Raises
     ------
@@ -54,7 +46,7 @@ class Store:
         self._chunks = folder / "chunks"
         if fresh:
             for path in [*self._chunks.glob("*.npz*"), *self._chunks.glob(".*.npz.*")]:
-                if _CHUNK_NAME.fullmatch(path.name):  # files with other names are kept
+                if _CHUNK_NAME.fullmatch(path.name):
                     path.unlink()
             (folder / "sweep.json").unlink(missing_ok=True)
         if (folder / "sweep.json").exists():
@@ -85,14 +77,15 @@ class Store:
     @property
     def chunks(self) -> list[range]:
         """Members of each chunk."""
-        return list(chunks_of(self.sweep.size, self.chunk))
+        size = self.sweep.size
+        return [range(begin, min(begin + self.chunk, size)) for begin in range(0, size, self.chunk)]
 
     def missing(self) -> list[int]:
         """Return the numbers of the chunks that are missing or damaged."""
         return [index for index in range(len(self.chunks)) if self.read(index) is None]
 
     def read(self, index: int) -> tuple[Array, str] | None:
-        """Return the table and the build of a chunk, or None if the chunk is missing or incomplete."""
+        """Return table and build of a chunk, or None if the chunk is missing or damaged."""
         try:
             with self._path(index).open("rb") as file, np.load(file, allow_pickle=False) as archive:
                 table, build = np.asarray(archive["table"], float), str(archive["build"])
@@ -102,21 +95,13 @@ class Store:
         return (table, build) if table.shape == shape else None
 
     def write(self, index: int, table: Array, build: str) -> None:
-        """Store a chunk; it appears under its name only when it is complete."""
-        from io import BytesIO
-
+        """Store a chunk."""
         buffer = BytesIO()
         np.savez(buffer, table=table, build=np.array(build))
         write_whole(self._path(index), buffer.getvalue(), sync=True)
 
     def table(self) -> Table:
-        """Return the whole table.
-
-        Raises
-        ------
-        StudyError
-            A chunk is missing.
-        """
+        """Return the whole table, or raise a `StudyError` if a chunk is missing."""
         found = [self.read(index) for index in range(len(self.chunks))]
         parts = [part for part in found if part is not None]
         if len(parts) < len(found):

@@ -1,4 +1,4 @@
-"""Parameters and statistics in words with their units, for the axes of pictures."""
+"""Parameters and statistics in words with their units, for pictures."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from typing import Final
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.study.statistics import unit_of
 
-#: Unit in pictures, and factor from the SI unit to this unit. The key is the ending of a parameter's name; the first
-#: ending that fits is used.
+#: Unit in pictures and its factor from SI, by the end of a parameter's name; the first end that fits counts.
 _ENDS: Final = {
     "_kg_m2": ("kg m²", 1.0),
     "_kg": ("kg", 1.0),
@@ -45,7 +44,7 @@ _SENSES: Final = {"ccw": "counter-clockwise", "cw": "clockwise"}
 
 
 def parameter_words(path: str) -> tuple[str, float]:
-    """Return a parameter in words with its unit, and the factor from SI to that unit."""
+    """Return a parameter in words with its unit, and the factor from SI to this unit."""
     if path == "contact.stiffness":
         return "contact stiffness [MN/mⁿ]", 1e-6
     plain, index = re.fullmatch(r"(.*?)(\[\d+\])?", path).groups()  # type: ignore[union-attr]
@@ -58,7 +57,7 @@ def parameter_words(path: str) -> tuple[str, float]:
 
 
 def statistic_words(path: str) -> tuple[str, float]:
-    """Return a statistic in words with its unit, and the factor from SI to that unit."""
+    """Return a statistic in words with its unit, and the factor from SI to this unit."""
     kind, *places = path.split(".")
     unit, factor = _SCALED.get(unit_of(path), (unit_of(path), 1.0))
     words = [_STATISTICS[kind]]

@@ -1,8 +1,11 @@
-"""Analysis of one recording; the motion is computed from a run's journal or another recording's load."""
+"""Analysis of one recording: the motion is computed under the recorded load and compared with the measurements.
+
+The load comes from the journal of a run, or from a mapped topic of another recording. A *stretch* is the motion between
+two resets. Signals are compared over the longest stretch, contacts are counted over all.
+"""
 
 from __future__ import annotations
 
-import glob
 import math
 import time
 from collections import Counter
@@ -18,19 +21,18 @@ from numpy.typing import NDArray
 from plow_twin.errors import RecordingError
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.model.scene import Scene
-from plow_twin.record.bag import beside_folders, readable_beside
+from plow_twin.record.bag import readable_beside
 from plow_twin.record.follow import Tail
 from plow_twin.record.importing import Feed
 from plow_twin.record.mapping import UNFIT, Role, messages_of, read_map, readings, roles_by_source, with_units
-from plow_twin.record.reader import FileStatus, RunReader, mcap_path, own_run, read_header
+from plow_twin.record.reader import FileStatus, RunReader, own_run
 from plow_twin.record.replay import following_twin
 from plow_twin.record.run_time import RunTime
-from plow_twin.record.sources import open_source, packed
+from plow_twin.record.sources import open_source
 from plow_twin.record.unit_check import check_units
 from plow_twin.record.walking import JournalWalk, Walked, Walker
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import dump_scene, load_scene
-from plow_twin.scene_file.parquet_lines import SUFFIX
 from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.intake import Intake
 from plow_twin.stream.journal import Loss, Pose, Reset, Restore, SetWear
@@ -43,44 +45,41 @@ from plow_twin.study.analysis.thinned import Thinned, ThinnedSignal
 
 Array = NDArray[np.float64]
 
-#: Columns of the prediction that are kept for the comparison.
 _COLUMNS: Final = (
     *("x", "y", "theta"),
     *(f"force_{name}" for name in PAIR_NAMES),
     *(f"gap_{name}" for name in PAIR_NAMES),
 )
-#: Tolerance with which the motion is computed if the recording comes from another program.
+#: Tolerance of the motion, for a recording of another program.
 _TOLERANCE: Final = 1e-9
-#: If a measured stamp is older than the newest stamp by more than this time [ns], the clock of the measurement is
-#: assumed to have stepped back.
+#: A measured stamp that is older than the newest stamp by more than this time [ns] shows that the clock of the
+#: measurement stepped back.
 _STEP_NS: Final = 1_000_000_000
-#: Largest measured value, in any unit; larger values are left out, because their squares may overflow.
+#: Largest measured value in any unit; the squares of larger values may overflow.
 _LARGEST: Final = 1e15
-#: Name that results give to the scene in a run's header.
 _OF_THE_RUN: Final = "of the run"
 _MAP: Final = "map_"
-#: Parameter whose presence marks a run as made by an analysis.
+#: Parameter that only runs made by an analysis have.
 MAPPED_LOAD: Final = f"{_MAP}excitation"
-#: Function that receives the share of the work that is done, 0..1.
+#: Function that gets the share of the work done, 0..1.
 OnProgress = Callable[[float], object]
 
 
 @dataclass
 class Prediction:
-    """The prediction for one scene: rows of the motion, and load totals of the contacts over all rows."""
+    """The motion for one scene, and the loads of its contacts."""
 
     name: str
     scene: Scene
     loads: LoadTotals
     longest: Thinned = field(default_factory=lambda: Thinned(len(_COLUMNS)))
     present: Thinned = field(default_factory=lambda: Thinned(len(_COLUMNS)))
-    #: number of resets of the motion so far, which is also the index of the present stretch (the motion between two
-    #: resets)
+    #: number of resets so far, which is the index of the present stretch
     resets: int = 0
-    #: first and last stamp [ns] of each stretch with rows, by index
+    #: first and last stamp [ns] of each stretch
     spans: dict[int, tuple[int, int]] = field(default_factory=dict)
     _longest_number: int = 0
-    #: clearances of all stretches; columns as in `CLEARANCE_NAMES`
+    #: clearances of all stretches, with the columns `CLEARANCE_NAMES`
     clearance: Thinned = field(default_factory=lambda: Thinned(len(CLEARANCE_NAMES)))
 
     def walked(self, part: Walked) -> None:
@@ -93,7 +92,7 @@ class Prediction:
         self.clearance.add(slow["stamp_ns"], slow["clearance"])
 
     def is_inside(self, signal: ThinnedSignal) -> NDArray[np.bool_]:
-        """Return for each measured value whether its stamp is within the time span of the load."""
+        """Return for each measured value whether its stamp is within the time of the load."""
         stamps = signal.series()[0]
         if not self.spans:
             return np.ones(len(stamps), np.bool_)
@@ -101,12 +100,12 @@ class Prediction:
         return np.asarray(np.any(inside, axis=0))
 
     def outside(self, signal: ThinnedSignal) -> int:
-        """Return the number of values of a signal whose stamps are outside the time span of the load."""
+        """Return the number of values of a signal outside the time of the load."""
         inside = self.is_inside(signal)
         return round(signal.came * (1.0 - float(inside.mean()))) if len(inside) else 0
 
     def restart(self) -> None:
-        """Begin a new stretch after a reset; its stamps may be earlier than those of the stretch before."""
+        """Begin a new stretch after a reset; its stamps may be earlier than those of the last stretch."""
         self.loads.restart()
         self._longest_number = self.longest_number
         self.longest, self.present = self._longer(), Thinned(len(_COLUMNS))
@@ -120,8 +119,8 @@ class Prediction:
     def is_of_longest(self, signal: ThinnedSignal) -> NDArray[np.bool_]:
         """Return for each measured value whether it belongs to the longest stretch.
 
-        A value belongs to the stretch that contains its stamp. If several stretches contain the stamp, as after a step
-        back of the clock, the value belongs to the stretch in which it arrived.
+        A value belongs to the stretch that contains its stamp. After a step back of the clock, several stretches may
+        contain it; then the value belongs to the stretch in which it arrived.
         """
         at, _ = signal.series()
         if len(self.spans) < 2:
@@ -145,26 +144,25 @@ class Prediction:
 
     @property
     def stride(self) -> int:
-        """Number n such that every n-th row of the longest stretch is kept for the signals."""
+        """Number n such that every n-th row of the longest stretch is kept."""
         return self._longer().stride
 
 
 @dataclass
 class Measured:
-    """Measured values by signal, in order of arrival; long signals keep only every 2nd, 4th, ... value."""
+    """Measured values by signal, in order of arrival."""
 
     signals: dict[str, ThinnedSignal] = field(default_factory=dict)
-    #: for each role, the stretch and the stamp [ns] of the latest message
+    #: stretch and stamp [ns] of the latest message by role
     _latest: dict[str, tuple[int, int]] = field(default_factory=dict)
-    #: number of values that are too large to be plausible in any unit
+    #: number of values that are too large in any unit
     implausible: int = 0
 
     def add(self, role: str, stamp_ns: int, numbers: Mapping[str, float], stretch: int = 0) -> None:
-        """Add the numbers of a message to a stretch; a number that is not finite counts as not measured."""
+        """Add the finite numbers of a message to a stretch."""
         before, newest = self._latest.get(role, (0, stamp_ns))
         back = newest - stamp_ns > _STEP_NS
-        # the measurement's clock may step back earlier than the load's clock; the measurement then begins the new
-        # stretch before the load does
+        # the clock of the measurement may step back before that of the load and so begin the stretch earlier
         stretch = max(stretch, before + back)
         self._latest[role] = stretch, stamp_ns if back else max(newest, stamp_ns)
         prefix = {"forces": "force_", "gaps": "gap_"}.get(role, "")
@@ -186,10 +184,10 @@ class Analysis:
     input: dict[str, int]
     losses: dict[str, int]
     unknown_types: dict[str, str]
-    #: times without samples, during which the load is interpolated linearly
+    #: times without samples, in which the load is interpolated linearly
     silences: Silences
     wall_s: float = 0.0
-    #: other folders in the recording's folder; they are empty or have recordings of their own
+    #: folders inside the recording that are empty or are recordings of their own
     left_out: tuple[Path, ...] = ()
 
     @property
@@ -199,14 +197,14 @@ class Analysis:
 
     @property
     def lost(self) -> dict[str, int]:
-        """Counts of lost data, including values of signals that are entirely outside the load's time."""
+        """Counts of lost data, including signals that lie entirely outside the time of the load."""
         counts = ((self.predictions[0].outside(signal), signal.came) for signal in self.measured.signals.values())
         outside = sum(count for count, came in counts if count == came)
         found = {"measured_implausible": self.measured.implausible, "measured_outside_the_load": outside}
         return self.losses | {name: count for name, count in found.items() if count}
 
     def comparisons(self, prediction: Prediction) -> dict[str, Comparison]:
-        """Return the measured signals compared with the prediction of one scene."""
+        """Return the comparison of each measured signal with the prediction of one scene."""
         stamps, columns = prediction.series()
         if not len(stamps):
             return {}
@@ -224,7 +222,7 @@ class Analysis:
         return found
 
     def facts(self) -> dict[str, Any]:
-        """Return all facts for JSON: the scene's prediction at the top level, and the other scenes under `with`."""
+        """Return all facts for JSON: the first prediction at the top level, the others under `with`."""
         first, *others = self.predictions
         return {
             "run": str(self.path),
@@ -241,7 +239,7 @@ class Analysis:
         }
 
     def _prediction(self, prediction: Prediction) -> dict[str, Any]:
-        signals = {name: found.facts() for name, found in self.comparisons(prediction).items()}
+        signals = {name: dict(vars(found)) for name, found in self.comparisons(prediction).items()}
         facts: dict[str, Any] = {"signals": signals, "loads": prediction.loads.facts()}
         outside = {name: prediction.outside(signal) for name, signal in self.measured.signals.items()}
         if any(outside.values()):
@@ -301,17 +299,15 @@ def analyse(
         A run of plow_twin, another recording (MCAP, rosbag2's sqlite3, CSV), or a folder with the parts of a recording.
     scene
         Scene file or preset; by default the scene of a run, or `scene.yaml` beside another recording.
-    mapping
-        YAML file that maps topics to roles.
-    units
-        Units by name (fx, x, ..., t), which replace the units of the mapping; only for recordings of other programs.
+    mapping, units
+        YAML file that maps topics to roles, and units by name (fx, x, ..., t) that replace those of the file.
     others
         Further scenes for predictions.
     out
         Folder in which a run named `run` is made from a recording of another program.
     tail, on_caught_up
-        If a `Tail` is given, a run of plow_twin is read while it is still being written; `on_caught_up` receives the
-        analysis so far whenever everything written has been read.
+        With a `Tail`, a run is read while it is still being written. `on_caught_up` gets the analysis so far each time
+        when everything written has been read.
 
     Raises
     ------
@@ -370,7 +366,7 @@ def _walk_own(
     for walker, prediction in zip(walkers, predictions, strict=True):
         walker.on_reset = prediction.restart
     walk = JournalWalk(walkers[:1], walkers[1:], whole=not header.part, same_scene=own)
-    journalled = Measured()  # the poses that the node has used are in its journal
+    journalled = Measured()
     run_time = RunTime(header.parameters)
 
     def so_far() -> Analysis:
@@ -404,10 +400,6 @@ def _walk_own(
 
 
 def _measured_beside(path: Path, mapping: Path | None, node: str) -> tuple[Measured, dict[str, str], dict[str, int]]:
-    """Return measurements stored beside a run, topics of unknown type, and counts of unusable messages.
-
-    Loads are not read, because the load of a run is in its journal.
-    """
     measured, unknown, unused = Measured(), dict[str, str](), Counter[str]()
     folder = path if path.is_dir() else path.parent
     places = [folder] if any(folder.glob("*.mcap")) else []
@@ -423,9 +415,8 @@ def _measured_beside(path: Path, mapping: Path | None, node: str) -> tuple[Measu
                 measured.add(name, *found)
         unknown |= source.losses.unknown_types
         for name, count in source.losses.counts.items():
-            if count and (
-                name == "undecodable" or number >= len(places)
-            ):  # all other losses are counted together with the run itself
+            # the run itself counts the other losses of its folder
+            if count and (name == "undecodable" or number >= len(places)):
                 unused[name] += count
     return measured, unknown, unused
 
@@ -486,92 +477,3 @@ def _writer(out: Path, prediction: Prediction, roles: Mapping[str, Role]) -> Any
     parameters = {"scene": prediction.name} | {f"{_MAP}{name}": role.topic for name, role in roles.items()}
     header = RunHeader(dump_scene(prediction.scene), tol=_TOLERANCE, parameters=parameters)
     return RunWriter(out / "run", header, chunk_size=2**20, min_free_bytes=64 * 1024 * 1024)
-
-
-_KINDS: Final = ("*.mcap", "*.db3", "*.csv")
-
-
-def _holds(folder: Path, kinds: Sequence[str] = _KINDS) -> bool:
-    return folder.is_dir() and any(any(folder.glob(pattern)) for pattern in kinds)
-
-
-def _is_recording(folder: Path, results: Sequence[Path]) -> bool:
-    """Return whether a folder is one recording: its files are the parts of a recording, or no folder in it is a run."""
-    if not _holds(folder):
-        return False
-    if (folder / "metadata.yaml").is_file() or any(folder.glob(f"{glob.escape(folder.name)}_*")):
-        return True
-    if (folder / "analysis.json").is_file():  # the run in this folder is a result of an analysis
-        results = [*results, (folder / "run").resolve()]
-    runs = [item for item in folder.iterdir() if _holds(item, _KINDS[:2]) and item.resolve() not in results]
-    return not set(runs) - set(beside_folders(folder))
-
-
-def left_out(path: Path, results: Sequence[Path] = ()) -> list[Path]:
-    """Return the items that `expand` leaves out: empty folders, tables beside runs, and runs inside other runs."""
-    if not path.is_dir():
-        return []
-    folders = [item for item in sorted(path.iterdir()) if item.is_dir()]
-    if _is_recording(path, results):
-        return [item for item in folders if _holds(item) and item not in beside_folders(path)]
-    empty = [item for item in folders if not any(item.iterdir())]
-    return empty + sorted(path.glob("*.csv")) + [one for item in folders if _holds(item) for one in left_out(item)]
-
-
-def expand(paths: Sequence[Path], results: Sequence[Path] = ()) -> list[Path]:
-    """Return the recordings at some paths; a folder of recordings is replaced by the recordings in it.
-
-    `results` are folders with results of an earlier analysis; they are not recordings.
-
-    Raises
-    ------
-    RecordingError
-        A folder has no recording.
-    """
-    found: list[Path] = []
-    for path in paths:
-        if not path.is_dir() or _is_recording(path, results):
-            found.append(path)
-            continue
-        inside = [
-            item
-            for item in sorted(path.iterdir())
-            # a recording with missing parts is analysed too; its analysis names the missing parts
-            if item.suffix in (".mcap", ".db3") or _holds(item) or (item / "metadata.yaml").is_file()
-        ]
-        # tables count only if there are no recordings, because a table beside recordings is assumed to be the result of
-        # an analysis
-        if not inside and any(path.glob(f"*{SUFFIX}")):
-            inside = [path]
-        if not inside:
-            raise RecordingError(f"{path}: got a folder without recordings, expected some{packed(path)}")
-        found += inside
-    return found
-
-
-def counted_once(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
-    """Return the recordings without repetitions, and a sentence for each repetition.
-
-    A recording is repeated if its path, or the random id of its run, occurs again.
-    """
-    kept: dict[object, Path] = {}
-    left: list[str] = []
-    for path in paths:
-        keys = path.resolve(), _identity(path)
-        known = next((kept[key] for key in keys if key in kept), None)
-        if known is None:
-            kept |= dict.fromkeys(keys, path)
-        elif known == path:
-            left.append(f"{path}: given twice, used once")
-        else:
-            left.append(f"{path}: left out: the same run as {known}")
-    return list(dict.fromkeys(kept.values())), left
-
-
-def _identity(path: Path) -> object:
-    """Return the identity of a recording: a run's random id and first part number, otherwise the path."""
-    try:
-        header = read_header(mcap_path(path))
-    except (RecordingError, OSError):  # the error will be reported where the recording is used
-        header = None
-    return path if header is None or not header.run_id else (header.run_id, header.part)

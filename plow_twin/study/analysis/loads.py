@@ -1,4 +1,4 @@
-"""Loads of the contacts, summed batch by batch: impacts, forces, duty, cycles, energy, forces along the face."""
+"""Loads of the contacts, summed batch by batch: impacts, forces, duty, cycles, energy, and forces along the face."""
 
 from __future__ import annotations
 
@@ -20,12 +20,10 @@ from plow_twin.run.energy_balance import elastic_energy
 
 Array = NDArray[np.float64]
 
-#: Number of bins of the rainflow count.
 CYCLE_BINS: Final = 16
 #: Length of a piece of the face [m].
 FACE_BIN_M: Final = 1.0
-#: Memory [B] for the force reversals of one contact pair, enough for 131,072 reversals. A longer series is kept on the
-#: disk and read back in blocks of this size.
+#: Memory [B] of a `Series`, enough for 131,072 numbers.
 _IN_MEMORY: Final = 2**20
 
 
@@ -33,7 +31,7 @@ _IN_MEMORY: Final = 2**20
 class Pass:
     """One pass along the face, from one reversal of the travel to the next.
 
-    Times in s since the first stamp, positions along the face in m, energy in J.
+    Times are in s since the first stamp, positions along the face in m, energy in J.
     """
 
     start_s: float
@@ -46,7 +44,7 @@ class Pass:
 
 
 class Series:
-    """A series of any length that is written once and can be read repeatedly. A long series is kept on the disk."""
+    """A series of any length. Beyond `_IN_MEMORY`, it is kept on the disk."""
 
     def __init__(self) -> None:
         self._file = tempfile.SpooledTemporaryFile(_IN_MEMORY)  # noqa: SIM115 (goes with this object)
@@ -69,7 +67,7 @@ class Series:
 
 @dataclass
 class LoadTotals:
-    """Sums over a run, to which `add` adds batch after batch."""
+    """Sums over a run."""
 
     scene: Scene
     duration_s: float = 0.0
@@ -80,24 +78,23 @@ class LoadTotals:
     contact_loss_j: float = 0.0
     sets: Counter[int] = field(default_factory=Counter)
     passes: list[Pass] = field(default_factory=list)
-    #: largest force in each piece of the face; the key is the pass and the piece
+    #: largest force by pass and piece of the face
     face: dict[tuple[int, int], float] = field(default_factory=dict)
     #: wear depth that the pads have gained [m], by direction of travel (0 forward, 1 backward)
     pad_wear: Array = field(default_factory=lambda: np.zeros((2, PAIR_COUNT)))
-    #: wear depth of the slide at each pair [m]; the key is the direction (0 forward, 1 backward) and the piece of the
-    #: face
+    #: wear depth of the slide at each pair [m], by direction and piece of the face
     slide_wear: dict[tuple[int, int], Array] = field(default_factory=dict)
     _first_ns: int | None = None
-    #: stamp [ns], load, pose, rates and penetrations of the previous row
+    #: stamp [ns], load, pose, rates and penetrations of the last row
     _last: tuple[int, Array, Array, Array, Array] | None = None
-    #: wear depth of the pads after the last advance [m]
+    #: wear depth of the pads after the last row [m]
     _worn: Array | None = None
     _place_m: float = 0.0
     _direction: float = 0.0
     _reversals: list[Series] = field(default_factory=lambda: [Series() for _ in range(PAIR_COUNT)])
 
     def restart(self) -> None:
-        """Continue after a reset; the interval across the reset is not counted."""
+        """Continue after a reset; the interval across the reset does not count."""
         self._last = self._worn = None
 
     def add(self, walked: Walked) -> None:
@@ -119,7 +116,7 @@ class LoadTotals:
             self.sets[int(mask)] += int(count)
         for pair, kept in enumerate(self._reversals):
             turning = reversals(rows.peak[:, pair])
-            if turning.any() or kept.last != 0.0:  # during a long time without contact only one zero is kept
+            if turning.any() or kept.last != 0.0:  # during a long time without contact, one zero is kept
                 kept.add(turning)
         loss = self._contact_loss(walked, steps)
         self.contact_loss_j += float(loss.sum())
@@ -130,8 +127,7 @@ class LoadTotals:
     def _contact_loss(self, walked: Walked, steps: Array) -> Array:
         """Return the energy [J] that contacts dissipate between rows: work of the load minus energy gained.
 
-        The work of the load is the mean load of two rows times the displacement between them. The energy gained is the
-        sum of kinetic energy, potential energy in gravity and elastic energy in the contacts.
+        The work of the load between two rows is their mean load times the displacement.
         """
         now = walked.wrench, walked.rows.q, walked.rows.v, walked.rows.penetration
         first = (column[0] for column in now) if self._last is None else self._last[1:]
@@ -141,10 +137,10 @@ class LoadTotals:
         return np.where(steps > 0.0, work - gain, 0.0)
 
     def _energy(self, q: Array, v: Array, penetration: Array) -> Array:
-        """Return the head's kinetic energy, its potential energy in gravity, and the elastic energy of contacts [J]."""
+        """Return kinetic energy, potential energy in gravity, and elastic energy of the contacts [J]."""
         head, gravity = self.scene.head, self.scene.gravity
         theta, omega = q[:, 2], v[:, 2]
-        # from the cavity's centre to the centre of mass, in world axes
+        # from the centre of the cavity to the centre of mass, in world axes
         along = np.cos(theta) * head.com_offset_m[0] - np.sin(theta) * head.com_offset_m[1]
         up = np.sin(theta) * head.com_offset_m[0] + np.cos(theta) * head.com_offset_m[1]
         speed_2 = (v[:, 0] - omega * up) ** 2 + (v[:, 1] + omega * along) ** 2
@@ -154,7 +150,6 @@ class LoadTotals:
         return np.asarray(kinetic + potential + elastic_energy(self.scene, penetration))
 
     def _face(self, walked: Walked, steps: Array, loss: Array) -> None:
-        """Assign impacts, energy and forces to the pass and the piece of the face."""
         speed = walked.speed_m_s
         direction = math.copysign(1.0, speed) if speed else 0.0
         now_s = (int(walked.stamp_ns[0]) - (self._first_ns or 0)) * 1e-9
@@ -179,10 +174,9 @@ class LoadTotals:
         self._worn = walked.rows.wear_depth[-1].copy()
 
     def _wear(self, depth: Array, speed: float, pieces: NDArray[np.int64]) -> None:
-        """Add the wear of the pads, and of the places of the slide that they pass, by direction of travel.
+        """Add the wear of the pads and of the pieces of the slide that they pass.
 
-        A pad wears over the whole distance travelled, but a place of the slide wears only while the length of a pad
-        passes it.
+        A pad wears over the whole distance travelled, a place of the slide only while the length of a pad passes it.
         """
         wear = self.scene.wear
         if wear is None or wear.coefficient_m2_n == 0.0:
@@ -209,8 +203,7 @@ class LoadTotals:
         if self.slide_wear:
             pieces = {piece for _, piece in self.slide_wear}
             total = np.sum(list(self.slide_wear.values()), axis=0) / len(pieces)
-            # mean over the pieces of the face; it equals the wear of the pads times the ratio of a pad's length to the
-            # face's length
+            # mean over the face: the wear of the pads times a pad's length over the face's length
             out["slide_mean_m"] = dict(zip(PAIR_NAMES, total.tolist(), strict=True))
             out["slide_pieces"] = len(pieces)
         return out

@@ -16,7 +16,7 @@ from plow_twin.model.law_modules import load_laws, loaded_laws
 from plow_twin.study.analysis.task import RunTask, run_task
 from plow_twin.study.cluster import completed, connect
 
-#: Function that receives the share of the recordings that are done, 0..1.
+#: Function that gets the share of the recordings done, 0..1.
 OnProgress = Callable[[float], object]
 _OnDone = Callable[[int, dict[str, Any]], object]
 
@@ -24,14 +24,10 @@ _OnDone = Callable[[int, dict[str, Any]], object]
 def run_many(
     tasks: Sequence[RunTask], *, workers: int, dask: str | None = None, on_progress: OnProgress = lambda share: None
 ) -> list[dict[str, Any]]:
-    """Return the facts of each task, or an `error` if the task failed; stored facts are used again.
+    """Return the facts of each task, or an `error` if the task failed. Tasks with stored facts do not run again.
 
-    Parameters
-    ----------
-    workers
-        Number of processes on this machine.
-    dask
-        Address of a Dask scheduler to use instead of local processes; its workers must have access to the same files.
+    The tasks run in `workers` processes, or on the Dask cluster with the scheduler at `dask`, whose workers must have
+    access to the same files.
 
     Raises
     ------
@@ -55,7 +51,7 @@ def run_many(
 def _here(tasks: Sequence[RunTask], waiting: list[int], workers: int, done: _OnDone) -> None:
     while waiting:
         left = _round(tasks, waiting, workers, done)
-        if len(left) == len(waiting):  # some task has killed its worker; to find it, the first tasks are run one by one
+        if len(left) == len(waiting):  # a task has killed its worker; to find this task, the first tasks run one by one
             left, first = left[workers:], left[:workers]
             for number in first:
                 if _round(tasks, [number], 1, done):
@@ -64,7 +60,7 @@ def _here(tasks: Sequence[RunTask], waiting: list[int], workers: int, done: _OnD
 
 
 def _round(tasks: Sequence[RunTask], waiting: list[int], workers: int, done: _OnDone) -> list[int]:
-    """Run the waiting tasks once; return the tasks that were not finished because a worker died."""
+    """Run the waiting tasks once; return the tasks that a dying worker left unfinished."""
     left = []
     others = active_children()
     pool = ProcessPoolExecutor(min(workers, len(waiting)), get_context("spawn"), _begin, (loaded_laws(),))
@@ -75,7 +71,7 @@ def _round(tasks: Sequence[RunTask], waiting: list[int], workers: int, done: _On
                 done(futures[future], future.result())
             except BrokenProcessPool:
                 left.append(futures[future])
-    except BaseException:  # an interrupt ends the workers; unfinished analyses are repeated by the next call
+    except BaseException:  # the next call repeats unfinished analyses
         for worker in set(active_children()).difference(others):
             worker.kill()
         raise
@@ -85,13 +81,12 @@ def _round(tasks: Sequence[RunTask], waiting: list[int], workers: int, done: _On
 
 
 def _begin(laws: tuple[str, ...]) -> None:
-    """Prepare a worker with the contact laws of its caller."""
     _belong_to_the_caller()
     load_laws(laws)
 
 
 def _belong_to_the_caller() -> None:
-    """Ignore interrupts, which the caller handles, and end this process when the caller's process ends."""
+    """Leave interrupts to the caller, and end this process when the caller ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = parent_process()
     assert parent is not None

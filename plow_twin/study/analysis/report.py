@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -10,91 +9,38 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from plow_twin.model.pairs import PAIR_NAMES
-from plow_twin.record.durable import naming, whole_file, write_whole
+from plow_twin.record.durable import naming, whole_file
+from plow_twin.stream.outputs import CLEARANCE_NAMES
 from plow_twin.study.analysis.signals import signal_unit
-from plow_twin.study.report import embedded_figure
+from plow_twin.study.report import embedded_figure, write_html, write_json
 from plow_twin.view.figures import date_text, legend_beside
 
 if TYPE_CHECKING:
     from plow_twin.study.analysis.analyse import Analysis, Prediction
 
 _MOST_POINTS: Final = 4000
-#: Text in place of results for a folder without a recording.
+#: Entry of a folder without a recording.
 LEFT_OUT: Final = "left out: no recording"
-
-_PAGE: Final = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><title>{{ facts.run }}</title>
-<style>body{font:15px/1.5 system-ui,sans-serif;margin:2em auto;max-width:70em;padding:0 1em;color:#222}
-table{border-collapse:collapse;margin:1em 0}td,th{border:1px solid #ccc;padding:.25em .6em;text-align:right}
-th:first-child,td:first-child,.long{text-align:left}img{max-width:100%}</style></head><body>
-<h1>{{ facts.run }}</h1>
-<p>{{ facts.kind }}; {{ facts.input.samples_used }} samples used, {{ "%.1f" | format(facts.loads.duration_s) }} s.
-{% if facts.without_samples %}{{ facts.without_samples }}; there the load is interpolated linearly.{% endif %}
-{% if facts.lost %}Lost: {{ facts.lost }}.{% endif %}
-{% if facts.left_out %}Left out, not part of this recording: {{ facts.left_out | join(", ") }}.{% endif %}
-{% if facts.skipped_topics %}Topics of unknown type: {{ facts.skipped_topics }}.{% endif %}</p>
-{% for part in parts %}
-<h2>Scene {{ part.scene }}</h2>
-{% if part.signals %}<h3>Predicted minus measured</h3>
-<table><tr><th>signal</th><th>n</th><th>bias</th><th>RMS</th><th>correlation [1]</th><th>lag [s]</th>
-<th>RMS aligned</th><th>coherence [1]</th></tr>{% for name, s in part.signals.items() %}
-<tr><td>{{ name }} [{{ unit(name) }}]</td><td>{{ s.n }}</td><td>{{ number(s.bias) }}</td><td>{{ number(s.rms) }}</td>
-<td>{{ number(s.correlation) }}</td><td>{{ number(s.lag_s) }}</td><td>{{ number(s.rms_aligned) }}</td>
-<td>{{ number(s.coherence) }}</td></tr>{% endfor %}</table>
-{% else %}<p>Nothing was measured.</p>{% endif %}
-{% if part.stretches %}<p>Resets divide the run into {{ part.stretches }} stretches; signals are of the
-longest. Measured values of the others: {{ part.not_compared or "none" }}.</p>{% endif %}
-{% if part.outside %}<p>Measured values outside the time of the load, not compared: {{ part.outside }}.</p>{% endif %}
-<h3>Contacts</h3>
-<table><tr><th>pair</th><th>impacts</th><th>largest force [kN]</th><th>impulse [kN s]</th><th>duty [%]</th></tr>
-{% for name in pairs %}<tr><td>{{ name }}</td><td>{{ part.loads.impacts[name] }}</td>
-<td>{{ "%.2f" | format(part.loads.largest_force_n[name] / 1e3) }}</td>
-<td>{{ "%.3f" | format(part.loads.impulse_n_s[name] / 1e3) }}</td>
-<td>{{ "%.2f" | format(100 * part.loads.duty[name]) }}</td></tr>{% endfor %}</table>
-<h3>Passes of the face</h3>
-<table><tr><th>pass</th><th>from [s]</th><th>to [s]</th><th>from [m]</th><th>to [m]</th><th>impacts</th>
-<th>largest force [kN]</th><th>taken by contacts [kJ]</th></tr>{% for p in part.loads.passes %}
-<tr><td>{{ loop.index }}</td><td>{{ "%.1f" | format(p.start_s) }}</td><td>{{ "%.1f" | format(p.end_s) }}</td>
-<td>{{ "%.1f" | format(p.start_m | round(1) + 0) }}</td><td>{{ "%.1f" | format(p.end_m | round(1) + 0) }}</td>
-<td>{{ p.impacts }}</td>
-<td>{{ "%.2f" | format(p.largest_force_n / 1e3) }}</td><td>{{ "%.3f" | format(p.contact_loss_j / 1e3) }}</td>
-</tr>{% endfor %}</table>
-<h3>Rainflow counts of the contact force</h3>
-<table><tr><th>pair</th><th>range up to [kN]: cycles</th></tr>{% for name, bins in part.loads.cycles.items() %}
-<tr><td>{{ name }}</td><td class="long">
-{% for b in bins %}{% if b.count %}{{ "%.1f" | format(b.range_n / 1e3) }}: {{ b.count }};
-{% endif %}{% endfor %}</td></tr>{% endfor %}</table>
-{% endfor %}
-<h2>Course</h2><img alt="Pose and forces in time" src="{{ picture }}">
-</body></html>
-"""
 
 
 def write_report(found: Analysis, out: Path) -> None:
     """Write all files of an analysis into the folder `out`; a disk error names the file."""
     with naming(out):
-        _write_report(found, out)
-
-
-def _write_report(found: Analysis, out: Path) -> None:
-    from jinja2 import Environment
-
-    out.mkdir(parents=True, exist_ok=True)
-    facts = found.facts()
-    write_whole(out / "analysis.json", json.dumps(facts, indent=2, allow_nan=False).encode())
-    environment = Environment(autoescape=True)
-    page = environment.from_string(_PAGE).render(
-        facts=facts,
-        parts=[facts, *facts["with"]],
-        pairs=PAIR_NAMES,
-        unit=signal_unit,
-        number=lambda value: "" if value is None else f"{value:.4g}",
-        picture=_picture(found),
-    )
-    write_whole(out / "report.html", page.encode())
-    for number, prediction in enumerate(found.predictions):
-        _write_tables(prediction, out, f"_{number}" if number else "")
-    _write_measured(found, out)
+        out.mkdir(parents=True, exist_ok=True)
+        facts = found.facts()
+        write_json(out / "analysis.json", facts)
+        context = {
+            "facts": facts,
+            "parts": [facts, *facts["with"]],
+            "pairs": PAIR_NAMES,
+            "unit": signal_unit,
+            "number": lambda value: "" if value is None else f"{value:.4g}",
+            "picture": _picture(found),
+        }
+        write_html(out / "report.html", "analysis.html.j2", context)
+        for number, prediction in enumerate(found.predictions):
+            _write_tables(prediction, out, f"_{number}" if number else "")
+        _write_measured(found, out)
 
 
 def _write_tables(prediction: Prediction, out: Path, suffix: str) -> None:
@@ -103,8 +49,6 @@ def _write_tables(prediction: Prediction, out: Path, suffix: str) -> None:
         _write_table({"stamp_ns": stamps, **columns}, out / f"predicted{suffix}.parquet")
     times, values = prediction.clearance.series()
     if len(times):
-        from plow_twin.stream.outputs import CLEARANCE_NAMES
-
         table = {"stamp_ns": times} | {name: values[:, index] for index, name in enumerate(CLEARANCE_NAMES)}
         _write_table(table, out / f"clearance{suffix}.parquet")
     if prediction.loads.face:
@@ -113,8 +57,6 @@ def _write_tables(prediction: Prediction, out: Path, suffix: str) -> None:
         face = {key: list(column) for key, column in zip(keys, zip(*rows, strict=True), strict=True)}
         _write_table(face, out / f"face{suffix}.parquet")
     if prediction.loads.slide_wear:
-        from plow_twin.model.pairs import PAIR_NAMES
-
         places = sorted(prediction.loads.slide_wear)
         depth = np.array([prediction.loads.slide_wear[place] for place in places])
         where = {"backward": [bool(one) for one, _ in places], "position_m": [piece for _, piece in places]}
@@ -146,7 +88,6 @@ def _write_table(columns: Mapping[str, Any], path: Path) -> None:
 
 
 def _picture(found: Analysis) -> str:
-    """Return measured and predicted pose and the largest force as an embedded PNG."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12, 9), layout="constrained")
@@ -183,7 +124,7 @@ def _picture(found: Analysis) -> str:
 
 
 def write_table_of_runs(rows: list[dict[str, Any]], out: Path, left_out: Sequence[Path] = ()) -> None:
-    """Write `runs.parquet` with a row for each recording, and a row with the reason for each folder left out."""
+    """Write `runs.parquet`: a row for each recording, and for each folder left out a row with the reason."""
     flat = []
     for facts in [*rows, *({"run": str(path), "error": LEFT_OUT} for path in left_out)]:
         lost = sum(facts["lost"].values()) if "lost" in facts else None

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-#: Largest lag [s] that is searched; a longer lag cannot be distinguished from a shift by a period of the load.
+#: Largest lag [s]; a longer lag resembles a shift by a period of the load.
 LARGEST_LAG_S: Final = 1.0
 #: Smallest number of measured values for a comparison.
 _FEWEST: Final = 8
@@ -20,44 +20,30 @@ _MOST_POINTS: Final = 400_000
 
 @dataclass(frozen=True)
 class Comparison:
-    """Comparison of a signal: predicted minus measured.
+    """Comparison of a signal: predicted minus measured."""
 
-    Attributes
-    ----------
-    n : int
-        Number of measured values within the time of the prediction.
-    bias, rms : float
-        Mean and root mean square of predicted minus measured, at equal stamps.
-    correlation : float or None
-        Pearson's correlation, at equal stamps; None if a signal does not change.
-    lag_s : float or None
-        Lag in s of the measurement behind the prediction at which the correlation is largest.
-    rms_aligned : float or None
-        Standard deviation of predicted minus measured at the lag `lag_s`.
-    coherence : float or None
-        Magnitude-squared coherence at the strongest frequency of the prediction.
-    """
-
+    #: measured values within the time of the prediction
     n: int
+    #: mean and root mean square of the difference at equal stamps
     bias: float
     rms: float
+    #: Pearson's correlation at equal stamps; None if a signal does not change
     correlation: float | None
+    #: lag of the measurement behind the prediction at which the correlation is largest [s]
     lag_s: float | None
+    #: standard deviation of the difference at this lag
     rms_aligned: float | None
+    #: magnitude-squared coherence at the strongest frequency of the prediction
     coherence: float | None
-
-    def facts(self) -> dict[str, Any]:
-        """Return the fields for JSON."""
-        return dict(vars(self))
 
 
 def signal_unit(name: str) -> str:
-    """Return the unit of a signal by its name."""
+    """Return the unit of a signal."""
     return "N" if name.startswith("force_") else "rad" if name == "theta" else "m"
 
 
 def compare(t: Array, predicted: Array, t_measured: Array, measured: Array) -> Comparison | None:
-    """Compare a prediction (n,) at rising times t with measured values (m,) at other times; None for too few values."""
+    """Compare a prediction (n,) at rising times t with measured values (m,); None for too few values."""
     inside = (t_measured >= t[0]) & (t_measured <= t[-1]) & np.isfinite(measured) if len(t) else np.zeros(0, bool)
     if inside.sum() < _FEWEST:
         return None
@@ -69,7 +55,7 @@ def compare(t: Array, predicted: Array, t_measured: Array, measured: Array) -> C
     lag_s = None if correlation is None else _lag(t, predicted, times, values)
     aligned = None
     if lag_s is not None:
-        rest = _shifted(t, predicted, times, lag_s) - values
+        rest = _at(times - lag_s, t, predicted) - values
         aligned = float(np.nanstd(rest))
     bias, rms = float(difference.mean()), math.sqrt(float((difference**2).mean()))
     return Comparison(len(values), bias, rms, correlation, lag_s, aligned, _coherence(times, here, values))
@@ -82,29 +68,25 @@ def _correlation(one: Array, other: Array) -> float | None:
         return None
     one, other = one - one.mean(), other - other.mean()
     size = math.sqrt(float(one @ one) * float(other @ other))
-    # the correlation is limited to 1 in magnitude, because rounding could give more
+    # rounding could give more than 1
     return min(1.0, max(-1.0, float(one @ other) / size)) if size > 1e-300 else None
 
 
-def _shifted(t: Array, predicted: Array, times: Array, lag_s: float) -> Array:
-    """Return the prediction at `times` minus `lag_s`, NaN outside the time of the prediction."""
-    return _at(times - lag_s, t, predicted)
-
-
 def _at(times: Array, t: Array, predicted: Array) -> Array:
+    """Return the prediction at some times, NaN outside its own time."""
     return np.interp(times, t, predicted, left=math.nan, right=math.nan)
 
 
 def _step(times: Array, span: float) -> float:
-    """Return the grid's step [s]: the median interval of stamps, or more to limit the number of points."""
+    """Return the step of the grid [s]."""
     return max(float(np.median(np.diff(np.unique(times)))), span / _MOST_POINTS, 1e-6)
 
 
 def _correlations(longer: Array, shorter: Array) -> Array:
     """Return Pearson's correlation of a series with each equally long piece of a longer series.
 
-    Only numbers that are not NaN are used; they are contiguous in the longer series. The result is -1 for a piece with
-    too few such numbers.
+    The longer series has NaN outside one contiguous part. The result is -1 for a piece with too few numbers of this
+    part.
     """
     from scipy.signal import correlate
 
@@ -126,14 +108,14 @@ def _correlations(longer: Array, shorter: Array) -> Array:
     square_one = sums(one**2, low + begin, high + begin) - count * mean_one**2
     square_other = sums(other**2, low, high) - count * mean_other**2
     product = correlate(one, other, mode="valid", method="fft") - count * mean_one * mean_other
-    # in a constant piece the deviations from the mean are only rounding errors, so it has no correlation
+    # the deviations of a constant piece from its mean are rounding errors, so it has no correlation
     enough = (high - low >= _FEWEST) & (square_one > 1e-12 * (one @ one)) & (square_other > 1e-12 * (other @ other))
     size = np.sqrt(np.where(enough, square_one * square_other, 1.0))
     return np.where(enough, product / size, -1.0)
 
 
 def _lag(t: Array, predicted: Array, times: Array, values: Array) -> float | None:
-    """Return the lag with the largest correlation, searched on a grid and refined between the grid's points."""
+    """Return the lag with the largest correlation, searched on a grid and then refined."""
     from scipy.optimize import minimize_scalar
 
     span = float(times[-1] - times[0])
@@ -150,7 +132,7 @@ def _lag(t: Array, predicted: Array, times: Array, values: Array) -> float | Non
     thin = max(1, len(times) // 50_000)
 
     def badness(lag_s: float) -> float:
-        found = _correlation(_shifted(t, predicted, times[::thin], lag_s), values[::thin])
+        found = _correlation(_at(times[::thin] - lag_s, t, predicted), values[::thin])
         return 1.0 if found is None else -found
 
     bounds = max(best - 1.5 * step, -LARGEST_LAG_S), min(best + 1.5 * step, LARGEST_LAG_S)

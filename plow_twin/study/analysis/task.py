@@ -23,15 +23,15 @@ from plow_twin.scene_file.presets import scene_path
 from plow_twin.study.analysis.analyse import MAPPED_LOAD, analyse
 from plow_twin.study.analysis.report import write_report
 
-#: File with the inputs of an analysis. It is written last, so that only a complete analysis has it.
+#: File with the inputs of an analysis, written last: only a complete analysis has it.
 _ASKED: Final = "asked.json"
 _FILES: Final = (_ASKED, "analysis.json", "report.html", "measured.parquet")
-#: Names of the tables of an analysis; each scene has its own tables, whose names may end in a number.
+#: Names of the tables; those of further scenes end in a number.
 _TABLE: Final = re.compile(r"(predicted|clearance|face|slide_wear)(_\d+)?\.parquet")
 
 
 def names_apart(paths: Sequence[Path]) -> list[str]:
-    """Return a short name for each recording: the end of its path that distinguishes it from the others."""
+    """Return for each recording the shortest end of its path that distinguishes it from the others."""
     whole = [path.absolute() for path in paths]
     stems = Counter(path if path.is_dir() else path.with_suffix("") for path in whole)
     parts = [
@@ -47,7 +47,7 @@ def names_apart(paths: Sequence[Path]) -> list[str]:
 
 
 class RunTask(Protocol):
-    """Interface of a task that works on one recording and can run in another process."""
+    """Work on one recording that can run in another process."""
 
     @property
     def path(self) -> Path:
@@ -62,20 +62,20 @@ class RunTask(Protocol):
 
 @dataclass(frozen=True)
 class Task:
-    """One analysis, which another process can run."""
+    """One analysis."""
 
     path: Path
     scene: Path | None
     mapping: Path | None
     others: tuple[Path, ...]
     out: Path | None
-    #: items in the recording's folder that are not analysed; the results list their names
+    #: items in the folder of the recording that are not analysed
     left_out: tuple[Path, ...] = ()
-    #: units of measured numbers by name; they take precedence over the units of the mapping
+    #: units by name, which replace those of the mapping
     units: Mapping[str, str] = field(default_factory=dict)
 
     def stored(self) -> dict[str, Any] | None:
-        """Return the facts of the same analysis if it was completed before, else None."""
+        """Return the facts of an earlier, complete analysis of the same inputs, otherwise None."""
         if self.out is None:
             return None
         try:
@@ -86,12 +86,12 @@ class Task:
         return {**facts, "lossy": bool(facts["lost"])} if asked == self._asked() else None
 
     def clear(self, inputs: Sequence[Path] = ()) -> None:
-        """Remove all files of an earlier analysis, but not a run that a twin has recorded.
+        """Remove the files of an earlier analysis, but not a run that a twin has recorded.
 
         Raises
         ------
         RecordingError
-            A file to remove is an input of this analysis or one of `inputs`, the inputs of other analyses.
+            A file to remove is an input of this analysis.
         """
         old = self._old()
         self._keep(old, (*self._inputs(), *inputs))
@@ -106,7 +106,7 @@ class Task:
         self._keep(self._old(), inputs)
 
     def _old(self) -> list[Path]:
-        """Return the files of an earlier analysis, first the file that marks the analysis as complete."""
+        """Return the files of an earlier analysis, first the one that marks it as complete."""
         if self.out is None or not self.out.is_dir():
             return []
         found = sorted(path for path in self.out.iterdir() if path.name in _FILES or _TABLE.fullmatch(path.name))
@@ -126,15 +126,9 @@ class Task:
         return [self.path, *(path for path in (self.scene, self.mapping, *self.others) if path is not None)]
 
     def run(self, on_progress: Callable[[float], object] | None = None) -> dict[str, Any]:
-        """Return the facts of the analysis and write its files.
-
-        Raises
-        ------
-        PlowTwinError
-            The analysis cannot be made.
-        """
+        """Return the facts of the analysis and write its files, or raise a `PlowTwinError`."""
         self.clear()
-        asked = self._asked()  # the inputs as they were at the start of the analysis
+        asked = self._asked()  # before the analysis, because files may change while it runs
         found = analyse(
             self.path,
             scene=self.scene,
@@ -153,11 +147,12 @@ class Task:
     def _asked(self) -> dict[str, Any]:
         """Return the inputs on which the result depends: recording, files beside it, scenes, mapping and units."""
         folder = self.path if self.path.is_dir() else self.path.parent
+        parts = [*sorted(folder.glob("*.mcap")), *beside_folders(folder)]
         beside = folder / "scene.yaml" if self.scene is None else None
         return {
             "run": _state(self.path, self.out),
-            # measurements may also be in the recording's other parts, and in folders beside a single part
-            "parts": [] if self.path.is_dir() else [_state(path, self.out) for path in _measured_near(folder)],
+            # the other parts, and folders beside a part, may have measurements
+            "parts": [] if self.path.is_dir() else [_state(path, self.out) for path in parts],
             "scene": _scene_state(self.scene),
             "scene_beside": _scene_state(beside) if beside is not None and beside.is_file() else None,
             "map": None if self.mapping is None else _state(self.mapping, None),
@@ -168,24 +163,23 @@ class Task:
 
 
 def _is_ours(file: Path) -> bool:
-    """Return whether a file is part of a run that an analysis has made."""
     if file.name in ("metadata.yaml", "metadata.yaml.partial"):
         return True
     if not re.fullmatch(r"run_\d+\.mcap", file.name):
         return False
-    if file.stat().st_size == 0:  # the process was killed before it wrote the first byte
+    if file.stat().st_size == 0:  # the process was killed before the first byte
         return True
     try:
         header = read_header(file)
         if header is None and next(iter(ChunkReader(file)), None) is None:
-            return True  # the process was killed before it wrote the header
+            return True  # the process was killed before the header
     except RecordingError:
         return False
     return header is not None and MAPPED_LOAD in header.parameters
 
 
 def _state(path: Path, out: Path | None) -> list[Any]:
-    """Return names, sizes and times of a file, or of all files in a folder except the results in `out`."""
+    """Return names, sizes and times of a file, or of the files in a folder except the results in `out`."""
     files = sorted(path.rglob("*")) if path.is_dir() else [path]
     if out is not None and out.resolve().is_relative_to(path.resolve()):
         results = out.resolve()
@@ -199,18 +193,13 @@ def _is_result(file: Path, out: Path) -> bool:
     return file.parent == out and (file.name in _FILES or _TABLE.fullmatch(file.name) is not None)
 
 
-def _measured_near(folder: Path) -> list[Path]:
-    """Return the files and folders that are searched for measurements in addition to a single part."""
-    return [*sorted(folder.glob("*.mcap")), *beside_folders(folder)]
-
-
 def _scene_state(scene: Path | None) -> list[str] | None:
-    """Return the name of a scene and the digest of its contents, including tables."""
+    """Return the name of a scene and the digest of its contents."""
     if scene is None:
         return None
     try:
         text = dump_scene(load_scene(scene_path(str(scene))))
-    except (PlowTwinError, OSError, ValueError):  # the analysis will report the error
+    except (PlowTwinError, OSError, ValueError):  # the analysis reports the error
         text = ""
     return [str(scene), hashlib.blake2b(text.encode(), digest_size=16).hexdigest()]
 
@@ -221,5 +210,5 @@ def run_task(task: RunTask) -> dict[str, Any]:
         return task.run()
     except PlowTwinError as error:
         return {"run": str(task.path), "error": str(error)}
-    except Exception as error:  # the other recordings continue, whatever the error of one recording is
+    except Exception as error:  # whatever the error, the other recordings continue
         return {"run": str(task.path), "error": f"{task.path}: {error!r}"}

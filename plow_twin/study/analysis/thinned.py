@@ -1,4 +1,4 @@
-"""Rows and values in bounded memory: if there are too many, every 2nd is kept, then every 4th, ..."""
+"""Series in bounded memory: a series that is too long keeps every 2nd row, then every 4th, and so on."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-#: Largest number of kept rows: 150 MB for a prediction, 16 MB for a measured signal.
+#: Largest number of kept rows: 150 MB of a prediction, 16 MB of a measured signal.
 MOST_ROWS: Final = 1_000_000
 
 
 class Thinned:
-    """Rows of several columns with their stamps. Of the `rows` received, one in `stride` is kept."""
+    """Rows of several columns with their stamps. Of `rows` received, one in `stride` is kept."""
 
     def __init__(self, columns: int) -> None:
         self._stamps: list[NDArray[np.int64]] = [np.zeros(0, np.int64)]
@@ -42,7 +42,7 @@ class Thinned:
 
 
 class ThinnedSignal:
-    """Values that are added one at a time, each with its stamp and the number of the stretch in which it arrived."""
+    """Single values with their stamps and the number of the stretch in which each arrived."""
 
     def __init__(self) -> None:
         self._stamps, self._values, self._stretches = array("q"), array("d"), array("I")
@@ -69,5 +69,5 @@ class ThinnedSignal:
         return np.array(self._stamps, np.int64), np.array(self._values)
 
     def stretches(self) -> NDArray[np.int64]:
-        """Return the number of the stretch in which each kept value arrived, shape (m,)."""
+        """Return the stretch of each kept value, shape (m,)."""
         return np.array(self._stretches, np.int64)

@@ -1,16 +1,16 @@
 """Fit of a scene's unknowns to an objective by independent starts, each of which searches globally, then locally.
 
-One start has three stages. (1) `screen` random points of the unit cube are evaluated; the best of them are the first
+A start has three stages. (1) `screen` random points of the unit cube are evaluated; the best of them are the first
 population of (2) a differential evolution (Storn and Price, J. Global Optim. 11 (1997) 341; scipy), in which each
 generation is one ensemble of runs. (3) The best point is polished in the unknowns that have a range, by least squares
-(trust region reflective, scipy) with a finite-difference Jacobian from one ensemble. For residuals with kinks, Nelder
-and Mead's simplex follows. Every start has its own random generator, spawned from the seed, so that the same seed gives
-the same bits with any number of threads.
+(trust region reflective, scipy) with a finite-difference Jacobian from one ensemble. For residuals with kinks, the
+simplex of Nelder and Mead follows. Every start has its own random generator, so a seed gives the same bits with any
+number of threads.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -21,27 +21,27 @@ from plow_twin.study.calibration.unknowns import Space
 from plow_twin.study.parameters import Value
 
 Array = NDArray[np.float64]
-#: Function that is called with the share of the work that is done, 0..1, and the best objective so far.
+#: Function that gets the share of the work done, 0..1, and the best objective so far.
 OnProgress = Callable[[float, float], None]
 
 
 @dataclass(frozen=True)
 class Search:
-    """Effort of one start: numbers of screened points, members, generations and simplex evaluations (0: no simplex)."""
+    """Effort of one start: numbers of screened points, members, generations and simplex evaluations."""
 
     screen: int = 200
     population: int = 30
     generations: int = 40
     simplex: int = 0
-    #: largest spread of the population's objectives, relative to their mean, at which the evolution ends
+    #: spread of the population's objectives, relative to their mean, at which the evolution ends
     spread: float = 1e-3
-    #: step of the difference quotients of the Jacobian, in the unit cube
+    #: step of the Jacobian, in the unit cube
     step: float = 1e-6
 
 
 @dataclass(frozen=True)
 class Start:
-    """Result of a start: point in the cube, values of the unknowns, and objective before and after polishing."""
+    """Result of a start: point in the cube, values of the unknowns, objective before and after polishing."""
 
     number: int
     point: Array
@@ -53,12 +53,12 @@ class Start:
 
 @dataclass(frozen=True)
 class Calibration:
-    """The result of a calibration; `starts` are sorted by their objective, best first."""
+    """The result of a calibration; the best start comes first."""
 
     starts: tuple[Start, ...]
     seed: int
     runs: int
-    #: all points of the last populations, some of which fit almost as well as the best point
+    #: the last populations, whose points may fit almost as well as the best point
     population: Array = field(repr=False)
     population_objective: Array = field(repr=False)
 
@@ -80,17 +80,8 @@ def calibrate(
 ) -> Calibration:
     """Minimise the objective over the space from independent random starts.
 
-    Parameters
-    ----------
-    space : Space
-    objective : Objective
-    seed, starts : int
-    search : Search, optional
-        Effort of each start.
-    first : ndarray, shape (n,), optional
-        A point for the first population of the first start, such as the point of the given scene.
-    on_progress : callable, optional
-        Called after every generation.
+    `first` is a point for the first population of the first start, such as the given scene. `on_progress` is called
+    after every generation.
     """
     search = search or Search()
     done: list[Start] = []
@@ -105,9 +96,9 @@ def calibrate(
         before = objective.runs
         known = first if number == 0 else None
         points, values = _evolve(space, objective, rng, search, known, report)
-        point, best = polish(space, objective, points[np.argmin(values)], search)
+        point, best = _polish(space, objective, points[np.argmin(values)], search)
         populations.append((points, values))
-        # the best point of the population is kept if polishing has not improved it
+        # polishing may not have improved the best point
         if values.min() < best:
             point, best = points[np.argmin(values)], float(values.min())
         point = space.settled(point)
@@ -127,7 +118,6 @@ def _evolve(
     first: Array | None,
     report: Callable[[float, float], None],
 ) -> tuple[Array, Array]:
-    """Return the last population of one start, shape (p, n), and its objectives."""
     from scipy.optimize import differential_evolution
 
     points = rng.random((max(search.screen, search.population), space.size))
@@ -142,8 +132,8 @@ def _evolve(
     cut, generation = float(values.max()), [0]
 
     def evaluate(columns: Array) -> Array:
-        # a trial worse than the whole population is never accepted and need not be run to the end
-        return sums(objective.residuals(space.values_of(np.atleast_2d(columns.T)), cut))
+        # a trial that is worse than the whole population is never accepted
+        return _sums(objective.residuals(space.values_of(np.atleast_2d(columns.T)), cut))
 
     def after(intermediate_result: object) -> None:
         generation[0] += 1
@@ -163,19 +153,19 @@ def _screened(space: Space, objective: Objective, points: Array, keep: int) -> A
     values = np.zeros(0)
     for begin in range(0, len(points), batch):
         cut = np.inf if len(values) < keep else float(np.sort(values)[keep - 1])
-        found = sums(objective.residuals(space.values_of(points[begin : begin + batch]), cut))
+        found = _sums(objective.residuals(space.values_of(points[begin : begin + batch]), cut))
         values = np.concatenate([values, found])
     return values
 
 
-def polish(space: Space, objective: Objective, point: Array, search: Search) -> tuple[Array, float]:
+def _polish(space: Space, objective: Objective, point: Array, search: Search) -> tuple[Array, float]:
     """Improve a point in its continuous unknowns; return the new point and its objective."""
     from scipy.optimize import least_squares, minimize
 
     free = space.continuous
     point = space.settled(point)
     if free.size == 0:
-        return point, float(sums(objective.residuals([space.values(point)]))[0])
+        return point, objective_of(objective, space.values(point))
 
     def full(x: Array) -> Array:
         whole = point.copy()
@@ -190,7 +180,7 @@ def polish(space: Space, objective: Objective, point: Array, search: Search) -> 
     best, value = full(result.x), float(2.0 * result.cost)
     if search.simplex > 0:
         simplex = minimize(
-            lambda x: float(sums(objective.residuals([space.values(full(x))]))[0]), best[free], method="Nelder-Mead",
+            lambda x: objective_of(objective, space.values(full(x))), best[free], method="Nelder-Mead",
             bounds=[(0.0, 1.0)] * free.size,
             options={"maxfev": search.simplex, "xatol": 1e-7, "fatol": 1e-7, "adaptive": True},
         )  # fmt: skip
@@ -200,9 +190,9 @@ def polish(space: Space, objective: Objective, point: Array, search: Search) -> 
 
 
 def jacobian(space: Space, objective: Objective, point: Array, step: float) -> Array:
-    """Return the Jacobian of the residuals in the unit cube, shape (r, n), by differences.
+    """Return the Jacobian of the residuals in the unit cube, shape (r, n); columns of choices are zero.
 
-    The differences are central, but one-sided at the walls of the cube. Columns of unknowns with choices are zero.
+    The differences are central, but one-sided at the walls of the cube.
     """
     free = space.continuous
     moved = np.repeat(point[None], 2 * free.size, axis=0)
@@ -217,6 +207,11 @@ def jacobian(space: Space, objective: Objective, point: Array, step: float) -> A
     return result
 
 
-def sums(residuals: Array) -> Array:
-    """Return the objective of each row of residuals, which is the sum of their squares."""
+def objective_of(objective: Objective, values: Mapping[str, Value]) -> float:
+    """Return the objective of one candidate."""
+    return float(_sums(objective.residuals([values]))[0])
+
+
+def _sums(residuals: Array) -> Array:
+    """Return the objective of each row of residuals, the sum of their squares."""
     return np.asarray((residuals**2).sum(axis=1))

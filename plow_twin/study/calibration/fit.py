@@ -1,4 +1,4 @@
-"""Results of a calibration as tables and files: the fitted scene, the targets, and the fit's uniqueness."""
+"""Results of a calibration as tables and files: the fitted scene, the targets, and the uniqueness of the fit."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from plow_twin.model.scene import Mark, Provenance, Scene
 from plow_twin.record.durable import write_whole
 from plow_twin.scene_file import dump_scene
 from plow_twin.study.calibration.calibrate import Calibration, Search
-from plow_twin.study.calibration.objective import Objective, TargetObjective
+from plow_twin.study.calibration.objective import TargetObjective
 from plow_twin.study.calibration.uniqueness import Cluster, Identifiability
 from plow_twin.study.calibration.unknowns import Space
 from plow_twin.study.parameters import Value, with_parameters
@@ -25,7 +25,7 @@ _NOT_NUMBERS: Final = ("sign", "scale", "labels", "law", "rotation")
 
 @dataclass(frozen=True)
 class TargetRow:
-    """One target at the best fit: statistics of its runs, residual, and whether it is met."""
+    """One target at the best fit."""
 
     name: str
     kind: str
@@ -41,7 +41,7 @@ class TargetRow:
 def fitted_scene(scene: Scene, values: Mapping[str, Value], source: str) -> Scene:
     """Return the scene with the fitted values; every number that they change is marked as reconstructed.
 
-    An unchanged number keeps its mark. A number of which only the sign has changed keeps the source of its magnitude.
+    A number whose sign alone has changed keeps the source of its size.
     """
     fit = with_parameters(scene, values)
     marks = dict(fit.marks)
@@ -68,7 +68,7 @@ def _mark(before: Any, after: Any, old: Provenance | None, source: str) -> Prove
 
 
 def _number_at(scene: Scene, key: str) -> Any:
-    """Return the number at a key of `Scene.marks`, such as `loads[0].force_n[1]`."""
+    """Return the number at a key such as `loads[0].force_n[1]`."""
     value: Any = scene
     for name, place in re.findall(r"(\w+)|\[(\d+)\]", key):
         value = getattr(value, name) if name else value[int(place)]
@@ -76,7 +76,7 @@ def _number_at(scene: Scene, key: str) -> Any:
 
 
 def target_rows(objective: TargetObjective, values: Mapping[str, Value]) -> list[TargetRow]:
-    """Return every target with the values that the candidate gives."""
+    """Return every target with the values of the candidate."""
     numbers, paths = objective.table(values)
     settings = list(objective.targets.settings)
     rows = []
@@ -104,7 +104,7 @@ class Fit:
     source: str
     identifiability: Identifiability
     clusters: list[Cluster]
-    #: objective of the scene as given; None if this scene is outside the ranges of the unknowns
+    #: objective of the given scene, or None outside the ranges of the unknowns
     before: float | None
     targets: list[TargetRow]
 
@@ -131,8 +131,3 @@ def write_fit(fit: Fit, space: Space, arguments: Mapping[str, Any], folder: Path
     write_whole(folder / "fit.yaml", dump_scene(fit.scene).encode(), sync=True)
     content = json.dumps(fit.plain(space, arguments), indent=1).encode()
     write_whole(folder / "calibration.json", content, sync=True)
-
-
-def objective_of(objective: Objective, values: Mapping[str, Value]) -> float:
-    """Return the objective of one candidate."""
-    return float((objective.residuals([values])[0] ** 2).sum())

@@ -1,4 +1,7 @@
-"""Objectives of a calibration: each candidate has one row of residuals, from targets or from a recorded motion."""
+"""Objectives of a calibration: the residuals of candidates, from targets or from a recorded motion.
+
+A *candidate* is a set of values of the unknowns.
+"""
 
 from __future__ import annotations
 
@@ -24,13 +27,13 @@ Values = Mapping[str, Value]
 
 
 class Objective(Protocol):
-    """The interface of an objective for a calibration."""
+    """A sum of squares to be minimised."""
 
     #: number of simulation runs so far
     runs: int
 
     def residuals(self, candidates: Sequence[Values], cut: float = np.inf) -> Array:
-        """Return the weighted residuals of m candidates, shape (m, r); the objective is their sum of squares.
+        """Return the weighted residuals of m candidates, shape (m, r).
 
         A candidate need not be evaluated to the end if its objective surely exceeds `cut`.
         """
@@ -38,7 +41,7 @@ class Objective(Protocol):
 
 @dataclass
 class TargetObjective:
-    """Residuals of targets (see `plow_twin.study.calibration.targets`)."""
+    """Residuals of targets (`plow_twin.study.calibration.targets`)."""
 
     scene: Scene
     targets: TargetSet
@@ -46,8 +49,7 @@ class TargetObjective:
     runs: int = 0
 
     def __post_init__(self) -> None:
-        # marks are removed, because they are never read here and a candidate without marks is made in a third of the
-        # time
+        # a candidate without marks is made in a third of the time
         self.scene = replace(self.scene, marks={})
 
     def residuals(self, candidates: Sequence[Values], cut: float = np.inf) -> Array:
@@ -64,12 +66,12 @@ class TargetObjective:
         return self._rows(table, paths, missing=FAILED_RESIDUAL)
 
     def unweighted(self, candidate: Values) -> Array:
-        """Return the unweighted residual of every target for one candidate, shape (targets,)."""
+        """Return the residual of every target for one candidate, shape (targets,)."""
         weights = np.sqrt([target.weight for target in self.targets.targets])
         return np.asarray(self.residuals([candidate])[0] / np.where(weights > 0.0, weights, 1.0))
 
     def table(self, candidate: Values) -> tuple[Array, list[str]]:
-        """Return the statistics of one candidate, shape (settings, paths), and the paths that name them."""
+        """Return the statistics of one candidate, shape (settings, paths), and their paths."""
         paths = sorted({path for target in self.targets.targets for path in target.paths})
         table = np.full((1, len(self.targets.settings), len(paths)), np.nan)
         self._fill(table, [candidate], np.arange(1), list(range(len(self.targets.settings))), paths)
@@ -78,14 +80,13 @@ class TargetObjective:
     def _fill(
         self, table: Array, candidates: Sequence[Values], rows: NDArray[np.int64], columns: list[int], paths: list[str]
     ) -> None:
-        """Run the candidates `rows` at the settings `columns` and put their statistics into the table."""
         scenes, places = [], []
         for row in rows:
             for column in columns:
                 try:
                     scenes.append(with_parameters(self.scene, {**self.targets.settings[column], **candidates[row]}))
                 except SceneError:
-                    continue  # impossible candidates get the residuals of a failed run
+                    continue
                 places.append((row, column))
         if not scenes:
             return
@@ -112,9 +113,8 @@ class TargetObjective:
 class RecordingObjective:
     """Distance from a recorded motion, (q - q recorded) / clearance at every row.
 
-    Angles are multiplied by the half diagonal. The rows are divided by the square root of their number, so that the
-    objective is the mean square error of x, y and theta together, relative to the clearance of the scene before the
-    fit.
+    Angles are multiplied by the half diagonal, and rows divided by the square root of their number. The objective is
+    thus the mean square error of x, y and theta together, relative to the clearance of the scene before the fit.
     """
 
     scene: Scene

@@ -17,18 +17,12 @@ from plow_twin.view.figures import signed, write_png
 from plow_twin.view.fitted import FittedPicture, FittedValue
 from plow_twin.view.fitted_file import write_fit_picture
 
-#: Larger residuals, such as those of failed runs, are drawn at this value.
+#: Largest residual in a picture; those of failed runs are larger.
 _MOST: Final = 5.0
 
 
 def draw_motion(fit: Fit, space: Space, objective: RecordingObjective, title: str, path: Path) -> None:
-    """Draw the recorded and the fitted motion as a PNG, or as a file for rerun if the suffix is .rrd.
-
-    Raises
-    ------
-    RecordingError
-        The file cannot be written.
-    """
+    """Draw the recorded and the fitted motion as a PNG, or as a file for rerun if the suffix is .rrd."""
     recording = objective.recording
     model = objective.motion(fit.calibration.best.values)
     values = [_value(unknown, fit) for unknown in space.unknowns if not unknown.choices]
@@ -40,7 +34,6 @@ def draw_motion(fit: Fit, space: Space, objective: RecordingObjective, title: st
 
 
 def _value(unknown: Unknown, fit: Fit) -> FittedValue:
-    """Return an unknown for the picture: its best value, the range of nearly as good values, and the search range."""
     value = fit.calibration.best.values[unknown.path]
     assert isinstance(value, float)
     low, high = fit.clusters[0].spread.get(unknown.path, (value, value)) if fit.clusters else (value, value)
@@ -56,7 +49,6 @@ def _value(unknown: Unknown, fit: Fit) -> FittedValue:
 
 
 def _notes(fit: Fit, space: Space) -> list[str]:
-    """Return objective, starts and choices in words."""
     found = fit.calibration
     before = "" if fit.before is None else f", before the fit {fit.before:.3g}"
     lines = [f"starts: {len(found.starts)}, objective of the best {found.best.objective:.3g}{before}"]
@@ -66,13 +58,7 @@ def _notes(fit: Fit, space: Space) -> list[str]:
 
 
 def draw_targets(fit: Fit, space: Space, title: str, path: Path) -> None:
-    """Draw the residual of each target as a PNG; the colour shows whether the target is met.
-
-    Raises
-    ------
-    RecordingError
-        The file cannot be written.
-    """
+    """Draw the residual of each target as a PNG; the colour shows whether the target is met."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12, 1.8 + 0.24 * len(fit.targets)), layout="constrained")
@@ -90,7 +76,6 @@ def draw_targets(fit: Fit, space: Space, title: str, path: Path) -> None:
 
 
 def _got_and_asked(target: TargetRow) -> str:
-    """Return the fitted and the published values of a target as text, forces in kN."""
     unit = unit_of(target.statistic)
     factor, shown = (1e-3, " kN") if unit == "N" else (1.0, "" if unit == "1" else f" {unit}")
     got = ", ".join(signed(factor * value, ".4g") for value in target.got)

@@ -23,18 +23,20 @@ Array = NDArray[np.float64]
 COLUMNS: Final = ("t", "x", "y", "theta")
 #: Largest unpacked size of an archive [B].
 _LARGEST_ARCHIVE: Final = 2**28
-#: Largest number of rows of a simulated motion; the motion is then interpolated to the recorded times.
+#: Largest number of rows of a simulated motion.
 _MOST_ROWS: Final = 20_000
 
 
 @dataclass(frozen=True)
 class PoseRecording:
-    """Recorded motion: times t [s], shape (n,), on the scene's clock, and q, shape (n, 3): x, y [m], theta [rad]."""
+    """Recorded motion: times t [s], shape (n,), on the clock of the scene, and q, shape (n, 3), with x, y [m], theta
+    [rad].
+    """
 
     t: Array
     q: Array
     source: str = ""
-    #: the recorded load; it replaces the loads of the scene
+    #: the recorded load, which replaces the loads of the scene
     load: Table | None = None
 
     @property
@@ -52,12 +54,7 @@ class PoseRecording:
         h = t[right] - t[left]
         s = ((self.t - t[left]) / h)[:, None]
         h = h[:, None]
-        q0, q1, v0, v1 = (
-            members.q[:, left],
-            members.q[:, right],
-            members.v[:, left],
-            members.v[:, right],
-        )
+        q0, q1, v0, v1 = members.q[:, left], members.q[:, right], members.v[:, left], members.v[:, right]
         return np.asarray(
             (1.0 + 2.0 * s) * (1.0 - s) ** 2 * q0
             + s * (1.0 - s) ** 2 * h * v0

@@ -7,10 +7,10 @@ Each target gives one residual r of a candidate, 0 if it is met exactly:
     above              r = max(0, largest of the others - s) / (tolerance |largest|)          met: r = 0
     trend              r = (steps the wrong way + shortfall of the rise or fall) / (tolerance mean)   met: r = 0
 
-Here s is the statistic of the run with the parameters in the target's `set`; if the target names several statistics, s
-is the smallest of them. A trend is judged over a sequence of runs along one parameter. For `rises_then_falls` the
-turning point with the smallest violation is used. Rise and fall must each be at least `margin` times the mean. The
-objective is the sum of weight times r^2.
+Here s is the statistic of the run with the parameters in the target's `set`, or the smallest if the target names
+several. A trend is judged over a sequence of runs along one parameter. For `rises_then_falls` the turning point with
+the smallest violation counts; rise and fall must each be at least `margin` times the mean. The objective is the sum of
+weight times r^2.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ from plow_twin.study.statistics import statistic
 Array = NDArray[np.float64]
 
 TRENDS: Final = ("rises", "falls", "rises_then_falls")
-#: Residual of a target if one of its runs has failed or was omitted.
+#: Residual of a target whose run failed or was omitted.
 FAILED_RESIDUAL: Final = 10.0
 
 
 @dataclass(frozen=True)
 class Target:
-    """A target; the module's docstring explains each kind."""
+    """A target; the docstring of the module explains each kind."""
 
     name: str
     kind: str
@@ -92,7 +92,7 @@ class Target:
 
 
 def _wrong_way(s: Array, least: Array) -> Array:
-    """Return the sum of downward steps of a sequence that should rise, plus the shortfall of its rise from `least`."""
+    """Return the sum of the downward steps of a sequence that should rise, plus the shortfall of its rise."""
     down = np.maximum(0.0, -np.diff(s, axis=1)).sum(axis=1)
     return np.asarray(down + np.maximum(0.0, least - (s[:, -1] - s[:, 0])))
 
@@ -105,7 +105,7 @@ class TargetSet:
     t_end_s: float
     tol: float = 1e-6
     source: str = ""
-    #: unknowns that the file proposes, written as on the command line
+    #: unknowns that the file proposes, as on the command line
     unknowns: tuple[str, ...] = ()
     settings: tuple[Mapping[str, Value], ...] = field(init=False)
 
@@ -113,7 +113,7 @@ class TargetSet:
         unique: list[Mapping[str, Value]] = []
         for target in self.targets:
             unique += [setting for setting in target.settings if setting not in unique]
-        # the setting that most targets use comes first; a candidate that fails at this setting needs no further runs
+        # the setting that most targets use comes first: a candidate that fails there needs no further runs
         uses = [sum(setting in target.settings for target in self.targets) for setting in unique]
         order = sorted(range(len(unique)), key=lambda index: -uses[index])
         object.__setattr__(self, "settings", tuple(unique[index] for index in order))
@@ -143,7 +143,6 @@ _TEXTS: Final[Schema] = {
     "anyOf": [TEXT, {"type": "array", "items": TEXT, "minItems": 1, "description": "one or more texts"}],
     "description": "a text, or a list of texts",
 }
-#: The kinds of targets; each target is of one kind.
 _KINDS: Final[dict[str, Schema]] = {
     "value": {**NUMBER, "not": {"const": 0}, "description": "a number but 0, because the tolerance is relative"},
     "at_least": NUMBER,
@@ -179,13 +178,7 @@ _FILE: Final = mapping(
 
 
 def load_targets(path: Path, scene: Scene) -> TargetSet:
-    """Read a target file.
-
-    Raises
-    ------
-    StudyError
-        The file cannot be read or used; the error lists every problem.
-    """
+    """Read a target file, or raise a `StudyError` that lists every problem."""
     raw, found = read_yaml(path, "target", "version, t_end, targets")
     problems = [str(problem) for problem in found or validate(raw, _FILE, "targets")]
     items = raw.get("targets") if isinstance(raw, dict) and not found else None
@@ -205,7 +198,6 @@ def load_targets(path: Path, scene: Scene) -> TargetSet:
 
 
 def _target(item: Mapping[str, Any], scene: Scene) -> Target:
-    """Return a target that fits the schema; its paths are checked against the scene."""
     kind = next(kind for kind in _KINDS if kind in item)
     names = _texts(item["statistic"])
     others = _texts(item["above"]) if kind == "above" else ()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,22 +15,22 @@ from plow_twin.study.parameters import Value
 
 Array = NDArray[np.float64]
 
+#: Step of the Jacobian in the unit cube.
+_STEP: Final = 1e-5
+#: Largest difference of an unknown within a cluster, as a share of its range.
+_DISTANCE: Final = 0.1
+
 
 @dataclass(frozen=True)
 class Identifiability:
-    """Singular values of dr/dz at the optimum: residuals r, places z (0..1) of the unknowns with a range.
+    """Singular values of dr/dz at the optimum, with residuals r and places z (0..1) of the unknowns with a range.
 
-    `weakest` is the singular vector of the smallest value: the data determine this combination of unknowns least.
+    `weakest` is the singular vector of the smallest value, the combination of unknowns that the data determine least.
     """
 
     paths: tuple[str, ...]
     singular_values: tuple[float, ...]
     weakest: dict[str, float]
-
-    @property
-    def condition(self) -> float:
-        """Ratio of the largest to the smallest singular value."""
-        return float(np.divide(self.singular_values[0], self.singular_values[-1])) if self.singular_values else 1.0
 
 
 @dataclass(frozen=True)
@@ -43,26 +44,22 @@ class Cluster:
     spread: dict[str, tuple[float, float]]
 
 
-def identifiability(space: Space, objective: Objective, point: Array, step: float = 1e-5) -> Identifiability:
+def identifiability(space: Space, objective: Objective, point: Array) -> Identifiability:
     """Return the singular values of the Jacobian at a point."""
     free = space.continuous
     paths = tuple(space.unknowns[index].path for index in free)
     if free.size == 0:
         return Identifiability((), (), {})
-    _, singular, right = np.linalg.svd(jacobian(space, objective, point, step)[:, free], full_matrices=False)
-    # the sign of a singular vector is arbitrary, so its largest component is made positive
+    _, singular, right = np.linalg.svd(jacobian(space, objective, point, _STEP)[:, free], full_matrices=False)
+    # the sign of a singular vector is arbitrary; here its largest component is positive
     weakest = right[-1] * np.sign(right[-1][np.argmax(np.abs(right[-1]))])
     return Identifiability(
         paths, tuple(map(float, singular)), {path: float(x) for path, x in zip(paths, weakest, strict=True)}
     )
 
 
-def near_optimal(space: Space, found: Calibration, excess: float, distance: float = 0.1) -> list[Cluster]:
-    """Cluster all found points whose objective exceeds the best objective by at most `excess`.
-
-    Points are in one cluster if their choices are equal and no unknown differs by more than `distance` of its range
-    (complete linkage). The clusters are sorted, best first.
-    """
+def near_optimal(space: Space, found: Calibration, excess: float) -> list[Cluster]:
+    """Cluster all found points whose objective exceeds the best by at most `excess`; the best cluster comes first."""
     points = np.concatenate([[start.point for start in found.starts], found.population])
     values = np.concatenate([[start.objective for start in found.starts], found.population_objective])
     keep = values <= found.best.objective + excess
@@ -75,17 +72,18 @@ def near_optimal(space: Space, found: Calibration, excess: float, distance: floa
     clusters = [
         _cluster(space, points[rows], values[rows])
         for members in groups.values()
-        for rows in _linked(points, np.array(members), distance)
+        for rows in _linked(points, np.array(members))
     ]
     return sorted(clusters, key=lambda cluster: cluster.objective)
 
 
-def _linked(points: Array, rows: NDArray[np.int64], distance: float) -> list[NDArray[np.int64]]:
+def _linked(points: Array, rows: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Return the rows of each cluster by complete linkage."""
     from scipy.cluster.hierarchy import fcluster, linkage
 
     if len(rows) == 1:
         return [rows]
-    labels = fcluster(linkage(points[rows], "complete", metric="chebyshev"), distance, "distance")
+    labels = fcluster(linkage(points[rows], "complete", metric="chebyshev"), _DISTANCE, "distance")
     return [rows[labels == label] for label in np.unique(labels)]
 
 

@@ -1,9 +1,11 @@
-"""Unknowns of a calibration: the map between the unit cube and the values of a scene's parameters."""
+"""Unknowns of a calibration: the map between the unit cube and the values of parameters.
+
+A *place* is a coordinate 0..1 of the cube.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,7 +28,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Unknown:
-    """A parameter to find: a number from `low` to `high` (uniform in the logarithm if `log`), or one of `choices`."""
+    """A number from `low` to `high` (uniform in the logarithm if `log`), or one of `choices`."""
 
     path: str
     low: float = 0.0
@@ -35,7 +37,7 @@ class Unknown:
     choices: tuple[Value, ...] = ()
 
     def value(self, place: float) -> Value:
-        """Return the value at a place 0..1 of the range."""
+        """Return the value at a place."""
         if self.choices:
             return self.choices[min(int(place * len(self.choices)), len(self.choices) - 1)]
         if self.log:
@@ -43,7 +45,7 @@ class Unknown:
         return float(self.low + (self.high - self.low) * place)
 
     def place(self, value: Value) -> float:
-        """Return the place 0..1 of a value; a choice is at the middle of its equal share of 0..1."""
+        """Return the place of a value; each choice has an equal share of 0..1 and is placed in its middle."""
         if self.choices:
             return (self.choices.index(value) + 0.5) / len(self.choices)
         number = float(value)
@@ -56,13 +58,7 @@ class Unknown:
 
 
 def parse_unknown(text: str, scene: Scene) -> Unknown:
-    """Read `PATH=LOW:HIGH[:log]`, `PATH=CHOICE,CHOICE..` or, for a sign, `PATH` alone.
-
-    Raises
-    ------
-    StudyError
-        The text is not an unknown; the message names the unknown, the value got and the value expected.
-    """
+    """Read `PATH=LOW:HIGH[:log]`, `PATH=CHOICE,CHOICE..` or, for a sign, `PATH`; raise a `StudyError` for others."""
     path, equals, rest = text.partition("=")
     check_path(scene, path)
     if not equals:
@@ -97,7 +93,7 @@ def _number(path: str, text: str) -> float:
 
 @dataclass(frozen=True)
 class Space:
-    """The space of all unknowns: a cube of places 0..1."""
+    """The cube of the places of all unknowns."""
 
     unknowns: tuple[Unknown, ...]
 
@@ -137,15 +133,13 @@ class Space:
         return np.array(places)
 
     def settled(self, point: Array) -> Array:
-        """Return the point with each choice in the middle of its share, so that equal choices have equal places."""
-        choices: Sequence[Unknown] = self.unknowns
-        return np.array(
-            [u.place(u.value(float(x))) if u.choices else float(x) for u, x in zip(choices, point, strict=True)]
-        )
+        """Return the point with each choice in the middle of its share."""
+        places = zip(self.unknowns, point, strict=True)
+        return np.array([u.place(u.value(float(x))) if u.choices else float(x) for u, x in places])
 
 
-def check_usable(space: Space, scene: Scene, trials: int = 100) -> None:
-    """Raise a `SceneError` (of the first point) if none of `trials` random points gives a usable scene."""
-    points = np.random.default_rng(0).random((trials, space.size))
+def check_usable(space: Space, scene: Scene) -> None:
+    """Raise a `SceneError` if none of 100 random points gives a usable scene."""
+    points = np.random.default_rng(0).random((100, space.size))
     if not any(is_usable(scene, values) for values in space.values_of(points)):
         with_parameters(scene, space.values(points[0]))

@@ -12,25 +12,22 @@ from scipy.stats import t as student
 
 Array = NDArray[np.float64]
 
-#: Number of bootstrap draws, with which the 2.5 % point of an interval has a standard error of 0.5 %.
+#: Number of bootstrap draws. The share of draws below the 2.5 % point then has a standard error of 0.5 %.
 _DRAWS: Final = 1000
-#: Smallest number of windows that can distinguish a change from chance.
 FEWEST: Final = 8
-#: Smallest variation of the load within groups, relative to the mean load; a smaller variation does not show how a
-#: quantity depends on the load.
+#: Smallest variation of the load within groups, relative to its mean, that shows how a quantity depends on the load.
 _LEAST_VARIATION: Final = 0.01
-#: If the loads of two groups differ by less than this share, they are treated as equal.
+#: Loads that differ by less than this share are treated as equal.
 _EQUAL_LOAD: Final = 0.01
-#: The loads of two groups must overlap between these percentiles [%], because a slope is valid only near the loads from
-#: which it was computed.
+#: The loads of two groups must overlap between these percentiles [%]: a slope is valid only near the loads that gave
+#: it.
 _USUAL: Final = (5.0, 95.0)
-#: Probability below which a change is statistically significant.
 _LEVEL: Final = 0.05
-#: Number of windows that are drawn at once; it limits the memory that is used.
+#: Windows drawn at once, which limits the memory.
 _AT_ONCE: Final = 2**21
-#: Relative difference that rounding alone can cause between the means of equal numbers.
+#: Relative difference that rounding can cause between means of equal numbers.
 _ROUNDING: Final = 1e-12
-#: Largest distance between the starts of two windows that count as neighbours, in window lengths.
+#: Largest distance between the starts of neighbouring windows, in window lengths.
 _NEXT: Final = 1.5
 
 
@@ -38,17 +35,13 @@ _NEXT: Final = 1.5
 class Change:
     """Change of a mean from one group to another, relative to the first mean.
 
-    Attributes
-    ----------
-    share, low, high : float
-        The relative change and the limits of its 95 % interval.
-    chance : float
-        Probability that such a change occurs by chance, adjusted for the number of cells (a quantity of a pair, or a
-        clearance) that are judged together (Benjamini and Hochberg). Of the cells with a probability below 0.05, about
-        one in twenty is below 0.05 only by chance.
-    machine, machine_low, machine_high, machine_chance : float or None
-        The same four numbers for the change at equal load; None if the load varies too little to show how the quantity
-        depends on it, or if the loads of the groups do not overlap.
+    `share` has the 95 % interval from `low` to `high`. `chance` is the probability that such a change occurs by chance.
+    It is adjusted for the number of cells, which are judged together (Benjamini and Hochberg); a *cell* is a quantity
+    of a pair, or a clearance. Of the cells with a probability below 0.05, about one in twenty has not changed.
+
+    The numbers `machine`, `machine_low`, `machine_high` and `machine_chance` are the same for the change at equal load.
+    They are None if the loads of the groups do not overlap, or vary too little to show how the quantity depends on
+    them.
     """
 
     share: float
@@ -71,7 +64,7 @@ class Change:
 
 
 def points(values: Array) -> dict[str, float]:
-    """Return mean, 5 %, 50 % and 95 % points of the values of windows, shape (n,)."""
+    """Return mean, 5 %, 50 % and 95 % points of values, shape (n,)."""
     p05, p50, p95 = np.percentile(values, (5.0, 50.0, 95.0)).tolist()
     return {"mean": float(values.mean()), "p05": p05, "p50": p50, "p95": p95}
 
@@ -79,10 +72,9 @@ def points(values: Array) -> dict[str, float]:
 def with_neighbours(load: Array, start_ns: NDArray[np.int64]) -> Array:
     """Return the load of each window, of the window before and of the window after, shape (n, 3).
 
-    A missing neighbour gets the window's own load. The neighbours are included because the load may change within a
-    window, and the head's motion still depends on the earlier load. The effect of a lasting change of the load is
-    therefore the sum of the slopes with respect to all three loads, not only the slope with respect to the window's own
-    load.
+    The load may change within a window, and the motion of the head still depends on the earlier load. The effect of a
+    lasting change of the load is therefore the sum of the slopes by all three loads. A missing neighbour has the load
+    of the window itself.
     """
     steps = np.diff(start_ns)
     joined = (steps > 0) & (steps < _NEXT * np.median(steps)) if len(steps) else steps > 0
@@ -92,43 +84,24 @@ def with_neighbours(load: Array, start_ns: NDArray[np.int64]) -> Array:
 
 
 class Drawn:
-    """Means and covariances of a group: row 0 for all windows, every other row for a bootstrap draw.
+    """Means and covariances of a group of windows: row 0 for all windows, every other row for a bootstrap draw.
 
-    Parameters
-    ----------
-    values
-        Quantities of the windows, shape (n, k).
-    load
-        Load of the windows, shape (n,), or the loads of `with_neighbours`, shape (n, 3).
-    random
-        Generator of the draws.
-    draws
-        Number of draws.
-
-    Attributes
-    ----------
-    usual : ndarray, shape (2,)
-        Smallest and largest usual load (`_USUAL`).
-    size : int
-        Number of windows in a draw.
-    mean : ndarray, shape (draws + 1, k)
-        Means of the quantities.
-    load : ndarray, shape (draws + 1, m)
-        Means of the loads.
-    within : ndarray, shape (draws + 1, m, m + k)
-        Covariance of the loads with each other and with the quantities.
+    `values`, shape (n, k), are quantities of n windows. `load`, shape (n,) or (n, m), has the load of each window in
+    its first column.
     """
 
     def __init__(self, values: Array, load: Array, random: np.random.Generator, draws: int = _DRAWS) -> None:
         load = load.reshape(len(load), -1)
+        #: number of windows
         self.size, width = load.shape
+        #: limits of the usual loads
         self.usual = np.percentile(load[:, 0], _USUAL)
         whole = np.hstack((load, values))
         usual = whole.mean(axis=0)
         centred = whole - usual
         means, products = [np.zeros((1, whole.shape[1]))], [centred[:, :width].T @ centred / self.size]
         done = 0
-        while done < draws:  # each round makes as many draws as the memory allows
+        while done < draws:
             count = min(draws - done, max(1, _AT_ONCE // self.size))
             done += count
             times = np.stack(
@@ -138,17 +111,19 @@ class Drawn:
             means.append(weights @ centred)
             products.append(np.stack([weights @ (centred[:, [one]] * centred) for one in range(width)], axis=1))
         offset = np.concatenate(means)
+        #: means of the quantities, shape (draws + 1, k), and of the loads, shape (draws + 1, m)
         self.mean, self.load = (usual + offset)[:, width:], (usual + offset)[:, :width]
         second = np.concatenate([part.reshape(-1, width, whole.shape[1]) for part in products])
+        #: covariance of the loads with each other and with the quantities, shape (draws + 1, m, m + k)
         self.within = second - offset[:, :width, None] * offset[:, None, :]
 
 
 def changes(before: Drawn, after: Drawn) -> list[Change | None]:
-    """Return the changes of quantities between two groups of windows, None if there are too few windows.
+    """Return the change of each quantity between two groups of windows, None if there are too few windows.
 
-    Means are compared by a bootstrap over windows. For the comparison at equal load, the part of a change that follows
-    from the load is subtracted. The slopes for this part come from the variation of the load within the groups
-    (analysis of covariance).
+    The means are compared by a bootstrap over windows. For the comparison at equal load, the part of a change that
+    follows from the load is subtracted (analysis of covariance). The slopes come from the variation of the load within
+    the groups.
 
     References
     ----------
@@ -176,8 +151,7 @@ def changes(before: Drawn, after: Drawn) -> list[Change | None]:
 def _tested(differences: Array, mean: Array, fewest: int) -> tuple[Array, Array, Array, Array]:
     """Return share, low, high and adjusted chance of each column; row 0 has values, the other rows draws.
 
-    Student's t distribution gets the degrees of freedom of the smaller group, so that the probabilities are too large
-    rather than too small.
+    Student's t distribution has the degrees of freedom of the smaller group, so the probabilities are rather too large.
     """
     drawn = np.divide(differences, mean, out=np.full_like(mean, np.nan), where=mean > 0.0)
     low, high = np.nanpercentile(drawn[1:], (2.5, 97.5), axis=0)
@@ -189,14 +163,13 @@ def _tested(differences: Array, mean: Array, fewest: int) -> tuple[Array, Array,
 
 
 def _apart(before: Drawn, after: Drawn) -> bool:
-    """Return whether the loads of two groups differ and do not overlap."""
     first, second = before.load[0, 0], after.load[0, 0]
     differ = abs(second - first) >= _EQUAL_LOAD * first
     return bool(differ and (before.usual[0] > after.usual[1] or after.usual[0] > before.usual[1]))
 
 
 def _at_equal_load(before: Drawn, after: Drawn) -> Array:
-    """Return the differences of the means at the first group's load, NaN if the load hardly varies."""
+    """Return the differences of the means at the load of the first group, NaN if the load hardly varies."""
     usual, difference = before.load[:, 0], after.load - before.load
     changed = np.abs(difference[:, 0]) >= _EQUAL_LOAD * usual
     width, size = difference.shape[1], before.size + after.size

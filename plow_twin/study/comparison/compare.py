@@ -1,4 +1,4 @@
-"""The comparison of runs: `compare` groups them by run, day or shift, and compares each group with the first."""
+"""The comparison of runs: `compare` groups windows by run, day or shift, and compares each group with the first."""
 
 from __future__ import annotations
 
@@ -17,43 +17,27 @@ from plow_twin.record.recording import read_recording
 from plow_twin.study.comparison.change import Change, Drawn, changes, points, with_neighbours
 from plow_twin.study.comparison.windows import FULL, QUANTITIES, Windows, windows_of
 
-#: Smallest stamp [ns] that counts as a date: 1e18 ns is in the year 2001.
+#: Smallest stamp [ns] that counts as a date; 1e18 ns is in the year 2001.
 _DATES_NS: Final = 10**18
-#: Share of a window that may be without messages.
-_MISSING: Final = 1.0 - FULL
-#: Default start times of the shifts.
 SHIFTS: Final = (time(6), time(14), time(22))
 
-#: Function that returns the label of a window's group, given the run's name and the window's stamp [ns].
+#: Function of a run's name and a window's stamp [ns] that returns the group of the window.
 Label = Callable[[str, int], str]
 
 
 @dataclass
 class Comparison:
-    """Groups of windows in order of first appearance, and the change from the first group to every other group.
-
-    Attributes
-    ----------
-    groups : dict of str to Windows
-        All windows of a group.
-    runs : dict of str to list of str
-        Names of the runs that have windows in a group, by group.
-    changes : dict
-        `Change` by group (except the first), pair and quantity; None if there are too few windows.
-    clearance_changes : dict
-        `Change` by group (except the first) and by `horizontal` and `vertical`.
-    scenes : list of str
-        Names of the scenes of all runs.
-    notes : list of str
-        Reasons to doubt the comparison: stretches without samples, times covered by several runs, different sample
-        rates or scenes.
-    """
+    """Groups of windows in order of first appearance, and the change from the first group to every other group."""
 
     groups: dict[str, Windows]
+    #: names of the runs with windows in a group
     runs: dict[str, list[str]]
+    #: changes by group (except the first), pair and quantity; None if there are too few windows
     changes: dict[str, dict[str, dict[str, Change | None]]] = field(default_factory=dict)
+    #: changes by group (except the first) and axis
     clearance_changes: dict[str, dict[str, Change | None]] = field(default_factory=dict)
     scenes: list[str] = field(default_factory=list)
+    #: reasons to doubt the comparison
     notes: list[str] = field(default_factory=list)
 
     def facts(self) -> dict[str, Any]:
@@ -90,7 +74,6 @@ class Comparison:
 
 
 def _facts(changes: Mapping[str, Change | None]) -> dict[str, Any]:
-    """Return changes as plain values."""
     return {
         name: None if found is None else {**vars(found), "verdict": found.verdict} for name, found in changes.items()
     }
@@ -102,21 +85,9 @@ def by_run(name: str, stamp_ns: int) -> str:
 
 
 def by_time(kind: str, shifts: Sequence[time] = SHIFTS, zone: tzinfo = UTC) -> Label:
-    """Return a function that labels a window in a time zone with its day, or its shift (see `shifts`).
+    """Return a function that labels a window with its day or its shift (`kind`) in a time zone.
 
-    Parameters
-    ----------
-    kind
-        `day` or `shift`.
-    shifts
-        Times at which shifts begin.
-    zone
-        Time zone of days and shifts.
-
-    Raises
-    ------
-    RecordingError
-        Raised by the returned function if a stamp is not a date.
+    Shifts begin at the times `shifts`. The function raises a `RecordingError` if a stamp is not a date.
     """
     begins = sorted(shifts)
 
@@ -127,7 +98,7 @@ def by_time(kind: str, shifts: Sequence[time] = SHIFTS, zone: tzinfo = UTC) -> L
         if kind == "day":
             return at.strftime("%Y-%m-%d")
         before = [begin for begin in begins if begin <= at.time()]
-        if not before:  # a time before the first shift of a day belongs to the last shift of the previous day
+        if not before:  # before the first shift of a day, the last shift of the day before still runs
             return f"{(at - timedelta(days=1)).strftime('%Y-%m-%d')} {begins[-1].strftime('%H:%M')}"
         return f"{at.strftime('%Y-%m-%d')} {before[-1].strftime('%H:%M')}"
 
@@ -140,18 +111,10 @@ def compare(
     seed: int = 0,
     scenes: Mapping[str, tuple[str, str]] = MappingProxyType({}),
 ) -> Comparison:
-    """Return the windows of the runs in groups, and the change from the first group to every other group.
+    """Return the windows of runs in groups, and the change from the first group to every other group.
 
-    Parameters
-    ----------
-    runs
-        Name and windows of each run, in order of time.
-    label
-        Function that returns the group of a window.
-    seed
-        Seed of the bootstrap draws.
-    scenes
-        Name and contents of each run's scene.
+    `runs` are names and windows in order of time, `scenes` name and contents of each run's scene. `seed` is that of the
+    bootstrap draws.
 
     Raises
     ------
@@ -201,22 +164,20 @@ def _cells(windows: Windows) -> np.ndarray[Any, Any]:
 
 
 def _overlapping(windows: Windows, others: Windows) -> np.ndarray[Any, Any]:
-    """Return a mask of the windows that overlap in time with a window of `others`."""
     if not len(others.start_ns):
         return np.zeros(len(windows.start_ns), bool)
     order = np.argsort(others.start_ns)
     (begins, ends), (starts, stops) = (
-        # begin and end of the part of a window in which there surely are messages
-        ((part.start_ns + _MISSING * part.length_ns), (part.start_ns + FULL * part.length_ns))
+        # begin and end of the part that surely has messages
+        ((part.start_ns + (1.0 - FULL) * part.length_ns), (part.start_ns + FULL * part.length_ns))
         for part in (windows, others)
     )
     starts, stops = starts[order], stops[order]
-    before = np.searchsorted(starts, ends) - 1  # the last of the other windows that begin before a window's end
+    before = np.searchsorted(starts, ends) - 1  # the last of the others that begins before a window ends
     return np.asarray((before >= 0) & (stops[before] > begins))
 
 
 def _rates_apart(runs: Sequence[tuple[str, Windows]]) -> list[str]:
-    """Return a note with the sample rates of the runs if they differ."""
     rates = {name: float(windows.rate_hz.mean()) for name, windows in runs if len(windows.rate_hz)}
     if not rates or min(rates.values()) >= FULL * max(rates.values()):
         return []
@@ -225,7 +186,6 @@ def _rates_apart(runs: Sequence[tuple[str, Windows]]) -> list[str]:
 
 
 def _scenes_apart(scenes: Mapping[str, tuple[str, str]]) -> list[str]:
-    """Return a note with the scenes of the runs if their contents differ."""
     if len({contents for _, contents in scenes.values()}) < 2:
         return []
     found = ", ".join(f"{run} {name or 'without a name'}" for run, (name, _) in scenes.items())
@@ -234,7 +194,7 @@ def _scenes_apart(scenes: Mapping[str, tuple[str, str]]) -> list[str]:
 
 @dataclass(frozen=True)
 class WindowsTask:
-    """The windows of one run, as a task that another process can run."""
+    """The windows of one run, as a `RunTask`."""
 
     path: Path
     window_s: float | None = None
@@ -244,13 +204,7 @@ class WindowsTask:
         return None
 
     def run(self) -> dict[str, Any]:
-        """Return the windows (`windows`), the run's losses (`lost`), and name and contents of its scene (`scene`).
-
-        Raises
-        ------
-        RecordingError
-            The run cannot be used.
-        """
+        """Return `windows`, the losses of the run (`lost`), and name and contents of its scene (`scene`)."""
         recording = read_recording(self.path)
         windows = windows_of(recording, self.window_s)
         scene = Path(str(recording.header.parameters.get("scene", ""))).name

@@ -20,22 +20,16 @@ from plow_twin.view.section import PAIR_COLORS
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: `_MOST_BOXES`: largest number of groups that are drawn as boxes
+#: `_MOST_BOXES`: largest number of groups drawn as boxes
 #: `_MOST_LABELS`: largest number of names on the axis
-#: `_WIDEST`: if a line of a name has more letters, all names are drawn slanted
+#: `_WIDEST`: names with longer lines are drawn slanted
 _MOST_BOXES: Final = 6
 _MOST_LABELS: Final = 12
 _WIDEST: Final = 10
 
 
 def write_comparison(found: Comparison, lost: dict[str, Any], out: Path) -> None:
-    """Write `compare.html`, `compare.json` and `windows.parquet` to a folder.
-
-    Raises
-    ------
-    ModuleNotFoundError
-        jinja2, matplotlib or pyarrow (extra `study`) is not installed.
-    """
+    """Write `compare.html`, `compare.json` and `windows.parquet` to a folder."""
     out.mkdir(parents=True, exist_ok=True)
     facts = found.facts()
     write_json(out / "compare.json", {**facts, "lost": lost})
@@ -51,7 +45,6 @@ def write_comparison(found: Comparison, lost: dict[str, Any], out: Path) -> None
 
 
 def _figure(found: Comparison) -> Figure:
-    """Return the distributions of the peaks by pair and group."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 4.5), layout="constrained")
@@ -77,7 +70,7 @@ def _figure(found: Comparison) -> Figure:
 
 
 def _lines(axis: Any, found: Comparison) -> None:
-    """Draw median and 95 % point of each pair's peaks as lines over many groups, because their boxes would overlap."""
+    """Draw median and 95 % point of each pair's peaks as lines, because many boxes would overlap."""
     peaks = [windows.pairs["peak"] / 1e3 for windows in found.groups.values()]
     places = np.arange(len(peaks))
     median, high = (np.array([np.percentile(values, point, axis=0) for values in peaks]) for point in (50.0, 95.0))
@@ -86,7 +79,7 @@ def _lines(axis: Any, found: Comparison) -> None:
         axis.plot(places, median[:, pair], color=color, label=name)
         axis.plot(places, high[:, pair], color=color, ls=":", lw=1.0)
     shown = places[:: 1 + len(places) // _MOST_LABELS]
-    # date and time of a shift are on two lines
+    # the time of a shift is written below its date
     names = [list(found.groups)[place].replace(" ", "\n") for place in shown]
     slanted = max(len(line) for name in names for line in name.split("\n")) > _WIDEST
     axis.set_xticks(shown, names, rotation=30 if slanted else 0, ha="right" if slanted else "center", fontsize=8)
@@ -96,7 +89,6 @@ def _lines(axis: Any, found: Comparison) -> None:
 
 
 def _title(found: Comparison) -> str:
-    """Return the scenes and, if stamps are dates, the dates of the first and the last window."""
     starts = np.concatenate([windows.start_ns for windows in found.groups.values()])
     first, last = date_text(int(starts.min())), date_text(int(starts.max()))
     span = f"{first} to {last}" if first else f"drawn {datetime.now(UTC):%Y-%m-%d}"
@@ -105,7 +97,7 @@ def _title(found: Comparison) -> str:
 
 
 def _write_windows(found: Comparison, path: Path) -> None:
-    """Write a row group for each group of windows, so that memory holds a copy of only one group at a time."""
+    """Write a row group for each group of windows, so that memory holds a copy of only one group."""
     import pyarrow as pa
     import pyarrow.parquet
 

@@ -13,43 +13,29 @@ from plow_twin.study.measured.square import LEAST_ROWS, RATE_HZ, bands
 
 Array = NDArray[np.float64]
 
-#: Half the side of the square in m.
+#: Half the side of the square [m].
 _HALF: Final = 0.03
-#: Criteria of an impact. `_FALL`: free-fall acceleration [m/s^2]
-#: `_JERK`: smallest deviation of the vertical acceleration from `_FALL` [m/s^2]
-#: `_TWIST`: smallest angular acceleration [rad/s^2]
-#: `_NEAR`: largest gap [m]
+#: Criteria of an impact: free-fall acceleration and smallest deviation from it [m/s^2], smallest angular acceleration
+#: [rad/s^2], largest gap [m].
 _FALL, _JERK, _TWIST, _NEAR = 9.0, 9.0, 300.0, 0.03
-#: Smallest rise in m between two separate bounces.
+#: Smallest rise between two bounces [m].
 _RISE: Final = 0.003
 
 
 @dataclass(frozen=True)
 class Drops:
-    """Measured drops of the square.
+    """Measured drops of the square."""
 
-    Attributes
-    ----------
-    pose : ndarray, shape (n, rows, 3)
-        x, z [m] and unwrapped theta [rad] at 250 Hz.
-    flight_rows : ndarray, shape (n,)
-        Number of rows before the first impact.
-    bounces : tuple of tuple of int
-        For each drop, the rows of the lowest points between rises of 3 mm.
-    """
-
+    #: x, z [m] and unwrapped theta [rad] at 250 Hz, shape (n, rows, 3)
     pose: Array
+    #: number of rows before the first impact, shape (n,)
     flight_rows: NDArray[np.intp]
+    #: rows of the lowest points of each drop, between rises of 3 mm
     bounces: tuple[tuple[int, ...], ...]
 
     @classmethod
     def load(cls, path: Path) -> Drops:
-        """Read the file of drops (`benchmark/data/measured/square_drops.npz`).
-
-        Parameters
-        ----------
-        path : Path
-        """
+        """Read a file of drops (`benchmark/data/measured/square_drops.npz`)."""
         with np.load(path) as data:
             pose = data["pose"] * data["scale"]
         pose[:, :, 2] = np.unwrap(pose[:, :, 2], axis=1)
@@ -57,24 +43,22 @@ class Drops:
         return cls(pose, flights, tuple(_bounces(one[:, 1]) for one in pose))
 
     def usable(self) -> list[int]:
-        """Return the indices of the drops with at least two bounces and with a flight that can be fitted."""
-        enough = [i for i, given in enumerate(self.flight_rows) if given > LEAST_ROWS and len(self.bounces[i]) > 1]
-        return enough
+        """Return the indices of the drops with at least two bounces and a flight that can be fitted."""
+        return [i for i, given in enumerate(self.flight_rows) if given > LEAST_ROWS and len(self.bounces[i]) > 1]
 
     def until(self, index: int, bounce: int) -> int:
-        """Return the row of bounce number `bounce` (from 0), or of the last bounce if there are fewer."""
+        """Return the row of a bounce, counted from 0, or of the last bounce if there are fewer."""
         return self.bounces[index][min(bounce, len(self.bounces[index]) - 1)]
 
-    def inside(self, index: int, bounce: int = 2) -> NDArray[np.bool_]:
-        """Return whether x, z and theta are in the predicted 90 % bands up to a bounce, shape (rows, 3)."""
-        rows = self.until(index, bounce) + 1
+    def inside(self, index: int) -> NDArray[np.bool_]:
+        """Return whether x, z and theta are in the predicted 90 % bands up to the third bounce, shape (rows, 3)."""
+        rows = self.until(index, 2) + 1
         points = bands(self.pose[index, : self.flight_rows[index]], rows)
         found: NDArray[np.bool_] = (self.pose[index, :rows] >= points[:, 0]) & (self.pose[index, :rows] <= points[:, 2])
         return found
 
 
 def _flight_rows(pose: Array) -> int:
-    """Return the number of rows before the first impact."""
     z, theta = pose[:, 1], pose[:, 2]
     gap = z - _HALF * (np.abs(np.cos(theta)) + np.abs(np.sin(theta)))
     pushed = np.abs(np.diff(z, 2) * RATE_HZ**2 + _FALL) > _JERK
@@ -84,7 +68,6 @@ def _flight_rows(pose: Array) -> int:
 
 
 def _bounces(z: Array) -> tuple[int, ...]:
-    """Return the rows of the lowest points between rises."""
     found, falling, low, high = [], True, 0, 0
     for row, height in enumerate(z):
         if falling:

@@ -1,4 +1,4 @@
-"""Single impacts of an ellipse on a flat surface, by the project's contact model."""
+"""Single impacts of an ellipse on a flat surface, by the contact model of this project."""
 
 from __future__ import annotations
 
@@ -21,57 +21,42 @@ Array = NDArray[np.float64]
 #: Semi-axes and radius of gyration in m.
 SEMI_AXES: Final = (0.035, 0.025)
 GYRATION: Final = 0.0192
-#: Contact stiffness per mass in 1/s^2. It affects only the duration of an impact, because position and lever arms are
-#: taken as constant during the impact.
+#: Contact stiffness per mass in 1/s^2. It determines only how long an impact takes: position and arms are constant
+#: during the impact.
 _STIFFNESS: Final = 1e9
-#: Speed of approach in m/s to which given restitutions refer: the middle of the measured speeds.
+#: Speed of approach in m/s to which restitutions refer, the middle of the measured speeds.
 USUAL_SPEED: Final = 2.5
 _LEAST, _LARGEST = 0.05, 0.98
-#: Upper bound for rates in m/s or rad/s; no measured body is as fast.
+#: Upper bound of rates in m/s or rad/s, which no measured body reaches.
 _FASTEST: Final = 1e4
-#: Gap in m at which a simulated impact starts; time in s after which the impact is surely over, 13 half periods of the
-#: contact's oscillation.
+#: Gap in m at which a simulated impact starts, and time in s after which it is over: 13 half periods of the contact.
 _GAP, _WHOLE = 1e-9, 40.0 / _STIFFNESS**0.5
 
 
 @dataclass(frozen=True)
 class EllipseContact:
-    """The parameters of an impact of the ellipse.
+    """The parameters of an impact of the ellipse."""
 
-    Attributes
-    ----------
-    law : str
-        Contact law, a key of `model.contact_laws.LAWS`.
-    exponent : float
-        n in F = K d^n.
-    restitution : float
-        Coefficient of restitution of an impact at 2.5 m/s without motion along the surface. For a law without such a
-        coefficient: the law's damping number lambda v0, or its damping C relative to the critical damping.
-    fall : float
-        Exponent q of the decrease (v / 2.5 m/s)^-q of the restitution with the speed of approach v.
-    fall_along : float
-        Decrease of the restitution with the speed of the centre of mass along the surface, in s/m.
-    friction : float
-        Coefficient of friction mu.
-    slip_speed : float
-        Regularisation speed in m/s; 0 for a tangential spring.
-    stick_stiffness : float
-        Ratio of tangential to normal stiffness.
-    stick_damping : float
-        Tangential damping relative to the critical damping.
-    tilt : float
-        Angle in rad of the surface relative to the axes of the data.
-    """
-
+    #: key of `model.contact_laws.LAWS`
     law: str = "exact_restitution"
+    #: n in F = K d^n
     exponent: float = 1.0
+    #: restitution of an impact at 2.5 m/s without motion along the surface; for a law without a restitution, the
+    #: damping number lambda v0, or the damping C relative to the critical damping
     restitution: float = 0.703
+    #: exponent q of the factor (v / 2.5 m/s)^-q of the restitution at the speed of approach v
     fall: float = 0.2523
+    #: decrease of the restitution with the speed of the centre of mass along the surface [s/m]
     fall_along: float = 0.2786
+    #: coefficient of friction
     friction: float = 0.1907
+    #: regularisation speed [m/s]; 0 for a tangential spring and damper
     slip_speed: float = 0.0
+    #: ratio of tangential to normal stiffness
     stick_stiffness: float = 1.584
+    #: tangential damping relative to the critical damping
     stick_damping: float = 0.1597
+    #: angle of the surface relative to the axes of the data [rad]
     tilt: float = -0.0131
 
 
@@ -82,10 +67,7 @@ ELLIPSE: Final = EllipseContact()
 def contact_arms(theta: Array) -> tuple[Array, Array]:
     """Return the lowest point relative to the centre in m, along and away from the surface, shape (n,) each.
 
-    Parameters
-    ----------
-    theta : ndarray, shape (n,)
-        Angle of the ellipse, counter-clockwise.
+    `theta` is counter-clockwise, shape (n,).
     """
     a, b = SEMI_AXES
     c, s = np.cos(theta), np.sin(theta)
@@ -107,8 +89,8 @@ def impact(before: ArrayLike, contact: EllipseContact = ELLIPSE) -> Array:
     Returns
     -------
     ndarray, shape (n, 6)
-        x, y, theta as before, and the velocities after the impact. The state is unchanged if the lowest point does not
-        approach the surface.
+        x, y, theta as before, and the velocities after the impact. A state whose lowest point does not approach the
+        surface is unchanged.
 
     Raises
     ------
@@ -170,15 +152,7 @@ def _preset() -> Scene:
 def impact_scene(before: ArrayLike) -> Scene:
     """Return the preset `measured_ellipse` with the ellipse a nanometre from the surface, before an impact.
 
-    Parameters
-    ----------
-    before : array_like, shape (6,)
-        A row as for `impact`.
-
-    Raises
-    ------
-    ArgumentError
-        As for `impact`.
+    `before`, shape (6,), is a row as for `impact`.
     """
     state = _states(np.asarray(before)[None])[0]
     along, up = (float(rate[0]) for rate in _to_surface(state[3:4], state[4:5], ELLIPSE.tilt))
@@ -191,23 +165,13 @@ def impact_scene(before: ArrayLike) -> Scene:
 
 
 def simulated_impact(before: ArrayLike) -> Array:
-    """Return the states after impacts, as `impact` does, but by full simulations of the preset `measured_ellipse`.
-
-    Parameters
-    ----------
-    before : array_like, shape (n, 6)
-
-    Raises
-    ------
-    ArgumentError
-        As for `impact`.
-    """
+    """Return the states after impacts, as `impact` does, by full simulations of the preset `measured_ellipse`."""
     states = _states(before)
     for state in states:
         scene = impact_scene(state)
         motion = simulate(scene, t_end=_WHOLE, output_dt=_WHOLE)
         (vx, vy, omega), theta = motion.v[-1], motion.q[-1, 2]
-        # the centre of mass is half a metre from the origin, so even the small turn during the impact moves it
+        # the centre of mass is half a metre from the origin, so the small turn of the impact moves it too
         x, y = scene.head.com_offset_m
         c, s = np.cos(theta), np.sin(theta)
         state[3:5] = _to_surface(vx - omega * (s * x + c * y), vy + omega * (c * x - s * y), ELLIPSE.tilt)
@@ -216,7 +180,7 @@ def simulated_impact(before: ArrayLike) -> Array:
 
 
 def _numbers(contact: EllipseContact, speed: Array, along: Array, normal_arm: Array) -> tuple[Array, NDArray[np.void]]:
-    """Return the damping factor lambda [s/m] of each impact, and the contact's parameters, which all impacts share."""
+    """Return the damping factor lambda [s/m] of each impact, and the parameters that they share."""
     law, wanted = LAWS[contact.law], contact.restitution
     e = np.clip(wanted * (speed / USUAL_SPEED) ** -contact.fall - contact.fall_along * np.abs(along), _LEAST, _LARGEST)
     viscous, damping = 0.0, np.zeros_like(speed)

@@ -1,4 +1,8 @@
-"""Drops of a square block: a fit of the first flight, and bands of the later motion from random motions."""
+"""Drops of a square block: a fit of the first flight, and bands of the motion that follows.
+
+A *touch* is one contact of a corner with the table. Restitution, friction and the point of action vary randomly from
+touch to touch, so the bands are quantiles of many random motions. A *marker* is the frame that the sensor tracks.
+"""
 
 from __future__ import annotations
 
@@ -15,19 +19,18 @@ from plow_twin.solve.rounded_block import BLOCK, toss_blocks
 
 Array = NDArray[np.float64]
 
-#: Rate of the measured rows in Hz.
+#: Rate of the measured rows [Hz].
 RATE_HZ: Final = 250.0
 _DT: Final = 1.0 / RATE_HZ
-#: Number of equal steps of restitution from 0 to 1 in the table of `damping_numbers`.
+#: Number of steps of the table of `damping_numbers`.
 _NUMBERS: Final = 1000
-#: Number of touches of one motion for which scatter is drawn; later touches have the scatter of the last of them.
+#: Number of touches with scatter of their own; later touches have the scatter of the last of them.
 _TOUCHES: Final = 64
-#: An impact is assumed if a row's angle differs by more than this [rad] from the angle extrapolated from the three rows
-#: before it.
+#: Difference [rad] of an angle from the line through the three rows before it that shows an impact.
 _TURN_IN_A_ROW: Final = 0.1
-#: Smallest number of rows of a first flight; the speeds of the drop are fitted to them.
+#: Smallest number of rows of a first flight, to which the speeds are fitted.
 LEAST_ROWS: Final = 4
-#: `_MOST_ROWS`: largest number of rows of the bands, which is 4 s (a block comes to rest within 1 s)
+#: `_MOST_ROWS`: largest number of rows of the bands, 4 s; a block comes to rest within 1 s
 #: `_FASTEST`: a speed in m/s that no drop reaches
 _MOST_ROWS, _FASTEST = 1000, 100.0
 
@@ -39,20 +42,15 @@ SQUARE: Final = np.array(
 
 @dataclass(frozen=True)
 class Marker:
-    """The tracked frame on the block, whose pose the sensor measures.
+    """The tracked frame on the block.
 
-    In 242 of 250 drops the block lies flat at rest, but its tracked angle is 33 mrad below the angle of a flat block.
-    The tracked height at rest depends on the side on which the block lies.
-
-    Attributes
-    ----------
-    turn : float
-        Measured angle minus true angle of the block [rad].
-    lever : tuple of 2 float
-        Vector from the block's centre to the tracked point, in the block's axes [m].
+    In 242 of 250 drops the block lies flat at rest, but its tracked angle is 33 mrad below that of a flat block. The
+    tracked height at rest depends on the side on which the block lies.
     """
 
+    #: measured angle minus true angle of the block [rad]
     turn: float = 0.0
+    #: vector from the centre of the block to the tracked point, in the axes of the block [m]
     lever: tuple[float, float] = (0.0, 0.0)
 
     def state_of_block(self, measured: Array) -> Array:
@@ -84,33 +82,21 @@ MARKER: Final = Marker(-0.0308, (2.3e-4, 5.2e-4))
 
 @dataclass(frozen=True)
 class Scatter:
-    """Standard deviations of the scatter about the parameters, the fitted speeds and the measured rows.
+    """Standard deviations of the random part of the parameters, the fitted speeds and the measured rows."""
 
-    Attributes
-    ----------
-    restitution, friction : float
-        Scatter from touch to touch of the restitution [1], and of the logarithm of the friction.
-    table, spin : float
-        Scatter of the table's height from drop to drop [m], and of the fitted rate of turning [rad/s].
-    speed : float
-        Scatter of the fitted speed [m/s].
-    place, angle : float
-        Scatter of a measured row [m], [rad].
-    shift : float
-        Scatter of the place along the table where the force of a touch acts [m].
-    drag : float
-        Scatter of the logarithm of a drop's drag.
-    """
-
+    #: from touch to touch: restitution [1], logarithm of the friction, place along the table where the force acts [m]
     restitution: float = 0.065
     friction: float = 0.5
+    shift: float = 1.5e-3
+    #: from drop to drop: height of the table [m], logarithm of the drag
     table: float = 3e-4
-    spin: float = 0.05
+    drag: float = 0.2
+    #: errors of the fitted flight: speed [m/s], rate of turning [rad/s]
     speed: float = 0.005
+    spin: float = 0.05
+    #: errors of a measured row: place [m], angle [rad]
     place: float = 6e-5
     angle: float = 1e-3
-    shift: float = 1.5e-3
-    drag: float = 0.2
 
 
 SCATTER: Final = Scatter()
@@ -124,22 +110,11 @@ def damping_numbers() -> Array:
 
 
 def toss(initial: Array, n_rows: int, blocks: NDArray[np.void], scatter: Array | None = None) -> Array:
-    """Return the motions of blocks tossed from initial states.
+    """Return the motions of blocks at 250 Hz, shape (m, n_rows, 6), from their states in the first row, shape (m,
+    6).
 
-    Parameters
-    ----------
-    initial : ndarray, shape (m, 6)
-        x, z [m], theta [rad] and their rates.
-    n_rows : int
-        Number of rows at 250 Hz; the first row is the start.
-    blocks : ndarray of `solve.rounded_block.BLOCK`, shape (m,)
-        Parameters of each block.
-    scatter : ndarray, shape (m, touches, 3), optional
-        Scatter of each touch (`solve.rounded_block.toss_blocks`); by default no scatter.
-
-    Returns
-    -------
-    ndarray, shape (m, n_rows, 6)
+    A state has x, z [m], theta [rad] and their rates. `blocks` are of `solve.rounded_block.BLOCK`, shape (m,).
+    `scatter`, shape (m, touches, 3), is that of `toss_blocks`.
     """
     rows = np.zeros((len(initial), n_rows, 6))
     rows[:, 0] = initial
@@ -150,34 +125,20 @@ def toss(initial: Array, n_rows: int, blocks: NDArray[np.void], scatter: Array |
 
 @dataclass(frozen=True)
 class Flight:
-    """A fitted first flight: state at its last row, with its covariance.
+    """A fitted first flight."""
 
-    Attributes
-    ----------
-    state : ndarray, shape (6,)
-        x, z, theta and their rates at the last row.
-    covariance : ndarray, shape (3, 2, 2)
-        Covariance of place and rate at the last row, for each of x, z, theta.
-    times : ndarray, shape (k,)
-        Times of the rows relative to the last row in s; a lost row adds one interval.
-    """
-
+    #: x, z, theta and their rates at the last row, shape (6,)
     state: Array
+    #: covariance of place and rate at the last row, for each of x, z, theta, shape (3, 2, 2)
     covariance: Array
+    #: times of the rows relative to the last row [s], shape (k,); a lost row adds one interval
     times: Array
 
 
 def fit_flight(first_flight: ArrayLike, block: NDArray[np.void] = SQUARE, scatter: Scatter = SCATTER) -> Flight:
-    """Fit a flight with drag to rows at 250 Hz, with robust weights.
+    """Fit a flight with drag to rows x, z [m], theta [rad] at 250 Hz before the first impact, shape (k, 3).
 
-    Parameters
-    ----------
-    first_flight : array_like, shape (k, 3)
-        Rows of x, z [m] and theta [rad] before the first impact.
-    block : ndarray of BLOCK, shape ()
-        Parameters of the block; only gravity and drag are used.
-    scatter : Scatter
-        Standard deviations; only the errors of a measured row (`place`, `angle`) are used.
+    The weights are robust. Of `block`, gravity and drag are used; of `scatter`, the errors of a measured row.
 
     Raises
     ------
@@ -204,12 +165,19 @@ def fit_flight(first_flight: ArrayLike, block: NDArray[np.void] = SQUARE, scatte
         )
     state, covariance = np.zeros(6), np.zeros((3, 2, 2))
     noise = (scatter.place, scatter.place, scatter.angle)
-    for j, drag in enumerate((block["drag"], block["drag"], block["spin_drag"])):
-        way = (1.0 - np.exp(-drag * times)) / drag
-        fall = -block["gravity"] / drag * (times - way) if j == 1 else 0.0
+    for j in range(3):
+        way, fall = _free_flight(block, j, times)
         fitted, covariance[j] = _fit_line(way, rows[:, j] - fall, noise[j])
         state[[j, 3 + j]] = fitted
     return Flight(state, covariance, times)
+
+
+def _free_flight(block: NDArray[np.void], axis: int, times: Array) -> tuple[Array, Array]:
+    """Return the way at each time of a flight with drag: the part per rate at time 0, and the part of gravity."""
+    drag = block["spin_drag" if axis == 2 else "drag"]
+    way = (1.0 - np.exp(-drag * times)) / drag
+    fall = -block["gravity"] / drag * (times - way) if axis == 1 else np.zeros_like(times)
+    return way, fall
 
 
 def _leaves_flight(rows: Array) -> bool:
@@ -222,7 +190,7 @@ def _leaves_flight(rows: Array) -> bool:
 
 
 def _row_times(rows: Array, gravity: float) -> Array:
-    """Return the row times in s, 0 at the last row; a doubled row distance is taken for a lost row."""
+    """Return the times of the rows in s, 0 at the last row; a doubled distance between rows shows a lost row."""
     way = np.hypot(*np.diff(rows[:, :2], axis=0).T)
     steps = np.ones(len(way))
     for _ in range(3):
@@ -236,7 +204,6 @@ def _row_times(rows: Array, gravity: float) -> Array:
 
 
 def _fit_line(way: Array, values: Array, noise: float) -> tuple[Array, Array]:
-    """Fit place and rate by least squares with Cauchy weights; return them and their covariance."""
     rows: Array = np.stack([np.ones_like(way), way], axis=1)
     weight: Array = np.ones_like(way)
     found: Array = np.zeros(2)
@@ -252,7 +219,7 @@ def _fit_line(way: Array, values: Array, noise: float) -> tuple[Array, Array]:
 def draw(
     flight: Flight, members: int, seed: int, block: NDArray[np.void], scatter: Scatter
 ) -> tuple[Array, NDArray[np.void], Array]:
-    """Return randomly drawn initial states (m, 6), blocks (m,) and scatter of touches (m, touches, 3)."""
+    """Draw initial states (m, 6), blocks (m,) and scatter of touches (m, touches, 3)."""
     rng = np.random.default_rng(seed)
     states = np.tile(flight.state, (members, 1))
     for j, more in enumerate((scatter.speed, scatter.speed, scatter.spin)):
@@ -277,25 +244,7 @@ def ensemble(
 ) -> Array:
     """Return random marker motions x, z, theta that fit the first flight, shape (members, n_rows, 3).
 
-    Parameters
-    ----------
-    first_flight : array_like, shape (k, 3)
-        Rows of x, z [m] and theta [rad] at 250 Hz before the first impact.
-    n_rows : int
-        Number of rows to return, counted from the first row of `first_flight`.
-    members, seed : int
-        Number of motions, and seed of the draws.
-    block : ndarray of BLOCK, shape ()
-        Parameters of the block.
-    scatter : Scatter
-        Scatter of the parameters from touch to touch and from drop to drop.
-    marker : Marker
-        The tracked frame.
-
-    Raises
-    ------
-    ArgumentError
-        As for `fit_flight`.
+    The rows are counted from the first row of `first_flight`; other arguments are those of `fit_flight`.
     """
     flight = fit_flight(first_flight, block, scatter)
     given = len(flight.times)
@@ -304,9 +253,8 @@ def ensemble(
     tossed = marker.measured(toss(marker.state_of_block(states), ahead, blocks, touches)[:, :, :3])
     found = np.empty((members, max(n_rows, given), 3))
     found[:, given - 1 : given - 1 + ahead] = tossed
-    for j, drag in enumerate((block["drag"], block["drag"], block["spin_drag"])):
-        way = (1.0 - np.exp(-drag * flight.times[:-1])) / drag
-        fall = -block["gravity"] / drag * (flight.times[:-1] - way) if j == 1 else 0.0
+    for j in range(3):
+        way, fall = _free_flight(block, j, flight.times[:-1])
         found[:, : given - 1, j] = states[:, j, None] + states[:, 3 + j, None] * way + fall
     noise = np.random.default_rng([seed, 1]).standard_normal(found.shape)
     found += noise * [scatter.place, scatter.place, scatter.angle]

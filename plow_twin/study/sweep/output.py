@@ -19,7 +19,6 @@ from plow_twin.view.figures import write_png
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-#: Key of the sweep's facts in the Parquet file's metadata.
 METADATA_KEY: Final = "plow_twin"
 #: Statistics that are whole numbers.
 _COUNTS: Final = ("makes", "events", "steps")
@@ -28,8 +27,7 @@ _COUNTS: Final = ("makes", "events", "steps")
 def write_parquet(table: Table, path: Path) -> None:
     """Write one row for each member: parameters, status (0 if done), status in words, and statistics.
 
-    The file's metadata has the key `plow_twin`, whose value is JSON with the arguments (the scene as YAML), units,
-    package version and builds.
+    The metadata key `plow_twin` holds JSON with the arguments (the scene as YAML), units, package version and builds.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -47,7 +45,7 @@ def write_parquet(table: Table, path: Path) -> None:
         "package_version": package_version(),
         "builds": [json.loads(build) for build in table.builds],
     }
-    # keys are sorted, so that the same table gives the same bytes
+    # sorted keys give the same bytes for the same table
     arrow = pa.table(columns).replace_schema_metadata({METADATA_KEY: json.dumps(facts, sort_keys=True)})
     with whole_file(path) as stream:
         pq.write_table(arrow, stream)
@@ -73,7 +71,6 @@ def draw(table: Table, path: Path, title: str) -> None:
 
 
 def _scaled(table: Table, index: int) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Return a statistic in the unit in which it is drawn."""
     return np.asarray(table.numbers[:, index] * statistic_words(table.sweep.statistics[index])[1])
 
 
@@ -82,7 +79,7 @@ def _curve(axes: Axes, table: Table, index: int) -> None:
 
     (axis,) = table.sweep.axes
     numbers, places = _scaled(table, index), _places(axis)
-    # points whose values are words are not joined by lines, because there are no values between two words
+    # no line joins words, because there are no values between them
     style = "none" if isinstance(axis.values[0], str) else "-"
     axes.plot(places, numbers, marker="o", markersize=3 if style == "-" else 6, linestyle=style)
     for member in table.failed:
@@ -100,13 +97,11 @@ def _curve(axes: Axes, table: Table, index: int) -> None:
 
 
 def _bracketed(name: str) -> str:
-    """Return the unit of a statistic in brackets, or an empty text if its words already end with the unit."""
     words = statistic_words(name)[0]
     return words[words.index(" [") :] if "," in words and " [" in words else ""
 
 
 def _legend(axes: Axes) -> None:
-    """Put the legend below the axes, where it hides no data."""
     axes.legend(fontsize=8, loc="upper right", bbox_to_anchor=(1.0, -0.16))
 
 
@@ -120,8 +115,7 @@ def _heat_map(axes: Axes, table: Table, index: int) -> None:
         x, y = np.unravel_index(table.failed, table.sweep.shape)
         axes.plot(_places(first)[x], _places(second)[y], "x", color="tab:red", label="failed")
         _legend(axes)
-    figure = axes.figure
-    figure.colorbar(mesh, ax=axes)
+    axes.figure.colorbar(mesh, ax=axes)
 
 
 def _places(axis: Axis) -> np.ndarray[Any, np.dtype[np.float64]]:
@@ -131,7 +125,7 @@ def _places(axis: Axis) -> np.ndarray[Any, np.dtype[np.float64]]:
 
 
 def _edges(axis: Axis) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Return the cell borders of a heat map, halfway between values (between logarithms on a log axis)."""
+    """Return the borders of the cells of a heat map, halfway between values (on a log axis between logarithms)."""
     places = np.log(_places(axis)) if axis.log else _places(axis)
     if len(places) == 1:
         half = 0.5 * abs(places[0]) or 0.5

@@ -1,4 +1,4 @@
-"""Computation of the missing chunks of a sweep, by the same code on this machine and a Dask cluster."""
+"""Computation of the missing chunks of a sweep, on this machine or on a Dask cluster."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from plow_twin.study.store import Store
 from plow_twin.study.sweep.table import Sweep, Table, run_members_of
 
 Array = NDArray[np.float64]
-#: Function that is called with the number of finished members.
+#: Function that gets the number of finished members.
 OnProgress = Callable[[int], None]
 
 
 def run_here(store: Store, workers: int | None = None, on_progress: OnProgress | None = None) -> Table:
-    """Compute the missing chunks with threads of this process, store each chunk, and return the whole table."""
+    """Compute and store the missing chunks with threads of this process; return the whole table."""
     chunks, missing = store.chunks, store.missing()
     done = store.sweep.size - sum(len(chunks[index]) for index in missing)
     build = _build()
@@ -38,9 +38,10 @@ def run_here(store: Store, workers: int | None = None, on_progress: OnProgress |
 
 
 def run_on_cluster(store: Store, address: str, on_progress: OnProgress | None = None) -> Table:
-    """Compute the missing chunks on the Dask cluster at `address`, each as one task; return the whole table.
+    """Compute the missing chunks on the Dask cluster at `address`; return the whole table.
 
-    The scheduler gives the tasks of a dead worker to another worker; a result is stored as soon as it arrives.
+    Each chunk is a task, whose result is stored as it arrives. The scheduler gives the tasks of a dead worker to
+    another.
 
     Raises
     ------
@@ -60,7 +61,7 @@ def run_on_cluster(store: Store, address: str, on_progress: OnProgress | None = 
             try:
                 table, build = future.result()
             except Exception as error:
-                # whatever the error of a worker is, stored chunks are kept, so the call can be repeated
+                # a worker can raise any error; the stored chunks serve the next call
                 raise StudyError(f"dask: chunk {index}: {type(error).__name__}: {error}") from error
             store.write(index, table, build)
             done += len(chunks[index])
@@ -70,7 +71,7 @@ def run_on_cluster(store: Store, address: str, on_progress: OnProgress | None = 
 
 
 def _task(sweep: Sweep, members: list[int]) -> tuple[Array, str]:
-    """Compute a chunk on a worker with a single thread, because each thread of a worker runs a task."""
+    """Compute a chunk with a single thread, because each thread of a worker runs a task."""
     return run_members_of(sweep, members, workers=1), _build()
 
 

@@ -1,10 +1,13 @@
-"""Sweep of one or two parameters of a scene, with statistics of the motion."""
+"""A sweep: statistics of the motion while one or two parameters of a scene vary.
+
+A *member* of a sweep is one run, with one value of each parameter.
+"""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final
 
@@ -21,10 +24,9 @@ from plow_twin.study.statistics import statistic, statistics_of
 
 Array = NDArray[np.float64]
 
-#: Status of a member whose parameter values make the scene unusable.
+#: Status of a member whose parameters make the scene unusable.
 UNUSABLE: Final = -1
-#: Largest number of members of a sweep; the number is limited, because the table and the list of chunks are kept in
-#: memory.
+#: Largest number of members; the table and the list of chunks are kept in memory.
 _MOST_MEMBERS: Final = 1_000_000
 
 
@@ -38,13 +40,7 @@ class Axis:
 
 
 def parse_axis(text: str, scene: Scene) -> Axis:
-    """Read `PATH=LOW:HIGH:COUNT[:log]` or `PATH=VALUE,VALUE..`.
-
-    Raises
-    ------
-    StudyError
-        The text is not an axis; the message names the axis, the value got and the value expected.
-    """
+    """Read `PATH=LOW:HIGH:COUNT[:log]` or `PATH=VALUE,VALUE..`, or raise a `StudyError` that names the axis."""
     path, _, rest = text.partition("=")
     check_path(scene, path)
     expected = f"{path}=LOW:HIGH:COUNT[:log] or {path}=VALUE,VALUE.."
@@ -64,7 +60,6 @@ def parse_axis(text: str, scene: Scene) -> Axis:
                 raise ValueError
             if int(count) > _MOST_MEMBERS:
                 raise StudyError(f"axis: got {int(count)} values of {path}, expected at most {_MOST_MEMBERS}")
-            # both functions return exactly `low` and `high` as the first and the last value
             spaced = (np.geomspace if log else np.linspace)(float(low), float(high), int(count))
             values = tuple(map(float, spaced))
     except StudyError:
@@ -78,7 +73,7 @@ def parse_axis(text: str, scene: Scene) -> Axis:
 
 @dataclass(frozen=True)
 class Sweep:
-    """The arguments of a sweep as plain data, which can be stored and sent. `scene_yaml` is self-contained."""
+    """The arguments of a sweep as plain data. `scene_yaml` needs no other file."""
 
     scene_yaml: str
     axes: tuple[Axis, ...]
@@ -104,7 +99,7 @@ class Sweep:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Number of values of each axis. In the order of the members, the last axis varies fastest."""
+        """Number of values of each axis; the last axis varies fastest."""
         return tuple(len(axis.values) for axis in self.axes)
 
     @property
@@ -118,28 +113,21 @@ class Sweep:
         return {axis.path: axis.values[int(place)] for axis, place in zip(self.axes, places, strict=True)}
 
     def arguments(self) -> dict[str, Any]:
-        """Return everything that determines the sweep's result, as plain data for JSON."""
+        """Return everything that determines the result, as plain data for JSON."""
         plain: dict[str, Any] = json.loads(json.dumps(asdict(self)))
         return plain
 
 
 @dataclass(frozen=True)
 class Table:
-    """Results of a sweep: one row for each member, in the order of the members.
-
-    Attributes
-    ----------
-    status : ndarray of int64, shape (m,)
-        `plow_twin.solve.state.Status`, or `UNUSABLE`.
-    numbers : ndarray, shape (m, statistics)
-        The statistics, NaN for a member whose status is not 0.
-    builds : tuple of str
-        The builds (versions, processor, platform) that computed the members.
-    """
+    """Results of a sweep: one row for each of m members."""
 
     sweep: Sweep
+    #: `plow_twin.solve.state.Status` or `UNUSABLE`, shape (m,)
     status: NDArray[np.int64]
+    #: shape (m, statistics); NaN for a member whose status is not 0
     numbers: Array
+    #: versions, processor and platform of each build that computed members
     builds: tuple[str, ...] = field(default=())
 
     @property
@@ -164,8 +152,7 @@ def run_members_of(
 ) -> Array:
     """Compute the members with these indices; return status and statistics, shape (k, 1 + statistics).
 
-    The results of a member are identical bit for bit in any chunk, in any thread, and on any machine with the same
-    build.
+    A member has the same bits in any chunk, in any thread, and on any machine with the same build.
     """
     scene = replace(sweep.scene(), marks={})
     table = np.full((len(members), 1 + len(sweep.statistics)), np.nan)
@@ -183,9 +170,3 @@ def run_members_of(
     table[rows, 0] = result.status
     table[rows, 1:] = statistics_of(result, scenes, sweep.statistics)
     return table
-
-
-def chunks_of(size: int, chunk: int) -> Iterator[range]:
-    """Yield the members of each chunk."""
-    for begin in range(0, size, chunk):
-        yield range(begin, min(begin + chunk, size))

@@ -1,0 +1,98 @@
+"""The recordings at the paths that a user gives, each once."""
+
+from __future__ import annotations
+
+import glob
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from plow_twin.errors import RecordingError
+from plow_twin.record.bag import beside_folders
+from plow_twin.record.reader import mcap_path, read_header
+from plow_twin.record.sources import packed
+from plow_twin.scene_file.parquet_lines import SUFFIX
+
+_KINDS: Final = ("*.mcap", "*.db3", "*.csv")
+
+
+def _holds(folder: Path, kinds: Sequence[str] = _KINDS) -> bool:
+    return folder.is_dir() and any(any(folder.glob(pattern)) for pattern in kinds)
+
+
+def _is_recording(folder: Path, results: Sequence[Path]) -> bool:
+    """Return whether a folder is one recording: it has the parts of a recording, or files but no folder with a run."""
+    if not _holds(folder):
+        return False
+    if (folder / "metadata.yaml").is_file() or any(folder.glob(f"{glob.escape(folder.name)}_*")):
+        return True
+    if (folder / "analysis.json").is_file():
+        results = [*results, (folder / "run").resolve()]
+    runs = [item for item in folder.iterdir() if _holds(item, _KINDS[:2]) and item.resolve() not in results]
+    return not set(runs) - set(beside_folders(folder))
+
+
+def left_out(path: Path, results: Sequence[Path] = ()) -> list[Path]:
+    """Return the items that `expand` leaves out: empty folders, tables beside runs, and runs inside other runs."""
+    if not path.is_dir():
+        return []
+    folders = [item for item in sorted(path.iterdir()) if item.is_dir()]
+    if _is_recording(path, results):
+        return [item for item in folders if _holds(item) and item not in beside_folders(path)]
+    empty = [item for item in folders if not any(item.iterdir())]
+    return empty + sorted(path.glob("*.csv")) + [one for item in folders if _holds(item) for one in left_out(item)]
+
+
+def expand(paths: Sequence[Path], results: Sequence[Path] = ()) -> list[Path]:
+    """Return the recordings at some paths and in the folders among them.
+
+    `results` are folders with results of an earlier analysis, which are not recordings.
+
+    Raises
+    ------
+    RecordingError
+        A folder has no recording.
+    """
+    found: list[Path] = []
+    for path in paths:
+        if not path.is_dir() or _is_recording(path, results):
+            found.append(path)
+            continue
+        inside = [
+            item
+            for item in sorted(path.iterdir())
+            # a recording with missing parts counts too; its analysis names the missing parts
+            if item.suffix in (".mcap", ".db3") or _holds(item) or (item / "metadata.yaml").is_file()
+        ]
+        # a table beside recordings is assumed to be a result of an analysis
+        if not inside and any(path.glob(f"*{SUFFIX}")):
+            inside = [path]
+        if not inside:
+            raise RecordingError(f"{path}: got a folder without recordings, expected some{packed(path)}")
+        found += inside
+    return found
+
+
+def counted_once(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
+    """Return the recordings without repetitions of a path or a run, and a sentence for each repetition."""
+    kept: dict[object, Path] = {}
+    left: list[str] = []
+    for path in paths:
+        keys = path.resolve(), _identity(path)
+        known = next((kept[key] for key in keys if key in kept), None)
+        if known is None:
+            kept |= dict.fromkeys(keys, path)
+        elif known == path:
+            left.append(f"{path}: given twice, used once")
+        else:
+            left.append(f"{path}: left out: the same run as {known}")
+    return list(dict.fromkeys(kept.values())), left
+
+
+def _identity(path: Path) -> object:
+    """Return the random id and the part number of a run, or the path of another recording."""
+    try:
+        header = read_header(mcap_path(path))
+    except (RecordingError, OSError):  # the analysis reports the error
+        header = None
+    return path if header is None or not header.run_id else (header.run_id, header.part)
