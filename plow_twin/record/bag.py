@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from plow_twin.build import package_version
-from plow_twin.record.chunks import is_begun, is_mcap
+from plow_twin.record.chunks import is_mcap
 from plow_twin.record.mcap_file import ChunkBuilder, McapFile, UnbufferedFile
 from plow_twin.record.metadata_yaml import LOST, PartFacts, TopicCount, bag_metadata, recorded_losses, write_metadata
 from plow_twin.record.writer import BESIDE, make_folder, shortage
@@ -100,7 +100,7 @@ class BagWriter:
         """
         self.flush()
         self._file.finish()
-        self._file.close()
+        self._file.out.close()
         counts = [
             TopicCount(topic.name, topic.message_type, self.written[topic.name], topic.qos, topic.type_hash)
             for topic in self._topics.values()
@@ -124,8 +124,8 @@ def readable_beside(run: Path, lost: Counter[str]) -> list[Path]:
         lost.update(recorded_losses(folder))
         parts = [*folder.glob("*.mcap")]
         # the reader of this folder counts its unreadable files
-        if any(is_begun(part) and is_mcap(part) for part in parts):
+        if any(map(is_mcap, parts)):
             found.append(folder)
         else:
-            lost.update("damaged_files" if is_begun(part) else "truncated_files" for part in parts)
+            lost.update("truncated_files" if is_mcap(part) is None else "damaged_files" for part in parts)
     return found

@@ -346,23 +346,14 @@ class _Waiting:
             self._messages = []
 
 
-def is_begun(path: Path) -> bool:
-    """Return whether an MCAP file has its first bytes; a process may be killed before it writes them."""
+def is_mcap(path: Path) -> bool | None:
+    """Return whether a file begins as an MCAP file does; None if its writer was killed while it wrote these bytes."""
     try:
         with path.open("rb") as stream:
             head = stream.read(len(MAGIC))
     except OSError:
         return True  # the reader will report why the file cannot be read
-    return len(head) == len(MAGIC) or not MAGIC.startswith(head)
-
-
-def is_mcap(path: Path) -> bool:
-    """Return whether a file begins like an MCAP file; a file that cannot be opened is left to its reader (True)."""
-    try:
-        with path.open("rb") as stream:
-            return MAGIC.startswith(stream.read(len(MAGIC)))
-    except OSError:
-        return True
+    return head == MAGIC or (None if MAGIC.startswith(head) else False)
 
 
 def metadata_records(path: Path) -> Iterator[tuple[str, dict[str, str]]]:

@@ -15,7 +15,7 @@ from typing import Any, Final
 from plow_twin.errors import RecordingError
 from plow_twin.record.bag import beside_folders
 from plow_twin.record.cdr import type_hash
-from plow_twin.record.chunks import DAMAGE_RECORD, MAGIC, ChunkReader, Messages, is_begun, is_mcap
+from plow_twin.record.chunks import DAMAGE_RECORD, MAGIC, ChunkReader, Messages, is_mcap
 from plow_twin.record.follow import is_claimed
 from plow_twin.record.header import LAYOUT_VERSION, LOSS_RECORD
 from plow_twin.record.mcap_file import ChunkBuilder, McapFile, UnbufferedFile
@@ -159,10 +159,10 @@ def examine(path: Path) -> RunReport:
 
 
 def _part(path: Path) -> PartReport:
-    if not is_mcap(path):
-        return PartReport(path, path.stat().st_size, finished=False, damaged_chunks=0, messages={}, mcap=False)
-    if not is_begun(path):
-        return PartReport(path, path.stat().st_size, finished=False, damaged_chunks=0, messages={})
+    begins = is_mcap(path)
+    if not begins:
+        size = path.stat().st_size
+        return PartReport(path, size, finished=False, damaged_chunks=0, messages={}, mcap=begins is None)
     reader = ChunkReader(path)
     counts: Counter[str] = Counter()
     for messages in reader:
@@ -275,7 +275,7 @@ def _mend(parts: Sequence[Path], last: Path) -> list[Path]:
     """Rewrite truncated or damaged parts, put empty parts aside, and return both."""
     mended = []
     for part in parts:
-        if not (is_begun(part) and is_mcap(part)):
+        if not is_mcap(part):
             _put_aside(part, "damaged")
         elif not _part(part).healthy:
             _rewrite(part, last=part == last)
@@ -295,7 +295,7 @@ def _put_aside(file: Path, ending: str) -> None:
 
 def _list_parts(folder: Path, parts: Sequence[Path], repaired: Sequence[str]) -> None:
     """Write `metadata.yaml` for the readable parts."""
-    facts = [_facts(part) for part in parts if part.exists() and is_begun(part) and is_mcap(part)]
+    facts = [_facts(part) for part in parts if part.exists() and is_mcap(part)]
     custom = {f"{LOST}{topic}": str(count) for topic, count in recorded_losses(folder).items()}
     if repaired:
         custom[f"plow_twin_{REPAIRED_KEY}"] = ", ".join(repaired)
@@ -340,7 +340,7 @@ def _rewrite(part: Path, *, last: bool) -> None:
         target.unlink(missing_ok=True)
         raise
     finally:
-        file.close()
+        file.out.close()
     _put_aside(part, "damaged")
     target.replace(part)
 

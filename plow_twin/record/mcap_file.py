@@ -164,7 +164,7 @@ class McapFile:
     def __init__(self, out: ByteFile, library: str) -> None:
         from mcap.records import Header
 
-        self.out = self._file = out
+        self.out = out
         self._schemas: dict[str, Any] = {}
         self._channels: dict[int, Any] = {}
         self._undeclared: list[Any] = []
@@ -175,13 +175,13 @@ class McapFile:
         self._metadata: list[Any] = []
         self._counts: Counter[int] = Counter()
         self._times: list[int] = []
-        self._file.write(MAGIC)
+        self.out.write(MAGIC)
         self._write(Header("ros2", library))
 
     @property
     def size(self) -> int:
         """Bytes written so far [B]."""
-        return self._file.tell()
+        return self.out.tell()
 
     @property
     def counts(self) -> Counter[int]:
@@ -194,8 +194,8 @@ class McapFile:
         return (min(self._times), max(self._times)) if self._times else (0, 0)
 
     def _write(self, record: Any) -> int:
-        data = _record_bytes(record)
-        self._file.write(data)
+        data = _records_bytes([record])
+        self.out.write(data)
         return len(data)
 
     def metadata(self, name: str, record: Mapping[str, str]) -> None:
@@ -234,7 +234,7 @@ class McapFile:
         try:
             self._chunk(builder.compression, content, index)
         except OSError:
-            self._file.truncate(whole)
+            self.out.truncate(whole)
             raise
 
     def _chunk(self, compression: str, content: Bytes, index: dict[int, Any]) -> None:
@@ -256,7 +256,7 @@ class McapFile:
             raw = entries.tobytes()
             parts.append(struct.pack("<BQHI", 7, 6 + len(raw), channel, len(raw)) + raw)
             place += len(parts[-1])
-        self._file.write(b"".join(parts))  # one call writes the chunk and its index
+        self.out.write(b"".join(parts))  # one call writes the chunk and its index
         self._undeclared = []
         for channel, entries in index.items():
             self._counts[channel] += len(entries)
@@ -264,19 +264,18 @@ class McapFile:
         if len(self._times) > 64:
             self._times = [min(self._times), max(self._times)]
         self._chunk_count += 1
-        self._chunk_index += _record_bytes(
-            ChunkIndex(
-                chunk_length=len(record),
-                chunk_start_offset=start,
-                compression=compression,
-                compressed_size=len(data),
-                message_end_time=last,
-                message_index_length=place - start - len(record),
-                message_index_offsets=offsets,
-                message_start_time=first,
-                uncompressed_size=len(content),
-            )
+        entry = ChunkIndex(
+            chunk_length=len(record),
+            chunk_start_offset=start,
+            compression=compression,
+            compressed_size=len(data),
+            message_end_time=last,
+            message_index_length=place - start - len(record),
+            message_index_offsets=offsets,
+            message_start_time=first,
+            uncompressed_size=len(content),
         )
+        self._chunk_index += _records_bytes([entry])
 
     def finish(self) -> None:
         """Write the index and the end of the MCAP file."""
@@ -314,26 +313,9 @@ class McapFile:
         offset_start = start + len(summary)
         summary += _records_bytes(offsets)
         crc = crc32(struct.pack("<BQQQ", Opcode.FOOTER, 20, start, offset_start), crc32(summary))
-        self._file.write(bytes(summary))
+        self.out.write(bytes(summary))
         self._write(Footer(summary_start=start, summary_offset_start=offset_start, summary_crc=crc))
-        self._file.write(MAGIC)
-
-    def sync(self) -> None:
-        """Wait until the disk has all bytes."""
-        self._file.sync()
-
-    def is_linked(self) -> bool:
-        """Return whether the path still leads to this file."""
-        return self._file.is_linked()
-
-    def close(self) -> None:
-        """Close the file without writing an index or an end."""
-        self._file.close()
-
-
-def _record_bytes(record: Any) -> bytes:
-    """Return a record as bytes."""
-    return _records_bytes([record])
+        self.out.write(MAGIC)
 
 
 def _records_bytes(records: Iterable[Any]) -> bytes:
@@ -348,17 +330,14 @@ def _records_bytes(records: Iterable[Any]) -> bytes:
 
 
 def _compress(compression: str, content: Bytes) -> bytes:
-    data: bytes
     if compression == "lz4":
         import lz4.frame
 
         # independent blocks take two thirds of the time of linked blocks to decompress and are 1 % larger
-        data = lz4.frame.compress(content, block_linked=False)
-    else:
-        import zstandard
+        return bytes(lz4.frame.compress(content, block_linked=False))
+    import zstandard
 
-        data = zstandard.ZstdCompressor(level=3).compress(content.tobytes())
-    return data
+    return bytes(zstandard.ZstdCompressor(level=3).compress(content.tobytes()))
 
 
 class UnbufferedFile:

@@ -12,7 +12,6 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import Enum
-from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -21,7 +20,7 @@ from numpy.typing import NDArray
 
 from plow_twin.errors import ForeignRecordingError, RecordingError
 from plow_twin.record.cdr import decode
-from plow_twin.record.chunks import ChunkReader, Messages, is_begun, is_mcap, metadata_records
+from plow_twin.record.chunks import ChunkReader, Messages, is_mcap, metadata_records
 from plow_twin.record.entries import NO_ENTRIES, Batch, Entries, Outputs, Record, in_order, parted_at, unwrap
 from plow_twin.record.follow import Tail
 from plow_twin.record.header import HEADER_RECORD, LOSS_RECORD, STOPPED_EARLY_KEY, RunHeader
@@ -104,7 +103,7 @@ class RunReader:
         """Find the files and order them by part number, from the header or, without header, from the name."""
         files = run_parts(self._place)
         for file in files:
-            if file not in self._headers and (len(files) == 1 or (is_begun(file) and is_mcap(file))):
+            if file not in self._headers and (len(files) == 1 or is_mcap(file)):
                 try:
                     header = read_header(file)
                 except RecordingError:
@@ -198,16 +197,17 @@ class RunReader:
         for part in self._parts_to_read():
             self.damaged_chunks += cut  # if the previous part was cut off, its last records may be missing
             cut = False
-            if self.tail is None and len(self.parts) > 1 and not is_begun(part):
+            begins = is_mcap(part) if len(self.parts) > 1 else True
+            if self.tail is None and begins is None:
                 finished, cut = False, True
                 continue
-            if len(self.parts) > 1 and not is_mcap(part):
+            if begins is False:
                 self.damaged_chunks += 1
                 continue
             reader = ChunkReader(
                 part,
                 self._metadata,
-                None if outputs else partial(merger.is_journal, part),
+                None if outputs else merger.is_journal,
                 None if self.tail is None else self.tail.more,
             )
             merger.begin(part, reader)
@@ -317,7 +317,7 @@ class _Merger:
         """End the part."""
         self._chunks = None
 
-    def is_journal(self, part: Path, numbers: set[int]) -> bool:
+    def is_journal(self, numbers: set[int]) -> bool:
         """Return whether one of the channels `numbers` belongs to the journal."""
         assert self._chunks is not None
         return any(self._chunks.channels[number].topic in self._journal for number in numbers)

@@ -13,7 +13,7 @@ from plow_twin.record.durable import sync_path
 from plow_twin.record.header import RunHeader
 from plow_twin.record.mcap_file import ByteFile
 from plow_twin.record.metadata_yaml import LOST, PartFacts, bag_metadata, write_metadata
-from plow_twin.record.writer import RunWriter, make_folder
+from plow_twin.record.writer import RunWriter, make_folder, shortage
 
 #: Number of parts of a full ring; the oldest part is dropped as a whole.
 PARTS: Final = 8
@@ -94,9 +94,8 @@ class RingWriter(RunWriter):
 
     def _dump(self, folder: Path, loss: Mapping[str, int], undone: ExitStack) -> None:
         """Write the parts to a folder; `undone` gets the removal of each file in case of a failure."""
-        shortage = self._shortage(folder)
-        if shortage is not None:
-            raise RecordingError(shortage)
+        if (short := shortage(folder, self._min_free_bytes)) is not None:
+            raise RecordingError(short)
         facts = []
         for _, part, content in self._kept:
             name = f"{folder.name}_{part.name.rpartition('_')[2]}"

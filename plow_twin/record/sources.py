@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.errors import RecordingError
-from plow_twin.record.chunks import MAGIC, Channel, ChunkReader, is_begun, is_mcap
+from plow_twin.record.chunks import MAGIC, Channel, ChunkReader, is_mcap
 from plow_twin.record.merging import StampOf, merged
 from plow_twin.record.metadata_yaml import missing_files
 from plow_twin.record.reader import part_number, run_parts
@@ -30,7 +30,6 @@ from plow_twin.scene_file.csv_rows import csv_rows, open_csv, tables
 from plow_twin.scene_file.parquet_lines import is_parquet
 
 _SQLITE_MAGIC: Final = b"SQLite format 3\0"
-_ROWS: Final = 1000
 _ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
 #: Largest message that is unpacked [B].
 _LARGEST_MESSAGE: Final = 2**26
@@ -42,6 +41,7 @@ _COMPUTED: Final = """
     UNION ALL SELECT 1 FROM pragma_table_xinfo('messages') WHERE hidden
     UNION ALL SELECT 1 FROM pragma_table_xinfo('topics') WHERE hidden LIMIT 1
 """
+_MESSAGES: Final = "SELECT topic_id, timestamp, data FROM messages ORDER BY id"
 #: Errors that sqlite3 raises for a damaged file; the last two are for text that is not UTF-8 and for cells of
 #: impossible length.
 _SQLITE_ERRORS: Final = (sqlite3.Error, UnicodeDecodeError, MemoryError)
@@ -225,7 +225,7 @@ class McapSource:
         """Return types by topic, from the first chunks of each part."""
         found: dict[str, str] = {}
         for part in self.parts:
-            if len(self.parts) > 1 and not (is_begun(part) and is_mcap(part)):
+            if len(self.parts) > 1 and not is_mcap(part):
                 continue
             reader = ChunkReader(part)
             for number, _ in enumerate(reader):
@@ -240,8 +240,8 @@ class McapSource:
         hole = False
         for part in self.parts:
             hole = hole or part in self._behind_holes
-            if len(self.parts) > 1 and not (is_begun(part) and is_mcap(part)):
-                self.losses.counts["damaged_files" if is_begun(part) else "truncated_files"] += 1
+            if len(self.parts) > 1 and not (begins := is_mcap(part)):
+                self.losses.counts["truncated_files" if begins is None else "damaged_files"] += 1
                 hole = True
                 continue
             reader = ChunkReader(part)
@@ -348,7 +348,7 @@ class SqliteSource:
                     number: (name, kind) for number, name, kind in topics if wanted(name) and decoder.knows(name, kind)
                 }
                 try:
-                    for number, stamp_ns, data in _rows(connection):
+                    for number, stamp_ns, data in connection.execute(_MESSAGES):
                         if number not in named:
                             continue
                         name, kind = named[number]
@@ -362,13 +362,6 @@ class SqliteSource:
                 except (*_SQLITE_ERRORS, OverflowError):
                     self.losses.counts["truncated_files"] += 1
                     hole = True
-
-
-def _rows(connection: sqlite3.Connection) -> Iterator[tuple[Any, Any, Any]]:
-    """Yield topic, time and data of all messages in order."""
-    cursor = connection.execute("SELECT topic_id, timestamp, data FROM messages ORDER BY id")
-    while rows := cursor.fetchmany(_ROWS):
-        yield from rows
 
 
 class CsvSource:

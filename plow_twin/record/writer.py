@@ -104,7 +104,7 @@ class RunWriter:
         file = McapFile(self._make(path), f"plow_twin {self.header.package_version}")
         file.metadata(HEADER_RECORD, {**self.header.to_record(), "part": str(self._number)})
         if self._sync:
-            file.sync()
+            file.out.sync()
             sync_path(self.folder, self.folder.parent)
         return _Part(path, file)
 
@@ -233,20 +233,17 @@ class RunWriter:
         """Pass all bytes to the operating system, so that they survive a kill of the process."""
         self._close_chunks()
         if self._sync:
-            self._part.file.sync()
+            self._part.file.out.sync()
 
     def reason_to_stop(self) -> str | None:
         """Return the reason why recording must end for good, or None."""
-        if not self._part.file.is_linked():
+        if not self._part.file.out.is_linked():
             return "the file was removed or replaced"
         return None
 
     def shortage(self) -> str | None:
         """Return a text when the disk has too little space to end the file, or None."""
-        return self._shortage(self.folder)
-
-    def _shortage(self, folder: Path) -> str | None:
-        return shortage(folder, self._min_free_bytes)
+        return shortage(self.folder, self._min_free_bytes)
 
     def split(self, loss: Mapping[str, int], keep_bytes: int = 0) -> None:
         """Start a new part, which is opened before the old part is closed.
@@ -272,8 +269,8 @@ class RunWriter:
         part.file.metadata(LOSS_RECORD, record)
         part.file.finish()
         if self._sync:
-            part.file.sync()
-        part.file.close()
+            part.file.out.sync()
+        part.file.out.close()
         self._bytes_before += part.file.size
         self._done.append(part.facts())
 
@@ -290,7 +287,7 @@ class RunWriter:
 
     def abandon(self) -> None:
         """Close the file without an index, after an error."""
-        self._part.file.close()
+        self._part.file.out.close()
 
 
 def shortage(folder: Path, min_free_bytes: int) -> str | None:

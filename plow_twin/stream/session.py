@@ -413,10 +413,8 @@ class Session:
             raise ValueError(
                 f"stamp: got {stamps[0]} ns first, expected stamps that do not fall, after {self.stamp_ns} ns"
             )
-        if self.held or self._travels:
-            found = self._advance_in_pieces(stamps, wrench, rows, taken, digest_after)
-        else:
-            found = self._advance(stamps, wrench, rows, taken, digest_after)
+        advance = self._advance_in_pieces if self.held or self._travels else self._advance
+        found = advance(stamps, wrench, rows, taken, digest_after)
         self._advances += len(stamps)
         return found
 
@@ -498,10 +496,8 @@ class Session:
         """Advance to samples."""
         stamps = np.array([sample.stamp_ns for sample in samples], np.int64)
         wrench = np.array([sample.wrench for sample in samples])
-        rows = self._stock.new(len(samples))
-        if self.held or self._travels:
-            return self._advance_in_pieces(stamps, wrench, rows, taken, NONE)
-        return self._advance(stamps, wrench, rows, taken, NONE)
+        advance = self._advance_in_pieces if self.held or self._travels else self._advance
+        return advance(stamps, wrench, self._stock.new(len(samples)), taken, NONE)
 
     def _advance(
         self,
@@ -717,11 +713,15 @@ class Session:
 
     def _restart(self, wear_depth: NDArray[np.float64]) -> None:
         """Reset the motion to its initial state."""
+        self._end_motion()
+        self.wear_depth = wear_depth.copy()
+        self.twin.reset(0.0, wear_depth=wear_depth)
+
+    def _end_motion(self) -> None:
+        """Let the waiting speeds act, and drop the time reached, the past and the sums of the outputs."""
         self._resume_wear()
         for travel in self._travels:
             self._set_speed(travel)
-        self.wear_depth = wear_depth.copy()
-        self.twin.reset(0.0, wear_depth=wear_depth)
         self.outputs.restart()
         self._forget_past()
         self._travels = []
@@ -759,13 +759,11 @@ class Session:
 
     def _restore_motion(self, data: bytes) -> None:
         """Restore only the motion of a snapshot, not the wear, model, speed along the face or counts."""
-        self._resume_wear()
-        for travel in self._travels:
-            self._set_speed(travel)
         travels = _HEADER.unpack_from(data)[-1]
         end = _HEADER.size + travels * _TRAVEL.size
         depth = np.frombuffer(data, np.float64, PAIR_COUNT, offset=end)
         twin_data, changes = self._split_twin(data[end + _WEAR_SIZE + self.outputs.state_size() :])
+        self._end_motion()
         known = "" if self.following is None else self.following.known
         if changes == self.changes and (depth == self.wear_depth).all():
             self.twin.restore(twin_data)
@@ -777,10 +775,6 @@ class Session:
             self.following.follow_estimate(known)
         if self._wears:
             self.twin.set_travel_speed(self._speed)
-        self.outputs.restart()
-        self._forget_past()
-        self._travels = []
-        self.origin_ns = self.stamp_ns = None
 
     def _split_twin(self, data: bytes) -> tuple[bytes, dict[str, float]]:
         """Split the end of a session's snapshot into the twin's snapshot and the changes of the model."""
