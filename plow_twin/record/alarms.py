@@ -1,4 +1,4 @@
-"""The alarms of a run: set by its parameters, written as messages, and computed again by a replay."""
+"""The alarms of a run: configured by its parameters, written as messages, and computed again by a replay."""
 
 from __future__ import annotations
 
@@ -19,9 +19,8 @@ from plow_twin.stream.alarms import Alarms, Thresholds
 from plow_twin.stream.journal import Parameter, Pose
 from plow_twin.stream.outputs import Published
 
-#: Base name of the topic of the alarms.
 ALARMS: Final = "alarms"
-#: Name under which the journal records an acknowledgement, in the form of a changed parameter.
+#: Parameter by which the journal records an acknowledgement.
 ACKNOWLEDGED: Final = "alarms_acknowledged"
 #: For each quantity, the factor from SI and the unit in an alarm's text.
 _UNITS: Final = {
@@ -33,8 +32,7 @@ _UNITS: Final = {
 }
 _NAMES: Final = ("force", "clearance", "clearance_rate", "wear_rate")
 
-#: A difference between a recorded and a computed message: step, stamp [ns], topic, field, recorded value, computed
-#: value.
+#: A difference of two messages: step, stamp [ns], topic, field, recorded value, computed value.
 Difference = tuple[int, int, str, str, str, str]
 
 
@@ -66,9 +64,9 @@ def alarms_message(alarms: Alarms, node: str, hardware_id: str) -> DiagnosticSta
 
 
 def alarm_texts(values: Mapping[str, str], *, own_start: bool = False, newest: bool = False) -> list[str]:
-    """Return a sentence for each latched alarm: value, pad, level, threshold and time.
+    """Return a sentence for each latched alarm in the `values` of `alarms_message`.
 
-    `values` are the values of `alarms_message`. `newest` adds the present value. `own_start` is passed to `time_text`.
+    `newest` adds the present value. `own_start` is passed to `time_text`.
     """
     found = []
     for name, (factor, unit) in _UNITS.items():
@@ -98,10 +96,8 @@ class AlarmCheck:
         self._alarms = alarms_of(header.parameters)
         self._computed: deque[tuple[int, int, DiagnosticStatus]] = deque()
         self._recorded: deque[OutputRecord] = deque()
-        #: whether every publication so far is present
         self.possible = possible
-        #: `compared`: number of recorded messages that were compared
-        #: `not_compared`: number of recorded messages that could not be compared
+        #: numbers of recorded messages that were compared, and that could not be compared
         self.compared = self.not_compared = 0
 
     def give_up(self) -> None:
@@ -163,8 +159,7 @@ class AlarmCheck:
     def differences(self) -> Iterator[Difference]:
         """Yield the differences between recorded and computed messages.
 
-        A message whose counterpart is missing waits, because the journal may later record that the counterpart was
-        lost.
+        A message without a counterpart waits, because the journal may still say that the counterpart was lost.
         """
         while self._recorded and self._computed:
             record, (sequence, step, computed) = self._recorded.popleft(), self._computed.popleft()
@@ -178,7 +173,9 @@ class AlarmCheck:
             yield step, record.publish_time_ns, ALARMS, *difference
 
     def left_over(self, step: int) -> Iterator[Difference]:
-        """Yield the messages without a counterpart at the end of a complete recording; `step` is the last advance."""
+        """Yield the messages that have no counterpart at the end of a complete recording; `step` is the last
+        advance.
+        """
         for record in self._recorded:
             self.compared += 1
             yield step, record.publish_time_ns, ALARMS, "message", "a message", "none"

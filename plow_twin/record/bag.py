@@ -32,8 +32,8 @@ class Topic:
 class BagWriter:
     """Write messages to a new folder; `lost` counts by topic the messages for which the disk had no room.
 
-    A killed process loses the messages since the last `flush`. `on_trouble` receives a text when the disk is full and
-    another when the disk has room again.
+    A killed process loses the messages since the last `flush`. `on_trouble` receives a text when the disk is full, and
+    another when it has room again.
 
     Raises
     ------
@@ -77,7 +77,7 @@ class BagWriter:
             if short is not None:
                 raise OSError(short)
             self._file.chunk(self._chunk)
-        except OSError as error:  # the waiting messages are lost; the next flush tries to write again
+        except OSError as error:  # the next flush tries to write again
             self._chunk.clear()
             self.lost.update(waiting)
             self.error = f"{self.path}: {error.strerror or error}"
@@ -115,15 +115,12 @@ def beside_folders(run: Path) -> Sequence[Path]:
 
 
 def readable_beside(run: Path, lost: Counter[str]) -> list[Path]:
-    """Return the readable folders of `beside_folders` and count the losses in `lost`.
-
-    The losses are the files in unreadable folders and, by topic, the messages that the recorders have lost.
-    """
+    """Return the folders of `beside_folders` that can be read; `lost` receives all other losses."""
     found = []
     for folder in beside_folders(run):
         lost.update(recorded_losses(folder))
         parts = [*folder.glob("*.mcap")]
-        # the reader of this folder counts its unreadable files
+        # the reader of the folder counts its unreadable files
         if any(map(is_mcap, parts)):
             found.append(folder)
         else:

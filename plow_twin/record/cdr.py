@@ -1,6 +1,6 @@
 """Conversion of plain messages to CDR bytes and back by the type store of rosbags, without a ROS installation.
 
-Padding bytes are zero, so equal messages have equal bytes and a replay can compare bytes.
+Padding bytes are zero, so equal messages have equal bytes.
 """
 
 from __future__ import annotations
@@ -180,7 +180,7 @@ def _decode_integers(wire: Any) -> Integers:
 
 
 def _decode_short_text(data: bytes) -> Text:
-    """Decode a string message without the general decoder, because the journal has many of them."""
+    """Decode a string message without rosbags, because the journal has many strings."""
     (length,) = struct.unpack_from("<I", data, 4) if len(data) >= _TEXT_AT else (0,)
     if data[:2] != b"\x00\x01" or not 0 < length <= len(data) - _TEXT_AT:
         raise RecordingError(f"{Text.TYPE}: got {len(data)} bytes, expected one message")
@@ -191,7 +191,7 @@ def _decode_short_text(data: bytes) -> Text:
 
 
 def _encode_short_text(message: Text) -> bytes:
-    """Encode a string message without the general encoder, because a live journal has several each second."""
+    """Encode a string message without rosbags, because a live journal has several strings each second."""
     text = message.data.encode()
     return b"\x00\x01\x00\x00" + struct.pack("<I", len(text) + 1) + text + b"\x00"
 

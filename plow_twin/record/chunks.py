@@ -1,6 +1,10 @@
-"""Reading of MCAP files from front to back, chunk by chunk; messages are arrays of offsets instead of objects.
+"""Reading of MCAP files from front to back, chunk by chunk.
 
-No index is needed: a truncated file is read up to its last whole record, and damaged chunks are skipped and counted.
+Messages are arrays of offsets instead of objects. No index is needed: a truncated file is read up to its last whole
+record, and damaged chunks are skipped and counted.
+
+A *head* is the opcode and the length at the start of a record. A *channel mask* has a bit for each channel of a chunk,
+so that a chunk can be skipped before it is read.
 """
 
 from __future__ import annotations
@@ -21,33 +25,29 @@ from plow_twin.record.compression import RECORD_LIMIT, decompress
 from plow_twin.record.template import Bytes, Indexes, compiled
 from plow_twin.record.words import word
 
-try:  # the crc32 of isal is twenty times as fast as the one of the standard library
+try:  # the crc32 of isal is twenty times as fast as that of the standard library
     from isal.isal_zlib import crc32 as crc32
 except ImportError:
     from zlib import crc32 as crc32
 
-#: Name of the metadata record that a repair writes in place of an unreadable chunk; the reader counts it as a damaged
-#: chunk.
+#: Name of the metadata record that a repair writes in place of a damaged chunk.
 DAMAGE_RECORD: Final = "plow_twin_damage"
 MAGIC: Final = b"\x89MCAP0\r\n"
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _METADATA = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x0C
 _ATTACHMENT: Final = 0x09
-#: File name endings of tables, which are not recordings.
 _TABLES: Final = (".csv", ".parquet")
 _HEAD: Final = struct.Struct("<BQ")
 _HEAD_SIZE: Final = _HEAD.size
 #: Size of a record's head and of the channel number at the start of an index record [B].
 _INDEX_HEAD: Final = _HEAD.size + 2
-#: Largest ratio of the unpacked size of a file's chunks to the size of the file; the chunks may exceed this by
-#: `RECORD_LIMIT`.
+#: Largest unpacked size of a file's chunks, as a multiple of the file's size; `RECORD_LIMIT` is allowed in addition.
 UNPACKED_RATIO: Final = 200
 #: Largest number of schemas and channels in a file.
 _MOST_DECLARED: Final = 10_000
 #: Number of channels that have a bit in a channel mask; the mask of a chunk with another channel is -1.
 _CHANNEL_BITS: Final = 63
-#: Number of record heads that are read at once.
 _AHEAD: Final = 64
-#: `pread` for the compiled code that reads record heads: a recording has many more record heads than opened chunks.
+#: Compiled code calls `pread`, because a recording has many record heads.
 _pread: Final[Any] = types.ExternalFunction("pread", types.intp(types.int32, types.uintp, types.uintp, types.int64))
 _CHUNK_HEAD: Final = struct.Struct("<QQQII")
 #: Bytes of a message record before its data: opcode, length, channel, sequence, log time, publish time.
@@ -56,7 +56,7 @@ _MESSAGE_FIELDS: Final = MESSAGE_HEAD - _HEAD_SIZE
 _COLUMNS: Final = 6
 #: Chunks below this size [B] are scanned together.
 _SMALL: Final = 2**18
-#: The same limit for a reader with `wanted`, which may skip the large chunks between the small ones.
+#: With `wanted`, chunks below this size are scanned together: large chunks between small ones may be skipped.
 _SMALL_ALONE: Final = 2**20
 
 
@@ -73,7 +73,7 @@ class Channel:
 
 @dataclass(frozen=True)
 class Messages:
-    """Messages of one chunk: places in `buffer`, in the file's order; every array has shape (n,)."""
+    """Messages of one chunk in the file's order; each array has shape (n,), and `start` are offsets in `buffer`."""
 
     buffer: Bytes
     channel: Indexes
@@ -106,19 +106,20 @@ class Messages:
 class ChunkReader:
     """Iterate over the chunks of one MCAP file.
 
-    `channels` grows while the file is read. Once the iteration has ended, `finished` says whether the file is complete
-    and `damaged` counts the chunks that could not be read. `on_metadata` receives each metadata record.
+    `channels` grows while the file is read. At the end, `finished` says whether the file is complete, `damaged` counts
+    the chunks that could not be read, and `left_out` those of them that a repair has left out.
 
     Parameters
     ----------
     path
         The file.
+    on_metadata
+        Function that receives each metadata record.
     wanted
-        Function that is called with the channel numbers of each chunk whose index can be read; if it returns False, the
-        chunk is not read.
+        Function that receives the channel numbers of each chunk with a readable index; False: the chunk is not read.
     more
-        Function that is called with the stream and the known size at the end of a file that is still being written,
-        after all messages and then an empty batch have been yielded. It returns True when the file has grown.
+        Function for a file that is still being written. It receives the stream and the known size at the end of the
+        file, after an empty batch has been yielded, and returns True when the file has grown.
     """
 
     path: Path
@@ -128,16 +129,15 @@ class ChunkReader:
     channels: dict[int, Channel] = field(default_factory=dict)
     finished: bool = False
     damaged: int = 0
-    #: number of damaged chunks that a repair has left out
     left_out: int = 0
     position: int = 0
-    #: result of `wanted` for each channel mask seen so far
+    #: result of `wanted` by channel mask
     _answers: dict[int, bool] = field(default_factory=dict, init=False)
-    #: number of rows of the next table of messages
+    #: number of rows for the next table of messages
     _room: int = field(default=256, init=False)
     #: unpacked size of the chunks so far [B]
     _unpacked: int = field(default=0, init=False)
-    #: schema and channel records by opcode and number, kept because chunks may repeat them
+    #: schema and channel records by opcode and number; a chunk may repeat them
     _declared: dict[tuple[int, bytes], bytes] = field(default_factory=dict, init=False)
     _others: Indexes = field(default_factory=lambda: np.empty(256, np.int64), init=False)
 
@@ -156,7 +156,7 @@ class ChunkReader:
                 begin = place + _HEAD_SIZE
                 if length > RECORD_LIMIT and opcode != _ATTACHMENT:
                     break
-                # a footer is read only together with the magic after it, which the writer may not have written yet
+                # a footer counts only together with the magic after it
                 behind = len(MAGIC) if opcode == _FOOTER else 0
                 if begin + length + behind > size:
                     if self.more is None:
@@ -190,7 +190,7 @@ class ChunkReader:
                 elif opcode == _METADATA:
                     yield from self._scan(
                         waiting.pop_all(), schemas
-                    )  # the messages before a note of damage are passed on first, so that the note keeps its place
+                    )  # pass on the messages before a note of damage first, so that the note keeps its place
                     self._metadata(os.pread(descriptor, length, begin))
                 elif opcode == _FOOTER:
                     self.finished = os.pread(descriptor, len(MAGIC), place) == MAGIC
@@ -219,7 +219,7 @@ class ChunkReader:
             if len(data) != length or size > RECORD_LIMIT:
                 return None
             content = decompress(compression, data, size)
-        except Exception:  # each decompressor has its own errors, and all of them mean damage
+        except Exception:  # each decompressor raises its own errors for damaged data
             return None
         if len(content) != size or (crc and crc32(content) != crc):
             return None
@@ -278,7 +278,7 @@ class ChunkReader:
                 self.channels[channel.id] = Channel(
                     channel.topic, name, channel.message_encoding, text, channel.metadata
                 )
-        except Exception:  # the record is damaged, so the messages of the channel are skipped
+        except Exception:  # the messages of a damaged channel are skipped
             self.damaged += 1
 
     def _metadata(self, record: bytes) -> None:
@@ -302,7 +302,7 @@ class ChunkReader:
         try:
             with self.path.open("rb") as stream:
                 summary = make_reader(stream).get_summary()
-        except Exception:  # without a readable index these channels stay unknown
+        except Exception:
             return
         if summary is None:
             return
@@ -316,7 +316,7 @@ class ChunkReader:
 
 
 class _Waiting:
-    """Contents of chunks, and messages outside chunks, that are scanned together, because a scan has a fixed cost."""
+    """Chunks and single messages that wait to be scanned together, because each scan has a fixed cost."""
 
     def __init__(self) -> None:
         self._contents: list[Bytes] = []
@@ -324,18 +324,15 @@ class _Waiting:
         self.size = 0
 
     def add(self, content: Bytes) -> None:
-        """Add the content of a chunk."""
         self._join()
         self._contents.append(content)
         self.size += len(content)
 
     def add_message(self, record: bytes) -> None:
-        """Add the record of a message outside the chunks."""
         self._messages.append(record)
         self.size += len(record)
 
     def pop_all(self) -> list[Bytes]:
-        """Return everything in file order and empty the list."""
         self._join()
         contents, self._contents, self.size = self._contents, [], 0
         return contents
@@ -352,7 +349,7 @@ def is_mcap(path: Path) -> bool | None:
         with path.open("rb") as stream:
             head = stream.read(len(MAGIC))
     except OSError:
-        return True  # the reader will report why the file cannot be read
+        return True
     return head == MAGIC or (None if MAGIC.startswith(head) else False)
 
 
@@ -381,7 +378,7 @@ def _metadata_by_heads(descriptor: int) -> list[tuple[str, dict[str, str]]]:
         if opcode == _METADATA and length <= RECORD_LIMIT:
             try:
                 record = Metadata.read(ReadDataStream(BytesIO(os.pread(descriptor, length, place))))
-            except Exception:  # the record is damaged
+            except Exception:
                 break
             found.append((record.name, dict(record.metadata)))
         place += length
@@ -396,7 +393,7 @@ class _Heads:
         self._table = np.empty((_AHEAD, 5), np.int64)
         self._rows: list[tuple[int, int, int, int, int]] = []
         self._next = 0
-        self._index = [0, 0]  # end of the newest record together with its index, and the channel mask of this index
+        self._index = [0, 0]  # end of the newest record with its index, and the channel mask of this index
 
     def at(self, place: int) -> tuple[int, int]:
         """Return opcode and length of the record at a place; zeros at the end."""
@@ -404,7 +401,7 @@ class _Heads:
             count = look_ahead(self._descriptor, self._size, place, self._table)
             self._rows, self._next = self._table[:count].tolist(), 0
             if not self._rows:
-                # no record was found; if the file cannot be read, this call raises the error
+                # raises the error if the file cannot be read
                 os.pread(self._descriptor, 1, place)
                 return 0, 0
         _, opcode, length, *self._index = self._rows[self._next]
@@ -412,20 +409,17 @@ class _Heads:
         return opcode, length & (1 << 64) - 1
 
     def index(self) -> tuple[int, int]:
-        """Return the channel mask of the index records after the newest chunk, and the offset of their end.
-
-        The mask is -1 if a channel has no bit in it.
-        """
+        """Return the channel mask of the newest chunk and the offset at which its index records end."""
         end, channels = self._index
         return channels, end
 
 
 @compiled
 def look_ahead(descriptor, size, place, table):  # type: ignore[no-untyped-def]
-    """Fill rows with place, opcode, length, end and channels of the records from `place` on; return the number of rows.
+    """Read the heads of the records from `place` on into the rows of `table`; return the number of rows.
 
-    The index records after a chunk have no rows of their own: the row of the chunk has their end and their channel mask
-    (-1: a channel has no bit in it).
+    The columns are place, opcode, length, end and channel mask. Index records have no rows of their own: the end and
+    the mask in the row of their chunk cover them.
     """
     head, count = np.zeros(_INDEX_HEAD, np.uint8), 0
     while True:
@@ -452,10 +446,11 @@ def look_ahead(descriptor, size, place, table):  # type: ignore[no-untyped-def]
 
 @compiled
 def scan(content: Bytes, table: Indexes, others: Indexes) -> tuple[int, int, bool]:
-    """Fill the columns of `table` with the messages of a chunk and `others` with the places of schemas and channels.
+    """Find the messages, schemas and channels in the content of a chunk.
 
-    Returns the numbers of both, and whether the records end with the chunk. If the table is too small, the number of
-    messages is one more than its rows.
+    The columns of `table` receive the messages, and `others` the places of schemas and channels. Returns the numbers of
+    both, and whether the records end with the chunk. If the table is too small, the number of messages is one more than
+    its rows.
     """
     place, count, other = 0, 0, 0
     size, room = content.size, table.shape[1]

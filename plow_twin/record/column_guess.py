@@ -23,8 +23,7 @@ from plow_twin.scene_file.csv_rows import csv_rows, delimiter_of, open_csv
 
 Array = NDArray[np.float64]
 
-#: Regular expression for the column name of each quantity, by role and name of the quantity; the column name is first
-#: reduced by `_plain`.
+#: Pattern of the column name of each quantity, by role and quantity; it is matched with the result of `_plain`.
 _NAMES: Final = {
     ("excitation", "fx"): r"fx|(force|load|kraft|last)x|x(force|load|kraft)|fhor(izontal)?|horizontalforce",
     ("excitation", "fy"): r"fy|(force|load|kraft|last)y|y(force|load|kraft)|fver(tical)?|verticalforce",
@@ -38,12 +37,11 @@ _TIME: Final = r"t|time|timestamp|stamp|zeit|zeitstempel|date|datetime|datum"
 _UNIT: Final = re.compile(
     r"(.+?)\s*(?:[\[(]\s*([^\])]+?)\s*[\])]|[ _](kN ?m|N ?m|kN|N|mm|cm|m|mrad|rad|deg|ms|us|ns|s))"
 )
-#: A time above one of these limits is taken as a count from 1970 in the unit before the limit; each limit is a date in
-#: 2001.
+#: A time above one of these limits counts from 1970 in the unit before the limit. Each limit is a date in 2001.
 _DATES: Final = (("ns", 1e18), ("us", 1e15), ("ms", 1e12), ("s", 1e9))
 #: Largest number of cells that are examined: the wider a file, the fewer of its rows are examined.
 _MOST_CELLS: Final = 2_000_000
-#: Role and name of each component of a load; each component needs a column.
+#: The components of a load; each needs a column.
 _NEEDED: Final = tuple(("excitation", name) for name in ROLES["excitation"])
 
 
@@ -67,7 +65,7 @@ class Guess:
     because: dict[str, str] = field(default_factory=dict)
     open: dict[str, tuple[str, ...]] = field(default_factory=dict)
     stamps_s: Array = field(default_factory=lambda: np.zeros(0))
-    #: values of the columns in SI, by role and name of the quantity
+    #: values of the columns in SI, by role and quantity
     values: dict[tuple[str, str], Array] = field(default_factory=dict)
 
     def mapping(self) -> dict[str, Any]:
@@ -92,7 +90,7 @@ class Guess:
         return text
 
 
-#: Pattern of the time zone at the end of a date with time.
+#: Time zone at the end of a date with time.
 _ZONE: Final = re.compile(r"([Zz]|:\d\d([.,]\d+)?[+-]\d\d(:?\d\d)?)$")
 
 
@@ -181,7 +179,6 @@ def _read(path: Path) -> tuple[Guess, list[list[str]]]:
 def _find_time(
     guess: Guess, rows: Sequence[Sequence[str]], numbers: Mapping[str, Array], given: str, unit: str
 ) -> None:
-    """Find the time column, by its name or as the only rising column, and its unit if the numbers show the unit."""
     alike = [name for name in guess.names if re.fullmatch(_TIME, _plain(name))]
     rising = [name for name, found in numbers.items() if len(found) > 2 and (np.diff(found) > 0.0).all()]
     choices = [given] if given else alike or rising
@@ -214,7 +211,6 @@ def _find_time(
 
 
 def _find_units(guess: Guess, numbers: Mapping[str, Array], scene: Scene, given: Mapping[str, str]) -> None:
-    """Find the units: as stated, from the columns' names, or from the magnitudes."""
     for key, column in guess.columns.items():
         unit = given.get(key[1]) or _unit_of(column)
         known = UNITS[QUANTITIES[key]]
@@ -237,7 +233,7 @@ def _find_units(guess: Guess, numbers: Mapping[str, Array], scene: Scene, given:
             guess.units[name] = doubt.likely
             guess.because[name] += f", {doubt.likely} by its size"
             guess.values[doubt.role, name] *= UNITS[QUANTITIES[doubt.role, name]][doubt.likely]
-    # a force without a known unit takes the unit of the other force
+    # the two forces have the same unit
     both = [name for name in ("fx", "fy") if ("excitation", name) in guess.columns]
     for name in both:
         other = next((guess.units[one] for one in both if one in guess.units), "")
@@ -245,7 +241,7 @@ def _find_units(guess: Guess, numbers: Mapping[str, Array], scene: Scene, given:
             guess.units[name] = other
             guess.because[name] += f", {other} like the other force"
             guess.values["excitation", name] *= UNITS["force"][other]
-    # the size of a moment does not show its unit, so the moment gets the unit of the forces
+    # the size of a moment does not show its unit
     if guess.units.get("fx") == "kN" and "m" not in guess.units and ("excitation", "m") in guess.columns:
         guess.units["m"] = "kN m"
         guess.because["m"] += ", kN m because the forces are in kN"

@@ -1,4 +1,7 @@
-"""Comparison, byte for byte, of the messages that a run sent with the messages that its replay computes."""
+"""Comparison, byte for byte, of the messages that a run sent with the messages that its replay computes.
+
+The *kind* of a message is the index of its topic in `REPLAYED`, -1 for any other topic.
+"""
 
 from __future__ import annotations
 
@@ -20,42 +23,43 @@ _IS_SLOW = np.array([topic.cadence is Cadence.SLOW for topic in REPLAYED])
 
 
 class Sent:
-    """Find, for each message sent during a series of journal entries, the advance that precedes it.
+    """Find, for each message that was sent during a series of journal entries, the advance before it.
 
     Parameters
     ----------
     sequence, kind : ndarray of int64, shape (n,)
-        Number of the journal entry before each message (rising), and index of the message's topic in `REPLAYED` (-1 for
-        any other topic).
+        Number of the journal entry before each message (rising), and kind of the message.
     done : ndarray of int64, shape (k,)
-        Number of advances up to each entry of the series, whose first entry has the sequence number `first`.
+        Number of advances up to each entry of the series.
+    first
+        Sequence number of the first entry.
     advances
         Number of advances in the series.
     """
 
     def __init__(self, sequence: Indexes, kind: Indexes, done: Indexes, first: int, advances: int) -> None:
         self.kind = kind
-        #: for each message, the index of the advance after which it was sent
+        #: index of the advance before each message
         self.after = np.empty(len(kind), np.int64)
-        #: number of messages on each topic of `REPLAYED`
+        #: number of messages of each kind
         self.counts = np.zeros(_KINDS, np.int64)
         numbers = np.full(advances, -1)
         find_advances(sequence, kind, done, first, self.after, self.counts, numbers)
-        #: indexes of the advances after which messages were sent
+        #: indexes of the advances after which messages were sent, that is, of the publications
         self.taken = np.flatnonzero(numbers >= 0)
         #: sequence number of the first message after each of these advances
         self.first_sequence = numbers[self.taken]
-        #: for each advance in `taken`, the index of its publication
+        #: index of the publication after each advance
         self.publication = np.empty(advances, np.int64)
         self.publication[self.taken] = np.arange(len(self.taken))
 
     def expect(self, published: Published, templates: Templates, kinds: NDArray[np.bool_]) -> None:
-        """Set the publication after each advance in `taken`; `kinds` is True for each topic to compare."""
+        """Set the expected publications; `kinds` is True for each kind of message to compare."""
         rows, slow = published
         slow_of = np.full(len(rows), -1)
         slow_of[slow["row"]] = np.arange(len(slow))
         numbers = [topic.numbers(topic.record_of(published)) for topic in REPLAYED]
-        #: these arrays are kept alive, because compiled code reads them by address
+        #: compiled code reads these arrays by address, so they must stay alive
         self._numbers = [[_with_whole_rows(part) for part in parts] for parts in numbers]
         self._expected = (
             self.publication, slow_of, kinds, np.ascontiguousarray(rows["stamp_ns"]),
@@ -83,7 +87,6 @@ def find_advances(sequence, kind, done, first, after, counts, numbers):  # type:
 
 
 def _with_whole_rows(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the numbers as an array whose rows are each contiguous; copy them only if necessary."""
     return numbers if numbers.strides[1] == numbers.itemsize else np.ascontiguousarray(numbers)
 
 
@@ -120,8 +123,7 @@ def compare(  # type: ignore[no-untyped-def]
     kinds, after : ndarray of int64, shape (n,)
         As in `Sent`.
     publication, slow : ndarray of int64
-        Index of each advance's publication, and index of each publication's slow part, which has clearance and wear
-        rate (below 0: no slow part).
+        Index of each advance's publication, and of each publication's slow part (below 0: no slow part).
     compared : ndarray of bool
         Whether messages of each kind are compared.
     pieces, piece_ends

@@ -14,8 +14,7 @@ import numpy as np
 from plow_twin.errors import RecordingError
 from plow_twin.record.template import Bytes
 
-#: Largest record and largest chunk content [B]; a greater length is taken as damage, because writers close a chunk at a
-#: few MiB.
+#: Largest record and largest chunk [B]. A greater length means damage, because writers close a chunk at a few MiB.
 RECORD_LIMIT: Final = 64 * 1024 * 1024
 _of_thread: Final = threading.local()
 #: Format of an LZ4 frame: head, magic number, flags, and the length before each block.
@@ -49,7 +48,6 @@ def decompress(compression: str, data: memoryview, size: int) -> bytes | Bytes:
 
 @cache
 def _lz4_block() -> Callable[[int, int, int, int], int] | None:
-    """Return `LZ4_decompress_safe(source, target, length, room)` of liblz4, or None if it cannot be called."""
     import lz4.block
 
     try:
@@ -63,9 +61,8 @@ def _lz4_block() -> Callable[[int, int, int, int], int] | None:
 def independent_blocks(data: memoryview, size: int) -> Bytes | None:
     """Return the content, `size` bytes, of an LZ4 frame written by the recorder, or None for any other frame.
 
-    The recorder writes independent blocks without checksums, because the chunk has a checksum. They are decompressed
-    here directly into the result. The lz4 package decompresses into its own memory and copies the content, which takes
-    a third longer and costs a replay 13 % more processor time.
+    The recorder writes independent blocks without checksums. They are decompressed directly into the result; the lz4
+    package copies the content, which costs a replay 13 % more processor time.
     """
     block = _lz4_block()
     if block is None or len(data) < _LZ4_HEAD.size or len(data) > RECORD_LIMIT:
@@ -81,7 +78,7 @@ def independent_blocks(data: memoryview, size: int) -> Bytes | None:
         place += 4
         if length == 0:
             return content if done == size else None
-        if length > len(data) - place:  # the block is truncated, or not compressed (the highest bit is set)
+        if length > len(data) - place:  # the block is truncated, or it is not compressed (the highest bit is set)
             return None
         count = block(source + place, target + done, length, size - done)
         if count < 0:
@@ -91,7 +88,7 @@ def independent_blocks(data: memoryview, size: int) -> Bytes | None:
 
 
 def _zstd() -> Any:
-    """Return this thread's decompressor; making a new one takes as long as decompressing a small chunk."""
+    """Return this thread's decompressor; to make one takes as long as to decompress a small chunk."""
     import zstandard
 
     if not hasattr(_of_thread, "zstd"):

@@ -1,4 +1,4 @@
-"""Selection of publications to record; a kept publication has the impulses and peaks of the others too."""
+"""Selection of publications to record; a kept publication also has the impulses and peaks of those left out."""
 
 from __future__ import annotations
 
@@ -11,13 +11,8 @@ from plow_twin.stream.outputs import Published
 class Decimation:
     """Thin publications out.
 
-    Parameters
-    ----------
-    outputs
-        `all`, `decimated` or `none`.
-    rate_hz
-        Rate of a decimated recording [Hz]. The first publication of each period is kept, and so is each publication
-        with a slow part (clearance and wear rate).
+    `outputs` is `all`, `decimated` or `none`. A decimated recording keeps the first publication in each period of
+    `rate_hz` [Hz], and each publication with a slow part.
     """
 
     def __init__(self, outputs: str, rate_hz: float) -> None:

@@ -36,7 +36,7 @@ from plow_twin.record.unused import InputCounts
 from plow_twin.stream.journal import Digest, Failed, Sample, Snapshot
 
 _CHUNK_SIZE: Final = 2**20
-#: Key under which `metadata.yaml` lists the repaired parts; in the file it has the prefix `plow_twin_`.
+#: Key of the repaired parts in `metadata.yaml`, there with the prefix `plow_twin_`.
 REPAIRED_KEY: Final = "repaired"
 _HASH: Final = "topic_type_hash"
 
@@ -50,7 +50,7 @@ class PartReport:
     finished: bool
     damaged_chunks: int
     messages: dict[str, int]
-    #: number of bytes after the end of the MCAP content; other readers refuse a file that has such bytes
+    #: number of bytes after the end; other readers refuse a file that has such bytes
     trailing_bytes: int = 0
     #: number of chunks that an earlier repair left out
     left_out: int = 0
@@ -74,13 +74,12 @@ class RunReport:
     layout_version: str = str(LAYOUT_VERSION)
     entries: Counter[str] = field(default_factory=Counter)
     gaps: int = 0
-    #: number of entries that occur more than once in the files
     repeated: int = 0
     lost: dict[str, int] = field(default_factory=dict)
     inputs: dict[str, dict[str, int]] = field(default_factory=dict)
     #: number of failed advances, whose samples have no forces
     failed_advances: int = 0
-    #: time from the first advance to the last [s], equal to `duration_s` in `cli/recording_facts.py`
+    #: time from the first advance to the last [s]
     span_s: float = 0.0
     problems: list[str] = field(default_factory=list)
 
@@ -128,7 +127,7 @@ def examine(path: Path) -> RunReport:
     report.parts = [_part(part) for part in reader.parts]
     expected: int | None = None if reader.header.part else 0
     run_time = RunTime(reader.header.parameters)
-    in_a_row = 0  # length of the unbroken series of entries directly before the expected entry
+    in_a_row = 0  # number of entries without a gap before the expected entry
     inputs = InputCounts(reader.header.excitation_source)
     for batch in reader.batches(outputs=False):
         entries = batch.entries
@@ -272,7 +271,6 @@ def repair(path: Path) -> list[Path]:
 
 
 def _mend(parts: Sequence[Path], last: Path) -> list[Path]:
-    """Rewrite truncated or damaged parts, put empty parts aside, and return both."""
     mended = []
     for part in parts:
         if not is_mcap(part):
@@ -286,7 +284,6 @@ def _mend(parts: Sequence[Path], last: Path) -> list[Path]:
 
 
 def _put_aside(file: Path, ending: str) -> None:
-    """Append `.<ending>` to the name of a file, with a number if the new name is already used."""
     target, number = file.with_name(f"{file.name}.{ending}"), 2
     while target.exists():
         target, number = file.with_name(f"{file.name}.{ending}_{number}"), number + 1
@@ -294,7 +291,6 @@ def _put_aside(file: Path, ending: str) -> None:
 
 
 def _list_parts(folder: Path, parts: Sequence[Path], repaired: Sequence[str]) -> None:
-    """Write `metadata.yaml` for the readable parts."""
     facts = [_facts(part) for part in parts if part.exists() and is_mcap(part)]
     custom = {f"{LOST}{topic}": str(count) for topic, count in recorded_losses(folder).items()}
     if repaired:
@@ -304,9 +300,9 @@ def _list_parts(folder: Path, parts: Sequence[Path], repaired: Sequence[str]) ->
 
 
 def _rewrite(part: Path, *, last: bool) -> None:
-    """Replace a file by a new file with its readable messages and a note at each gap.
+    """Replace a file by a new file with its readable messages and a note of damage at each gap.
 
-    A missing end counts as a gap, except in the last part: there the recording ended.
+    A missing end is a gap, except in the last part.
     """
     target = part.with_name(f"{part.name}.partial")
     target.unlink(missing_ok=True)
@@ -316,7 +312,7 @@ def _rewrite(part: Path, *, last: bool) -> None:
     def on_metadata(name: str, record: dict[str, str]) -> None:
         if name == LOSS_RECORD:
             loss.update(record)
-        elif name != DAMAGE_RECORD:  # the old notes of damage are not copied, because they are written anew below
+        elif name != DAMAGE_RECORD:  # notes of damage are written anew below
             file.metadata(name, record)
 
     reader = ChunkReader(part, on_metadata)

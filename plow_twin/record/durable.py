@@ -24,8 +24,8 @@ def naming(path: Path) -> Iterator[None]:
 def whole_file(path: Path, *, sync: bool = False) -> Iterator[BinaryIO]:
     """Open a stream whose content becomes the file `path` in one step at the end.
 
-    Until the end, and after an error or a kill, an existing file stays unchanged. With `sync` the new file also
-    survives a loss of power. A pipe or a device is written to directly.
+    Until then, and after an error or a kill, an existing file stays unchanged. With `sync` the new file also survives a
+    loss of power. A pipe or a device is written to directly.
 
     Raises
     ------
@@ -37,7 +37,7 @@ def whole_file(path: Path, *, sync: bool = False) -> Iterator[BinaryIO]:
             with path.open("wb") as stream:
                 yield stream
             return
-        place = path.resolve()  # the target of a symbolic link is replaced, so that the link stays
+        place = path.resolve()  # a symbolic link stays, and its target is replaced
         beside = place.with_name(f".{place.name}.{os.getpid()}")
         try:
             with beside.open("wb") as stream:
@@ -52,7 +52,7 @@ def whole_file(path: Path, *, sync: bool = False) -> Iterator[BinaryIO]:
         if sync:
             sync_path(place.parent)
     except OSError as error:
-        if error.errno is None:  # a library has raised the error, with its own text
+        if error.errno is None:  # the library that raised the error has described it
             raise
         raise OSError(error.errno, error.strerror, str(path)) from error
 
@@ -64,13 +64,7 @@ def write_whole(path: Path, content: bytes, *, sync: bool = False) -> None:
 
 
 def sync_path(*paths: Path) -> None:
-    """Wait until files, or the entries of folders, are on the disk; a new file also needs its entry in the folder.
-
-    Raises
-    ------
-    OSError
-        The disk cannot be written.
-    """
+    """Wait until files, or the entries of folders, are on the disk. A new file needs both."""
     for path in paths:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
         try:

@@ -1,4 +1,6 @@
-"""Records of a recording (journal entries and outputs), one by one and in batches of arrays."""
+"""Records of a recording, one by one and in batches of arrays: journal entries, and outputs (messages that were
+sent).
+"""
 
 from __future__ import annotations
 
@@ -52,9 +54,9 @@ Record = EntryRecord | OutputRecord
 class Entries:
     """Journal entries as arrays of shape (n,), in the order in which the twin used them.
 
-    `sample` is True for samples of the load. `digest_at` (m,) has the indexes of the digests (hashes of the twin's
-    state), `digest` (m,) their values, and `stamp_ns` their stamps. `rest` maps the index of each other entry to the
-    entry. The numbers in `sequence` do not wrap at 2^32.
+    `sample` is True for samples of the load. `digest_at` (m,) has the indexes of the digests, `digest` (m,) their
+    values, and `stamp_ns` their stamps. `rest` maps the index of each other entry to the entry. The numbers in
+    `sequence` do not wrap at 2^32.
     """
 
     sequence: Indexes
@@ -86,7 +88,7 @@ class Entries:
     def samples(self) -> tuple[Indexes, NDArray[np.float64]]:
         """Return the stamps and wrenches of the samples."""
         places = np.flatnonzero(self.sample)
-        # indices are used, because a mask takes five times as long
+        # indices take a fifth of the time of a mask
         return self.stamp_ns[places], self.wrench.take(places, axis=0)
 
     @cached_property
@@ -194,7 +196,7 @@ class Holes:
     """Search for missing journal entries by sequence number, batch after batch."""
 
     def __init__(self) -> None:
-        self._next: int | None = None  # sequence number that the next entry should have
+        self._next: int | None = None
 
     def find(self, entries: Entries) -> dict[int, int]:
         """Map the index of each entry after a gap to the number of entries missing in the gap, in order."""
@@ -223,8 +225,8 @@ def in_order(batch: Batch) -> Iterator[Record]:
     sequences = [part.sequence for part in batch.outputs]
     owners = np.concatenate([np.full(len(part), number) for number, part in enumerate(sequences)] or [np.zeros(0, int)])
     places = np.concatenate([np.arange(len(part)) for part in sequences] or [np.zeros(0, int)])
-    # a message is placed before the first entry with a higher sequence number; because entries may be out of order, the
-    # highest number up to each entry is compared
+    # A message comes before the first entry with a higher number. Entries may be out of order, so the highest number up
+    # to each entry is compared.
     bounds = np.maximum.accumulate(batch.entries.sequence) if len(batch.entries) else batch.entries.sequence
     slots = np.searchsorted(bounds, np.concatenate(sequences or [np.zeros(0, np.int64)]), side="right")
     order = np.argsort(slots, kind="stable")

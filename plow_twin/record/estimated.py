@@ -30,7 +30,7 @@ from plow_twin.stream.session import wear_in
 class LiveEstimate:
     """An estimate in a node's journal, and its window of measurements, formed again from the journal.
 
-    `window` is None if part of it is missing because files were removed or entries were lost.
+    `window` is None if measurements are missing.
     """
 
     entry: Estimated

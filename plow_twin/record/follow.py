@@ -37,24 +37,16 @@ def is_claimed(descriptor: int) -> bool:
 
 
 class Tail:
-    """The wait of a reader at the end of a growing file.
-
-    Parameters
-    ----------
-    stop
-        Called while the reader waits; True ends the reading.
-    """
+    """The wait of a reader at the end of a growing file. It calls `stop` meanwhile; True ends the reading."""
 
     def __init__(self, stop: Callable[[], bool] = lambda: False) -> None:
         self._stop = stop
-        #: whether `stop` has ended the reading
         self.stopped = False
 
     def more(self, stream: IO[bytes], size: int) -> bool:
         """Wait until a file is longer than `size` [B]; return False if its writer ends or `stop` is true."""
         while True:
-            # the lock is checked before the size: otherwise the bytes that a writer adds between the two checks, just
-            # before it ends, would not be read
+            # the lock is checked before the size, so that bytes are read that a writer adds just before it ends
             alive = is_claimed(stream.fileno())
             if os.fstat(stream.fileno()).st_size > size:
                 return True

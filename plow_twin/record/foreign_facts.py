@@ -14,7 +14,7 @@ from plow_twin.record.sources import open_source
 
 @dataclass
 class _Seen:
-    """Messages of a role: counts of used and unfit messages, ranges of their stamps [ns] and SI values."""
+    """Counts of a role's used and unfit messages, and the ranges of their stamps [ns] and SI values."""
 
     used: int = 0
     unfit: int = 0

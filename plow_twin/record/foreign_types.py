@@ -6,10 +6,9 @@ from typing import Any, Final
 
 from plow_twin.errors import RecordingError
 
-#: Largest length of the text of a type and of all types that it uses, without comments [characters]; usual texts have
-#: some 10,000 characters.
+#: Largest length of the text of a type and its parts, without comments [characters]; usual texts have some 10,000.
 _LONGEST: Final = 2**18
-#: Largest number of parts (numbers, texts, arrays of numbers) of a message; a sequence counts as if it had one item.
+#: Largest number of parts (numbers, texts, arrays of numbers) of a message; a sequence counts as one item.
 _MOST_PARTS: Final = 1_000
 
 
@@ -24,7 +23,7 @@ def parsed_types(text: str, message_type: str) -> dict[str, Any]:
     """
     from rosbags.typesys import get_types_from_msg
 
-    # empty lines are left out: the parser's time grows with the square of the number of consecutive empty lines
+    # the parser's time grows with the square of the number of consecutive empty lines
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     if sum(map(len, lines)) > _LONGEST:
         raise RecordingError(f"{message_type}: got a longer text, expected at most {_LONGEST} characters")
@@ -36,11 +35,11 @@ def parsed_types(text: str, message_type: str) -> dict[str, Any]:
 
 
 def _count(name: str, types: dict[str, Any], counts: dict[str, int]) -> int:
-    """Return the number of parts of a message of type `name`; a type not in `types` counts as one part."""
+    """Return the number of parts of a message; a type that is not in `types` is one part."""
     if name not in types:
         return 1
     if name not in counts:
-        # a type counts as too large until its parts are counted, so that a type that contains itself is refused
+        # until its parts are counted, a type counts as too large, so that a type that contains itself is refused
         counts[name] = _MOST_PARTS + 1
         counts[name] = max(1, sum(_parts(field, types, counts) for _, field in types[name][1]))
     if counts[name] > _MOST_PARTS:

@@ -17,7 +17,7 @@ from plow_twin.stream.journal import ParameterValue
 HEADER_RECORD: Final = "plow_twin"
 #: Name of the MCAP metadata record with the loss counters, written at close.
 LOSS_RECORD: Final = "plow_twin_loss"
-#: Key, in the loss record, of the reason why recording ended earlier than the run; all other keys are topics.
+#: Key, in the loss record, of the reason of an early end; the other keys are topics.
 STOPPED_EARLY_KEY: Final = "stopped_early"
 #: Version of the layout that `docs/recording.md` describes.
 LAYOUT_VERSION: Final = 4
@@ -27,10 +27,10 @@ LAYOUT_VERSION: Final = 4
 class RunHeader:
     """Scene and settings of a run.
 
-    `scene_yaml` is self-contained. `topics` maps base names of outputs to their topic names in the run. `clock` is
-    the clock of the receive times: `system` or `ros` (under `/clock`). `origin_ns` is the first stamp if it was known.
-    `record_outputs` says which outputs are recorded: `all`, `decimated` or `none`. `part` is the number of this file in
-    the run; all files of a run share the random `run_id`.
+    `scene_yaml` is self-contained. `topics` maps base names of outputs to their topic names in the run. `clock` is the
+    clock of the receive times: `system` or `ros` (under `/clock`). `origin_ns` is the first stamp if it was known.
+    `record_outputs` says which outputs are recorded: `all`, `decimated` or `none`. `part` is the number of this file;
+    all files of a run share the random `run_id`.
     """
 
     scene_yaml: str
@@ -79,7 +79,7 @@ class RunHeader:
         Raises
         ------
         RecordingError
-            The scene cannot be used: the recording is damaged, or this version does not know its contact law.
+            The recording is damaged, or this version does not know the scene's contact law.
         """
         from plow_twin.scene_file import loads_scene
 

@@ -1,4 +1,4 @@
-"""Use of any recording's load as input of a twin; checks, late samples and journal are as in a live run."""
+"""Use of any recording's load as input of a twin, with the checks, the late samples and the journal of a live run."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from plow_twin.stream.steps import Steps
 
 @dataclass
 class Feed:
-    """Pass messages to walkers, which advance twins, in order of arrival; check samples of the load first.
+    """Pass messages to walkers in order of arrival; check samples of the load first.
 
     `measured` is called with the role, stamp [ns] and numbers of each message that is neither a load nor a speed.
     """
@@ -32,9 +32,9 @@ class Feed:
     roles: dict[str, Role]
     measured: Callable[[str, int, dict[str, float]], object]
     intake: Intake = field(default_factory=Intake)
-    #: number of unused messages by reason; the intake also counts the unused messages of the load
+    #: unused messages by reason; the intake also counts those of the load
     unfit: Counter[str] = field(default_factory=Counter)
-    #: whether the measured poses go into the first walker's journal; they do not affect the motion
+    #: whether the measured poses go into the first walker's journal
     with_poses: bool = False
     #: stretches without samples, in which the load is interpolated linearly
     silences: Silences = field(default_factory=lambda: Silences(Policy.excitation_timeout_s))
@@ -138,7 +138,6 @@ class Feed:
 
 
 def _pose(stamp_ns: int, values: dict[str, float]) -> Pose | PartOfPose:
-    """Return the journal entry of a measured pose, a `PartOfPose` if numbers are missing."""
     pose = tuple(values.get(name, math.nan) for name in DOF_NAMES)
     known = tuple(place for place, value in enumerate(pose) if math.isfinite(value))
     if len(known) < len(pose):

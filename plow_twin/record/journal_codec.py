@@ -76,7 +76,6 @@ _DIGEST_HEAD: Final = np.frombuffer(struct.pack("<BBHIII4x", 0, 1, 0, 0, 0, 2), 
 _DIGEST_SIZE: Final = len(_DIGEST_HEAD) + 16
 _MASK: Final = 2**64 - 1
 _SIGN: Final = 2**63
-#: Fields that an entry may lack.
 _OPTIONAL: Final = frozenset({"deviation"})
 _NAMES: Final = {kind: name for name, kind in _KINDS.items()}
 
@@ -94,7 +93,7 @@ def to_message(entry: Entry | Dropped, frame_id: str) -> Message:
     if isinstance(entry, Snapshot | Restore):
         values["data"] = base64.b64encode(entry.data).decode()
     elif isinstance(entry, Unused):
-        # infinity and NaN are written as strings, because JSON has no such numbers
+        # JSON has no infinity and NaN, so they are written as texts
         values["values"] = [
             [number if math.isfinite(number) else repr(number) for number in row] for row in entry.values
         ]
@@ -151,7 +150,7 @@ def _from_json(text: str, source: str) -> Entry | Dropped:
 
 
 def _exactly(*kinds: type) -> Callable[[Any], Any]:
-    """Return a function that accepts only values of exactly these types, so that 1, 1.0 and True differ."""
+    """Return a function that accepts only values of exactly these types: 1, 1.0 and True differ."""
 
     def read(value: Any) -> Any:
         if type(value) not in kinds:
@@ -182,7 +181,6 @@ def _ints(value: Any) -> tuple[int, ...]:
 
 
 def _rows(value: Any) -> tuple[tuple[float, ...], ...]:
-    """Return the rows of numbers in `value`, in which infinity and NaN are texts."""
     read = _exactly(float, str)
     rows = tuple(tuple(float(read(item)) for item in row) for row in value)
     return rows
@@ -198,7 +196,7 @@ _READERS: Final[dict[str, Callable[[Any], Any]]] = {
     "tuple[tuple[float, ...], ...]": _rows,
     "ParameterValue": _exactly(bool, int, float, str),
 }
-#: For each kind of entry, the name of each field and the function that reads its value.
+#: For each kind of entry, its fields and the functions that read their values.
 _FIELDS: Final = {
     name: [(spec.name, _READERS[str(spec.type)]) for spec in fields(kind)] for name, kind in _KINDS.items()
 }

@@ -13,7 +13,7 @@ from plow_twin.record.times import STAMP_UNITS
 from plow_twin.scene_file.validation import NUMBER, Schema, choice, mapping, validate
 from plow_twin.scene_file.yaml_text import read_yaml
 
-#: For each role that a topic can have, the names of the quantities that its messages may contain.
+#: For each role of a topic, the quantities that its messages may contain.
 ROLES: Final[dict[str, tuple[str, ...]]] = {
     "excitation": ("fx", "fy", "m"),
     "head_pose": ("x", "y", "theta"),
@@ -24,14 +24,14 @@ ROLES: Final[dict[str, tuple[str, ...]]] = {
 }
 #: Type of a topic whose fields are nodes of an OPC UA server.
 OPCUA: Final = "opcua"
-#: Which of the two stamps of a node's value becomes the stamp of the sample: the sensor's or the server's.
+#: Stamp of a node's value that becomes the stamp of the sample: the sensor's or the server's.
 SOURCE_STAMP: Final = "source"
 SERVER_STAMP: Final = "server"
 #: Keys that a node may have besides its identifier.
 _NODE_KEYS: Final = ("scale", "offset", "unit", "limits")
 #: Key of the model that computes the load from the drive's signals.
 LOAD_MODEL: Final = "load_model"
-#: For each quantity, the factor from each of its units to SI.
+#: For each kind of quantity, the factor from each of its units to SI.
 UNITS: Final[dict[str, dict[str, float]]] = {
     "force": {"N": 1.0, "kN": 1e3, "MN": 1e6},
     "moment": {"N m": 1.0, "Nm": 1.0, "kN m": 1e3, "kNm": 1e3},
@@ -40,7 +40,7 @@ UNITS: Final[dict[str, dict[str, float]]] = {
     "power": {"W": 1.0, "kW": 1e3, "MW": 1e6},
     "speed": {"m/s": 1.0, "mm/s": 1e-3, "m/min": 1.0 / 60.0, "km/h": 1.0 / 3.6},
 }
-#: The quantity that each number measures, by role and name.
+#: The kind of each quantity, by role and name.
 QUANTITIES: Final = {
     **{("excitation", name): "force" for name in ("fx", "fy")},
     ("excitation", "m"): "moment",
@@ -95,7 +95,6 @@ def read_map_file(path: Path) -> dict[str, Any]:
 
 
 def _for_each(role: Any, entry: Any) -> Any:
-    """Return a role without empty keys; a scale, offset, unit or limit for all names is repeated for each name."""
     if role not in ROLES or not isinstance(entry, dict):
         return entry
     kinds: dict[str, tuple[type, ...]] = {
@@ -114,7 +113,7 @@ def _for_each(role: Any, entry: Any) -> Any:
 
 
 def _nodes_as_fields(role: Any, entry: Any) -> Any:
-    """Return a role with its nodes (`fx: {node: ns=2;s=Load.Fx, unit: kN}`) in the form of other fields."""
+    """Return a role whose nodes (`fx: {node: ns=2;s=Load.Fx, unit: kN}`) are written as fields."""
     if role not in ROLES or not isinstance(entry, dict):
         return entry
     named = {**entry, **(entry["fields"] if isinstance(entry.get("fields"), dict) else {})}
@@ -130,7 +129,7 @@ def _nodes_as_fields(role: Any, entry: Any) -> Any:
             given = rest.get(key)
             rest[key] = {**(given if isinstance(given, dict) else {}), **own}
         elif isinstance(rest.get(key), dict):
-            # a value for all names was repeated for each name; it is dropped for names without a node
+            # a value for all names is kept only for names with a node or field
             rest[key] = {name: value for name, value in rest[key].items() if name in fields or name not in ROLES[role]}
     return {"stamp": SOURCE_STAMP, "stamp_unit": "ns", **rest, "topic": role, "type": OPCUA, "fields": fields}
 

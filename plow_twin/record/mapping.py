@@ -1,4 +1,8 @@
-"""Roles of the topics of a recording: fields, factors, offsets and stamps, from a YAML file or from names and types."""
+"""Roles of the topics of a recording: fields, factors, offsets and stamps, from a YAML file or from names and types.
+
+A *role* says which quantities of the model a topic has: `excitation` (the load), `head_pose`, `travel`, `forces`,
+`gaps` or `drive`.
+"""
 
 from __future__ import annotations
 
@@ -32,8 +36,7 @@ from plow_twin.record.times import NO_TIME, NUMBER, STAMP_UNITS, TIMES, likely_u
 from plow_twin.scene_file.parquet_lines import SUFFIX
 
 Number = TypeVar("Number", float, NDArray[np.float64])
-#: Prefix of the keys under which the losses count messages that do not fit their role; the rest of the key is the
-#: reason.
+#: Losses whose keys begin with this prefix count messages that do not fit their role.
 UNFIT: Final = "unfit, "
 _WRENCH: Final = {"fx": "wrench.force.x", "fy": "wrench.force.y", "m": "wrench.torque.z"}
 _POSE: Final = {"x": "pose.position.x", "y": "pose.position.y", "theta": "pose.orientation"}
@@ -60,12 +63,13 @@ _NAMES: Final = {
 
 @dataclass(frozen=True)
 class Role:
-    """The role of a topic (load, pose, ...): where a message has each quantity, and how to convert it.
+    """The role of a topic: where a message has each quantity, and how to convert it.
 
     A quantity in SI is (`scale` times the field plus `offset`) times `factor`; values outside `limits` are not used.
     `stamp` is `header`, `log`, or for CSV and JSON the path of the time (a number in `stamp_unit`, or an ISO 8601
-    text); `clock_offset_ns` is added to the stamp. `sequence` is the path of the sender's message number, or empty. A
-    field is a path of names. `[3]` selects an array item by its index, and `[name]` by the index of this name in the
+    text); `clock_offset_ns` is added to the stamp. `sequence` is the path of the sender's message number, or empty.
+
+    A field is a path of names. `[3]` selects an array item by its index, and `[name]` by the index of this name in the
     message's field `name`. A path to a quaternion gives the angle about z.
     """
 
@@ -104,7 +108,9 @@ class Role:
         return None if stamp_ns is None else stamp_ns + self.clock_offset_ns
 
     def why_unfit(self, arrived: Arrived, *, with_value: bool = False) -> str:
-        """Return why a message does not fit: the topic, and the field or stamp that is not a number, with its value."""
+        """Return a sentence that says which field or stamp of a message is not a number; `with_value` adds its
+        value.
+        """
         content = arrived.content
         if with_value and content is None:
             count = len(self.message_type.names) if isinstance(self.message_type, Columns) else 0
@@ -169,7 +175,7 @@ class Role:
             if self.stamp == "header":
                 name = next((name for name in TIMES if name in content), None)
                 return received_ns if name is None else time_ns(content[name], self.stamp_unit)
-            # where the mapping names the stamp, a missing stamp is not replaced by the receive time
+            # if the mapping names the stamp, the receive time does not replace a missing stamp
             return time_ns(_at(content, self.stamp), self.stamp_unit)
         stamp = getattr(getattr(content, "header", None), "stamp", None)
         # types without a header have only their receive time
@@ -177,7 +183,6 @@ class Role:
 
 
 def _at(content: Mapping[str, Any], path: str) -> Any | None:
-    """Return the value at a path of keys and indexes, or None."""
     if path in content:
         return content[path]
     value: Any = content
@@ -192,9 +197,8 @@ def _at(content: Mapping[str, Any], path: str) -> Any | None:
 
 
 def _plain_number(value: Any) -> float | None:
-    """Return a number of CSV or JSON, NaN for an empty cell, or None for any other value."""
     if isinstance(value, str):
-        value = value.strip()  # this also removes space characters that `float` refuses
+        value = value.strip()  # `strip` also removes space characters that `float` refuses
         if not value:
             return math.nan
         if not NUMBER.fullmatch(value):
@@ -269,9 +273,9 @@ def messages_of(source: Source, roles: Mapping[str, Role]) -> Iterator[Arrived]:
 def roles_by_source(
     sources: Sequence[Source], path: Path | None, left_out: str = ""
 ) -> Iterator[tuple[Source, dict[str, Role]]]:
-    """Yield each recording of a run with its topics' roles, which are found among all topics together.
+    """Yield each recording of a run with the roles of its topics.
 
-    Topics that begin with `left_out` have no role.
+    A role is looked for among the topics of all recordings. Topics that begin with `left_out` have no role.
     """
     tables = [
         {topic: kind for topic, kind in source.topics().items() if not left_out or not topic.startswith(left_out)}
@@ -285,13 +289,12 @@ def roles_by_source(
 def read_map(path: Path | None, topics: Mapping[str, TopicType] | None) -> dict[str, Role]:
     """Return the roles of topics, by the YAML file `path` or, if it is None, by names and types.
 
-    `topics` maps topics to types. If it is None, the types are unknown, and each topic has the type that the file
-    states, by default JSON.
+    `topics` maps topics to types. If it is None, each topic has the type that the file states, by default JSON.
 
     Raises
     ------
     MapError
-        The file cannot be used; the message names key, value got and value expected.
+        The file cannot be used.
     """
     if path is None:
         topics = topics or {}
@@ -333,7 +336,7 @@ def _role(path: Path, role: str, entry: Mapping[str, Any], topics: Mapping[str, 
 
 
 def _check_nodes(path: Path, role: str, found: Role) -> None:
-    """Raise a `MapError` for a stamp, stamp unit or sequence that OPC UA nodes do not have."""
+    """Raise a `MapError` for settings that OPC UA nodes do not have."""
     if found.stamp not in (SOURCE_STAMP, SERVER_STAMP):
         raise map_error(path, f"{role}.stamp", found.stamp, f"{SOURCE_STAMP} or {SERVER_STAMP} for nodes")
     if found.stamp_unit != "ns":
@@ -370,7 +373,6 @@ def with_units(roles: Mapping[str, Role], units: Mapping[str, str]) -> dict[str,
 
 
 def _limits(path: Path, key: str, given: float | list[float]) -> tuple[float, float]:
-    """Return the smallest and the largest allowed value; a single number limits the absolute value."""
     low, high = given if isinstance(given, list) else (-given, given)
     if not low < high:
         raise map_error(path, key, given, "the smallest number, then the largest")
@@ -378,7 +380,7 @@ def _limits(path: Path, key: str, given: float | list[float]) -> tuple[float, fl
 
 
 def _check_columns(path: Path, name: str, role: Role) -> None:
-    """Raise a `MapError` for a name that is neither a column nor a path that begins with a column (`load.f[0]`)."""
+    """Raise a `MapError` for a name that is not a column, nor a path that begins with a column (`load.f[0]`)."""
     columns = role.message_type
     if not isinstance(columns, Columns):
         return
@@ -406,7 +408,6 @@ def _check_stamp_unit(path: Path, name: str, role: Role) -> None:
 def _topic(
     path: Path, role: str, entry: Mapping[str, Any], topics: Mapping[str, TopicType] | None
 ) -> tuple[str, TopicType]:
-    """Return name and type of a role's topic."""
     if topics is None:
         return entry["topic"], str(entry.get("type", "json"))
     topic = entry["topic"].removesuffix(".csv").removesuffix(SUFFIX)
@@ -432,7 +433,7 @@ def _default_fields(role: str, kind: TopicType) -> dict[str, str]:
 
 
 def _guess(role: str, topics: Mapping[str, TopicType]) -> Role | None:
-    """Return the role of a topic found by its name, or of the only topic of a fitting type, or None."""
+    """Return the role of a topic that is found by its name or as the only topic of a fitting type."""
     fitting = {}
     for topic, kind in topics.items():
         fields = _default_fields(role, kind)
@@ -440,7 +441,7 @@ def _guess(role: str, topics: Mapping[str, TopicType]) -> Role | None:
         if enough and "/journal/" not in topic:
             fitting[topic] = fields
     ending = [topic for name in _NAMES[role] for topic in fitting if topic.rpartition("/")[2] == name]
-    # many topics have the same types as forces and gaps, so these two roles are found by name only
+    # many topics have the types of forces and gaps, so these two roles are found by name only
     lonely = list(fitting) if len(fitting) == 1 and role in ("excitation", "head_pose", "travel") else []
     lonely = [topic for topic in lonely if topic.rpartition("/")[2] not in ("head_state", "contact_forces")]
     for topic in (*ending, *lonely):

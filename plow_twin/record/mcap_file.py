@@ -1,7 +1,7 @@
 """Writer of one MCAP file; compiled code writes many messages at a time into chunks.
 
-The compiled code and the compressors run without the interpreter lock. Each write is a whole record, so that the file
-of a killed process can be read up to its last chunk.
+Compiled code and compressors run without the interpreter lock. Each write is a whole record, so that the file of a
+killed process can be read up to its last chunk.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class ChunkBuilder:
         length: Indexes,
         data: bytes,
     ) -> None:
-        """Add messages; arrays have shape (n,), and `data` has the data of all messages, one after the other."""
+        """Add messages; arrays have shape (n,), and `data` has the bytes of all messages, one after the other."""
         sizes = MESSAGE_HEAD + length
         ends = np.cumsum(sizes)
         starts = self.reserve(int(ends[-1]) if len(ends) else 0) + ends - sizes
@@ -97,7 +97,9 @@ class ChunkBuilder:
         self._offsets.append(offset)
 
     def pop(self) -> tuple[Bytes, dict[int, Any]]:
-        """Return the records and each channel's index (times and offsets, in order of time), and empty the builder."""
+        """Return the records and the index of each channel (times and offsets, in order of time), and empty the
+        builder.
+        """
         channels, times, offsets = map(np.concatenate, (self._channels, self._times, self._offsets))
         index = {}
         for channel in np.unique(channels).tolist():
@@ -155,10 +157,10 @@ class ByteFile(Protocol):
 
 
 class McapFile:
-    """An MCAP file that is being written.
+    """An MCAP file that is being written to `out`.
 
     Every method may raise `OSError` (disk full). The bytes of a failed `chunk` are removed and its messages are lost;
-    after any other failed method only `close` may be called.
+    after any other failed method `out` must be closed.
     """
 
     def __init__(self, out: ByteFile, library: str) -> None:
@@ -168,8 +170,7 @@ class McapFile:
         self._schemas: dict[str, Any] = {}
         self._channels: dict[int, Any] = {}
         self._undeclared: list[Any] = []
-        # the index is kept as bytes, because a live run has some thousand chunks an hour, and objects would take ten
-        # times the memory
+        # A live run writes some thousand chunks an hour. Bytes take a tenth of the memory of objects.
         self._chunk_index = bytearray()
         self._chunk_count = 0
         self._metadata: list[Any] = []
@@ -256,7 +257,7 @@ class McapFile:
             raw = entries.tobytes()
             parts.append(struct.pack("<BQHI", 7, 6 + len(raw), channel, len(raw)) + raw)
             place += len(parts[-1])
-        self.out.write(b"".join(parts))  # one call writes the chunk and its index
+        self.out.write(b"".join(parts))
         self._undeclared = []
         for channel, entries in index.items():
             self._counts[channel] += len(entries)
@@ -319,7 +320,6 @@ class McapFile:
 
 
 def _records_bytes(records: Iterable[Any]) -> bytes:
-    """Return records as bytes, one after the other."""
     from mcap.data_stream import RecordBuilder
 
     builder = RecordBuilder()
@@ -333,7 +333,7 @@ def _compress(compression: str, content: Bytes) -> bytes:
     if compression == "lz4":
         import lz4.frame
 
-        # independent blocks take two thirds of the time of linked blocks to decompress and are 1 % larger
+        # independent blocks are decompressed in two thirds of the time of linked blocks, and take 1 % more space
         return bytes(lz4.frame.compress(content, block_linked=False))
     import zstandard
 
@@ -341,7 +341,7 @@ def _compress(compression: str, content: Bytes) -> bytes:
 
 
 class UnbufferedFile:
-    """A file without a buffer, so that on a full disk no bytes remain whose write could fail a second time."""
+    """A file without a buffer: after a write has failed on a full disk, no bytes are left to be written."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

@@ -2,7 +2,9 @@
 
 A folder contains scene.yaml, load.csv (t, fx, fy, m) and pose.csv (t, x, y, theta). If gaps were measured, it also
 contains gaps.csv (t and columns named after pairs), and pose.csv may be missing. contact_forces.csv is optional and has
-the same columns as gaps.csv. Each table may be a Parquet file instead, such as load.parquet.
+the columns of gaps.csv. Each table may be a Parquet file instead, such as load.parquet.
+
+A *stretch* is a part of the load without missing samples.
 """
 
 from __future__ import annotations
@@ -44,24 +46,21 @@ FORCES_FILE = "contact_forces.csv"
 _LOAD_COLUMNS: Final = ("t", "fx", "fy", "m")
 _POSE_COLUMNS: Final = ("t", "x", "y", "theta")
 _NOT_STATED: Final = (math.nan,) * 3
-#: Largest number of rows that are kept of a table; the newest rows are kept. At this length a load takes 320 MB and
-#: covers nearly three hours at 1 kHz.
+#: Largest number of rows that are kept of a table; a load then takes 320 MB and covers nearly three hours at 1 kHz.
 MOST_ROWS: Final = 10_000_000
-#: Key under which the losses count rows that are older than the kept rows.
+#: Key of the losses for rows that were dropped because they are older.
 OLDER_ROWS: Final = "older_rows"
 
 
 class _Rows:
-    """The newest `MOST_ROWS` rows of numbers, and up to a quarter more until `table` is called."""
+    """The newest `MOST_ROWS` rows of a table; up to a quarter more wait to be dropped."""
 
     def __init__(self, columns: int) -> None:
         self._columns, self._values = columns, array("d")
-        #: number of rows that were dropped
         self.dropped = 0
 
     @property
     def came(self) -> int:
-        """Number of rows that were added, kept or not."""
         return self.dropped + len(self._values) // self._columns
 
     def add(self, values: Iterable[float] | Array) -> None:
@@ -143,7 +142,7 @@ def read_measured(folder: Path, scene: Path | None = None) -> Measured:
         poses = _read(file, lost, _POSE_COLUMNS)
     model = load_scene(scene_path(str(scene)) if scene else folder / SCENE_FILE)
     if len(load) and load[0, 0] >= EPOCH_S:
-        # dates are replaced by the time since the first sample of the load, as in a recording
+        # times count from the first sample of the load
         for table in (poses, gaps, forces, load):
             table[:, 0] -= load[0, 0]
     return Measured(model, load, poses, lost.total(), gaps=gaps, lost=dict(lost), forces=forces)
@@ -164,8 +163,8 @@ def _table(folder: Path, name: str) -> Path:
 def read_recording(path: Path, scene: Path | None = None, mapping: Path | None = None) -> Measured:
     """Read a run by its journal, or another recording (MCAP, rosbag2's sqlite3, CSV) by the mapping.
 
-    The measured pose of a run is in its journal if the node used it. Otherwise it is read from the other topics in the
-    run's folder and in its subfolders `beside`, `beside_2`, .... Times count from the first sample of the load.
+    A pose that is not in the journal of a run is read from the other topics in the run's folder and in its subfolders
+    `beside`, `beside_2`, .... Times count from the first sample of the load.
 
     Raises
     ------
@@ -216,9 +215,9 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
 def _journal(reader: RunReader, lost: Counter[str]) -> tuple[Array, list[int], Array, Array, Array, Array]:
     """Return the samples, the rows before which samples are missing, the poses, the gaps, and the stated deviations.
 
-    The first column of each table is the stamp [ns]. The standard deviations are the largest stated for the load, shape
-    (3,), and those of each pose, shape (n, 3), NaN if not stated. Only the data after the last change of the pads or
-    step of the clock are returned, because earlier data were measured with other pads or on another time scale.
+    The first column of each table is the stamp [ns]. The deviations are the largest of the load, shape (3,), and those
+    of each pose, shape (n, 3), NaN if not stated. Data from before a change of the pads or a step of the clock are left
+    out.
     """
     loads, poses, gaps = _Rows(4), _Rows(7), _Rows(1 + PAIR_COUNT)
     holes, begins, spread = Holes(), list[int](), np.zeros(3)
@@ -248,10 +247,10 @@ def _journal(reader: RunReader, lost: Counter[str]) -> tuple[Array, list[int], A
 
 
 def _longest(rows: Array, begins: list[int]) -> Array:
-    """Return the longest stretch of a load without missing samples.
+    """Return the longest stretch of a load.
 
-    A new stretch begins at a row of `begins` if the gap before it is long. Samples in this gap were lost, so an unknown
-    load acted; in a silence, by contrast, no samples were sent.
+    A stretch ends at a row of `begins` if the gap before this row is long: samples were lost there, so the load is
+    unknown.
     """
     if len(rows) < 2:
         return rows
@@ -265,9 +264,9 @@ def _longest(rows: Array, begins: list[int]) -> Array:
 def _collect(
     places: list[Path], mapping: Path | None, wanted: tuple[str, ...], node: str
 ) -> tuple[dict[str, Array], list[int], Counter[str], str]:
-    """Return each wanted role's rows (stamps in ns), the indexes of rows after gaps, losses and a reason.
+    """Return the rows of each wanted role, the rows of the load before which messages are missing, and the losses.
 
-    The indexes refer to the rows of the load. The reason is a text that says why messages do not fit their role.
+    The first column of each table is the stamp [ns]. The last result says why messages do not fit their roles.
     """
     rows = {name: _Rows(1 + len(ROLES[name])) for name in wanted}
     lost, begins = Counter[str](), list[int]()
@@ -289,7 +288,7 @@ def _collect(
 
 
 def _read(path: Path, lost: Counter[str], columns: tuple[str, ...], some: tuple[str, ...] = ()) -> Array:
-    """Return the rows of a csv file, NaN for an empty cell; rows that could not be read are counted in `lost`.
+    """Return the rows of a table, NaN for an empty cell; rows that could not be read are counted in `lost`.
 
     All of `columns` and at least one column of `some` are required; other missing columns of `some` are NaN.
     """
@@ -325,7 +324,6 @@ def _counted(rows: _Rows, lost: Counter[str]) -> Array:
 
 
 def _date(cell: str) -> float | None:
-    """Return the time since the epoch [s] of an ISO 8601 date, or None for any other text."""
     stamp_ns = time_ns(cell)
     return None if stamp_ns is None else 1e-9 * stamp_ns
 

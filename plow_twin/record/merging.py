@@ -12,26 +12,24 @@ T = TypeVar("T")
 #: A function that returns the stamp of a message [ns], or None.
 StampOf: TypeAlias = Callable[[T], int | None]
 
-#: A stamp that is older than the newest stamp by more than this [ns] is taken as a step of the clock, and a stamp that
-#: is older by less as a late row.
+#: A stamp older than the newest stamp by more than this [ns] is a step of the clock; an older stamp is a late row.
 _STEP_NS: Final = 1_000_000_000
-#: A stamp that is newer than the newest stamp so far by more than this [ns] may be wrong, so it is checked against the
-#: next stamp.
+#: A stamp newer than the newest stamp by more than this [ns] may be wrong; the next stamp decides.
 _JUMP_NS: Final = 10_000_000_000
 
 
 def merged(streams: Iterable[Iterator[T]], stamp_ns: StampOf[T]) -> Iterator[T]:
     """Yield the messages of all streams in the order of their stamps; each stream keeps its own order.
 
-    A message without a stamp stays where it is in its stream, and so does a message with a single wrong stamp. After
-    its clock has stepped back, a stream waits until the clocks of the other streams have stepped back too.
+    A message without a stamp, or with a single wrong stamp, keeps its place in its stream. After its clock has stepped
+    back, a stream waits until the clocks of the other streams have stepped back too.
     """
     for _, _, arrived in heapq.merge(*(_placed(stream, stamp_ns) for stream in streams), key=lambda item: item[:2]):
         yield arrived
 
 
 def _placed(stream: Iterator[T], stamp_ns: StampOf[T]) -> Iterator[tuple[int, int, T]]:
-    """Yield each message with the number of steps of the clock before it and the newest stamp so far."""
+    """Yield each message with the number of clock steps before it and the newest stamp so far."""
     steps, newest = 0, None
     stamped = ((arrived, stamp_ns(arrived)) for arrived in stream)
     for (arrived, stamp), (_, following) in pairwise(chain(stamped, [(None, None)])):
@@ -45,7 +43,7 @@ def _placed(stream: Iterator[T], stamp_ns: StampOf[T]) -> Iterator[tuple[int, in
 
 
 def _is_stray(stamp: int, newest: int, following: int | None) -> bool:
-    """Return whether only this stamp is wrong, because the next stamp continues the earlier stamps."""
+    """Return whether only this stamp is wrong: the next stamp continues the earlier stamps."""
     if following is None:
         return False
     back = newest - stamp > _STEP_NS

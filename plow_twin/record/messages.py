@@ -1,7 +1,6 @@
 """Messages of the node and of its journal, as plain immutable values without ROS.
 
-Each class is one ROS 2 message type (`TYPE`). The live node fills ROS messages from them, the recorder encodes them and
-replay compares them. Stamps are integer nanoseconds.
+Each class is one ROS 2 message type (`TYPE`). Stamps are integer nanoseconds.
 """
 
 from __future__ import annotations
@@ -14,7 +13,6 @@ from numpy.typing import NDArray
 
 Float64s = NDArray[np.float64]
 
-#: Empty array, the default of the arrays in a message.
 EMPTY: Final[Float64s] = np.zeros(0)
 _ZERO36: Final[Float64s] = np.zeros(36)
 
@@ -23,7 +21,7 @@ _ZERO36: Final[Float64s] = np.zeros(36)
 class JointState:
     """Named numbers: `position`, `velocity` and `effort` each have the length of `name` or are empty.
 
-    The arrays belong to the message: the sender must not change them.
+    The sender must not change the arrays afterwards.
     """
 
     TYPE: ClassVar = "sensor_msgs/msg/JointState"
@@ -100,7 +98,6 @@ class Integers:
 
 
 Message = JointState | Odometry | DiagnosticStatus | WrenchStamped | Text | Integers
-#: Every message class by its ROS 2 type.
 MESSAGE_TYPES: Final[dict[str, type[Message]]] = {
     kind.TYPE: kind for kind in (JointState, Odometry, DiagnosticStatus, WrenchStamped, Text, Integers)
 }

@@ -15,7 +15,7 @@ from plow_twin.stream.topics import TOPICS
 
 METADATA_VERSION: Final = 9
 _INFINITE: Final = {"sec": 9223372036, "nsec": 854775807}
-#: Prefix of the keys in `custom_data` that count lost messages; the topic follows the prefix.
+#: Prefix of the keys in `custom_data` that count lost messages by topic.
 LOST: Final = "plow_twin_lost "
 
 
@@ -54,7 +54,7 @@ def offered(reliable: bool, latched: bool, depth: int) -> dict[str, Any]:
 
 
 def qos_text(base_name: str) -> str:
-    """Return the QoS of a topic as the text that its channel in an MCAP file carries."""
+    """Return the QoS of a topic as the text of its channel in an MCAP file."""
     return dump_yaml([qos_profile(base_name)], flow=False).strip()
 
 

@@ -1,4 +1,4 @@
-"""Messages of a publication, made by the table of topics in the same way in a live run and in a replay."""
+"""Messages of a publication, made from the table of topics both in a live run and in a replay."""
 
 from __future__ import annotations
 
@@ -14,17 +14,15 @@ from plow_twin.stream.topics import JOINT_STATE, Cadence, Topic, names_of, topic
 
 Array = NDArray[np.float64]
 
-#: Topics whose messages a replay computes from the journal. Some have a message in each publication, the others in each
-#: publication that has intervals of forces or a slow part (clearance and wear rate).
+#: Topics whose messages a replay computes from the journal.
 REPLAYED: Final = topics_of(Cadence.EACH, Cadence.FOLLOWED, Cadence.SLOW)
-#: Base names of the topics in `REPLAYED`.
 PUBLICATION_TOPICS: Final = tuple(topic.name for topic in REPLAYED)
 #: Topics that only a twin with `follow: full` has.
 FOLLOWED_TOPICS: Final = names_of(Cadence.FOLLOWED)
 
 
 def publication_messages(published: Published, frame_id: str, child_frame_id: str) -> dict[str, Message]:
-    """Return the messages of a publication by base name of the topic; slow messages only if it has a slow part."""
+    """Return the messages of a publication by base name of the topic; slow messages only for a slow part."""
     return _messages(REPLAYED, published, frame_id, child_frame_id)
 
 

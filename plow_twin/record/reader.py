@@ -1,7 +1,7 @@
-"""Reading a recording from front to back: complete, cut off by a kill, or with damaged chunks; one part or many.
+"""Reading of a recording from front to back, even if it was cut off by a kill or has damaged chunks.
 
-Only some chunks are in memory at a time, and no index is needed: a truncated file is read as far as possible. Journal
-and outputs are in separate chunks and are put in order by their sequence numbers.
+A recording has one or many *parts*, which are files. Only some chunks are in memory at a time. Journal entries and
+outputs are in separate chunks, and are put in order by their sequence numbers.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ from plow_twin.record.metadata_yaml import missing_files
 from plow_twin.record.template import Indexes, Template, read_numbers
 from plow_twin.stream.journal import Entry, Loss, Sample
 
-#: Largest number of journal entries that wait for the messages sent after them, so that memory is bounded.
+#: Largest number of journal entries that wait for the messages after them.
 _PENDING: Final = 65_536
-#: Smallest number of entries in a batch. A batch may be smaller once the outputs of `_LEAST // 16` chunks wait.
+#: Smallest number of entries in a batch, unless the outputs of `_LEAST // 16` chunks wait.
 _LEAST: Final = 8192
 #: Smallest number of entries in a batch without outputs, which take most of the memory.
 _LEAST_ALONE: Final = 32_768
-#: Growth of a recording of all outputs at 1 kHz [B/s], used to estimate the duration of a recording without an index.
+#: Typical growth of a recording at 1 kHz [B/s], for an estimate of the duration without an index.
 _BYTES_PER_S: Final = 400_000
-#: Indexes of Fx, Fy and M among the six numbers of a sample.
+#: Indexes of Fx, Fy and M in force and torque.
 _WRENCH: Final = np.array([0, 1, 5])
 
 
@@ -56,14 +56,13 @@ class FileStatus(Enum):
 class RunReader:
     """Iterate over the records of a recording: a folder or an `.mcap` file.
 
-    `status`, `damaged_chunks`, `lost`, `stop_reason` (of a recording that stopped early) and `counts` (records by
-    topic) are known once the iteration has ended; `position` is the share of the files that has been read, 0..1.
+    After the iteration, `status`, `damaged_chunks`, `lost`, `stop_reason` (of a recording that stopped early) and
+    `counts` (records by topic) are known. `position` is the share of the files that has been read, 0..1.
 
-    `path` is the first file. `parts` are the files that are read; `repeated` maps files that repeat a part to the file
-    that is read instead; `foreign` maps files of another run to the keys of their headers that differ from the
-    majority. A part that is not an MCAP file is counted as a damaged chunk. `missing_parts` counts the parts that the
-    folder lacks, according to `metadata.yaml` and to gaps in the part numbers. Parts that are removed while others are
-    read are skipped.
+    `parts` are the files that are read, and `path` is the first of them. `repeated` maps files that repeat a part to
+    the file that is read instead. `foreign` maps files of another run to the keys of their headers that differ from the
+    majority. A part that is not an MCAP file counts as a damaged chunk, and parts that are removed meanwhile are
+    skipped.
 
     With a `tail` a recording is followed while it is written: new parts are read as well, and an empty batch is yielded
     whenever all records so far have been read.
@@ -90,7 +89,7 @@ class RunReader:
         self._place = Path(self.path)
         self._headers: dict[Path, RunHeader] = {}
         self._counted: Counter[str] = Counter()
-        self._noted: dict[int, Loss | Dropped] = {}  # keyed by sequence number, because an entry may be in two chunks
+        self._noted: dict[int, Loss | Dropped] = {}  # by sequence number, because an entry may be in two chunks
         self._look_for_parts()
         self.path = self.parts[0]
         for part in self.parts:
@@ -100,14 +99,13 @@ class RunReader:
         raise ForeignRecordingError(f"{self.path}: metadata {HEADER_RECORD!r} is missing: not a recording of plow_twin")
 
     def _look_for_parts(self) -> None:
-        """Find the files and order them by part number, from the header or, without header, from the name."""
         files = run_parts(self._place)
         for file in files:
             if file not in self._headers and (len(files) == 1 or is_mcap(file)):
                 try:
                     header = read_header(file)
                 except RecordingError:
-                    if len(files) > 1 and not file.exists():  # the file was removed in the meantime
+                    if len(files) > 1 and not file.exists():
                         continue
                     raise
                 if header is not None:
@@ -121,7 +119,7 @@ class RunReader:
                 self.repeated[file] = read[self._headers[file].part]
 
     def _of_other_runs(self) -> dict[Path, tuple[str, ...]]:
-        """Return the files whose headers differ from the majority, with the keys that differ."""
+        """Return the files of other runs, with the header keys in which they differ from the run of most files."""
         records = {file: header.to_record() for file, header in self._headers.items()}
         for record in records.values():
             del record["part"]
@@ -157,10 +155,10 @@ class RunReader:
 
     @property
     def lost_parts(self) -> dict[str, int]:
-        """Numbers of missing parts and of parts of another run, by their keys among the losses; zeros are left out."""
+        """Numbers of missing and foreign parts, by their keys among the losses; zeros are left out."""
         missing = (
             self.missing_parts if self.tail is None else 0
-        )  # the recorder may remove the oldest parts of a followed recording
+        )  # the recorder of a followed run may remove the oldest parts
         found = {"missing_parts": missing, "foreign_parts": len(self.foreign)}
         return {name: count for name, count in found.items() if count}
 
@@ -169,7 +167,7 @@ class RunReader:
         return self._headers[file].part if file in self._headers else part_number(file)[0]
 
     def _place_of(self, file: Path) -> tuple[int, bool, str]:
-        """Return the sort key of a file: its number, then whether its name lacks this number."""
+        """Return the sort key of a part."""
         named = part_number(file)[0]
         number = self.number(file)
         return number, named != number, file.name
@@ -195,7 +193,7 @@ class RunReader:
         size, before = self.size(), 0
         finished, cut = True, False
         for part in self._parts_to_read():
-            self.damaged_chunks += cut  # if the previous part was cut off, its last records may be missing
+            self.damaged_chunks += cut  # a part that was cut off may lack its last records
             cut = False
             begins = is_mcap(part) if len(self.parts) > 1 else True
             if self.tail is None and begins is None:
@@ -247,7 +245,7 @@ class RunReader:
         """Return the size of the parts on the disk [B]."""
         found = 0
         for part in self.parts:
-            with suppress(FileNotFoundError):  # the file was removed in the meantime
+            with suppress(FileNotFoundError):
                 found += part.stat().st_size
         return found
 
@@ -262,7 +260,6 @@ class RunReader:
         return first_ns if known else None
 
     def _received_ns(self) -> tuple[int, int, bool]:
-        """Return the first and the last receive time [ns], and whether every part has an index."""
         from mcap.reader import make_reader
 
         first, last = [], []
@@ -300,7 +297,7 @@ class _Merger:
         self._template = sample_template(header.frame_id)
         self._places = self._template.places[_WRENCH]
         self._entries = [NO_ENTRIES]
-        self._count = 0  # number of waiting entries
+        self._count = 0
         self._outputs: list[Outputs] = []
         self._base = 0
         self._part = reader.path
@@ -309,12 +306,10 @@ class _Merger:
         self._damaged = 0
 
     def begin(self, part: Path, chunks: ChunkReader) -> None:
-        """Start the next part."""
         self._part, self._chunks = part, chunks
         self._topics = {}
 
     def end(self) -> None:
-        """End the part."""
         self._chunks = None
 
     def is_journal(self, numbers: set[int]) -> bool:
@@ -340,7 +335,7 @@ class _Merger:
             elif channel.message_type in MESSAGE_TYPES:
                 sent.append(number)
                 named = channel.topic, channel.message_type
-                if self._topics.get(number) != named:  # a new mapping is made, because earlier outputs use the old one
+                if self._topics.get(number) != named:  # earlier outputs keep the old mapping
                     self._topics = {**self._topics, number: named}
         if journal:
             chosen = messages if len(journal) == len(there) else _of(messages, journal)
@@ -357,12 +352,10 @@ class _Merger:
         yield from self._read_to(newest)
 
     def finish(self) -> Iterator[Batch]:
-        """Yield what still waits."""
         newest = max((part.newest for part in self._outputs), default=-1)
         yield from self._read_to(self._newest(newest) + 1)
 
     def _newest(self, least: int) -> int:
-        """Return the highest sequence number of the waiting entries, at least `least`."""
         return max(int(part.sequence.max(initial=least)) for part in self._entries)
 
     def _unwrap(self, sequence: Indexes) -> Indexes:
@@ -371,7 +364,7 @@ class _Merger:
         return unwrapped
 
     def _read_to(self, end: int) -> Iterator[Batch]:
-        """Yield the waiting entries and outputs with sequence numbers below `end`."""
+        """Yield the waiting records with sequence numbers below `end`."""
         waiting = Entries.joined(self._entries)
         later = np.flatnonzero(waiting.sequence >= end)
         count = int(later[0]) if later.size else len(waiting)
@@ -384,7 +377,6 @@ class _Merger:
             self._damaged = damaged
 
     def _read(self, messages: Messages, samples: int, digests: int) -> Entries:
-        """Return the entries in journal messages, given the channels of samples and digests (-1: no such channel)."""
         sequence = self._unwrap(messages.sequence)
         if len(sequence):
             self._base = int(sequence[-1])
@@ -449,7 +441,7 @@ def read_header(path: Path) -> RunHeader | None:
 
     for _ in ChunkReader(path, on_metadata):
         break
-    if not found:  # programs that rewrite a file put the header's record last, so the whole file is searched
+    if not found:  # programs that rewrite a file put the header's record last
         for name, record in metadata_records(path):
             on_metadata(name, record)
     return found[0] if found else None

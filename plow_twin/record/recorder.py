@@ -1,8 +1,10 @@
-"""The recorder of a live node: it queues entries and publications without waiting and writes them in its own thread.
+"""The recorder of a live node.
 
-The caller only reads a clock and appends to the queue. The thread empties the queue every 50 ms, writes many messages
-into chunks by one compiled call, and compresses the chunks without the interpreter lock. When the thread falls behind,
-entries and messages that do not fit in the queue are dropped, counted by topic, and noted at their place in the file.
+A caller puts journal entries and publications in a queue and never waits for the disk. The recorder's thread empties
+the queue every 50 ms and writes the file. When the thread falls behind, items that do not fit in the queue are dropped.
+Each loss is counted by topic, and the file has a note of it at its place.
+
+A *ring* is a recording in memory that keeps only the newest seconds of a run; `Recorder.mark` writes it to the disk.
 """
 
 from __future__ import annotations
@@ -39,20 +41,19 @@ if TYPE_CHECKING:
 JOURNAL: Final = "journal"
 #: Interval at which the thread empties the queue [s].
 _POLL_S: Final = 0.05
-#: Errors that mean a full disk; there may be room again later.
+#: Errors of a full disk, on which there may be room again later.
 _FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
-#: Number of items that the thread writes between two sleeps (some 0.2 ms of Python). Callers get the interpreter during
-#: a sleep; without the sleep the thread would take it back at once.
+#: Number of items that the thread writes before it sleeps, so that callers of the recorder get the interpreter lock.
 _BURST: Final = 128
 
 
 @dataclass(frozen=True)
 class RecorderCounters:
-    """State of a recorder. `lost` counts lost messages by topic, and lost journal entries under `journal`.
+    """The state of a recorder.
 
-    `error` is the reason why recording has stopped (None once it continues), or why the last ring (the newest seconds,
-    kept in memory) was not written. `marks` counts the rings that were written, and `marks_lost` the rings that could
-    not be written.
+    `lost` counts lost messages by topic, and lost journal entries under `journal`. `error` says why recording has
+    stopped, or why the newest ring was not written. `marks` and `marks_lost` count the rings that were and were not
+    written.
     """
 
     written: int
@@ -66,7 +67,7 @@ class RecorderCounters:
 
 @dataclass(frozen=True)
 class LossReport:
-    """End of a recording: losses by topic, whether the file was closed, and the error that stopped it."""
+    """The losses of a recording by topic, whether its file was closed, and the error that stopped it."""
 
     lost: Mapping[str, int]
     closed: bool
@@ -78,7 +79,7 @@ class LossReport:
         return self.closed and not self.lost and self.error is None
 
     def sentence(self, folder: Path) -> str:
-        """Return a sentence with the losses of the recording in `folder` and the commands that show and complete it."""
+        """Return a sentence with the losses, and with the commands that show and complete the recording in `folder`."""
         lacks = [f"{count} lost of {topic}" for topic, count in self.lost.items()]
         if self.error is not None:
             lacks.append(self.error)
@@ -97,29 +98,28 @@ class Recorder:
     path
         Folder to make, e.g. `runs/monday`; the file is `runs/monday/monday_0.mcap`.
     header
-        Scene and settings, which replay needs beside the journal.
+        Scene and settings of the run.
     queue_size
         Number of items that may wait for the thread; the last quarter of the queue is kept for the journal.
     flush_period_s
-        Interval between writes to the operating system [s]. A killed process loses at most the journal entries of one
-        interval and the messages of two intervals.
+        Interval between writes to the operating system [s]. If the process is killed, the journal of up to one interval
+        and the messages of up to two intervals are lost.
     chunk_size
-        Total size [B] of the waiting journal entries and outputs at which their two chunks are closed.
+        Size of the waiting data [B] at which a chunk is closed.
     min_free_bytes
         Free space on the disk [B] below which recording pauses.
     part_bytes, part_s
-        Size [B] and duration [s] of a part (file) at which a new part is started; 0: never.
+        Size [B] and duration [s] at which a new part (file) is started; 0: never.
     keep_bytes
-        Size of all ended parts together [B] above which the oldest parts are removed; 0: all are kept.
+        Size of all ended parts [B] above which the oldest parts are removed; 0: all are kept.
     ring_s
-        Length [s] of the ring, the newest part of the run, which is kept in memory and written at each `mark`; 0: no
-        ring, everything is written.
+        Length of the ring [s]; 0: everything is written.
     sync
         Whether each flush, new part and ring waits for the disk (`fdatasync`), so that it survives a loss of power.
     now_ns
-        Function that returns the receive time [ns], called in the caller's thread.
+        Function that returns the receive time [ns]; it is called in the caller's thread.
     on_error
-        Called once, from the recorder's thread, with the reason when recording stops early.
+        Function that receives the reason, once and in the recorder's thread, when recording stops early.
 
     Raises
     ------
@@ -157,7 +157,7 @@ class Recorder:
             part_bytes, part_s, keep_bytes = 0, ring_s / PARTS, 0
         self._writer = self._ring or RunWriter(self._folder, header, chunk_size, min_free_bytes, sync=sync)
         self.path = self._writer.path
-        self._mark: Path | None = None  # folder to which the ring is written next
+        self._mark: Path | None = None  # folder for the ring
         self._marks = self._marks_lost = 0
         self._mark_error: str | None = None
         each, slow, marked = (
@@ -174,23 +174,22 @@ class Recorder:
         self._split_due = False
         self._part_since = time.monotonic()
         self._queue: deque[_Item] = deque()
-        #: number of waiting entries and publications minus number of items in the queue, since an item may hold several
-        #: entries or publications
+        #: an item may hold many entries or publications; this counts all but one of each item
         self._more = 0
         self._queue_size = queue_size
         self._flush_period_s = flush_period_s
         self._now_ns = now_ns
         self._on_error = on_error
-        self._lock = threading.Lock()  # the lock is held for microseconds, never while the thread writes
+        self._lock = threading.Lock()  # never held while the thread writes
         self._sequence = -1
         self._journal_gap = 0
         self._snapshot_due = False
         self._output_gaps: Counter[str] = Counter()
         self._lost: Counter[str] = Counter()
-        self._unflushed: Counter[str] = Counter()  # counts of items that are written but not yet flushed
+        self._unflushed: Counter[str] = Counter()
         self._written = 0
         self._error: str | None = None
-        self._paused: str | None = None  # reason why new items are refused; None while they are accepted
+        self._paused: str | None = None
         self._closed = False
         self._accepting = True
         self._stopping = threading.Event()
@@ -215,10 +214,10 @@ class Recorder:
         return RecorderCounters(self._written, self._queued, self._writer.bytes_written, lost, error, *marks)
 
     def mark(self) -> Path | None:
-        """Write the ring as soon as the next `Snapshot` is journalled or the recorder is closed.
+        """Write the ring once the next `Snapshot` is journalled or the recorder is closed.
 
-        Returns the folder to which the ring will be written, or None for a recorder without a ring. Further calls
-        before the ring is written have no effect.
+        Returns the folder for the ring, or None for a recorder without a ring. Further calls have no effect until the
+        ring is written.
         """
         from plow_twin.record.writer import free_folder
 
@@ -237,7 +236,7 @@ class Recorder:
         now = self._now_ns()
         with self._lock:
             snapshot = isinstance(entry, Snapshot)
-            if not (snapshot or self._journal_gap) and self._room(1, self._queue_size):  # the usual case
+            if not (snapshot or self._journal_gap) and self._room(1, self._queue_size):
                 self._push_entry(now, entry)
                 return True
             notes = len(self._output_gaps) if snapshot else 0
@@ -246,7 +245,8 @@ class Recorder:
                 if self._journal_gap:
                     self._push_entry(now, Loss(self._journal_gap))
                     self._journal_gap = 0
-                if snapshot:  # notes of losses come before the snapshot, so that all messages after it can be compared
+                # notes of losses come before the snapshot, so that all messages after the snapshot can be compared
+                if snapshot:
                     self._push_notes(now)
                 self._push_entry(now, entry)
                 self._snapshot_due = self._snapshot_due and not snapshot
@@ -254,7 +254,7 @@ class Recorder:
                 return True
             self._snapshot_due = True
             if not (self._journal_gap and snapshot):
-                self._sequence += 1  # a lost entry keeps its sequence number, because messages refer to this number
+                self._sequence += 1  # a lost entry keeps its number, because messages refer to it
                 self._journal_gap += 1
                 self._lost[JOURNAL] += 1
             return False
@@ -270,8 +270,8 @@ class Recorder:
     def publication(self, published: Published, sent: Mapping[str, bytes] = MappingProxyType({})) -> bool:
         """Queue the messages of a publication of one row; return False if they were lost.
 
-        `sent` has the bytes of the messages by base name of the topic. If it is empty, the recorder makes the messages
-        that a replay can compute from the journal.
+        `sent` maps base names of topics to the bytes of their messages. If `sent` is empty, the recorder makes the
+        messages that a replay can compute.
         """
         now = self._now_ns()
         topics = self._topics_of[len(published.slow) > 0, bool(sent) and bool(published.rows["marked"][0])]
@@ -281,9 +281,9 @@ class Recorder:
         return fits
 
     def series(self, series: Series) -> NDArray[np.int64]:
-        """Queue the samples and digests of a series as entries of the journal, or lose all of them.
+        """Queue all samples and digests of a series as journal entries, or lose all of them.
 
-        Returns, for each sample, the number of the journal entry that precedes its publication, shape (n,).
+        Returns, for each sample, the number of the journal entry before its publication, shape (n,).
         """
         now, samples = self._now_ns(), len(series.stamps)
         count = samples + len(series.digests)
@@ -311,7 +311,7 @@ class Recorder:
         return fits
 
     def _admitted(self, now: int, items: int, topics: Iterable[str]) -> bool:
-        """Return whether messages may be queued; if so, note earlier losses, otherwise count new losses."""
+        """Return whether messages may be queued; note earlier losses or count this loss."""
         if not self._room(items, self._queue_size * 3 // 4):
             self._snapshot_due = True
             self._output_gaps.update(topics)
@@ -327,11 +327,9 @@ class Recorder:
 
     @property
     def _queued(self) -> int:
-        """Number of waiting items; each entry and publication of a series counts as one item."""
         return len(self._queue) + self._more
 
     def _push_many(self, item: _SeriesItem | _PublicationsItem, count: int) -> None:
-        """Queue an item that contains `count` entries or publications."""
         self._more += count - 1
         self._queue.append(item)
 
@@ -345,10 +343,9 @@ class Recorder:
         self._output_gaps.clear()
 
     def close(self, timeout_s: float = 5.0) -> LossReport:
-        """Write the queued items, close the file and return the losses.
+        """Write the queued items, close the file and return the losses; a second call only returns the losses.
 
-        Waits until all items are written, but gives up after `timeout_s` [s] in which no item was written. A second
-        call only returns the report.
+        Gives up when the thread writes no item for `timeout_s` [s].
         """
         atexit.unregister(self.close)
         with self._lock:
@@ -394,7 +391,7 @@ class Recorder:
                 self._give_up(reason)
             if self._mark is not None:
                 self._split()
-            with self._lock:  # the lock is needed, because callers may still count losses
+            with self._lock:  # callers may still count losses
                 lost = dict(self._lost)
             self._writer.close(lost, reason or self._paused)
             self._closed = True
@@ -438,7 +435,7 @@ class Recorder:
             else:
                 publications = self._write_publications(publications)
                 item.write(self._writer)
-        # samples are written first, because their chunk must precede the chunk of the messages sent after them
+        # in the file, the chunk of samples comes before the chunk of the messages that were sent after these samples
         self._write_samples(samples)
         self._write_publications(publications)
 
@@ -476,8 +473,7 @@ class Recorder:
                 self._dump(self._ring, self._mark, lost)
             except (OSError, RecordingError) as failed:  # the ring stays in memory
                 error = f"{self._mark}: the last {self._ring_s:g} s not written: {failed}"
-            # `_mark` and the count change under one lock, because a caller that reads the new count may mark again at
-            # once
+            # the lock covers `_mark` and the counts, because a caller that sees the new count may mark again at once
             with self._lock:
                 self._mark = None
                 if error is None:
@@ -492,14 +488,14 @@ class Recorder:
 
         try:
             ring.dump(folder, lost)
-        except TakenError:  # another process has made this folder in the meantime
+        except TakenError:  # another process made this folder meanwhile
             in_free_folder(self._folder, lambda other: ring.dump(other, lost))
 
     def _flush(self) -> str | None:
         self._writer.flush()
         self._unflushed.clear()
         reason = self._writer.reason_to_stop()
-        if reason is not None:  # the folder may be gone too, so its free space is not looked up
+        if reason is not None:  # the folder may be gone, so the free space of its disk is not looked up
             return reason
         if self._part_is_full():
             self._split_due = True
@@ -512,7 +508,7 @@ class Recorder:
         return None
 
     def _pause(self, reason: str) -> None:
-        """Refuse items until the disk has room again; queued items and items not yet flushed are lost."""
+        """Refuse items until the disk has room again; queued and unflushed items are lost."""
         with self._lock:
             first = not self._paused
             self._paused = reason
@@ -530,7 +526,7 @@ class Recorder:
             self._on_error(error)
 
     def _give_up(self, reason: str, unsafe: Mapping[str, int] = MappingProxyType({})) -> None:
-        """Refuse further items, count queued and unflushed (`unsafe`) items as lost, report why once."""
+        """Refuse items for good and report why; queued items and the unflushed items `unsafe` are lost."""
         first = self._error is None
         with self._lock:
             self._accepting, self._paused = False, None
@@ -543,7 +539,7 @@ class Recorder:
 
 
 class _SeriesItem(NamedTuple):
-    """Samples and digests of the journal on their way to the file; `sequence` is the number of the first entry."""
+    """Samples and digests for the file; `sequence` is the number of the first entry."""
 
     sequence: int
     log_time_ns: int
@@ -551,7 +547,6 @@ class _SeriesItem(NamedTuple):
 
     @property
     def keys(self) -> Mapping[str, int]:
-        """Topics that lose messages if this item is lost, with the number of these messages."""
         return {JOURNAL: len(self.series.stamps) + len(self.series.digests)}
 
     def write(self, writer: RunWriter) -> None:
@@ -570,9 +565,9 @@ class _SeriesItem(NamedTuple):
 
 
 class _PublicationsItem(NamedTuple):
-    """Publications on their way to the file, each written after the journal entry with its number.
+    """Publications for the file; `sequence` has, for each publication, the number of the journal entry before it.
 
-    `keys` are the topics that lose messages if this item is lost, with the number of these messages.
+    The `keys` of every item are the topics that lose messages if the item is lost.
     """
 
     sequence: NDArray[np.int64]
@@ -586,22 +581,18 @@ class _PublicationsItem(NamedTuple):
 
 
 def _numbers(items: Sequence[_EntryItem | _PublicationItem]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return sequence numbers and log times [ns] of items."""
     sequence, log_time_ns, *_ = zip(*items, strict=True)
     return np.array(sequence, np.int64), np.array(log_time_ns, np.int64)
 
 
-# four thousand of these items are made each second; a named tuple takes a quarter of the time of a frozen dataclass
+# About 4000 of these items are made each second. A named tuple takes a quarter of the time of a frozen dataclass.
 class _EntryItem(NamedTuple):
-    """A journal entry on its way to the file."""
-
     sequence: int
     log_time_ns: int
     entry: Entry | Dropped
 
     @property
     def keys(self) -> tuple[str, ...]:
-        """Topics that lose a message if this item is lost."""
         return (JOURNAL,)
 
     def write(self, writer: RunWriter) -> None:
@@ -609,8 +600,6 @@ class _EntryItem(NamedTuple):
 
 
 class _OutputItem(NamedTuple):
-    """A message on its way to the file."""
-
     sequence: int
     log_time_ns: int
     topic: str
@@ -619,7 +608,6 @@ class _OutputItem(NamedTuple):
 
     @property
     def keys(self) -> tuple[str, ...]:
-        """Topics that lose a message if this item is lost."""
         return (self.topic,)
 
     def write(self, writer: RunWriter) -> None:
@@ -627,8 +615,6 @@ class _OutputItem(NamedTuple):
 
 
 class _PublicationItem(NamedTuple):
-    """A publication on its way to the file with all its messages; `keys` are the topics of these messages."""
-
     sequence: int
     log_time_ns: int
     published: Published
@@ -640,14 +626,12 @@ _Item: TypeAlias = _EntryItem | _OutputItem | _PublicationItem | _SeriesItem | _
 
 
 def _count(item: _Item) -> int:
-    """Return the number of entries or publications in an item."""
     if isinstance(item, _SeriesItem):
         return item.keys[JOURNAL]
     return len(item.sequence) if isinstance(item, _PublicationsItem) else 1
 
 
 def _add_keys(counts: Counter[str], items: Iterable[_Item]) -> None:
-    """Add the entries and messages of items to counts of losses."""
     several = [item for item in items if isinstance(item, _SeriesItem | _PublicationsItem)]
     if not several:
         counts.update(chain.from_iterable(item.keys for item in items))

@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 Indexes = NDArray[np.int64]
 
 _POSE: Final = ("x", "y", "theta")
-#: Names of quantities that differ between record and tables: name in the record, name in the tables.
+#: Quantities whose names differ: name in the record, name in the tables.
 _NAMES: Final = {"makes": "touches"}
 
 
@@ -278,7 +278,6 @@ def _exported_tables(recording: Recording, kind: str, out: Path) -> dict[str, in
 
 
 def _poses(batch: Batch) -> Batched | None:
-    """Return the measured poses of a batch, NaN where a component was not measured."""
     found = [
         (entry.stamp_ns, entry.pose if isinstance(entry, Pose) else whole_pose(entry))
         for _, entry in sorted(batch.entries.others.items())
@@ -290,7 +289,6 @@ def _poses(batch: Batch) -> Batched | None:
 
 
 def _plain(name: str, rows: Rows) -> Batched:
-    """Return the numbers of messages in the columns of the table, with an angle instead of a quaternion."""
     values = rows.numbers
     if name == "head_state":
         theta = 2.0 * np.arctan2(values[:, 2], values[:, 3])

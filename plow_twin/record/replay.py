@@ -1,7 +1,13 @@
 """Run a recording again: the journal alone moves the model, whose messages are compared with the recorded messages.
 
-Nothing is copied from the recorded messages. The state is taken from a recorded snapshot only at the start of the
-journal and after a loss; every other snapshot is compared.
+Terms of this module:
+
+- The replay is *synced* while its state must equal the state of the live session. A missing entry ends this; the next
+  snapshot restores it. All other snapshots are compared.
+- The *output window* is the motion since the previous publication. It must be known to compare a *cumulative* message,
+  such as a peak since the previous message.
+- A *run* of entries consists of samples and digests without a gap, which are applied together.
+- The *sink* is a new recording that a replay can write.
 """
 
 from __future__ import annotations
@@ -62,13 +68,11 @@ from plow_twin.stream.topics import TOPICS
 if TYPE_CHECKING:
     from plow_twin.record.writer import RunWriter
 
-#: Topics that depend on the previous publication: after a lost message they cannot be compared until the next snapshot.
+#: Names of the cumulative topics.
 _CUMULATIVE: Final = frozenset(topic.name for topic in TOPICS if topic.cumulative)
-#: For each topic of `PUBLICATION_TOPICS`, whether it depends on the previous publication.
 _IS_CUMULATIVE: Final = np.array([name in _CUMULATIVE for name in PUBLICATION_TOPICS])
 _SEQUENCE_MASK: Final = 0xFFFFFFFF
 
-#: A function that receives the share of the file that has been replayed, 0..1.
 ProgressCallback = Callable[[float], object]
 
 
@@ -82,12 +86,12 @@ def replay(
     path
         The recording: its folder or one `.mcap` file.
     on_progress
-        Receives the share of the recording's bytes that has been replayed, 0..1.
+        Function that receives the share of the recording's bytes that has been replayed, 0..1.
     digests_only
         Compare the digests alone; chunks that contain only messages are not read.
     write
-        Folder for a full recording made from the journal, with all outputs after each advance. If it is given, only
-        digests are compared.
+        Folder for a full recording made from the journal, with all outputs after each advance; only digests are
+        compared.
 
     Raises
     ------
@@ -125,12 +129,10 @@ def following_twin(header: RunHeader, scene: Scene) -> Driven:
 
 
 class _Replay:
-    """The state of a replay: a session, and whether its state equals the state of the live session."""
+    """The state of a replay."""
 
     def __init__(self, header: RunHeader, report: ReplayReport, digests_only: bool) -> None:
         self.digests_only = digests_only
-        #: whether every publication was recorded, so that each output window (the time since the previous publication)
-        #: is known
         self.all_outputs = not digests_only and header.record_outputs == "all"
         self.header = header
         self.report = report
@@ -152,8 +154,8 @@ class _Replay:
         if excitation == "sampled":
             _warm_up(scene, header.tol, self.templates, rows=not digests_only)
         self.sink: RunWriter | None = None
-        self.rows = np.zeros(0, ROW)  # buffer for the rows of the newest run of samples
-        # publications of the newest unbroken series of samples; messages of the last of them may still follow
+        self.rows = np.zeros(0, ROW)
+        # publications of the newest run; messages of the last of them may still follow
         self.published: Published | None = None
         self.session = Session(
             twin, header.origin_ns, rollback_span_s=float(header.parameters.get("rollback_span", 0.0))
@@ -161,20 +163,20 @@ class _Replay:
         absent = FOLLOWED_TOPICS if header.follow != "full" else ()
         self.topics = {header.topic(name): name for name in PUBLICATION_TOPICS if name not in absent}
         self.next_sequence = 0
-        self.in_a_row = 0  # length of the unbroken series of entries directly before the next entry
-        self.synced = False  # whether the session's state equals the state of the live session
-        self.outputs_synced = False  # whether the output windows of the session also equal those of the live session
-        self.outputs_whole = True  # whether the current batch has a note for every missing message
-        self.resumed = False  # whether the session took its state from a snapshot and has made no advance since then
+        self.in_a_row = 0
+        self.synced = False
+        self.outputs_synced = False  # whether the output window is known
+        self.outputs_whole = True  # whether the current batch has a note for each missing message
+        self.resumed = False  # whether the session has not advanced since it restored a snapshot
         self.messages: Mapping[str, Message] | None = None
         self.first_ns: int | None = None
         self.gaps = 0
-        self.lost_entries = 0  # number of lost entries according to notes in the journal
+        self.lost_entries = 0  # as noted in the journal
         self.inputs = InputCounts(header.excitation_source)
         self.alarms = AlarmCheck(header, self.all_outputs)
 
     def batch(self, batch: Batch) -> None:
-        """Apply and compare a batch: unbroken series of samples at once, other entries one by one."""
+        """Apply and compare a batch: runs at once, other entries one by one."""
         self.outputs_whole = not batch.damaged
         self.outputs_synced = self.outputs_synced and self.outputs_whole
         if batch.damaged:
@@ -182,7 +184,7 @@ class _Replay:
         entries = batch.entries
         sent = SentMessages.of(batch.outputs, self.topics)
         count = len(entries)
-        breaks = np.ones(count, bool)  # entries that end a run of samples
+        breaks = np.ones(count, bool)
         breaks[1:] = np.diff(entries.sequence) != 1
         digests = entries.digest_at
         behind = digests > 0
@@ -223,7 +225,6 @@ class _Replay:
         return self.synced and expected and bool(entries.sample[place]) and sampled
 
     def _compare_alarms(self, batch: Batch) -> None:
-        """Compare the alarm messages of a batch."""
         topic = self.header.topic(ALARMS)
         said = []
         for part in batch.outputs:
@@ -236,14 +237,13 @@ class _Replay:
             self._note(Divergence(*difference))
 
     def _messages(self, sent: SentMessages, begin: int, end: int) -> None:
-        # without a new recording (`sink`), the topics computed from the journal are compared; with a new recording, the
-        # other topics are copied to it
+        # the sink gets copies of the messages that a replay cannot compute; without a sink, the others are compared
         chosen = (sent.kind[begin:end] >= 0) == (self.sink is None)
         for index in (begin + np.flatnonzero(chosen)).tolist():
             self.output(sent.record(index))
 
     def _run(self, entries: Entries, sent: SentMessages, begin: int, end: int) -> bool:
-        """Apply a series of samples and digests and compare its messages; False: nothing was applied."""
+        """Apply a run and compare its messages; return False, with nothing applied, if a sample is refused."""
         done: Indexes = np.cumsum(entries.sample, dtype=np.int64)
         digests = entries.digest_at
         stamps, wrench = entries.samples()
@@ -262,7 +262,7 @@ class _Replay:
             rows = self.rows[: len(stamps)]
         try:
             found = self.session.advance(stamps, wrench, rows, taken, done[digests])
-        except ValueError:  # the entries are then applied one by one, so that the refused sample is counted
+        except ValueError:  # the entries are then applied one by one
             return False
         self.inputs.add(entries)
         self.report.entries += len(entries)
@@ -294,7 +294,7 @@ class _Replay:
         return True
 
     def _write_run(self, entries: Entries, found: Applied) -> None:
-        """Write a series of samples and digests, and a publication after each sample."""
+        """Write a run, with a publication after each sample."""
         assert self.sink is not None
         begin = 0
         for end in (*sorted(entries.others), len(entries)):
@@ -308,7 +308,7 @@ class _Replay:
                 self.sink.write_entry(record.sequence, record.log_time_ns, record.entry)
             begin = end + 1
         samples, published = np.flatnonzero(entries.sample), found.published
-        if found.failed:  # a failed advance is not published
+        if found.failed:
             good = np.flatnonzero(found.rows["stamp_ns"])
             samples, published = samples[good], published.of(good)
         self.sink.write_publications(entries.sequence[samples], entries.log_time_ns[samples], published)
@@ -318,7 +318,7 @@ class _Replay:
         assert self.sink is not None
         entry = record.entry
         if isinstance(entry, Snapshot) and self.synced:
-            # this session's own snapshot is written, because its output windows fit the publications written here
+            # the session's own snapshot has the output window of the publications written here
             entry = self.session.snapshot()
         self.sink.write_entry(record.sequence, record.log_time_ns, entry)
         published = self.session.outputs.pop() if self.synced and isinstance(entry, Sample | Hold | Unload) else NOTHING
@@ -335,7 +335,7 @@ class _Replay:
         done: Indexes,
         first_step: int,
     ) -> list[tuple[int, int, str, str, str, str]]:
-        """Return the differences between the messages that the run sent and the computed messages."""
+        """Return the differences between the sent and the computed messages of a run."""
         poses = [
             (int(entries.sequence[index]) & _SEQUENCE_MASK, first_step + int(done[index]) - 1, entry)
             for index, entry in sorted(entries.rest.items())
@@ -359,7 +359,7 @@ class _Replay:
         return differences
 
     def _difference(self, record: OutputRecord, published: Published) -> tuple[str, str, str] | None:
-        """Return the difference between a recorded message and the message of the computed publication."""
+        """Return the first difference between a recorded and a computed message."""
         name = self.topics[record.topic]
         computed = publication_messages(published, self.header.frame_id, self.header.child_frame_id).get(name)
         if computed is None:
@@ -367,12 +367,11 @@ class _Replay:
         return None if encode(computed) == record.data else _first_difference(record, computed)
 
     def entry(self, record: EntryRecord) -> None:
-        """Apply or compare one entry of the journal."""
         if not self.report.entries and self.header.part:
-            self.next_sequence = record.sequence  # the recording lacks its earlier parts, so counting starts here
+            self.next_sequence = record.sequence  # the earlier parts are missing
             self.alarms.give_up()
         missing = (record.sequence - self.next_sequence) & _SEQUENCE_MASK
-        if 0 < (-missing & _SEQUENCE_MASK) <= self.in_a_row:  # a repeated entry
+        if 0 < (-missing & _SEQUENCE_MASK) <= self.in_a_row:
             self.report.repeated += 1
             return
         self.inputs.add_entry(record.entry)
@@ -382,11 +381,11 @@ class _Replay:
             self.alarms.give_up()
             self.synced = self.outputs_synced = False
         elif record.sequence == 0 and not isinstance(record.entry, Snapshot):
-            # the entry with sequence number 0 is the first of the run, which begins with the scene's own initial state
+            # the first entry of a run: the state is the scene's initial state
             self.synced, self.outputs_synced = True, self.all_outputs and self.outputs_whole
         self.next_sequence = (record.sequence + 1) & _SEQUENCE_MASK
         self.in_a_row += 1
-        if not isinstance(record.entry, Dropped):  # a note of a loss may stand between messages of one publication
+        if not isinstance(record.entry, Dropped):  # a note of a loss may stand between the messages of one publication
             self.messages = self.published = None
         self.report.entries += 1
         match record.entry:
@@ -422,13 +421,13 @@ class _Replay:
         try:
             self.session.apply(entry)
         except ValueError:
-            # the refusal is right if the live session refused the entry too; otherwise the next comparison fails
+            # if the live session used this entry, the next comparison fails
             self.report.refused += 1
 
     def _snapshot(self, snapshot: Snapshot) -> None:
         if self.synced and self.outputs_synced:
             self.report.snapshots_compared += 1
-            # `renew` drops all earlier states, as the live session did when it journalled the snapshot
+            # like the live session, `renew` drops all earlier states
             computed = self.session.renew().data
             self._compare("snapshot", snapshot.stamp_ns, "state", _hash(snapshot.data), _hash(computed))
             return
@@ -437,16 +436,15 @@ class _Replay:
             self.session.apply(snapshot)
         except (ValueError, struct.error) as error:
             raise RecordingError(f"{self.report.path}: snapshot at {snapshot.stamp_ns} ns: {error}") from error
-        # no entry was lost, but messages were, so only the motion can be compared with the snapshot
+        # messages were lost but no entry, so only the motion can be compared
         if before is not None:
             self._compare("snapshot", snapshot.stamp_ns, "state", self.session.twin.digest(), before)
         self.synced = self.resumed = True
-        # the output windows are known only if every publication was recorded
         self.outputs_synced = self.all_outputs and self.outputs_whole
 
     def output(self, record: OutputRecord) -> None:
         """Compare a recorded message with the message computed after the same journal entry."""
-        if self.sink is not None:  # messages of other topics are copied unchanged
+        if self.sink is not None:
             place = (record.topic, record.sequence, record.log_time_ns, record.publish_time_ns)
             self.sink.write_output(*place, record.message())
             return
@@ -455,7 +453,7 @@ class _Replay:
         if not self.synced or record.sequence != here or (name in _CUMULATIVE and not self.outputs_synced):
             self.report.not_compared[name] += 1
             return
-        if self.messages is None:  # this is the first message of a publication
+        if self.messages is None:
             if self.published is not None:
                 published = self.published.at(len(self.published.rows) - 1)
             else:
@@ -487,7 +485,6 @@ class _Replay:
             self.report.first_divergence = divergence
 
     def finish(self, reader: RunReader, wall_s: float) -> ReplayReport:
-        """Complete the report once the file has been read."""
         report = self.report
         report.status, report.damaged_chunks, report.wall_s = reader.status, reader.damaged_chunks, wall_s
         if report.status is FileStatus.COMPLETE:
@@ -527,7 +524,7 @@ def _hash(data: bytes) -> str:
 
 
 def _first_difference(record: OutputRecord, computed: Message) -> tuple[str, str, str]:
-    """Return field, recorded and computed value of the first difference between two messages."""
+    """Return the first field in which two messages differ, with its recorded and computed value."""
     try:
         recorded = decode(record.data, record.message_type)
     except RecordingError:

@@ -1,4 +1,4 @@
-"""The newest seconds of a run, kept in memory as parts of a recording and written to a folder on request."""
+"""The ring: the newest seconds of a run, kept in memory as parts of a recording and written to a folder on request."""
 
 from __future__ import annotations
 
@@ -22,14 +22,8 @@ PARTS: Final = 8
 class RingWriter(RunWriter):
     """A recording in memory that drops its oldest parts.
 
-    Parameters
-    ----------
-    folder
-        Name of the recording; the folder is not made.
-    ring_s
-        Shortest time that is kept [s]; up to an eighth more is kept.
-    sync_dumps
-        Whether `dump` waits for the disk.
+    `folder` only names the recording. At least the newest `ring_s` seconds are kept, and up to an eighth more. With
+    `sync_dumps`, `dump` waits for the disk.
     """
 
     def __init__(
@@ -52,7 +46,7 @@ class RingWriter(RunWriter):
         return MemoryFile()
 
     def _prepare(self, folder: Path) -> None:
-        """Do nothing, as no folder is needed."""
+        """A ring needs no folder."""
 
     @property
     def bytes_written(self) -> int:
@@ -60,7 +54,7 @@ class RingWriter(RunWriter):
         return sum(len(content) for _, _, content in self._kept) + self.part_bytes
 
     def shortage(self) -> str | None:
-        """Return None, because memory does not fill up."""
+        """Return None, because a ring needs no disk."""
         return None
 
     def split(self, loss: Mapping[str, int], keep_bytes: int = 0) -> None:
@@ -84,7 +78,7 @@ class RingWriter(RunWriter):
             The folder cannot be written; the ring stays as it is.
         """
         make_folder(folder)
-        with ExitStack() as undone:  # this removes an incomplete ring
+        with ExitStack() as undone:  # removes an incomplete ring
             undone.callback(_remove, folder)
             self._dump(folder, loss, undone)
             undone.pop_all()
@@ -93,7 +87,7 @@ class RingWriter(RunWriter):
         self._kept = []
 
     def _dump(self, folder: Path, loss: Mapping[str, int], undone: ExitStack) -> None:
-        """Write the parts to a folder; `undone` gets the removal of each file in case of a failure."""
+        """Write the parts to a folder; `undone` receives the removal of each file, for a failure."""
         if (short := shortage(folder, self._min_free_bytes)) is not None:
             raise RecordingError(short)
         facts = []
@@ -119,7 +113,6 @@ class RingWriter(RunWriter):
 
 
 def _remove(folder: Path) -> None:
-    """Remove a folder if it is empty."""
     with suppress(OSError):
         folder.rmdir()
 

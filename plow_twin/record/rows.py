@@ -1,4 +1,4 @@
-"""The messages of a batch as arrays of numbers, which views and tables use instead of costly message objects."""
+"""The messages of a batch as arrays of numbers, which are cheaper than message objects."""
 
 from __future__ import annotations
 
@@ -44,15 +44,8 @@ def rows_by_topic(
 ) -> dict[str, Rows]:
     """Return the rows of each topic that has messages.
 
-    Parameters
-    ----------
-    outputs
-            The outputs of a batch.
-        topics
-            Base names by topic.
-        templates
-            Templates by base name. A message whose texts differ from its template (such as an older name) is decoded
-            individually; a message with another count of numbers is left out.
+    `topics` has the base name of each topic, and `templates` the template of each base name. A message whose texts
+    differ from its template is decoded; a message with another count of numbers is left out.
     """
     found: dict[str, list[Rows]] = {}
     for part in outputs:

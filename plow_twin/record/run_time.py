@@ -1,4 +1,4 @@
-"""The time that the journal of a run covers: its span, and its stretches without samples."""
+"""The time that the journal of a run covers: its span and its silences."""
 
 from __future__ import annotations
 
@@ -19,10 +19,7 @@ _TIMEOUT = "excitation_timeout"
 class RunTime:
     """Measure the time of a run from its entries in order.
 
-    Parameters
-    ----------
-    parameters
-        Parameters of the node in the run's header, of which `excitation_timeout` is used.
+    `parameters` are the node's parameters in the run's header, of which `excitation_timeout` is used.
     """
 
     def __init__(self, parameters: Mapping[str, Any]) -> None:
@@ -39,7 +36,7 @@ class RunTime:
     def add(self, entries: Entries) -> list[tuple[int, int, int]]:
         """Add entries; return the silences that end in them: index of the ending sample, begin and end [ns].
 
-        A stretch with missing entries is no silence, because some of them may be samples.
+        A time with missing entries is no silence.
         """
         found, done, missing = [], 0, self._holes.find(entries)
         samples = np.flatnonzero(entries.sample)
@@ -64,7 +61,7 @@ class RunTime:
             case Reset() | SetWear() | Restore():
                 self._reached_ns = None
                 self.silences.restart()
-            case Loss():  # the time across a loss is no silence, because samples may be among the lost entries
+            case Loss():  # samples may be among the lost entries
                 self.silences.restart()
             case Parameter(name, value) if name == _TIMEOUT:
                 self.silences.timeout_s = float(value)

@@ -21,12 +21,8 @@ _WORD: Final = 8
 class Messages:
     """Write the messages of each publication to the same memory.
 
-    Parameters
-    ----------
-    frame_id, child_frame_id
-        Frames named in the messages.
-    intervals
-        Whether to make the messages with the 5 % to 95 % intervals of forces.
+    `frame_id` and `child_frame_id` are named in the messages. With `intervals`, there are also messages with the 5 % to
+    95 % intervals of forces.
     """
 
     def __init__(self, frame_id: str, child_frame_id: str, *, intervals: bool = False) -> None:
@@ -41,8 +37,8 @@ class Messages:
     def write(self, published: Published) -> tuple[tuple[str, memoryview], ...]:
         """Return the topic and bytes of each message of a publication of one row, in the order of sending.
 
-        Messages with intervals are not included (see `intervals`). The bytes are valid until the next call. The result
-        is empty if a number is not finite.
+        The bytes are valid until the next call. The result is empty if a number is not finite. The messages of
+        `intervals` are not included.
         """
         rows, slow = published
         if not self._each.fill(rows) or (len(slow) and not self._slow.fill(slow)):
@@ -62,15 +58,15 @@ class Messages:
 
 
 class _Group(NamedTuple):
-    """Buffer of the messages made from one record, one after the other; only stamps and numbers change."""
+    """Buffer of the messages that are made from one record; only stamps and numbers change."""
 
-    #: base name of each topic, and the part of `buffer` that holds its message
+    #: base name of each topic, and the part of `buffer` with its message
     parts: tuple[tuple[str, memoryview], ...]
     buffer: NDArray[np.uint8]
-    #: offset in the buffer at which each message begins [B]
+    #: offset of each message in the buffer [B]
     starts: NDArray[np.int64]
-    #: for each number: its offset in the buffer [B], its offset in the record [words], and whether the record has it as
-    #: an integer
+    #: for each number: its offset in the buffer [B] and in the record [words], and whether it is an integer in the
+    #: record
     places: NDArray[np.int64]
     sources: NDArray[np.int64]
     integers: NDArray[np.bool_]
@@ -89,7 +85,6 @@ class _Group(NamedTuple):
         return cls(tuple(parts), buffer, ends[:-1].copy(), places, sources, integers)
 
     def fill(self, records: NDArray[np.void]) -> bool:
-        """Write the messages of a record, shape (1,); return False if a number is not finite."""
         stamp_ns, numbers = records["stamp_ns"], records.view(np.float64)
         return bool(_write(numbers, stamp_ns, self.buffer, self.starts, self.places, self.sources, self.integers))
 
@@ -101,7 +96,6 @@ def _sources(topic: Topic) -> NDArray[np.int64]:
 
 
 def _integers(topic: Topic) -> NDArray[np.bool_]:
-    """Return, for each number of a message, whether it is an integer in its record."""
     fields: Any = topic.record_type.fields
     return np.concatenate([np.full(count, fields[name][0].base.kind == "i") for name, count in topic.parts])
 
@@ -113,7 +107,6 @@ def warm_up() -> None:
 
 @compiled
 def _write(numbers, stamps, buffer, starts, places, sources, integers):  # type: ignore[no-untyped-def]
-    """Write the stamp and numbers of a record into its messages; return False if a number is not finite."""
     stamp = stamp_word(stamps[0])
     for start in starts:
         set_word(buffer, start + STAMP_AT, stamp)

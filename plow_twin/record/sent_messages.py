@@ -1,4 +1,4 @@
-"""The messages that a run has sent, from all chunks, as one sequence in the order of the journal."""
+"""The messages that a run has sent, as one sequence in the order of the journal."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from plow_twin.record.template import Indexes
 class SentMessages:
     """Sent messages of many chunks in order of sequence number; an index counts over all chunks.
 
-    `kind` is the index of a message's topic in `PUBLICATION_TOPICS`, -1 for other topics; part k begins at `begins[k]`.
+    `kind` is the index of a message's topic in `PUBLICATION_TOPICS`, -1 for other topics. Part k begins at `begins[k]`.
     """
 
     parts: list[Outputs]
@@ -28,8 +28,8 @@ class SentMessages:
 
     @classmethod
     def of(cls, outputs: list[Outputs], topics: Mapping[str, str]) -> Self:
-        """Collect messages; `topics` gives the base name of each topic whose messages follow from the motion."""
-        # few tables are made, because parts share their topics
+        """Collect messages; `topics` has the base names of the topics that a replay can compute."""
+        # many parts share one mapping of topics
         tables = {id(part.topics): _kinds(part.topics, topics) for part in outputs}
         sequence = _joined(part.sequence for part in outputs)
         kind = _joined(tables[id(part.topics)][part.messages.channel] for part in outputs)
@@ -55,7 +55,7 @@ class SentMessages:
         return self.parts[part].record(index - int(self.begins[part]))
 
     def pieces(self, begin: int, end: int) -> Iterator[tuple[Messages, int, int]]:
-        """Yield the messages from `begin` to before `end` in pieces of one chunk, each with its first and end index."""
+        """Yield the messages from `begin` to before `end` chunk by chunk, each with its first and end index."""
         first = int(np.searchsorted(self.begins, begin, side="right")) - 1
         while begin < end:
             origin, behind = self.begins[first : first + 2].tolist()
@@ -70,7 +70,6 @@ def _joined(arrays: Iterable[Indexes]) -> Indexes:
 
 
 def _kinds(channels: Mapping[int, tuple[str, str]], topics: Mapping[str, str]) -> Indexes:
-    """Return the kind of the messages (see `kind`) by channel."""
     lookup = np.full(max(channels, default=-1) + 1, -1)
     for channel, (topic, _) in channels.items():
         if topic in topics:

@@ -1,7 +1,7 @@
 """Any recording as a stream of messages: MCAP or rosbag2's sqlite3 (a file or a folder of parts), CSV, or Parquet.
 
-Messages come in the order in which they were written. Unreadable messages are counted and skipped, and a truncated file
-is read as far as possible. Only some chunks are in memory at a time.
+Messages come in the order in which they were written, and only some chunks are in memory at a time. Unreadable messages
+are counted and skipped, and a truncated file is read as far as possible.
 """
 
 from __future__ import annotations
@@ -33,8 +33,7 @@ _SQLITE_MAGIC: Final = b"SQLite format 3\0"
 _ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
 #: Largest message that is unpacked [B].
 _LARGEST_MESSAGE: Final = 2**26
-#: Query that returns a row if `topics` or `messages` is a view or a virtual table, or has computed columns. Such a
-#: table is not read, because reading it may never end.
+#: Finds views, virtual tables and computed columns; reading a table with these may never end.
 _COMPUTED: Final = """
     SELECT 1 FROM sqlite_master
     WHERE name COLLATE NOCASE IN ('topics', 'messages') AND (type != 'table' OR rootpage = 0)
@@ -42,14 +41,13 @@ _COMPUTED: Final = """
     UNION ALL SELECT 1 FROM pragma_table_xinfo('topics') WHERE hidden LIMIT 1
 """
 _MESSAGES: Final = "SELECT topic_id, timestamp, data FROM messages ORDER BY id"
-#: Errors that sqlite3 raises for a damaged file; the last two are for text that is not UTF-8 and for cells of
-#: impossible length.
+#: Errors for a damaged file, for text that is not UTF-8, and for cells of impossible length.
 _SQLITE_ERRORS: Final = (sqlite3.Error, UnicodeDecodeError, MemoryError)
 
 
 @dataclass(frozen=True, slots=True)
 class Columns:
-    """The type of a topic whose messages are lines: the names of the columns, or the keys of the first line."""
+    """The type of a topic whose messages are lines: the names of the columns, or the keys of the first JSON object."""
 
     names: tuple[str, ...]
 
@@ -75,7 +73,7 @@ class Arrived:
     """A message: topic, when it was received [ns], and its fields by path (`wrench.force.x`)."""
 
     topic: str
-    #: receive time [ns], or `NO_TIME` if it is unknown
+    #: receive time [ns], or `NO_TIME`
     log_time_ns: int
     content: Any
     #: whether the broker had retained the message from before the subscription
@@ -152,7 +150,6 @@ def packed(path: Path) -> str:
 
 
 def _decompressed(data: bytes) -> bytes:
-    """Return a message of a bag whose messages are compressed one by one; empty for a damaged message."""
     import zstandard
 
     try:
@@ -173,14 +170,14 @@ class Decoder:
         self._store = get_typestore(Stores.ROS2_JAZZY)
 
     def knows(self, topic: str, message_type: str, schema: str = "") -> bool:
-        """Return whether a type can be decoded; a type that cannot is recorded as unknown."""
+        """Return whether a type can be decoded; any other type is noted as unknown."""
         from plow_twin.record.foreign_types import parsed_types
 
         if message_type not in self._store.types and schema:
             try:
                 types = parsed_types(schema, message_type)
                 self._store.register({name: type_ for name, type_ in types.items() if name not in self._store.types})
-            except Exception:  # the schema is in another language, damaged or endless: its topic cannot be read
+            except Exception:  # the schema may be in another language, damaged, or endless
                 self._losses.unknown_types[topic] = message_type
         if message_type in self._store.types:
             return True
@@ -188,7 +185,7 @@ class Decoder:
         return False
 
     def reads(self, channel: Channel) -> bool:
-        """Return whether an MCAP channel can be decoded; other channels are noted as unknown with their encoding."""
+        """Return whether an MCAP channel can be decoded; any other channel is noted as unknown with its encoding."""
         if channel.encoding != "cdr":
             self._losses.unknown_types[channel.topic] = f"{channel.message_type} encoded as {channel.encoding}"
             return False
@@ -208,7 +205,6 @@ class Decoder:
 
 
 def _behind_holes(parts: Sequence[Path], missing: Sequence[Path]) -> set[Path]:
-    """Return the parts before which other parts are missing."""
     order = sorted((*parts, *missing), key=part_number)
     return {part for before, part in pairwise(order) if before in missing}
 
@@ -281,7 +277,7 @@ class SqliteSource:
         self._behind_holes = _behind_holes(parts, missing)
 
     def _open(self, path: Path) -> sqlite3.Connection:
-        log = path.with_name(path.name + "-wal")  # this log has the last messages of a killed recorder
+        log = path.with_name(path.name + "-wal")  # the log has the last messages of a killed recorder
         kept = log.is_file() and log.stat().st_size > 0
         place = quote(path.resolve().as_posix())
         connection = sqlite3.connect(f"file:{place}?mode=ro" + ("" if kept else "&immutable=1"), uri=True)
@@ -289,7 +285,7 @@ class SqliteSource:
             try:
                 connection.execute("SELECT 1 FROM sqlite_master")
             except sqlite3.OperationalError:
-                # in a read-only folder the database's log cannot be opened, so it is left unread
+                # in a read-only folder the log cannot be opened
                 connection.close()
                 connection = sqlite3.connect(f"file:{place}?mode=ro&immutable=1", uri=True)
                 self._unread.add(path)
@@ -320,7 +316,7 @@ class SqliteSource:
 
     @contextmanager
     def _reading(self, part: Path) -> Iterator[tuple[sqlite3.Connection | None, list[tuple[int, str, str]]]]:
-        """Open a file and read its topics (number, name, type); a damaged file gives None and no topics."""
+        """Open a file and read its topics as (number, name, type); a damaged file gives None and no topics."""
         topics: list[tuple[int, str, str]] = []
         with ExitStack() as opened:
             try:
@@ -372,13 +368,7 @@ class CsvSource:
         self.losses = Losses()
 
     def topics(self) -> dict[str, TopicType]:
-        """Return the columns by topic.
-
-        Raises
-        ------
-        RecordingError
-            A file has no header, or two columns have the same name.
-        """
+        """Return the columns by topic."""
         found: dict[str, TopicType] = {}
         for part in self.parts:
             try:
@@ -410,9 +400,7 @@ class CsvSource:
 
 
 def read_table(path: Path) -> tuple[Columns, Iterator[list[str]]]:
-    """Return the columns of a CSV or Parquet file and its rows, one at a time, as `CsvSource` reads them.
-
-    Lines that begin with `#` are skipped.
+    """Return the columns of a CSV or Parquet file and its rows, one at a time; lines that begin with `#` are skipped.
 
     Raises
     ------
@@ -445,7 +433,6 @@ def read_columns(path: Path, names: Sequence[str]) -> NDArray[np.float64]:
 
 
 def _table_rows(path: Path) -> Iterator[list[str]]:
-    """Yield the rows of a file, the header first."""
     try:
         with open_csv(path) as stream:
             yield from (cells for _, cells in csv_rows(stream, "#"))
@@ -474,5 +461,5 @@ def _log_time_ns(arrived: Arrived) -> int | None:
 
 
 def _row_time_ns(cell: str) -> int:
-    """Return the time of a row for merging files; a number too large for seconds is read in a smaller unit."""
+    """Return the time in a cell, in seconds or, if it is too large for seconds, in a smaller unit."""
     return next((found for unit in STAMP_UNITS if (found := time_ns(cell, unit)) is not None), NO_TIME)

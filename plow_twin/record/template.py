@@ -1,7 +1,7 @@
 """Templates of messages of fixed length: bytes with places for numbers, which are filled in or compared many at a time.
 
-Messages of one kind with equal texts differ only in the stamp and in some float64 numbers. CDR has these at fixed
-places, which are found by encoding the message once with numbers that occur nowhere else.
+Messages with equal texts differ only in the stamp and in some float64 numbers. Their places are found by encoding the
+message once with numbers that occur nowhere else.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from plow_twin.record.words import set_word, word
 Bytes = NDArray[np.uint8]
 Indexes = NDArray[np.int64]
 
-#: Place of the stamp (seconds and nanoseconds) after the four bytes that name the encoding.
+#: Offset of the stamp, after the four bytes that name the encoding.
 STAMP_AT: Final = 4
 _SECOND_NS: Final = 1_000_000_000
 
@@ -35,9 +35,9 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 
 @dataclass(frozen=True)
 class Template:
-    """The bytes of a message (`data`), the places of its numbers (`places`, shape (count,)), and a mask (`fixed`).
+    """The bytes of a message (`data`) and the offsets of its numbers (`places`, shape (count,)).
 
-    `fixed` has all bits set in the bytes that do not change.
+    `fixed` is a mask whose bits are set in the bytes that do not change.
     """
 
     message_type: str
@@ -81,7 +81,7 @@ def _fits(buffer: Bytes, start: int, length: int, data: Bytes, fixed: Bytes) -> 
     """Return whether the bytes from `start` on are a message of a template, with any numbers."""
     if length != data.size or start < 0 or start + length > buffer.size:
         return False
-    last = length - 8  # the last word ends with the message, so it may overlap the word before it
+    last = length - 8  # this word may overlap the word before it
     wrong = (word(buffer, start + last) ^ word(data, last)) & word(fixed, last)
     for k in range(length >> 3):
         wrong |= (word(buffer, start + 8 * k) ^ word(data, 8 * k)) & word(fixed, 8 * k)
@@ -90,14 +90,14 @@ def _fits(buffer: Bytes, start: int, length: int, data: Bytes, fixed: Bytes) -> 
 
 @compiled
 def stamp_word(stamp_ns: int) -> int:
-    """Return the stamp as one 64-bit word, with seconds and nanoseconds side by side as in a message."""
+    """Return the stamp as one 64-bit word: seconds and nanoseconds as in a message."""
     seconds = stamp_ns // _SECOND_NS
     return (seconds & 0xFFFFFFFF) | ((stamp_ns - seconds * _SECOND_NS) << 32)
 
 
 @compiled
 def read_numbers(buffer, starts, lengths, data, fixed, places, stamps, values, good):  # type: ignore[no-untyped-def]
-    """Read stamp and numbers of each message that fits the template; `good` is False for a message that does not."""
+    """Read stamp and numbers of each message that fits the template; `good` is False for any other message."""
     for n in range(starts.size):
         start = starts[n]
         good[n] = _fits(buffer, start, lengths[n], data, fixed)
@@ -111,7 +111,7 @@ def read_numbers(buffer, starts, lengths, data, fixed, places, stamps, values, g
 
 @dataclass(frozen=True)
 class Templates:
-    """Several templates one after the other, to compare messages of different templates in one pass.
+    """Several templates one after the other; messages of different kinds are compared in one pass.
 
     `ends` (k + 1,) and `place_ends` (k + 1,) are the bounds of each template's bytes and places.
     """

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-#: Names of the column or key that has the time, if the mapping does not name it.
+#: Names of the column or key of the time, if the mapping does not name it.
 TIMES: Final = ("t", "time")
 #: Length of each unit of time [ns].
 STAMP_UNITS: Final = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
@@ -19,12 +19,11 @@ NO_TIME: Final = -1
 NUMBER: Final = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|inf|nan)", re.IGNORECASE)
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 _NANOSECONDS: Final = re.compile(r"[.,]\d{6}(\d{1,3})")
-#: A time below this [s] counts from an unknown start, not from 1970. `START_NS` is added to it, because a stamp of 0
-#: would mean a missing stamp.
+#: A time below this [s] counts from an unknown start. `START_NS` is added to it, because a stamp of 0 would mean a
+#: missing stamp.
 EPOCH_S: Final = 1e9
 #: Stamp that a time of 0 receives [ns].
 START_NS: Final = 1_000_000_000
-#: Characters of plain decimal numbers.
 OF_NUMBERS: Final = b"0123456789+-.eE "
 #: Dates after this [ns] are placeholders: many databases write 9999-12-31 where there is no date.
 _FARTHEST_NS: Final = 4_000_000_000_000_000_000
@@ -34,7 +33,7 @@ def time_ns(value: Any, unit: str = "s") -> int | None:
     """Return the stamp [ns] of a number or of an ISO 8601 text (UTC unless stated), or None for any other value."""
     if isinstance(value, str):
         value = value.strip()
-        # try a number first, because 20260102 is a date too
+        # a number first, because 20260102 is a date too
         if value.isascii() and value.isdigit() and len(value) < 20:
             value = int(value)
         elif NUMBER.fullmatch(value):
@@ -44,7 +43,7 @@ def time_ns(value: Any, unit: str = "s") -> int | None:
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e19:
         return None
     scale = STAMP_UNITS[unit]
-    # integers keep their nanoseconds, but a float resolves today's date only to 0.2 us
+    # a float resolves today's date only to 0.2 us
     stamp_ns = _within(value * scale if isinstance(value, int) else round(value * scale))
     return stamp_ns if stamp_ns is None or stamp_ns >= EPOCH_S * 1e9 else stamp_ns + START_NS
 
@@ -94,5 +93,5 @@ def _date_ns(text: str) -> int | None:
     except ValueError:
         return None
     time = time if time.tzinfo else time.replace(tzinfo=UTC)
-    digits = _NANOSECONDS.search(text)  # these are the digits that a datetime does not keep
+    digits = _NANOSECONDS.search(text)  # a datetime keeps six digits
     return (time - _EPOCH) // timedelta(microseconds=1) * 1000 + (int(digits[1].ljust(3, "0")) if digits else 0)

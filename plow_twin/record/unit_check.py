@@ -23,33 +23,30 @@ from plow_twin.stream.limits import excitation_limits, largest_displacement
 Array = NDArray[np.float64]
 _START_S: Final = START_NS * 1e-9
 
-#: Number of messages that are checked: 20 s at 1 kHz, which contain several periods of a load.
+#: Number of messages that are checked; at 1 kHz these are 20 s, several periods of a load.
 CHECKED: Final = 20_000
 #: An idling machine has forces above this share of the scene's largest force.
 _IDLE_SHARE: Final = 1e-2
 #: Forces between this share and `_IDLE_SHARE` of the scene's largest force look like kN.
 _BROKEN_SHARE: Final = 1e-4
-#: Units of forces that are too small, each with a factor for both shares: forces a thousand times smaller than those in
-#: kN look like MN. Other small forces may be the noise of an idle sensor.
+#: Units of forces that are too small, each with a factor for both shares. Smaller forces may be the noise of an idle
+#: sensor.
 _SMALLER: Final = {"kN": 1.0, "MN": 1e-3}
 #: Largest angle of the model [rad], 45 degrees.
 _LARGEST_ANGLE_RAD: Final = 0.25 * np.pi
-#: A swing larger than this multiple of the angle that the clearance allows must be in degrees, because wear and pressed
-#: contacts alone do not let a head turn so far.
+#: A swing is half the range of an angle. Above this multiple of the angle that the clearance allows, it must be in
+#: degrees: wear and pressed contacts alone do not let a head turn so far.
 _BEYOND_CLEARANCE: Final = 3.0
-#: A swing up to this angle [rad] is accepted in any case, because soft pads let a head turn farther than a narrow
-#: clearance does.
+#: A swing up to this [rad] is always accepted, because soft pads let a head turn farther than a narrow clearance does.
 _BELIEVED_SWING_RAD: Final = 0.1
 #: Stamps further apart than this [s] are too coarse for a load that changes smoothly from sample to sample.
 _SLOW_S: Final = 0.5
 #: A load is smooth if its median change between two samples is less than this share of its range.
 _SMOOTH: Final = 0.05
-#: Ploughs travel at 3.6 m/s at most (Caterpillar GH1600); a speed above this [m/s] is in another unit.
+#: Speed that no plough reaches [m/s]; the fastest travel at 3.6 m/s (Caterpillar GH1600).
 _FASTEST_M_S: Final = 5.0
-#: Share of stamps below their predecessor above which the column is not a time.
-#: Share of such stamps above which the rows are in reverse order.
+#: Share of falling stamps above which the column is not a time, and above which the rows are in reverse order.
 _FALLING, _REVERSED = 0.2, 0.9
-#: Length [s] of each unit of time except the second.
 _TIMES: Final = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 #: Spreadsheets count days since 1900; dates of this century lie between these two day numbers.
 _SHEET_DAYS: Final = (36_525.0, 73_050.0)
@@ -58,7 +55,7 @@ _FEW: Final = 20
 _SORT: Final = "sort the rows by time"
 _NAME_TIME: Final = "name the column of the time in a mapping (stamp: NAME)"
 _WRITE_SECONDS: Final = "write seconds, or dates such as 2026-01-02T03:04:05.678Z"
-#: Load cells send at 10 kHz at most; if stamps are closer together than this [s], they are in another unit.
+#: Load cells send at 10 kHz at most, so stamps closer together than this [s] are in another unit.
 _SHORTEST_SPACING_S: Final = 1e-4
 #: Stamps above this [s] are dates: 1e9 s is in the year 2001.
 _DATES_S: Final = 1e9
@@ -66,7 +63,7 @@ _DATES_S: Final = 1e9
 
 @dataclass(frozen=True)
 class UnitDoubt:
-    """Numbers of a role that seem to be in another unit; the stamps of the load have the name `t`.
+    """Numbers of a role that seem to be in another unit; the name `t` stands for the stamps of the load.
 
     `found` and `expected` say why, and `likely` is the unit that they seem to have. `is_impossible` is True if no head
     can move like this. `advice` is a remedy if no unit helps.
@@ -99,7 +96,7 @@ def unit_doubts(
     Parameters
     ----------
     values
-        Measured numbers by role and name, such as ("excitation", "fx") or ("head_pose", "theta"); NaN where missing.
+        Measured numbers by role and name, such as ("excitation", "fx"); NaN where missing.
     load_stamps_s
         Stamps of the load [s].
     scene
@@ -122,16 +119,10 @@ def small_thresholds(thresholds: Sequence[float], scene: Scene) -> str:
 
 
 def large_loads(values: Mapping[tuple[str, str], Array], units: Mapping[str, str], scene: Scene) -> dict[str, str]:
-    """Return the loads that a live twin would not use, by name, with a text that says why and which unit would fit.
+    """Return the loads that a live twin would refuse: for each name, a text that says why and which unit would fit.
 
-    Parameters
-    ----------
-    values
-        Numbers in SI, by role and name.
-    units
-        Units of the original numbers, by name; SI where missing.
-    scene
-        A load is returned if more than one number in a hundred exceeds the `excitation_limits` of this scene.
+    A load is refused if more than one number in a hundred exceeds the scene's `excitation_limits`. `values` are in SI,
+    by role and name; `units` are the original units, by name.
     """
     found = {}
     for name, most in zip(("fx", "fy", "m"), excitation_limits(scene).largest, strict=True):
@@ -157,7 +148,7 @@ def check_units(messages: Iterable[Arrived], roles: Mapping[str, Role], scene: S
     Raises
     ------
     UnitError
-        Numbers seem to be in another unit; the error names them, their values, and how to state the unit.
+        Numbers seem to be in another unit; the error says how to state the unit.
     """
     stamps: list[float] = []
     values: dict[tuple[str, str], list[float]] = {}
@@ -178,19 +169,12 @@ def check_units(messages: Iterable[Arrived], roles: Mapping[str, Role], scene: S
 
 
 def check_poses(t: Array, q: Array, scene: Scene, source: object) -> None:
-    """Refuse measured poses whose numbers seem to be in another unit.
-
-    Parameters
-    ----------
-    t, q
-        Times, shape (n,), and x, y, theta, shape (n, 3).
-    scene, source
-        Scene of the head, and name of the recording.
+    """Refuse measured poses `q`, shape (n, 3), at times `t`, shape (n,), that seem to be in another unit.
 
     Raises
     ------
     UnitError
-        Numbers seem to be in another unit; the error names them and their values.
+        Numbers seem to be in another unit; the error names them and the recording `source`.
     """
     magnitudes = {("head_pose", name): _usual_magnitude(q[:, place]) for place, name in enumerate(("x", "y"))}
     doubts = [*_lengths(magnitudes, scene), *_angle(q[:, 2], scene), *_spacing(t, q)]
@@ -200,7 +184,6 @@ def check_poses(t: Array, q: Array, scene: Scene, source: object) -> None:
 
 
 def _stated(doubt: UnitDoubt, roles: Mapping[str, Role]) -> bool:
-    """Return whether the mapping states a unit for each of the doubted numbers."""
     role = roles[doubt.role]
     return set(doubt.names) <= {*role.factor, *role.scale, *role.limits}
 
@@ -212,7 +195,7 @@ def _usual_magnitude(values: Array, percent: float = 99.0) -> float:
 
 
 def _load(magnitudes: Mapping[tuple[str, str], float], scene: Scene) -> list[UnitDoubt]:
-    """Doubt the forces together, since one component may be small, and the moment in proportion to the forces."""
+    """Doubt the forces together, because one may be small, and the moment in proportion to the forces."""
     found = [magnitudes[key] for key in (("excitation", "fx"), ("excitation", "fy")) if key in magnitudes]
     usual = _largest_force(scene)
     largest = max(found, default=0.0)
@@ -224,7 +207,7 @@ def _load(magnitudes: Mapping[tuple[str, str], float], scene: Scene) -> list[Uni
             largest *= UNITS["force"][unit]
     if largest < _IDLE_SHARE * usual:
         return doubts
-    # small forces come with a small moment, so the expected moment is reduced in proportion to the forces
+    # small forces come with a small moment
     beside = float(compile_loads(scene.loads).largest()[2]) * min(1.0, largest / usual) if usual else 0.0
     moment = magnitudes.get(("excitation", "m"), 0.0)
     if _BROKEN_SHARE * beside < moment < _IDLE_SHARE * beside:
@@ -234,11 +217,11 @@ def _load(magnitudes: Mapping[tuple[str, str], float], scene: Scene) -> list[Uni
 
 
 def _angle(theta: Array, scene: Scene) -> list[UnitDoubt]:
-    """Doubt angles outside the model, and angles whose swing about their middle no clearance allows."""
+    """Doubt angles outside the model, and swings that no clearance allows."""
     largest = _usual_magnitude(theta)
     if scene.head.carries == "corners" or not 0.0 < largest < np.degrees(_LARGEST_ANGLE_RAD):
         return []
-    # the zero of a sensor may differ from the head's zero, so the swing, half the range, is judged as well
+    # the swing is judged too, because the zero of a sensor may differ from the head's
     low, high = np.percentile(theta[np.isfinite(theta)], (0.5, 99.5))
     swing = 0.5 * float(high - low)
     allowed = max(_BELIEVED_SWING_RAD, _BEYOND_CLEARANCE * largest_angle(scene))
@@ -262,7 +245,6 @@ def _lengths(magnitudes: Mapping[tuple[str, str], float], scene: Scene) -> list[
 
 
 def _travel(values: Mapping[tuple[str, str], Sequence[float] | Array]) -> list[UnitDoubt]:
-    """Doubt speeds along the face that no plough reaches, unless they are single outliers."""
     speed = _usual_magnitude(np.asarray(values.get(("travel", "speed"), ()), float), 90.0)
     if speed <= _FASTEST_M_S:
         return []
@@ -271,13 +253,12 @@ def _travel(values: Mapping[tuple[str, str], Sequence[float] | Array]) -> list[U
 
 
 def _largest_force(scene: Scene) -> float:
-    """Return the largest force [N] of the scene's loads, or the head's weight if it is larger."""
     amplitude = compile_loads(scene.loads).largest()
     return max(float(amplitude[:2].max()), scene.head.mass_kg * abs(scene.gravity.acceleration_m_s2))
 
 
 def _spacing(stamps_s: Array, load: Array) -> list[UnitDoubt]:
-    """Doubt the unit of stamps that are too far apart for a load (n, k) that changes smoothly between them."""
+    """Doubt stamps that fall, and stamps that are too far apart for a load that changes smoothly between them."""
     if len(stamps_s) < _FEW:
         return []
     steps = np.diff(stamps_s)
@@ -292,7 +273,7 @@ def _spacing(stamps_s: Array, load: Array) -> list[UnitDoubt]:
     if stamps_s.max() > _DATES_S:
         return []
     spacing = float(np.median(np.abs(steps)))
-    # `time_ns` has added a second to times that count from an unknown start, so the limits get a second too
+    # `time_ns` has added a second to times that count from an unknown start
     low, high = (days + _START_S for days in _SHEET_DAYS)
     if low <= stamps_s[0] <= high and np.ptp(stamps_s) < 1.0 and spacing < _SHORTEST_SPACING_S:
         found = f"{stamps_s[0] - _START_S:.6g} and stamps {spacing:.2g} s apart"

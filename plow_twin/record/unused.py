@@ -1,4 +1,4 @@
-"""Messages at the inputs of a run, from its journal: counts of all, and the unused ones with reason and sender."""
+"""Messages at the inputs of a run, from its journal: counts of all messages, and each unused message."""
 
 from __future__ import annotations
 
@@ -18,8 +18,7 @@ from plow_twin.stream.journal import Entry, Gaps, PartOfPose, Pose, Sample, Trav
 class InputCounts:
     """Counts of messages by input and outcome; an outcome is `used` or a reason of `Unused`.
 
-    For the input `source`, the sum of all counts except `not_followed` is the number of messages that its publisher has
-    sent.
+    For the input `source`, all counts except `not_followed` add up to the messages that its publisher has sent.
     """
 
     source: str
@@ -57,7 +56,7 @@ class InputCounts:
 def unused_messages(path: Path) -> Iterator[dict[str, Any]]:
     """Yield each unused message in the journal of a run: input, sender, reason, stamp, values.
 
-    Each entry's messages without values come last, as one row with their `count` and no stamp.
+    An entry's messages without values come last, as one row with their `count` and no stamp.
 
     Raises
     ------

@@ -1,6 +1,6 @@
 """Advance of a session by many samples at a time, from the journal of a run or from the load of any recording.
 
-Time follows the stamps. The load is linear from sample to sample and is never held.
+A *walker* advances one session. Time follows the stamps; the load is linear from sample to sample and is never held.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 #: Number of samples by which the session advances at once.
 BATCH: Final = 4096
-#: A walk stops at these entries. Across all other entries, late samples are sorted in.
+#: Entries at which a walk stops; late samples are sorted in across all other entries.
 _ACTING: Final = (Travel, Reset, Loss, Restore, Snapshot, SetModel, SetWear)
 #: Further entries at which a walk stops if the motion follows measurements.
 _FOLLOWED: Final = (Pose, PartOfPose, Estimated, Parameter)
@@ -55,28 +55,20 @@ class Walked:
 
     stamp_ns: NDArray[np.int64]
     wrench: NDArray[np.float64]
-    #: the rows of `published`, with the total number of touches so far
+    #: the rows of `published`, with the number of touches so far
     rows: AdvanceSeries
     published: Published
     #: touches since the previous advance, shape (n, 8)
     makes: NDArray[np.int64]
-    #: signed speed along the face [m/s]
     speed_m_s: float
     #: scene with all changes of the model so far
     scene: Scene
 
 
 class Walker:
-    """Advance a session by many samples at a time, write its journal and outputs, and pass the rows on.
+    """Advance a session by many samples at a time, write its journal and outputs to `writer`, and pass the rows on.
 
-    Parameters
-    ----------
-    session
-        The session, which only the walker changes.
-    on_walked
-        Receives the rows of each batch.
-    writer
-        Writer of journal and outputs, or None.
+    Only the walker may change the session. `on_walked` receives the rows of each batch.
     """
 
     def __init__(
@@ -88,15 +80,12 @@ class Walker:
         self._sequence = -1
         self._advances = 0
         self._log_time_ns = 0
-        #: number of failed advances
         self.failures = 0
-        #: called after each reset of the motion
         self.on_reset: Callable[[], object] = lambda: None
         self.speed_m_s = 0.0
         self._opening: Snapshot | None = session.snapshot()
 
     def _open(self, log_time_ns: int) -> None:
-        """Begin the journal with the initial state, at the receive time of the first entry."""
         opening, self._opening = self._opening, None
         if opening is not None:
             self._sequence += 1
@@ -176,8 +165,8 @@ class Walker:
 class JournalWalk:
     """Pass the journal of a run through walkers of its scene and of other scenes.
 
-    `used` and `late` count samples; a late sample is sorted in by its stamp unless the walkers have passed this stamp.
-    `missing` counts the entries that are missing in the journal; after each gap a new part of the motion begins.
+    `used` and `late` count samples; a late sample is sorted in unless the walkers have passed its stamp. `missing`
+    counts missing entries; after each gap a new part of the motion begins.
 
     Parameters
     ----------
@@ -188,8 +177,8 @@ class JournalWalk:
     whole
         Whether the journal begins with the run; otherwise its first snapshot is restored.
     same_scene
-        Whether `own` have the scene of the run. If so, they apply changes of the model and restored motions, and also
-        measurements if their twin follows them.
+        Whether `own` have the scene of the run. Then they apply changes of the model and restored motions, and
+        measurements if their twin follows these.
     """
 
     def __init__(
@@ -216,7 +205,7 @@ class JournalWalk:
         self._whole(entries[begin:])
 
     def _hole(self, count: int) -> None:
-        """Begin a new part of the motion, because no load may be interpolated over missing entries."""
+        """Begin a new part of the motion: no load is interpolated over missing entries."""
         self.missing += count
         self._entry(Loss(count))
 
@@ -238,7 +227,7 @@ class JournalWalk:
         stamps, wrench = stamps[order], wrench[order]
         while len(stamps):
             count = len(stamps)
-            if self._travels:  # a speed sent ahead of time acts from its stamp on
+            if self._travels:  # a speed acts from its stamp on
                 count = int(np.searchsorted(stamps, self._travels[0].stamp_ns, "right"))
             if count:
                 self._reached_ns = int(stamps[count - 1])
@@ -251,11 +240,10 @@ class JournalWalk:
     def _speed(self, speed_m_s: float) -> None:
         for walker in self._all:
             walker.speed_m_s = speed_m_s
-            # the stamp is the time already reached, so that the speed acts at once
+            # a speed with a stamp that is already reached acts at once
             walker.apply(Travel(max(0, self._reached_ns), speed_m_s))
 
     def _begin_anew(self) -> None:
-        """Forget the time reached, so that any stamp may come next; waiting speeds act from now on."""
         for travel in self._travels:
             self._speed(travel.speed_m_s)
         self._travels, self._reached_ns = [], -1

@@ -18,13 +18,12 @@ from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.model.scene import Scene
 from plow_twin.record.durable import write_whole
 
-#: Name of the wear file in the folder that the user gives.
 FILE_NAME: Final = "wear.json"
 VERSION: Final = 1
 
 
 class WearStateError(PlowTwinError, ValueError):
-    """A wear file cannot be used; the message names the file and the reason."""
+    """A wear file cannot be used."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +113,7 @@ def claim_folder(folder: Path) -> int:
     except BlockingIOError:
         os.close(descriptor)
         raise WearStateError(f"{folder}: another twin keeps its wear there, expected a folder for each") from None
-    except OSError:  # without locks the file system cannot show whether another twin uses the folder
+    except OSError:  # the file system has no locks
         pass
     beside = folder / f".{FILE_NAME}.{os.getpid()}"
     try:
@@ -144,13 +143,12 @@ def wear_content(state: WearState) -> bytes:
 
 
 def save_wear(folder: Path, content: bytes) -> None:
-    """Write the file in one step; after a crash it is either the complete old file or the complete new file.
+    """Write the file in one step; after a crash it is the complete old or the complete new file.
 
     Raises
     ------
     OSError
-        The disk refuses the file. The file then has the old content, or it has the new content but the disk has not
-        confirmed it.
+        The disk refuses the file, or has not confirmed the new content.
     """
     folder.mkdir(parents=True, exist_ok=True)
     write_whole(folder / FILE_NAME, content, sync=True)

@@ -23,7 +23,7 @@ def _place(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
 
 
 def _word(typingctx: Any, data: Any, place: Any) -> Any:
-    """Return the eight bytes of a contiguous array that begin at byte `place` as an int64; bounds are not checked."""
+    """Return the eight bytes of a contiguous array from byte `place` on as an int64, without a check of bounds."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.load(_place(context, builder, signature, arguments), align=1)
@@ -32,7 +32,7 @@ def _word(typingctx: Any, data: Any, place: Any) -> Any:
 
 
 def _set_word(typingctx: Any, data: Any, place: Any, value: Any) -> Any:
-    """Write an int64 to the eight bytes of a contiguous array that begin at byte `place`; bounds are not checked."""
+    """Write an int64 to the eight bytes of a contiguous array from byte `place` on, without a check of bounds."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         number = context.cast(builder, arguments[2], signature.args[2], types.int64)
@@ -52,7 +52,7 @@ def _bits(typingctx: Any, number: Any) -> Any:
 
 
 def _eight_differ(typingctx: Any, data: Any, place: Any, address: Any) -> Any:
-    """Return 0 if the 64 bytes of a contiguous array that begin at byte `place` equal the 64 bytes at an address."""
+    """Return 0 if the 64 bytes of a contiguous array from byte `place` on equal the 64 bytes at an address."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         vector = ir.VectorType(_WORD, 8)

@@ -37,13 +37,11 @@ Made = TypeVar("Made")
 
 @dataclass
 class _Part:
-    """One file of the recording."""
-
     path: Path
     file: McapFile
-    #: for each topic, number, message type and QoS text of its channel
+    #: number, message type and QoS text of the channel, by topic
     channels: dict[str, tuple[int, str, str]] = field(default_factory=dict)
-    #: for each publication topic (base name), the number of its channel
+    #: number of the channel, by base name of the topic
     sent: dict[str, int] = field(default_factory=dict)
 
     def facts(self) -> PartFacts:
@@ -58,13 +56,16 @@ class RunWriter:
     """Write entries and outputs in the order of the calls.
 
     Journal and outputs have separate chunks; the chunk of entries precedes the chunk of the outputs sent after them.
-    Every method may raise `OSError` (disk full). After a failed `flush` or write the file is complete up to the
+
+    Every method may raise `OSError` (disk full). After a failed write or `flush`, the file is complete up to the
     previous flush and can be continued; after any other failed method only `abandon` may be called.
 
     Parameters
     ----------
     folder
         Folder to make; an existing folder must be empty.
+    header
+        Scene and settings of the run.
     chunk_size
         Bytes [B] of journal and outputs at which their chunks are closed.
     min_free_bytes
@@ -200,7 +201,7 @@ class RunWriter:
     def _write(
         self, chunk: ChunkBuilder, topic: str, sequence: int, log_time_ns: int, stamp_ns: int, message: Message
     ) -> None:
-        # MCAP times are unsigned, so a negative time becomes 0; the message itself keeps the exact stamp
+        # MCAP times are unsigned; the message keeps the exact stamp
         log_time_ns, stamp_ns = max(0, log_time_ns), max(0, stamp_ns)
         channel = self._channel(topic, message.TYPE)
         chunk.add(channel, sequence & _SEQUENCE_MASK, log_time_ns, stamp_ns, encode(message))
@@ -226,7 +227,7 @@ class RunWriter:
             self._part.file.chunk(self._journal)
             self._part.file.chunk(self._outputs)
         except OSError:
-            self._outputs.clear()  # outputs are useless without the journal before them, so they are dropped
+            self._outputs.clear()  # outputs are useless without the journal before them
             raise
 
     def flush(self) -> None:
@@ -246,10 +247,9 @@ class RunWriter:
         return shortage(self.folder, self._min_free_bytes)
 
     def split(self, loss: Mapping[str, int], keep_bytes: int = 0) -> None:
-        """Start a new part, which is opened before the old part is closed.
+        """Start a new part, which is opened before the old part is closed; the caller must write a snapshot next.
 
-        The caller must write a snapshot next. With `keep_bytes`, the oldest parts are removed while the total size is
-        larger.
+        With `keep_bytes`, the oldest parts are removed while the total size is larger.
         """
         self._close_chunks()
         old, self._number = self._part, self._number + 1
@@ -297,7 +297,7 @@ def shortage(folder: Path, min_free_bytes: int) -> str | None:
 
 
 def _is_free(folder: Path) -> bool:
-    """Return whether a recording can be made in a folder, in which folders of other topics may exist already."""
+    """Return whether a recording can be made in a folder, which may already have folders of other topics."""
     if not folder.exists():
         return True
     return folder.is_dir() and all(item.name.startswith(BESIDE) and item.is_dir() for item in folder.iterdir())
