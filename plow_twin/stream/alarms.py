@@ -1,6 +1,7 @@
-"""Alarms on publications, with two levels, hysteresis and a minimum duration, latched until acknowledged.
+"""Alarms on publications, with two levels, hysteresis and a minimum duration.
 
-Alarms depend only on the publications and the acknowledgements, so a replay gives the same alarms.
+An alarm keeps its highest level, the *latched* level, until it is acknowledged. Alarms depend only on the publications,
+the measured poses and the acknowledgements, so a replay gives the same alarms.
 """
 
 from __future__ import annotations
@@ -24,10 +25,10 @@ from plow_twin.stream.outputs import CLEARANCE_NAMES, Published, Rows
 
 #: An alarm leaves a level when its value falls below this share of the level's threshold.
 HYSTERESIS: Final = 0.95
-#: Time [ns] over which the growth rate of the clearance is computed. In the 0.1 s between two published clearances, the
-#: clearance grows too little.
+#: Time [ns] over which the growth rate of the clearance is computed; from one clearance to the next it grows too
+#: little.
 RATE_SPAN_NS: Final = 10 * NS_PER_S
-#: Time [ns] for which the model's poses are kept for measured poses that arrive late.
+#: Time [ns] for which poses of the model are kept for late measured poses.
 _KEPT_NS: Final = 2 * NS_PER_S
 _PRUNED: Final = 500
 _MOST_WAITING: Final = 1000
@@ -60,7 +61,7 @@ class Thresholds:
 
 @dataclass(frozen=True)
 class Raised:
-    """Cause of an alarm's latched level: value, threshold, stamp, and the pair or axis, if any."""
+    """Cause of a latched level: value, threshold, stamp, and the pair or axis, if any."""
 
     value: float
     threshold: float
@@ -70,16 +71,16 @@ class Raised:
 
 @dataclass
 class Alarm:
-    """The alarm of one quantity: its value, its present level, and its highest level since the last acknowledgement."""
+    """The alarm of one quantity, with its present and its latched level."""
 
     thresholds: Thresholds
     value: float = 0.0
     level: Level = Level.NONE
     latched: Level = Level.NONE
-    #: cause of the latched level; None if no level is latched
+    #: cause of the latched level
     raised: Raised | None = None
     _since_ns: int | None = None
-    #: smallest threshold; while the level is NONE and the value is below this threshold, the level stays NONE
+    #: smallest threshold; the level stays NONE while the value is below it
     lowest: float = field(init=False)
 
     def __post_init__(self) -> None:
@@ -111,7 +112,7 @@ class Alarm:
         return self.thresholds.error if self.latched is Level.ERROR else self.thresholds.warn
 
     def acknowledge(self) -> None:
-        """Release the latched level, which falls to the present level of the alarm."""
+        """Lower the latched level to the present level."""
         self.latched = self.level
         if not self.level:
             self.raised = None
@@ -120,7 +121,7 @@ class Alarm:
 
     def stays(self, values: NDArray[np.float64]) -> bool:
         """Return whether the level stays the same for all these values."""
-        if self.level or self.lowest == math.inf:  # `lowest` is infinite if the alarm has no threshold
+        if self.level or self.lowest == math.inf:  # an alarm without a threshold stays quiet
             return not self.level
         return float(values.max(initial=-math.inf)) < self.lowest
 
@@ -136,7 +137,7 @@ class _Model:
     def add(self, stamp_ns: int, x: float, y: float) -> list[tuple[int, float]]:
         """Add a pose of the model; return stamps and residuals [m] of the measured poses that waited for it."""
         place = bisect_left(self._stamps_ns, stamp_ns)
-        # after a late sample the motion is computed again, so the poses from its stamp on are dropped
+        # a late sample makes the model's poses from its stamp on obsolete
         del self._stamps_ns[place:], self._q[place:]
         self._stamps_ns.append(stamp_ns)
         self._q.append((x, y))
@@ -171,9 +172,9 @@ class Alarms:
     ----------
     thresholds
         By name: `force` [N], the largest force of a pair in the advances with samples since the previous publication;
-        `clearance` [m], the larger of the horizontal and the vertical clearance; `clearance_rate` [m/s], the growth
-        rate of `clearance` over `RATE_SPAN_NS`; `wear_rate` [m/s], the largest wear rate of a pad; `residual` [m], the
-        distance of a measured pose from the model at the pose's stamp.
+        `clearance` [m], the larger of the horizontal and the vertical clearance; `clearance_rate` [m/s], its growth
+        rate over `RATE_SPAN_NS`; `wear_rate` [m/s], the largest wear rate of a pad; `residual` [m], the distance of a
+        measured pose from the model.
     duration_s
         Time for which a level must last before the alarm takes this level [s].
     """
@@ -183,7 +184,7 @@ class Alarms:
         self._duration_ns = round(duration_s * NS_PER_S)
         self._model = _Model() if "residual" in self.alarms else None
         self._clearances: deque[tuple[int, float]] = deque()
-        #: names of the alarms that the newest row or pose has raised to a higher latched level
+        #: alarms whose latched level was raised by the newest row or pose
         self.raised: list[str] = []
 
     def feed(self, published: Published) -> Iterator[int]:
@@ -199,7 +200,6 @@ class Alarms:
                 yield number
 
     def _feed_row(self, rows: Rows, number: int, slow: np.void | None) -> bool:
-        """Judge a row and its slow part (clearance, wear rate), if any; return whether a level changed."""
         stamp_ns, _, held, samples, x, y, force, _ = summary(rows, number)
         if held and not samples:
             return False
@@ -252,7 +252,7 @@ class Alarms:
                 for found in zip(stamps_ns, earlier, strict=False):
                     self._growth(*found)
             rate = self._growth(stamps_ns[-1], clearance)
-        # no level changes, so it is enough to keep the newest values
+        # no level changes, so only the newest values matter
         newest = {name: float(found[-1].max()) for name, found in values.items() if len(found)}
         for name, value in (newest | ({"clearance_rate": rate} if stamps_ns else {})).items():
             if name in self.alarms:
@@ -278,7 +278,7 @@ class Alarms:
         return changed
 
     def _growth(self, stamp_ns: int, clearance: float) -> float:
-        """Return the growth rate of the clearance [m/s] over `RATE_SPAN_NS`, 0 until this time has passed."""
+        """Return the growth rate of the clearance [m/s]; 0 until `RATE_SPAN_NS` has passed."""
         if self._clearances and stamp_ns <= self._clearances[-1][0]:
             self._clearances.clear()
         self._clearances.append((stamp_ns, clearance))
@@ -299,7 +299,7 @@ class Alarms:
         return max((max(levels) for levels in self.levels.values()), default=Level.NONE)
 
     def acknowledge(self) -> list[str]:
-        """Release latched alarms; return the names of the alarms that are still present."""
+        """Acknowledge all alarms; return the names of the alarms that are still present."""
         for alarm in self.alarms.values():
             alarm.acknowledge()
         return [name for name, alarm in self.alarms.items() if alarm.level]

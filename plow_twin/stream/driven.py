@@ -13,8 +13,7 @@ from plow_twin.run.twin import Advanced
 
 Array = NDArray[np.float64]
 
-#: Largest number of measured poses that are kept in case the motion must be computed again: ten seconds at 1 kHz. All
-#: estimates are kept.
+#: Largest number of measured poses that are kept in case the motion is computed again: ten seconds at 1 kHz.
 MOST_MEASURED: Final = 10_000
 
 
@@ -58,7 +57,7 @@ class Following(Driven, Protocol):
 
     #: number of poses and estimates added so far
     added: int
-    #: whether, for a row that is published by itself, the work on intervals and measurements is left to `catch_up`
+    #: whether `catch_up` does the work on intervals and measurements of a row that is published alone
     defers: bool
 
     def catch_up(self) -> None:
@@ -81,7 +80,7 @@ class Following(Driven, Protocol):
         """Continue from the present state with an estimate that `known` returned."""
 
     def follow_parameters(self) -> None:
-        """Continue from the state of the median twin with a single twin, without corrections by poses."""
+        """Continue as a single twin from the state of the median twin, without corrections by poses."""
 
     def end_spans(self, ends: NDArray[np.int64], begins: bool) -> None:
         """Set which rows of the next `advance_rows` are published, and whether the first begins a span."""

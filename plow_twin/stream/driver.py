@@ -1,4 +1,7 @@
-"""Handling of arriving samples and of silence, with intake, hold policy and session."""
+"""Handling of arriving samples and of silence: the driver feeds a session from live events.
+
+The *intake* judges each sample. During a *silence* no sample arrives, and the model follows the steady clock.
+"""
 
 from __future__ import annotations
 
@@ -41,12 +44,12 @@ from plow_twin.stream.steps import Steps
 #: Stamp [ns] and wrench (Fx, Fy [N], M [N m]) of an arrived sample.
 Arrival = tuple[int, tuple[float, float, float]]
 
-#: Largest model time that one call may catch up when the excitation is silent [ns], so that a call's work is bounded.
+#: Largest model time [ns] by which one call advances during a silence.
 _LARGEST_HOLD_NS: Final = NS_PER_S
-#: Longest time between two checks for silence [ns]; it is limited because the policy may change meanwhile.
+#: Longest time between two checks for silence [ns]; the policy may change meanwhile.
 _LONGEST_QUIET_NS: Final = NS_PER_S // 10
-#: Largest number of resets by jumps of the clock within `_RESET_WINDOW_NS`: two clocks that disagree must not reset the
-#: model for ever.
+#: Largest number of resets by jumps of the clock within `_RESET_WINDOW_NS`. Two clocks that disagree would otherwise
+#: reset the model for ever.
 _MOST_RESETS: Final = 5
 _RESET_WINDOW_NS: Final = 10 * NS_PER_S
 
@@ -65,11 +68,10 @@ class StreamState(Enum):
 class Policy:
     """Settings that may change at run time.
 
-    After `excitation_timeout_s` without a sample, the model follows the steady clock, delayed by this time, so that a
-    sample with a smaller delay is still used. The setting `hold` is `hold` (the last load is kept) or `zero` (the load
-    falls to zero within the first call of `Driver.silence` that advances the model); after a further `hold_limit_s` the
-    model stands still. After `failure_limit` failed advances in a row the model is reset (`Failures.wants_restart`); a
-    limit of 0 means never.
+    After `excitation_timeout_s` without a sample, the model follows the steady clock. It stays behind the clock by this
+    time, so that samples with a smaller delay can still be used. If `hold` is `hold`, the last load is kept; if it is
+    `zero`, the load falls to zero within one call of `Driver.silence`. After a further `hold_limit_s` the model stands
+    still. After `failure_limit` failed advances in a row the model is reset (see `Failures.wants_restart`); 0: never.
     """
 
     excitation_timeout_s: float = 0.5
@@ -99,13 +101,12 @@ class Driver:
         self.every_sample = every_sample
         self.real_time = RealTimeFactor()
         self.state = StreamState.WAITING
-        #: failed advances
         self.failed = Failures(session.emit)
         self.resets = 0
         self.holds = 0
-        #: number of late samples that were inserted by going back to a snapshot
+        #: number of late samples that were inserted
         self.rolled_back = 0
-        #: number of speeds along the face that could not act at their stamps
+        #: number of speeds that could not act at their stamps
         self.travel_misplaced = 0
         #: times of the latest resets by jumps of the clock, on the steady clock [ns]
         self._resets_ns: deque[int] = deque()
@@ -115,10 +116,10 @@ class Driver:
         self.clock = Intake(jump_back_s=intake.jump_back_s, jump_forward_s=intake.jump_forward_s)
         self._received_ns = 0
         self._newest_ns: int | None = None
-        #: model time up to which the real-time factor has counted [ns]
+        #: time up to which the real-time factor has counted [ns]
         self._counted_ns: int | None = None
         self._zeroed = False
-        #: time spent inactive [ns], by which the stamps of the scene's own loads lag behind the clock
+        #: time spent inactive [ns], by which the scene's own loads lag behind the clock
         self._behind_ns = 0
         self._resumed = False
 
@@ -140,7 +141,7 @@ class Driver:
     def samples(self, arrived: Iterable[Arrival], now_ns: int) -> Iterator[Published]:
         """Judge samples in order of arrival, advance to the accepted samples, and yield the publications.
 
-        The caller sends each publication before the next one is computed, so that a recording has them in order. A
+        The caller must send each publication before it asks for the next, so that a recording has them in order. A
         sample whose stamp jumps is held back until the next sample arrives or the stream falls silent.
         """
         run: list[Sample] = []
@@ -160,11 +161,10 @@ class Driver:
     def series(
         self, stamps: NDArray[np.int64], wrench: NDArray[np.float64], now_ns: int
     ) -> Iterator[Published | Series]:
-        """Use many samples in order of arrival, stamps (n,) [ns] and wrenches (n, 3), as `samples` does.
+        """Use many samples, stamps (n,) [ns] and wrenches (n, 3), with the same outcome as `samples`.
 
-        Samples without a jump are applied together as a `Series`, which the caller journals and publishes before the
-        next `Series` or publication is computed. All other samples go through `samples`. The outcome is the same as if
-        all samples went through `samples`.
+        Plausible samples are applied together as a `Series`, which the caller journals and publishes before it asks for
+        the next item. The other samples go through `samples`.
         """
         run: list[Sample] = []
         goes_on = self.intake.go_on(stamps, wrench)
@@ -204,7 +204,7 @@ class Driver:
         return not (reached_ns is None or self._steps.waits) and self.intake.goes_on(stamp_ns, wrench, reached_ns)
 
     def _goes_on(self, stamp_ns: int, wrench: tuple[float, float, float]) -> bool:
-        """Accept a sample that is clearly plausible; return False if `judge` must decide."""
+        """Accept a sample that is clearly plausible; return False if `_judge` must decide."""
         found = self._may_go_on(stamp_ns, wrench)
         if found:
             self.intake.accept(stamp_ns, wrench)
@@ -213,10 +213,10 @@ class Driver:
     def _use_samples(
         self, run: list[Sample], stamp_ns: int, wrench: tuple[float, float, float], now_ns: int
     ) -> Iterator[Published]:
-        """Judge a sample and add it to `run`, the samples to apply together; `run` is applied first where needed."""
+        """Judge a sample and add it to `run`, the samples to apply together; apply `run` first where necessary."""
         late = bool(run) and self._is_late(run[0])
-        # a stamp that does not rise is either late or a jump back; `judge` can decide which only after `run` has been
-        # applied
+        # A stamp that does not rise is late or a jump back. Which of them it is, can be judged only after `run` has
+        # been applied.
         if run and not late and stamp_ns <= run[-1].stamp_ns:
             yield from self._use(run, now_ns)
             late = False
@@ -289,7 +289,6 @@ class Driver:
         if not verdict.used:
             return NOTHING
         if verdict.resets:
-            # the model restarts at the time of the clock
             stamp_ns += self._behind_ns
             self._behind_ns = 0
             self.clock.restart()
@@ -298,10 +297,10 @@ class Driver:
         return self._advance(Hold(stamp_ns), now_ns, StreamState.RUNNING)
 
     def travel(self, stamp_ns: int, speed_m_s: float) -> None:
-        """Use a speed along the face [m/s] from its stamp on; the sign is the direction, and wear uses the magnitude.
+        """Use a speed along the face [m/s] from its stamp on; the sign is the direction.
 
-        A stamp that is further ahead than `jump_forward_s`, or older than every kept state, is taken to be from another
-        clock; such a speed acts from the time that the model has reached on, and is counted in `travel_misplaced`.
+        If the stamp is more than `jump_forward_s` ahead, or older than every kept state, it must come from another
+        clock. The speed then acts at once and is counted in `travel_misplaced`.
         """
         reached_ns, oldest_ns = self.session.stamp_ns, self.session.history.oldest_ns
         if reached_ns is not None:
@@ -325,7 +324,7 @@ class Driver:
         self.session.apply(Mark(stamp_ns, text))
 
     def snapshot(self) -> Snapshot:
-        """Journal and return the exact state; samples older than this state can no longer be inserted."""
+        """Journal and return the exact state; older samples can no longer be inserted."""
         snapshot = self.session.renew()
         self.session.emit(snapshot)
         return snapshot
@@ -339,7 +338,7 @@ class Driver:
         self.clock.restart()
 
     def set_model(self, stamp_ns: int, changes: Mapping[str, float]) -> None:
-        """Continue with `changes` to scene numbers, by key in its file; other numbers are as in the file.
+        """Continue with `changes` to scene numbers, by key; all other numbers are as in the scene file.
 
         Raises
         ------
@@ -368,7 +367,7 @@ class Driver:
         self.clock.restart()
 
     def unsteady(self, now_ns: int) -> bool:
-        """Return whether stamps have recently jumped repeatedly: resets were refused, or many stamps were stray."""
+        """Return whether stamps have jumped repeatedly: resets were refused, or many stamps were stray."""
         refused = self._unsteady_ns is not None and now_ns - self._unsteady_ns < _RESET_WINDOW_NS
         return refused or self._steps.unsteady(now_ns)
 
@@ -384,7 +383,7 @@ class Driver:
         self._resumed = True
 
     def pause(self) -> None:
-        """Count a held-back sample as stray, because the next sample will not come at present."""
+        """Count a held-back sample as stray, because no sample will come at present."""
         self._steps.end()
 
     def close(self) -> None:
@@ -409,7 +408,7 @@ class Driver:
         return len(self._resets_ns) < _MOST_RESETS
 
     def _restart_model(self, stamp_ns: int, reason: str, now_ns: int | None) -> None:
-        """Reset the model; resets by request, restore or failure (`now_ns` None) are not counted towards the limit."""
+        """Reset the model; a reset by a jump of the clock has a `now_ns`, and counts towards the limit."""
         if now_ns is not None:
             self._resets_ns.append(now_ns)
         self.failed.end()
@@ -423,7 +422,6 @@ class Driver:
         self.state = StreamState.WAITING
 
     def _use(self, run: list[Sample], now_ns: int) -> Iterator[Published]:
-        """Advance to the samples of `run`, empty it, and yield the publications."""
         samples = run.copy()
         run.clear()
         for part in self.session.parts(samples, each=self.every_sample):
@@ -431,12 +429,10 @@ class Driver:
             if len(published.rows):
                 yield published
         if self._newest_ns is None:
-            # a silence between a reset and the next sample must also be noticed, so silence is measured from the stamp
-            # that the model has reached
+            # a silence directly after a reset is measured from the stamp that the model has reached
             self._newest_ns = self.session.stamp_ns
 
     def _apply(self, samples: Sequence[Sample], now_ns: int) -> Published:
-        """Apply samples together and return the publication."""
         applied = self.session.apply_samples(samples, each=self.every_sample)
         self.rolled_back += applied.late
         self._advanced(now_ns)
@@ -448,7 +444,6 @@ class Driver:
         return applied.published
 
     def _advance(self, entry: Hold | Unload, now_ns: int, state: StreamState) -> Published:
-        """Advance without a sample."""
         rows = self.session.apply(entry)
         assert rows is not None, "a hold or an unload makes an advance"
         self._advanced(now_ns)
@@ -457,14 +452,13 @@ class Driver:
         return self.due() if self.every_sample else NOTHING
 
     def _advanced(self, now_ns: int) -> None:
-        """Add the model time since the last call to the real-time factor."""
         reached_ns = self.session.stamp_ns
         if self._counted_ns is not None and reached_ns is not None:
             self.real_time.advanced((reached_ns - self._counted_ns) * 1e-9, now_ns)
         self._counted_ns = reached_ns
 
     def _judge_rows(self, rows: Rows) -> None:
-        """Count the good and the failed advances of rows with at least one failure."""
+        """Judge each of several advances, of which at least one has failed."""
         stamps = (self.session.origin_ns or 0) + np.rint(rows["t"] * NS_PER_S).astype(np.int64)
         for status, stamp_ns in zip(rows["status"].tolist(), stamps.tolist(), strict=True):
             self._judge_advance(status, stamp_ns, StreamState.RUNNING)

@@ -10,28 +10,22 @@ from plow_twin.stream.journal import Failed
 class Failures:
     """Failed advances of a run.
 
-    Parameters
-    ----------
-    emit
-        Function that receives a `Failed` entry at the first failure of a stretch and, if more failures follow, another
-        `Failed` for these failures at the end of the stretch.
+    `emit` receives a `Failed` entry at the first failure of a stretch and, if more failures follow, another for them at
+    the end of the stretch.
     """
 
     def __init__(self, emit: Callable[[Failed], object]) -> None:
         self._emit = emit
-        #: `count`: number of failed advances
-        #: `stretches`: number of stretches of failed advances
+        #: numbers of failed advances, and of stretches
         self.count = self.stretches = 0
-        #: reason of the newest failure; empty without a failure
         self.reason = ""
-        #: stamps of the first and the last advance of the newest stretch [ns]
+        #: stamps of the first and the last failed advance of the newest stretch [ns]
         self.since_ns = self.until_ns = 0
         #: whether the motion has restarted since the newest stretch began
         self.restarts = False
         self._in_a_row = 0
-        #: length of the stretch of failed advances before the newest restart [ns]
+        #: length of the stretch before the newest restart [ns]
         self._before_ns = 0
-        #: stamp of the newest restart [ns]
         self._restarted_ns: int | None = None
 
     @property
@@ -58,9 +52,9 @@ class Failures:
     def wants_restart(self, limit: int) -> bool:
         """Return whether the model should restart, after `limit` failed advances in a row; 0: never.
 
-        If the model fails again soon after a restart (within the length of the previous stretch of failures), the next
-        restart waits until the new stretch is twice as long as the previous stretch. The number of restarts then grows
-        with the logarithm of time, and at most half of the time in which the model could move is lost.
+        If the model fails again soon after a restart, the next restart waits until the new stretch is twice as long as
+        the previous stretch. The number of restarts then grows only with the logarithm of time, and at most half of the
+        time is lost in which the model could move.
         """
         if not 0 < limit <= self._in_a_row:
             return False

@@ -18,7 +18,7 @@ class DurationHistogram:
     """Durations from 1 us to 100 s in bins of equal ratio, 50 per decade, so that a quantile is accurate to 2.4 %."""
 
     def __init__(self) -> None:
-        # a list is used, not an array: incrementing an item of a list takes a tenth of the time
+        # to increment an item of a list takes a tenth of the time that an array takes
         self._counts = [0] * _BINS
         self._counted = np.zeros(len(self._counts), np.int64)
         self.largest_s = 0.0
@@ -62,12 +62,11 @@ class Periods:
     Parameters
     ----------
     period_s
-        Nominal period of the loop [s]; longer times between turns count as missed periods.
+        Nominal period of the loop [s].
     """
 
     def __init__(self, period_s: float) -> None:
         self._period_s = period_s
-        #: number of missed periods so far
         self.missed = 0
         self._before_s = math.nan
         self._recent: list[float] = []
@@ -90,7 +89,7 @@ class Periods:
 
 
 class RealTimeFactor:
-    """Model seconds advanced per wall second, since the start and since the last reading."""
+    """Model seconds per wall second, since the start and since the last reading."""
 
     def __init__(self) -> None:
         self.model_s = 0.0

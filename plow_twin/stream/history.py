@@ -1,8 +1,8 @@
 """The last seconds of a session, kept for late samples: snapshots, and all entries since the oldest snapshot.
 
-The age at which a sample is too old depends on the journal alone, not on the number of samples in a call. Calls with
-one sample each make many snapshots; a call with many samples makes one snapshot and notes the stamps at which calls
-with one sample would have made theirs, so that the age limit is the same.
+A history divides time into *spans*. A session that applies samples one by one has a snapshot at the first sample of
+each span. A session that applies many at once has fewer snapshots, but notes the same stamps. The stamps, and not the
+snapshots, decide whether a sample is too old, so this depends on the journal alone.
 """
 
 from __future__ import annotations
@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from plow_twin.stream.journal import Sample, Travel
 
-#: Number of snapshots in the kept time. To insert a late sample, the session goes back to a snapshot and computes all
-#: samples after this snapshot again.
+#: Number of spans in the kept time; after a late sample, at least one span is computed again.
 SNAPSHOTS: Final = 100
 
 
@@ -34,18 +33,15 @@ class History:
         self._span_ns = span_ns
         self._spacing_ns = max(1, span_ns // SNAPSHOTS)
         self._snapshots: list[tuple[int, bytes]] = []
-        #: for each span (the kept time divided by `SNAPSHOTS`), the stamp of its first sample; a session that takes
-        #: samples one by one has a snapshot at each of these stamps
+        #: stamp of the first sample of each span
         self._kept_ns: list[int] = []
-        #: largest stamp in `_kept_ns` so far. After going back, no kept stamp is dropped until the session has computed
-        #: up to this stamp again.
+        #: largest stamp in `_kept_ns` so far; after going back, no stamp is dropped until this stamp is reached again
         self._newest_kept_ns: int | None = None
         self._samples: list[Sample] = []
         self._stamps_ns: list[int] = []
         self._travels: list[Travel] = []
-        #: applied samples as arrays, which become `Sample` objects when needed
+        #: applied samples as arrays; `_make_samples` turns them into `Sample` objects
         self._later: deque[tuple[NDArray[np.int64], NDArray[np.float64]]] = deque()
-        #: whether a span has begun since the newest snapshot
         self._due = True
 
     @property
@@ -55,7 +51,7 @@ class History:
 
     @property
     def oldest_ns(self) -> int | None:
-        """Stamp [ns] of the oldest snapshot, after which late samples can be inserted; None without a snapshot."""
+        """Stamp [ns] of the oldest kept state, after which late samples can be inserted; None without a state."""
         return self._kept_ns[0] if self._kept_ns else None
 
     @property
@@ -90,7 +86,7 @@ class History:
         self._later.append((stamps_ns, wrench))
         last_ns = self._kept_ns[-1] if self._kept_ns else None
         if last_ns is not None and stamps_ns.item(-1) // self._spacing_ns == last_ns // self._spacing_ns:
-            return  # this is the usual case, because stamps rise
+            return  # the usual case
         cells = stamps_ns // self._spacing_ns
         begins = np.ones(len(cells), bool)
         begins[1:] = cells[1:] != cells[:-1]
@@ -100,7 +96,7 @@ class History:
         self._keep(stamps_ns[begins])
 
     def _keep(self, stamps_ns: NDArray[np.int64]) -> None:
-        """Append rising stamps to `_kept_ns`, and forget everything that is older than the kept time."""
+        """Append rising stamps to `_kept_ns`, and forget everything older than the kept time."""
         if not len(stamps_ns):
             return
         newest_ns, before_ns = int(stamps_ns[-1]), self._newest_kept_ns
@@ -117,7 +113,6 @@ class History:
         self._forget_old()
 
     def _forget_old(self) -> None:
-        """Forget the snapshots and samples that are not needed to go back to the oldest stamp."""
         oldest_ns, old = self._kept_ns[0], 0
         while old + 1 < len(self._snapshots) and self._snapshots[old + 1][0] <= oldest_ns:
             old += 1
@@ -150,7 +145,7 @@ class History:
         self._travels.insert(place, travel)
 
     def add_snapshot(self, stamp_ns: int, data: bytes, *, kept: bool = True) -> None:
-        """Add a snapshot at `stamp_ns`; with `kept`, note its stamp even if it begins no span."""
+        """Add a snapshot at `stamp_ns`; with `kept`, its stamp counts like that of a span's first sample."""
         if not self._span_ns:
             return
         if not self._snapshots or self._snapshots[-1][0] < stamp_ns:
@@ -160,7 +155,9 @@ class History:
             self._keep(np.array([stamp_ns]))
 
     def rewind(self, stamp_ns: int) -> tuple[bytes, list[Sample], list[Travel]]:
-        """Drop all after the last snapshot before `stamp_ns`; return it, dropped samples and speeds."""
+        """Drop everything after the last snapshot before `stamp_ns`; return the snapshot, and the dropped samples and
+        speeds.
+        """
         self._make_samples()
         while self._snapshots[-1][0] >= stamp_ns:
             self._snapshots.pop()
@@ -175,7 +172,7 @@ class History:
 
 
 class RecentStamps:
-    """Stamps of a stream whose values only need sorting: a value up to `span_s` late can still be used."""
+    """Stamps of a stream whose values only need sorting: a value may be late by up to `span_s`."""
 
     def __init__(self, span_s: float) -> None:
         self._span_ns = round(span_s * 1e9)

@@ -1,4 +1,7 @@
-"""The decision whether an arriving sample is used, and counts of unused samples by reason."""
+"""The decision whether an arriving sample is used, and counts of unused samples by reason.
+
+Stamps *jump* if they differ by more than a late or missing sample explains: the sender's clock has stepped.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ NS_PER_S = 1_000_000_000
 
 
 class KnownStamps(Protocol):
-    """Stamps of the past among which a late sample can be inserted."""
+    """Stamps of the past, among which a late sample can be inserted."""
 
     @property
     def oldest_ns(self) -> int | None:
@@ -44,10 +47,9 @@ class Verdict(Enum):
     WORKED_IN = "worked_in"
     #: a value is impossibly large, or changes impossibly fast
     IMPLAUSIBLE = "implausible"
-    #: the stamps jump repeatedly, so that this jump does not reset the model
+    #: the stamps jump repeatedly, so this jump does not reset the model
     UNSTEADY = "unsteady"
-    #: the stamp jumped, but the next stamp continued the stamps from before the jump: this stamp was wrong, and the
-    #: sender's clock did not step
+    #: the stamp jumped but the next stamp did not, so only this stamp was wrong
     STRAY = "stray"
     #: names or lengths of the message do not fit the scene
     MALFORMED = "malformed"
@@ -58,19 +60,16 @@ class Verdict(Enum):
     #: arrived before the first message on /clock
     NO_CLOCK = "without_clock"
 
-    # verdicts are looked up several times for each sample, so they are hashed by identity: the hash of an enumeration
-    # is slow
+    # the hash of an enumeration is slow, so verdicts are hashed by identity
     __hash__ = object.__hash__
 
     def __init__(self, name: str) -> None:
         #: whether the model is reset before the sample is used
         self.resets = name in ("jump_back", "jump_forward")
-        #: whether the sample is used
         self.used = self.resets or name in ("accepted", "worked_in")
 
 
-def _ignore(verdict: Verdict, stamp_ns: int, values: Sequence[float]) -> None:
-    """Do nothing with an unused sample."""
+def _ignore(verdict: Verdict, stamp_ns: int, values: Sequence[float]) -> None: ...
 
 
 class Intake:
@@ -79,12 +78,11 @@ class Intake:
     Parameters
     ----------
     jump_back_s
-        A stamp that is older than the newest stamp by more than this [s] is taken as a step of the sender's clock; a
-        stamp that is older by less is taken as a late packet.
+        A stamp that is older than the newest stamp by more than this [s] is a jump; otherwise the sample is late.
     jump_forward_s
-        A stamp that is newer than the model's time by more than this [s] is taken as a step of the sender's clock.
+        A stamp that is newer than the model's time by more than this [s] is a jump.
     expected_rate_hz
-        Rate of the samples [Hz], from which gaps in the stamps are counted as missing samples; 0: unknown.
+        Rate of the samples [Hz], from which missing samples are counted; 0: unknown.
     limits
         Largest plausible values and rates of change; None: any finite value is plausible.
     on_unused
@@ -106,20 +104,17 @@ class Intake:
         self.expected_rate_hz = expected_rate_hz
         self.limits = limits
         self.counts: dict[Verdict, int] = dict.fromkeys(Verdict, 0)
-        #: number of samples that were used although a component outside the plane was not zero
+        #: number of used samples with a component outside the plane
         self.out_of_plane = 0
         self._newest_ns: int | None = None
         self._newest_values: Sequence[float] = ()
-        #: newest stamp before the last jump [ns]
         self._before_jump_ns: int | None = None
-        #: whether the last judged sample continued the stamps from before a jump, so that the stamps since the jump
-        #: were wrong
+        #: whether the last sample returned to the stamps from before a jump, so that the stamps since the jump were
+        #: wrong
         self.returned = False
         #: number of samples missing up to the last jump
         self._missing_before = 0
-        #: first stamp since the last jump [ns]
         self._first_ns = 0
-        #: number of samples used since the last jump
         self._since_first = 0
 
     @property
@@ -129,7 +124,9 @@ class Intake:
 
     @property
     def missing(self) -> int:
-        """Number of missing samples at the expected rate from first to newest stamp; extra samples make up for gaps."""
+        """Number of missing samples, at the expected rate, from first to newest stamp; extra samples make up for
+        gaps.
+        """
         if self._newest_ns is None or self.expected_rate_hz <= 0.0:
             return self._missing_before
         asked = round((self._newest_ns - self._first_ns) * self.expected_rate_hz / NS_PER_S) + 1
@@ -161,8 +158,8 @@ class Intake:
         history
             The stamps of the past, among which late samples are inserted.
         may_reset
-            Whether a step of the sender's clock may reset the model now. A return to the stamps from before the last
-            step may always reset the model; otherwise a single wrong stamp could exclude all correct stamps.
+            Whether a jump may reset the model now. A return to the stamps from before the last jump always may;
+            otherwise a single wrong stamp could exclude all correct stamps.
         """
         verdict = self._judge(stamp_ns, values, reached_ns, history)
         self.returned = verdict.resets and self._goes_on_from_before(stamp_ns)
@@ -174,7 +171,7 @@ class Intake:
             return verdict
         if self._newest_ns is None or verdict.resets:
             self._missing_before, self._first_ns, self._since_first = self.missing, stamp_ns, 0
-            # after a return, the newest stamp is one of the wrong stamps, to which no later sample may return
+            # after a return the newest stamp is wrong, and no later sample may return to it
             self._before_jump_ns = None if self.returned else self._newest_ns
         self._since_first += 1
         if self._newest_ns is None or verdict.resets or stamp_ns > self._newest_ns:
@@ -182,19 +179,21 @@ class Intake:
         return verdict
 
     def jumps(self, stamp_ns: int, reached_ns: int | None = None) -> bool:
-        """Return whether a stamp is a step of the sender's clock away from earlier stamps, as `judge` would find."""
+        """Return whether `judge` would find that a stamp jumps."""
         newest_ns = self._newest_ns if self._newest_ns is not None else reached_ns
         if newest_ns is None or stamp_ns <= 0:
             return False
         return not self.near(stamp_ns, newest_ns, reached_ns)
 
     def near(self, stamp_ns: int, newest_ns: int, reached_ns: int | None = None) -> bool:
-        """Return whether a stamp follows the newest stamp and the model's time without a clock step."""
+        """Return whether a stamp follows the newest stamp and the model's time without a jump."""
         ahead_ns = stamp_ns - (newest_ns if reached_ns is None else max(newest_ns, reached_ns))
         return ahead_ns <= self.jump_forward_s * NS_PER_S and newest_ns - stamp_ns <= self.jump_back_s * NS_PER_S
 
     def goes_on(self, stamp_ns: int, values: Sequence[float], reached_ns: int) -> bool:
-        """Return whether a sample, like most samples, is certain to be accepted; if not, `jumps` and `judge` decide."""
+        """Return whether a sample, like most samples, is certain to be accepted; otherwise `jumps` and `judge`
+        decide.
+        """
         newest_ns = self._newest_ns
         if newest_ns is None or self.limits is None:
             return False
@@ -204,7 +203,7 @@ class Intake:
         return self.limits.keep(self._newest_values, values, (stamp_ns - newest_ns) * 1e-9)
 
     def go_on(self, stamps_ns: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return, for each sample after the first, whether it `goes_on` if the previous sample was accepted."""
+        """Return `goes_on` for each sample after the first, with the previous sample as newest."""
         if self.limits is None:
             return np.zeros(len(stamps_ns) - 1, bool)
         ahead_ns = np.diff(stamps_ns)
@@ -249,8 +248,7 @@ class Intake:
             return Verdict.JUMP_FORWARD
         if ahead_ns > 0:
             return Verdict.IMPLAUSIBLE if self._too_fast(stamp_ns, values) else Verdict.ACCEPTED
-        # the stamp is compared with the sender's own stamps, because the hold policy may have moved the model's time
-        # ahead of the sender's clock
+        # the sender's own stamps show a jump back; the hold policy may have moved the model ahead of them
         if newest_ns - stamp_ns > self.jump_back_s * NS_PER_S:
             return Verdict.JUMP_BACK
         if history is not None and history.oldest_ns is not None and stamp_ns > history.oldest_ns:

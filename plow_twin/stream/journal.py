@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-#: A value that a parameter can take.
 ParameterValue = bool | int | float | str
 
 
@@ -16,8 +15,8 @@ ParameterValue = bool | int | float | str
 class Sample:
     """Advance to `stamp_ns`; the load varies linearly from the previous sample to this sample.
 
-    A stamp before the time that the model has reached belongs to a late sample, which is inserted at its place in time.
-    `wrench` is Fx, Fy [N] and M [N m] about the cavity's centre, gravity not included.
+    `wrench` is Fx, Fy [N] and M [N m] about the cavity's centre, without gravity. A stamp that the model has passed
+    belongs to a late sample, which is inserted at its place in time.
     """
 
     stamp_ns: int
@@ -95,8 +94,7 @@ class Mark:
 class Failed:
     """`advances` advances up to `stamp_ns` have failed, in a stretch that began at `since_ns`; no effect on the motion.
 
-    A stretch of failures has one entry at its first failure and another entry for the rest at its end, so that the sum
-    of `advances` is the number of failures.
+    A stretch of failures has one entry at its first failure, and another at its end for all further failures.
     """
 
     stamp_ns: int
@@ -156,9 +154,9 @@ class Unused:
     """`count` messages of `sender` arrived on the input `topic` and were not used; no effect on the motion.
 
     `reason` is the name in a counter `dropped_<reason>`, or `not_followed`, or `lost` for messages that never arrived
-    (a negative `count` means that they arrived after all). `stamps_ns` and `values` have an item for each message in
-    order of arrival, or only for the first of very many messages. An unreadable message has no values and stamp 0. A
-    value need not be finite.
+    (a negative `count` means that they arrived after all). `stamps_ns` and `values` have an item for each message, or
+    only for the first of very many messages. An unreadable message has no values and stamp 0. Values need not be
+    finite.
     """
 
     topic: str
@@ -173,10 +171,10 @@ class Unused:
 class Estimated:
     """The estimate from the window that begins at `start_ns` and ends just before `end_ns` is finished.
 
-    `samples` and `poses` are the numbers of load samples and of poses in the window; the fit began at `guess`, or with
-    a search if `guess` is empty. `shift` has 6 numbers [m]. From this entry on they are added to the model's horizontal
-    clearance (with wear) and its 5 % and 95 % quantiles, and to the vertical clearance and its quantiles. `result` is
-    the whole estimate (JSON).
+    `samples` and `poses` count the load samples and poses in the window; the fit began at `guess`, or with a search if
+    `guess` is empty. From this entry on, the 6 numbers of `shift` [m] are added to the model's horizontal clearance
+    (with wear) and its 5 % and 95 % quantiles, and to the same three numbers of the vertical clearance. `result` is the
+    whole estimate (JSON).
     """
 
     start_ns: int

@@ -17,7 +17,7 @@ from plow_twin.model.scene import Scene
 
 #: Largest plausible load, as a multiple of the sum of the scene's largest loads and the head's weight.
 _MARGIN: Final = 10.0
-#: A load may change by its largest value within this time [s], so that an impact of a millisecond is accepted.
+#: Shortest time [s] in which a load may change by its largest value; an impact lasts a millisecond.
 _SHORTEST_S: Final = 1e-3
 
 
@@ -45,7 +45,7 @@ class Limits:
         `duration_s`, shape (n-1,), is the time between rows in s.
         """
         within = np.abs(values[1:]) <= np.array(self.largest)
-        with np.errstate(invalid="ignore"):  # inf - inf is NaN, which is treated as too fast
+        with np.errstate(invalid="ignore"):  # inf - inf is NaN, which counts as too fast
             steady = np.abs(np.diff(values, axis=0)) <= np.array(self.fastest) * duration_s[:, None]
         return np.asarray((within & steady).all(axis=1))
 

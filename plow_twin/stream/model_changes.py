@@ -12,7 +12,7 @@ from plow_twin.errors import ArgumentError
 from plow_twin.model.scene import Scene
 from plow_twin.stream.driven import Driven
 
-#: Numbers of a scene that can change while the model runs: keys in the scene file, each with its smallest value.
+#: Keys in the scene file of the numbers that can change, each with its smallest value.
 CHANGEABLE: Final[Mapping[str, float]] = {
     "clearance.horizontal_m": 0.0,
     "clearance.vertical_m": 0.0,
@@ -29,7 +29,7 @@ def changed_scene(scene: Scene, changes: Mapping[str, float]) -> Scene:
     Raises
     ------
     ArgumentError
-        A key or a number cannot be used; the message names the key, the value got and the value expected.
+        A key or a number cannot be used.
     """
     for key, value in changes.items():
         if key not in CHANGEABLE:

@@ -1,6 +1,8 @@
 """Publications of the motion: each row sums up the motion since the previous row.
 
-A publication depends on the journal alone, so that a replay forms the same publications bit for bit.
+The *window* is the motion since the previous publication. A *slow part* has clearances and wear rates, which change
+slowly: at most one publication in 0.1 s has a slow part. Publications depend on the journal alone, so a replay forms
+the same publications bit for bit.
 """
 
 from __future__ import annotations
@@ -22,8 +24,7 @@ from plow_twin.solve.totals import publish, publish_window, summary
 Array = NDArray[np.float64]
 Rows = NDArray[np.void]
 
-#: Length of a span of stamps [ns]; only the first publication in a span has a slow part, which consists of `clearance`
-#: and `wear_rate`.
+#: Length of a span of stamps [ns]; only the first publication in a span has a slow part.
 SLOW_PERIOD_NS: Final = 100_000_000
 
 PAD_NAMES: Final = tuple(f"pad_{name}" for name in PAIR_NAMES)
@@ -36,11 +37,11 @@ _ON_SIDES: Final = np.array(
     [np.flatnonzero(side) for side in (NORMAL_X < 0.0, NORMAL_X > 0.0, NORMAL_Y > 0.0, NORMAL_Y < 0.0)]
 )
 _STATE_SIZE: Final = 4 * PAIR_COUNT
-#: Slowly changing values: clearances in the order of `CLEARANCE_NAMES` [m], growth of each pad's wear [m/s].
+#: A slow part: clearances in the order of `CLEARANCE_NAMES` [m], growth of each pad's wear [m/s].
 SLOW: Final = np.dtype(
     [
         ("stamp_ns", "i8"),
-        ("row", "i8"),  # index, among the publication's rows, of the row to which this slow part belongs
+        ("row", "i8"),  # index of its row in the publication
         ("clearance", "f8", (len(CLEARANCE_NAMES),)),
         ("wear_rate", "f8", (PAIR_COUNT,)),
     ]
@@ -51,22 +52,20 @@ THE_ONE: Final = np.zeros(1, np.int64)
 NONE: Final = np.zeros(0, np.int64)
 _NO_ROWS: Final = np.zeros(0, ROW)
 _NO_SLOW: Final = np.zeros(0, SLOW)
-#: Fields that a row has in addition if the motion follows measurements.
 FOLLOWED_FIELDS: Final = (
     "followed", "known_clearance", "force_low", "force_high", "peak_low", "peak_high", "impulse_low", "impulse_high",
 )  # fmt: skip
-#: Fields that describe the motion at the row's time.
 _MOTION: Final = ("t", "stamp_ns", "held", "q", "v", "penetration", "rate", "force", "wear_depth", *FOLLOWED_FIELDS)
 #: Fields that `summary` sums up, to find numbers that are not finite.
 _SUMMED: Final = ("q", "v", "penetration", "rate", "force", "impulse", "peak")
-#: Index in `clearance` of each of the six numbers of `known_clearance`, and of an estimate's six shifts.
+#: Indexes in `clearance` of the numbers of `known_clearance`, and of an estimate's six shifts.
 _KNOWN: Final = np.array([0, len(_CLEARANCES), len(_CLEARANCES) + 1, 1, len(_CLEARANCES) + 2, len(_CLEARANCES) + 3])
-#: Number of rows made at once, because numpy makes many rows in the same time as one row.
+#: Rows are made many at a time, because numpy takes the same time for one row.
 _STOCK: Final = 256
 
 
 class Published(NamedTuple):
-    """A publication: records of type `ROW`, shape (n,), and slow parts of some of them, of type `SLOW`, shape (m,)."""
+    """A publication: rows of type `ROW`, shape (n,), and slow parts of some of them, of type `SLOW`, shape (m,)."""
 
     rows: Rows
     slow: Rows
@@ -135,10 +134,10 @@ class Stock:
 
 
 def clearances(scene: Scene, wear_depth: Array) -> Array:
-    """Return the two total clearances and eight pad depths, (..., 10) [m], from wear depths (..., 8).
+    """Return the horizontal and the vertical clearance and the eight pad depths, (..., 10) [m], from wear depths (...,
+    8).
 
-    The horizontal clearance comes first, then the vertical. The wall of a side is assumed to move out by the mean wear
-    depth of the two pads on this side.
+    The wall of a side is assumed to move out by the mean wear depth of its two pads.
     """
     moved = 0.5 * (wear_depth[..., _ON_SIDES[:, 0]] + wear_depth[..., _ON_SIDES[:, 1]])
     found = np.empty((*wear_depth.shape[:-1], len(_CLEARANCES)))
@@ -151,9 +150,8 @@ def clearances(scene: Scene, wear_depth: Array) -> Array:
 def prior_points(scene: Scene, wear_depth: Array) -> tuple[Array, Array]:
     """Return the 5 % and 95 % quantiles of the pad depths under the wear prior, shape (8,) each [m].
 
-    This assumes that the growth of a depth, with running-in removed, is proportional to the wear coefficient k_s; this
-    holds as long as the growth is small compared with the clearance. Without wear, or with k_s = 0, both quantiles
-    equal the wear depth.
+    The growth of a depth, with running-in removed, is assumed to be proportional to the wear coefficient k_s. This
+    holds while the growth is small compared with the clearance. Without wear both quantiles equal the wear depth.
     """
     if scene.wear is None or scene.wear.coefficient_m2_n == 0.0:
         return wear_depth, wear_depth
@@ -171,28 +169,25 @@ class Outputs:
 
     def __init__(self, scene: Scene) -> None:
         self._scene, self._publish = scene, _publish()
-        #: sums since the previous publication; while `_waits` is 1, also the newest advance, which still waits to be
-        #: published
+        #: the window; while `_waits` is 1, it includes the newest advance, which is not published yet
         self._window = np.zeros(1, ROW)
         self._waits = 0
         self._stock = Stock()
-        #: stamp and pad depths of the last slow part; None before the first slow part
+        #: stamp and pad depths of the last slow part
         self._slow_ns: int | None = None
         self._slow_wear_depth = np.zeros(PAIR_COUNT)
-        #: stamp from which the published motion was computed again [ns]; valid while the window is marked as corrected
+        #: stamp from which the motion was computed again [ns]; valid while the window is marked as corrected
         self._corrected_ns = 0
-        #: copy of the window from before this correction if an advance was waiting in it, otherwise None
+        #: the window before this correction, if an advance waited in it
         self._before: Rows | None = None
-        #: amounts by which an estimate shifts the clearances and their quantiles, in the order of `CLEARANCE_NAMES`;
-        #: None without an estimate
+        #: shifts of the numbers in `CLEARANCE_NAMES` by an estimate
         self._shift: Array | None = None
 
     def set_shift(self, shift: Sequence[float]) -> None:
-        """Shift the model's horizontal and vertical clearance, and their quantiles, from now on.
+        """Shift the horizontal and vertical clearance, and their quantiles, from now on.
 
         `shift` has 6 numbers [m]: for the horizontal clearance, for its 5 % and 95 % quantiles, and the same for the
-        vertical clearance. The shift is not part of `state`, so that an estimate stays in force when late samples are
-        inserted.
+        vertical clearance. A shift is not part of `state`, so it stays in force when late samples are inserted.
         """
         values = np.zeros(len(CLEARANCE_NAMES))
         values[_KNOWN] = shift
@@ -240,10 +235,9 @@ class Outputs:
         return Published(rows, self._slow(rows))
 
     def correct(self, stamp_ns: int, oldest_ns: int) -> int:
-        """Note that the motion is computed again from `stamp_ns`; return the window's first such stamp.
+        """Note that the motion is computed again from `stamp_ns`; return the earliest such stamp in the window.
 
-        The window is the time since the previous publication. A correction that began at or before `oldest_ns` is over;
-        this call then begins a new correction.
+        A correction from `oldest_ns` or earlier is over; this call then begins a new correction.
         """
         window = self._window[0]
         if not window["corrected"] or self._corrected_ns <= oldest_ns:
@@ -255,7 +249,7 @@ class Outputs:
         return self._corrected_ns
 
     def begin_correction(self) -> None:
-        """Restart impulses and peaks at the time that `correct` returned, to which the session went back.
+        """Restart impulses and peaks at the time that `correct` returned.
 
         Advances that were published before are not published again, even if every later advance fails.
         """
@@ -303,7 +297,6 @@ class Outputs:
         self._slow_ns, self._slow_wear_depth = before
 
     def _slow(self, rows: Rows) -> Rows:
-        """Return the slow parts of publications: one for the first good publication in each span of stamps."""
         stamps, before_ns = rows["stamp_ns"], self._slow_ns
         if before_ns is not None:
             before = before_ns // SLOW_PERIOD_NS
@@ -333,7 +326,6 @@ class Outputs:
         return slow
 
     def _clearance(self, wear_depth: Array) -> Array:
-        """Return the clearances of `CLEARANCE_NAMES`, shape (..., 30) [m], from wear depths (..., 8)."""
         best, points = clearances(self._scene, wear_depth), prior_points(self._scene, wear_depth)
         low, high = (best if depth is wear_depth else clearances(self._scene, depth) for depth in points)
         count = len(_CLEARANCES)
@@ -350,7 +342,7 @@ class Outputs:
         return np.stack((middle, low, high), axis=1)[:2].ravel()
 
     def state(self) -> bytes:
-        """Return the exact state that determines, with the next advance, the numbers of the next publication."""
+        """Return the exact state from which, with later advances, the next publication follows."""
         slow_ns, window = -1 if self._slow_ns is None else self._slow_ns, self._window
         numbers = (window["makes"], window["impulse"], window["peak"], self._slow_wear_depth, np.array([slow_ns]))
         return b"".join(part.tobytes() for part in numbers)
@@ -361,8 +353,8 @@ class Outputs:
         self._clear()
         self._window["makes"] = parts[0].view(np.int64)
         self._window["impulse"], self._window["peak"] = parts[1:3]
-        # a saved state has no `measured_peak` (the peak in advances with samples), so the peak of all advances takes
-        # its place
+        # a state has no `measured_peak` (the peak in advances with samples), so the peak of all advances takes its
+        # place
         self._window["measured_peak"] = parts[2]
         self._slow_wear_depth = parts[3].copy()
         slow_ns = int(np.frombuffer(data, np.int64, 1, offset=8 * _STATE_SIZE)[0])
@@ -384,6 +376,6 @@ def warm_up() -> None:
 
 @cache
 def _publish() -> Callable[..., int]:
-    """Return `publish` compiled for its fixed argument types: checking types would take longer than the call."""
+    """Return `publish` compiled for its argument types, since a check of types would take longer than the call."""
     rows = np.zeros(1, ROW)
     return for_arguments(publish, (rows, THE_ONE, 0, THE_ONE, rows, 0))

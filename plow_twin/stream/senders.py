@@ -1,8 +1,6 @@
 """Selection of one sender when several send the same input, and the count of its lost samples.
 
-The middleware numbers the messages of each publisher, starting at 1. A gap in these numbers therefore means that
-messages were lost in transit or in an overrun queue. This holds at any message rate, and also when messages arrive in
-bursts.
+The middleware numbers the messages of each publisher from 1, so a gap in these numbers means that messages were lost.
 """
 
 from __future__ import annotations
@@ -11,8 +9,7 @@ from collections.abc import Collection
 
 #: Silence of the followed sender [ns] after which `OneSender` follows another sender.
 _SILENT_NS = 10_000_000_000
-#: Largest number of senders whose next message number is stored; when there are more, the sender that was heard first
-#: (except the followed sender) is forgotten.
+#: Largest number of senders whose next number is stored; the oldest of more senders is forgotten.
 _MOST_SENDERS = 64
 
 
@@ -20,11 +17,11 @@ class Senders:
     """Follow the first sender heard until it disappears or a switch is requested."""
 
     def __init__(self) -> None:
-        #: the followed sender; None before the first sample and after the sender has disappeared
+        #: the followed sender; None before the first sample, and after the sender has disappeared
         self.followed: bytes | None = None
-        #: number of samples that the followed sender sent and that never arrived
+        #: number of samples of the followed sender that never arrived
         self.lost = 0
-        #: number of samples of other senders, which are not used
+        #: number of unused samples of other senders
         self.ignored = 0
         self._next: dict[bytes, int] = {}
         self._before: frozenset[bytes] = frozenset()
@@ -53,7 +50,7 @@ class Senders:
             self.followed = sender
         followed = sender == self.followed
         if followed:
-            # a message that was counted as lost and arrives late is subtracted again
+            # a late message was counted as lost before
             self.lost += number - expected if number >= expected else -1 if self.lost else 0
         else:
             self.ignored += count
@@ -64,8 +61,7 @@ class Senders:
     def alive(self, present: Collection[bytes]) -> None:
         """Update the present senders; if the followed sender is gone, follow the next sender heard.
 
-        A sender that has never been among the present senders does not count as disappeared, because it may not have
-        been discovered yet.
+        A sender that was never among the present senders is not gone: it may not have been discovered yet.
         """
         gone = self._listed.difference(present)
         self._listed = set(present)
@@ -86,9 +82,7 @@ class OneSender:
     """Follow the first sender heard until it disappears, or is silent for 10 s while another sender sends."""
 
     def __init__(self) -> None:
-        #: the followed sender; None before the first message and after the sender has disappeared
         self.followed: bytes | None = None
-        #: number of messages of other senders, which are not used
         self.ignored = 0
         self._heard_ns = 0
         self._listed: set[bytes] = set()

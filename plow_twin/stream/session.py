@@ -1,4 +1,12 @@
-"""The deterministic core of the live node and of a replay, which computes the motion from journal entries."""
+"""The deterministic core of the live node and of a replay: a session computes the motion from journal entries.
+
+Terms of this module:
+
+- An *advance* moves the model to a stamp, usually the stamp of a sample. Its result is a *row*.
+- The load is *held* while the motion advances without samples.
+- A sample is *late* if the model has passed its stamp. The session then goes back to a snapshot in its *history*,
+  inserts the sample, and computes the motion again.
+"""
 
 from __future__ import annotations
 
@@ -49,27 +57,24 @@ from plow_twin.stream.outputs import NONE, NOTHING, THE_ONE, Outputs, Published,
 #: Number of advances from one digest to the next.
 DIGEST_INTERVAL: Final = 100
 #: Header of a snapshot: whether a stamp is known, stamp of model time 0, stamp reached, number of advances, whether the
-#: load is held, speed along the face, number of speeds that wait for their stamps.
+#: load is held, speed along the face, number of waiting speeds.
 _HEADER: Final = struct.Struct("<?qqq?dq")
 _TRAVEL: Final = struct.Struct("<qd")
-#: Largest time [ns] by which a pose may be ahead of the time that the model has reached. When a bag is played fast,
-#: poses arrive before the load samples of the same time. A pose that is further ahead is assumed to come from another
-#: clock.
+#: Largest time [ns] by which a pose may be ahead of the model. When a bag is played fast, poses arrive long before the
+#: samples of the same time; a pose further ahead must come from another clock.
 _AHEAD_NS: Final = 3_600_000_000_000
 _WEAR_SIZE: Final = 8 * PAIR_COUNT
 _NO_LOAD: Final = np.zeros((1, 3))
 _NO_ROWS: Final = NOTHING.rows
 
 
-def _ignore(entry: Entry) -> None:
-    """Drop an entry."""
+def _ignore(entry: Entry) -> None: ...
 
 
 class _Measured(NamedTuple):
     """A pose or an estimate given to the twin, with its index, its stamp and the time then reached [ns].
 
-    The measurement has an effect only from model time `known` [s] on. This also holds after the session has gone back
-    in time to insert a late sample.
+    It acts from model time `known` [s] on, even if the session has gone back behind this time.
     """
 
     number: int
@@ -80,11 +85,7 @@ class _Measured(NamedTuple):
 
 
 class Applied(NamedTuple):
-    """Result of applying samples.
-
-    The fields are a row for each sample, the publications, the requested digests, and the numbers of failed advances
-    and late samples.
-    """
+    """Result of applying samples: a row for each sample, the publications and digests, and counts."""
 
     rows: Rows
     published: Published
@@ -94,10 +95,10 @@ class Applied(NamedTuple):
 
 
 class Series(NamedTuple):
-    """Samples that have been applied together and are not in the journal yet.
+    """Samples that were applied together and are not in the journal yet.
 
-    The fields are stamps [ns], shape (n,), and wrenches (n, 3); the publications, with a row after each sample or
-    without rows; and the digests, with the number of samples before each digest, shape (m,).
+    `stamps` [ns] has shape (n,), `wrench` (n, 3), and `digest_after` (m,) has the number of samples before each digest.
+    `published` has a row after each sample, or no rows.
     """
 
     stamps: NDArray[np.int64]
@@ -122,22 +123,20 @@ class Series(NamedTuple):
 
 
 class _UndoneError(Exception):
-    """An advance failed, and the twin has been restored to its state before the samples."""
+    """An advance failed, and the twin is back in its state before the samples."""
 
 
 class Session:
     """One run of a twin whose inputs are entries of a journal.
 
-    The same entries in the same order give bit-identical motion, publications (`outputs`) and digests, independently of
-    the clock. Model time is (stamp - origin); by default the origin is the first stamp.
+    The same entries in the same order give the same motion, publications and digests, bit for bit and at any speed.
 
-    Motion and wear are separate states: a `Reset` restores the initial motion but keeps the wear, which only `SetWear`
-    sets. While the load is held or removed (`Hold`, `Unload`), the pads do not wear, because the true load is unknown.
-    If the scene itself defines the loads, the load is known, and a `Hold` only advances the time.
+    Model time is (stamp - origin); by default the origin is the first stamp. A `Reset` restores the initial motion but
+    keeps the wear, which only `SetWear` sets. While the load is held or removed, the true load is unknown, so the pads
+    do not wear. If the scene itself defines the loads, a `Hold` only advances the time.
 
-    A sample whose stamp is behind the time reached is late: the session goes back to the newest snapshot before this
-    stamp, inserts the sample and computes the motion again up to the newest sample. Motion without samples after the
-    newest sample is dropped.
+    For a late sample, the session goes back to the newest snapshot before its stamp and computes up to the newest
+    sample again. Motion after the newest sample is dropped.
 
     Parameters
     ----------
@@ -147,9 +146,9 @@ class Session:
     origin_ns
         Stamp of model time 0, or None: the first stamp.
     on_entry
-        Function that receives the entries in order of use: the entries of one call before the call applies them, and
-        each digest after the advance that it covers. If the twin refuses an entry because a number is not finite, the
-        entry has already been emitted; a replay refuses this entry too.
+        Function that receives each entry before it is applied, and each digest after the advance that it covers. It
+        also receives an entry that the twin then refuses because a number is not finite; a replay refuses this entry
+        too.
     rollback_span_s
         Largest age of a late sample relative to the newest sample [s]; 0: late samples are refused.
     wear_depth
@@ -166,23 +165,21 @@ class Session:
         wear_depth: Sequence[float] | None = None,
     ) -> None:
         self._use(twin)
-        #: poses and estimates since the earliest state that is kept
+        #: measurements since the earliest state that is kept
         self._measured: deque[_Measured] = deque()
-        #: number of poses that were dropped because they were too far ahead of the load, or because `_measured` was
-        #: full
+        #: number of poses that came too far ahead of the load, or beyond `MOST_MEASURED`
         self.poses_dropped = 0
         self._scene = twin.scene
-        #: numbers of the scene that were changed while the model ran: new value by key
+        #: changed numbers of the scene: new value by key
         self.changes: dict[str, float] = {}
         self.origin_ns = origin_ns
         #: the time that the model has reached [ns], None before the first stamp
         self.stamp_ns: int | None = None
         self.outputs = Outputs(twin.scene)
         self._stock = Stock()
-        #: row of the latest advance, kept until the wear at its end is read
+        #: row of the latest advance, until the wear at its end is read
         self._row: Rows | None = None
         scene, self._sampled = twin.scene, twin.excitation == "sampled"
-        #: past states and samples, from which the session starts again to insert late samples
         self.history = History(round(rollback_span_s * 1e9) if self._sampled else 0)
         self.wear_depth = np.zeros(PAIR_COUNT)
         if scene.wear is not None:
@@ -191,7 +188,6 @@ class Session:
             self.wear_depth[:] = wear_depth
             twin.reset(twin.time, wear_depth=self.wear_depth)
         self._largest_error_m = 0.0
-        #: whether the motion advances without samples
         self.held = False
         self._wears = scene.wear is not None and scene.wear.coefficient_m2_n != 0.0
         self._speed = scene.wear.travel_speed_m_s if scene.wear is not None else 0.0
@@ -200,9 +196,7 @@ class Session:
         self._advances = 0
 
     def _use(self, twin: Driven) -> None:
-        """Make `twin` the twin that the session drives from now on."""
         self.twin: Driven = twin
-        #: the twin if it follows measurements, otherwise None
         self.following = twin if isinstance(twin, Following) else None
 
     def catch_up(self) -> None:
@@ -224,14 +218,12 @@ class Session:
     def apply(self, entry: Entry) -> Rows | None:
         """Emit one entry, apply it, and return the row of its advance, shape (1,), or None without an advance.
 
-        `outputs` publishes the row on request. A digest or a loss only describes the journal from which it was read and
-        changes nothing, so it is not emitted a second time.
+        A digest or a loss only describes the journal from which it was read: it has no effect and is not emitted.
 
         Raises
         ------
         ValueError
-            The entry cannot be applied (its stamp is too far behind the time reached, or a number is not finite); the
-            motion is then unchanged.
+            The stamp is too far behind the time reached, or a number is not finite; the motion is unchanged.
         """
         match entry:
             case Sample():
@@ -248,7 +240,7 @@ class Session:
             case SetWear(_, depth):
                 self._on_entry(entry)
                 self._restart(np.array(depth))
-                # the estimate belongs to the pads before this change of wear, so it no longer applies
+                # the estimate belongs to the earlier pads
                 self.outputs.clear_shift()
             case Estimated(shift=shift):
                 self._on_entry(entry)
@@ -272,7 +264,7 @@ class Session:
                 self.following.follow_parameters()
                 self._forget()
             case Parameter() | Gaps() | Mark() | Failed() | Spread() | Unused():
-                # these entries act through later entries, or have no effect here
+                # these entries act through later entries, or not at all
                 self._on_entry(entry)
             case Snapshot(_, data):
                 self._on_entry(entry)
@@ -291,7 +283,7 @@ class Session:
         Raises
         ------
         ValueError
-            Stamps do not rise.
+            A stamp falls.
         """
         for earlier, later in pairwise(samples):
             if later.stamp_ns < earlier.stamp_ns:
@@ -306,15 +298,15 @@ class Session:
             samples = samples[count:]
 
     def apply_samples(self, samples: Sequence[Sample], *, each: bool = False) -> Applied:
-        """Emit and apply one of the `parts` of samples; the division into parts does not change a bit of the result.
+        """Emit and apply one of the `parts` of samples; the result does not depend on the division into parts.
 
         Parameters
         ----------
         samples : sequence of Sample
             At least one sample.
         each : bool
-            Whether to publish after each sample (if samples are late, only after the last sample); otherwise `outputs`
-            accumulates the samples for the next publication.
+            Whether to publish after each sample, or once after late samples. Otherwise `outputs` sums the samples up
+            for the next publication.
 
         Raises
         ------
@@ -347,13 +339,12 @@ class Session:
         wrench : ndarray, shape (n, 3)
             Fx, Fy [N] and M [N m] at each stamp, finite.
         each : bool
-            Whether to publish after each sample; otherwise `outputs` accumulates the samples for the next publication.
+            As for `apply_samples`.
 
         Returns
         -------
         Series or None
-            None, with nothing changed, if the samples must be applied one by one, for example because an advance fails
-            or a number is not finite.
+            None, with nothing changed, if the samples must be applied one by one, for example because an advance fails.
         """
         if self.stamp_ns is None or self.held or self._travels or not (self.outputs.is_clear or not each):
             return None
@@ -398,16 +389,16 @@ class Session:
         wrench : ndarray, shape (n, 3)
             Fx, Fy [N] and M [N m] at each stamp.
         rows : ndarray of `ROW`, shape (n,), or None
-            Receives the rows; with None, no row is read out or passed to `outputs`.
+            Receives the rows; with None, rows are neither made nor published.
         taken : ndarray of int64
             As for `Outputs.add`.
         digest_after : ndarray of int64, shape (m,)
-            Rising numbers from 1 to n: counts of samples after which a digest is made.
+            Rising counts of samples, from 1 to n, after which a digest is made.
 
         Raises
         ------
         ValueError
-            A number is not finite, or a stamp falls; the motion is then unchanged.
+            A number is not finite, or a stamp falls; the motion is unchanged.
         """
         if self._is_late(int(stamps[0])) or (stamps[1:] < stamps[:-1]).any():
             raise ValueError(
@@ -426,7 +417,7 @@ class Session:
         taken: NDArray[np.int64],
         digest_after: NDArray[np.int64],
     ) -> Applied:
-        """Advance in parts: up to each pending speed along the face, and to the first sample after a held load."""
+        """Advance in parts, which end at each waiting speed, and after the first sample that follows a held load."""
         if not np.isfinite(wrench).all():
             raise ValueError(f"wrench: got {wrench!r}, expected finite numbers")
         resumed, begin, count = self._resume_wear(), 0, len(stamps)
@@ -438,8 +429,7 @@ class Session:
                 continue
             if travel is not None:
                 end = int(np.searchsorted(stamps, travel.stamp_ns, side="right"))
-            # the first sample after a motion without samples is an advance of its own, and the state after this sample
-            # is kept, because the session never goes back to before this sample
+            # the session never goes back before the first sample after a held load, so the state at this sample is kept
             if resumed:
                 end = begin + 1
             here = slice(begin, end)
@@ -487,13 +477,12 @@ class Session:
         )
         travels = b"".join(_TRAVEL.pack(travel.stamp_ns, travel.speed_m_s) for travel in self._travels)
         stamp_ns = self.stamp_ns if self.stamp_ns is not None else self.origin_ns or 0
-        # the changes of the model come last, so that they can be absent: most runs have no changes
+        # the changes are last, so that a snapshot without changes ends with the twin's
         changes = json.dumps(self.changes).encode() if self.changes else b""
         data = header + travels + self.wear_depth.tobytes() + self.outputs.state() + self.twin.snapshot() + changes
         return Snapshot(stamp_ns, data)
 
     def _run(self, samples: Sequence[Sample], taken: NDArray[np.int64] = NONE) -> Applied:
-        """Advance to samples."""
         stamps = np.array([sample.stamp_ns for sample in samples], np.int64)
         wrench = np.array([sample.wrench for sample in samples])
         advance = self._advance_in_pieces if self.held or self._travels else self._advance
@@ -512,8 +501,8 @@ class Session:
     ) -> Applied:
         """Advance to samples without other entries between them.
 
-        `resumed` is True if there was a time without samples before the first sample. If an advance fails and `undo` is
-        given, the twin returns to this snapshot and `_UndoneError` is raised.
+        `resumed` is True for the first sample after a held load. If an advance fails and `undo` is given, the twin
+        returns to this snapshot and `_UndoneError` is raised.
         """
         origin_ns = self._begin(int(stamps[0])) if self.origin_ns is None else self.origin_ns
         if self.history.is_due and not resumed:
@@ -538,7 +527,7 @@ class Session:
         return Applied(rows, self.outputs.add(rows, stamps, taken), digests, failed)
 
     def _follow(self, stamp_ns: int, entry: Pose | PartOfPose | Estimated, known: float = -math.inf) -> None:
-        """Pass a measurement to a twin that follows measurements; no effect before the first sample."""
+        """Pass a measurement to a twin that follows measurements."""
         if self.following is None or self.origin_ns is None:
             return
         time = (stamp_ns - self.origin_ns) * 1e-9
@@ -566,7 +555,9 @@ class Session:
         self._set_speed(travel)
 
     def _is_late(self, stamp_ns: int) -> bool:
-        """Return whether a stamp is before the time reached, or equal to it if no sample is there."""
+        """Return whether a stamp is before the time reached; at the time reached, a sample is late if the load is
+        held.
+        """
         if self.stamp_ns is None or stamp_ns > self.stamp_ns:
             return False
         return stamp_ns < self.stamp_ns or (self.held and self.history.oldest_ns is not None)
@@ -595,23 +586,22 @@ class Session:
     def _rewind(self, stamp_ns: int, *more: Travel) -> list[Sample]:
         """Go back to the newest snapshot before `stamp_ns`; return the samples after the snapshot.
 
-        The speeds used after the snapshot, and the speeds in `more`, become pending again.
+        The speeds after the snapshot and the speeds `more` wait for their stamps again.
         """
         data, samples, travels = self.history.rewind(stamp_ns)
         advances, pending, slow = self._advances, self._travels, self.outputs.slow_before
         self._restore(data)
         self._advances, self.outputs.slow_before = advances, slow
         if self.following is not None:
-            # each measurement acts only from the time at which it became known. Otherwise the motion would depend on
-            # how far the session goes back; publications decide this, but a publication must not change the motion
+            # A measurement acts only from the time at which it became known. Otherwise the motion would depend on how
+            # far the session goes back, which the publications decide.
             measured, self._measured = self._measured, deque()
             for one in measured:
                 if one.number > self.following.added:
                     self._follow(one.stamp_ns, one.entry, one.known)
                 else:
                     self._measured.append(one)
-        # a speed with the stamp of the snapshot may be both in the snapshot and among the later speeds, so only one
-        # speed is kept for each stamp
+        # a speed with the stamp of the snapshot may be in both lists
         known = {travel.stamp_ns: travel for travel in (*self._travels, *travels, *pending, *more)}
         self._travels = sorted(known.values(), key=lambda travel: travel.stamp_ns)
         return samples
@@ -636,7 +626,7 @@ class Session:
         return rows
 
     def _move(self, stamps: NDArray[np.int64], wrench: NDArray[np.float64], *, held: bool) -> Rows:
-        """Advance to a stamp, shape (1,), without a sample."""
+        """Advance without a sample to one stamp, shape (1,)."""
         assert self.origin_ns is not None
         rows = self._stock.new(1)
         if self.following is not None:
@@ -656,7 +646,7 @@ class Session:
                 self.twin.set_travel_speed(0.0)
 
     def _resume_wear(self) -> bool:
-        """Let the load wear the pads again after a hold; return whether the load was held."""
+        """Let the pads wear again after a hold; return whether the load was held."""
         held, self.held = self.held, False
         if held and self._wears:
             self.twin.set_travel_speed(self._speed)
@@ -668,13 +658,13 @@ class Session:
         if not self._wears:
             self._speed = travel.speed_m_s
         elif self.stamp_ns is None:
-            # the speed acts from the first sample on, because the session never goes back before this sample
+            # the session never goes back before the first sample
             self._use_speed(travel.speed_m_s)
         elif travel.stamp_ns > self.stamp_ns:
             insort(self._travels, travel, key=lambda item: item.stamp_ns)
         elif oldest_ns is not None and travel.stamp_ns <= oldest_ns:
-            # the speed is too old to act at its stamp, so it acts from the newest sample on or, if there is no sample,
-            # from the only kept state on
+            # The speed is too old to act at its stamp. It acts from the newest sample on or, without samples, from the
+            # kept state on.
             self._set_speed(Travel(oldest_ns if newest_ns is None else newest_ns, travel.speed_m_s))
         elif newest_ns is None or oldest_ns is None or travel.stamp_ns >= newest_ns:
             self._set_speed(travel)
@@ -691,7 +681,6 @@ class Session:
             self.twin.set_travel_speed(self._speed)
 
     def _count(self, advances: int) -> None:
-        """Count advances, and emit a digest after every `DIGEST_INTERVAL` advances."""
         before, self._advances = self._advances, self._advances + advances
         if before // DIGEST_INTERVAL != self._advances // DIGEST_INTERVAL and self.stamp_ns is not None:
             self._on_entry(Digest(self.stamp_ns, self.twin.digest()))
@@ -701,24 +690,21 @@ class Session:
             self.history.add_snapshot(self.stamp_ns, self.snapshot().data, kept=kept)
 
     def _forget(self) -> None:
-        """Drop everything before the present state."""
         self._forget_past()
         if not self.held:
             self._remember()
 
     def _forget_past(self) -> None:
-        """Drop the past."""
         self.history.clear()
         self._measured.clear()
 
     def _restart(self, wear_depth: NDArray[np.float64]) -> None:
-        """Reset the motion to its initial state."""
         self._end_motion()
         self.wear_depth = wear_depth.copy()
         self.twin.reset(0.0, wear_depth=wear_depth)
 
     def _end_motion(self) -> None:
-        """Let the waiting speeds act, and drop the time reached, the past and the sums of the outputs."""
+        """End the motion for good: waiting speeds act now, and the past and the unpublished sums are dropped."""
         self._resume_wear()
         for travel in self._travels:
             self._set_speed(travel)
@@ -728,7 +714,7 @@ class Session:
         self.origin_ns = self.stamp_ns = None
 
     def _begin(self, stamp_ns: int) -> int:
-        """Return the stamp that model time 0 must have so that the present model time has the stamp `stamp_ns`."""
+        """Return the stamp of model time 0 for which the present model time has the stamp `stamp_ns`."""
         return stamp_ns - round(self.twin.time * 1e9)
 
     def _change_model(self, changes: dict[str, float]) -> None:
@@ -744,7 +730,7 @@ class Session:
         self._forget()
 
     def _changed_twin(self, changes: Mapping[str, float]) -> Driven:
-        """Return a twin with changed numbers, which must allow the present and the waiting speeds."""
+        """Return a twin with changed numbers, if these allow the present and the waiting speeds."""
         found = changed_twin(self.twin, self._scene, changes)
         for speed in (self._speed, *(travel.speed_m_s for travel in self._travels)):
             check_travel_speed(found.scene, speed)
@@ -758,7 +744,7 @@ class Session:
             self.twin.advance(before.time, before.wrench)
 
     def _restore_motion(self, data: bytes) -> None:
-        """Restore only the motion of a snapshot, not the wear, model, speed along the face or counts."""
+        """Restore only the motion of a snapshot."""
         travels = _HEADER.unpack_from(data)[-1]
         end = _HEADER.size + travels * _TRAVEL.size
         depth = np.frombuffer(data, np.float64, PAIR_COUNT, offset=end)
@@ -777,7 +763,6 @@ class Session:
             self.twin.set_travel_speed(self._speed)
 
     def _split_twin(self, data: bytes) -> tuple[bytes, dict[str, float]]:
-        """Split the end of a session's snapshot into the twin's snapshot and the changes of the model."""
         size = len(self.twin.snapshot()) if self.following is None else self.following.snapshot_size(data)
         return data[:size], read_changes(data[size:].decode()) if len(data) > size else {}
 
@@ -804,7 +789,7 @@ def _all_finite(rows: Rows | None) -> bool:
 
 
 def wear_in(snapshot: bytes) -> tuple[float, ...]:
-    """Return the wear depths [m] of the eight pads that a session's snapshot contains."""
+    """Return the wear depths [m] of the eight pads in a session's snapshot."""
     travels = _HEADER.unpack_from(snapshot)[-1]
     depth: list[float] = np.frombuffer(snapshot, np.float64, PAIR_COUNT, _HEADER.size + travels * _TRAVEL.size).tolist()
     return tuple(depth)

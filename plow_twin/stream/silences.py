@@ -1,4 +1,4 @@
-"""Stretches without samples, found from the stamps."""
+"""Silences, which are stretches without samples, found from the stamps."""
 
 from __future__ import annotations
 
@@ -10,33 +10,25 @@ from numpy.typing import NDArray
 from plow_twin.stream.intake import NS_PER_S
 
 Indexes = NDArray[np.int64]
-#: An interval is a silence only if it is longer than this many times the interval before it. A log with one sample a
-#: minute therefore has no silences.
+#: A silence is longer than this many times the interval before it: a log with one sample a minute has no silences.
 _LONGER: Final = 5
 
 
 class Silences:
     """Count silences: intervals between two stamps that are longer than the timeout of the excitation.
 
-    To count as a silence, an interval must also be longer than five times the interval before it. During a silence the
-    motion continues, either under the hold policy or with a load that changes linearly up to the next sample.
-
-    Parameters
-    ----------
-    timeout_s
-        Longest time between two samples [s] that does not count as a silence; the value may be changed later.
+    During a silence the motion continues, either under the hold policy or with a load that changes linearly up to the
+    next sample. `timeout_s` may be changed later.
     """
 
     def __init__(self, timeout_s: float) -> None:
         self.timeout_s = timeout_s
         self.count = 0
-        #: total length of all silences [ns]
         self.total_ns = 0
-        #: begin and end of the longest silence [ns]
         self.longest_ns = (0, 0)
         self._first_ns: int | None = None
         self._newest_ns: int | None = None
-        #: the newest interval between samples that is not a silence [ns]
+        #: the newest interval that is not a silence [ns]
         self._interval_ns: int | None = None
 
     def add(self, stamps_ns: Indexes) -> list[tuple[int, int, int]]:
@@ -65,7 +57,6 @@ class Silences:
         return found
 
     def _is_silence(self, interval_ns: int) -> bool:
-        """Return whether an interval is a silence; any other interval is kept for the next comparison."""
         before_ns = self._interval_ns
         is_long = before_ns is not None and interval_ns > max(self.timeout_s * NS_PER_S, _LONGER * before_ns)
         if not is_long:
@@ -100,7 +91,6 @@ class Silences:
         return {"count": self.count, "total_s": self.total_ns * 1e-9, "longest_from_s": begin_s} if self.count else {}
 
     def _begin(self, stamp_ns: int) -> int:
-        """Return the newest stamp so far [ns]; at the start this is the given stamp."""
         if self._first_ns is None:
             self._first_ns = stamp_ns
         if self._newest_ns is None:

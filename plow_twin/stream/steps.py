@@ -1,4 +1,4 @@
-"""Distinction between a step of the sender's clock and a single wrong stamp, by the next sample."""
+"""Distinction between a step of the sender's clock and a single wrong (*stray*) stamp, by the next sample."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from typing import Final
 
 from plow_twin.stream.intake import NS_PER_S, Intake, Verdict
 
-#: Number of stray stamps (jumps that the next sample did not confirm) within `_WINDOW_NS` from which on the stamps
-#: count as unsteady.
+#: Number of stray stamps within `_WINDOW_NS` from which on the stamps count as unsteady.
 _MOST_STRAYS: Final = 5
 _WINDOW_NS: Final = 10 * NS_PER_S
 
@@ -17,19 +16,16 @@ Timed = tuple[int, tuple[float, float, float], int]
 
 
 class Steps:
-    """Keep a sample whose stamp jumps until the next sample confirms it, so that a single wrong stamp has no effect.
+    """Keep a sample whose stamp jumps until the next sample confirms it, so that a stray stamp has no effect.
 
-    Parameters
-    ----------
-    intake
-        Judges the samples and counts stray samples.
+    The intake judges the samples and counts stray samples.
     """
 
     def __init__(self, intake: Intake) -> None:
         self._intake = intake
-        #: the sample that waits because its stamp jumped; otherwise None
+        #: the sample that waits because its stamp jumped
         self._jumped: Timed | None = None
-        #: times at which the latest stray stamps were found [ns]
+        #: times of the latest stray stamps [ns]
         self._strays_ns: deque[int] = deque(maxlen=_MOST_STRAYS)
 
     @property
@@ -43,7 +39,7 @@ class Steps:
         """Add a sample; return the samples that can be judged now, in order of arrival."""
         jumped, jumps = self._jumped, self._intake.jumps(stamp_ns, reached_ns)
         arrival = stamp_ns, wrench, now_ns
-        if jumped is None or stamp_ns <= 0:  # a sample without a stamp shows nothing about the clock
+        if jumped is None or stamp_ns <= 0:  # a missing stamp shows nothing about the clock
             if not jumps:
                 return (arrival,)
             self._jumped = arrival

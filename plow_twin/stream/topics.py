@@ -24,17 +24,12 @@ _DEPTH: Final = 1000
 class Cadence(Enum):
     """When a message is sent."""
 
-    #: with each publication
     EACH = "each publication"
-    #: with each publication, if `follow` is `full`
     FOLLOWED = "each publication, with `follow: full`"
-    #: with the first publication in each 0.1 s of stamps
     SLOW = "every 0.1 s of stamps"
     #: with each marked publication, and with the first publication after it
     MARKED = "marked publications"
-    #: with each estimate
     ESTIMATE = "each estimate"
-    #: when its content has changed
     CHANGE = "on change"
 
 
@@ -61,7 +56,7 @@ class Topic:
         Names in a `JointState`.
     columns : mapping
         For each field of the message, the fields of the record that fill it, in order, each as (name, count of
-        numbers). A topic without columns needs more than a record to make its messages.
+        numbers). Empty for a topic whose messages are not made from a record alone.
     """
 
     name: str
