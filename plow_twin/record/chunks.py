@@ -353,35 +353,18 @@ def is_mcap(path: Path) -> bool | None:
     return head == MAGIC or (None if MAGIC.startswith(head) else False)
 
 
-def metadata_records(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
-    """Yield the name and content of each metadata record of a file without opening a chunk."""
+def metadata_records(path: Path) -> list[tuple[str, dict[str, str]]]:
+    """Return the name and content of each metadata record of a file."""
     from mcap.reader import make_reader
 
-    found: list[tuple[str, dict[str, str]]] = []
     with open_mcap(path) as stream:
         try:
-            found = [(record.name, dict(record.metadata)) for record in make_reader(stream).iter_metadata()]
+            return [(record.name, dict(record.metadata)) for record in make_reader(stream).iter_metadata()]
         except Exception:  # the file has no index at its end, or a damaged index
-            found = _metadata_by_heads(stream.fileno())
-    yield from found
-
-
-def _metadata_by_heads(descriptor: int) -> list[tuple[str, dict[str, str]]]:
-    """Return the metadata records of a file that has no index, found by stepping from record head to record head."""
-    from mcap.data_stream import ReadDataStream
-    from mcap.records import Metadata
-
-    found, place, size = [], len(MAGIC), os.fstat(descriptor).st_size
-    while place + _HEAD.size <= size:
-        opcode, length = _HEAD.unpack(os.pread(descriptor, _HEAD.size, place))
-        place += _HEAD.size
-        if opcode == _METADATA and length <= RECORD_LIMIT:
-            try:
-                record = Metadata.read(ReadDataStream(BytesIO(os.pread(descriptor, length, place))))
-            except Exception:
-                break
-            found.append((record.name, dict(record.metadata)))
-        place += length
+            pass
+    found: list[tuple[str, dict[str, str]]] = []
+    for _ in ChunkReader(path, lambda name, record: found.append((name, record)), lambda numbers: False):
+        pass
     return found
 
 

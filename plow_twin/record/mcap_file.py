@@ -11,7 +11,7 @@ import struct
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 
@@ -132,28 +132,6 @@ def spread(buffer, starts, length, data):  # type: ignore[no-untyped-def]
         start, end = starts[n], place + length[n]
         buffer[start : start + length[n]] = data[place:end]
         place = end
-
-
-class ByteFile(Protocol):
-    """Destination of a recording's bytes: a file or memory."""
-
-    def write(self, data: bytes) -> None:
-        """Write all bytes of `data`."""
-
-    def tell(self) -> int:
-        """Return the bytes written so far."""
-
-    def truncate(self, size: int) -> None:
-        """Truncate to a size."""
-
-    def sync(self) -> None:
-        """Wait for the disk."""
-
-    def is_linked(self) -> bool:
-        """Return whether the path still leads to this file."""
-
-    def close(self) -> None:
-        """Close the destination."""
 
 
 class McapFile:
@@ -390,3 +368,36 @@ class UnbufferedFile:
         if self._open:
             self._open = False
             os.close(self._descriptor)
+
+
+class MemoryFile:
+    """A file in memory."""
+
+    def __init__(self) -> None:
+        self.content = bytearray()
+
+    def write(self, data: bytes) -> None:
+        """Write all bytes of `data`."""
+        self.content += data
+
+    def tell(self) -> int:
+        """Return the bytes written so far."""
+        return len(self.content)
+
+    def truncate(self, size: int) -> None:
+        """Truncate to a size."""
+        del self.content[size:]
+
+    def sync(self) -> None:
+        """Do nothing."""
+
+    def is_linked(self) -> bool:
+        """Return True."""
+        return True
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+#: Destination of a recording's bytes.
+ByteFile: TypeAlias = UnbufferedFile | MemoryFile

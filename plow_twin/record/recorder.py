@@ -28,7 +28,7 @@ from plow_twin.errors import RecordingError, TakenError
 from plow_twin.record.header import RunHeader
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.messages import Message
-from plow_twin.stream.journal import Digest, Entry, Loss, Sample, Snapshot
+from plow_twin.stream.journal import Entry, Loss, Sample, Snapshot
 from plow_twin.stream.outputs import Published
 from plow_twin.stream.session import Series
 from plow_twin.stream.topics import Cadence, names_of
@@ -550,18 +550,10 @@ class _SeriesItem(NamedTuple):
         return {JOURNAL: len(self.series.stamps) + len(self.series.digests)}
 
     def write(self, writer: RunWriter) -> None:
-        stamps, wrench, sequence, begin = self.series.stamps, self.series.wrench, self.sequence, 0
-        digests = dict(zip(self.series.digest_after.tolist(), self.series.digests, strict=True))
-        for end in sorted({*digests, len(stamps)}):
-            here = slice(begin, end)
-            numbers = np.arange(sequence, sequence + end - begin)
-            log_times = np.full(end - begin, self.log_time_ns, np.int64)
-            writer.write_samples(numbers, log_times, stamps[here], wrench[here])
-            sequence += end - begin
-            if end in digests:
-                writer.write_entry(sequence, self.log_time_ns, Digest(stamps.item(end - 1), digests[end]))
-                sequence += 1
-            begin = end
+        series = self.series
+        digests = dict(zip(series.digest_after.tolist(), series.digests, strict=True))
+        log_times = np.full(len(series.stamps), self.log_time_ns, np.int64)
+        writer.write_series(self.sequence, log_times, series.stamps, series.wrench, digests)
 
 
 class _PublicationsItem(NamedTuple):

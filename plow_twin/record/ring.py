@@ -11,7 +11,7 @@ from typing import Final
 from plow_twin.errors import RecordingError, TakenError
 from plow_twin.record.durable import sync_path
 from plow_twin.record.header import RunHeader
-from plow_twin.record.mcap_file import ByteFile
+from plow_twin.record.mcap_file import ByteFile, MemoryFile
 from plow_twin.record.metadata_yaml import LOST, PartFacts, bag_metadata, write_metadata
 from plow_twin.record.writer import RunWriter, make_folder, shortage
 
@@ -115,32 +115,3 @@ class RingWriter(RunWriter):
 def _remove(folder: Path) -> None:
     with suppress(OSError):
         folder.rmdir()
-
-
-class MemoryFile:
-    """A file in memory."""
-
-    def __init__(self) -> None:
-        self.content = bytearray()
-
-    def write(self, data: bytes) -> None:
-        """Write all bytes of `data`."""
-        self.content += data
-
-    def tell(self) -> int:
-        """Return the bytes written so far."""
-        return len(self.content)
-
-    def truncate(self, size: int) -> None:
-        """Truncate to a size."""
-        del self.content[size:]
-
-    def sync(self) -> None:
-        """Do nothing."""
-
-    def is_linked(self) -> bool:
-        """Return True."""
-        return True
-
-    def close(self) -> None:
-        """Do nothing."""

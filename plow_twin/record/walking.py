@@ -139,18 +139,8 @@ class Walker:
     ) -> None:
         assert self._writer is not None
         self._open(int(log_ns[0]))
-        sequence = (
-            self._sequence + 1 + np.arange(len(stamp_ns)) + np.searchsorted(marks, np.arange(len(stamp_ns)), "right")
-        )
-        begin = 0
-        for mark, digest in zip((*marks.tolist(), len(stamp_ns)), (*done.digests, ""), strict=True):
-            part = slice(begin, mark)
-            if mark > begin:
-                self._writer.write_samples(sequence[part], log_ns[part], stamp_ns[part], wrench[part])
-            if digest:
-                place = int(sequence[mark - 1]) + 1
-                self._writer.write_entry(place, int(log_ns[mark - 1]), Digest(int(stamp_ns[mark - 1]), digest))
-            begin = mark
+        digests = dict(zip(marks.tolist(), done.digests, strict=True))
+        sequence = self._writer.write_series(self._sequence + 1, log_ns, stamp_ns, wrench, digests)
         self._sequence += len(stamp_ns) + len(marks)
         self._log_time_ns = int(log_ns[-1])
         if not done.failed:

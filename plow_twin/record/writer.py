@@ -141,6 +141,29 @@ class RunWriter:
         )
         self._close_full_chunks()
 
+    def write_series(
+        self,
+        sequence: int,
+        log_time_ns: Indexes,
+        stamp_ns: Indexes,
+        wrench: NDArray[np.float64],
+        digests: Mapping[int, str],
+    ) -> Indexes:
+        """Write samples and digests as entries from number `sequence` on; return the number of each sample.
+
+        Each digest is written after as many samples as its key says.
+        """
+        index = np.arange(len(stamp_ns))
+        numbers = sequence + index + np.searchsorted(sorted(digests), index, "right")
+        begin = 0
+        for end in sorted({*digests, len(stamp_ns)}):
+            here, begin = slice(begin, end), end
+            self.write_samples(numbers[here], log_time_ns[here], stamp_ns[here], wrench[here])
+            if end in digests:
+                entry = Digest(int(stamp_ns[end - 1]), digests[end])
+                self.write_entry(int(numbers[end - 1]) + 1, int(log_time_ns[end - 1]), entry)
+        return numbers
+
     def write_publications(self, sequence: Indexes, log_time_ns: Indexes, published: Published) -> None:
         """Write the messages of many publications, each sent after journal entry number `sequence`."""
         log_time_ns = np.maximum(log_time_ns, 0)
