@@ -14,7 +14,6 @@ from plow_twin.live.wear_keeper import KeptWear, WearKeeper
 from plow_twin.model.scene import Scene
 from plow_twin.record.wear_state import (
     FILE_NAME,
-    WearState,
     WearStateError,
     parse_wear,
     read_wear,
@@ -31,7 +30,7 @@ NEW, WORN = np.zeros(8), np.full(8, 1e-3)
 
 
 def _save(folder: Path, depth: tuple[float, ...] = DEPTH) -> Path:
-    save_wear(folder, wear_content(WearState("head 7", scene_identity(SCENE), depth)))
+    save_wear(folder, wear_content("head 7", scene_identity(SCENE), depth))
     return folder / FILE_NAME
 
 

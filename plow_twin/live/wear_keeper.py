@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from plow_twin.model.scene import Scene
 from plow_twin.record.wear_state import (
     FILE_NAME,
-    WearState,
     WearStateError,
     claim_folder,
     parse_wear,
@@ -103,7 +102,7 @@ class WearKeeper:
                     "is: clean up and configure to continue with its wear, or move it away to save the wear of "
                     "this twin"
                 )
-            content = wear_content(WearState(self._head, self._identity, values))
+            content = wear_content(self._head, self._identity, values)
             self._own = (content,) if found is None else (found, content)
             save_wear(self.folder, content)
             self._own = (content,)

@@ -11,7 +11,7 @@ from typing import Final
 from plow_twin.build import package_version
 from plow_twin.record.chunks import is_mcap
 from plow_twin.record.mcap_file import ChunkBuilder, McapFile, UnbufferedFile
-from plow_twin.record.metadata_yaml import LOST, PartFacts, TopicCount, bag_metadata, recorded_losses, write_metadata
+from plow_twin.record.metadata_yaml import PartFacts, TopicCount, bag_metadata, recorded_losses, write_metadata
 from plow_twin.record.writer import BESIDE, make_folder, shortage
 
 _CHUNK_SIZE: Final = 2**20
@@ -105,8 +105,7 @@ class BagWriter:
             TopicCount(topic.name, topic.message_type, self.written[topic.name], topic.qos, topic.type_hash)
             for topic in self._topics.values()
         ]
-        custom = {f"{LOST}{name}": str(count) for name, count in self.lost.items()}
-        write_metadata(self.folder, bag_metadata([PartFacts(self.path.name, *self._file.times, counts)], custom))
+        write_metadata(self.folder, bag_metadata([PartFacts(self.path.name, *self._file.times, counts)], self.lost))
 
 
 def beside_folders(run: Path) -> Sequence[Path]:

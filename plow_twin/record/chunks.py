@@ -170,7 +170,7 @@ class ChunkReader:
                     continue
                 place = self.position = begin + length
                 if opcode == _MESSAGE:
-                    waiting.add_message(os.pread(descriptor, _HEAD_SIZE + length, begin - _HEAD_SIZE))
+                    waiting.add(np.frombuffer(os.pread(descriptor, _HEAD_SIZE + length, begin - _HEAD_SIZE), np.uint8))
                 if waiting.size > small:
                     yield from self._scan(waiting.pop_all(), schemas)
                 if opcode == _CHUNK:
@@ -188,9 +188,8 @@ class ChunkReader:
                 elif opcode in (_SCHEMA, _CHANNEL):
                     self._declare(opcode, os.pread(descriptor, length, begin), schemas)
                 elif opcode == _METADATA:
-                    yield from self._scan(
-                        waiting.pop_all(), schemas
-                    )  # pass on the messages before a note of damage first, so that the note keeps its place
+                    # the messages before a note of damage are passed on first, so that the note keeps its place
+                    yield from self._scan(waiting.pop_all(), schemas)
                     self._metadata(os.pread(descriptor, length, begin))
                 elif opcode == _FOOTER:
                     self.finished = os.pread(descriptor, len(MAGIC), place) == MAGIC
@@ -320,27 +319,15 @@ class _Waiting:
 
     def __init__(self) -> None:
         self._contents: list[Bytes] = []
-        self._messages: list[bytes] = []
         self.size = 0
 
     def add(self, content: Bytes) -> None:
-        self._join()
         self._contents.append(content)
         self.size += len(content)
 
-    def add_message(self, record: bytes) -> None:
-        self._messages.append(record)
-        self.size += len(record)
-
     def pop_all(self) -> list[Bytes]:
-        self._join()
         contents, self._contents, self.size = self._contents, [], 0
         return contents
-
-    def _join(self) -> None:
-        if self._messages:
-            self._contents.append(np.frombuffer(b"".join(self._messages), np.uint8))
-            self._messages = []
 
 
 def is_mcap(path: Path) -> bool | None:

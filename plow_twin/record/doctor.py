@@ -21,7 +21,6 @@ from plow_twin.record.header import LAYOUT_VERSION, LOSS_RECORD
 from plow_twin.record.mcap_file import ChunkBuilder, McapFile, UnbufferedFile
 from plow_twin.record.messages import MESSAGE_TYPES
 from plow_twin.record.metadata_yaml import (
-    LOST,
     PartFacts,
     TopicCount,
     bag_metadata,
@@ -292,11 +291,9 @@ def _put_aside(file: Path, ending: str) -> None:
 
 def _list_parts(folder: Path, parts: Sequence[Path], repaired: Sequence[str]) -> None:
     facts = [_facts(part) for part in parts if part.exists() and is_mcap(part)]
-    custom = {f"{LOST}{topic}": str(count) for topic, count in recorded_losses(folder).items()}
-    if repaired:
-        custom[f"plow_twin_{REPAIRED_KEY}"] = ", ".join(repaired)
+    custom = {f"plow_twin_{REPAIRED_KEY}": ", ".join(repaired)} if repaired else {}
     if facts:
-        write_metadata(folder, bag_metadata(facts, custom))
+        write_metadata(folder, bag_metadata(facts, recorded_losses(folder), custom))
 
 
 def _rewrite(part: Path, *, last: bool) -> None:

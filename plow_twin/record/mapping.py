@@ -141,19 +141,12 @@ class Role:
         )
         return f"{self.topic} has no time at {stamp!r}{got(stamp)}, expected {expected}"
 
-    def plausible(self, values: Mapping[str, float]) -> bool:
-        """Return whether all numbers are within their limits; a missing number passes."""
+    def plausible(self, values: Mapping[str, Number]) -> bool:
+        """Return whether all numbers, or arrays of numbers, are within their limits; a missing number passes."""
         return not any(
-            values[name] < low or values[name] > high for name, (low, high) in self.limits.items() if name in values
-        )
-
-    def all_plausible(self, values: NDArray[np.float64]) -> bool:
-        """Return whether all numbers (n, k) of messages, in the order of `fields`, are within their limits."""
-        places = {name: place for place, name in enumerate(self.fields)}
-        return not any(
-            bool(((values[:, places[name]] < low) | (values[:, places[name]] > high)).any())
+            np.any((values[name] < low) | (values[name] > high))
             for name, (low, high) in self.limits.items()
-            if name in places
+            if name in values
         )
 
     def empty(self, arrived: Arrived) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final
 
 from plow_twin.errors import Problem, RecordingError
@@ -16,7 +17,7 @@ from plow_twin.stream.topics import TOPICS
 METADATA_VERSION: Final = 9
 _INFINITE: Final = {"sec": 9223372036, "nsec": 854775807}
 #: Prefix of the keys in `custom_data` that count lost messages by topic.
-LOST: Final = "plow_twin_lost "
+_LOST: Final = "plow_twin_lost "
 
 
 @dataclass
@@ -68,8 +69,10 @@ class PartFacts:
     topics: Sequence[TopicCount]
 
 
-def bag_metadata(parts: Sequence[PartFacts], custom: Mapping[str, str]) -> dict[str, Any]:
-    """Return the content of `metadata.yaml` for the files of a recording, in order."""
+def bag_metadata(
+    parts: Sequence[PartFacts], lost: Mapping[str, int], custom: Mapping[str, str] = MappingProxyType({})
+) -> dict[str, Any]:
+    """Return the content of `metadata.yaml` for the files of a recording, in order, and its losses by topic."""
     totals: dict[str, TopicCount] = {}
     for part in parts:
         for topic in part.topics:
@@ -111,7 +114,7 @@ def bag_metadata(parts: Sequence[PartFacts], custom: Mapping[str, str]) -> dict[
             "compression_mode": "",
             "relative_file_paths": [part.name for part in parts],
             "files": [{"path": part.name, **span([part])} for part in parts],
-            "custom_data": dict(custom) or None,
+            "custom_data": {**{f"{_LOST}{topic}": str(count) for topic, count in lost.items()}, **custom} or None,
             "ros_distro": "jazzy",
         }
     }
@@ -149,7 +152,7 @@ def recorded_losses(folder: Path) -> dict[str, int]:
     """Return the losses by topic in `metadata.yaml`; empty if the file cannot be read."""
     try:
         custom = _information(folder)["custom_data"] or {}
-        return {key.removeprefix(LOST): int(count) for key, count in custom.items() if key.startswith(LOST)}
+        return {key.removeprefix(_LOST): int(count) for key, count in custom.items() if key.startswith(_LOST)}
     except (RecordingError, LookupError, TypeError, AttributeError, ValueError):
         return {}
 

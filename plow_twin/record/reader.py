@@ -156,9 +156,8 @@ class RunReader:
     @property
     def lost_parts(self) -> dict[str, int]:
         """Numbers of missing and foreign parts, by their keys among the losses; zeros are left out."""
-        missing = (
-            self.missing_parts if self.tail is None else 0
-        )  # the recorder of a followed run may remove the oldest parts
+        # the recorder of a followed run may remove the oldest parts
+        missing = self.missing_parts if self.tail is None else 0
         found = {"missing_parts": missing, "foreign_parts": len(self.foreign)}
         return {name: count for name, count in found.items() if count}
 

@@ -12,7 +12,7 @@ from plow_twin.errors import RecordingError, TakenError
 from plow_twin.record.durable import sync_path
 from plow_twin.record.header import RunHeader
 from plow_twin.record.mcap_file import ByteFile, MemoryFile
-from plow_twin.record.metadata_yaml import LOST, PartFacts, bag_metadata, write_metadata
+from plow_twin.record.metadata_yaml import PartFacts, bag_metadata, write_metadata
 from plow_twin.record.writer import RunWriter, make_folder, shortage
 
 #: Number of parts of a full ring; the oldest part is dropped as a whole.
@@ -102,10 +102,9 @@ class RingWriter(RunWriter):
             if self._sync_dumps:
                 sync_path(folder / name)
             facts.append(PartFacts(name, part.start_ns, part.end_ns, part.topics))
-        lost = {f"{LOST}{topic}": str(n) for topic, n in loss.items()}
         for name in ("metadata.yaml", "metadata.yaml.partial"):
             undone.callback((folder / name).unlink, missing_ok=True)
-        write_metadata(folder, bag_metadata(facts, lost), sync=self._sync_dumps)
+        write_metadata(folder, bag_metadata(facts, loss), sync=self._sync_dumps)
 
     def close(self, loss: Mapping[str, int], stop_reason: str | None = None) -> None:
         """Free the memory."""

@@ -5,10 +5,8 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import json
-import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
@@ -24,15 +22,6 @@ VERSION: Final = 1
 
 class WearStateError(PlowTwinError, ValueError):
     """A wear file cannot be used."""
-
-
-@dataclass(frozen=True)
-class WearState:
-    """Wear depth [m] of the eight pads of the head `head`, which runs in the slide of a scene."""
-
-    head: str
-    scene: str
-    depth_m: tuple[float, ...]
 
 
 def scene_identity(scene: Scene) -> str:
@@ -81,18 +70,27 @@ def parse_wear(content: bytes, path: Path, head: str, scene: Scene) -> tuple[flo
     WearStateError
         The content is damaged, or belongs to another head or scene.
     """
-    state = _parse(content, path)
-    for name, got, expected in (("head", state.head, head), ("scene", state.scene, scene_identity(scene))):
-        if got != expected:
+    try:
+        record: dict[str, Any] = json.loads(content)
+        if record["version"] != VERSION:
+            raise WearStateError(f"{path}: version: got {record['version']!r}, expected {VERSION}")
+        found = {name: str(record[name]) for name in ("head", "scene")}
+        depth = tuple(float(record["depth_m"][name]) for name in PAIR_NAMES)
+    except WearStateError:
+        raise
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise WearStateError(f"{path}: damaged, expected the wear of {len(PAIR_NAMES)} pads ({error!r})") from error
+    for name, expected in (("head", head), ("scene", scene_identity(scene))):
+        if found[name] != expected:
             raise WearStateError(
-                f"{path}: {name}: got {got!r}, expected {expected!r}: the wear of another {name} is not used; "
+                f"{path}: {name}: got {found[name]!r}, expected {expected!r}: the wear of another {name} is not used; "
                 "give another folder or move the file away"
             )
     try:
-        check_depth(state.depth_m, scene)
+        check_depth(depth, scene)
     except ValueError as error:
         raise WearStateError(f"{path}: depth_m: {error}") from error
-    return state.depth_m
+    return depth
 
 
 def claim_folder(folder: Path) -> int:
@@ -130,14 +128,17 @@ def _unwritable(folder: Path, error: OSError) -> WearStateError:
     return WearStateError(f"wear_state_path: got {str(folder)!r}, expected a folder that can be written to: {reason}")
 
 
-def wear_content(state: WearState) -> bytes:
-    """Return the content of a file with this wear and the present time."""
+def wear_content(head: str, scene: str, depth_m: Sequence[float]) -> bytes:
+    """Return the content of a file with the wear depths [m] of the head `head`, which runs in the slide of a scene.
+
+    `scene` is a `scene_identity`.
+    """
     record = {
         "version": VERSION,
-        "head": state.head,
-        "scene": state.scene,
+        "head": head,
+        "scene": scene,
         "saved": datetime.now(UTC).isoformat(timespec="seconds"),
-        "depth_m": dict(zip(PAIR_NAMES, state.depth_m, strict=True)),
+        "depth_m": dict(zip(PAIR_NAMES, depth_m, strict=True)),
     }
     return (json.dumps(record, indent=1) + "\n").encode()
 
@@ -152,20 +153,3 @@ def save_wear(folder: Path, content: bytes) -> None:
     """
     folder.mkdir(parents=True, exist_ok=True)
     write_whole(folder / FILE_NAME, content, sync=True)
-
-
-def _parse(content: bytes, path: Path) -> WearState:
-    try:
-        record: dict[str, Any] = json.loads(content)
-        version = record["version"]
-        if version != VERSION:
-            raise WearStateError(f"{path}: version: got {version!r}, expected {VERSION}")
-        depth = tuple(float(record["depth_m"][name]) for name in PAIR_NAMES)
-        head, scene = str(record["head"]), str(record["scene"])
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
-        if isinstance(error, WearStateError):
-            raise
-        raise WearStateError(f"{path}: damaged, expected the wear of {len(PAIR_NAMES)} pads ({error!r})") from error
-    if not all(0.0 <= value < math.inf for value in depth):
-        raise WearStateError(f"{path}: depth_m: got {depth}, expected finite depths >= 0 in m")
-    return WearState(head, scene, depth)

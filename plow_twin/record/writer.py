@@ -20,7 +20,7 @@ from plow_twin.record.header import HEADER_RECORD, LOSS_RECORD, STOPPED_EARLY_KE
 from plow_twin.record.journal_codec import Dropped, to_message
 from plow_twin.record.mcap_file import ByteFile, ChunkBuilder, McapFile, UnbufferedFile
 from plow_twin.record.messages import Message, WrenchStamped
-from plow_twin.record.metadata_yaml import LOST, PartFacts, TopicCount, bag_metadata, qos_text, write_metadata
+from plow_twin.record.metadata_yaml import PartFacts, TopicCount, bag_metadata, qos_text, write_metadata
 from plow_twin.record.outputs import REPLAYED, publication_templates
 from plow_twin.record.reader import sample_template
 from plow_twin.record.template import Indexes
@@ -300,13 +300,13 @@ class RunWriter:
     def close(self, loss: Mapping[str, int], stop_reason: str | None = None) -> None:
         """Write the loss counters, the reason of an early end, the index and `metadata.yaml`."""
         record = {topic: str(count) for topic, count in loss.items()}
-        custom: dict[str, str] = {f"{LOST}{topic}": count for topic, count in record.items()}
+        custom: dict[str, str] = {}
         if stop_reason is not None:
             record[STOPPED_EARLY_KEY] = custom[f"plow_twin_{STOPPED_EARLY_KEY}"] = stop_reason
         self._close_chunks()
         self._finish(self._part, record)
         self._bytes_before -= self._part.file.size
-        write_metadata(self.folder, bag_metadata(self._done, custom), sync=self._sync)
+        write_metadata(self.folder, bag_metadata(self._done, loss, custom), sync=self._sync)
 
     def abandon(self) -> None:
         """Close the file without an index, after an error."""

@@ -146,7 +146,8 @@ class Driver:
         """
         run: list[Sample] = []
         for stamp_ns, wrench in arrived:
-            if self.every_sample and not run and self._goes_on(stamp_ns, wrench):  # the usual case
+            if self.every_sample and not run and self._may_go_on(stamp_ns, wrench):  # the usual case
+                self.intake.accept(stamp_ns, wrench)
                 self._newest_ns, self._received_ns, self._zeroed = stamp_ns, now_ns, False
                 self.silences.add_one(stamp_ns)
                 published = self._apply([Sample(stamp_ns, wrench)], now_ns)
@@ -202,13 +203,6 @@ class Driver:
         """Return whether a sample is clearly plausible and no other sample waits."""
         reached_ns = self.session.stamp_ns
         return not (reached_ns is None or self._steps.waits) and self.intake.goes_on(stamp_ns, wrench, reached_ns)
-
-    def _goes_on(self, stamp_ns: int, wrench: tuple[float, float, float]) -> bool:
-        """Accept a sample that is clearly plausible; return False if `_judge` must decide."""
-        found = self._may_go_on(stamp_ns, wrench)
-        if found:
-            self.intake.accept(stamp_ns, wrench)
-        return found
 
     def _use_samples(
         self, run: list[Sample], stamp_ns: int, wrench: tuple[float, float, float], now_ns: int

@@ -124,7 +124,7 @@ class Feeder:
         if inputs.senders.followed != self._name:
             return False
         found = table.read(role)
-        if found is None or not role.all_plausible(found[1]):
+        if found is None or not role.plausible(dict(zip(role.fields, found[1].T, strict=True))):
             return False
         for arrived in table if len(roles) > 1 else ():
             for name, other in roles:
