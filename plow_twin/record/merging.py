@@ -12,7 +12,7 @@ T = TypeVar("T")
 #: A function that returns the stamp of a message [ns], or None.
 StampOf: TypeAlias = Callable[[T], int | None]
 
-#: A stamp older than the newest stamp by more than this [ns] is a step of the clock; an older stamp is a late row.
+#: A stamp older than the newest stamp by more than this [ns] is a step of the clock; otherwise the row is late.
 _STEP_NS: Final = 1_000_000_000
 #: A stamp newer than the newest stamp by more than this [ns] may be wrong; the next stamp decides.
 _JUMP_NS: Final = 10_000_000_000

@@ -209,8 +209,7 @@ class Driver:
     ) -> Iterator[Published]:
         """Judge a sample and add it to `run`, the samples to apply together; apply `run` first where necessary."""
         late = bool(run) and self._is_late(run[0])
-        # A stamp that does not rise is late or a jump back. Which of them it is, can be judged only after `run` has
-        # been applied.
+        # a stamp that does not rise is late or a jump back, which can be judged only after `run` has been applied
         if run and not late and stamp_ns <= run[-1].stamp_ns:
             yield from self._use(run, now_ns)
             late = False

@@ -18,7 +18,7 @@ class DurationHistogram:
     """Durations from 1 us to 100 s in bins of equal ratio, 50 per decade, so that a quantile is accurate to 2.4 %."""
 
     def __init__(self) -> None:
-        # to increment an item of a list takes a tenth of the time that an array takes
+        # incrementing an item of a list takes a tenth of the time that an item of an array takes
         self._counts = [0] * _BINS
         self._counted = np.zeros(len(self._counts), np.int64)
         self.largest_s = 0.0

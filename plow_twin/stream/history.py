@@ -1,8 +1,8 @@
 """The last seconds of a session, kept for late samples: snapshots, and all entries since the oldest snapshot.
 
-A history divides time into *spans*. A session that applies samples one by one has a snapshot at the first sample of
-each span. A session that applies many at once has fewer snapshots, but notes the same stamps. The stamps, and not the
-snapshots, decide whether a sample is too old, so this depends on the journal alone.
+A history divides the kept time into *cells*. A session that applies samples one by one has a snapshot at the first
+sample of each cell. A session that applies many samples at once has fewer snapshots, but notes the same stamps. These
+stamps decide whether a sample is too old, so the decision depends on the journal alone.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from plow_twin.stream.journal import Sample, Travel
 
-#: Number of spans in the kept time; after a late sample, at least one span is computed again.
+#: Number of cells in the kept time.
 SNAPSHOTS: Final = 100
 
 
@@ -31,9 +31,9 @@ class History:
 
     def __init__(self, span_ns: int) -> None:
         self._span_ns = span_ns
-        self._spacing_ns = max(1, span_ns // SNAPSHOTS)
+        self._cell_ns = max(1, span_ns // SNAPSHOTS)
         self._snapshots: list[tuple[int, bytes]] = []
-        #: stamp of the first sample of each span
+        #: stamp of the first sample of each cell
         self._kept_ns: list[int] = []
         #: largest stamp in `_kept_ns` so far; after going back, no stamp is dropped until this stamp is reached again
         self._newest_kept_ns: int | None = None
@@ -85,13 +85,13 @@ class History:
             return
         self._later.append((stamps_ns, wrench))
         last_ns = self._kept_ns[-1] if self._kept_ns else None
-        if last_ns is not None and stamps_ns.item(-1) // self._spacing_ns == last_ns // self._spacing_ns:
+        if last_ns is not None and stamps_ns.item(-1) // self._cell_ns == last_ns // self._cell_ns:
             return  # the usual case
-        cells = stamps_ns // self._spacing_ns
+        cells = stamps_ns // self._cell_ns
         begins = np.ones(len(cells), bool)
         begins[1:] = cells[1:] != cells[:-1]
         if last_ns is not None:
-            begins &= (stamps_ns > last_ns) & (cells != last_ns // self._spacing_ns)
+            begins &= (stamps_ns > last_ns) & (cells != last_ns // self._cell_ns)
         self._due = self._due or bool(begins.any())
         self._keep(stamps_ns[begins])
 
@@ -145,7 +145,7 @@ class History:
         self._travels.insert(place, travel)
 
     def add_snapshot(self, stamp_ns: int, data: bytes, *, kept: bool = True) -> None:
-        """Add a snapshot at `stamp_ns`; with `kept`, its stamp counts like that of a span's first sample."""
+        """Add a snapshot at `stamp_ns`; with `kept`, its stamp counts like that of a cell's first sample."""
         if not self._span_ns:
             return
         if not self._snapshots or self._snapshots[-1][0] < stamp_ns:

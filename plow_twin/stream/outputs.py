@@ -60,7 +60,7 @@ _MOTION: Final = ("t", "stamp_ns", "held", "q", "v", "penetration", "rate", "for
 _SUMMED: Final = ("q", "v", "penetration", "rate", "force", "impulse", "peak")
 #: Indexes in `clearance` of the numbers of `known_clearance`, and of an estimate's six shifts.
 _KNOWN: Final = np.array([0, len(_CLEARANCES), len(_CLEARANCES) + 1, 1, len(_CLEARANCES) + 2, len(_CLEARANCES) + 3])
-#: Rows are made many at a time, because numpy takes the same time for one row.
+#: Number of rows made at once, because numpy makes many rows in the time of a single row.
 _STOCK: Final = 256
 
 

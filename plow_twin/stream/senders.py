@@ -9,7 +9,7 @@ from collections.abc import Collection
 
 #: Silence of the followed sender [ns] after which `OneSender` follows another sender.
 _SILENT_NS = 10_000_000_000
-#: Largest number of senders whose next number is stored; the oldest of more senders is forgotten.
+#: Largest number of senders whose next number is stored; beyond it, the sender heard first is forgotten.
 _MOST_SENDERS = 64
 
 

@@ -704,7 +704,7 @@ class Session:
         self.twin.reset(0.0, wear_depth=wear_depth)
 
     def _end_motion(self) -> None:
-        """End the motion for good: waiting speeds act now, and the past and the unpublished sums are dropped."""
+        """End the present motion: waiting speeds act now, and the past and the unpublished sums are dropped."""
         self._resume_wear()
         for travel in self._travels:
             self._set_speed(travel)
