@@ -95,16 +95,10 @@ _ZONE: Final = re.compile(r"([Zz]|:\d\d([.,]\d+)?[+-]\d\d(:?\d\d)?)$")
 
 
 def guess_columns(path: Path, scene: Scene, columns: Mapping[str, str], units: Mapping[str, str]) -> Guess:
-    """Guess the meanings of a CSV or Parquet file's columns, from at most 20,000 rows and two million cells.
+    """Guess the meanings of a table's columns, from at most 20,000 rows and two million cells.
 
-    Parameters
-    ----------
-    path
-        The file.
-    scene
-        Scene whose loads and sizes say which magnitudes are plausible.
-    columns, units
-        Columns and units that the user states, by name of the quantity (fx, ..., or t for the time).
+    `columns` and `units` are stated by the user, by name of the quantity (fx, ..., or t for the time). The scene's
+    loads and sizes say which magnitudes are plausible.
 
     Raises
     ------

@@ -31,10 +31,8 @@ class Sent:
         Number of the journal entry before each message (rising), and kind of the message.
     done : ndarray of int64, shape (k,)
         Number of advances up to each entry of the series.
-    first
-        Sequence number of the first entry.
-    advances
-        Number of advances in the series.
+    first, advances
+        Sequence number of the first entry, and number of advances.
     """
 
     def __init__(self, sequence: Indexes, kind: Indexes, done: Indexes, first: int, advances: int) -> None:

@@ -93,14 +93,8 @@ def unit_doubts(
 ) -> list[UnitDoubt]:
     """Return the numbers that seem to be in a unit other than SI.
 
-    Parameters
-    ----------
-    values
-        Measured numbers by role and name, such as ("excitation", "fx"); NaN where missing.
-    load_stamps_s
-        Stamps of the load [s].
-    scene
-        Scene whose loads and sizes determine which magnitudes are plausible.
+    `values` are measured numbers by role and name, such as ("excitation", "fx"), NaN where missing; `load_stamps_s` are
+    the stamps of the load [s]. The scene's loads and sizes say which magnitudes are plausible.
     """
     magnitudes = {key: _usual_magnitude(np.asarray(found, float)) for key, found in values.items()}
     load = [values["excitation", name] for name in ("fx", "fy", "m") if ("excitation", name) in values]

@@ -153,22 +153,14 @@ class Walker:
 
 
 class JournalWalk:
-    """Pass the journal of a run through walkers of its scene and of other scenes.
+    """Pass the journal of a run through walkers of its scene (`own`) and of other scenes (`others`).
 
     `used` and `late` count samples; a late sample is sorted in unless the walkers have passed its stamp. `missing`
     counts missing entries; after each gap a new part of the motion begins.
 
-    Parameters
-    ----------
-    own
-        Walkers that take over the state in the journal after a loss, and after wear was set.
-    others
-        Walkers that keep their own states.
-    whole
-        Whether the journal begins with the run; otherwise its first snapshot is restored.
-    same_scene
-        Whether `own` have the scene of the run. Then they apply changes of the model and restored motions, and
-        measurements if their twin follows these.
+    The walkers `own` take over the state in the journal after a loss, and after wear was set. If `same_scene` is set,
+    their scene is that of the run: they also apply changes of the model and restored motions, and measurements if their
+    twin follows these. Unless the journal is `whole`, its first snapshot is restored.
     """
 
     def __init__(

@@ -53,25 +53,12 @@ class _Part:
 
 
 class RunWriter:
-    """Write entries and outputs in the order of the calls.
+    """Write entries and outputs in the order of the calls; the arguments are as for `Recorder`.
 
     Journal and outputs have separate chunks; the chunk of entries precedes the chunk of the outputs sent after them.
 
     Every method may raise `OSError` (disk full). After a failed write or `flush`, the file is complete up to the
     previous flush and can be continued; after any other failed method only `abandon` may be called.
-
-    Parameters
-    ----------
-    folder
-        Folder to make; an existing folder must be empty.
-    header
-        Scene and settings of the run.
-    chunk_size
-        Bytes [B] of journal and outputs at which their chunks are closed.
-    min_free_bytes
-        Free space on the disk [B] below which `shortage` returns a text.
-    sync
-        Whether each flush and the start and end of each part wait for the disk.
     """
 
     def __init__(

@@ -83,14 +83,8 @@ class Policy:
 class Driver:
     """Feed a session from live events and return the publications.
 
-    Times are arguments: `now_ns` is on a steady clock, and stamps are on the clock of the samples.
-
-    Parameters
-    ----------
-    session, intake, policy
-        The session to drive, the judge of the samples, and the rules for silence and failures.
-    every_sample : bool
-        Publish after each advance; otherwise only `due` publishes.
+    Times are arguments: `now_ns` is on a steady clock, and stamps are on the clock of the samples. With `every_sample`,
+    each advance is published; otherwise only `due` publishes.
     """
 
     def __init__(self, session: Session, intake: Intake, policy: Policy, *, every_sample: bool = True) -> None:

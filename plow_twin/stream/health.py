@@ -57,13 +57,7 @@ class DurationHistogram:
 
 
 class Periods:
-    """Times between the turns of a loop: mean, standard deviation and maximum, and the number of missed periods.
-
-    Parameters
-    ----------
-    period_s
-        Nominal period of the loop [s].
-    """
+    """Times between the turns of a loop, and the number of missed periods."""
 
     def __init__(self, period_s: float) -> None:
         self._period_s = period_s

@@ -23,10 +23,7 @@ SNAPSHOTS: Final = 100
 class History:
     """Snapshots at intervals, with the samples and speeds since the oldest snapshot.
 
-    Parameters
-    ----------
-    span_ns
-        Time kept before the newest sample [ns]; 0: nothing is kept.
+    Everything older than `span_ns` [ns] before the newest sample is forgotten; with 0 nothing is kept.
     """
 
     def __init__(self, span_ns: int) -> None:

@@ -300,13 +300,8 @@ class Session:
     def apply_samples(self, samples: Sequence[Sample], *, each: bool = False) -> Applied:
         """Emit and apply one of the `parts` of samples; the result does not depend on the division into parts.
 
-        Parameters
-        ----------
-        samples : sequence of Sample
-            At least one sample.
-        each : bool
-            Whether to publish after each sample, or once after late samples. Otherwise `outputs` sums the samples up
-            for the next publication.
+        With `each`, each sample is published, or late samples together; otherwise `outputs` sums the samples up for the
+        next publication.
 
         Raises
         ------
@@ -332,19 +327,9 @@ class Session:
     def apply_series(self, stamps: NDArray[np.int64], wrench: NDArray[np.float64], *, each: bool) -> Series | None:
         """Apply samples together without emitting entries; the caller journals the series.
 
-        Parameters
-        ----------
-        stamps : ndarray of int64, shape (n,)
-            Rising stamps [ns]; the first is not late.
-        wrench : ndarray, shape (n, 3)
-            Fx, Fy [N] and M [N m] at each stamp, finite.
-        each : bool
-            As for `apply_samples`.
-
-        Returns
-        -------
-        Series or None
-            None, with nothing changed, if the samples must be applied one by one, for example because an advance fails.
+        The stamps, shape (n,) [ns], rise and the first is not late; the wrenches, shape (n, 3), are finite; `each` is
+        as for `apply_samples`. Returns None, with nothing changed, if the samples must be applied one by one, for
+        example because an advance fails.
         """
         if self.stamp_ns is None or self.held or self._travels or not (self.outputs.is_clear or not each):
             return None
@@ -384,10 +369,8 @@ class Session:
 
         Parameters
         ----------
-        stamps : ndarray of int64, shape (n,)
-            Stamps that never fall [ns]; the first is not late.
-        wrench : ndarray, shape (n, 3)
-            Fx, Fy [N] and M [N m] at each stamp.
+        stamps, wrench : ndarray, shapes (n,) and (n, 3)
+            Stamps that never fall [ns], of which the first is not late, and Fx, Fy [N] and M [N m] at each stamp.
         rows : ndarray of `ROW`, shape (n,), or None
             Receives the rows; with None, rows are neither made nor published.
         taken : ndarray of int64
