@@ -31,7 +31,7 @@ def error_scale(scene: Scene) -> tuple[float, float, float]:
 
 
 def reference_poses(name: str) -> tuple[Array, float]:
-    """Return the reference poses (n, 3) over 20 s and the interval of their rows in s."""
+    """Return the reference poses (n, 3) over 20 s and their interval in s."""
     fine = FINE_REFERENCE / f"bench_{name}.npz"
     path, dt = (fine, 1e-3) if fine.exists() else (ROOT / "test" / "data" / f"bench_{name}.npz", 1e-2)
     with np.load(path) as archive:

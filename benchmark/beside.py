@@ -2,8 +2,8 @@
 
     python benchmark/beside.py COMMIT [--rounds 5]
 
-Each round starts a process in a worktree of the commit and a process in this checkout, in alternating order. A process
-warms up, repeats each case and reports its fastest time. The medians over the rounds and their ratio are written to
+Each round starts a process in a worktree of the commit and a process in this checkout. A process warms up, repeats each
+case and reports its fastest time. The medians over the rounds and their ratio are written to
 benchmark/results/beside.md.
 """
 
@@ -61,7 +61,7 @@ print(json.dumps(found))
 
 
 def measure(tree: Path, cache: str) -> dict[str, float]:
-    """Return the time of each case in s, measured in a separate process."""
+    """Return the time of each case in s, measured in a process of its own."""
     environment = os.environ | {"PYTHONPATH": str(tree), "NUMBA_CACHE_DIR": cache}
     done = subprocess.run(
         [sys.executable, "-c", _WORK, str(tree)], cwd=tree, env=environment, capture_output=True, text=True, check=True
@@ -71,7 +71,6 @@ def measure(tree: Path, cache: str) -> dict[str, float]:
 
 
 def table(commit: str, now: list[dict[str, float]], before: list[dict[str, float]]) -> str:
-    """Return the medians and their ratio as a table."""
     lines = []
     for case in now[0]:
         old, new = (1e3 * statistics.median(times[case] for times in rounds) for rounds in (before, now))

@@ -47,8 +47,8 @@ class Row:
     steps: int | None = None
     evaluations: int | None = None
     events: int | None = None
-    #: the figure of the row's section: number of members beyond the listed error, multiple of real time, share of a
-    #: core, error in tolerances, ratio of times, or number of compiled kernels
+    #: figure of the section: members beyond the listed error, multiple of real time, share of a core, error in
+    #: tolerances, ratio of times, or number of compiled kernels
     value: float | None = None
     #: factor by which a small displacement at t = 0 grows, in the random scenes and the ensemble
     amplification: float | None = None
@@ -79,8 +79,8 @@ def measure(
 ) -> list[Row]:
     """Run every case once, then the chosen cases in turn, up to `repeats` runs each.
 
-    Runs in turn spread a change of the machine's speed over all cases. `choose` returns the indices of the cases on
-    which a figure depends; without it, all cases are chosen.
+    Turns spread a change of the machine's speed over all cases. `choose` returns the indices of the cases on which a
+    figure depends; without it, all cases are chosen.
     """
     rows = [case.row for case in cases]
     ready: dict[int, Callable[[], Sample]] = {}

@@ -1,9 +1,8 @@
 """Time and memory of `compare` over a month: `python benchmark/compare_month.py FOLDER`.
 
-With `--hours 0.5 --rate 100 --verb analyse` it measures `analyse` over many short runs.
-
-Ten minutes are computed once, and each day's run repeats them with its own stamps. The memory depends on the number of
-windows, which does not depend on the sampling rate.
+With `--hours 0.5 --rate 100 --verb analyse` it measures `analyse` over many short runs. Ten minutes are computed once,
+and each day's run repeats them with its own stamps. The memory depends on the number of windows, not on the sampling
+rate.
 """
 
 from __future__ import annotations
@@ -58,7 +57,6 @@ def write_days(folder: Path, days: int, hours: float, rate_hz: float) -> None:
 
 
 def _heights() -> np.ndarray:
-    """Return the amplitude of the load in each of its periods."""
     return np.random.default_rng(1).normal(1.0, 0.08, len(np.arange(0.0, 2.0 * _SPAN_S, np.pi)))
 
 
@@ -70,7 +68,6 @@ def _heights() -> np.ndarray:
 @click.option("--verb", type=click.Choice(["compare", "analyse"]), default="compare", show_default=True)
 @click.option("--workers", default=1, show_default=True)
 def main(folder: Path, days: int, hours: float, rate: float, verb: str, workers: int) -> None:
-    """Write the runs, and compare them by day or analyse them."""
     write_days(folder, days, hours, rate)
     runs = [str(folder / f"day_{day:02}") for day in range(days)]
     command = [sys.executable, "-m", "plow_twin", verb, *runs, "--workers", str(workers), "--quiet"]

@@ -22,7 +22,6 @@ _LIBRARIES = [
 
 
 def program() -> str:
-    """Return the compiled program, or raise `NotInstalled`."""
     try:
         return compile_c("cvode_bench.c", _LIBRARIES)
     except NotInstalled as problem:
@@ -34,7 +33,7 @@ def version() -> str:
 
 
 def prepare(p: Array, law: str, method: str, roots: bool, rtol: float, output_dt: float) -> Callable[[], Sample]:
-    """Prepare one setting; each call starts a process, which measures the time of its run without the start."""
+    """Prepare one setting; each call starts a process, which measures its own time."""
     executable = program()
     numbers = " ".join(repr(float(number)) for number in p)
 

@@ -33,7 +33,6 @@ PERTURBATION = 1e-8
 
 
 def clearance_pairs(columns: int, rows: int, name: str = "kv") -> list[Scene]:
-    """Return bench scenes with horizontal and vertical clearances over 20..30 mm."""
     scene = bench_scene(name)
     return [
         dataclasses.replace(scene, clearance=Clearance(float(gx), float(gy)))
@@ -136,7 +135,7 @@ def _member_errors(scenes: Sequence[Scene], q: Array, exact: Array) -> Array:
 
 
 def _amplification(scenes: Sequence[Scene], exact: Array) -> Array:
-    """Return the larger growth of two displacements at t = 0, along x and along theta."""
+    """Return the larger growth of a displacement along x and of one along theta."""
     growth = np.zeros(len(scenes))
     for axis in (0, 2):
         moved = []
@@ -157,7 +156,6 @@ def _member_row(scene: Scene, tol: float, error: float, growth: float) -> Row:
 
 
 def _heyoka_rows(name: str, scenes: Sequence[Scene], exact: Array, notify: Notify) -> Iterator[Row]:
-    """Yield rows of heyoka in batches from loose to tight tolerances, until all pairs are within `LISTED`."""
     pairs = np.array([[scene.clearance.horizontal_m, scene.clearance.vertical_m] for scene in scenes])
     for tol in _BATCH_TOLERANCES:
         notify(f"ensemble heyoka in batches tol={tol:g}")

@@ -18,7 +18,6 @@ from cases import Array, Sample
 
 
 def _force_function(sx: int, sy: int, p: Array, esym: Any) -> Callable[..., Any]:
-    """Return the force of one corner on the head's marker as a function of symbolic place and velocity."""
     k, n, c = (float(number) for number in p[8:11])
     far_x, far_y = 0.5 * float(p[0] + p[2]), 0.5 * float(p[1] + p[3])
     zero = esym.Real(0.0)

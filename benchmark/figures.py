@@ -98,7 +98,6 @@ def missed() -> str:
 
 
 def random_scenes() -> str:
-    """Return for each tolerance the largest error of the random scenes that amplify little."""
     rows = [verdict for verdict in targets.verdicts(solver_rows()) if "random scenes" in verdict.work]
     asked = [re.search(r"tol=([\d.e-]+)", row.work) for row in rows]
     texts = [row.measured.replace("worst", "largest").replace(" 0 failed", " no scene failed") for row in rows]
@@ -106,8 +105,6 @@ def random_scenes() -> str:
 
 
 def stored(name: str) -> Callable[[], str]:
-    """Return a function that makes a Markdown table of a CSV file of results."""
-
     def shown() -> str:
         with (RESULTS / f"{name}.csv").open(newline="", encoding="utf-8") as file:
             head, *lines = csv.reader(file)

@@ -62,7 +62,7 @@ _UNKNOWN_NOISE = 3e-4
 
 @kernel(entry=True)
 def move(params, parts, states, saved, work, totals, times, wrench, rows, pace):  # type: ignore[no-untyped-def]
-    """Choose the contact modes of all members and advance them; the arrays are those of `advance_rows`."""
+    """Choose the contact modes of all members and advance them."""
     marks = np.zeros(0, np.int64)
     for m in range(states.size):
         settle_modes(params[m], states[m], parts.terms.stick)
@@ -115,7 +115,7 @@ class Members:
         wrench = ends * unknown[:, None, 4:7] / self._masses
         result = np.zeros((len(out), 1), ROW)
         pace = new_record(PACE)
-        pace.slice = 2**62  # all work is one slice
+        pace.slice = 2**62  # so large that all work is one slice
         move(
             self._params, self._parts, states, new_records(STATE, 1), self._work, self._totals, np.array([end]), wrench,
             result, pace,

@@ -23,7 +23,6 @@ from plow_twin.estimate.forces import ForceEnsemble
 @click.option("--seed", default=7000, show_default=True, help="First seed.")
 @click.option("--members", default=256, show_default=True)
 def main(group: str, truths: int, seed: int, members: int) -> None:
-    """Estimate truths, advance the ensemble under samples at 1 kHz, and compare its forces with the true forces."""
     for number in range(seed, seed + truths):
         truth = draw(GROUPS[group], number)
         found = estimate(truth.nominal, truth.load, truth.poses)

@@ -24,7 +24,7 @@ _GX, _GY = 8, 9
 
 
 def _pairs(p: Array, state: Sequence[Any], hy: Any) -> list[tuple[Any, ...]]:
-    """Return for each pair (see `lean`) the penetration, its rate, and the wrench in body axes of a force of 1 N."""
+    """Return for each pair the penetration, its rate, and the wrench in body axes of a force of 1 N."""
     a, b, far_x, far_y = 0.5 * p[0], 0.5 * p[1], 0.5 * (p[0] + hy.par[_GX]), 0.5 * (p[1] + hy.par[_GY])
     x, y, th, vx, vy, om = state
     c, s = hy.cos(th), hy.sin(th)

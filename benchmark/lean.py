@@ -9,7 +9,7 @@ from typing import Any, Final
 from cases import Array
 from numba import njit
 
-#: numba's decorators, typed as returning callables, which numba's own types do not
+#: numba's decorators with types of our own: those of numba do not declare compiled functions as callable.
 compiled: Final[Callable[[Any], Any]] = njit
 fast: Final[Callable[[Any], Any]] = njit(fastmath=True)
 inlined: Final[Callable[[Any], Any]] = njit(inline="always", fastmath=True)

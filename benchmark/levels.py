@@ -33,7 +33,7 @@ _NEAR = 1.4
 
 @dataclass(frozen=True)
 class Reached:
-    """The time in ms in which a solver reaches an error, with the setting or the two settings between which it lies."""
+    """The time in ms in which a solver reaches an error, with its setting or the two settings around it."""
 
     wall_ms: float
     solver: str
@@ -41,7 +41,6 @@ class Reached:
 
 
 def ladders(rows: Sequence[Row], scene: str, output_s: float, member: Member) -> list[list[Row]]:
-    """Return the rows of each solver of a group, with the loosest setting first."""
     found: dict[str, list[Row]] = {}
     for row in rows:
         if row.section == SECTION and row.scene == scene and row.output_s == output_s and member(row.solver):
@@ -66,7 +65,6 @@ def reach(ladder: Sequence[Row], level: float) -> Reached | None:
 
 
 def fastest(rows: Sequence[Row], scene: str, output_s: float, level: float, member: Member) -> Reached | None:
-    """Return the time of the fastest solver of a group for an error of at most `level`."""
     times = [reach(ladder, level) for ladder in ladders(rows, scene, output_s, member)]
     return min((time for time in times if time is not None), key=lambda time: time.wall_ms, default=None)
 

@@ -161,7 +161,7 @@ class Probe:
 
 @contextmanager
 def running(answerer: list[str]) -> Iterator[tuple[Probe, int]]:
-    """Start an answering process and wait for its first answer; yield a probe and the process id."""
+    """Start an answering process; yield a probe and the process id after the first answer."""
     probe = Probe()
     process = subprocess.Popen(answerer, env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
@@ -180,7 +180,7 @@ def source(rate_hz: float, seconds: float) -> subprocess.Popen[bytes]:
 
 
 def measure(answerer: list[str], rate_hz: float, seconds: float) -> dict[str, float]:
-    """Run an answering process at a rate; return samples sent, used and lost, its CPU time and the ages of messages."""
+    """Run an answering process; return samples sent, used and lost, its CPU time and the ages of messages."""
     with running(answerer) as (probe, process_id):
         sender, ages, figures = source(rate_hz, seconds), probe.ages, probe.figures
         try:
@@ -208,7 +208,6 @@ def measure(answerer: list[str], rate_hz: float, seconds: float) -> dict[str, fl
 
 
 def _quantiles(ages: list[float], without: Any = math.nan) -> dict[str, Any]:
-    """Return the median and the 99 % point of ages, or `without` if there are none."""
     found = sorted(ages)
     return {f"age_p{p}_ms": round(found[len(found) * p // 100], 3) if found else without for p in (50, 99)}
 
@@ -225,7 +224,6 @@ def _twin(mode: str, folder: str, namespace: str = "/live_load", given: dict[str
 
 
 def estimating(seconds: float, repeats: int) -> None:
-    """Print CPU time and age without and with the estimate in turn, then the medians."""
     runs: dict[bool, list[dict[str, float]]] = {False: [], True: []}
     for _ in range(repeats):
         for on, found in runs.items():
@@ -272,7 +270,6 @@ def _children(process_id: int) -> list[int]:
 
 
 def compare(seconds: float, repeats: int) -> None:
-    """Print each run when it ends, then the medians of all cases, and the targets with the results."""
     runs: dict[Case, list[dict[str, float]]] = {case: [] for case in CASES}
     with tempfile.TemporaryDirectory() as folder:
         for repeat in range(repeats):
@@ -307,7 +304,6 @@ def _targets(rows: dict[Case, dict[str, float]]) -> Iterator[tuple[str, float, f
 
 
 def beside(seconds: float) -> None:
-    """Print CPU time, ages and ratios of the echo, the node and a recording node under the same samples."""
     from sensor_msgs.msg import JointState
 
     probe, cases = Probe(), {"echo": ECHO, "on_sample": ON_SAMPLE, "recording": RECORDED}
@@ -420,7 +416,6 @@ def _growth(minutes: list[float], sizes: list[float]) -> tuple[float, float]:
 
 
 def _account(figures: dict[str, str]) -> dict[str, int]:
-    """Return how many of the messages sent were used, dropped for a reason, and lost."""
     dropped = sum(int(value) for key, value in figures.items() if key.startswith("dropped_"))
     return {
         "used": int(figures.get("samples_used", 0)),

@@ -60,7 +60,6 @@ def _one_twin(scene: Scene, t: Array, wrench: Array, repeats: int) -> Row:
 
 
 def _many_twins(scene: Scene, t: Array, wrench: Array, samples: int) -> float:
-    """Return the time in s of all twins, which differ in stiffness, if each call has `samples` samples."""
     contacts = [
         dataclasses.replace(scene.contact, stiffness=scene.contact.stiffness * (1.0 + i / TWINS)) for i in range(TWINS)
     ]

@@ -138,7 +138,6 @@ def summary(rows: list[dict[str, Any]]) -> str:
 @click.option("--seed", default=1000, show_default=True, help="First seed.")
 @click.option("--out", type=click.Path(path_type=Path), default=RESULTS / "lives.jsonl", show_default=True)
 def main(lives: int, seed: int, out: Path) -> None:
-    """Run the lives; each is written as soon as it is done, and lives in the file are not run again."""
     rows = load_rows(out)
     for number in range(seed, seed + lives):
         if any(row["seed"] == number for row in rows):

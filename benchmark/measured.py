@@ -129,7 +129,6 @@ class Impacts:
 
 
 def errors(missed: np.ndarray) -> dict[str, Any]:
-    """Return the RMS and the median of errors in m/s."""
     return {"rms": round(float(np.sqrt((missed**2).mean())), 4), "median": round(float(np.median(missed)), 4)}
 
 
@@ -185,8 +184,8 @@ def drumwright_shell(slip, rate, tt, nn, tn, e, mu):  # type: ignore[no-untyped-
     away, along = (tn * slip - tt * rate) / determinant, (tn * rate - nn * slip) / determinant
     slides = np.abs(along) > mu * away
     side = np.sign(along)
-    # on the edge of the friction cone, along (side mu, 1), the impulse leaves the least energy or stops the approach,
-    # whichever is larger
+    # on the edge of the friction cone, along (side mu, 1), the larger impulse counts: the one that leaves the least
+    # energy, or the one that stops the approach
     least = -(side * mu * slip + rate) / (tt * mu**2 + 2.0 * side * mu * tn + nn)
     stopped = -rate / (nn + tn * mu * side)
     away = np.where(slides, np.maximum(least, stopped), away)
@@ -194,7 +193,7 @@ def drumwright_shell(slip, rate, tt, nn, tn, e, mu):  # type: ignore[no-untyped-
 
 
 def anitescu_potra_newton(slip, rate, tt, nn, tn, e, mu):  # type: ignore[no-untyped-def]
-    """Return impulses of the complementarity problem, both components scaled by Newton's restitution."""
+    """Return the impulses of `newton` without restitution, times 1 + e."""
     along, away = newton(slip, rate, tt, nn, tn, 0.0, mu)  # type: ignore[no-untyped-call]
     return (1.0 + e) * along, (1.0 + e) * away
 
@@ -230,7 +229,6 @@ RIGID = {
 
 
 def by_law(impacts: Impacts) -> dict[str, Any]:
-    """Return the errors of each law with each friction, all parameters fitted, and of extensions of one law."""
     found: dict[str, Any] = {"any impulse at the point": impacts.floor()}
     for name, model in RIGID.items():
         found[f"rigid: {name}"] = impacts.rigid(model)
@@ -486,7 +484,6 @@ def of_drops(drops: Drops) -> dict[str, Any]:
 
 
 def of_table(drops: Drops) -> dict[str, Any]:
-    """Return figures of the estimated height of the table in each drop, with a prior of 5 mm."""
     square, rng = load_scene("measured_square"), np.random.default_rng(1)
     marks = dict(square.marks)
     marks["clearance.vertical_m"] = replace(marks["clearance.vertical_m"], deviation=0.01)
@@ -539,7 +536,6 @@ def of_heights(drops: Drops) -> dict[str, Any]:
 
 
 def plot(results: dict[str, Any], drops: Drops) -> None:
-    """Draw errors by law, a drop with its band, and coverage by bounce."""
     import matplotlib
 
     matplotlib.use("Agg")

@@ -149,7 +149,6 @@ def summary(rows: list[dict[str, Any]]) -> str:
 @click.option("--day-km", default=75.0, show_default=True, help="Travel along the face in a day: 300 passes of 250 m.")
 @click.option("--out", type=click.Path(path_type=Path), default=RESULTS / "month.jsonl", show_default=True)
 def main(truths: int, seed: int, day_km: float, out: Path) -> None:
-    """Run the months; each is written as soon as it is done, and months in the file are not run again."""
     rows = [row for row in load_rows(out) if row["day_m"] == 1e3 * day_km]
     for number in range(seed, seed + truths):
         if any(row["seed"] == number for row in rows):

@@ -14,7 +14,7 @@ FLAGS = ("-O3", "-march=native", "-std=gnu11", "-Wall")
 
 
 class NotInstalled(Exception):
-    """A program or library that a peer needs is missing; the message names it."""
+    """A program or library that a peer needs is missing."""
 
 
 def compile_c(source: str, libraries: Sequence[str], flags: Sequence[str] = FLAGS) -> str:

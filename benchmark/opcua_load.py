@@ -166,7 +166,6 @@ def _live(
 
 @contextmanager
 def _server(rate_hz: float, seconds: float) -> Iterator[tuple[subprocess.Popen[str], int]]:
-    """Run a server in a process; yield the process and the port of the server."""
     with socket.socket() as found:
         found.bind(("127.0.0.1", 0))
         port = int(found.getsockname()[1])

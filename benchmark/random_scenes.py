@@ -38,7 +38,7 @@ _KINDS = {"kelvin_voigt": 0, "hunt_crossley": 1, "exact_restitution": 2}
 
 @dataclass(frozen=True)
 class ReferenceRun:
-    """A reference trajectory: poses `q` (rows, 3), whether the run was completed, and its cost."""
+    """A reference trajectory with poses `q` (rows, 3), and its cost."""
 
     q: NDArray[np.float64]
     finished: bool

@@ -103,7 +103,7 @@ def restitution_laws() -> list[str]:
 
 
 def valid_ranges(rows: Sequence[Row]) -> str:
-    """Return the ranges of the nominal restitution (> 0) in which the delivered restitution is within 5 % of it."""
+    """Return the ranges of the nominal restitution (> 0) in which the law is valid."""
     inside = [row.asked > 0.0 and abs(row.delivered / row.asked - 1.0) <= VALID for row in rows]
     edges = np.flatnonzero(np.diff([False, *inside, False])).reshape(-1, 2)
     parts = [
@@ -137,7 +137,6 @@ def ratio_table(rows: Sequence[Row]) -> str:
 
 
 def ramp_table(rows: Sequence[Row]) -> str:
-    """Return delivered restitutions of the ramped law by damping ratio (columns) and length of the ramp."""
     ratios = [row.asked for row in rows if row.law == "kelvin_voigt"]
     lines = []
     for ramp in RAMPS:
@@ -147,7 +146,6 @@ def ramp_table(rows: Sequence[Row]) -> str:
 
 
 def draw(rows: Sequence[Row], path: Path) -> None:
-    """Draw the delivered restitution against the nominal one, and the line on which both are equal."""
     import matplotlib
 
     matplotlib.use("Agg")

@@ -1,6 +1,6 @@
 """Measure run time against error of this solver and its peers; write the table, the picture and the pages' figures.
 
-`make bench` is one run. All rows are measured on one core unless a row says otherwise.
+`make bench` is one run. Rows are measured on one core unless they say otherwise.
 """
 
 from __future__ import annotations

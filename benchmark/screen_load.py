@@ -33,7 +33,6 @@ threading.Event().wait()
 
 
 def measured(pages: int, seconds: float) -> dict[str, float]:
-    """Return the shares of one core [%] that the feed of the twin and the server take."""
     rows = np.zeros(1, ROW)
     with Screen(PageAccess("127.0.0.1", 0), facts_of(load_scene(scene_path("paper")), {}, "")) as screen:
         screen.feed._load = lambda: np.zeros(3)

@@ -25,7 +25,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Ratio:
-    """Target to be at least `times` as fast as a group of peers at equal error."""
+    """Target to be `times` as fast as a group of peers at equal error."""
 
     scene: str
     output_s: float
@@ -65,7 +65,6 @@ IDLE_SHARE = 0.01
 
 
 def verdicts(rows: Sequence[Row]) -> Iterator[Verdict]:
-    """Yield a verdict on every target for which there are rows."""
     for ratio in RATIOS:
         yield from _of_ratio(rows, ratio)
     yield from _of_ensemble(rows)

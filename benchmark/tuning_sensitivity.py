@@ -117,7 +117,6 @@ def summary(name: str, factor: float, rows: list[dict[str, Any]]) -> str:
 
 
 def table() -> str:
-    """Return all tuned numbers with their meaning, the data on which they were set, and their effect."""
     rows = load_rows(FILE)
     count = {group: sum(row["group"] == group and row["name"] != "" for row in rows) for group in CASES}
     varied_in = ", ".join(f"`{group}` {number}" for group, number in count.items() if number)
@@ -142,7 +141,6 @@ def _short(value: tuning.Value) -> str:
 @click.option("--case", "cases", multiple=True, type=click.Choice(CASES), help="Only these truths.")
 @click.option("--out", type=click.Path(path_type=Path), default=FILE, show_default=True)
 def main(numbers: tuple[str, ...], cases: tuple[str, ...], out: Path) -> None:
-    """Vary the numbers and write one line of JSON for each estimate."""
     done = {(row["group"], row["name"], row["factor"]) for row in load_rows(out)}
     warm_up(draw(replace(GROUPS["plain"], periods=1.0), 0).nominal)
     for group in cases or CASES:

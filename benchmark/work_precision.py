@@ -201,7 +201,6 @@ def located_cases(scene_name: str) -> Iterator[Case]:
 
 
 def multibody_cases(scene_name: str) -> Iterator[Case]:
-    """Yield cases of MuJoCo and Exudyn, which write rows at each step or every 1 ms."""
     p = constants(bench_scene(scene_name))
     for integrator, steps in _MUJOCO.items() if scene_name == "kv" else ():
         for dt in steps:

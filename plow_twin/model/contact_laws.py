@@ -20,7 +20,7 @@ from plow_twin.errors import ArgumentError
 #: Below this value of 1 - e, rounding dominates the residual of the exact law. D is then computed from the first two
 #: terms of its series.
 _NEARLY_ELASTIC: Final = 1e-5
-#: Largest D = lambda v0. Without a limit, D would be infinite at a restitution of 0.
+#: Largest D = lambda v0. The D of some laws is infinite at a restitution of 0.
 DAMPING_NUMBER_CAP: Final = 1e3
 
 
@@ -108,17 +108,12 @@ class ContactLaw:
         return self.number_of is not None
 
     def damping_number(self, restitution: float) -> float:
-        """Return D = lambda v0 of the law for a nominal restitution.
+        """Return D = lambda v0 [1] of the law for a nominal restitution, at most `DAMPING_NUMBER_CAP`.
 
         Parameters
         ----------
         restitution : float
             Coefficient of restitution [1], 0 to 1.
-
-        Returns
-        -------
-        float
-            D [1], at most `DAMPING_NUMBER_CAP`.
 
         Raises
         ------

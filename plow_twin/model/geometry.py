@@ -61,17 +61,7 @@ _ARC_SIDES = 6
 def outline(sides: NDArray[np.float64], radius: float) -> NDArray[np.float64]:
     """Return the closed outline of a rectangle with rounded corners about the origin, clockwise from the top left.
 
-    Parameters
-    ----------
-    sides : ndarray, shape (2,)
-        Width and height.
-    radius : float
-        Radius of the corners in the same unit; 0 for sharp corners.
-
-    Returns
-    -------
-    ndarray, shape (n, 2)
-        Points of the outline; the last repeats the first.
+    `sides`, shape (2,), are width and height, in the unit of `radius`. The outline has shape (n, 2).
     """
     angles = np.linspace(math.pi, 0.5 * math.pi, _ARC_SIDES + 1 if radius > 0.0 else 1)
     points = []
@@ -99,7 +89,7 @@ def wall_distances(scene: Scene) -> NDArray[np.float64]:
 
 
 def _along_normal(scene: Scene) -> NDArray[np.float64]:
-    """Return n . p of each pair without its constant, as coefficients of c, s, X, Y, for a head that carries walls."""
+    """Return the coefficients of n . p without its constant, shape (4, 8), for a head that carries walls."""
     corner_x, corner_y = corner_positions(scene)
     return np.array(
         [NORMAL_X * corner_x + NORMAL_Y * corner_y, NORMAL_X * corner_y - NORMAL_Y * corner_x, -NORMAL_X, -NORMAL_Y]
@@ -107,7 +97,7 @@ def _along_normal(scene: Scene) -> NDArray[np.float64]:
 
 
 def _along_tangent(scene: Scene) -> NDArray[np.float64]:
-    """Return t . p of each pair without its constant, as coefficients of c, s, X, Y, for a head that carries walls."""
+    """Return the coefficients of t . p without its constant, shape (4, 8), for a head that carries walls."""
     corner_x, corner_y = corner_positions(scene)
     return np.array(
         [NORMAL_X * corner_y - NORMAL_Y * corner_x, -NORMAL_Y * corner_y - NORMAL_X * corner_x, NORMAL_Y, -NORMAL_X]
@@ -138,7 +128,7 @@ def _of_places(scene: Scene, rows: NDArray[np.float64]) -> NDArray[np.float64]:
 def _of_arms(scene: Scene, rows: NDArray[np.float64]) -> NDArray[np.float64]:
     """Adapt rows of an arm about G, made for a head that carries walls, to the head of the scene, and return them.
 
-    The arm of a head that carries corners does not depend on the position of the head.
+    The arm of a carried corner does not depend on the position of the head.
     """
     if scene.head.carries == "corners":
         rows[0] *= -1.0

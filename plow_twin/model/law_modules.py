@@ -16,10 +16,7 @@ _loaded: list[str] = []
 def load_laws(names: Iterable[str]) -> None:
     """Import modules that call `add_law`, so that this process knows their laws.
 
-    Parameters
-    ----------
-    names : iterable of str
-        For each module, the path of a file that ends in .py, or the name of an installed module.
+    A name is the path of a file that ends in .py, or the name of an installed module.
 
     Raises
     ------

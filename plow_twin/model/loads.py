@@ -46,22 +46,16 @@ class Pieces:
 
 @dataclass(frozen=True)
 class LoadSet:
-    """The sum of all loads of a scene.
+    """The sum of all loads of a scene."""
 
-    constant : ndarray, shape (3,)
-        Sum of the constant wrenches: Fx, Fy in N, M in N m.
-    omega : ndarray, shape (h,)
-        Distinct angular frequencies in rad/s.
-    sine, cosine : ndarray, shape (h, 3)
-        Amplitudes of sin(omega t) and cos(omega t) in N, N, N m.
-    pieces : Pieces or None
-        Sum of the tables, or None without tables.
-    """
-
+    #: sum of the constant wrenches: Fx, Fy in N, M in N m, shape (3,)
     constant: Array
+    #: distinct angular frequencies in rad/s, shape (h,)
     omega: Array
+    #: amplitudes of sin(omega t) and cos(omega t) in N, N, N m, shape (h, 3)
     sine: Array
     cosine: Array
+    #: sum of the tables
     pieces: Pieces | None
 
     def at(self, t: Array) -> Array:

@@ -529,19 +529,7 @@ def fastest_travel(wear: Wear | None, contact: Contact) -> float:
 
 
 def check_travel_speed(scene: Scene, speed_m_s: float) -> None:
-    """Check that a twin of the scene can run at a speed along the face.
-
-    Parameters
-    ----------
-    scene : Scene
-    speed_m_s : float
-        Speed in m/s, of either sign.
-
-    Raises
-    ------
-    ArgumentError
-        The speed is not finite, or a force would wear a pad faster than it moves the head.
-    """
+    """Raise an `ArgumentError` if a twin of the scene cannot run at a speed along the face in m/s, of either sign."""
     fastest = fastest_travel(scene.wear, scene.contact)
     if not math.isfinite(speed_m_s):
         raise ArgumentError(f"speed_m_s: got {speed_m_s!r}, expected a finite speed in m/s")

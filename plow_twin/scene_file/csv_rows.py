@@ -22,12 +22,7 @@ MOST_COLUMNS: Final = 10_000
 def open_csv(path: Path) -> IO[str]:
     """Open a CSV file as text without its byte order mark, or a Parquet file as lines of CSV.
 
-    Raises
-    ------
-    OSError
-        The file cannot be opened.
-    csv.Error, ExcessError
-        As for `check_text` and `ParquetLines`.
+    The errors are `OSError`, and those of `check_text` and `ParquetLines`.
     """
     if is_parquet(path):
         return io.TextIOWrapper(io.BufferedReader(ParquetLines(path)), encoding="utf-8", errors="replace", newline="")
@@ -56,12 +51,8 @@ _OTHERS: Final = {
 
 
 def check_text(begin: bytes) -> None:
-    """Check that a file that begins with these bytes can be CSV.
-
-    Raises
-    ------
-    csv.Error
-        The file is UTF-16 (the "Unicode text" of spreadsheets), a workbook, or compressed.
+    """Raise a `csv.Error` for a file that begins as UTF-16 (the "Unicode text" of spreadsheets), a workbook, or
+    compressed.
     """
     for first, kind in _OTHERS.items():
         if begin.startswith(first):

@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 SUFFIX: Final = ".parquet"
-#: Number of rows that are converted at once.
 _ROWS: Final = 4096
 #: Largest number of rows per byte of a file. Compression lets a few bytes hold any number of rows.
 _MOST_PER_BYTE: Final = 100
@@ -24,7 +23,7 @@ _ALWAYS: Final = 1_000_000
 _LARGEST_COLUMN: Final = 2**29
 #: Largest number of columns.
 _MOST_COLUMNS: Final = 10_000
-#: Longest text in the file's metadata [B].
+#: Longest text in the metadata [B].
 _LONGEST_TEXT: Final = 2**24
 
 
@@ -38,10 +37,6 @@ class ParquetLines(io.RawIOBase):
 
     Numbers keep all their digits. Times are written in UTC, times without a zone as they are. A cell without a value is
     empty. Columns of lists, structures or bytes are left out.
-
-    Parameters
-    ----------
-    path
 
     Raises
     ------

@@ -22,14 +22,8 @@ Samples = tuple[NDArray[np.float64], NDArray[np.float64]]
 def read_table(path: Path, columns: Sequence[str] | None = None, key: str = "file") -> Samples:
     """Read times, shape (n,) [s], and wrenches, shape (n, 3) [N, N, N m], from a CSV file with a header line.
 
-    Parameters
-    ----------
-    path : Path
-        The file; lines that start with `#` are skipped.
-    columns : sequence of str, optional
-        Column names of time, Fx, Fy and M; by default `t` (or `time`), `fx`, `fy`, `m`.
-    key : str
-        Name of the file in messages.
+    `columns` are the names of time, Fx, Fy and M, by default `t` (or `time`), `fx`, `fy`, `m`. Lines that start with
+    `#` are skipped. Messages call the file `key`.
 
     Raises
     ------

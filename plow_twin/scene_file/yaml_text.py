@@ -120,7 +120,7 @@ def _excess(text: str, most_values: float) -> Problem | None:
     """Return the problem of a document whose events exceed a bound, or None; YAML errors are raised."""
     scalar = _Size()
     values = repeated = 0
-    sizes: dict[str, _Size | None] = {}  # by anchor; None until the node ends
+    sizes: dict[str, _Size | None] = {}  # size of each anchored node; None until the node ends
     outer, is_mapping, anchor = _Size(), False, None
     stack: list[tuple[_Size, bool, str | None]] = []  # size, kind and anchor of the outer collections
     event: Any
