@@ -16,9 +16,10 @@ from plow_twin.estimate.estimate import summarise
 from plow_twin.estimate.fit import fit, link_weights
 from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.result import Interval, State
-from plow_twin.estimate.unknowns import GX, LEAST_CLEARANCE, MOVING, Unknowns
+from plow_twin.estimate.unknowns import GAIN, GX, LEAST_CLEARANCE, MOVING, SIZE, SOFTNESS, Unknowns
 from plow_twin.estimate.verdict import Verdict
 from plow_twin.kernel.low_pass import lagged
+from plow_twin.model.scene import Scene
 
 
 def test_links_have_the_weight_of_white_noise_of_acceleration() -> None:
@@ -86,6 +87,30 @@ def test_a_clearance_at_its_bound_is_not_observable() -> None:
         result = summarise(problem, one, Verdict(broken=True), 0)
         assert result.horizontal_state is state and result.vertical_state is State.ESTIMATED
     assert result.horizontal.p95 - result.horizontal.p05 > 5e-3
+
+
+def test_a_change_without_effect_on_the_motion_has_no_derivative() -> None:
+    """Mass, inertia, stiffness and load larger by the same share change nothing; steps of a fit leave a quarter."""
+    truth = draw(replace(GROUPS["plain"], periods=3.0), 2)
+    unknowns, share = Unknowns(truth.nominal), 1e-5
+    forward = Forward(truth.nominal, truth.load)
+    problem, found = search.candidate(forward, unknowns, truth.poses, truth.load.period()) or (None, None)
+    assert problem is not None and found is not None
+    point, step = found.point, np.zeros(SIZE)
+
+    def heavier(scene: Scene) -> Scene:
+        head = scene.head
+        inertia, mass = head.inertia_kg_m2 * (1.0 + share), head.mass_kg * (1.0 + share)
+        return replace(scene, head=replace(head, inertia_kg_m2=inertia, mass_kg=mass))
+
+    stiffer = unknowns.stiffness_of(float(point.shared[SOFTNESS])) * (1.0 + share)
+    step[SOFTNESS] = unknowns.softness_of(stiffer) - point.shared[SOFTNESS]
+    step[GAIN] = share * point.shared[GAIN]
+    moved = problem.evaluate(point.shared, point.states, change=heavier)
+    assert moved is not None
+    by_mass = np.nan_to_num(moved.predicted - point.predicted)
+    left = by_mass + problem.with_fine_steps().linearise(point).rows[:, :, :SIZE] @ step
+    assert (np.linalg.norm(left, axis=0) < 0.02 * np.linalg.norm(by_mass, axis=0)).all()
 
 
 @pytest.mark.parametrize(("group", "least", "most"), [("plain", 3, 4), ("noisy", 8, 11)])

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Final
 
@@ -66,7 +66,10 @@ class Graded:
     Attributes
     ----------
     shared, covariance : ndarray, shape (SIZE,), (SIZE, SIZE)
-        The shared unknowns and their covariance.
+        The shared unknowns and their covariance. If the fit passes all checks, they belong to a machine that differs
+        from the scene only as in the fit.
+    clearance, clearance_deviation : ndarray, shape (2,)
+        The clearances in m, and their standard deviations, if the machine may differ in any quantity.
     differs : dict of str to (float, float, float)
         For each further quantity, the probability that it differs from the scene, and mean and standard deviation of
         the difference.
@@ -78,19 +81,17 @@ class Graded:
         Mean square of the differences in units of their prior deviations, at least 1.
     harmonics : Harmonics, optional
         The harmonics that were added to the load, if any.
-    unseen : ndarray, shape (2,)
-        Deviation of the clearances in m due to differences that the motion neither shows nor excludes, beside
-        `covariance`; zero if `covariance` includes them.
     """
 
     shared: Array
     covariance: Array
+    clearance: Array
+    clearance_deviation: Array
     differs: dict[str, tuple[float, float, float]]
     load: Array
     inflation: Array
     surprise: float
     harmonics: Harmonics | None = None
-    unseen: Array = field(default_factory=lambda: np.zeros(2))
 
 
 def graded(problem: Problem, found: Fit, doubtful: bool = False, seed: int = 0) -> Graded:
@@ -110,32 +111,36 @@ def graded(problem: Problem, found: Fit, doubtful: bool = False, seed: int = 0) 
     numpy.linalg.LinAlgError
         If the equations cannot be solved.
     """
+    problem = problem.with_fine_steps()
+    found = replace(found, linear=problem.linearise(found.point))
     columns, pushes = _columns(problem, found)
     linear = _Linearised(problem, found, columns, pushes)
     for rounds in _ROUNDS:
         linear.learn(rounds)
         linear.temper()
     linear.eliminate()
-    mean, covariance, often, exact = linear.averaged(np.random.default_rng(seed))
+    mean, covariance, often = linear.averaged(np.random.default_rng(seed), tuning.DIFFERS[int(doubtful)])
     surprise, named = linear.surprise(mean, often), linear.named(mean, often)
-    free = linear.free()
-    if doubtful or not exact:
-        # if the machine differs, every quantity may differ
-        mean, covariance = free
-        surprise = max(surprise, linear.surprise(mean, np.ones(len(often))))
-    # mean square about `mean` if every quantity may differ
-    square = np.diag(free[1])[[GX, GY]] + (free[0] - mean)[[GX, GY]] ** 2
-    widened = max(1.0, linear.scatter()) * surprise
-    unseen = np.sqrt(widened * np.maximum(square - np.diag(covariance)[[GX, GY]], 0.0))
-    covariance = covariance * widened
-    harmonics = problem.harmonics and problem.harmonics.moved(mean[linear.waves], np.diag(covariance)[linear.waves])
-    step, covariance = mean[:SIZE], covariance[:SIZE, :SIZE]
-    covariance += np.diag((tuning.BENT * step) ** 2)
     share, exponent, _ = named.get("contact.exponent", (0.0, 0.0, 0.0))
     bent = tuning.BENT_BY_EXPONENT * share * exponent**2
     unexplained = tuning.UNEXPLAINED * math.sqrt(float(linear.inflation.mean()) - 1.0)
-    covariance[[GX, GY], [GX, GY]] += bent**2 + unexplained**2
-    return Graded(found.shared + step, covariance, named, linear.load, linear.inflation, surprise, harmonics, unseen)
+    ratio = max(1.0, linear.scatter()) * surprise
+
+    def widened(step: Array, covariance: Array) -> Array:
+        """Return the covariance of the shared unknowns, with the errors of the linearised step."""
+        out: Array = ratio * covariance[:SIZE, :SIZE] + np.diag((tuning.BENT * step[:SIZE]) ** 2)
+        out[[GX, GY], [GX, GY]] += bent**2 + unexplained**2
+        return out
+
+    clearance = (found.shared + mean[:SIZE])[[GX, GY]]
+    deviation = np.sqrt(np.diag(widened(mean, covariance))[[GX, GY]])
+    if not doubtful:
+        mean, covariance = linear.exact()
+    harmonics, variance = problem.harmonics, ratio * np.diag(covariance)
+    return Graded(
+        found.shared + mean[:SIZE], widened(mean, covariance), clearance, deviation, named, linear.load,
+        linear.inflation, surprise, harmonics and harmonics.moved(mean[linear.waves], variance[linear.waves]),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,8 +168,8 @@ def _columns(problem: Problem, found: Fit) -> tuple[dict[str, _Column], Array]:
 
     scene, depth = problem.unknowns.scene, problem.unknowns.penetration_of(float(found.shared[SOFTNESS]))
     out: dict[str, _Column] = {}
-    for path, step in STATED.items():
-        deviation = deviation_of(scene, path)
+    for path, coarse in STATED.items():
+        deviation, step = deviation_of(scene, path), problem.steps * coarse
         change = partial(_moved, path=path, step=step, depth=depth)
         column = by(step, change=change) if deviation > 0.0 else None
         if column is not None:
@@ -174,9 +179,9 @@ def _columns(problem: Problem, found: Fit) -> tuple[dict[str, _Column], Array]:
         # at small angles a rounded corner acts like sides that are shorter by twice its radius
         out["corner_radius"] = _Column(ROUNDING, -2.0 * (sides[0] + sides[1]))
     for wall, pads in zip(("left", "right", "top", "bottom"), WALLS, strict=True):
-        share, name = np.ones(PAIR_COUNT), f"stiffness_{wall}"
-        share[list(pads)] += _WALL_STEP
-        column = by(_WALL_STEP, share=share)
+        share, name, step = np.ones(PAIR_COUNT), f"stiffness_{wall}", problem.steps * _WALL_STEP
+        share[list(pads)] += step
+        column = by(step, share=share)
         if column is not None:
             out[name] = _Column(UNSTATED[name], column)
     held, columns, prior = problem.differences.any(), problem.by_differences(point), deviations()
@@ -191,7 +196,8 @@ def _columns(problem: Problem, found: Fit) -> tuple[dict[str, _Column], Array]:
         for index, name in enumerate(problem.harmonics.names):
             out[name] = _Column(tuning.LACKING, columns[:, :, index], float(values[index]))
     size = np.ptp(problem.forward.load.wrench, axis=0) / 2.0
-    pushes = [by(_PUSH_STEP, push=_PUSH_STEP * push) for push in np.diag(np.maximum(size, 1e-3 * size.max()))]
+    step = problem.steps * _PUSH_STEP
+    pushes = [by(step, push=step * push) for push in np.diag(np.maximum(size, 1e-3 * size.max()))]
     return out, np.stack([np.zeros_like(point.rate) if push is None else push for push in pushes], axis=2)
 
 
@@ -318,19 +324,24 @@ class _Linearised:
             square = float((column[known] ** 2).mean())
             self.inflation[index] = max(1.0, square / usual) * _lasting(column, self._swing, square)
 
-    def free(self) -> tuple[Array, Array]:
-        """Return mean and covariance of the border's unknowns if every quantity may differ."""
-        covariance = np.linalg.inv(self._normal)
-        return covariance @ self._score, covariance
+    def exact(self) -> tuple[Array, Array]:
+        """Return mean and covariance of the border's unknowns if only the quantities that the fit includes differ."""
+        return self._of(self._held)
 
-    def averaged(self, rng: np.random.Generator) -> tuple[Array, Array, Array, bool]:
-        """Return the draws' mean and covariance, how often each quantity differs, and whether the scene may be exact.
+    def _of(self, differs: NDArray[np.bool_]) -> tuple[Array, Array]:
+        """Return mean and covariance if some quantities differ, and the others have their values in the scene."""
+        size, use = len(self._precision), np.append(np.arange(SIZE), SIZE + np.flatnonzero(differs))
+        mean, covariance = np.zeros(size), np.zeros((size, size))
+        inverse = np.linalg.inv(self._normal[np.ix_(use, use)])
+        mean[use], covariance[np.ix_(use, use)] = inverse @ self._score[use], inverse
+        return mean, covariance
 
-        The scene may be exact if it is exact in any draw. A quantity that the fit includes always differs.
+    def averaged(self, rng: np.random.Generator, prior: float) -> tuple[Array, Array, Array]:
+        """Return the draws' mean and covariance, and how often each quantity differs.
+
+        `prior` is the prior probability that a quantity differs. A quantity that the fit includes always differs.
         """
-        count, size = len(self._held), len(self._precision)
-        differs, log_precision = self._held.copy(), np.log(self._precision)
-
+        size, log_precision = len(self._precision), np.log(self._precision)
         known: dict[bytes, float] = {}
 
         def evidence(which: NDArray[np.bool_]) -> float:
@@ -339,13 +350,14 @@ class _Linearised:
                 use = np.append(np.arange(SIZE), SIZE + np.flatnonzero(which))
                 lower = np.linalg.cholesky(self._normal[np.ix_(use, use)])
                 half = np.linalg.solve(lower, self._score[use])
-                odds = which.sum() * np.log(tuning.DIFFERS / (1.0 - tuning.DIFFERS))
+                odds = which.sum() * np.log(prior / (1.0 - prior))
                 inside = np.log(np.diag(lower)).sum()
                 known[key] = float(0.5 * half @ half - inside + 0.5 * log_precision[use].sum() + odds)
             return known[key]
 
-        now, exact = evidence(differs), False
-        mean, second, often, counted = np.zeros(size), np.zeros((size, size)), np.zeros(count), _SWEEPS - _BURNT
+        differs, counted = self._held.copy(), _SWEEPS - _BURNT
+        now = evidence(differs)
+        mean, second, often = np.zeros(size), np.zeros((size, size)), np.zeros(len(differs))
         for sweep in range(_SWEEPS):
             for index in rng.permutation(np.flatnonzero(~self._held)):
                 other = differs.copy()
@@ -353,18 +365,13 @@ class _Linearised:
                 instead = evidence(other)
                 if np.log(rng.random()) < instead - now:
                     differs, now = other, instead
-                exact |= sweep >= _BURNT and bool((differs == self._held).all())
             if sweep >= _BURNT:
-                use = np.append(np.arange(SIZE), SIZE + np.flatnonzero(differs))
-                inverse = np.linalg.inv(self._normal[np.ix_(use, use)])
-                step = np.zeros(size)
-                step[use] = inverse @ self._score[use]
-                second[np.ix_(use, use)] += inverse
-                second += np.outer(step, step)
+                step, covariance = self._of(differs)
+                second += covariance + np.outer(step, step)
                 mean += step
                 often += differs
         mean /= counted
-        return mean, second / counted - np.outer(mean, mean), often / counted, exact
+        return mean, second / counted - np.outer(mean, mean), often / counted
 
     def scatter(self) -> float:
         """Return the variance from the swings' scatter relative to that from noise, averaged over `MOVING`."""

@@ -376,9 +376,12 @@ def with_bounced(result: Estimate, bounced: Bounced, spent: int) -> Estimate:
 
 
 def _with_apparent(result: Estimate, apparent: tuple[Interval, ...]) -> Estimate:
-    """Return an estimate with other apparent clearances, and with the same uncertainty of the frame beside them."""
+    """Return an estimate with other apparent clearances, and with the same differences of the frame beside them."""
     horizontal, vertical = (
-        Interval.normal(new.mean, math.hypot(new.deviation, math.sqrt(max(value.deviation**2 - old.deviation**2, 0.0))))
+        Interval.normal(
+            value.mean + new.mean - old.mean,
+            math.hypot(new.deviation, math.sqrt(max(value.deviation**2 - old.deviation**2, 0.0))),
+        )
         for value, old, new in zip((result.horizontal, result.vertical), result.in_scene_frame(), apparent, strict=True)
     )
     return replace(
@@ -556,13 +559,12 @@ def _state(withdrawn: bool, observed: bool, rough: bool = False) -> State:
     return known if observed else State.NOT_OBSERVABLE
 
 
-def _unseen(fit: Fit, beside: Graded | None) -> Array:
-    """Return the deviation of the clearances in m due to differences that the motion does not show, shape (2,).
+def _unseen(fit: Fit) -> Array:
+    """Return the deviation of the clearances in m due to turns of walls with a pad that is never touched, shape (2,).
 
-    If the head touches only one pad of a wall, the wall's turn is one of them; to the linearised fit the other pad is a
-    bound at which the turn may end.
+    To the linearised fit this pad is a bound at which the turn may end.
     """
-    square = np.zeros(2) if beside is None else beside.unseen**2
+    square = np.zeros(2)
     seconds = fit.point.contact.sum(axis=0)
     for side, pads in _SIDES.items():
         if seconds[list(pads)].min() < tuning.TOUCHED:
@@ -665,8 +667,12 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
         covariance = beside.covariance
         covariance[[GX, GY], [GX, GY]] += _between_optima(unknowns, shared) ** 2
     rough = beside is not None and (suspect or not finished or bool(verdict.lacking))
-    unseen = _unseen(fit, beside)
     deviation = np.sqrt(np.diag(covariance))
+    published, spread = shared[[GX, GY]], deviation[[GX, GY]]
+    if beside is not None:
+        published = np.maximum(beside.clearance, LEAST_CLEARANCE)
+        spread = np.hypot(beside.clearance_deviation, _between_optima(unknowns, shared))
+    spread = np.hypot(spread, _unseen(fit))
     reasons = verdict.model + verdict.sensor + ([verdict.lacking] if verdict.lacking else [])
     if not finished and not suspect:
         gain = f"the cost would still fall by {fit.gain_left:.0f}, expected at most {tuning.OUTLYING**2:g}"
@@ -691,7 +697,7 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
         observed = tested and touched > tuning.TOUCHED and shared[index] > LEAST_CLEARANCE
         observed &= deviation[index] < (2.0 * tuning.OBSERVED if rough else tuning.OBSERVED) and (finished or rough)
         apparent.append(Interval.normal(shared[index], deviation[index]))
-        value = Interval.normal(shared[index], math.hypot(deviation[index], unseen[index]))
+        value = Interval.normal(published[index], spread[index])
         if not observed:
             value = _unobserved(unknowns, deviation, index, least[index], fit.noise)
         clearances.append(value.above(0.0))
@@ -712,7 +718,9 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
         sensor="suspect" if verdict.sensor else "ok",
         reasons=tuple(reasons),
         lost=lost,
-        apparent=(apparent[0], apparent[1]) if unseen.any() and all(state.known for state in states) else None,
+        apparent=(apparent[0], apparent[1])
+        if all(state.known for state in states) and not np.allclose(spread, deviation[[GX, GY]])
+        else None,
         load_harmonics=None if beside is None else beside.harmonics,
         groups=_groups(
             problem, fit, float(np.sqrt(alone[GX, GX] / plain[GX, GX])), states, untested, shared, covariance - alone

@@ -14,6 +14,7 @@ Optimization, ch. 10; Huber, Robust Statistics, ch. 7; Tremolet, Q. J. R. Meteor
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from copy import copy
 from dataclasses import dataclass, replace
 from itertools import chain, pairwise
 from typing import Final
@@ -52,6 +53,10 @@ DIFFERENCES: Final = ("turn_left", "turn_right", "turn_top", "turn_bottom", "lev
 DIFFERENCE_STEPS: Final = np.array([2e-4, 2e-4, 2e-4, 2e-4, 1e-3, 1e-3, 4e-6])
 #: Step: for the difference quotients with respect to the amplitude of a harmonic, in units of half the load's range.
 _HARMONIC_STEP = 5e-3
+#: Step: factor on the steps above and on those of `QUANTITIES` for derivatives that must be accurate. The steps
+#: themselves average over the motion's kinks, which a search needs, but their curvature looks like information about
+#: changes without effect (mass, inertia, stiffness and load larger by the same share).
+_FINE = 1.0 / 300.0
 #: Derived: smallest number of rows of a swing; two rows of three numbers would just determine the six numbers of the
 #: swing's start.
 FEWEST_OF_SWING = 4
@@ -239,12 +244,20 @@ class Problem:
         self.mean, self.deviation = prior or (unknowns.nominal(), unknowns.deviations())
         self.differences = np.zeros(len(DIFFERENCES)) if differences is None else differences
         self.drift, self.harmonics = drift, harmonics
+        #: factor on the steps of the difference quotients
+        self.steps = 1.0
         self.link = np.zeros((0, 6, 6)) if drift is None else link_weights(np.diff(window.starts)[:-1], drift)
         self._memory: Memory | None = None
         self._columns: tuple[Point | None, Array] = None, np.zeros(0)
         self._waves: tuple[Point | None, Array] = None, np.zeros(0)
         self._scene: tuple[bytes, Scene] = b"", unknowns.scene
         self._at: _Rows | None = None
+
+    def with_fine_steps(self) -> Problem:
+        """Return the same problem with accurate derivatives."""
+        fine = copy(self)
+        fine.steps, fine._columns, fine._waves = _FINE, (None, np.zeros(0)), (None, np.zeros(0))
+        return fine
 
     def evaluate(
         self, shared: Array, states: Array, differences: Array | None = None, push: Array | None = None,
@@ -352,12 +365,13 @@ class Problem:
         """Return the Jacobians of the prediction and of the ends of the swings."""
         rows, ends = np.zeros((len(point.residual), 3, SIZE + OWN)), np.zeros((len(point.defect), 6, SIZE + OWN))
         # the derivatives with respect to states and gains come first, because they need the scene of the point itself
-        together = self._evaluate(point.shared, point.states + np.diag(_DISPLACED)[:, None])
+        displaced = self.steps * _DISPLACED
+        together = self._evaluate(point.shared, point.states + np.diag(displaced)[:, None])
         for j in range(6):
             if together is not None:
-                found = _by_state(point, together[j], j, _DISPLACED[j])
+                found = _by_state(point, together[j], j, displaced[j])
             else:
-                found = self._quotient_by_state(point, j)
+                found = self._quotient_by_state(point, j, displaced[j])
             rows[:, :, SIZE + j], ends[:, :, SIZE + j] = found
         for j in reversed(MOVING):
             if j != DAMPING or self.unknowns.damped:
@@ -381,7 +395,7 @@ class Problem:
         if self._columns[0] is not point:
             out = np.zeros((*point.residual.shape, len(DIFFERENCES)))
             resolved = self.window.poses.interval() <= RESOLVING
-            for index, step in enumerate(DIFFERENCE_STEPS[: None if resolved else LAG]):
+            for index, step in enumerate(self.steps * DIFFERENCE_STEPS[: None if resolved else LAG]):
                 moved = self.differences.copy()
                 moved[index] += step
                 other = self.evaluate(point.shared, point.states, moved)
@@ -398,19 +412,20 @@ class Problem:
         if self._waves[0] is not point:
             load, size = harmonics.moved(-harmonics.amplitude).added(self.forward.load), harmonics.amplitude.size
             out = np.zeros((*point.residual.shape, size))
-            here = self.evaluate(point.shared, point.states, load=load)
+            here, step = self.evaluate(point.shared, point.states, load=load), self.steps * _HARMONIC_STEP
             for index, one in enumerate(np.eye(size).reshape(size, *harmonics.amplitude.shape)):
-                wave = replace(harmonics, amplitude=_HARMONIC_STEP * one).at(load.t)
+                wave = replace(harmonics, amplitude=step * one).at(load.t)
                 moved = replace(load, wrench=load.wrench + wave)
                 other = self.evaluate(point.shared, point.states, load=moved)
                 if here is not None and other is not None:
-                    out[:, :, index] = np.nan_to_num((other.predicted - here.predicted) / _HARMONIC_STEP)
+                    out[:, :, index] = np.nan_to_num((other.predicted - here.predicted) / step)
             self._waves = point, out
         return self._waves[1]
 
     def _quotient(self, point: Point, index: int) -> tuple[Array, Array]:
         step = QUANTITIES[index].step
         assert step is not None, "it moves the head"
+        step *= self.steps
         for signed in (step, -step):
             moved = point.shared.copy()
             moved[index] += signed
@@ -422,8 +437,8 @@ class Problem:
                 return np.nan_to_num((point.residual - other.residual) / change), (point.defect - other.defect) / change
         return np.zeros_like(point.residual), np.zeros_like(point.defect)
 
-    def _quotient_by_state(self, point: Point, index: int) -> tuple[Array, Array]:
-        for signed in (_DISPLACED[index], -_DISPLACED[index]):
+    def _quotient_by_state(self, point: Point, index: int, step: float) -> tuple[Array, Array]:
+        for signed in (step, -step):
             moved = point.states.copy()
             moved[:, index] += signed
             other = self.evaluate(point.shared, moved)
