@@ -1,4 +1,4 @@
-"""Time windows of a run, each about one load period long, with the load and quantities of each pair."""
+"""Time windows of a run, each about one load period long, with the load and the quantities of each pair."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.record.recording import Batched, Recording
 from plow_twin.record.run_time import RunTime
 from plow_twin.stream.outputs import CLEARANCE_NAMES, PAD_NAMES
+from plow_twin.stream.silences import Silences
 
 Array = NDArray[np.float64]
 Indexes = NDArray[np.int64]
 
-#: The quantities that each window has for each pair, with their units.
+#: Quantities of each pair in a window, with their units.
 QUANTITIES: Final[Mapping[str, str]] = {
     "peak": "N",
     "impacts": "1/min",
@@ -28,13 +29,11 @@ QUANTITIES: Final[Mapping[str, str]] = {
     "dissipation": "W",
     "wear": "m/h",
 }
-#: Duration [s], from the start of the load, that is searched for a period.
+#: Length of the start of a run in which the period of the load is searched [s].
 _PERIOD_SPAN_S: Final = 60.0
-#: Length of a window if the load has no period [s].
 _NO_PERIOD_S: Final = 10.0
-#: Smallest number of messages in a window, as a share of the number in a full window. A window with fewer messages,
-#: because the run ends or has a gap, is left out. No note is made if the lowest sample rate of the runs is at least
-#: this share of the highest.
+#: Smallest number of messages in a window, relative to a full window. Windows with fewer messages, at the end of a run
+#: or at a gap, are left out. Sample rates whose ratio is at least this number count as equal.
 FULL: Final = 0.9
 _PADS: Final = np.array([CLEARANCE_NAMES.index(name) for name in PAD_NAMES])
 _TOTALS: Final = np.array([CLEARANCE_NAMES.index(name) for name in ("horizontal", "vertical")])
@@ -42,37 +41,25 @@ _TOTALS: Final = np.array([CLEARANCE_NAMES.index(name) for name in ("horizontal"
 
 @dataclass
 class Windows:
-    """The n windows of a run.
+    """The n windows of a run."""
 
-    Attributes
-    ----------
-    start_ns : ndarray, shape (n,)
-        First stamp of each window [ns].
-    pairs : dict of str to ndarray, shape (n, 8)
-        `QUANTITIES`: largest force, impacts per minute, share of samples in contact, impulse and dissipated energy per
-        second, wear per hour.
-    load : ndarray, shape (n, 2)
-        Root mean square of the force [N] and of the moment [N m] of the load.
-    clearance : ndarray, shape (n, 2)
-        Horizontal and vertical clearance [m].
-    length_ns : ndarray, shape (n,)
-        Length of each window [ns].
-    rate_hz : ndarray, shape (n,)
-        Sample rate of the load [Hz].
-    silent : int
-        Number of windows left out because of a stretch without samples.
-    """
-
+    #: first stamp [ns], shape (n,)
     start_ns: Indexes
+    #: an array, shape (n, 8), for each of `QUANTITIES`
     pairs: dict[str, Array]
+    #: root mean square of the force [N] and of the moment [N m] of the load, shape (n, 2)
     load: Array
+    #: horizontal and vertical clearance [m], shape (n, 2)
     clearance: Array
+    #: length [ns], shape (n,)
     length_ns: Indexes
+    #: sample rate of the load [Hz], shape (n,)
     rate_hz: Array
+    #: number of windows left out because samples are missing
     silent: int = 0
 
     def chosen(self, which: NDArray[np.bool_]) -> Windows:
-        """Return the windows selected by a mask, shape (n,), without a copy if it selects all."""
+        """Return the windows selected by a mask, shape (n,); no copy is made if all are."""
         if which.all():
             return self
         return Windows(
@@ -101,7 +88,7 @@ class Windows:
 
 @dataclass
 class _Sums:
-    """Sums over the messages of each window, by window number."""
+    """Sums over the messages of each window, by the number of the window."""
 
     width: int
     rows: dict[int, Array] = field(default_factory=dict)
@@ -122,111 +109,136 @@ class _Sums:
 def windows_of(recording: Recording, window_s: float | None = None) -> Windows:
     """Return the windows of a run of plow_twin whose outputs were recorded.
 
-    Parameters
-    ----------
-    recording
-        The run.
-    window_s
-        Length of a window [s]; by default the period of the load, or 10 s if it has no period.
+    A window is `window_s` long; by default it is the period of the load, or 10 s without a period.
 
     Raises
     ------
     RecordingError
-        The recording is not a run of plow_twin or has no outputs, or each window has a stretch without samples.
+        The recording is not a run of plow_twin, has no outputs, or lacks samples in each window.
     """
-    window_ns = round(1e9 * (window_s or _load_period(recording)))
-    peak, moved, contact, load = _Sums(PAIR_COUNT), _Sums(2 * PAIR_COUNT), _Sums(2 * PAIR_COUNT + 1), _Sums(3)
-    slow, slow_count = _Sums(2), _Sums(1)
-    messages, silences, silent_ns = _Sums(1), RunTime(recording.header.parameters).silences, list[tuple[int, int]]()
-    touches: Array | None = None
-    newest: tuple[Indexes, Array] | None = None
-    pads: dict[int, tuple[Array, Array]] = {}
+    sums = _RunSums(round(1e9 * (window_s or _load_period(recording))), RunTime(recording.header.parameters).silences)
     for found in recording.batches("excitation", "contact_forces", "contact_peaks", "clearance"):
-        for part, name in ((part, name) for name, part in found.items() if len(part.stamp_ns)):
-            window = part.stamp_ns // window_ns
-            if (np.diff(window) < 0).any():
-                part, window = _risen(part, window)
-            if name == "excitation":
-                silent_ns += [(begin, end) for _, begin, end in silences.add(part.stamp_ns)]
-                force2, moment2 = (part.values[:, :2] ** 2).sum(axis=1), part.values[:, 2] ** 2
-                load.add(window, np.column_stack((force2, moment2, np.ones(len(window)))))
-            elif name == "contact_peaks":
-                total, impulse, largest = np.split(part.values, 3, axis=1)
-                before = total[:1] if touches is None else touches[None]
-                made = np.clip(np.diff(np.concatenate((before, total)), axis=0), 0.0, None)
-                touches = total[-1]
-                moved.add(window, np.hstack((made, impulse)))
-                peak.add(window, largest, np.maximum)
-                messages.add(window, np.ones((len(window), 1)))
-            elif name == "contact_forces":
-                stamps, power, in_contact = _powers(part, newest)
-                newest = part.stamp_ns[-1:], part.values[-1:]
-                step_s = np.diff(stamps) * 1e-9
-                near = (step_s < 0.1 * window_ns * 1e-9)[:, None]
-                work = np.where(near, 0.5 * (power[1:] + power[:-1]) * step_s[:, None], 0.0)
-                count = len(work)
-                ends = window[len(window) - count :]
-                contact.add(ends, np.hstack((work, in_contact[len(in_contact) - count :], np.ones((count, 1)))))
-            else:
-                slow.add(window, part.values[:, _TOTALS])
-                slow_count.add(window, np.ones((len(window), 1)))
-                for number in np.unique(window).tolist():
-                    rows = part.values[window == number][:, _PADS]
-                    pads[number] = (pads[number][0] if number in pads else rows[0], rows[-1])
-    for name, found_of in (("contact_peaks", messages), ("clearance", slow)):
-        if not found_of.rows:
+        for name, part in found.items():
+            if len(part.stamp_ns):
+                sums.add(name, part)
+    for name, part_of in (("contact_peaks", sums.messages), ("clearance", sums.clearance)):
+        if not part_of.rows:
             raise RecordingError(
                 f"{recording.path}: got no {name}, expected a run with outputs: plow-twin replay --write"
             )
-    full = FULL * float(np.median([row[0] for row in messages.rows.values()]))
-    # messages at the end of a silence describe the whole silence, so all windows that the silence touches are left out
-    known, silent = np.array(sorted(messages.rows)), set[int]()
-    for begin, end in silent_ns:
-        first, last = np.searchsorted(known, begin // window_ns), np.searchsorted(known, end // window_ns, side="right")
-        silent.update(known[first:last].tolist())
-    numbers = sorted(number for number, row in messages.rows.items() if row[0] >= full and number not in silent)
+    silent = sums.silent()
+    full = FULL * float(np.median([row[0] for row in sums.messages.rows.values()]))
+    numbers = sorted(number for number, row in sums.messages.rows.items() if row[0] >= full and number not in silent)
     if not numbers:
         raise RecordingError(
             f"{recording.path}: each window has a stretch without samples, expected some complete windows; "
             "samples further apart than excitation_timeout are such a stretch"
         )
-    seconds = window_ns * 1e-9
-    sums, touched = moved.of(numbers), contact.of(numbers)
-    squares = load.of(numbers)
-    grown = np.array([pads[number][1] - pads[number][0] if number in pads else np.zeros(8) for number in numbers])
-    return Windows(
-        np.array(numbers, np.int64) * window_ns,
-        {
-            "peak": peak.of(numbers),
-            "impacts": sums[:, :PAIR_COUNT] * 60.0 / seconds,
-            "in_contact": touched[:, PAIR_COUNT : 2 * PAIR_COUNT] / np.maximum(touched[:, -1:], 1.0),
-            "impulse": sums[:, PAIR_COUNT:] / seconds,
-            "dissipation": touched[:, :PAIR_COUNT] / seconds,
-            "wear": grown.reshape(-1, PAIR_COUNT) * 3600.0 / seconds,
-        },
-        np.sqrt(squares[:, :2] / np.maximum(squares[:, 2:], 1.0)),
-        _between(slow, slow_count, numbers),
-        np.full(len(numbers), window_ns, np.int64),
-        squares[:, 2] / seconds,
-        len(silent),
-    )
+    return sums.windows(numbers, len(silent))
+
+
+class _RunSums:
+    """Sums over a run by window, to which the messages of each topic are added batch by batch."""
+
+    def __init__(self, window_ns: int, silences: Silences) -> None:
+        self._window_ns, self._silences = window_ns, silences
+        self._silent_ns: list[tuple[int, int]] = []
+        self.messages, self.clearance, self._clearance_count = _Sums(1), _Sums(2), _Sums(1)
+        self._load, self._peak, self._moved = _Sums(3), _Sums(PAIR_COUNT), _Sums(2 * PAIR_COUNT)
+        self._contact = _Sums(2 * PAIR_COUNT + 1)
+        #: first and last wear depth of the pads
+        self._pads: dict[int, tuple[Array, Array]] = {}
+        #: cumulative number of impacts of each pair in the last message
+        self._impacts: Array | None = None
+        #: stamp and values of the last message of forces
+        self._newest: tuple[Indexes, Array] | None = None
+
+    def add(self, name: str, part: Batched) -> None:
+        """Add messages of a topic."""
+        window = part.stamp_ns // self._window_ns
+        if (np.diff(window) < 0).any():
+            part, window = _risen(part, window)
+        if name == "excitation":
+            self._silent_ns += [(begin, end) for _, begin, end in self._silences.add(part.stamp_ns)]
+            force2, moment2 = (part.values[:, :2] ** 2).sum(axis=1), part.values[:, 2] ** 2
+            self._load.add(window, np.column_stack((force2, moment2, np.ones(len(window)))))
+        elif name == "contact_peaks":
+            self._add_peaks(part, window)
+        elif name == "contact_forces":
+            self._add_forces(part, window)
+        else:
+            self.clearance.add(window, part.values[:, _TOTALS])
+            self._clearance_count.add(window, np.ones((len(window), 1)))
+            for number in np.unique(window).tolist():
+                rows = part.values[window == number][:, _PADS]
+                self._pads[number] = (self._pads[number][0] if number in self._pads else rows[0], rows[-1])
+
+    def _add_peaks(self, part: Batched, window: Indexes) -> None:
+        total, impulse, largest = np.split(part.values, 3, axis=1)
+        before = total[:1] if self._impacts is None else self._impacts[None]
+        made = np.clip(np.diff(np.concatenate((before, total)), axis=0), 0.0, None)
+        self._impacts = total[-1]
+        self._moved.add(window, np.hstack((made, impulse)))
+        self._peak.add(window, largest, np.maximum)
+        self.messages.add(window, np.ones((len(window), 1)))
+
+    def _add_forces(self, part: Batched, window: Indexes) -> None:
+        stamps, power, in_contact = _powers(part, self._newest)
+        self._newest = part.stamp_ns[-1:], part.values[-1:]
+        step_s = np.diff(stamps) * 1e-9
+        near = (step_s < 0.1 * self._window_ns * 1e-9)[:, None]
+        work = np.where(near, 0.5 * (power[1:] + power[:-1]) * step_s[:, None], 0.0)
+        count = len(work)
+        ends = window[len(window) - count :]
+        self._contact.add(ends, np.hstack((work, in_contact[len(in_contact) - count :], np.ones((count, 1)))))
+
+    def silent(self) -> set[int]:
+        """Return the windows that a silence touches: the message after a silence describes the whole silence."""
+        known, silent = np.array(sorted(self.messages.rows)), set[int]()
+        for begin, end in self._silent_ns:
+            first = np.searchsorted(known, begin // self._window_ns)
+            last = np.searchsorted(known, end // self._window_ns, side="right")
+            silent.update(known[first:last].tolist())
+        return silent
+
+    def windows(self, numbers: list[int], silent: int) -> Windows:
+        """Return the windows `numbers`."""
+        seconds = self._window_ns * 1e-9
+        sums, touched, squares = self._moved.of(numbers), self._contact.of(numbers), self._load.of(numbers)
+        pads = [self._pads.get(number, (0.0, np.zeros(PAIR_COUNT))) for number in numbers]
+        return Windows(
+            np.array(numbers, np.int64) * self._window_ns,
+            {
+                "peak": self._peak.of(numbers),
+                "impacts": sums[:, :PAIR_COUNT] * 60.0 / seconds,
+                "in_contact": touched[:, PAIR_COUNT : 2 * PAIR_COUNT] / np.maximum(touched[:, -1:], 1.0),
+                "impulse": sums[:, PAIR_COUNT:] / seconds,
+                "dissipation": touched[:, :PAIR_COUNT] / seconds,
+                "wear": np.array([end - begin for begin, end in pads]) * 3600.0 / seconds,
+            },
+            np.sqrt(squares[:, :2] / np.maximum(squares[:, 2:], 1.0)),
+            _between(self.clearance, self._clearance_count, numbers),
+            np.full(len(numbers), self._window_ns, np.int64),
+            squares[:, 2] / seconds,
+            silent,
+        )
 
 
 def _between(sums: _Sums, count: _Sums, numbers: list[int]) -> Array:
-    """Return the means of windows; a window without a message gets interpolated means."""
+    """Return the means of windows, interpolated for a window without a message."""
     known = sorted(sums.rows)
     means = sums.of(known) / count.of(known)
     return np.column_stack([np.interp(numbers, known, column) for column in means.T])
 
 
 def _risen(part: Batched, window: Indexes) -> tuple[Batched, Indexes]:
-    """Return the rows sorted by stamp; with late samples or clock steps, older stamps can come later."""
+    """Return the rows sorted by stamp: late samples and clock steps can bring older stamps later."""
     order = np.argsort(part.stamp_ns, kind="stable")
     return Batched(part.stamp_ns[order], part.values[order]), window[order]
 
 
 def _powers(part: Batched, newest: tuple[Indexes, Array] | None) -> tuple[Indexes, Array, Array]:
-    """Return stamps, power into each contact [W] and whether it has force; the row `newest` comes first."""
+    """Return stamps, power into each contact [W] and whether it has force, from the row `newest` on."""
     stamps, values = part.stamp_ns, part.values
     if newest is not None and newest[0][0] < stamps[0]:
         stamps, values = np.concatenate((newest[0], stamps)), np.concatenate((newest[1], values))
@@ -235,7 +247,6 @@ def _powers(part: Batched, newest: tuple[Indexes, Array] | None) -> tuple[Indexe
 
 
 def _load_period(recording: Recording) -> float:
-    """Return the period of the load in the first minute [s]."""
     stamps, wrench, span = list[Indexes](), list[Array](), 0.0
     for part in recording["excitation"].batches():
         stamps.append(part.stamp_ns)
