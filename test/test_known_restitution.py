@@ -6,10 +6,8 @@ A free point hits a wall; cases 1 and 2 of docs/known_answers.md.
 from __future__ import annotations
 
 import csv
-import importlib.util
 import math
 import sys
-from types import ModuleType
 
 import pytest
 from scenes import ROOT
@@ -18,6 +16,9 @@ from scipy.integrate import solve_ivp
 from plow_twin import Contact
 from plow_twin.model.contact_laws import LAWS, exact_damping_number
 
+sys.path.insert(0, str(ROOT / "benchmark"))
+import restitution
+
 # `DELIVERED` has the restitutions that each law delivers for the nominal restitutions `ASKED`, by published tables
 ASKED = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
 DELIVERED = {
@@ -25,18 +26,6 @@ DELIVERED = {
     "flores": (0.0694, 0.1555, 0.2562, 0.3629, 0.4704, 0.5773, 0.6832, 0.7885, 0.8939, 0.9468),
     "hunt_crossley": (0.5158, 0.5469, 0.5813, 0.6197, 0.6630, 0.7120, 0.7680, 0.8329, 0.9090, 0.9524),
 }
-
-
-def load_benchmark(name: str) -> ModuleType:
-    """Import a module of the benchmark folder, which is not a package."""
-    spec = importlib.util.spec_from_file_location(name, ROOT / "benchmark" / f"{name}.py")
-    assert spec is not None and spec.loader is not None
-    sys.modules[name] = module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-restitution = load_benchmark("restitution")
 
 
 @pytest.mark.parametrize("n", [1.0, 1.5, 2.2, 3.0])

@@ -8,16 +8,17 @@ see docs/known_answers.md.
 from __future__ import annotations
 
 import itertools
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import preset
-from test_known_restitution import load_benchmark
+from scenes import ROOT, preset
 
 from plow_twin import Clearance, Frame, Initial, simulate
 
-siconos = load_benchmark("siconos")
+sys.path.insert(0, str(ROOT / "benchmark"))
+import siconos
 
 
 def penetrations(y: float, theta: float) -> np.ndarray:
