@@ -89,7 +89,6 @@ def _print(study: PaperStudy, out: Path) -> None:
 
 
 def _print_row(console: Console, row: Row, difference: str) -> None:
-    """Print verdict and statement in a line, with numbers after them and texts below."""
     verdict = Text(f"{row.verdict.value:13}", _STYLES[row.verdict.value])
     if row.published_value is not None:
         figures = f"{row.published:>6} {row.computed:>8} {row.unit:2} {difference:>8}"

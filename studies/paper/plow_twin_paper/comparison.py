@@ -23,7 +23,7 @@ def all_rows(runs: PaperRuns) -> list[Row]:
 
 
 def one_run_rows(runs: PaperRuns, index: int) -> list[Row]:
-    """Return the rows of Figs 6 to 9 for one form of the head's rotation (see `Rotation`)."""
+    """Return the rows of Figs 6 to 9 for one form of the head's rotation."""
     assert runs.rotation is not None
     scene, result = runs.rotation.scenes[index], runs.rotation.results[index]
     return [*rows_motion.rows(scene, result), *rows_sets.rows(scene, result)]

@@ -17,7 +17,7 @@ from plow_twin_paper.values import FACE_T_END_S, MOMENTS, OMEGA_RAD_S, SENSE_NAM
 
 @dataclass(frozen=True)
 class Contradiction:
-    """A contradiction: its place in the paper, the paper's statement, and the number that decides about it."""
+    """A contradiction with its place in the paper and the number that decides about it."""
 
     source: str
     statement: str
@@ -61,8 +61,7 @@ def _zero_load(runs: PaperRuns) -> Contradiction:
 def _doubled(runs: PaperRuns) -> Contradiction:
     pair = int(runs.case.penetration.max(axis=0).argmax())
     depth = float(runs.case.penetration[:, pair].max())
-    # for a point that is `depth` outside a strip, the sum of the distances to the strip's two sides exceeds the strip's
-    # width by `excess`
+    # for a point `depth` outside a strip, the distances to its two sides exceed its width by `excess`
     width = runs.scene.frame.height_m + runs.scene.clearance.vertical_m
     excess = abs(-depth) + abs(width + depth) - width
     return Contradiction(

@@ -39,7 +39,7 @@ def fig06(runs: PaperRuns) -> Figure:
 
 
 def fig07(runs: PaperRuns) -> Figure:
-    """Force at each point by sense, with the published largest value and mean where the paper gives one."""
+    """Force at each point by sense, with the published largest value and mean."""
     letters, t = paper_sets.letters_of_pairs(runs.scene), runs.case.t
     table = force_table(runs.scene, runs.case)
     highest = 1.12e-3 * max([*(row["max"] for row in table.values()), *(force.value_n for force in FORCES)])
@@ -90,9 +90,9 @@ def fig09(runs: PaperRuns) -> Figure:
 
 
 def _close_up(runs: PaperRuns, sense: Sense) -> Figure:
-    """Forces of one sense over a period around the quoted times; below, the times at which each point carries force."""
+    """Forces of one sense over a period around the quoted times, and when each point carries force."""
     times = {moment: shown_time(moment.time_s, runs.t_end) for moment in MOMENTS if moment.sense == sense}
-    # a shorter run may end before some of the quoted times, so all times are moved back by the same amount
+    # a shorter run may end before some quoted times, so all move back by the same number of periods
     back = max(moment.time_s - time for moment, time in times.items())
     times = {moment: moment.time_s - back for moment in times}
     centre = 0.5 * (min(times.values()) + max(times.values()))
@@ -131,7 +131,7 @@ def _moved(back: float) -> str:
 
 
 def _bars(panel: Any, timeline: list[paper_sets.Hold], left: float) -> None:
-    """Draw the times at which each point carries force, one line for each point."""
+    """Draw when each point carries force, one line for each point."""
     for row, corner in enumerate(CORNERS):
         spans = [
             (hold.start_s, hold.duration_s)

@@ -16,7 +16,7 @@ from plow_twin_paper.values import CORNERS, FACE_MARKS, FACES, FIXED_M, GRID_M, 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: Colour and line style of each of the three forms of the head's rotation.
+#: Colour and line style of the three forms of the head's rotation.
 _FORMS: Final = (
     ("constant moment (paper)", "#333333", "-"),
     ("exact, I about the centre of mass", "#D55E00", "--"),
@@ -53,7 +53,7 @@ def _sweep(sweep: Sweep, along: str, fixed: str) -> Figure:
 
 
 def fig13(runs: PaperRuns) -> Figure:
-    """Force on each inner face over two periods, with the three contact states that the paper marks."""
+    """Force on each inner face over two periods, with the contact states that the paper marks."""
     run, end = runs.faces, float(runs.faces.t[-1])
     since = max(end - 2.0 * PERIOD_S, 0.0)
     rows = run.t >= since
@@ -76,7 +76,7 @@ def fig13(runs: PaperRuns) -> Figure:
 
 
 def _mark(panels: Any, found: tuple[float, float], text: str, level: int) -> None:
-    """Shade a span of time (start and length in s) in all panels, and name it above the first panel."""
+    """Shade a span (start and length in s) in all panels, and name it above the first."""
     for panel in panels:
         panel.axvspan(found[0], found[0] + found[1], color="#F0E442", alpha=0.85, linewidth=0.0)
     panels[0].annotate(
@@ -126,7 +126,7 @@ def _faces(runs: tuple[FaceRun, ...], along: str) -> Figure:
 
 
 def rotation_figure(rotation: Rotation) -> Figure:
-    """Poses of the first seconds and largest forces under the three forms of the head's rotation."""
+    """First seconds and largest forces under the three forms of the head's rotation."""
     with sheet(11.0, 6.6) as figure:
         grid = figure.add_gridspec(3, 2, width_ratios=(1.5, 1))
         labels = ("x [mm]", "y [mm]", "theta [mrad]")

@@ -1,7 +1,6 @@
 """A scene's run as a recording and as a rerun file, as the live node would leave them.
 
-Needs the extras `record` and `view`. The twin takes the scene's loads as samples joined by straight lines, so that the
-recording holds the load too.
+The twin takes the loads of the scene as samples joined by straight lines, so that the recording has the load too.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 #: Interval of the samples [s].
 SAMPLE_S: Final = 1e-3
-#: A message is written at every n-th sample. Its peaks cover all samples since the previous message.
+#: A message is written at every n-th sample; its peaks cover all samples since the last one.
 MESSAGE_EVERY: Final = 4
 _CHUNK_B: Final = 256 * 1024
 _MIN_FREE_B: Final = 64 * 1024 * 1024
@@ -38,7 +37,7 @@ _MIN_FREE_B: Final = 64 * 1024 * 1024
 
 @dataclass(frozen=True)
 class Recording:
-    """The files of a recorded run, and the pose of its head at the samples, shape (n, 3) at t, shape (n,)."""
+    """The files of a recorded run, and the pose of its head, shape (n, 3), at the samples t, shape (n,)."""
 
     mcap: Path
     rrd: Path
@@ -49,12 +48,10 @@ class Recording:
 def record(
     scene: Scene, t_end: float, folder: Path, on_progress: Callable[[float], object] = lambda share: None
 ) -> Recording:
-    """Run a scene, write `folder`/..._0.mcap and `folder`.rrd.
+    """Run a scene; write `folder`/..._0.mcap and `folder`.rrd.
 
     Raises
     ------
-    ModuleNotFoundError
-        One of the extras `record` and `view` is not installed.
     SolverError
         The motion could not be continued.
     RecordingError
@@ -78,13 +75,8 @@ def record(
     return Recording(writer.path, rrd, times, q)
 
 
-def _drive(
-    scene: Scene,
-    times: Array,
-    writer: RunWriter,
-    on_progress: Callable[[float], object],
-) -> Array:
-    """Feed the scene's loads to a twin, write its inputs and outputs, and return its poses, shape (n, 3)."""
+def _drive(scene: Scene, times: Array, writer: RunWriter, on_progress: Callable[[float], object]) -> Array:
+    """Feed the loads to a twin, write its inputs and outputs, and return its poses, shape (n, 3)."""
     from plow_twin.record.outputs import publication_messages
 
     header, sequence = writer.header, -1

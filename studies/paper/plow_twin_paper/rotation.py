@@ -1,8 +1,8 @@
 """The same scene with a constant moment of gravity, as in the paper, and as an exact rigid body.
 
-A centre of mass off the cavity's centre couples translation and rotation in the mass matrix; the paper omits this
-and keeps a constant moment -m g arm (its section 2). The equivalent offset is `com_offset_m = (arm, 0)`. The paper does
-not state the reference point of its inertia, so both readings are run.
+A centre of mass off the centre of the cavity couples translation and rotation in the mass matrix. The paper omits this
+coupling and keeps a constant moment -m g arm (its section 2). The equivalent offset is `com_offset_m = (arm, 0)`. The
+paper does not state the reference point of its inertia, so both readings are run.
 """
 
 from __future__ import annotations
@@ -18,13 +18,15 @@ from plow_twin.run.simulate import Result, simulate
 from plow_twin_paper import sets as paper_sets
 from plow_twin_paper.values import CORNERS, SENSE_NAMES
 
-#: Distance between two motions [m] above which they count as separated.
+#: Distance of two motions that count as separated [m].
 PARTED_M = 1e-3
 
 
 @dataclass(frozen=True)
 class Rotation:
-    """Three runs: constant moment; exact, with I about the centre of mass; exact, with I about the cavity's centre."""
+    """Three runs: constant moment; exact, with I about the centre of mass; exact, with I about the centre of the
+    cavity.
+    """
 
     scenes: tuple[Scene, Scene, Scene]
     results: tuple[Result, Result, Result]
@@ -32,7 +34,7 @@ class Rotation:
 
     @property
     def parted_s(self) -> float:
-        """Time in s from which the first two runs are more than `PARTED_M` apart, or NaN if they never are."""
+        """Time in s from which the first two runs are more than `PARTED_M` apart, NaN if they never are."""
         first, second = self.results[:2]
         apart = np.hypot(*(first.q - second.q)[:, :2].T) > PARTED_M
         return float(first.t[np.argmax(apart)]) if apart.any() else float("nan")
@@ -40,7 +42,7 @@ class Rotation:
 
 @dataclass(frozen=True)
 class RotationRow:
-    """One quantity of the three runs and its unit."""
+    """One quantity of the three runs."""
 
     what: str
     unit: str
@@ -49,12 +51,12 @@ class RotationRow:
     consistent_centre: float
 
     def change(self, value: float) -> float | None:
-        """Return the relative difference of a value from the constant moment's value, or None if the latter is zero."""
+        """Return the relative difference from the value with the constant moment, or None if that is zero."""
         return (value - self.constant) / abs(self.constant) if self.constant else None
 
 
 def rotation_scenes(scene: Scene, t_end: float, output_dt: float) -> Rotation | None:
-    """Run the scene with the three forms of rotation; return None if gravity has no arm or the inertia is too small."""
+    """Run the three forms of rotation; return None if gravity has no arm or the inertia is too small."""
     head, gravity = scene.head, scene.gravity
     offset = gravity.arm_m if head.rotation == "paper" else head.com_offset_m[0]
     about_centre = head.inertia_kg_m2 - head.mass_kg * offset**2

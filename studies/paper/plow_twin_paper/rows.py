@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
-#: Whether the scene's numbers were fitted to a row of the comparison.
+#: Whether the numbers of the scene were fitted to a row.
 FITTED: Final = "fitted to this"
 CHECK: Final = "not fitted to this"
 ASSUMED: Final = "not fitted to this; other clearance assumed 20 mm"
@@ -14,7 +14,7 @@ UNKNOWN: Final = "the scene does not say"
 
 
 class Verdict(Enum):
-    """Whether a row agrees by its criterion, or `NOT_COMPUTED` if the row's run failed."""
+    """Whether a row agrees by its criterion; `NOT_COMPUTED` if its run failed."""
 
     AGREES = "yes"
     DISAGREES = "no"
@@ -22,48 +22,37 @@ class Verdict(Enum):
 
     @staticmethod
     def of(agrees: bool) -> Verdict:
-        """Return the verdict of a criterion that could be applied."""
+        """Return the verdict of a criterion."""
         return Verdict.AGREES if agrees else Verdict.DISAGREES
 
 
 @dataclass(frozen=True)
 class Row:
-    """One published statement beside the computed value.
-
-    Attributes
-    ----------
-    group, source : str
-        Heading of the row and place of the statement in the paper.
-    what, published, computed : str
-        The statement, the paper's value and this run's value, as text.
-    verdict, criterion
-        Whether the values agree, and the rule that decides this.
-    inputs : str
-        Whether the scene's fitted numbers were fitted to this statement (`FITTED`) or not (`CHECK`).
-    published_value, value : float, optional
-        Both values as numbers in `unit`, for numeric statements.
-    """
+    """One published statement beside the computed value."""
 
     group: str
+    #: place of the statement in the paper
     source: str
     what: str
     published: str
     computed: str
     verdict: Verdict
     criterion: str
+    #: `FITTED`, `CHECK`, `ASSUMED` or `UNKNOWN`
     inputs: str
+    #: unit and values of a numeric statement
     unit: str = ""
-    published_value: float | None = field(default=None)
-    value: float | None = field(default=None)
+    published_value: float | None = None
+    value: float | None = None
 
     @property
     def difference(self) -> float | None:
-        """Computed minus published value as a share of the published value, or None without numbers."""
+        """Computed minus published value as a share of the published value."""
         if self.published_value is None or self.value is None:
             return None
         return (self.value - self.published_value) / abs(self.published_value)
 
 
 def braces(corners: str) -> str:
-    """Write a set of corners as {a,d}; `none` for the empty set."""
+    """Write a set of corners as {a,d}."""
     return "{" + ",".join(corners) + "}" if corners else "none"

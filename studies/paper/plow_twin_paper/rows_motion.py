@@ -34,7 +34,7 @@ def rows(scene: Scene, result: Result) -> list[Row]:
 
 
 def force_table(scene: Scene, result: Result) -> dict[tuple[Sense, str], dict[str, float]]:
-    """Return the statistics of each corner in each sense [N], as in `Result.statistics`."""
+    """Return the statistics of each corner in each sense [N]."""
     letters, pairs = paper_sets.letters_of_pairs(scene), list(result.statistics.values())
     return {
         (sense, letter): dict(pairs[pair])

@@ -41,7 +41,7 @@ def rises(values: Array) -> bool:
 
 
 def rises_then_falls(values: Array) -> bool:
-    """Return whether a curve rises to an inner value and then falls; steps against the trend as in `rises`."""
+    """Return whether a curve rises to an inner value and then falls, judged as in `rises`."""
     slack, top = TREND_SLACK * float(values.max()), int(values.argmax())
     if not 0 < top < len(values) - 1:
         return False
@@ -87,12 +87,10 @@ def _trend(group: str, source: str, what: str, values: Array, at: str, falls: bo
 
 
 def longest_faces(runs: PaperRuns, mark: FaceMark, since_s: float = 0.0) -> tuple[float, float] | None:
-    """Return start and length in s of the longest time with the mark's number of faces in contact in its sense, if any.
+    """Return start and length [s] of the longest time with the mark's number of faces in contact, if any.
 
-    The search goes from `since_s` to the end of the 20 s of the paper's section 5.
-
-    In each sense a corner has one pair, and the pairs of different corners touch different faces, so the numbers of
-    points and of faces in contact are equal.
+    The search goes from `since_s` to the end of section 5's 20 s. In each sense a corner has one pair, and different
+    corners touch different faces, so as many points as faces are in contact.
     """
     chosen = paper_sets.of_sense(mark.sense)
     faces = [face for pair, face in enumerate(face_of_pair()) if chosen[pair]]

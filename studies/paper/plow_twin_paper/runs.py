@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -32,34 +32,31 @@ from plow_twin_paper.values import (
 Array = NDArray[np.float64]
 OnProgress = Callable[[float], object]
 
-#: Shortest permitted run [s]: two load periods, of which the second counts as settled.
+#: Shortest run [s]: two load periods, of which the second counts as settled.
 SHORTEST_S: Final = 2.0 * PERIOD_S
-#: Length of the longest run [s]; at this length the rows of the three forms of rotation take about a gigabyte.
+#: Longest run [s]; the rows of its three forms of rotation take about a gigabyte.
 LONGEST_S: Final = 1000.0
-#: Interval of the rows in figures [s]. Forces change over tens of milliseconds, so the rows show every change.
+#: Interval of the rows in figures [s]; forces change over tens of milliseconds.
 OUTPUT_DT_S: Final = 1e-3
-#: The paper's curves are read at five places. Between two neighbouring places a curve is computed at this many steps.
+#: Steps of a computed curve between two of the five places at which the paper's curves are read.
 _FINE_STEPS: Final = 10
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """Largest force of each corner over both senses [N], shape (n, 4), against a clearance [m], shape (n,)."""
+    """Largest force of each corner over both senses [N], shape (n, 4), by clearance [m], shape (n,)."""
 
     clearance_m: Array
     largest_n: Array
 
     def on_grid(self) -> Array:
-        """Return the forces at the five places of the paper's grid, shape (5, 4)."""
+        """Return the forces at the five places, shape (5, 4)."""
         return self.largest_n[::_FINE_STEPS]
 
 
 @dataclass(frozen=True)
 class FaceRun:
-    """A run of 20 s at a clearance [m] and the force on each inner face [N] over time, shape (n, 4) as `FACES`.
-
-    The forces of a run that failed are NaN.
-    """
+    """The force on each inner face [N], shape (n, 4) as `FACES`, at a clearance [m]; NaN if the run failed."""
 
     clearance_m: float
     t: Array
@@ -73,15 +70,13 @@ class FaceRun:
 
 @dataclass(frozen=True)
 class PaperRuns:
-    """All runs, with the scene and the settings from which they were computed.
-
-    `scale` is the ratio of the scene's clearances (horizontal, vertical) to the published clearances. `failed` counts
-    the runs that could not be completed; the case itself is always complete.
-    """
+    """All runs, with the scene and the settings from which they were computed."""
 
     scene: Scene
     t_end: float
+    #: ratio of the scene's clearances (horizontal, vertical) to the published clearances
     scale: tuple[float, float]
+    #: run of Figs 6 to 9, which is always complete
     case: Result
     vertical: Sweep
     horizontal: Sweep
@@ -89,11 +84,12 @@ class PaperRuns:
     faces_vertical: tuple[FaceRun, ...]
     faces_horizontal: tuple[FaceRun, ...]
     rotation: Rotation | None
+    #: number of runs that could not be completed
     failed: int
 
 
-def check_scene(scene: Scene) -> None:
-    """Raise `SceneError` for a scene that cannot be compared with the paper."""
+def _check_scene(scene: Scene) -> None:
+    """Raise a `SceneError` for a scene that cannot be compared with the paper."""
     problems = []
     if tuple(sorted(scene.frame.labels)) != CORNERS:
         problems.append(
@@ -109,47 +105,42 @@ def check_scene(scene: Scene) -> None:
         raise SceneError(problems, "comparison with the paper")
 
 
-def run_all(scene: Scene, t_end: float, workers: int | None = None, on_progress: OnProgress | None = None) -> PaperRuns:
+def run_all(
+    scene: Scene, t_end: float, workers: int | None = None, on_progress: OnProgress = lambda share: None
+) -> PaperRuns:
     """Run everything that the figures and the table need.
 
-    Parameters
-    ----------
-    scene : Scene
-        Scene with the clearance of the paper's Figs 6 to 9, measured by any convention; the other clearances are scaled
-        in proportion.
-    t_end : float
-        End of the runs in s, at least `SHORTEST_S`; the runs of section 5 end at 20 s, or at `t_end` if it is smaller.
-    workers, on_progress
-        Number of threads, by default all cores; function that receives the share that is done.
+    The scene has the clearance of the paper's Figs 6 to 9, measured by any convention; the other clearances are scaled
+    in proportion. The runs of section 5 end at 20 s, or at `t_end` if it is earlier. A run may fail; its rows are then
+    not computed.
 
     Raises
     ------
     SceneError
         The scene cannot be compared: labels, loads or clearances.
     SolverError
-        The run of Figs 6 to 9 could not be continued. Other runs may fail; their rows are then not computed.
+        The run of Figs 6 to 9 could not be continued.
     """
-    check_scene(scene)
+    _check_scene(scene)
     scale = (scene.clearance.horizontal_m / CASE_M[0], scene.clearance.vertical_m / CASE_M[1])
-    tell = on_progress or (lambda share: None)
     case = simulate(scene, t_end, OUTPUT_DT_S)
     rotation, lost = _rotation(scene, t_end)
-    tell(0.1)
-    sweeps, failed = _sweeps(scene, scale, t_end, workers, tell)
+    on_progress(0.1)
+    sweeps, failed = _sweeps(scene, scale, t_end, workers, on_progress)
     end = min(FACE_T_END_S, t_end)
     vertical = [_face_run(_at(scene, scale, FIXED_M, value), value, end) for value in FACE_GRID_M]
     horizontal = [_face_run(_at(scene, scale, value, FIXED_M), value, end) for value in FACE_GRID_M]
     rows = case.t <= end
-    faces = FaceRun(CASE_M[1], case.t[rows], face_forces(case.force[rows]))
+    faces = FaceRun(CASE_M[1], case.t[rows], _face_forces(case.force[rows]))
     failed += lost + sum(run.failed for run in (*vertical, *horizontal))
-    tell(1.0)
+    on_progress(1.0)
     return PaperRuns(
         scene, t_end, scale, case, *sweeps, faces, tuple(vertical), tuple(horizontal), rotation, failed,
     )  # fmt: skip
 
 
 def _sweeps(
-    scene: Scene, scale: tuple[float, float], t_end: float, workers: int | None, tell: OnProgress
+    scene: Scene, scale: tuple[float, float], t_end: float, workers: int | None, on_progress: OnProgress
 ) -> tuple[tuple[Sweep, Sweep], int]:
     """Return the curves of Figs 10 and 11, and how many of their runs failed; failed runs have NaN forces."""
     fine = np.linspace(GRID_M[0], GRID_M[-1], _FINE_STEPS * (len(GRID_M) - 1) + 1)
@@ -157,7 +148,7 @@ def _sweeps(
     scenes = [_at(scene, scale, *cell) for cell in cells]
 
     def on_member(done: int) -> None:
-        tell(0.1 + 0.8 * done / len(scenes))
+        on_progress(0.1 + 0.8 * done / len(scenes))
 
     many = simulate_many(scenes, t_end, t_end, workers=workers, on_progress=on_member)
     good = many.status == Status.OK
@@ -175,7 +166,7 @@ def _at(scene: Scene, scale: tuple[float, float], horizontal_m: float, vertical_
 
 
 def _by_corner(scene: Scene, peak: Array) -> Array:
-    """Return the larger peak of each corner's two pairs, shape (m, 4), from the peaks of the pairs, shape (m, 8)."""
+    """Return the larger peak of each corner's two pairs, shape (m, 4)."""
     letters = letters_of_pairs(scene)
     pairs = [[pair for pair, letter in enumerate(letters) if letter == corner] for corner in CORNERS]
     return np.stack([peak[:, index].max(axis=1) for index in pairs], axis=1)
@@ -187,11 +178,11 @@ def _face_run(scene: Scene, clearance_m: float, t_end: float) -> FaceRun:
     except SolverError:
         times = output_times(t_end, OUTPUT_DT_S)
         return FaceRun(clearance_m, times, np.full((len(times), len(FACES)), np.nan))
-    return FaceRun(clearance_m, result.t, face_forces(result.force))
+    return FaceRun(clearance_m, result.t, _face_forces(result.force))
 
 
 def _rotation(scene: Scene, t_end: float) -> tuple[Rotation | None, int]:
-    """Return the runs of the three forms of rotation and the number of failures; one failure leaves no comparison."""
+    """Return the three forms of rotation and the number of failures; one failure leaves no comparison."""
     try:
         return rotation_scenes(scene, t_end, OUTPUT_DT_S), 0
     except SolverError:
@@ -199,14 +190,12 @@ def _rotation(scene: Scene, t_end: float) -> tuple[Rotation | None, int]:
 
 
 def face_of_pair() -> list[str]:
-    """Return the inner face of the head that each pair touches, shape (8,)."""
+    """Return the inner face that each pair touches, shape (8,)."""
     return [name.rpartition("_")[2] for name in PAIR_NAMES]
 
 
-def face_forces(force: Array) -> Array:
-    """Return the force on each inner face [N], shape (n, 4) as `FACES`, from the pairs' forces, shape (n, 8)."""
+def _face_forces(force: Array) -> Array:
+    """Return the force on each inner face [N], shape (n, 4), from those of the pairs, shape (n, 8)."""
     faces = face_of_pair()
-    columns: Sequence[Array] = [
-        force[:, [pair for pair, name in enumerate(faces) if name == face]].sum(axis=1) for face in FACES
-    ]
-    return np.stack(columns, axis=1)
+    pairs = [[pair for pair, name in enumerate(faces) if name == face] for face in FACES]
+    return np.stack([force[:, chosen].sum(axis=1) for chosen in pairs], axis=1)

@@ -1,4 +1,4 @@
-"""Which corners carry force together, and for how long: read from the list of contact events, exact in time."""
+"""Which corners carry force together, and for how long, exactly, from the contact events."""
 
 from __future__ import annotations
 
@@ -13,14 +13,13 @@ from plow_twin.model.scene import Scene
 from plow_twin.run.simulate import Result
 from plow_twin_paper.values import SHORTEST_HOLD_S, Sense
 
-#: Mode of a pair that carries force. In mode 0 the pair is apart; in mode 2 it is in contact but its force is clipped
-#: at zero.
+#: Mode of a pair that carries force; 0 is apart, and 2 is in contact with a force clipped at zero.
 _CARRIES = 1
 
 
 @dataclass(frozen=True)
 class Hold:
-    """A time from `start_s` to `end_s` in which the same corners carry force, e.g. `abd`; "" if no corner does."""
+    """A time in which the same corners carry force, e.g. `abd`; "" if no corner does."""
 
     start_s: float
     end_s: float
@@ -49,12 +48,12 @@ def letters_of_pairs(scene: Scene) -> list[str]:
 
 
 def of_sense(sense: Sense) -> NDArray[np.bool_]:
-    """Return for each pair whether it belongs to a sense, shape (8,)."""
+    """Return which pairs belong to a sense, shape (8,)."""
     return STOPS_COUNTER_CLOCKWISE if sense == "ccw" else ~STOPS_COUNTER_CLOCKWISE
 
 
 def holds(scene: Scene, result: Result, sense: Sense) -> list[Hold]:
-    """Return the sets of one sense in order of time, without gaps, from 0 to the end of the run."""
+    """Return the sets of one sense in order of time, without gaps, to the end of the run."""
     letters, chosen = letters_of_pairs(scene), of_sense(sense)
     carries = result.force[0] > 0.0  # a pair that penetrates at t = 0 is in contact without an event
     found: list[Hold] = []
@@ -75,7 +74,7 @@ def _name(letters: Sequence[str], carries: NDArray[np.bool_]) -> str:
 
 
 def figures(timeline: Sequence[Hold]) -> dict[str, SetFigures]:
-    """Return the figures of every set that occurs, however briefly, in order of decreasing share."""
+    """Return the figures of every set that occurs, the largest share first."""
     total = sum(hold.duration_s for hold in timeline if hold.corners)
     table = {}
     for name in {hold.corners for hold in timeline} - {""}:

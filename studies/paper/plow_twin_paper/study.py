@@ -1,4 +1,4 @@
-"""The study of the paper: every published figure and number is computed again, compared and written to a report."""
+"""The study of the paper: published figures and numbers are computed again, compared and written to a report."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from plow_twin_paper.rows import FITTED, Row, Verdict
 from plow_twin_paper.runs import PaperRuns, run_all
 
 OnProgress = Callable[[float], object]
-#: The three forms of the head's rotation in words, in the order of `Rotation.scenes`.
+#: The forms in words, in the order of `Rotation.scenes`.
 FORMS = ("constant moment", "exact, I about the centre of mass", "exact, I about the cavity's centre")
 
 
@@ -56,7 +56,7 @@ class PaperStudy:
 
     @property
     def recording_error_m(self) -> float | None:
-        """Largest distance in m of the recorded head from the head of the report's run; None without a recording."""
+        """Largest distance in m of the recorded head from the head of the report's run."""
         if self.recording is None:
             return None
         apart = self.recording.q[:, :2] - self.runs.case.q[:, :2]
@@ -64,22 +64,9 @@ class PaperStudy:
 
 
 def compare(
-    scene: Scene, t_end: float, workers: int | None = None, on_progress: OnProgress | None = None
+    scene: Scene, t_end: float, workers: int | None = None, on_progress: OnProgress = lambda share: None
 ) -> PaperStudy:
-    """Compute the whole comparison, without a file.
-
-    Parameters
-    ----------
-    scene, t_end, workers, on_progress
-        As in `run_all`.
-
-    Raises
-    ------
-    SceneError
-        The scene cannot be compared with the paper.
-    SolverError
-        The run of Figs 6 to 9 could not be continued.
-    """
+    """Compute the whole comparison without a file; arguments and errors are those of `run_all`."""
     begin = time.perf_counter()
     runs = run_all(scene, t_end, workers, on_progress)
     rotation = [] if runs.rotation is None else rotation_rows(runs.rotation)
@@ -96,12 +83,13 @@ def study_paper(
     recording: bool = True,
     on_progress: OnProgress = lambda share: None,
 ) -> PaperStudy:
-    """Compare a scene with the paper and leave report.html, table.json, table.csv, figures/, run/ and run.rrd in `out`.
+    """Compare a scene with the paper and leave report.html, table.json, table.csv, figures/, run/ and run.rrd in
+    `out`.
 
     Raises
     ------
     SceneError, SolverError
-        As in `compare`.
+        As in `run_all`.
     ModuleNotFoundError
         One of the extras `study`, `record`, `view` is not installed (the last two with `recording`).
     OSError
@@ -140,8 +128,7 @@ def _changes(runs: PaperRuns) -> list[Change]:
     ]
 
 
-def row_as_plain(row: Row) -> dict[str, Any]:
-    """Return a row for JSON and CSV; the difference is a share, and published values have the mark `given`."""
+def _row_as_plain(row: Row) -> dict[str, Any]:
     return asdict(row) | {
         "difference": row.difference,
         "verdict": row.verdict.value,
@@ -152,14 +139,13 @@ def row_as_plain(row: Row) -> dict[str, Any]:
 def _write(study: PaperStudy, out: Path) -> None:
     from plow_twin.study.report import write_csv, write_html, write_json
 
-    rows = [row_as_plain(row) for row in study.rows]
+    rows = [_row_as_plain(row) for row in study.rows]
     write_csv(out / "table.csv", rows)
-    write_json(out / "table.json", as_plain(study))
+    write_json(out / "table.json", _as_plain(study))
     write_html(out / "report.html", "paper.html.j2", _context(study), "plow_twin_paper")
 
 
-def as_plain(study: PaperStudy) -> dict[str, Any]:
-    """Return the study without its series as plain values."""
+def _as_plain(study: PaperStudy) -> dict[str, Any]:
     from plow_twin.build import build_fingerprint
     from plow_twin.scene_file import dump_scene
 
@@ -169,12 +155,12 @@ def as_plain(study: PaperStudy) -> dict[str, Any]:
         "t_end_s": runs.t_end,
         "clearance_scale": runs.scale,
         "verdicts": study.verdicts,
-        "rows": [row_as_plain(row) for row in study.rows],
+        "rows": [_row_as_plain(row) for row in study.rows],
         "rotation": {
             "offset_m": None if rotation is None else rotation.offset_m,
             "parted_s": None if rotation is None else rotation.parted_s,
             "rows": [asdict(row) for row in study.rotation],
-            "changed_verdicts": [{"form": change.form, **row_as_plain(change.row)} for change in study.changes],
+            "changed_verdicts": [{"form": change.form, **_row_as_plain(change.row)} for change in study.changes],
         },
         "contradictions": [asdict(entry) for entry in study.contradictions],
         "failed_runs": runs.failed,
@@ -188,7 +174,7 @@ def as_plain(study: PaperStudy) -> dict[str, Any]:
 def _context(study: PaperStudy) -> dict[str, Any]:
     marks = study.runs.scene.marks
     return {
-        **as_plain(study),
+        **_as_plain(study),
         "study": study,
         "groups": _grouped(study.rows),
         "disagreeing": [row for row in study.rows if row.verdict is Verdict.DISAGREES],

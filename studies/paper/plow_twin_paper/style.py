@@ -1,4 +1,4 @@
-"""Style of the report's figures: colours for colour-blind readers too (Okabe and Ito), and one type size."""
+"""Style of the report's figures, with colours for colour-blind readers too (Okabe and Ito)."""
 
 from __future__ import annotations
 

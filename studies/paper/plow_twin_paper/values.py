@@ -1,8 +1,7 @@
-"""The paper's published values with their place in the text; in the terms of scenes their mark is `given`.
+"""The paper's published values with their place in the text. In the terms of scenes, their mark is `given`.
 
 Source: Mao, Zhang et al., "Dynamic characteristics of plough head under contact-impact with clearances", J. Vibration
-and Shock 34(19), 2015. Only the text describes its curves, so the places are sections and figures. The criteria of
-agreement at the end are this project's.
+and Shock 34(19), 2015. Only its text describes the curves. The criteria of agreement at the end are ours.
 """
 
 from __future__ import annotations
@@ -18,23 +17,22 @@ FACES: Final = ("top", "right", "bottom", "left")
 
 #: Clearance of Figs 6 to 9 (section 3): horizontal, vertical [m].
 CASE_M: Final = (0.025, 0.030)
-#: In Figs 10 and 11 (section 4), one clearance is fixed at this value [m].
+#: Fixed clearance of Figs 10 and 11 (section 4) [m].
 FIXED_M: Final = 0.020
-#: In Figs 10 and 11, the five values of the other clearance [m].
+#: Values of the other clearance in Figs 10 and 11 [m].
 GRID_M: Final = (0.020, 0.0225, 0.025, 0.0275, 0.030)
 #: Values of both clearances in Figs 14 and 15, section 5 [m].
 FACE_GRID_M: Final = (0.020, 0.025, 0.030)
-#: Length of the simulation for Figs 14 and 15 [s].
+#: Length of the simulation of Figs 14 and 15 [s].
 FACE_T_END_S: Final = 20.0
 #: Angular frequency of the loads [rad/s] (section 3).
 OMEGA_RAD_S: Final = 2.0
-#: Period of the loads [s].
 PERIOD_S: Final = 2.0 * math.pi / OMEGA_RAD_S
 
 
 @dataclass(frozen=True)
 class Force:
-    """A published force: the largest of its kind over the four points, and the point at which it occurs."""
+    """A published force, the largest of its kind over the four points, and its point."""
 
     sense: Sense
     statistic: Literal["max", "mean_in_contact"]
@@ -82,12 +80,12 @@ class FaceMark:
 
 FACE_MARKS: Final = (FaceMark(1, "ccw", 1), FaceMark(2, "cw", 2), FaceMark(3, "cw", 3))
 
-#: A force agrees if it differs from the published force by at most this share.
+#: Largest relative difference of a force that agrees.
 FORCE_TOLERANCE: Final = 0.05
-#: A contact set counts as occurring if it lasts at least this long [s] without a break.
+#: Shortest time of a contact set without a break [s] that counts as its occurrence.
 SHORTEST_HOLD_S: Final = 5e-3
-#: A step against a trend counts only if it is at least this share of the curve's largest value, because a printed curve
-#: shows no smaller step.
+#: Smallest step against a trend that counts, as a share of the curve's largest value; a printed curve shows no smaller
+#: one.
 TREND_SLACK: Final = 0.005
-#: A set that the paper does not mention counts as "rare" if it lasts for at most this share of the contact time.
+#: Largest share of the contact time of a set that counts as rare.
 RARE_SHARE: Final = 0.10
