@@ -28,7 +28,8 @@ DELIVERED = {
 }
 
 
-@pytest.mark.parametrize("n", [1.0, 1.5, 2.2, 3.0])
+# integer exponents from 2 on compile kernels of their own
+@pytest.mark.parametrize("n", [1.0, 1.5, 2.2, pytest.param(3.0, marks=pytest.mark.stress)])
 @pytest.mark.parametrize("e", [0.05, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99])
 def test_exact_restitution_is_returned_for_any_stiffness_exponent_and_mass(n: float, e: float) -> None:
     """The identity D (1 + e) = ln((1 + D) / (1 - D e)) is valid for every exponent, stiffness, mass and speed."""
@@ -123,7 +124,7 @@ def test_the_page_shows_the_results_of_the_solver() -> None:
         for again in restitution.measure(law, list(stored)[5:-1:10]):
             assert stored[again.asked] == pytest.approx(again.delivered, abs=2e-9)
     assert {row.delivered for row in rows if row.law == "hertz"} == {1.0}
-    for row in [row for row in rows if row.law == "ramped_damping"][::9]:
+    for row in [row for row in rows if row.law == "ramped_damping" and row.asked > 0.0][::9]:
         (again,) = restitution.measure(row.law, [row.asked], row.ramp)
         assert row.delivered == pytest.approx(again.delivered, abs=2e-9)
 

@@ -39,7 +39,7 @@ from plow_twin import (
 from plow_twin.cli.app import run
 from plow_twin.solve.state import Status
 
-BENCH = preset("bench_kv")
+BENCH = preset("paper")
 
 
 def test_a_run_stops_at_its_limits_and_says_where_it_stood() -> None:

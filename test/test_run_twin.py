@@ -36,7 +36,7 @@ def test_sampled_at_1_khz_follows_the_analytic_motion() -> None:
         assert series.makes[:, pair].sum() == row["makes"]
 
 
-@pytest.mark.parametrize("name", ["paper", "bench_hc"])
+@pytest.mark.parametrize("name", ["paper", pytest.param("bench_hc", marks=pytest.mark.stress)])
 def test_impulses_of_all_advances_are_those_of_the_run(name: str) -> None:
     """Steps that begin at a touch measure time from the touch; with d^1.5 they advance in the root of time."""
     exact = simulate(preset(name), 2.0, tol=1e-9)
@@ -64,7 +64,7 @@ def test_samples_in_any_batches_give_the_same_bits(cuts: list[int]) -> None:
 
 
 def test_the_same_time_can_be_asked_for_twice() -> None:
-    twin = Twin(preset("bench_kv"))
+    twin = Twin(preset("paper"))
     for t in np.random.default_rng(1).uniform(0.0, 2e-3, 500).cumsum():
         assert twin.advance(t).q.tolist() == twin.advance(t).q.tolist()
         assert twin.time == t

@@ -28,9 +28,9 @@ SCENES = {
     "wear": replace(PAPER, wear=Wear(1e-9, 3.0, 0.015)),
     "locked": replace(PAPER, locked=("y",)),
 }
-SCENES["offset, wear"] = replace(SCENES["offset"], wear=SCENES["wear"].wear)
-# only the full run has these scenes, each of which compiles its own kernels; in the quick run test_solve_ramp covers a
-# ramp, and test_solve_falling the law of `paper`
+SCENES["offset, ramp, wear"] = replace(SCENES["offset"], contact=SCENES["ramp"].contact, wear=SCENES["wear"].wear)
+# only the full run has these scenes, each of which compiles its own kernels; in the quick run test_solve_falling has
+# the law of `paper`
 FULL_COUNT = ("paper", "bench_hc", "offset", "ramp", "wear", "locked")
 
 
@@ -67,6 +67,7 @@ def test_a_wrong_motion_does_not_balance() -> None:
     assert energy_balance_of(compiled, motion.state, motion.sums).relative_imbalance > 1e-10
 
 
+@pytest.mark.stress  # this test compiles kernels of its own
 def test_the_balance_of_fixed_steps_balance_to_their_order() -> None:
     coarse, fine = (
         simulate(PAPER, 2.0, method="rk4", dt=dt, output_dt=0.1, energy_balance=True).energy_balance

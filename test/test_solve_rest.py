@@ -6,10 +6,10 @@ import dataclasses
 
 import numpy as np
 import pytest
-from scenes import preset, wall_and_point
+from scenes import FIRM, preset, wall_and_point
 from scipy.optimize import fsolve
 
-from plow_twin import Gravity, Harmonic, Initial, Scene, Twin, Wear, simulate
+from plow_twin import Gravity, Harmonic, Head, Initial, Scene, Twin, Wear, simulate
 from plow_twin.model import geometry
 from plow_twin.model.geometry import arm_rows, body_state, penetration_rows
 from plow_twin.solve import compiled_scene
@@ -48,22 +48,23 @@ def static_pose(scene: Scene, guess: np.ndarray) -> np.ndarray:
     return np.asarray(fsolve(balance, guess, xtol=1e-14))
 
 
+# the balance and the other law compile kernels of their own
 @pytest.mark.parametrize(
-    "law", [name if name == "kelvin_voigt" else pytest.param(name, marks=pytest.mark.stress) for name in LAWS]
+    ("law", "balance"),
+    [("kelvin_voigt", False), *(pytest.param(name, True, marks=pytest.mark.stress) for name in LAWS)],
 )
-def test_an_hour_at_rest_costs_next_to_nothing_and_is_in_balance(law: str) -> None:
+def test_an_hour_at_rest_costs_next_to_nothing_and_is_in_balance(law: str, balance: bool) -> None:
     scene = fallen(law)
-    result = simulate(scene, 3600.0, 360.0, energy_balance=True)
-    settled = simulate(scene, 120.0, 1.0, energy_balance=True)
+    result = simulate(scene, 3600.0, 360.0, energy_balance=balance)
+    settled = simulate(scene, 120.0, 1.0)
     assert result.solver["steps"] < settled.solver["steps"] + 40
     assert np.array_equal(result.q[1], result.q[-1]) and not result.v[-1].any()
     assert np.abs(result.q[-1] - static_pose(scene, result.q[-1])).max() < 1e-12
     weight = scene.head.mass_kg * scene.gravity.acceleration_m_s2
-    assert (
-        result.energy_balance is not None
-        and result.energy_balance.imbalance_j < 1e-12 * result.energy_balance.turnover_j
-    )
-    assert np.abs(result.energy_balance.momentum_imbalance).max() < 1e-12 * weight * 3600.0
+    if (sums := result.energy_balance) is not None:
+        assert sums.imbalance_j < 1e-12 * sums.turnover_j
+        assert np.abs(sums.momentum_imbalance).max() < 1e-12 * weight * 3600.0
+    assert (result.energy_balance is not None) == balance
     # during rest the pads bear the weight, so the totals grow
     carried = sum(row["impulse"] for row in result.statistics.values())
     before = sum(row["impulse"] for row in settled.statistics.values())
@@ -86,11 +87,11 @@ def test_a_load_that_changes_wakes_the_head() -> None:
 
 def test_a_sliding_head_is_not_at_rest() -> None:
     sliding = dataclasses.replace(
-        fallen(), locked=("theta",), gravity=Gravity(9.81), pairs=("top_left_top", "top_right_top"),
+        fallen(), head=Head(2430.0, FIRM), gravity=Gravity(9.81), pairs=("top_left_top", "top_right_top"),
         initial=Initial((0.0, 0.0, 0.0), (1e-9, 0.0, 0.0)),
     )  # fmt: skip
     result = simulate(sliding, 300.0, 30.0)
-    assert np.abs(np.diff(result.q[:, 0]) - 3e-8).max() < 1e-15
+    assert np.abs(np.diff(result.q[:, 0]) - 3e-8).max() < 1e-11
 
 
 @pytest.mark.parametrize("corners", [("left", "right"), ("left",)])

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scenes import preset, wall_and_point
+from scenes import FIRM, preset, wall_and_point, with_presets_terms
 
 from plow_twin import Clearance, Contact, Head, Initial, PlowTwinError, Scene, Status, Twin, simulate
 
@@ -94,6 +94,7 @@ def test_hours_at_rest_do_not_drift_and_cost_little(hours: float) -> None:
         Contact("kelvin_voigt", 2e7, damping=6e4), speed=0.0, mass=2430.0, gravity=9.81,
         pairs=("top_left_top", "top_right_top"),
     )  # fmt: skip
+    scene = dataclasses.replace(scene, head=Head(2430.0, FIRM), locked=())
     settled = simulate(scene, 10.0, output_dt=10.0)
     late = simulate(scene, hours * 3600.0, output_dt=3600.0)
     assert np.abs(late.q[1:] - settled.q[-1]).max() < 1e-12
@@ -104,7 +105,8 @@ def test_hours_at_rest_do_not_drift_and_cost_little(hours: float) -> None:
 
 def test_two_corners_at_the_same_instant_touch_together() -> None:
     contact = Contact("exact_restitution", 1e9, 1.5, restitution=0.6)
-    result = simulate(wall_and_point(contact, speed=1.0, pairs=("top_left_top", "top_right_top")), 0.02, tol=1e-10)
+    scene = with_presets_terms(wall_and_point(contact, speed=1.0, pairs=("top_left_top", "top_right_top")))
+    result = simulate(scene, 0.02, tol=1e-10)
     first = result.events[:2]
     assert set(first["pair"]) == {0, 2} and first["time"][0] == pytest.approx(first["time"][1], abs=1e-15)
     assert result.v[-1, 1] == pytest.approx(0.6, abs=1e-8)
