@@ -121,28 +121,25 @@ def _run(
     """Run the processes to their end; return the node's last figures and the number of samples sent."""
     from plow_twin.demo.excitation_publisher import QUEUE
 
-    node = [
-        *("plow_twin.ros.main", "--ros-args", "-p", f"scene:={_worn_scene(folder)}"),
-        *("-p", f"record_path:={(folder / 'run').resolve()}", "-p", f"expected_rate:={_RATE_HZ}"),
+    parameters = {
+        "scene": _worn_scene(folder),
+        "record_path": (folder / "run").resolve(),
+        "expected_rate": _RATE_HZ,
         # publisher and reader keep every sample, so that a busy machine loses none
-        *("-p", "qos_overrides./excitation.subscription.reliability:=reliable"),
-        *("-p", f"input_depth:={QUEUE}"),
-        # the run ends before the hold policy acts
-        *("-p", "excitation_timeout:=60.0", "-p", f"use_sim_time:={str(speed == 'fast').lower()}"),
-    ]
+        "qos_overrides./excitation.subscription.reliability": "reliable",
+        "input_depth": QUEUE,
+        "excitation_timeout": 60.0,  # the run ends before the hold policy acts
+        "use_sim_time": str(speed == "fast").lower(),
+    }
     publisher = ["plow_twin.demo.excitation_publisher", "--speed", speed, "--seconds", repr(seconds)]
     estimating = seconds >= _ESTIMATED_S
     if estimating:
-        node += [
-            "-p",
-            "estimate:=true",
-            "-p",
-            f"estimate_window:={_WINDOW_S}",
-            "-p",
-            f"estimate_interval:={_INTERVAL_S}",
-        ]
-        node += ["-p", "qos_overrides./head_pose.subscription.reliability:=reliable"]
+        parameters |= {"estimate": "true", "estimate_window": _WINDOW_S, "estimate_interval": _INTERVAL_S}
+        parameters["qos_overrides./head_pose.subscription.reliability"] = "reliable"
         publisher += ["--sensor", repr(_SENSOR_MM)]
+    node = ["plow_twin.ros.main", "--ros-args"]
+    for name, value in parameters.items():
+        node += ["-p", f"{name}:={value}"]
     with ExitStack() as opened:
         bar = opened.enter_context(_progress(console, quiet))
         watch, spin = opened.enter_context(_watching())

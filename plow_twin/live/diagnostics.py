@@ -213,26 +213,23 @@ def summary(lifecycle: str, reason: str, runtime: Runtime | None, preparing: boo
     level = _LEVELS[state]
     values["solver_failures"] = str(runtime.driver.failed.count)
     said = [state.value, *failures(runtime)]
-    others, keeper = runtime.inputs.other_senders(), runtime.wear_keeper
+    others, keeper = ", ".join(runtime.inputs.other_senders()), runtime.wear_keeper
+    silent = ", ".join(runtime.inputs.silent())
     troubles = [
         (ERROR, runtime.unsteady, "the stamps jump again and again: samples are dropped"),
         (ERROR, values["recorder"] == "trouble", "the recording has lost data or has stopped"),
-        (ERROR, bool(keeper and keeper.error), keeper.error if keeper else ""),
-        (WARN, estimation is not None and bool(estimation.worker.error), estimation.worker.error if estimation else ""),
-        (
-            WARN,
-            estimation is not None and bool(estimation.reasons),
-            "; ".join(estimation.reasons if estimation else ()),
-        ),
+        (ERROR, keeper, keeper.error if keeper else ""),
+        (WARN, estimation, estimation.worker.error if estimation else ""),
+        (WARN, estimation, "; ".join(estimation.reasons) if estimation else ""),
         (WARN, runtime.reduced, "the following twins did not keep up: only the parameters follow"),
         (OK, runtime.clock == "paused", "/clock is paused"),
         (WARN, runtime.without_clock, "use_sim_time is set and nothing has come on /clock"),
-        (WARN, bool(others), f"another publisher of {', '.join(others)} sends too and is not followed"),
+        (WARN, others, f"another publisher of {others} sends too and is not followed"),
         (WARN, runtime.others_publish, "another node publishes contact_forces under this name too: a second twin?"),
-        (WARN, bool(runtime.inputs.silent()), f"silent: {', '.join(runtime.inputs.silent())}"),
+        (WARN, silent, f"silent: {silent}"),
     ]
     for trouble_level, there, text in troubles:
-        if there:
+        if there and text:
             level = max(level, trouble_level)
             said.append(text)
     return level, "; ".join(said), values

@@ -6,9 +6,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from plow_twin.live.parameters import Settings
 from plow_twin.record.alarms import ALARMS, alarm_texts, alarms_message
 from plow_twin.record.messages import Message
@@ -104,19 +101,10 @@ class Publishing:
         self.received_ns = 0
         #: stamp of the sample that changed the alarms within a series [ns]
         self.series_ns: int | None = None
-        self._newest: Rows | None = None
+        #: newest published row, shape (1,), which the next publication overwrites
+        self.newest: Rows | None = None
         self._catch_up = catch_up
         self.watch: Callable[[Published], object] | None = None
-
-    @property
-    def q(self) -> NDArray[np.float64] | None:
-        """Newest published pose: x, y [m], theta [rad]."""
-        return None if self._newest is None else self._newest["q"][0]
-
-    @property
-    def newest(self) -> Rows | None:
-        """Newest published row, shape (1,), which the next publication overwrites."""
-        return self._newest
 
     @property
     def memory(self) -> Mapping[str, memoryview]:
@@ -146,7 +134,7 @@ class Publishing:
             intervals = self._messages.intervals(published)
             yield from intervals
             sent += intervals
-        self._newest, (stamp_ns, marked, held, *_) = rows, summary(rows, 0)
+        self.newest, (stamp_ns, marked, held, *_) = rows, summary(rows, 0)
         self.published += 1
         if marked:
             self.held_frames += held
@@ -169,7 +157,7 @@ class Publishing:
             return
         stamps = series.stamps
         self.latency.add((time.monotonic_ns() - self.received_ns) * 1e-9, len(stamps))
-        self._newest = published.rows[-1:]
+        self.newest = published.rows[-1:]
         self.published += len(stamps)
         for row in self.alarms.feed(published):
             part, begin = series.part(begin, row + 1), row + 1

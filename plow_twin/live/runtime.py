@@ -190,8 +190,8 @@ class Runtime:
 
     def residual(self) -> tuple[float, float, float] | None:
         """Return model minus newest measured pose: x, y [m], theta [rad], or None."""
-        q = self.publishing.q
-        return self.inputs.residual(q) if q is not None else None
+        newest = self.publishing.newest
+        return None if newest is None else self.inputs.residual(newest["q"][0])
 
     def newest_sample_age_s(self) -> float | None:
         """Return the time since the stamp of the newest sample used [s], or None."""

@@ -66,16 +66,13 @@ class Preparation:
 
 def key(settings: Settings) -> tuple[object, ...]:
     """Return the settings on which a prepared twin depends; a rewritten scene file is another scene."""
+    follow = settings.follows, settings.follow_members
+    own = settings.scene, settings.tolerance, settings.excitation_source, settings.max_evaluations, *follow
     try:
         found = os.stat(scene_path(settings.scene))
     except (OSError, PlowTwinError):
-        return settings.scene, *_numbers(settings)
-    return settings.scene, *_numbers(settings), found.st_mtime_ns, found.st_size
-
-
-def _numbers(settings: Settings) -> tuple[object, ...]:
-    follow = settings.follows, settings.follow_members
-    return settings.tolerance, settings.excitation_source, settings.max_evaluations, *follow
+        return own
+    return *own, found.st_mtime_ns, found.st_size
 
 
 def _prepare(settings: Settings, warm_up: Callable[[], None]) -> Prepared:

@@ -15,7 +15,7 @@ from itertools import chain, islice
 from pathlib import Path
 from typing import Any, Final
 
-from plow_twin.live.bridge.source import BATCH, BridgeError, Lines, Messages, Rows, SourceState
+from plow_twin.live.bridge.source import BATCH, Bridge, BridgeError, Lines, Messages, Rows
 from plow_twin.live.bridge.table import Table
 from plow_twin.record.merging import StampOf, merged
 from plow_twin.record.sources import Arrived, TopicType, columns_of
@@ -198,7 +198,7 @@ def _numbered(path: Path) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]
 
 
-class Files(SourceState):
+class Files(Bridge):
     """Files as topics, named without the ending; the files of a pattern (`load_*.csv`) are one topic.
 
     With `follow`, files may appear later and grow; otherwise their messages are sorted by their stamps. A file that
@@ -313,7 +313,7 @@ def _sent_ns(row: Arrived, stamp_ns: StampOf[Arrived] | None) -> int | None:
     return None if stamp_ns is None else stamp_ns(Arrived(row.topic, NO_TIME, row.content))
 
 
-class StandardInput(SourceState):
+class StandardInput(Bridge):
     """Lines from standard input or another file descriptor, until its end."""
 
     def __init__(self, descriptor: int = 0) -> None:

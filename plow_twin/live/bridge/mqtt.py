@@ -17,7 +17,7 @@ from plow_twin.live.bridge.paho_client import (
     subscription_refusal,
     use_tls,
 )
-from plow_twin.live.bridge.source import LONGEST, BridgeError, SourceState, read_json
+from plow_twin.live.bridge.source import LONGEST, Bridge, BridgeError, read_json
 from plow_twin.record.merging import StampOf
 from plow_twin.record.sources import Arrived
 
@@ -28,7 +28,7 @@ _QUEUED_BYTES: Final = 2**26
 _PORTS: Final = {"mqtt": 1883, "mqtts": 8883}
 
 
-class Mqtt(SourceState):
+class Mqtt(Bridge):
     """A session that a broker keeps while the connection is broken; messages of QoS 1 then arrive later.
 
     Raises BridgeError if the address is invalid, no broker answers within `connect_s`, or it refuses the connection.

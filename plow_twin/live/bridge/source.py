@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from typing import Any, Final, Protocol, runtime_checkable
 
@@ -30,47 +31,35 @@ class Messages(Protocol):
     def __iter__(self) -> Iterator[Arrived]: ...
 
 
-class Bridge(Protocol):
-    """A source of messages.
+class Bridge(ABC):
+    """A source of messages."""
 
-    Attributes
-    ----------
-    ends : bool
-        Whether the source has an end and its own time, like a file that is read once.
-    finished : bool
-        Whether the source has ended.
-    connected : bool
-    lost : int
-        Number of messages that were dropped before they were read.
-    trouble : str
-        Why no messages can come at present; empty if they can.
-    """
+    def __init__(self, *, ends: bool = False, connected: bool = False) -> None:
+        #: whether the source has an end and its own time, like a file that is read once
+        self.ends = ends
+        #: whether the source has ended
+        self.finished = False
+        self.connected = connected
+        #: number of messages that were dropped before they were read
+        self.lost = 0
+        #: why no messages can come at present; empty if they can
+        self.trouble = ""
 
-    ends: bool
-    finished: bool
-    connected: bool
-    lost: int
-    trouble: str
-
+    @abstractmethod
     def topics(self) -> Mapping[str, TopicType] | None:
         """Return the type of each topic, or None if the mapping may name any topic."""
 
+    @abstractmethod
     def start(self, topics: list[str], stamp_ns: StampOf[Arrived] | None = None) -> None:
         """Subscribe to topics; a file that is read once orders its messages by `stamp_ns`."""
 
+    @abstractmethod
     def poll(self, timeout_s: float) -> Messages:
         """Return messages after `timeout_s` at most; the content of an unreadable message is None."""
 
+    @abstractmethod
     def close(self) -> None:
         """Close the source."""
-
-
-class SourceState:
-    """Base class with the attributes of a `Bridge`."""
-
-    def __init__(self, *, ends: bool = False, connected: bool = False) -> None:
-        self.ends, self.finished, self.connected = ends, False, connected
-        self.lost, self.trouble = 0, ""
 
 
 @runtime_checkable

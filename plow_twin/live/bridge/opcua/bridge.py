@@ -24,7 +24,7 @@ from plow_twin.live.bridge.access import Access, host_and_port
 from plow_twin.live.bridge.opcua.link import PUBLISHING_MS, Link, Revised
 from plow_twin.live.bridge.opcua.readings import Counts, overflowed, reading
 from plow_twin.live.bridge.opcua.samples import Samples
-from plow_twin.live.bridge.source import BATCH, BridgeError, SourceState
+from plow_twin.live.bridge.source import BATCH, Bridge, BridgeError
 from plow_twin.live.part import Part
 from plow_twin.record.map_file import OPCUA, SERVER_STAMP, SOURCE_STAMP
 from plow_twin.record.mapping import Role
@@ -52,7 +52,7 @@ _FIRST_WAIT_S: Final = 1.0
 _LONGEST_WAIT_S: Final = 30.0
 
 
-class OpcUa(SourceState):
+class OpcUa(Bridge):
     """A subscription to the nodes of a mapping, which is renewed after a break.
 
     Each role of the mapping is a topic, and its fields are nodes. `rate_hz` is the expected rate of the samples; 0
