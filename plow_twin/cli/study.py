@@ -13,7 +13,6 @@ from plow_twin.cli.study_calibrate import calibrate
 from plow_twin.cli.study_sweep import sweep
 from plow_twin.errors import PlowTwinError
 
-#: Folder of the paper's study in a clone of the repository.
 CLONE: Final = Path(__file__).resolve().parents[2] / "studies" / "paper"
 
 

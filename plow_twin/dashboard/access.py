@@ -15,7 +15,6 @@ from plow_twin.errors import InputError, Problem
 
 #: Environment variable with the token, if there is no token file.
 TOKEN_VARIABLE: Final = "PLOW_TWIN_DASHBOARD_TOKEN"
-#: Smallest length of a token.
 _SHORTEST: Final = 16
 
 

@@ -20,12 +20,10 @@ from plow_twin.stream.outputs import CLEARANCE_NAMES, Published
 
 Array = NDArray[np.float64]
 
-#: Rate of the screen's updates [Hz].
 RATE_HZ: Final = 10.0
 #: Largest number of publications that wait to be summed up.
 _MOST: Final = 256
 _EVENTS: Final = 20
-#: Longest text that is passed on [characters].
 _LONGEST: Final = 1000
 #: Largest number of operators' requests that are handled at once.
 _MOST_ASKED: Final = 8
@@ -159,7 +157,6 @@ class Feed:
         self._link, self._answer, self._load, self._on_error = link, answer, load, on_error
         self._by_second = by_second
         self._end = f"{process} has ended: {consequence}, the twin goes on"
-        #: newest report of the process about itself
         self.report: dict[str, Any] = {}
         self._ended = False
         self._news: dict[str, Any] = {"facts": {**facts, "can_ask": answer is not None}}

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import deque
 from typing import Any, Final
 
-#: Span of stamps that is kept [s].
 SPAN_S: Final = 3600
 #: The clearances of a second, in their order.
 _CLEARANCES: Final = tuple(f"{name}{point}" for name in ("horizontal", "vertical") for point in ("", "/p05", "/p95"))

@@ -8,7 +8,6 @@ import socket
 from contextlib import suppress
 from typing import Any, Final
 
-#: Largest message [B].
 LONGEST: Final = 1 << 16
 #: Room for messages that wait for the other side [B].
 _ROOM: Final = 1 << 18
@@ -21,7 +20,6 @@ class Link:
         end.setblocking(False)
         end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _ROOM)
         self._end = end
-        #: whether the other side has gone
         self.broken = False
 
     def fileno(self) -> int:

@@ -36,7 +36,6 @@ MOST_PAGES: Final = 50
 _PATIENCE_S: Final = 20.0
 #: Longest time without a message to a page, and shortest time between two requests of a page [s].
 _WORD_S, _WISH_S = 1.0, 0.2
-#: Longest request of a page [B].
 _WISH: Final = 4096
 #: Increment of `nice`, which gives the twin priority.
 _NICE: Final = 10

@@ -37,7 +37,6 @@ _RATE_HZ: Final = 1000.0
 _SENSOR_MM: Final = 1.5
 #: Shortest demo with an estimate, length of its window, time between the ends of two windows [s].
 _ESTIMATED_S, _WINDOW_S, _INTERVAL_S = 15.0, 14.0, 3.0
-#: Longest time without progress [s].
 _STUCK_S: Final = 30.0
 
 

@@ -50,11 +50,8 @@ FIRST_STAMP_NS: Final = NS_PER_S
 WINDOW: Final = 200
 #: Number of samples by which a reliable reader may be late: 100 s at 1 kHz.
 QUEUE: Final = 100_000
-#: Number of samples between two messages on /clock.
 _CLOCK_EVERY: Final = 10
-#: Time between two messages on travel [s].
 _TRAVEL_S: Final = 0.1
-#: Rate of the synthetic sensor [Hz].
 _POSE_HZ: Final = 100.0
 #: Noise of the synthetic sensor [m, m, rad].
 _POSE_NOISE: Final = np.array([5e-4, 5e-4, 2e-3])
@@ -99,7 +96,6 @@ class ExcitationPublisher(WithoutEvents):
         self._twin_reads = False
         self._answered_ns = FIRST_STAMP_NS
         self.sent = 0
-        #: largest delay of a sample [s]
         self.latest_s = 0.0
         #: how often the twin did not answer in time
         self.stalls = 0

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 _LARGEST: Final = 65536
 #: Largest number of requests that a call of `Control.turn` answers.
 _MOST: Final = 8
-#: How long a client waits for the answer [s].
 _PATIENCE_S: Final = 5.0
 #: Period of the calls of `Control.turn` [s].
 TURN_S: Final = 0.1

@@ -32,7 +32,6 @@ from plow_twin.stream.journal import (
 )
 from plow_twin.stream.session import Series, Session
 
-#: Base names of the topics.
 ESTIMATE, WINDOW_FORCES, FORECAST = ESTIMATES
 #: SI unit in which a forecast is published, by the unit in which it is made.
 _SI: Final = {"hours": "seconds", "km": "metres"}
@@ -60,7 +59,6 @@ class Estimation:
         self.reasons: tuple[str, ...] = ()
         #: number of estimates, and of windows that a newer window replaced before they were estimated
         self.count = self.skipped = 0
-        #: time that the newest estimate took [s]
         self.wall_s = 0.0
         self.end_ns: int | None = None
         #: the newest forecast, or the reason why there is none

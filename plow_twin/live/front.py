@@ -94,7 +94,6 @@ class BridgeFront:
         #: calls between the messages
         self.timers: list[Timer] = []
         self._watchers: list[Watcher] = []
-        #: further parts of the diagnostics, by name
         self.more_parts: dict[str, Callable[[], Part]] = {}
 
     def attach(self, watcher: Watcher) -> None:

@@ -18,7 +18,6 @@ from plow_twin.stream.senders import OneSender, Senders
 if TYPE_CHECKING:
     from plow_twin.live.publishing import Front
 
-#: The inputs, by the names of their topics.
 TOPICS: Final = ("excitation", "tool_forces", "travel", "head_pose", "gaps")
 #: The inputs besides the load.
 OPTIONAL: Final = ("travel", "head_pose", "gaps")
@@ -64,7 +63,6 @@ class Inputs:
         #: newest stamp [ns] and gap [m] of each pair
         self._newest_gaps: dict[int, tuple[int, float]] = {}
         self._newest_pose = (0.0, 0.0, 0.0)
-        #: newest measured pose x, y [m], theta [rad]
         self.measured: tuple[float, float, float] | None = None
         self.refused_publishers = 0
         #: number of senders to which each input is connected

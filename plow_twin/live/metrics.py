@@ -18,9 +18,7 @@ if TYPE_CHECKING:
     from prometheus_client.metrics_core import Metric
 
 _OTHER: Final = re.compile(r"[^a-zA-Z0-9_]")
-#: Largest number of readers at once.
 _READERS: Final = 16
-#: Longest wait for a silent reader [s].
 _PATIENCE_S: Final = 10.0
 
 

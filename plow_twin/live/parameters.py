@@ -364,7 +364,6 @@ _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _LONGEST: Final = 4096
 #: One line without control characters, which a terminal would obey.
 _ONE_LINE: Final = r"^[^\x00-\x1f\x7f-\x9f]*\Z"
-#: Parameters that rclpy itself declares.
 _FOREIGN: Final = ("use_sim_time", "start_type_description_service")
 
 

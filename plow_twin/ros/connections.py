@@ -23,7 +23,6 @@ from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock
 
-#: Period of the look-up [s].
 LOOK_S: Final = 0.2
 #: Name of a node whose topics are discovered before the node itself (rmw_dds_common sends both in separate messages).
 _UNNAMED: Final = "_NODE_NAME_UNKNOWN_"

@@ -18,9 +18,7 @@ from plow_twin.telemetry.way import State
 
 #: Largest number of points that wait: ten minutes of all groups of numbers at 1 Hz; the oldest are dropped.
 _WAITING: Final = 2000
-#: Largest number of points in a request.
 _AT_ONCE: Final = 500
-#: Longest wait for an answer [ms].
 _ANSWER_MS: Final = 5000
 #: First and longest wait after a failed attempt to write [s]; the wait doubles with each failure.
 _FIRST_WAIT_S: Final = 1.0

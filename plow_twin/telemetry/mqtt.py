@@ -18,7 +18,6 @@ from plow_twin.telemetry.way import State, TelemetryError
 
 #: Largest number of messages that wait: ten minutes of all groups of numbers at 1 Hz; the oldest are dropped.
 _WAITING: Final = 2000
-#: Largest number of messages that the broker has not acknowledged.
 _UNACKNOWLEDGED: Final = 20
 #: Keep-alive interval [s]; 1.5 silent intervals mean that the broker has gone.
 _KEEPALIVE_S: Final = 10

@@ -22,7 +22,6 @@ from plow_twin.errors import PlowTwinError
 from plow_twin.telemetry.values import Newest
 from plow_twin.telemetry.way import Way
 
-#: Module and class of each output.
 WAYS: Final = {
     "mqtt": ("plow_twin.telemetry.mqtt", "MqttOut"),
     "sparkplug": ("plow_twin.telemetry.sparkplug", "Sparkplug"),

@@ -38,7 +38,6 @@ _FIELDS: Final = {
     "PropertySet": (("keys", 1, _STRING, ""), ("values", 2, _MESSAGE, "PropertyValue")),
     "PropertyValue": (("type", 1, _UINT32, ""), ("string_value", 8, _STRING, "")),
 }  # fmt: skip
-#: Numbers of the types of metrics.
 _INT32, _UINT64_TYPE, _DOUBLE_TYPE, _BOOLEAN, _TEXT = 3, 8, 10, 11, 12
 #: The two metrics that Sparkplug requires.
 BIRTH_NUMBER: Final = "bdSeq"
@@ -74,7 +73,6 @@ class Sparkplug:
         self._connection = -1
         self._rebirth = False
         self._newest = Newest()
-        #: newest value that was sent of each metric
         self._sent: dict[tuple[str, str], Value] = {}
         # the next birth has all newest values, so messages that a break delayed are dropped
         self._broker = Broker(will=self._next_death, on_connected=self._born, keeps=False, **options)

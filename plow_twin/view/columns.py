@@ -14,7 +14,6 @@ from plow_twin.record.template import compiled
 Array = NDArray[np.float64]
 Indexes = NDArray[np.int64]
 
-#: Number of rows that are collected before they are sent.
 BLOCK_ROWS: Final = 20_000
 ROS_TIME: Final = "ros_time"
 STEP: Final = "step"

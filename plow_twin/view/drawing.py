@@ -50,7 +50,6 @@ _BAND_ROWS: Final = 10
 _FACE_NS: Final = 1_000_000_000
 
 
-#: Receives the stream and its blueprint.
 Sink = Callable[[rr.RecordingStream, rrb.Blueprint], object]
 
 

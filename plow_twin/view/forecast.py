@@ -12,7 +12,6 @@ from plow_twin.view.figures import legend_beside, write_png
 if TYPE_CHECKING:
     from plow_twin.estimate.forecast import Forecast
 
-#: Number of instants at which the clearances are drawn.
 _MOMENTS = 120
 _COLOURS = ("#1f4e9c", "#d62728")
 

@@ -14,7 +14,6 @@ from plow_twin.view.rrd import ViewSummary
 
 #: Rate of the spans in which a curve keeps two values [Hz]; an hour of all curves takes some 200 MB in the viewer.
 CURVE_HZ: Final = 25.0
-#: Rate of the cross-section in a live view [Hz].
 SECTION_HZ: Final = 20.0
 #: Rate of the cross-section for the part recorded before the view started [Hz].
 _SECTION_HZ_BEFORE: Final = 1.0

@@ -11,7 +11,6 @@ from plow_twin.record.column_guess import Guess
 from plow_twin.view.figures import write_png
 
 _SHOWN_S: Final = 10.0
-#: SI prefixes of newtons.
 _PREFIXES: Final = (("M", 1e6), ("k", 1e3))
 
 

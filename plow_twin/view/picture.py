@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 #: Room around the end of an arrow for its label [mm].
 _LABEL_ROOM_MM: Final = 50.0
-#: Width of an upright label as a share of its axes.
 _LABEL_WIDTH: Final = 0.015
 _LOAD_NAMES: Final = ("Fx [kN]", "Fy [kN]", "M [kN m]")
 #: The state of a clearance in the words of the operator's screen.

@@ -12,7 +12,6 @@ from plow_twin.record.reader import FileStatus, RunReader
 from plow_twin.view.drawing import Drawing
 from plow_twin.view.rrd_file import RrdFile
 
-#: Largest number of rows of a curve that is not thinned.
 MOST_ROWS: Final = 200_000
 #: Rate of the cross-section [Hz]; curves keep every row.
 SECTION_HZ: Final = 100.0

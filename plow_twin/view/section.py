@@ -19,14 +19,12 @@ Array = NDArray[np.float64]
 _MM: Final = 1000.0
 #: Length of an arrow [mm] per force [N].
 ARROW_MM_PER_N: Final = 7e-4
-#: Smallest force that is drawn [N].
 FAINT_N: Final = 500.0
 #: Distance of the body's drawn outline from the cavity [mm], since a scene states no outline.
 BODY_MARGIN_MM: Final = 60.0
 
 #: Drawn depth of a pad per depth of its wear [mm/mm].
 PAD_MM_PER_MM: Final = 200.0
-#: Drawn length of a pad [mm].
 _PAD_MM: Final = 60.0
 #: Distance of a label below its place [mm].
 LABEL_MM: Final = 16.0
@@ -57,7 +55,6 @@ class Section:
     #: name of the body that is drawn at rest; on a support, the section is drawn in its axes
     frame_name: str = "frame (fixed)"
     is_block: bool = False
-    #: radius of the corners of the frame or of the block
     radius: float = 0.0
 
     @classmethod

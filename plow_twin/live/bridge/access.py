@@ -15,7 +15,6 @@ from plow_twin.live.bridge.source import BridgeError
 from plow_twin.scene_file.validation import TEXT, mapping, validate
 from plow_twin.scene_file.yaml_text import read_yaml
 
-#: Keys in a credentials file whose values are names of files.
 _FILES: Final = ("ca", "certificate", "key", "user_certificate", "user_key", "password_file")
 _CREDENTIALS: Final = mapping(
     {"user": TEXT, "plain": {"type": "boolean", "description": "true or false"}, **dict.fromkeys(_FILES, TEXT)}

@@ -27,9 +27,7 @@ from plow_twin.scene_file.parquet_lines import ParquetLines, is_parquet
 _BLOCK: Final = 1 << 18
 #: Number of bytes, the last ones read, by which a rewritten file is recognised.
 _REMEMBERED: Final = 256
-#: Interval at which a followed file is read [s].
 _LOOK_S: Final = 0.02
-#: Interval at which missing files are searched for [s].
 _LOOK_FOR_FILES_S: Final = 0.2
 STDIN_TOPIC: Final = "stdin"
 

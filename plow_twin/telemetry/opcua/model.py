@@ -14,7 +14,6 @@ from asyncua.ua.object_ids import ObjectIds
 
 from plow_twin.telemetry.values import UNITS, Group
 
-#: Namespace of type and instance.
 NAMESPACE: Final = "https://plow-twin.readthedocs.io/opcua"
 _NODESETS: Final = Path(__file__).with_name("nodesets")
 #: Nodeset files, each after those that it needs.

@@ -46,9 +46,7 @@ _AHEAD_NS: Final = 86_400_000_000_000
 _HISTORY_LAG_S: Final = 5.0
 #: Longest wait for the first values of a subscription [s], which a server sends at once.
 _FIRST_VALUES_S: Final = 10.0
-#: First wait before another attempt to connect [s].
 _FIRST_WAIT_S: Final = 1.0
-#: Longest wait before another attempt to connect [s].
 _LONGEST_WAIT_S: Final = 30.0
 
 

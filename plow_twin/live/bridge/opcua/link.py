@@ -27,13 +27,9 @@ _QUEUE: Final = 10_000
 _KEEPALIVE_S: Final = 2.0
 #: Time for which the server keeps a subscription without its client [s].
 _LIFETIME_S: Final = 60.0
-#: Largest number of lost messages that are requested again at once.
 _MOST_AGAIN: Final = 100
-#: Longest wait for an answer [s].
 _ANSWER_S: Final = 10.0
-#: Longest wait for the end of a session [s].
 _CLOSE_S: Final = 2.0
-#: Largest message that a server may send [B].
 _LARGEST_MESSAGE: Final = 64 << 20
 #: Largest part (chunk) of a message [B]; the OPC UA standard demands that a limit allows at least 8 KiB.
 _LARGEST_PART: Final = 1 << 20
@@ -94,7 +90,6 @@ class Link:
         self._next_number: int | None = None
         self._keepalive_s = _KEEPALIVE_S
         self._heard_s = 0.0
-        #: why the subscription has ended
         self._ended = ""
 
     async def open(self) -> Revised:

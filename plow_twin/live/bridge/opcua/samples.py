@@ -9,7 +9,6 @@ from typing import Final
 #: A value that was not measured, or that the twin does not use.
 NOT_MEASURED: Final = ""
 Value = float | str
-#: Largest number of stamps that wait for values.
 _MOST_WAITING: Final = 10_000
 
 
@@ -25,7 +24,6 @@ class Samples:
         self._stamps_ns: list[int] = []
         #: for each stamp: the arrival of its first value [s], and the values by node
         self._waiting: dict[int, tuple[float, dict[str, Value]]] = {}
-        #: stamp of each node's newest value [ns]
         self.newest_ns = dict.fromkeys(nodes, 0)
         self._held: dict[str, Value] = {}
         #: nodes whose only value is older than the first sample
