@@ -6,7 +6,6 @@ import itertools
 import os
 import signal
 import subprocess
-import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -15,6 +14,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import forge
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import WrenchStamped
@@ -45,12 +45,8 @@ class Process:
 
     def __init__(self, module: str, arguments: Sequence[str], log: Path) -> None:
         self._log = log
-        environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
-        environment["AMENT_PREFIX_PATH"] = environment.get("AMENT_PREFIX_PATH") or sys.prefix
         with log.open("wb") as stream:
-            self._process = subprocess.Popen(
-                [sys.executable, "-m", module, *arguments], env=environment, stdout=stream, stderr=subprocess.STDOUT
-            )
+            self._process = forge.start(module, arguments, stream)
 
     @property
     def running(self) -> bool:
