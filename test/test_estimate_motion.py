@@ -74,7 +74,10 @@ def test_effects_outside_the_model_are_flagged_and_rough_at_best(name: str) -> N
 
 @pytest.mark.parametrize(
     ("name", "seed", "names", "size"),
-    [("lever", 80_000, ("lever_x", "lever_y"), 5e-3), ("filter_5", 96_001, ("filter",), 1e-3)],
+    [
+        ("lever", 80_000, ("lever_x", "lever_y"), 5e-3),
+        pytest.param("filter_5", 96_001, ("filter",), 1e-3, marks=pytest.mark.stress),
+    ],
 )
 def test_a_sensor_beside_the_centre_or_behind_a_low_pass_is_found_and_the_interval_holds(
     name: str, seed: int, names: tuple[str, ...], size: float
@@ -126,7 +129,8 @@ def test_the_intervals_of_a_machine_that_does_not_differ_stay_narrow() -> None:
             assert exact.deviation < value.deviation < 2.5 * exact.deviation and value.p05 < true < value.p95
 
 
-@pytest.mark.parametrize("seed", [pytest.param(43202, marks=pytest.mark.stress), 43210])
+@pytest.mark.stress
+@pytest.mark.parametrize("seed", [43202, 43210])
 def test_intervals_hold_between_soft_and_hard_contacts(seed: int) -> None:
     """The first machine is treated as if its contact were hard: errors of the frame, here zero, widen its intervals."""
     truth = draw(GROUPS["middle"], seed)

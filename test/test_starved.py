@@ -147,25 +147,43 @@ NEEDING: dict[str, tuple[str, ...]] = {
 }
 
 
-@pytest.mark.parametrize("module", NEEDING)
-def test_a_missing_library_is_named_with_its_extra(module: str, tmp_path: Path) -> None:
+#: Program that runs each command in a fork that does not find its library.
+WITHOUT = """
+import os, sys
+from plow_twin.cli.app import run
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition('.')[0] == module:
+            raise ModuleNotFoundError(f'No module named {name!r}', name=name)
+for module, words in NEEDING.items():
+    found = module in sys.modules
+    if not (pid := os.fork()):
+        sys.meta_path.insert(0, Missing())
+        os._exit(run(words))
+    _, status = os.waitpid(pid, 0)
+    print("ended", module, os.waitstatus_to_exitcode(status), found, file=sys.stderr, flush=True)
+"""
+
+
+def test_a_missing_library_is_named_with_its_extra(tmp_path: Path) -> None:
     _csv(tmp_path / "load.csv", 10)
     (tmp_path / "load.parquet").write_bytes(b"PAR1")
     (tmp_path / "map.yaml").write_text("excitation: {topic: a, fields: {fx: x, fy: y, m: m}}\n")
     (tmp_path / "nodes.yaml").write_text("excitation: {fx: {node: i=1}, fy: {node: i=2}, m: {node: i=3}}\n")
-    (tmp_path / "sitecustomize.py").write_text(
-        "import sys\n"
-        "class Missing:\n"
-        "    def find_spec(self, name, path=None, target=None):\n"
-        f"        if name.partition('.')[0] == {module!r}:\n"
-        "            raise ModuleNotFoundError(f'No module named {name!r}', name=name)\n"
-        "sys.meta_path.insert(0, Missing())\n"
-    )
-    path = os.pathsep.join([str(tmp_path), str(ROOT)])
-    code, said = _run(tmp_path, *NEEDING[module], PYTHONPATH=path)
-    lines = [line for line in said if not line.startswith("OK status")]
-    assert code == 1 and len(lines) == 1, said
-    assert f"needs {module}, which is not installed: pip install 'plow_twin[{EXTRA_OF_MODULE[module]}]'" in lines[0]
+    done = subprocess.run(
+        [sys.executable, "-c", f"NEEDING = {NEEDING!r}\n{WITHOUT}"],
+        cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT), "COLUMNS": "10000"},
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, check=False,
+    )  # fmt: skip
+    said = [line for line in done.stderr.splitlines() if not line.startswith("OK status")]
+    expected = [
+        [f"needs {module}, which is not installed: pip install 'plow_twin[{EXTRA_OF_MODULE[module]}]'",
+         f"ended {module} 1 False"]
+        for module in NEEDING
+    ]  # fmt: skip
+    assert len(said) == 2 * len(NEEDING), said
+    for part, line in zip((part for both in expected for part in both), said, strict=True):
+        assert part in line
 
 
 def test_two_runs_into_one_folder_both_end_and_are_both_whole(folder: Path) -> None:
