@@ -23,7 +23,6 @@ _ENDS: Final = {
 _PARAMETERS: Final = {
     "clearance.horizontal_m": "horizontal clearance",
     "clearance.vertical_m": "vertical clearance",
-    "contact.stiffness": "contact stiffness",
 }
 _STATISTICS: Final = {
     "max": "largest force",

@@ -287,7 +287,7 @@ def analyse(
     units: Mapping[str, str] = MappingProxyType({}),
     others: Sequence[Path] = (),
     out: Path | None = None,
-    on_progress: OnProgress | None = None,
+    on_progress: OnProgress = lambda share: None,
     tail: Tail | None = None,
     on_caught_up: Callable[[Analysis], object] = lambda found: None,
 ) -> Analysis:
@@ -352,7 +352,7 @@ def _walk_own(
     path: Path,
     mapping: Path | None,
     predictions: list[Prediction],
-    on_progress: OnProgress | None,
+    on_progress: OnProgress,
     on_caught_up: Callable[[Analysis], object],
 ) -> Analysis:
     header = reader.header
@@ -394,8 +394,7 @@ def _walk_own(
                 journalled.add("head_pose", entry.stamp_ns, pose, stretch)
         if not len(batch.entries) and reader.tail is not None:
             on_caught_up(so_far())
-        if on_progress is not None:
-            on_progress(reader.position)
+        on_progress(reader.position)
     return so_far()
 
 

@@ -7,7 +7,7 @@ import json
 import re
 import shutil
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Protocol
@@ -20,7 +20,7 @@ from plow_twin.record.durable import write_whole
 from plow_twin.record.reader import read_header
 from plow_twin.scene_file import dump_scene, load_scene
 from plow_twin.scene_file.presets import scene_path
-from plow_twin.study.analysis.analyse import MAPPED_LOAD, analyse
+from plow_twin.study.analysis.analyse import MAPPED_LOAD, OnProgress, analyse
 from plow_twin.study.analysis.report import write_report
 
 #: File with the inputs of an analysis, written last: only a complete analysis has it.
@@ -125,7 +125,7 @@ class Task:
     def _inputs(self) -> list[Path]:
         return [self.path, *(path for path in (self.scene, self.mapping, *self.others) if path is not None)]
 
-    def run(self, on_progress: Callable[[float], object] | None = None) -> dict[str, Any]:
+    def run(self, on_progress: OnProgress = lambda share: None) -> dict[str, Any]:
         """Return the facts of the analysis and write its files, or raise a `PlowTwinError`."""
         self.clear()
         asked = self._asked()  # before the analysis, because files may change while it runs

@@ -22,7 +22,7 @@ from plow_twin.study.parameters import Value
 
 Array = NDArray[np.float64]
 #: Function that gets the share of the work done, 0..1, and the best objective so far.
-OnProgress = Callable[[float, float], None]
+OnProgress = Callable[[float, float], object]
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def calibrate(
     starts: int,
     search: Search | None = None,
     first: Array | None = None,
-    on_progress: OnProgress | None = None,
+    on_progress: OnProgress = lambda share, best: None,
 ) -> Calibration:
     """Minimise the objective over the space from independent random starts.
 
@@ -90,8 +90,7 @@ def calibrate(
         rng = np.random.default_rng(child)
 
         def report(share: float, best: float, number: int = number) -> None:
-            if on_progress is not None:
-                on_progress((number + share) / starts, min([best, *(start.objective for start in done)]))
+            on_progress((number + share) / starts, min([best, *(start.objective for start in done)]))
 
         before = objective.runs
         known = first if number == 0 else None

@@ -17,10 +17,10 @@ from plow_twin.study.sweep.table import Sweep, Table, run_members_of
 
 Array = NDArray[np.float64]
 #: Function that gets the number of finished members.
-OnProgress = Callable[[int], None]
+OnProgress = Callable[[int], object]
 
 
-def run_here(store: Store, workers: int | None = None, on_progress: OnProgress | None = None) -> Table:
+def run_here(store: Store, workers: int | None = None, on_progress: OnProgress = lambda count: None) -> Table:
     """Compute and store the missing chunks with threads of this process; return the whole table."""
     chunks, missing = store.chunks, store.missing()
     done = store.sweep.size - sum(len(chunks[index]) for index in missing)
@@ -28,16 +28,15 @@ def run_here(store: Store, workers: int | None = None, on_progress: OnProgress |
     for index in missing:
 
         def report(count: int, before: int = done) -> None:
-            if on_progress is not None:
-                on_progress(before + count)
+            on_progress(before + count)
 
         store.write(index, run_members_of(store.sweep, chunks[index], workers, report), build)
         done += len(chunks[index])
-        report(0, done)
+        on_progress(done)
     return store.table()
 
 
-def run_on_cluster(store: Store, address: str, on_progress: OnProgress | None = None) -> Table:
+def run_on_cluster(store: Store, address: str, on_progress: OnProgress = lambda count: None) -> Table:
     """Compute the missing chunks on the Dask cluster at `address`; return the whole table.
 
     Each chunk is a task, whose result is stored as it arrives. The scheduler gives the tasks of a dead worker to
@@ -65,8 +64,7 @@ def run_on_cluster(store: Store, address: str, on_progress: OnProgress | None = 
                 raise StudyError(f"dask: chunk {index}: {type(error).__name__}: {error}") from error
             store.write(index, table, build)
             done += len(chunks[index])
-            if on_progress is not None:
-                on_progress(done)
+            on_progress(done)
     return store.table()
 
 
