@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Sample:
-    """Result of one run: its time in s, poses (rows, 3) or None, and counts."""
+    """Result of one run; the poses have shape (rows, 3)."""
 
     wall_s: float
     q: Array | None = None

@@ -84,7 +84,6 @@ def work() -> str:
 
 
 def missed() -> str:
-    """Return the missed targets of the solver; targets relative to the same peer share a line."""
     groups: dict[tuple[str, str], list[targets.Verdict]] = {}
     for verdict in targets.verdicts(solver_rows()):
         if not verdict.reached:

@@ -14,7 +14,6 @@ LEVELS = (1e-2, 1e-3, 1e-6, 1e-9)
 OUTPUTS = (0.1, 1e-3)
 Member = Callable[[str], bool]
 
-#: Groups of peers; at each level of error, the fastest member of a group counts.
 PEERS: dict[str, Member] = {
     "CVODE from C": lambda solver: solver.startswith("CVODE") and solver.endswith("(C)"),
     "CVODE from C, rootfinding": lambda solver: "rootfinding" in solver,

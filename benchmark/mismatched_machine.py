@@ -34,9 +34,7 @@ class Machine:
     stiffness_share: Array
     #: distance by which the wall of each pair lies farther out [m], shape (8,)
     depth: Array
-    #: radius of the corners [m]
     radius: float = 0.0
-    #: coefficient of friction
     friction: float = 0.0
     #: stiffness of the spring under the frame, along x and along y [N/m]; 0 for a fixed frame
     spring: float = 0.0

@@ -31,7 +31,6 @@ from plow_twin.model.loads import compile_loads
 from plow_twin.stream.outputs import clearances
 
 Array = NDArray[np.float64]
-#: Days on which the pose is measured.
 DAYS = np.linspace(0.0, 30.0, 7)
 SPEED_M_S, PAD_AREA_M2 = 2.0, 0.06
 #: 5 % and 95 % points [m^2/N] of the prior, from which the true coefficient is drawn.

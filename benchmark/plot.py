@@ -14,7 +14,6 @@ from cases import Row
 from matplotlib.ticker import LogLocator, NullFormatter
 from work_precision import OURS, SECTION
 
-#: Colour and marker of each solver, in the order of the legend.
 STYLES: dict[str, tuple[str, str]] = {
     OURS: ("#d62728", "o"),
     "heyoka (Taylor, events)": ("#111111", "*"),

@@ -18,14 +18,12 @@ from lives import SHARES
 
 from plow_twin.estimate.result import NORMAL_P95, State
 
-#: Colours of the groups, in the order of the legend.
 STYLES = {
     "plain": "#1f4e9c", "sensor": "#5aae61", "stochastic": "#dfa526", "middle": "#8c510a", "firm": "#35978f",
     "hard": "#d62728", "hard_sensor": "#9970ab",
 }  # fmt: skip
 #: First seed that no tuning used.
 _FRESH = 50_000
-#: Limit of the error axis [mm].
 _MOST_MM = 0.5
 
 

@@ -24,11 +24,9 @@ PICTURE = ROOT / "docs" / "images" / "restitution.png"
 PAGE = ROOT / "benchmark" / "results" / "restitution.md"
 BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
 
-#: Nominal restitutions in the CSV file.
+#: Nominal restitutions in the CSV file and on the page, and damping ratios C / (2 sqrt(K m)) of Kelvin-Voigt.
 ASKED = tuple(round(0.01 * k, 2) for k in range(101))
-#: Nominal restitutions on the page.
 SHOWN = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0)
-#: Damping ratios C / (2 sqrt(K m)) of the Kelvin-Voigt table.
 RATIOS = (0.0, 0.01, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 2.0)
 #: Lengths of the ramp, as multiples of the depth v sqrt(m/K) of the undamped impact.
 RAMPS = (0.001, 0.01, 0.1, 0.3, 1.0, 3.0, 10.0)

@@ -40,7 +40,6 @@ QUICK_TOLERANCES = (1e-3, 1e-6, 1e-9, 1e-12)
 FIXED_STEPS = (1e-3, 5e-4, 2e-4, 1e-4, 5e-5, 2e-5, 1e-5)
 LEAN_STEPS = (*FIXED_STEPS, 5e-6, 2e-6, 1e-6)
 _LADDER = _decades(2, 13)
-#: Tolerances of CVODE in C, down to the one at which it breaks down.
 _C_LADDER = _decades(2, 14)
 #: Tolerances of `solve_ivp`, whose loop in Python is run with sparse output only. Radau and BDF take seconds, so they
 #: have whole decades only.

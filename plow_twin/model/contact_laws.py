@@ -174,7 +174,6 @@ _LAWS: Final[dict[str, ContactLaw]] = {
         ramped=True,
     ),
 }
-#: Every law, by the name that scenes use.
 LAWS: Final[Mapping[str, ContactLaw]] = MappingProxyType(_LAWS)
 
 

@@ -25,9 +25,8 @@ PAIR_COUNT: Final = len(PAIR_NAMES)
 
 CORNER_NAMES: Final[tuple[str, ...]] = ("top_left", "top_right", "bottom_right", "bottom_left")
 
-#: Side of each pair's corner, shape (8,): -1 left, +1 right.
+#: Side of each pair's corner, shape (8,) each: -1 left, +1 right; -1 bottom, +1 top.
 CORNER_X: Final[NDArray[np.float64]] = np.array([-1.0, -1.0, 1.0, 1.0, 1.0, 1.0, -1.0, -1.0])
-#: Side of each pair's corner, shape (8,): -1 bottom, +1 top.
 CORNER_Y: Final[NDArray[np.float64]] = np.array([1.0, 1.0, 1.0, 1.0, -1.0, -1.0, -1.0, -1.0])
 #: Outward normal of each pair's wall in head axes, shape (8,) each.
 NORMAL_X: Final[NDArray[np.float64]] = np.array([0.0, -1.0, 0.0, 1.0, 0.0, 1.0, 0.0, -1.0])

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
-#: Scenes that come with the package.
 PRESETS: Final = ("paper", "bench_kv", "bench_hc", "measured_square", "measured_ellipse")
 
 

@@ -26,7 +26,6 @@ except ImportError:
 
 #: Largest file [B]. A table of 200,000 rows fits; longer tables belong in CSV.
 LARGEST_FILE: Final = 64 * 2**20
-#: Largest number of values in a file.
 MOST_VALUES: Final = 1_000_000
 #: Deepest nesting of collections; a scene has six levels.
 DEEPEST: Final = 20

@@ -11,7 +11,6 @@ from plow_twin.study.parameters import StudyError
 if TYPE_CHECKING:
     from distributed import Client, Future
 
-#: Time to wait for a scheduler [s].
 CONNECT_TIMEOUT_S = 20.0
 #: Longest time that a cluster may be without a worker [s].
 WORKER_TIMEOUT_S = 300.0

@@ -32,8 +32,7 @@ from plow_twin.solve.state import Status
 from plow_twin.study.parameters import StudyError, nearest_of
 
 Array = NDArray[np.float64]
-#: Function that returns a statistic of m runs, shape (m,).
-Statistic = Callable[[Ensemble], Array]
+Statistic = Callable[[Ensemble], Array]  # shape (m,) for m runs
 
 SENSES: Final = ("ccw", "cw")
 

@@ -155,7 +155,6 @@ class Measured:
     signals: dict[str, ThinnedSignal] = field(default_factory=dict)
     #: stretch and stamp [ns] of the latest message by role
     _latest: dict[str, tuple[int, int]] = field(default_factory=dict)
-    #: number of values that are too large in any unit
     implausible: int = 0
 
     def add(self, role: str, stamp_ns: int, numbers: Mapping[str, float], stretch: int = 0) -> None:

@@ -21,7 +21,6 @@ from plow_twin.run.energy_balance import elastic_energy
 Array = NDArray[np.float64]
 
 CYCLE_BINS: Final = 16
-#: Length of a piece of the face [m].
 FACE_BIN_M: Final = 1.0
 #: Memory [B] of a `Series`, enough for 131,072 numbers.
 _IN_MEMORY: Final = 2**20

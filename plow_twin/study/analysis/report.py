@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from plow_twin.study.analysis.analyse import Analysis, Prediction
 
 _MOST_POINTS: Final = 4000
-#: Entry of a folder without a recording.
 LEFT_OUT: Final = "left out: no recording"
 
 

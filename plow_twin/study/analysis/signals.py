@@ -13,7 +13,6 @@ Array = NDArray[np.float64]
 
 #: Largest lag [s]; a longer lag resembles a shift by a period of the load.
 LARGEST_LAG_S: Final = 1.0
-#: Smallest number of measured values for a comparison.
 _FEWEST: Final = 8
 _MOST_POINTS: Final = 400_000
 
@@ -22,7 +21,6 @@ _MOST_POINTS: Final = 400_000
 class Comparison:
     """Comparison of a signal: predicted minus measured."""
 
-    #: measured values within the time of the prediction
     n: int
     #: mean and root mean square of the difference at equal stamps
     bias: float

@@ -71,7 +71,6 @@ class Task:
     out: Path | None
     #: items in the folder of the recording that are not analysed
     left_out: tuple[Path, ...] = ()
-    #: units by name, which replace those of the mapping
     units: Mapping[str, str] = field(default_factory=dict)
 
     def stored(self) -> dict[str, Any] | None:
@@ -210,5 +209,5 @@ def run_task(task: RunTask) -> dict[str, Any]:
         return task.run()
     except PlowTwinError as error:
         return {"run": str(task.path), "error": str(error)}
-    except Exception as error:  # whatever the error, the other recordings continue
+    except Exception as error:
         return {"run": str(task.path), "error": f"{task.path}: {error!r}"}

@@ -35,7 +35,6 @@ class Search:
     simplex: int = 0
     #: spread of the population's objectives, relative to their mean, at which the evolution ends
     spread: float = 1e-3
-    #: step of the Jacobian, in the unit cube
     step: float = 1e-6
 
 

@@ -15,7 +15,6 @@ from plow_twin.study.parameters import Value
 
 Array = NDArray[np.float64]
 
-#: Step of the Jacobian in the unit cube.
 _STEP: Final = 1e-5
 #: Largest difference of an unknown within a cluster, as a share of its range.
 _DISTANCE: Final = 0.1

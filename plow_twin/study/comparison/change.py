@@ -25,7 +25,7 @@ _USUAL: Final = (5.0, 95.0)
 _LEVEL: Final = 0.05
 #: Windows drawn at once, which limits the memory.
 _AT_ONCE: Final = 2**21
-#: Relative difference that rounding can cause between means of equal numbers.
+#: Relative difference that rounding can cause.
 _ROUNDING: Final = 1e-12
 #: Largest distance between the starts of neighbouring windows, in window lengths.
 _NEXT: Final = 1.5

@@ -43,15 +43,12 @@ _TOTALS: Final = np.array([CLEARANCE_NAMES.index(name) for name in ("horizontal"
 class Windows:
     """The n windows of a run."""
 
-    #: first stamp [ns], shape (n,)
     start_ns: Indexes
     #: an array, shape (n, 8), for each of `QUANTITIES`
     pairs: dict[str, Array]
     #: root mean square of the force [N] and of the moment [N m] of the load, shape (n, 2)
     load: Array
-    #: horizontal and vertical clearance [m], shape (n, 2)
-    clearance: Array
-    #: length [ns], shape (n,)
+    clearance: Array  # horizontal, vertical [m], shape (n, 2)
     length_ns: Indexes
     #: sample rate of the load [Hz], shape (n,)
     rate_hz: Array

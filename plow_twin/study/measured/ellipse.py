@@ -39,7 +39,6 @@ class EllipseContact:
 
     #: key of `model.contact_laws.LAWS`
     law: str = "exact_restitution"
-    #: n in F = K d^n
     exponent: float = 1.0
     #: restitution of an impact at 2.5 m/s without motion along the surface; for a law without a restitution, the
     #: damping number lambda v0, or the damping C relative to the critical damping
@@ -48,7 +47,6 @@ class EllipseContact:
     fall: float = 0.2523
     #: decrease of the restitution with the speed of the centre of mass along the surface [s/m]
     fall_along: float = 0.2786
-    #: coefficient of friction
     friction: float = 0.1907
     #: regularisation speed [m/s]; 0 for a tangential spring and damper
     slip_speed: float = 0.0

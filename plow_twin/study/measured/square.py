@@ -22,13 +22,11 @@ Array = NDArray[np.float64]
 #: Rate of the measured rows [Hz].
 RATE_HZ: Final = 250.0
 _DT: Final = 1.0 / RATE_HZ
-#: Number of steps of the table of `damping_numbers`.
 _NUMBERS: Final = 1000
 #: Number of touches with scatter of their own; later touches have the scatter of the last of them.
 _TOUCHES: Final = 64
 #: Difference [rad] of an angle from the line through the three rows before it that shows an impact.
 _TURN_IN_A_ROW: Final = 0.1
-#: Smallest number of rows of a first flight, to which the speeds are fitted.
 LEAST_ROWS: Final = 4
 #: `_MOST_ROWS`: largest number of rows of the bands, 4 s; a block comes to rest within 1 s
 #: `_FASTEST`: a speed in m/s that no drop reaches

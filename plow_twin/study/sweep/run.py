@@ -16,8 +16,7 @@ from plow_twin.study.store import Store
 from plow_twin.study.sweep.table import Sweep, Table, run_members_of
 
 Array = NDArray[np.float64]
-#: Function that gets the number of finished members.
-OnProgress = Callable[[int], object]
+OnProgress = Callable[[int], object]  # gets the number of finished members
 
 
 def run_here(store: Store, workers: int | None = None, on_progress: OnProgress = lambda count: None) -> Table:

@@ -18,7 +18,7 @@ from plow_twin.run.simulate import Result, simulate
 from plow_twin_paper import sets as paper_sets
 from plow_twin_paper.values import CORNERS, SENSE_NAMES
 
-#: Distance of two motions that count as separated [m].
+#: Distance [m] of two motions that count as separated.
 PARTED_M = 1e-3
 
 

@@ -14,9 +14,7 @@ from plow_twin_paper.values import Sense
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: Colour and marker of each corner.
 CORNER_STYLE: Final = {"a": ("#0072B2", "o"), "b": ("#D55E00", "s"), "c": ("#009E73", "^"), "d": ("#CC79A7", "D")}
-#: Colour and marker of each inner face.
 FACE_STYLE: Final = {
     "top": ("#D55E00", "s"), "right": ("#0072B2", "o"), "bottom": ("#CC79A7", "D"), "left": ("#009E73", "^"),
 }  # fmt: skip

@@ -25,7 +25,6 @@ GRID_M: Final = (0.020, 0.0225, 0.025, 0.0275, 0.030)
 FACE_GRID_M: Final = (0.020, 0.025, 0.030)
 #: Length of the simulation of Figs 14 and 15 [s].
 FACE_T_END_S: Final = 20.0
-#: Angular frequency of the loads [rad/s] (section 3).
 OMEGA_RAD_S: Final = 2.0
 PERIOD_S: Final = 2.0 * math.pi / OMEGA_RAD_S
 
