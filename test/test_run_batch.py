@@ -115,7 +115,7 @@ def test_a_twin_at_rest_costs_next_to_nothing() -> None:
 
 
 def test_one_sample_a_call_a_pause_and_a_restored_snapshot_change_no_bit() -> None:
-    scenes = members()[:4]
+    scenes = members()
     wrench = samples(len(scenes))
     whole = TwinBatch(scenes).advance_samples(TIMES, wrench)
     one = TwinBatch(scenes)
@@ -131,6 +131,21 @@ def test_one_sample_a_call_a_pause_and_a_restored_snapshot_change_no_bit() -> No
     assert np.isfinite(held.q).all()
     one.reset(0.0)
     assert np.array_equal(one.advance_samples(TIMES, wrench).q, whole.q)
+
+
+def test_twins_moved_between_calls_go_on_like_twins_restored_there_and_no_sample_changes_nothing() -> None:
+    scenes = members()
+    wrench = samples(len(scenes))
+    twins, other = TwinBatch(scenes), TwinBatch(scenes)
+    twins.advance_samples(TIMES[:100], wrench[:, :100])
+    twins.advance(TIMES[100], wrench[:, 100])
+    before = twins.digest()
+    assert len(twins.advance_samples([], np.zeros((0, 3))).t) == 0 and twins.digest() == before
+    twins.move([2, 8], [[1e-3, 0.0, 0.0], [0.0, 1e-3, 1e-3]], np.zeros((2, 3)))
+    other.restore(twins.snapshot())
+    rows, others = (one.advance(TIMES[101], wrench[:, 101]) for one in (twins, other))
+    assert np.array_equal(rows.q, others.q) and np.array_equal(rows.peak, others.peak)
+    assert twins.digest() == other.digest() != before
 
 
 # friction compiles kernels that no other test has

@@ -75,6 +75,21 @@ def _copy_record(typingctx: Any, target: Any, source: Any) -> Any:
 copy_record = cast("Callable[[Any, Any], None]", intrinsic(_copy_record))
 
 
+def _copy_part(typingctx: Any, target: Any, source: Any, first: Any, last: Any) -> Any:
+    """Copy the bytes from `first` to before `last` of a record to the same place in a record of another type."""
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        begin, end = (context.cast(builder, arguments[i], signature.args[i], types.intp) for i in (2, 3))
+        there, here = (builder.gep(builder.bitcast(one, cgutils.voidptr_t), [begin]) for one in arguments[:2])
+        cgutils.raw_memcpy(builder, there, here, builder.sub(end, begin), 1)  # type: ignore[no-untyped-call]
+        return context.get_dummy_value()
+
+    return types.void(target, source, first, last), codegen
+
+
+copy_part = cast("Callable[[Any, Any, int, int], None]", intrinsic(_copy_part))
+
+
 @kernel()
 def copy_into(target: Any, source: Any) -> None:
     """Copy the numbers of an array to an array of the same size."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
@@ -42,6 +43,8 @@ __all__ = ["TwinBatch"]
 
 _Array = NDArray[np.float64]
 _NO_MARKS = np.zeros(0, np.int64)
+#: Number of numbers that Python checks one by one in the time of a call of numpy.
+_FEW = 32
 #: Terms that have no effect if their parameters are zero, so that a scene without such a term can run with compiled
 #: code that includes the term.
 _OPTIONAL = ("hysteretic", "wear", "sliding", "running_in", "offset", "free", "slip")
@@ -107,9 +110,10 @@ class TwinBatch:
             self._params[index] = compiled.params
         self._stick = terms.stick
         self._states = new_records(state_type(self._compiled[0].parts.terms), len(scenes))
-        #: copy of the states from before a call
-        self._before = np.zeros(self._states.nbytes, np.uint8)
-        self._wrench = np.zeros((len(scenes), 3))
+        #: states before the newest call, and memory for the states after the next
+        self._before = new_records(self._states.dtype, len(scenes))
+        #: last samples, shape (m, 3), or (1, 3) for all twins
+        self._wrench = np.zeros((1, 3))
         self._masses = np.array([inertias(scene) for scene in scenes])
         self._max_steps, self._max_wall_s = max_steps, max_wall_s
         count = max(1, min(workers, os.cpu_count() or 1, len(scenes)))
@@ -165,7 +169,7 @@ class TwinBatch:
         ArgumentError
             As for `advance_samples`.
         """
-        sample = self._wrench if wrench is None else np.asarray(wrench, dtype=np.float64)
+        sample = self._samples_before() if wrench is None else np.asarray(wrench, dtype=np.float64)
         if sample.shape not in ((3,), (len(self), 3)):
             raise ArgumentError(f"wrench: got shape {sample.shape}, expected (3,) or ({len(self)}, 3)")
         return self.advance_samples(np.array([t], dtype=np.float64), sample[..., None, :])
@@ -193,12 +197,12 @@ class TwinBatch:
         times, samples = np.ascontiguousarray(t, dtype=np.float64), np.asarray(wrench, dtype=np.float64)
         check_times(self.time, times)
         shape = (len(self), len(times), 3)
-        if samples.shape not in (shape, shape[1:]) or not np.isfinite(samples).all():
+        if samples.shape not in (shape, shape[1:]) or not _all_finite(samples):
             raise ArgumentError(f"wrench: got {samples!r}, expected finite numbers of shape {shape} or {shape[1:]}")
         samples = np.ascontiguousarray(samples if samples.ndim == 3 else samples[None])
         rows = self._run(times, samples)
         if len(times):
-            self._wrench[:] = samples[:, -1]
+            self._wrench = samples[:, -1].copy()
         return AdvanceBatch(rows)
 
     def reset(self, t: float) -> None:
@@ -218,7 +222,8 @@ class TwinBatch:
             raise ArgumentError(f"t: got {t!r}, expected a finite time in s")
         for index, compiled in enumerate(self._compiled):
             self._states[index] = compiled.initial_state(t)
-        self._wrench = np.zeros((len(self), 3))
+        self._reload()
+        self._wrench = np.zeros((1, 3))
 
     def begin_beside(self, snapshot: bytes, moved: ArrayLike, *, again: bool = False) -> None:
         """Set all twins to displaced states of a sampled twin, with its contacts, last sample and travel speed.
@@ -245,12 +250,14 @@ class TwinBatch:
         damping[displaced] = damping[0]
         if not again:
             damping[:] = here["damping_factor"]
-        self._states[:], self._wrench[:] = here, sample
+        self._states[:], self._wrench = here, np.reshape(sample, (1, 3)).copy()
+        self._reload()
         self.set_travel_speed(speed)
         row = self.advance(self.time)
         pose = np.concatenate([row.q[0, 0], row.v[0, 0]])
         self._states[:] = here
         self._states["damping_factor"] = damping
+        self._reload()
         for index in np.flatnonzero(displaced):
             there = pose + away[index]
             self._states["y"][index] = geometry.state_of(self.scenes[index], there[:3], there[3:])
@@ -270,6 +277,7 @@ class TwinBatch:
         poses, rates = np.asarray(q, dtype=np.float64), np.asarray(v, dtype=np.float64)
         places = geometry.states_of(self.scenes[0], np.concatenate([poses, rates], axis=1))
         settle_moved(self._params, self._states, index, places, self.time, self._stick)
+        self._reload()
 
     def change(self, which: ArrayLike, scenes: Sequence[Scene]) -> NDArray[np.bool_]:
         """Replace the scenes of some twins, which keep their places, wear and travel speed.
@@ -299,6 +307,7 @@ class TwinBatch:
             if scene.contact.damping is not None and one.parts.terms.hysteretic is not None:
                 self._states["damping_factor"][place] = scene.contact.damping
         self.scenes = tuple(own)
+        self._reload()
         return changed
 
     def set_travel_speed(self, speed_m_s: ArrayLike) -> None:
@@ -323,7 +332,7 @@ class TwinBatch:
 
     def snapshot(self) -> bytes:
         """Return the exact state as bytes, for twins of the same scenes and tolerance."""
-        return self._states.tobytes() + self._wrench.tobytes() + self._params["wear_per_impulse"].tobytes()
+        return self._states.tobytes() + self._samples_before().tobytes() + self._params["wear_per_impulse"].tobytes()
 
     def restore(self, data: bytes) -> None:
         """Restore a state saved by `snapshot`.
@@ -339,10 +348,11 @@ class TwinBatch:
             The data does not have the size of a snapshot.
         """
         wear = self._params["wear_per_impulse"]
-        ends = np.cumsum([self._states.nbytes, self._wrench.nbytes, wear.nbytes])
+        ends = np.cumsum([self._states.nbytes, 24 * len(self), wear.nbytes])
         if len(data) != ends[-1]:
             raise ArgumentError(f"snapshot: got {len(data)} bytes, expected {ends[-1]}")
         self._states[...] = np.frombuffer(data[: ends[0]], self._states.dtype)
+        self._reload()
         self._wrench = np.frombuffer(data[ends[0] : ends[1]]).reshape(-1, 3).copy()
         wear[...] = np.frombuffer(data[ends[1] :]).reshape(wear.shape)
 
@@ -370,12 +380,17 @@ class TwinBatch:
                 worker.advance(*records, 0, 1, times[i : i + 1], np.ascontiguousarray(line), self._max_steps, row)
                 rows[member, i] = row.view(np.uint8)[0, : ADVANCE.itemsize].view(ADVANCE)[0]
 
-            worker.lanes.advance(times, Load(self._wrench, samples, self._masses), rows, worker.pace, alone)
+            load = Load(self._wrench, samples, self._masses)
+            worker.lanes.advance(self._states, times, load, rows, worker.pace, alone)
 
-        # records are copied as bytes, because numpy copies a record field by field
-        states, begun = self._states.view(np.uint8), list[Future[None]]()
-        self._before[:] = states
+        if not len(times):
+            return rows
+        before, after, begun = self._states, self._before, list[Future[None]]()
+        if any(one.lanes is None or one.lanes.stale for one in self._workers):
+            # records are copied as bytes, because numpy copies a record field by field
+            after.view(np.uint8)[:] = before.view(np.uint8)
         try:
+            self._states, self._before = after, before
             if self._pool is None:
                 run(0)
             else:
@@ -384,7 +399,7 @@ class TwinBatch:
                     one.result()
         except (OutOfTimeError, KeyboardInterrupt) as stop:
             self._stop(begun)
-            states[:] = self._before
+            self._states, self._before = before, after
             late = isinstance(stop, OutOfTimeError)
             reason = f"max_wall_s = {self._max_wall_s:g} reached" if late else "interrupted"
             span = f"t = {self.time:.9g} s to {float(times[-1]):.9g} s"
@@ -392,9 +407,19 @@ class TwinBatch:
             raise (LimitError if late else RunInterrupted)(message, None, self.time) from None
         return rows
 
+    def _reload(self) -> None:
+        """Let lanes read the states from their records, because these have changed."""
+        for worker in self._workers:
+            if worker.lanes is not None:
+                worker.lanes.reload()
+
+    def _samples_before(self) -> NDArray[np.float64]:
+        """Return the last samples of all twins, shape (m, 3)."""
+        return np.broadcast_to(self._wrench, (len(self), 3))
+
     def _ends(self, samples: NDArray[np.float64], members: slice) -> NDArray[np.float64]:
         """Return the previous sample and the samples of some twins per mass and inertia, shape (k, n + 1, 3)."""
-        before, masses = self._wrench[members, None], self._masses[members, None]
+        before, masses = self._samples_before()[members, None], self._masses[members, None]
         own = samples[members] if len(samples) > 1 else np.broadcast_to(samples, (len(before), *samples.shape[1:]))
         joined: NDArray[np.float64] = np.concatenate([before, own], axis=1) / masses
         return joined
@@ -410,6 +435,12 @@ class TwinBatch:
                 worker.totals[name] = 0
             if worker.lanes is not None:
                 worker.lanes.clear()
+
+
+def _all_finite(numbers: NDArray[np.float64]) -> bool:
+    if numbers.size <= _FEW:
+        return all(map(math.isfinite, numbers.ravel().tolist()))
+    return bool(np.isfinite(numbers).all())
 
 
 class _Worker(NamedTuple):
@@ -431,7 +462,7 @@ class _Worker(NamedTuple):
 
     def with_lanes(self, batch: TwinBatch, terms: Terms, members: range) -> _Worker:
         """Return a worker with lanes for the twins `members`."""
-        found = LaneTwins(batch._params, batch._states, terms, members, self.work, batch._max_steps)
+        found = LaneTwins(batch._params, terms, members, self.work, batch._max_steps)
         return self._replace(lanes=found)
 
     def advance(

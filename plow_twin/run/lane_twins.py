@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from plow_twin.kernel.compiler import for_arguments
 from plow_twin.run.pace import Pace
-from plow_twin.solve.lanes.advance import Load, Samples, advance_lanes
-from plow_twin.solve.lanes.record import WIDTH, new_lanes, powers
-from plow_twin.solve.state import TOTALS, Terms
+from plow_twin.solve.lanes.advance import OTHERS, Load, Samples, advance_lanes
+from plow_twin.solve.lanes.record import BLOCK, WIDTH, new_lanes, powers
+from plow_twin.solve.state import TOTALS, Terms, new_records
 
 #: Number of steps in a slice of work, summed over all lanes; a slice takes about a millisecond.
 _SLICE: Final = 256
@@ -25,8 +25,8 @@ class LaneTwins:
 
     Parameters
     ----------
-    params, states : ndarray of records, shape (m,)
-        Parameters and states of all twins of a batch.
+    params : ndarray of records, shape (m,)
+        Parameters of all twins of a batch.
     terms : Terms
         Joint terms of all twins.
     members : range
@@ -38,44 +38,50 @@ class LaneTwins:
     """
 
     def __init__(
-        self,
-        params: NDArray[np.void],
-        states: NDArray[np.void],
-        terms: Terms,
-        members: range,
-        work: NDArray[np.void],
-        max_steps: int,
+        self, params: NDArray[np.void], terms: Terms, members: range, work: NDArray[np.void], max_steps: int
     ) -> None:
-        self._params, self._states, self._terms, self._work = params, states, terms, work
-        self._members, self._max_steps, self._order = np.array(members), max_steps, int(params["order"][members[0]])
-        self._place, self._queue = np.zeros(len(params), np.int64), self._members.copy()
-        self._other, self._progress = np.zeros(len(params), np.int64), np.zeros(2, np.int64)
+        self._params, self._terms, self._work = params, terms, work
+        self._members, self._max_steps, self._order = members, max_steps, int(params["order"][members[0]])
+        count = -(-len(members) // WIDTH)
+        self._blocks, self._noted = new_records(BLOCK, count), np.empty(count, np.int64)
+        self._place, self._other = np.zeros(len(params), np.int64), np.zeros(len(params), np.int64)
+        self._start = np.array([0, 0, 0, members.start, members.stop], np.int64)
+        self._progress = self._start.copy()
         self._kernel: Callable[..., bool] | None = None
         self.clear()
 
     def clear(self) -> None:
         """Empty the lanes after a call that was stopped."""
         self._lanes, self._totals = new_lanes(), np.zeros(WIDTH, TOTALS)
+        self.reload()
+
+    def reload(self) -> None:
+        """Load all twins from their records at the next advance, because records have changed."""
+        self._noted[:] = -1
+        self.stale = True
 
     def advance(
-        self, times: _Array, load: Load, rows: NDArray[np.void], pace: Pace, alone: Callable[[int, int], None]
+        self,
+        states: NDArray[np.void],
+        times: _Array,
+        load: Load,
+        rows: NDArray[np.void],
+        pace: Pace,
+        alone: Callable[[int, int], None],
     ) -> None:
         """Advance all twins to all times; `alone` advances a single twin to one of these times by other methods.
 
-        `load` and `rows` are as in `Samples`.
+        `load` and `rows` are as in `Samples`. `states` receives the new states of all twins. If `stale` is set, it must
+        hold the present states.
         """
-        if not len(times):
-            return
-        self._place[self._members] = 0
-        self._queue[:] = self._members
-        queue = self._queue
-        while len(queue):
-            self._progress[:] = 0
+        self._place[:], self.stale = 0, False
+        terms = self._terms
+        while True:
+            self._progress[:] = self._start
             samples = Samples(
-                self._params, self._states, self._totals, times, load, rows, self._place, queue, self._progress,
-                self._other,
+                self._params, states, self._blocks, self._noted, self._totals, times, load, rows, self._place,
+                self._progress, self._other,
             )  # fmt: skip
-            terms = self._terms
             arguments = (
                 samples, terms.viscous, terms.hysteretic, *powers(terms), terms.rest, self._order, self._lanes,
                 self._work, self._max_steps, _SLICE,
@@ -83,14 +89,10 @@ class LaneTwins:
             if self._kernel is None:
                 self._kernel = for_arguments(advance_lanes, arguments)
             pace.run(self._kernel, arguments)
-            if not self._progress[1]:
+            others: list[int] = self._other[: self._progress[OTHERS]].tolist()
+            if not others:
                 return
-            queue = np.array(self._advance_others(len(times), alone), np.int64)
-
-    def _advance_others(self, count: int, alone: Callable[[int, int], None]) -> list[int]:
-        """Advance each twin without a lane to its next time; return those that have not reached all `count` times."""
-        others: list[int] = self._other[: self._progress[1]].tolist()
-        for member in others:
-            alone(member, int(self._place[member]))
-            self._place[member] += 1
-        return [member for member in others if self._place[member] < count]
+            self.stale = True
+            for member in others:
+                alone(member, int(self._place[member]))
+                self._place[member] += 1

@@ -323,20 +323,21 @@ TOTALS: Final = np.dtype(
 FOLLOWED: Final = 1
 WITH_INTERVALS: Final = 2
 
-#: The motion at the end of an advance, and the sums over it; the rows of twins in lanes.
+#: The motion at the end of an advance, and the sums over it; the rows of twins in lanes. Eight single numbers come
+#: first, so that the numbers of the eight pairs begin at a cache line.
 _ADVANCE_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("t", "f8"),
     ("q", "f8", (3,)),
     ("v", "f8", (3,)),
+    ("error_estimate", "f8"),
     *((name, "f8", (PAIR_COUNT,)) for name in ("penetration", "rate", "force", "peak", "impulse")),
     ("time_in_contact", "f8", (PAIR_COUNT,)),
     ("makes", "i8", (PAIR_COUNT,)),
     ("wear_depth", "f8", (PAIR_COUNT,)),
     ("steps", "i8"),
     ("status", "i8"),
-    ("error_estimate", "f8"),
 ]
-ADVANCE: Final = np.dtype(_ADVANCE_FIELDS)
+ADVANCE: Final = _in_lines(_ADVANCE_FIELDS)
 
 #: A row of `ADVANCE` with the further values of a published message; the solver passes these rows on to the messages.
 ROW: Final = np.dtype(

@@ -30,14 +30,19 @@ from plow_twin.solve.lanes.loop import (
 from plow_twin.solve.lanes.maps import choose_maps, note_durations
 from plow_twin.solve.lanes.record import (
     COMPONENTS,
+    COUNTS,
+    STEPS,
     WIDTH,
+    empty_lanes,
     join_lanes,
     linear_at,
     load_lane,
     note_modes,
     penetration_at,
+    read_block,
+    refresh,
     save_lanes,
-    weigh_lanes,
+    write_block,
     write_place,
 )
 from plow_twin.solve.lanes.series import accurate_steps, accurate_steps_by_power, expand, raised
@@ -57,12 +62,15 @@ _SHORTEST_SPAN: Final = 1e-100
 _OK, _RANGE, _NON_FINITE = int(Status.OK), int(Status.OUT_OF_RANGE), int(Status.NON_FINITE)
 _BUDGET: Final = int(Status.BUDGET)
 _AT_SAMPLE: Final = 7
+#: Index in `kept` of the rows after state, lambda and modes.
+_TIMES: Final = 3 * PAIR_COUNT
 
 
 class Load(NamedTuple):
     """The samples of the load of all twins."""
 
-    before: NDArray[np.float64]  #: previous sample, Fx, Fy [N] and M [N m] about the cavity's centre, shape (m, 3)
+    #: previous sample, Fx, Fy [N] and M [N m] about the cavity's centre, shape (m, 3), or (1, 3) for all twins
+    before: NDArray[np.float64]
     samples: NDArray[np.float64]  #: shape (m, n, 3), or (1, n, 3) for all twins
     masses: NDArray[np.float64]  #: mass, mass and inertia of each twin, shape (m, 3)
 
@@ -72,15 +80,23 @@ class Samples(NamedTuple):
 
     params: NDArray[np.void]  #: parameters of all twins, shape (m,)
     states: NDArray[np.void]
+    blocks: NDArray[np.void]  #: the twins of a thread, eight in a `BLOCK`; shape (b,)
+    #: for each block, a bit for each twin whose modes are noted in it; -1 for a block that must be loaded from records
+    noted: NDArray[np.int64]
     totals: NDArray[np.void]  #: counts of touches since the previous sample, by lane, shape (8,)
     times: NDArray[np.float64]  #: times of the samples in s, shape (n,)
     load: Load
     rows: NDArray[np.void]  #: rows of `ADVANCE` to fill, shape (m, n)
     place: NDArray[np.int64]  #: number of samples that each twin has passed, shape (m,)
-    queue: NDArray[np.int64]  #: indices of the twins that wait for a lane
-    #: first the number of twins taken from the queue, then the number of twins that left for another method
-    progress: NDArray[np.int64]
+    progress: NDArray[np.int64]  #: by `BLOCK_NOW` to `LOADED`
     other: NDArray[np.int64]  #: indices of the twins that left for another method, shape (m,)
+
+
+#: Indices in `Samples.progress`: the present block, the number of twins that left for another method, whether the
+#: present block is in the lanes (`_LOADED`, or `_LEFT` if one of its twins left), and the thread's first twin and the
+#: twin after its last.
+BLOCK_NOW, OTHERS, LOADED, FIRST, END = range(5)
+_LOADED, _LEFT = 1, 2
 
 
 @kernel(inline="source")
@@ -88,8 +104,8 @@ def _unowned_samples(s):
     """Return the arrays without reference counts."""
     load = Load(unowned(s.load.before), unowned(s.load.samples), unowned(s.load.masses))
     return Samples(
-        unowned(s.params), unowned(s.states), unowned(s.totals), unowned(s.times), load, unowned(s.rows),
-        unowned(s.place), unowned(s.queue), unowned(s.progress), unowned(s.other),
+        unowned(s.params), unowned(s.states), unowned(s.blocks), unowned(s.noted), unowned(s.totals),
+        unowned(s.times), load, unowned(s.rows), unowned(s.place), unowned(s.progress), unowned(s.other),
     )  # fmt: skip
 
 
@@ -102,11 +118,10 @@ def _begin_samples(s, lanes, bits) -> None:
     for lane in range(WIDTH):
         if bits >> lane & 1:
             member = lanes.member[lane]
-            i, own, state = s.place[member], member if samples.shape[0] > 1 else 0, s.states[member]
-            lanes.stop[lane], lanes.kept_touched[lane] = s.times[i], lanes.touched[lane]
+            i, own = s.place[member], member if samples.shape[0] > 1 else 0
+            lanes.stop[lane] = s.times[i]
             for j in range(3):
                 lanes.next[j, lane] = samples[own, i, j]
-            _keep_counts(state, lanes, lane)
     time, stop, zero = exact_row(lanes.time, 0), exact_row(lanes.stop, 0), exact_splat(0.0)
     span = stop - time
     per_span = choose(below(exact_splat(_SHORTEST_SPAN), span), exact_splat(1.0) / span, zero)
@@ -118,57 +133,122 @@ def _begin_samples(s, lanes, bits) -> None:
         set_row(lanes.slope, j, choose(bits, slope, exact_row(lanes.slope, j)))
     set_row(lanes.knot, 0, choose(bits, time, exact_row(lanes.knot, 0)))
     for i in range(PAIR_COUNT):
-        _keep(lanes, i, exact_row(lanes.y, i), bits)
-        _keep(lanes, PAIR_COUNT + i, exact_row(lanes.factor, i), bits)
-        _keep(lanes, 2 * PAIR_COUNT + i, exact_row(lanes.mode, i), bits)
-    _keep(lanes, 3 * PAIR_COUNT, exact_row(lanes.touch_time, 0), bits)
-    _keep(lanes, 3 * PAIR_COUNT + 1, exact_row(lanes.before_it, 0), bits)
+        _copy_lanes(lanes.kept, i, lanes.y, i, bits)
+        _copy_lanes(lanes.kept, PAIR_COUNT + i, lanes.factor, i, bits)
+        _copy_lanes(lanes.kept, 2 * PAIR_COUNT + i, lanes.mode, i, bits)
+    _copy_lanes(lanes.kept, _TIMES, lanes.touch_time, 0, bits)
+    _copy_lanes(lanes.kept, _TIMES + 1, lanes.before_it, 0, bits)
+    _copy_lanes(lanes.kept, _TIMES + 2, lanes.touched, 0, bits)
+    for i in range(COUNTS):
+        _copy_lanes(lanes.kept_counts, i, lanes.counts, i, bits)
 
 
 @kernel(inline="code")
-def _keep(lanes, i, value, bits) -> None:
-    set_row(lanes.kept, i, choose(bits, value, exact_row(lanes.kept, i)))
-
-
-@kernel(inline="code")
-def _keep_counts(state, lanes, lane) -> None:
-    counts = lanes.counts
-    counts[0, lane], counts[1, lane], counts[2, lane] = state.steps, state.evaluations, state.events
-    counts[3, lane], counts[4, lane] = state.guard_roots, state.recoveries
-    counts[5, lane] = state.events_at_once
+def _copy_lanes(there, i, source, at, bits) -> None:
+    set_row(there, i, choose(bits, exact_row(source, at), exact_row(there, i)))
 
 
 @kernel()
-def _load_waiting(s, power, lanes) -> bool:
-    """Move waiting twins into empty lanes, and begin their advances; return whether any was waiting."""
-    bits = 0
+def _undo(s, lanes, bits) -> None:
+    """Set some lanes back to their states at the previous sample, and clear their sums; `note_modes` must follow."""
+    for i in range(PAIR_COUNT):
+        _copy_lanes(lanes.y, i, lanes.kept, i, bits)
+        _copy_lanes(lanes.factor, i, lanes.kept, PAIR_COUNT + i, bits)
+        _copy_lanes(lanes.mode, i, lanes.kept, 2 * PAIR_COUNT + i, bits)
+    _copy_lanes(lanes.touch_time, 0, lanes.kept, _TIMES, bits)
+    _copy_lanes(lanes.before_it, 0, lanes.kept, _TIMES + 1, bits)
+    _copy_lanes(lanes.touched, 0, lanes.kept, _TIMES + 2, bits)
+    for i in range(COUNTS):
+        _copy_lanes(lanes.counts, i, lanes.kept_counts, i, bits)
+    _copy_lanes(lanes.time, 0, lanes.knot, 0, bits)
+    lanes.stale[0] = 1
+    _clear_sums(s, lanes, bits)
+
+
+@kernel()
+def _steps_since(lanes, lane) -> int:
+    """Return the number of steps since the previous sample."""
+    taken: int = lanes.counts[STEPS, lane] - lanes.kept_counts[STEPS, lane]
+    return taken
+
+
+@kernel()
+def _next_block(s, hysteretic, power, lanes) -> bool:
+    """Load the next block with a twin that has not passed all samples; return whether there is such a block."""
+    progress = s.progress
+    if progress[LOADED] != 0:
+        _store_block(s, hysteretic, power, lanes)
+    while progress[BLOCK_NOW] < s.blocks.size:
+        first, live, count = progress[FIRST] + WIDTH * progress[BLOCK_NOW], 0, 0
+        for lane in range(WIDTH):
+            if first + lane < progress[END]:
+                count += 1
+                live |= 1 << lane if s.place[first + lane] < s.times.size else 0
+        if live != 0:
+            _load_block(s, power, lanes, first, count, live)
+            return True
+        progress[BLOCK_NOW] += 1
+    return False
+
+
+@kernel()
+def _load_block(s, power, lanes, first, count, live) -> None:
+    """Put `count` twins from `first` on into the lanes, and begin the advances of the twins in `live`."""
+    block = s.progress[BLOCK_NOW]
+    if s.noted[block] < 0:
+        for lane in range(count):
+            _load_record(s, power, lanes, lane, first + lane)
+        join_lanes(lanes, (1 << count) - 1)
+    else:
+        read_block(lanes, s.blocks[block])
     for lane in range(WIDTH):
-        if lanes.member[lane] < 0 and s.progress[0] < s.queue.size:
-            member = s.queue[s.progress[0]]
-            s.progress[0] += 1
-            p = s.params[member]
-            load_lane(p, s.states[member], power, lanes, lane, member)
-            lanes.small[lane] = _VANISHED * p.threshold[p.order]
-            i, before = s.place[member], s.load.before
-            own = member if s.load.samples.shape[0] > 1 else 0
+        lanes.member[lane] = first + lane if live >> lane & 1 else -1
+    lanes.live[0] = live
+    if s.noted[block] != live:
+        note_modes(lanes)
+        lanes.stale[0] = 1
+    s.progress[LOADED], before, samples = _LOADED, s.load.before, s.load.samples
+    for lane in range(WIDTH):
+        if live >> lane & 1:
+            member = first + lane
+            i, own = s.place[member], member if samples.shape[0] > 1 else 0
+            first_own = member if before.shape[0] > 1 else 0
             for j in range(3):
-                lanes.mass[j, lane] = s.load.masses[member, j]
-                lanes.next[j, lane] = before[member, j] if i == 0 else s.load.samples[own, i - 1, j]
-            bits |= 1 << lane
-    if bits == 0:
-        return False
+                lanes.next[j, lane] = before[first_own, j] if i == 0 else samples[own, i - 1, j]
     for j in range(3):
-        before_it = exact_row(lanes.next, j)
-        set_row(lanes.next, j, choose(bits, before_it / exact_row(lanes.mass, j), before_it))
-    join_lanes(lanes, bits)
-    _begin_samples(s, lanes, bits)
-    return True
+        set_row(lanes.next, j, exact_row(lanes.next, j) / exact_row(lanes.mass, j))
+    _begin_samples(s, lanes, live)
+
+
+@kernel()
+def _load_record(s, power, lanes, lane, member) -> None:
+    """Put a twin into a lane from its record; `join_lanes` must follow."""
+    p = s.params[member]
+    load_lane(p, s.states[member], power, lanes, lane, member)
+    lanes.small[lane] = _VANISHED * p.threshold[p.order]
+    for j in range(3):
+        lanes.mass[j, lane] = s.load.masses[member, j]
+
+
+@kernel()
+def _store_block(s, hysteretic, power, lanes) -> None:
+    """Write the lanes to their block; if a twin left for another method, the block must be loaded from records."""
+    block = s.progress[BLOCK_NOW]
+    if s.progress[LOADED] == _LOADED:
+        refresh(lanes, hysteretic, power)
+        write_block(s.blocks[block], lanes, s.noted[block] < 0)
+        if lanes.noted[0] >= 0:
+            s.noted[block] = lanes.noted[0]
+    else:
+        s.noted[block] = -1
+    s.progress[BLOCK_NOW] += 1
+    s.progress[LOADED] = 0
 
 
 @kernel()
 def _clear_sums(s, lanes, bits) -> None:
-    """Clear the sums of the rows of some lanes."""
-    zero = exact_splat(0.0)
+    """Clear the sums of the rows of some lanes, and of all lanes whose twins are done."""
+    zero, bits = exact_splat(0.0), bits | ~lanes.live[0]
     for pair in range(PAIR_COUNT):
         set_row(lanes.peak, pair, choose(bits, zero, exact_row(lanes.peak, pair)))
         set_row(lanes.impulse, pair, choose(bits, zero, exact_row(lanes.impulse, pair)))
@@ -181,31 +261,15 @@ def _clear_sums(s, lanes, bits) -> None:
 
 
 @kernel()
-def _leave(s, lanes, lane) -> None:
-    """Set a twin back to its state at the previous sample, and take it out of its lane; `note_modes` must follow."""
-    state, kept, counts = s.states[lanes.member[lane]], lanes.kept, lanes.counts
-    for i in range(PAIR_COUNT):
-        lanes.y[i, lane], lanes.factor[i, lane] = kept[i, lane], kept[PAIR_COUNT + i, lane]
-    bit = 1 << lane
-    for i in range(PAIR_COUNT):
-        set_row(lanes.mode, i, choose(bit, exact_row(kept, 2 * PAIR_COUNT + i), exact_row(lanes.mode, i)))
-    lanes.time[lane], lanes.touched[lane] = lanes.knot[lane], lanes.kept_touched[lane]
-    lanes.touch_time[lane], state.last_step_size = kept[3 * PAIR_COUNT, lane], kept[3 * PAIR_COUNT + 1, lane]
-    state.steps, state.evaluations, state.events = counts[0, lane], counts[1, lane], counts[2, lane]
-    state.guard_roots, state.recoveries, state.events_at_once = counts[3, lane], counts[4, lane], counts[5, lane]
-    _clear_sums(s, lanes, bit)
-    save_lanes(s.states, lanes, bit)
-
-
-@kernel()
 def _fail(s, lanes, lane, code) -> None:
-    """Undo a failed advance: the twin has its old state at the next sample's time, and is queued again."""
-    member = lanes.member[lane]
-    i, steps = s.place[member], s.states[member].steps - lanes.counts[0, lane]
-    _leave(s, lanes, lane)
+    """Undo a failed advance: the twin has its old state at the next sample's time. `note_modes` must follow."""
+    member, steps = lanes.member[lane], _steps_since(lanes, lane)
+    i = s.place[member]
+    _undo(s, lanes, 1 << lane)
+    lanes.touch_time[lane] += s.times[i] - lanes.time[lane]
+    lanes.time[lane] = s.times[i]
+    save_lanes(s.states, lanes, 1 << lane)
     p, state, out, zero = s.params[member], s.states[member], s.rows[member, i], exact_splat(0.0)
-    state.touch_time += s.times[i] - state.time
-    state.step_start = state.time = s.times[i]
     out.t, out.status, out.steps, out.error_estimate = s.times[i], code, steps, 0.0
     pose_of(p, state.y, None, out.q, out.v)
     copy_into(out.wear_depth, state.wear_depth)
@@ -214,10 +278,6 @@ def _fail(s, lanes, lane, code) -> None:
     set_row(out.impulse, 0, zero)
     set_row(out.time_in_contact, 0, zero)
     set_row(out.makes, 0, zero)
-    s.place[member] += 1
-    if s.place[member] < s.times.size:
-        s.progress[0] -= 1
-        s.queue[s.progress[0]] = member
 
 
 @kernel()
@@ -270,7 +330,7 @@ def _write_rows(s, lanes, reached) -> None:
             state, now = s.states[member], turned[0, lane]
             i = s.place[member]
             out = s.rows[member, i]
-            out.t, out.status, out.steps = s.times[i], _OK, state.steps - lanes.counts[0, lane]
+            out.t, out.status, out.steps = s.times[i], _OK, _steps_since(lanes, lane)
             out.error_estimate = 0.0
             out.q[0], out.q[1], out.q[2] = now[X], now[Y], now[THETA]
             out.v[0], out.v[1], out.v[2] = now[VX], now[VY], now[OMEGA]
@@ -285,23 +345,24 @@ def _write_rows(s, lanes, reached) -> None:
 
 
 @kernel()
-def _go_on(s, lanes, reached) -> int:
-    """Begin the advances of lanes to their next samples; after the last sample a twin leaves.
+def _go_on(s, lanes, passed) -> int:
+    """Begin the advances of lanes to their next samples; a twin that has passed the last sample is done.
 
     Returns a bit for each lane that can take a step at once, without another check.
     """
     over = 0
     for lane in range(WIDTH):
-        if reached >> lane & 1:
+        if passed >> lane & 1:
             member = lanes.member[lane]
             s.place[member] += 1
             over |= 1 << lane if s.place[member] == s.times.size else 0
     if over != 0:
         save_lanes(s.states, lanes, over)
-    if reached == over:
+        empty_lanes(lanes, over)
+    if passed == over:
         return 0
-    _begin_samples(s, lanes, reached & ~over)
-    return _limit_steps(lanes) & reached & ~over
+    _begin_samples(s, lanes, passed & ~over)
+    return _limit_steps(lanes) & passed & ~over
 
 
 @kernel()
@@ -328,7 +389,7 @@ def _look(s, rest, lanes, lane, budget, in_range, ahead) -> int:
     state = s.states[member]
     if not in_range and not lane_in_range(lanes, s.params[member], state, lane):
         return _RANGE
-    taken = state.steps - lanes.counts[0, lane]
+    taken = _steps_since(lanes, lane)
     if not ahead:
         return _AT_SAMPLE
     if taken >= budget:
@@ -343,40 +404,47 @@ def _look(s, rest, lanes, lane, budget, in_range, ahead) -> int:
 
 @kernel()
 def _get_ready(s, viscous, hysteretic, power, fraction, rest, lanes, budget) -> bool:
-    """Write the rows of reached samples and fill empty lanes; return whether any lane has a step to take."""
-    left = False
+    """Write the rows of passed samples and load blocks; return whether any lane has a step to take."""
     while True:
-        if _load_waiting(s, power, lanes):
-            left = False
-        in_range, ahead, reached, live, changed = bits_in_range(lanes), _limit_steps(lanes), 0, 0, False
+        if lanes.live[0] == 0 and not _next_block(s, hysteretic, power, lanes):
+            return False
+        in_range, ahead, reached, failed, left = bits_in_range(lanes), _limit_steps(lanes), 0, 0, 0
         for lane in range(WIDTH):
             if lanes.member[lane] < 0:
                 continue
             code = _look(s, rest, lanes, lane, budget, in_range >> lane & 1 == 1, ahead >> lane & 1 == 1)
-            if code == _OK:
-                live |= 1 << lane
-            elif code == _AT_SAMPLE:
+            if lanes.failed[0] >> lane & 1:
+                code = _NON_FINITE
+            if code == _AT_SAMPLE:
                 reached |= 1 << lane
             elif code == OTHER_METHOD:
-                s.other[s.progress[1]] = lanes.member[lane]
-                s.progress[1] += 1
                 _leave(s, lanes, lane)
-                changed = left = True
-            else:
+                left |= 1 << lane
+            elif code != _OK:
                 _fail(s, lanes, lane, code)
-                changed = left = True
+                failed |= 1 << lane
+        lanes.failed[0] = 0
         if reached != 0:
             _tell(lanes, reached, viscous, hysteretic, power, fraction)
             _write_rows(s, lanes, reached)
             _clear_sums(s, lanes, reached)
-            ready = _go_on(s, lanes, reached)
-            live |= ready
-            changed |= ready != reached
-            left |= ready != reached
-        if not changed:
-            if left and live != 0:
-                note_modes(lanes)
-            return live != 0
+        if left | failed != 0:
+            note_modes(lanes)
+        ready = _go_on(s, lanes, reached | failed)
+        if left | failed == 0 and ready == reached:
+            return True
+
+
+@kernel()
+def _leave(s, lanes, lane) -> None:
+    """Let another method continue a twin from the previous sample; `note_modes` must follow."""
+    bit = 1 << lane
+    s.other[s.progress[OTHERS]] = lanes.member[lane]
+    s.progress[OTHERS] += 1
+    s.progress[LOADED] = _LEFT
+    _undo(s, lanes, bit)
+    save_lanes(s.states, lanes, bit)
+    empty_lanes(lanes, bit)
 
 
 @kernel()
@@ -386,10 +454,7 @@ def _step(s, viscous, hysteretic, power, fraction, order, lanes, w) -> None:
     for j in range(3):
         sampled = fused(exact_row(lanes.slope, j), time, exact_row(lanes.sample, j))
         set_row(lanes.held, j, exact_row(lanes.constant, j) + sampled)
-    if lanes.stale[0] == 1:
-        if hysteretic is None and power is None:
-            weigh_lanes(lanes)
-        lanes.stale[0] = 0
+    refresh(lanes, hysteretic, power)
     if fraction is not None:
         choose_maps(None, None, None, None, hysteretic, fraction, 1, lanes, w)
     used = expand(lanes, w, order, None, None, viscous, hysteretic, power, fraction, 1)
@@ -397,13 +462,12 @@ def _step(s, viscous, hysteretic, power, fraction, order, lanes, w) -> None:
         infinite = accurate_steps(s.params, lanes, order)
     else:
         infinite = accurate_steps_by_power(lanes, w, order, fraction)
+    lanes.failed[0] = infinite
     if infinite != 0:
-        for lane in range(WIDTH):
-            if infinite >> lane & 1:
-                _fail(s, lanes, lane, _NON_FINITE)
+        lanes.live[0] &= ~infinite
         note_modes(lanes)
-    first_events(s.states, lanes, w, used, order, hysteretic, power, fraction)
-    go_past_an_instant(s.params, s.states, lanes)
+    first_events(lanes, w, used, order, hysteretic, power, fraction)
+    go_past_an_instant(s.params, lanes)
     note_switches(lanes, used, viscous, fraction)
     if fraction is not None:
         note_durations(lanes)
@@ -411,18 +475,18 @@ def _step(s, viscous, hysteretic, power, fraction, order, lanes, w) -> None:
     add_step(None, lanes, w, used, order, viscous, hysteretic, power, fraction)
     move(lanes)
     for lane in range(WIDTH):
-        member = lanes.member[lane]
-        if member >= 0:
-            complete(s.params[member], s.states[member], s.totals[lane], lanes, lane, hysteretic, fraction)
+        if lanes.live[0] >> lane & 1:
+            complete(s.params[lanes.member[lane]], s.totals[lane], lanes, lane, hysteretic, fraction)
     if lanes.stale[0] == 1:
         note_modes(lanes)
+    lanes.live[0] |= infinite
 
 
 @kernel(entry=True)
 def advance_lanes(
     s, viscous, hysteretic, power, fraction, rest, order, eight, work, budget, iterations
 ) -> bool:  # fmt: skip
-    """Advance the twins in the queue through all samples, eight at a time; return False if `iterations` are used up.
+    """Advance the twins in the blocks through all samples, a block at a time; return False if `iterations` are used up.
 
     `eight` and `work`, shape (1,), are lanes and scratch space. `budget` is the largest number of steps of an advance
     to a sample. If an advance fails, the twin keeps its state, and its time becomes that of the sample. A twin at rest

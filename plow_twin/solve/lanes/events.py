@@ -17,6 +17,7 @@ from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.events import LET_GO, ON_THE_WALL
 from plow_twin.solve.lanes.record import (
     AGAIN,
+    GUARD_ROOTS,
     GUARDS,
     SECOND,
     WIDTH,
@@ -358,7 +359,7 @@ def _note_root(lanes, lane, at, i, order) -> None:
 
 
 @kernel()
-def first_events(states, lanes, w, order, full, hysteretic, power, fraction) -> None:
+def first_events(lanes, w, order, full, hysteretic, power, fraction) -> None:
     """Shorten each lane's step to end at its first event; write the guard to `lanes.event`, or -1 without an event.
 
     `order` is the order of the series. Guards always have the largest number of orders, `full`, because the rounding of
@@ -379,7 +380,7 @@ def first_events(states, lanes, w, order, full, hysteretic, power, fraction) -> 
             return
         bits = _write_chosen(lanes, at, order, full, fraction) & ((1 << count) - 1)
         if bits != 0:
-            _search(states, lanes, w, at, full, bits)
+            _search(lanes, w, at, full, bits)
     lanes.rounds[0] = GUARDS
 
 
@@ -403,7 +404,7 @@ def _write_chosen(lanes, at, order, full, fraction):
 
 
 @kernel()
-def _search(states, lanes, w, at, order, bits) -> None:
+def _search(lanes, w, at, order, bits) -> None:
     """Find each guard's first root; search a guard again later if a shorter step may change the result."""
     guard = lanes.guard[at]
     single, several = isolate(lanes, guard, w, order, bits)
@@ -426,7 +427,7 @@ def _search(states, lanes, w, at, order, bits) -> None:
                 column[k] = guard[k, i]
             lanes.root[i] = first_root(column, order, reach, w)
         if lanes.root[i] < reach:
-            states[lanes.member[lane]].guard_roots += 1
+            lanes.counts[GUARD_ROOTS, lane] += 1
             _note_root(lanes, lane, at, i, order)
 
 

@@ -9,20 +9,26 @@ from numpy.typing import NDArray
 
 from plow_twin.kernel.arrays import unowned
 from plow_twin.kernel.compiler import kernel
-from plow_twin.kernel.simd import below, exact_row, exact_splat, fused, magnitude, set_row
+from plow_twin.kernel.simd import below, choose, exact_row, exact_splat, fused, magnitude, set_row
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.kinematics import pose_of, rate_at
 from plow_twin.solve.lanes.events import first_events, note_switches
 from plow_twin.solve.lanes.maps import choose_maps, duration_of, note_durations, sigma_of
 from plow_twin.solve.lanes.record import (
+    AT_ONCE,
     COMPONENTS,
+    EVALUATIONS,
+    EVENTS,
+    RECOVERIES,
+    STEPS,
     WIDTH,
+    empty_lanes,
     join_lanes,
     load_lane,
     note_modes,
     penetration_at,
+    refresh,
     save_lanes,
-    weigh_lanes,
     write_place,
 )
 from plow_twin.solve.lanes.series import accurate_steps, accurate_steps_by_power, expand, expand_loads
@@ -100,7 +106,7 @@ def _look(members, flight, rest, lanes, lane, w, t_end, budget, in_range) -> int
         return _RANGE
     if lanes.time[lane] >= t_end:
         return _DONE
-    if state.steps >= budget:
+    if lanes.counts[STEPS, lane] >= budget:
         return _BUDGET
     lanes.stop[lane], lanes.whole[lane] = t_end, min(t_end - lanes.time[lane], LONGEST_STEP)
     if _another_method(
@@ -152,12 +158,12 @@ def turn(out, first, second) -> None:
 
 
 @kernel()
-def _part(state, sums, lanes, lane) -> None:
+def _part(sums, lanes, lane) -> None:
     """Set the CLIPPED and RELEASED pairs that leave their wall within a lane's step to OFF."""
     for pair in range(PAIR_COUNT):
         if lanes.parted[pair, lane] < lanes.step[lane]:
             lanes.mode[pair, lane] = OFF
-            state.events += 1
+            lanes.counts[EVENTS, lane] += 1
             sums.logged += 1
 
 
@@ -190,14 +196,14 @@ def _touch_or_release(p, lanes, pair, lane) -> None:
 
 
 @kernel()
-def _switch(p, state, sums, lanes, lane, hysteretic, fraction) -> None:
+def _switch(p, sums, lanes, lane, hysteretic, fraction) -> None:
     """Change the modes of a lane's pairs at the step's end."""
     for pair in range(PAIR_COUNT):
         new, old = lanes.switch[pair, lane], lanes.mode[pair, lane]
         if new < 0:
             continue
         lanes.mode[pair, lane] = new
-        state.events += 1
+        lanes.counts[EVENTS, lane] += 1
         if old == OFF:
             sums.makes[pair] += 1
             if hysteretic is not None:
@@ -223,54 +229,56 @@ def end_of(lanes, lane, fraction):
 
 
 @kernel()
-def complete(p, state, sums, lanes, lane, hysteretic, fraction) -> None:
+def complete(p, sums, lanes, lane, hysteretic, fraction) -> None:
     """Move the time, counts and modes of a lane to the end of its step; its state must already be there.
 
     If modes change, `lanes.stale` is set, and `note_modes` must follow.
     """
-    begin, parted = lanes.time[lane], False
-    state.steps += 1
-    state.evaluations += lanes.orders[lane]
+    begin, parted, counts = lanes.time[lane], False, lanes.counts
+    counts[STEPS, lane] += 1
+    counts[EVALUATIONS, lane] += lanes.orders[lane]
     if lanes.parting[0] >> lane & 1:
         for pair in range(PAIR_COUNT):
             parted |= lanes.parted[pair, lane] < lanes.step[lane]
     if parted:
-        _part(state, sums, lanes, lane)
+        _part(sums, lanes, lane)
     end = end_of(lanes, lane, fraction)
     lanes.time[lane] = end
     at_once = end - begin <= ONE_INSTANT * (1.0 + abs(begin))
     if not at_once:
-        state.last_step_size = lanes.before_it[lane] = end - begin
+        lanes.before_it[lane] = end - begin
     if not at_once or lanes.event[lane] < 0:
         lanes.touched[lane] = 0
     if lanes.event[lane] < 0:
-        state.events_at_once = 0
+        counts[AT_ONCE, lane] = 0
         if not parted:
             return
     else:
-        state.events_at_once = state.events_at_once + 1 if at_once else 0
-        _switch(p, state, sums, lanes, lane, hysteretic, fraction)
+        counts[AT_ONCE, lane] = counts[AT_ONCE, lane] + 1 if at_once else 0
+        _switch(p, sums, lanes, lane, hysteretic, fraction)
     lanes.stale[0] = 1
 
 
 @kernel()
 def move(lanes) -> None:
-    """Add the changes over the steps to the states, and recompute cosine and sine from the angle."""
-    for component in range(COMPONENTS):
-        set_row(lanes.y, component, exact_row(lanes.y, component) + exact_row(lanes.change, component))
-    turn_lanes(lanes.y[THETA], lanes.y[COS], lanes.y[SIN])
+    """Add the changes over the steps to the states of scenes, and recompute cosine and sine from the angle."""
+    y, moved, live = lanes.y, lanes.out, lanes.live[0]
+    for i in range(COMPONENTS):
+        set_row(moved, i, exact_row(y, i) + exact_row(lanes.change, i))
+    turn_lanes(moved[THETA], moved[COS], moved[SIN])
+    for i in range(COMPONENTS):
+        set_row(y, i, choose(live, exact_row(moved, i), exact_row(y, i)))
 
 
 @kernel()
-def go_past_an_instant(params, states, lanes) -> None:
+def go_past_an_instant(params, lanes) -> None:
     """Step past an instant at which modes would switch back and forth endlessly; keep the present modes."""
     for lane in range(WIDTH):
         member = lanes.member[lane]
         if member >= 0 and lanes.event[lane] >= 0:
             lanes.ends_at_stop[lane] = 0
-            state = states[member]
-            if state.events_at_once > params[member].max_events:
-                state.recoveries += 1
+            if lanes.counts[AT_ONCE, lane] > params[member].max_events:
+                lanes.counts[RECOVERIES, lane] += 1
                 lanes.step[lane] = max(lanes.step[lane], min(lanes.accurate[lane], PAST_AN_INSTANT))
                 lanes.event[lane] = -1
 
@@ -285,6 +293,8 @@ def _leave(members, lanes, w, order, lane, code, t) -> None:
         totals.peak[pair], totals.impulse[pair] = lanes.peak[pair, lane], lanes.impulse[pair, lane]
         totals.time_in_contact[pair] = lanes.time_in_contact[pair, lane]
     save_lanes(members.states, lanes, 1 << lane)
+    empty_lanes(lanes, 1 << lane)
+    lanes.touched[lane] = 0
     note_modes(lanes)
     members.status[member] = _OK if code == _DONE else code
     if code != _DONE:
@@ -356,10 +366,7 @@ def run_lanes(
                 _leave(members, lanes, w, order, lane, code, t)
         if live == 0:
             return True
-        if lanes.stale[0] == 1:
-            if hysteretic is None and power is None:
-                weigh_lanes(lanes)
-            lanes.stale[0] = 0
+        refresh(lanes, hysteretic, power)
         _step(members, waves, second, viscous, hysteretic, power, fraction, order, lanes, w, t)
     for lane in range(WIDTH):
         if lanes.member[lane] >= 0:
@@ -383,8 +390,8 @@ def _step(members, waves, second, viscous, hysteretic, power, fraction, order, l
         for lane in range(WIDTH):
             if infinite >> lane & 1:
                 _leave(members, lanes, w, order, lane, _NON_FINITE, t)
-    first_events(members.states, lanes, w, order, order, hysteretic, power, fraction)
-    go_past_an_instant(members.params, members.states, lanes)
+    first_events(lanes, w, order, order, hysteretic, power, fraction)
+    go_past_an_instant(members.params, lanes)
     note_switches(lanes, order, viscous, fraction)
     if fraction is not None:
         note_durations(lanes)
@@ -402,7 +409,6 @@ def _step(members, waves, second, viscous, hysteretic, power, fraction, order, l
     for lane in range(WIDTH):
         member = lanes.member[lane]
         if member >= 0:
-            p, state, sums = members.params[member], members.states[member], members.totals[member]
-            complete(p, state, sums, lanes, lane, hysteretic, fraction)
+            complete(members.params[member], members.totals[member], lanes, lane, hysteretic, fraction)
     if lanes.stale[0] == 1:
         note_modes(lanes)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from plow_twin.kernel.arrays import copy_part
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.polynomial import sum_to_bernstein
 from plow_twin.kernel.simd import choose, equal, exact_row, exact_splat, fused, lowest_bit, set_row, transpose
@@ -35,11 +36,70 @@ _LANES_OF: Final = (WIDTH,)
 #: Blocks of `staged`: five rows of the penetrations, two of the arms, then state, lambda, modes, and whether a pair can
 #: touch.
 _ARM, _Y, _FACTOR, _MODE, _ENABLED, _BLOCKS = 5, 7, 8, 9, 10, 11
-#: Numbers of events, steps and searches that are set back if an advance fails.
+#: Indices in `counts`: steps, evaluations, events, searches of roots, recoveries, events at one instant.
+STEPS, EVALUATIONS, EVENTS, GUARD_ROOTS, RECOVERIES, AT_ONCE = range(6)
 COUNTS: Final = 6
+
+#: The constants and the state of eight scenes, from which their next steps follow.
+_BLOCK_FIELDS: Final[list[tuple[Any, ...]]] = [
+    ("rows", "f8", (PAIR_COUNT, 5, WIDTH)),  # factors of cosine, sine, X and Y in the penetration, and its constant
+    ("arms", "f8", (PAIR_COUNT, 2, WIDTH)),  # factors of cosine and sine in the arm
+    ("enabled", "i8", _PAIRS),  # 1 if the pair can touch
+    ("constant", "f8", (3, WIDTH)),
+    ("inverse_mass", "f8", _LANES_OF),
+    ("inverse_inertia", "f8", _LANES_OF),
+    ("radius", "f8", _LANES_OF),
+    ("weight", "f8", _LANES_OF),
+    ("stiffness", "f8", _LANES_OF),
+    ("viscous", "f8", _LANES_OF),
+    ("half_cavity", "f8", _LANES_OF),
+    ("mass", "f8", (3, WIDTH)),  # sampled loads: mass, mass and inertia
+    ("small", "f8", _LANES_OF),  # size below which a term over the longest wanted step counts as vanished
+    # exponents other than 1
+    ("exponent", "f8", _LANES_OF),
+    ("threshold", "f8", (MOST_LACUNA, WIDTH)),  # admissible sizes of the last orders, as velocities
+    ("stretch", "f8", _LANES_OF),  # log2 of velocity tolerance / (position tolerance (order + 1))
+    ("release", "f8", _LANES_OF),  # penetration below which the force is negligible
+    # state
+    ("y", "f8", (COMPONENTS, WIDTH)),  # state at the step's start
+    ("factor", "f8", _PAIRS),  # lambda
+    ("mode", "i8", _PAIRS),
+    ("time", "f8", _LANES_OF),
+    ("before_it", "f8", _LANES_OF),  # size of the previous step in s
+    ("touch_time", "f8", _LANES_OF),  # time of the last touch
+    ("touched", "i8", _LANES_OF),  # a bit for each pair that touches at the step's start
+    ("counts", "i8", (COUNTS, WIDTH)),  # by `STEPS` to `AT_ONCE`, as in the records of the states
+    # derived from modes (`note_modes`, `_weigh_lanes`)
+    ("ratio", "f8", _PAIRS),  # C / K of pairs that are ON
+    ("filled", "i8", _LANES_OF),  # number of slots that a lane's pairs fill
+    ("on", "i8", (PAIR_COUNT,)),  # a bit for each lane in which the pair is ON
+    ("off", "i8", (PAIR_COUNT,)),  # a bit for each lane in which the pair is OFF and can touch
+    ("taken", "i8", (PAIR_COUNT,)),  # a bit for each lane with a pair in the slot
+    ("watched", "i8", _LANES_OF),  # a bit for each guard that is always searched
+    ("inside", "i8", _LANES_OF),  # number of pairs that penetrate
+    ("carrying", "i8", _LANES_OF),  # a bit for each pair that is ON
+    ("along", "f8", (2, 6, WIDTH)),  # factors of c, s, X or Y and of their rates in the forces along X and Y
+    # moment = c Gc + s Gs - X fy + Y fx: factors of c, s, X, Y and of their rates in Gc and Gs
+    ("turn", "f8", (2, 8, WIDTH)),
+    ("slot", "i8", _PAIRS),  # the pair in each slot
+    ("gear", "f8", (PAIR_COUNT, 8, WIDTH)),  # for the pairs in each slot: `rows`, `arms` and `factor`
+]
+BLOCK: Final = np.dtype(_BLOCK_FIELDS)
+
+
+def _begin_of(field: str) -> int:
+    parts: Any = BLOCK.fields
+    return int(parts[field][1])
+
+
+#: Where state, notes on modes and slots begin in `BLOCK`, in bytes, and where the slots' gears begin; size of a gear.
+_STATE, _NOTES, _SLOTS, _GEARS = _begin_of("y"), _begin_of("ratio"), _begin_of("slot"), _begin_of("gear")
+_SIZE: Final = BLOCK.itemsize
+_GEAR: Final = (_SIZE - _GEARS) // PAIR_COUNT
 
 LANES: Final = np.dtype(
     [
+        *_BLOCK_FIELDS,
         ("series", "f8", (COMPONENTS, _ROWS, WIDTH)),  # state
         ("moment", "f8", (4, _ROWS, WIDTH)),  # factors of c, s, X and Y in the moment of the contacts
         ("load", "f8", (3, _ROWS, WIDTH)),  # S1, S2, M
@@ -50,33 +110,14 @@ LANES: Final = np.dtype(
         ("bernstein", "f8", (_ROWS, WIDTH)),
         ("bulge", "f8", (_ROWS, WIDTH)),  # forces whose maximum must still be found, because it may exceed the peak
         ("bulge_step", "f8", _LANES_OF),  # step sizes that belong to the forces in `bulge`
-        ("rows", "f8", (PAIR_COUNT, 5, WIDTH)),  # factors of cosine, sine, X and Y in the penetration, and its constant
-        ("arms", "f8", (PAIR_COUNT, 2, WIDTH)),  # factors of cosine and sine in the arm
-        ("ratio", "f8", _PAIRS),  # C / K of pairs that are ON
-        ("factor", "f8", _PAIRS),  # lambda
-        ("gear", "f8", (PAIR_COUNT, 8, WIDTH)),  # for the pairs in each slot: `rows`, `arms` and `factor`
         # guards of a round: the penetration's rows, factors of d and d', a further constant
         ("chosen", "f8", (8, WIDTH)),
-        ("along", "f8", (2, 6, WIDTH)),  # factors of c, s, X or Y and of their rates in the forces along X and Y
-        # moment = c Gc + s Gs - X fy + Y fx: factors of c, s, X, Y and of their rates in Gc and Gs
-        ("turn", "f8", (2, 8, WIDTH)),
-        ("constant", "f8", (3, WIDTH)),
+        ("direction", "f8", (4, WIDTH)),
         ("slope", "f8", (3, WIDTH)),  # sampled loads: slope from the previous sample to the next sample
         ("sample", "f8", (3, WIDTH)),  # sampled loads: value at the previous sample
         ("held", "f8", (3, WIDTH)),  # load at the step's start, including the constant loads
         ("next", "f8", (3, WIDTH)),  # sampled loads: value at the next sample
-        ("mass", "f8", (3, WIDTH)),  # sampled loads: mass, mass and inertia
         ("knot", "f8", _LANES_OF),  # sampled loads: time of the previous sample
-        ("small", "f8", _LANES_OF),  # size below which a term over the longest wanted step counts as vanished
-        ("direction", "f8", (4, WIDTH)),
-        ("inverse_mass", "f8", _LANES_OF),
-        ("inverse_inertia", "f8", _LANES_OF),
-        ("radius", "f8", _LANES_OF),
-        ("weight", "f8", _LANES_OF),
-        ("stiffness", "f8", _LANES_OF),
-        ("viscous", "f8", _LANES_OF),
-        ("half_cavity", "f8", _LANES_OF),
-        ("y", "f8", (COMPONENTS, WIDTH)),  # state at the step's start
         ("change", "f8", (COMPONENTS, WIDTH)),  # change of the state over the step
         ("gained", "f8", (2, WIDTH)),  # scratch for one slot: impulse over the step, and peak
         ("sum", "f8", (4, WIDTH)),  # integrals over the step of the changes of cosine, sine, X, Y
@@ -99,20 +140,11 @@ LANES: Final = np.dtype(
         # blocks whose rows are lanes and whose columns are pairs or components, and the transposed blocks
         ("staged", "f8", (_BLOCKS, WIDTH, PAIR_COUNT)),
         ("turned", "f8", (_BLOCKS, PAIR_COUNT, WIDTH)),
-        # state, lambda, modes, `touch_time` and `before_it` at the previous sample
-        ("kept", "f8", (3 * PAIR_COUNT + 2, WIDTH)),
-        ("time", "f8", _LANES_OF),
+        # state, lambda, modes, `touch_time`, `before_it` and `touched` at the previous sample
+        ("kept", "f8", (3 * PAIR_COUNT + 3, WIDTH)),
+        ("kept_counts", "i8", (COUNTS, WIDTH)),
         ("member", "i8", _LANES_OF),  # the scene in a lane, -1 for an empty lane
-        ("mode", "i8", _PAIRS),
-        ("enabled", "i8", _PAIRS),  # 1 if the pair can touch
-        ("filled", "i8", _LANES_OF),  # number of slots that a lane's pairs fill
         ("switch", "i8", _PAIRS),  # modes that pairs take at the step's end, -1 for no change
-        ("on", "i8", (PAIR_COUNT,)),  # a bit for each lane in which the pair is ON
-        ("off", "i8", (PAIR_COUNT,)),  # a bit for each lane in which the pair is OFF and can touch
-        ("taken", "i8", (PAIR_COUNT,)),  # a bit for each lane with a pair in the slot
-        ("slot", "i8", _PAIRS),  # the pair in each slot
-        ("watched", "i8", _LANES_OF),  # a bit for each guard that is always searched
-        ("inside", "i8", _LANES_OF),  # number of pairs that penetrate
         ("event", "i8", _LANES_OF),  # the guard that ends the step, or -1
         ("ends_at_stop", "i8", _LANES_OF),
         ("todo", "i8", _LANES_OF),  # a bit for each guard that remains to be searched
@@ -122,36 +154,28 @@ LANES: Final = np.dtype(
         ("bulge_pair", "i8", _LANES_OF),
         ("bulge_lane", "i8", _LANES_OF),
         ("orders", "i8", _LANES_OF),  # order of each lane's series; the terms beyond have vanished
-        # at the previous sample: steps, evaluations, events, searches of roots, recoveries, events at one instant
-        ("counts", "i8", (COUNTS, WIDTH)),
-        ("kept_touched", "i8", _LANES_OF),  # `touched` at the previous sample
-        ("carrying", "i8", _LANES_OF),  # a bit for each pair that is ON
         # the following fields are used only for exponents other than 1
         ("power", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # d^n of each slot's pairs
         # base of the power: d, or d / sigma^2 for a pair that touches at the step's start; d^2 if n is an integer
         ("base", "f8", (PAIR_COUNT, _ROWS, WIDTH)),
         ("rate", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # d' of each slot's pairs
         ("per_base", "f8", _PAIRS),  # 1 / base at the step's start
-        ("exponent", "f8", _LANES_OF),
-        ("threshold", "f8", (MOST_LACUNA, WIDTH)),  # admissible sizes of the last orders, as velocities
-        ("stretch", "f8", _LANES_OF),  # log2 of velocity tolerance / (position tolerance (order + 1))
         # the following fields are used only for exponents that are not integers
         ("rates", "f8", (4, _ROWS, WIDTH)),  # rates of cosine, sine, X and Y
         ("alpha", "f8", _LANES_OF),  # time since the step's start: alpha sigma + beta sigma^2 / 2
         ("beta", "f8", _LANES_OF),
         ("duration", "f8", _LANES_OF),  # step size in s, where `step` and `whole` are values of sigma
-        ("before_it", "f8", _LANES_OF),  # size of the previous step in s
-        ("touch_time", "f8", _LANES_OF),  # time of the last touch
-        ("release", "f8", _LANES_OF),  # penetration below which the force is negligible
         ("may_stop", "i8", _LANES_OF),  # 1 if a step of the size `whole` ends at `stop`
-        ("touched", "i8", _LANES_OF),  # a bit for each pair that touches at the step's start
         ("touching", "i8", (PAIR_COUNT,)),  # a bit for each lane whose pair in the slot touches at the step's start
         # single numbers come last, so that every row before them fills a cache line
+        ("live", "i8", (1,)),  # a bit for each lane that has a scene
+        ("noted", "i8", (1,)),  # `live` at the last `note_modes`; -1 if the notes are those of the lanes' block
         ("parting", "i8", (1,)),  # a bit for each lane in which a CLIPPED pair parts
         ("rounds", "i8", (1,)),
         ("bulges", "i8", (1,)),  # number of forces in `bulge`
         ("vanished", "i8", (1,)),  # a bit for each lane whose series ends early
-        ("stale", "i8", (1,)),  # 1 if modes or scenes have changed since the last `weigh_lanes`
+        ("failed", "i8", (1,)),  # sampled loads: a bit for each lane whose series was not finite
+        ("stale", "i8", (1,)),  # 1 if modes or scenes have changed since the last `_weigh_lanes`
     ]
 )
 
@@ -189,6 +213,7 @@ def new_lanes() -> NDArray[np.void]:
 def load_lane(p, state, power, lanes, lane, member) -> None:
     """Put a scene into a lane; `join_lanes` must follow."""
     lanes.member[lane], lanes.time[lane] = member, state.step_start
+    lanes.live[0] |= 1 << lane
     for i in range(5):
         constant = exact_row(p.penetration_rows, i)
         if i == 4:
@@ -215,7 +240,10 @@ def load_lane(p, state, power, lanes, lane, member) -> None:
             lanes.threshold[i, lane] = p.threshold[p.order - i] if i < p.lacuna else np.inf
         lanes.stretch[lane] = math.log2(p.velocity_tolerance / (p.position_tolerance * (p.order + 1)))
     lanes.before_it[lane], lanes.touch_time[lane] = state.last_step_size, state.touch_time
-    lanes.touched[lane] = state.touching
+    lanes.touched[lane], counts = state.touching, lanes.counts
+    counts[STEPS, lane], counts[EVALUATIONS, lane], counts[EVENTS, lane] = state.steps, state.evaluations, state.events
+    counts[GUARD_ROOTS, lane], counts[RECOVERIES, lane] = state.guard_roots, state.recoveries
+    counts[AT_ONCE, lane] = state.events_at_once
     state.in_flight = state.at_rest = 0
 
 
@@ -252,10 +280,11 @@ def write_place(state, lanes, lane) -> None:
 
 @kernel()
 def save_lanes(states, lanes, bits) -> None:
-    """Write the states of some lanes to their records, and empty these lanes; `note_modes` must follow."""
+    """Write the states of some lanes to their records."""
     transpose(lanes.turned[0], lanes.y)
     transpose(lanes.turned[1], lanes.factor)
     transpose(lanes.turned[2], lanes.mode)
+    counts = lanes.counts
     for lane in range(WIDTH):
         if bits >> lane & 1:
             state = states[lanes.member[lane]]
@@ -264,15 +293,27 @@ def save_lanes(states, lanes, bits) -> None:
             set_row(state.mode, 0, exact_row(lanes.turned, 2 * WIDTH + lane))
             state.step_start = state.time = lanes.time[lane]
             state.touching, state.touch_time = lanes.touched[lane], lanes.touch_time[lane]
-            lanes.member[lane], lanes.touched[lane] = -1, 0
+            state.last_step_size, state.steps = lanes.before_it[lane], counts[STEPS, lane]
+            state.evaluations, state.events = counts[EVALUATIONS, lane], counts[EVENTS, lane]
+            state.guard_roots, state.recoveries = counts[GUARD_ROOTS, lane], counts[RECOVERIES, lane]
+            state.events_at_once = counts[AT_ONCE, lane]
+
+
+@kernel()
+def empty_lanes(lanes, bits) -> None:
+    """Empty some lanes; `note_modes` must follow."""
+    for lane in range(WIDTH):
+        if bits >> lane & 1:
+            lanes.member[lane] = -1
+    lanes.live[0] &= ~bits
 
 
 @kernel()
 def note_modes(lanes) -> None:
     """Derive the guards of all lanes from the modes of their pairs, and put the pairs that are ON into slots."""
-    live, damped = 0, exact_row(lanes.viscous, 0) / exact_row(lanes.stiffness, 0)
+    live, damped = lanes.live[0], exact_row(lanes.viscous, 0) / exact_row(lanes.stiffness, 0)
+    lanes.noted[0] = live
     for lane in range(WIDTH):
-        live |= 1 << lane if lanes.member[lane] >= 0 else 0
         lanes.inside[lane] = lanes.carrying[lane] = lanes.watched[lane] = lanes.filled[lane] = 0
     for pair in range(PAIR_COUNT):
         on, off = equal(lanes.mode, pair, ON) & live, equal(lanes.mode, pair, OFF) & live
@@ -305,7 +346,16 @@ def _take_slot(lanes, lane, pair, slot) -> None:
 
 
 @kernel()
-def weigh_lanes(lanes) -> None:
+def refresh(lanes, hysteretic, power) -> None:
+    """Renew the maps of `_weigh_lanes` if modes or scenes have changed."""
+    if lanes.stale[0] == 1:
+        if hysteretic is None and power is None:
+            _weigh_lanes(lanes)
+        lanes.stale[0] = 0
+
+
+@kernel()
+def _weigh_lanes(lanes) -> None:
     """Sum, over each lane's acting pairs, the linear maps from an order of the state to that of the forces.
 
     Along a wall's normal  f = -n F  with  F = K (a c + b s + n Z) + C (a c' + b s' + n Z'),  where Z is X or Y. The
@@ -337,6 +387,24 @@ def _add(there, rates, factor, gear, third, fourth, stiffness, viscous) -> None:
         at = third if i == 2 else fourth if i == 3 else i
         set_row(there, i, fused(spring, exact_row(gear, at), exact_row(there, i)))
         set_row(there, rates + i, fused(damper, exact_row(gear, at), exact_row(there, rates + i)))
+
+
+@kernel()
+def read_block(lanes, block) -> None:
+    """Copy constants, state and notes from a block to the lanes."""
+    copy_part(lanes, block, 0, _SLOTS)
+    used = 0
+    while used < PAIR_COUNT and lanes.taken[used] != 0:
+        used += 1
+    if used > 0:
+        copy_part(lanes, block, _SLOTS, _GEARS + used * _GEAR)
+    lanes.noted[0] = -1
+
+
+@kernel()
+def write_block(block, lanes, new) -> None:
+    """Copy the state of the lanes to their block, also the notes if they have changed, and all if the block is new."""
+    copy_part(block, lanes, 0 if new else _STATE, _NOTES if lanes.noted[0] < 0 else _SIZE)
 
 
 @kernel(inline="code")

@@ -115,7 +115,7 @@ def expand(lanes, w, limit, waves, second, viscous, hysteretic, power, fraction,
     reach = exact_splat(1.0)
     if segments is not None:
         start_x, start_y, turned_at = exact_row(lanes.held, 0), exact_row(lanes.held, 1), exact_row(lanes.held, 2)
-        active = _live(lanes)
+        active, lanes.vanished[0] = lanes.live[0], 0
     m, i = exact_row(lanes.inverse_mass, 0), exact_row(lanes.inverse_inertia, 0)
     along, turn, load, direction = lanes.along, lanes.turn, lanes.load, lanes.direction
     order = limit
@@ -269,16 +269,6 @@ def _set_rates(lanes, k, dx, dy, dc, ds) -> None:
 
 
 @kernel()
-def _live(lanes) -> int:
-    """Return a bit for each lane that has a scene, and mark all series as not yet ended."""
-    bits = 0
-    for lane in range(WIDTH):
-        bits |= 1 << lane if lanes.member[lane] >= 0 else 0
-    lanes.vanished[0] = 0
-    return bits
-
-
-@kernel()
 def _end_series(lanes, active, ended, k) -> int:
     """Record that the series of the lanes `ended` end at order k; return the bits of the other active lanes."""
     for lane in range(WIDTH):
@@ -311,7 +301,7 @@ def _add_ends(load, k, c0, s0, c, s, share, wc, ws):
 def _start(lanes, viscous, c, s, x, y, dc, ds, dx, dy):
     """Return order 0 of the contacts' forces along X and Y and of their factors of cosine and sine in the moment.
 
-    They are computed from the same penetrations as the guards. The summed maps (`weigh_lanes`) would be rounded
+    They are computed from the same penetrations as the guards. The summed maps (`record._weigh_lanes`) would be rounded
     differently, so that the force would begin 1e-17 m away from the event.
     """
     fx = fy = gc = gs = exact_splat(0.0)
