@@ -142,12 +142,13 @@ class _Replay:
         }
         scene = header.scene(report.path)
         excitation: Any = "scene" if header.excitation_source == "scene" else "sampled"
-        bound = header.parameters.get("max_evaluations") or None
-        bound = None if bound is None else int(bound)
-        twin: Driven = Twin(scene, tol=header.tol, excitation=excitation, max_evaluations=bound)
         self.follows = header.follow != "off"
-        if self.follows:
-            twin = following_twin(header, scene)
+        bound = int(header.parameters.get("max_evaluations") or 0) or None
+        twin: Driven = (
+            following_twin(header, scene)
+            if self.follows
+            else Twin(scene, tol=header.tol, excitation=excitation, max_evaluations=bound)
+        )
         twin.warm_up()
         templates = publication_templates(header.frame_id, header.child_frame_id)
         self.templates = Templates.of(templates[name] for name in PUBLICATION_TOPICS)
@@ -183,23 +184,7 @@ class _Replay:
             self.alarms.give_up()
         entries = batch.entries
         sent = SentMessages.of(batch.outputs, self.topics)
-        count = len(entries)
-        breaks = np.ones(count, bool)
-        breaks[1:] = np.diff(entries.sequence) != 1
-        digests = entries.digest_at
-        behind = digests > 0
-        behind[behind] = ~entries.sample[digests[behind] - 1]
-        kinds = Gaps | Unused if self.follows else Pose | PartOfPose | Gaps | Unused
-        for index in sorted({*entries.rest, *digests[behind | breaks[digests]].tolist()}):
-            goes_on = not breaks[index] and (index == 0 or entries.sample[index - 1] or not breaks[index - 1])
-            still = index not in entries.rest or isinstance(entries.rest[index], kinds)
-            if not (goes_on and still):
-                breaks[index : index + 2] = True
-        samples = np.flatnonzero(entries.sample)
-        late = samples[1:][np.diff(entries.stamp_ns[samples]) < 0]  # late samples are applied one by one
-        breaks[late] = True
-        breaks[late[late + 1 < count] + 1] = True
-        ends = np.append(np.flatnonzero(breaks), count)
+        ends, count = self._run_ends(entries), len(entries)
         place = begin = 0
         while place < count:
             end = int(ends[np.searchsorted(ends, place, side="right")])
@@ -218,6 +203,30 @@ class _Replay:
         self._messages(sent, begin, len(sent))
         if not self.digests_only:
             self._compare_alarms(batch)
+
+    def _run_ends(self, entries: Entries) -> Indexes:
+        """Return the rising indexes at which runs end, the last of which is the number of entries.
+
+        A run ends at a missing entry. Some entries are applied alone, so that runs end before and after them: late
+        samples, entries that change the motion, and a digest with which a run would begin.
+        """
+        count = len(entries)
+        breaks = np.ones(count, bool)
+        breaks[1:] = np.diff(entries.sequence) != 1
+        digests = entries.digest_at
+        behind = digests > 0
+        behind[behind] = ~entries.sample[digests[behind] - 1]
+        kinds = Gaps | Unused if self.follows else Pose | PartOfPose | Gaps | Unused
+        for index in sorted({*entries.rest, *digests[behind | breaks[digests]].tolist()}):
+            goes_on = not breaks[index] and (index == 0 or entries.sample[index - 1] or not breaks[index - 1])
+            still = index not in entries.rest or isinstance(entries.rest[index], kinds)
+            if not (goes_on and still):
+                breaks[index : index + 2] = True
+        samples = np.flatnonzero(entries.sample)
+        late = samples[1:][np.diff(entries.stamp_ns[samples]) < 0]
+        breaks[late] = True
+        breaks[late[late + 1 < count] + 1] = True
+        return np.append(np.flatnonzero(breaks), count)
 
     def _is_run(self, entries: Entries, place: int) -> bool:
         expected = (int(entries.sequence[place]) - self.next_sequence) & _SEQUENCE_MASK == 0
