@@ -98,7 +98,7 @@ def test_harmonics_are_found_where_the_residuals_do_not_repeat_with_the_load() -
     assert abs(found.vertical.mean - truth.clearance[1]) < 3e-4
 
 
-@pytest.mark.parametrize("kind", ["load_5", "friction_05"])
+@pytest.mark.parametrize("kind", ["load_5", pytest.param("friction_05", marks=pytest.mark.stress)])
 def test_harmonics_that_explain_nothing_are_given_up_before_whole_swings(
     kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
