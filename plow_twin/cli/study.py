@@ -25,7 +25,7 @@ def study() -> None:
 
 
 def paper_command() -> click.Command:
-    """Return the verb `paper` of the package `plow_twin_paper`, installed or in a clone; else a verb that says how."""
+    """Return the verb `paper` of `plow_twin_paper`, installed or in a clone, or a verb that says how to install it."""
     if CLONE.is_dir() and str(CLONE) not in sys.path:
         sys.path.append(str(CLONE))
     try:

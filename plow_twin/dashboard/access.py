@@ -73,7 +73,7 @@ class PageAccess:
         return not is_loopback(self.host) and (is_address(name) or name in (socket.gethostname(), socket.getfqdn()))
 
     def is_own(self, origin: str | None, host: str) -> bool:
-        """Return whether a connection comes from the page itself, or from no browser."""
+        """Return whether a connection comes from the page itself, or from a program that is no browser."""
         return origin is None or urlsplit(origin).netloc.lower() == host.lower()
 
 

@@ -131,7 +131,7 @@ class Feed:
     facts
         Facts about the machine (`facts.facts_of`).
     answer
-        Does an operator's request (`acknowledge` or `mark`, with a text), and returns success and an answer.
+        Carries out an operator's request (`acknowledge` or `mark`, with a text), and returns success and an answer.
     load
         Returns the load Fx, Fy [N], M [N m] at the newest publication, shape (3,).
     on_error
@@ -199,7 +199,7 @@ class Feed:
         del self._events[:-_EVENTS]
 
     def turn(self) -> None:
-        """Do operators' requests and send an update; to be called at the rate of the updates."""
+        """Carry out operators' requests and send an update; to be called at the rate of the updates."""
         self.hear()
         self.send()
         if self._link.broken and not self._ended:
@@ -207,7 +207,7 @@ class Feed:
             self._on_error(self._end)
 
     def hear(self) -> None:
-        """Do operators' requests, and read reports of the process."""
+        """Carry out operators' requests, and read reports of the process."""
         for _ in range(_MOST_ASKED):
             asked = self._link.receive()
             if asked is None:

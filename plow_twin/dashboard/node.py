@@ -49,7 +49,7 @@ _NEWEST, _ALL = 1, 1000
 
 
 class NodeWatch:
-    """Listens to a node, for which it waits until `stopped` or for `wait_s`; without it, DashboardError is raised."""
+    """Listens to a node; raises DashboardError if it is `stopped` or does not find the node within `wait_s`."""
 
     def __init__(self, namespace: str, name: str, wait_s: float, stopped: Callable[[], bool]) -> None:
         self.node = WithoutEvents(

@@ -22,7 +22,7 @@ class Services:
         self._kept: Snapshot | None = None
 
     def call(self, name: str, text: str | None = None) -> tuple[bool, str]:
-        """Do the service `name`, unless `services_off` names it; `text` belongs to a mark."""
+        """Carry out the service `name`, unless `services_off` names it; `text` belongs to a mark."""
         if name in services_off(self._runtime.settings):
             return False, f"{name}: switched off by the parameter services_off"
         if name == "mark":

@@ -167,7 +167,7 @@ class RosFront:
         self._loop.run_timers(False)
 
     def answer(self, name: str) -> tuple[bool, str]:
-        """Do the service `name`; return success and an answer."""
+        """Carry out the service `name`; return success and an answer."""
         with self.turns:
             if self.runtime.waits_for_clock:
                 return False, "use_sim_time is set and nothing has come on /clock yet"

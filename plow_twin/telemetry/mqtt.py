@@ -176,7 +176,7 @@ class MqttOut:
         """Do nothing, because the connection has its own thread."""
 
     async def close(self, patience_s: float) -> None:
-        """Send waiting messages, and that the twin is offline."""
+        """Send waiting messages, and the message that the twin is offline."""
         await self._broker.close(self._gone, patience_s)
 
 

@@ -104,7 +104,7 @@ class Conditions:
         await condition.events.trigger(datetime.now(UTC), message=f"{name} {values[name]}{place}, {condition.level}")
 
     async def _called(self, parent: ua.NodeId, *arguments: ua.Variant) -> ua.StatusCode:
-        """Do a condition's method Acknowledge, called with an event's identifier and a comment."""
+        """Answer a condition's method Acknowledge, called with an event's identifier and a comment."""
         if len(arguments) != 2:
             missing = len(arguments) < 2
             return ua.StatusCode(StatusCodes.BadArgumentsMissing if missing else StatusCodes.BadTooManyArguments)
