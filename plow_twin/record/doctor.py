@@ -42,7 +42,7 @@ _HASH: Final = "topic_type_hash"
 
 @dataclass
 class PartReport:
-    """State of one file of a recording: whether it has an end, and how much of it could not be read."""
+    """State of one file of a recording."""
 
     path: Path
     bytes: int
@@ -64,7 +64,7 @@ class PartReport:
 
 @dataclass
 class RunReport:
-    """Report on a recording: its parts, journal entries, losses and problems."""
+    """State of a recording: its parts, journal entries, losses and problems."""
 
     path: Path
     parts: list[PartReport] = field(default_factory=list)
@@ -83,7 +83,7 @@ class RunReport:
     problems: list[str] = field(default_factory=list)
 
     def facts(self) -> dict[str, Any]:
-        """Return all facts in a form that can be written as JSON."""
+        """Return all facts for JSON."""
         parts = [
             {
                 "file": part.path.name,

@@ -22,7 +22,7 @@ _LOST: Final = "plow_twin_lost "
 
 @dataclass
 class TopicCount:
-    """A topic of a recording and its number of messages, with QoS and type hash if the node does not send the topic."""
+    """A topic of a recording and its number of messages; an empty QoS or type hash is filled in."""
 
     topic: str
     message_type: str

@@ -624,9 +624,8 @@ def _count(item: _Item) -> int:
 
 
 def _add_keys(counts: Counter[str], items: Iterable[_Item]) -> None:
-    several = [item for item in items if isinstance(item, _SeriesItem | _PublicationsItem)]
-    if not several:
+    if any(isinstance(item, _SeriesItem | _PublicationsItem) for item in items):
+        for item in items:
+            counts.update(item.keys)
+    else:
         counts.update(chain.from_iterable(item.keys for item in items))
-        return
-    for item in items:
-        counts.update(item.keys)

@@ -29,11 +29,11 @@ class Divergence:
 
 @dataclass
 class ReplayReport:
-    """The result of a replay. `compared` and `not_compared` count messages by base name of their topic.
+    """The result of a replay; `compared` and `not_compared` count messages by base name of their topic.
 
-    `inputs` counts messages by input and outcome. `repeated` counts entries that occur more than once. `repeated_parts`
-    maps each file that repeats a part to the file that is read instead, and `foreign_parts` maps each file of another
-    run to the keys of its header that differ.
+    `inputs` counts messages by input and outcome, and `repeated` the entries that occur more than once.
+    `repeated_parts` maps each file that repeats a part to the file that is read, and `foreign_parts` maps each file of
+    another run to the keys of its header that differ.
     """
 
     path: Path

@@ -16,7 +16,7 @@ from plow_twin.stream.journal import Entry, Gaps, PartOfPose, Pose, Sample, Trav
 
 @dataclass
 class InputCounts:
-    """Counts of messages by input and outcome; an outcome is `used` or a reason of `Unused`.
+    """Counts of messages by input and outcome, which is `used` or a reason of `Unused`.
 
     For the input `source`, all counts except `not_followed` add up to the messages that its publisher has sent.
     """
