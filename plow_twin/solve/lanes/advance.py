@@ -45,7 +45,7 @@ from plow_twin.solve.lanes.record import (
     write_block,
     write_place,
 )
-from plow_twin.solve.lanes.series import accurate_steps, accurate_steps_by_power, expand, raised
+from plow_twin.solve.lanes.series import accurate_steps, expand, raised
 from plow_twin.solve.lanes.totals import add_step, sum_step
 from plow_twin.solve.method.rest import slow_enough
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, Status, X, Y
@@ -458,10 +458,7 @@ def _step(s, viscous, hysteretic, power, fraction, order, lanes, w) -> None:
     if fraction is not None:
         choose_maps(None, None, None, None, hysteretic, fraction, 1, lanes, w)
     used = expand(lanes, w, order, None, None, viscous, hysteretic, power, fraction, 1)
-    if power is None:
-        infinite = accurate_steps(s.params, lanes, order)
-    else:
-        infinite = accurate_steps_by_power(lanes, w, order, fraction)
+    infinite = accurate_steps(lanes, w, order, power, fraction)
     lanes.failed[0] = infinite
     if infinite != 0:
         lanes.live[0] &= ~infinite

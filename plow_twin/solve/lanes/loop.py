@@ -31,7 +31,7 @@ from plow_twin.solve.lanes.record import (
     save_lanes,
     write_place,
 )
-from plow_twin.solve.lanes.series import accurate_steps, accurate_steps_by_power, expand, expand_loads
+from plow_twin.solve.lanes.series import accurate_steps, expand, expand_loads
 from plow_twin.solve.lanes.totals import add_step, find_peaks, sum_step
 from plow_twin.solve.lanes.waves import turn_lanes
 from plow_twin.solve.method.flight import safe_time
@@ -382,10 +382,7 @@ def _step(members, waves, second, viscous, hysteretic, power, fraction, order, l
     if waves is not None:
         expand_loads(members.harmonics, members.extent, second, fraction, lanes, w, order)
     expand(lanes, w, order, waves, second, viscous, hysteretic, power, fraction, None)
-    if power is None:
-        infinite = accurate_steps(members.params, lanes, order)
-    else:
-        infinite = accurate_steps_by_power(lanes, w, order, fraction)
+    infinite = accurate_steps(lanes, w, order, power, fraction)
     if infinite != 0:
         for lane in range(WIDTH):
             if infinite >> lane & 1:

@@ -55,10 +55,10 @@ _BLOCK_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("half_cavity", "f8", _LANES_OF),
     ("mass", "f8", (3, WIDTH)),  # sampled loads: mass, mass and inertia
     ("small", "f8", _LANES_OF),  # size below which a term over the longest wanted step counts as vanished
-    # exponents other than 1
-    ("exponent", "f8", _LANES_OF),
     ("threshold", "f8", (MOST_LACUNA, WIDTH)),  # admissible sizes of the last orders, as velocities
     ("stretch", "f8", _LANES_OF),  # log2 of velocity tolerance / (position tolerance (order + 1))
+    # exponents other than 1
+    ("exponent", "f8", _LANES_OF),
     ("release", "f8", _LANES_OF),  # penetration below which the force is negligible
     # state
     ("y", "f8", (COMPONENTS, WIDTH)),  # state at the step's start
@@ -236,9 +236,9 @@ def load_lane(p, state, power, lanes, lane, member) -> None:
     lanes.half_cavity[lane] = p.half_cavity
     if power is not None:
         lanes.exponent[lane], lanes.release[lane] = p.exponent, p.release
-        for i in range(MOST_LACUNA):
-            lanes.threshold[i, lane] = p.threshold[p.order - i] if i < p.lacuna else np.inf
-        lanes.stretch[lane] = math.log2(p.velocity_tolerance / (p.position_tolerance * (p.order + 1)))
+    for i in range(MOST_LACUNA):
+        lanes.threshold[i, lane] = p.threshold[p.order - i] if i < p.lacuna else np.inf
+    lanes.stretch[lane] = math.log2(p.velocity_tolerance / (p.position_tolerance * (p.order + 1)))
     lanes.before_it[lane], lanes.touch_time[lane] = state.last_step_size, state.touch_time
     lanes.touched[lane], counts = state.touching, lanes.counts
     counts[STEPS, lane], counts[EVALUATIONS, lane], counts[EVENTS, lane] = state.steps, state.evaluations, state.events

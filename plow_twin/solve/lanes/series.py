@@ -9,10 +9,6 @@ slot may differ.
 
 from __future__ import annotations
 
-import math
-
-import numpy as np
-
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import below, choose, exact_row, exact_splat, fused, magnitude, set_row, square_root
 from plow_twin.model.pairs import PAIR_COUNT
@@ -106,9 +102,7 @@ def expand(lanes, w, limit, waves, second, viscous, hysteretic, power, fraction,
         exact_row(lanes.constant, 2),
     )
     active = calm = history = 0
-    recent = 2
-    if power is not None:
-        recent = MOST_LACUNA
+    recent = tested(power)
     alpha, beta = exact_row(lanes.alpha, 0), exact_row(lanes.beta, 0)
     older_c = older_s = x_rate = y_rate = vx_rate = vy_rate = om_rate = c_rate = s_rate = angle_rate = zero
     before_c = before_s = zero
@@ -249,6 +243,14 @@ def expand(lanes, w, limit, waves, second, viscous, hysteretic, power, fraction,
             set_row(lanes.size, k - (limit - recent), _size(lanes, vx, vy, om, c, s))
     _set_state(series, order, x, y, vx, vy, om, c, s, angle)
     return order
+
+
+@kernel(inline="code")
+def tested(power) -> int:
+    """Return how many of the last orders tell the size of a step."""
+    if power is None:
+        return 2
+    return MOST_LACUNA
 
 
 @kernel(inline="code")
@@ -527,38 +529,6 @@ def _size(lanes, vx, vy, om, c, s):
 
 
 @kernel()
-def accurate_steps(params, lanes, order) -> int:
-    """Write to `lanes.step` the step over which each lane's series meets its share of the tolerance.
-
-    The test is that of `method.step_size.accurate_step`. Returns a bit for each lane whose series is not finite.
-    """
-    infinite = 0
-    for lane in range(WIDTH):
-        member, whole = lanes.member[lane], lanes.whole[lane]
-        lanes.ends_at_stop[lane] = 1
-        lanes.step[lane] = lanes.accurate[lane] = whole
-        if member < 0 or lanes.vanished[0] >> lane & 1:
-            continue
-        lanes.orders[lane] = order
-        p, least = params[member], np.inf
-        for k in range(order, order - 2, -1):
-            size = lanes.size[k - order + 1, lane]
-            if not size <= _FINITE:
-                infinite |= 1 << lane
-            elif size > 0.0:
-                least = min(least, math.log(p.threshold[k] / size) / k)
-        step = min(whole, math.exp(least))
-        # over a long step an admissible error of velocity becomes too large an error of position; the step is then
-        # shortened
-        stretch = step * p.velocity_tolerance / (p.position_tolerance * (order + 1))
-        if stretch > 1.0 and step < whole:
-            step *= math.exp(-math.log(stretch) / order)
-        lanes.step[lane] = lanes.accurate[lane] = step
-        lanes.ends_at_stop[lane] = 1 if step == whole else 0
-    return infinite
-
-
-@kernel()
 def _not_too_far(lanes, step):
     """Limit the steps whose variable is the square root of the time since a touch (`method.taylor`)."""
     zero, alpha, beta = exact_splat(0.0), exact_row(lanes.alpha, 0), exact_row(lanes.beta, 0)
@@ -571,14 +541,16 @@ def _not_too_far(lanes, step):
 
 
 @kernel()
-def accurate_steps_by_power(lanes, w, order, fraction) -> int:
-    """Do what `accurate_steps` does, for exponents other than 1, from the last `MOST_LACUNA` orders.
+def accurate_steps(lanes, w, order, power, fraction) -> int:
+    """Write to `lanes.step` the step over which each lane's series meets its share of the tolerance.
 
-    A coarse logarithm suffices, because a step that is longer by 1e-4 has an error that is larger by 0.2 %.
+    The test is that of `method.step_size.accurate_step`. A coarse logarithm suffices, because a step that is longer by
+    1e-4 has an error that is larger by 0.2 %. Returns a bit for each lane whose series is not finite.
     """
     whole, least, zero, infinite = exact_row(lanes.whole, 0), exact_splat(1e3), exact_splat(0.0), 0
-    for i in range(MOST_LACUNA):
-        size = exact_row(lanes.size, MOST_LACUNA - 1 - i)
+    recent = tested(power)
+    for i in range(recent):
+        size = exact_row(lanes.size, recent - 1 - i)
         infinite |= ~below(size, exact_splat(_FINITE))
         here = coarse_log2(exact_row(lanes.threshold, i) / size) * w.inverse[order - i]
         least = choose(below(here, least), here, least)
