@@ -271,11 +271,12 @@ class _Linearised:
         self._residual = [np.nan_to_num(residual[some]).ravel() for some in self._rows]
         self._there = [np.isfinite(residual[some]).ravel() for some in self._rows]
         self._left = self._residual
+        self._start_spread = problem.start_spread
         self.inflation, self.load = np.ones(3), np.full(3, tuning.PUSH)
 
     def eliminate(self) -> None:
         """Eliminate the unknowns of each swing."""
-        held = np.diag(np.concatenate([tuning.START_SPREAD**-2.0, self.load**-2.0]))
+        held = np.diag(np.concatenate([self._start_spread**-2.0, self.load**-2.0]))
         self._blocks, self._swings = [], []
         for rows, border, own, residual, there, left in zip(
             self._rows, self._border, self._own, self._residual, self._there, self._left, strict=True

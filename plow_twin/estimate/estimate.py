@@ -39,6 +39,7 @@ from plow_twin.estimate.unknowns import (
     Unknowns,
     with_other_law,
 )
+from plow_twin.estimate.unmeasured import fit_some_components
 from plow_twin.estimate.verdict import COMPONENTS, Verdict, judge, judge_sensor, predicted, sandwich
 from plow_twin.kernel.low_pass import lagged
 from plow_twin.model import geometry
@@ -196,10 +197,9 @@ def _from_motion(
         )
         return replace(prior_of(unknowns, span, lost), reasons=(few,)), ()
     lacking = _lacking(poses)
-    if lacking and _all_but_angle(poses) and not _is_dead(load, poses):
-        period = min(load.period(), float(poses.t[-1] - poses.t[0]))
-        nothing = replace(prior_of(unknowns, (float(poses.t[0]), float(poses.t[-1])), lost), reasons=lacking)
-        return under_uncertain_load(nothing, unknowns, thinned(load, period)[0], poses, period), ()
+    some = _well_measured(poses)
+    if some is not None and not _is_dead(load, some):
+        return _from_some_components(unknowns, load, some, lost, lacking), ()
     if lacking:
         nothing = prior_of(unknowns, (float(poses.t[0]), float(poses.t[-1])), lost)
         unseen = State.NOT_OBSERVABLE
@@ -239,6 +239,30 @@ def _from_motion(
             following = tuple(numbers.tolist())
         return _moved_back(result, bias), following
     return _searched(forward, unknowns, poses, period, drift, lost, forces)
+
+
+def _from_some_components(
+    unknowns: Unknowns, load: Load, poses: Poses, lost: int, lacking: tuple[str, ...]
+) -> Estimate:
+    """Estimate from poses of which one or two components were never measured.
+
+    If no motion under the believed load comes near the measured one, x and y are compared with motions under errors of
+    the load.
+    """
+    period = min(load.period(), float(poses.t[-1] - poses.t[0]))
+    felt, _ = thinned(load, period)
+    share, time = tuning.UNMEASURED_LOAD
+    drift = 2.0 * time * (share * load.wrench.std(axis=0) / np.asarray(inertias(unknowns.scene))) ** 2
+    found = fit_some_components(Forward(unknowns.scene, felt), unknowns, poses, period, drift)
+    if found is not None:
+        result = summarise(*found, judge(*found, period), lost)
+        if _known(result):
+            return replace(result, reasons=(*lacking, *result.reasons))
+    nothing = replace(prior_of(unknowns, (float(poses.t[0]), float(poses.t[-1])), lost), reasons=lacking)
+    if poses.measured[:2].all():
+        return under_uncertain_load(nothing, unknowns, felt, poses, period)
+    unseen = State.NOT_OBSERVABLE
+    return replace(nothing, horizontal_state=unseen, vertical_state=unseen)
 
 
 def _searched(
@@ -665,13 +689,13 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
     if beside is not None:
         shared = unknowns.within(beside.shared)
         covariance = beside.covariance
-        covariance[[GX, GY], [GX, GY]] += _between_optima(unknowns, shared) ** 2
+        covariance[[GX, GY], [GX, GY]] += _between_optima(problem, shared) ** 2
     rough = beside is not None and (suspect or not finished or bool(verdict.lacking))
     deviation = np.sqrt(np.diag(covariance))
     published, spread = shared[[GX, GY]], deviation[[GX, GY]]
     if beside is not None:
         published = np.maximum(beside.clearance, LEAST_CLEARANCE)
-        spread = np.hypot(beside.clearance_deviation, _between_optima(unknowns, shared))
+        spread = np.hypot(beside.clearance_deviation, _between_optima(problem, shared))
     spread = np.hypot(spread, _unseen(fit))
     reasons = verdict.model + verdict.sensor + ([verdict.lacking] if verdict.lacking else [])
     if not finished and not suspect:
@@ -681,6 +705,8 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
     given = tuning.GIVEN * float(np.exp(shared[SOFTNESS] + NORMAL_P95 * min(deviation[SOFTNESS], 1.0)))
     least = range_of_motion(unknowns.scene, poses)[0] - given
     share = predicted(fit).sum(axis=0) / np.maximum(np.isfinite(fit.point.residual).sum(axis=0), 1)
+    # through its equations, the motion tests the clearance along a component that was not measured
+    share = np.where(poses.measured, share, share[poses.measured].min())
     apparent, clearances, states = [], [], []
     untested: dict[int, Interval] = {}
     for index, sides in ((GX, ("left", "right")), (GY, ("top", "bottom"))):
@@ -761,7 +787,7 @@ def _with_forces(result: Estimate, problem: Problem, fit: Fit, forces: ContactFo
     if joint.shared is None or joint.covariance is None:
         return result
     covariance = joint.covariance
-    covariance[[GX, GY], [GX, GY]] += _between_optima(problem.unknowns, joint.shared) ** 2
+    covariance[[GX, GY], [GX, GY]] += _between_optima(problem, joint.shared) ** 2
     deviation = np.sqrt(np.diag(covariance))
     normal = [Interval.normal(value, spread) for value, spread in zip(joint.shared, deviation, strict=True)]
     states = result.horizontal_state, result.vertical_state
@@ -803,7 +829,7 @@ def _covariance(problem: Problem, fit: Fit, verdict: Verdict, plain: Array) -> A
     """
     size = len(fit.shared)
     covariance: Array = plain * _widened(problem, fit, verdict) + np.outer(fit.left[:size], fit.left[:size])
-    covariance[[GX, GY], [GX, GY]] += _between_optima(problem.unknowns, fit.shared) ** 2
+    covariance[[GX, GY], [GX, GY]] += _between_optima(problem, fit.shared) ** 2
     return covariance
 
 
@@ -815,8 +841,14 @@ def _widened(problem: Problem, fit: Fit, verdict: Verdict) -> float:
     return widened**2 * ratio
 
 
-def _between_optima(unknowns: Unknowns, shared: Array) -> float:
-    """Return the additional standard deviation in m of a clearance if the contact is hard or nearly hard."""
+def _between_optima(problem: Problem, shared: Array) -> float:
+    """Return the standard deviation in m between the clearances of optima that explain the motion equally well.
+
+    There are several if the contact is hard or nearly hard, or if only one component was measured.
+    """
+    unknowns = problem.unknowns
+    if problem.window.poses.measured.sum() == 1:
+        return tuning.OPTIMA[2]
     if unknowns.is_hard(shared):
         return tuning.OPTIMA[0]
     return tuning.OPTIMA[1] if unknowns.penetration_of(float(shared[SOFTNESS])) < tuning.FIRM else 0.0
@@ -927,16 +959,24 @@ def _lacking(poses: Poses) -> tuple[str, ...]:
     return lacking
 
 
-def _all_but_angle(poses: Poses) -> bool:
-    """Return whether x and y were measured well, and theta not at all."""
-    counts, usable = np.isfinite(poses.q).sum(axis=0), np.array(poses.deviation) <= useless_deviation()
-    good = (counts >= FEWEST_POSES) & usable
-    return bool(good[:2].all() and not counts[2] and poses.interval() <= tuning.SPARSEST)
+def _well_measured(poses: Poses) -> Poses | None:
+    """Return the poses without components that were hardly measured; None if all components or none were measured well.
+
+    Nor is there a result if the others are so rare that they miss flights.
+    """
+    counts = np.isfinite(poses.q).sum(axis=0)
+    well = (np.array(poses.deviation) <= useless_deviation()) & (counts >= FEWEST_POSES)
+    if well.all() or not well.any():
+        return None
+    q = np.where(well, poses.q, np.nan)
+    rows = np.isfinite(q).any(axis=1)
+    some = replace(poses, t=poses.t[rows], q=q[rows])
+    return some if max(float(np.median(np.diff(some.t))), some.gap()) <= tuning.SPARSEST else None
 
 
 def _is_dead(load: Load, poses: Poses) -> bool:
     """Return whether the load is not really measured: it never changes, but the head does not come to rest."""
-    late = filled(poses)[len(poses.t) // 2 :]
+    late = filled(poses)[len(poses.t) // 2 :, poses.measured]
     return not np.ptp(load.wrench, axis=0).any() and bool(
         (late.std(axis=0) > tuning.OUTLYING * noise_level(late)).any()
     )
@@ -951,7 +991,7 @@ def _is_idle(scene: Scene, load: Load, poses: Poses) -> bool:
 
 def _rests(poses: Poses) -> bool:
     """Return whether the last three quarters of the poses are only noise."""
-    q = filled(poses)[len(poses.t) // 4 :]
+    q = filled(poses)[len(poses.t) // 4 :, poses.measured]
     return bool((q.std(axis=0) < tuning.RESTS * noise_level(q)).all())
 
 

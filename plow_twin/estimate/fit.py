@@ -246,6 +246,8 @@ class Problem:
         self.drift, self.harmonics = drift, harmonics
         #: factor on the steps of the difference quotients
         self.steps = 1.0
+        #: prior deviation (6,) of the starting states; assumed components say nothing about their true values
+        self.start_spread = tuning.START_SPREAD * np.tile(np.where(window.poses.measured, 1.0, tuning.ASSUMED), 2)
         self.link = np.zeros((0, 6, 6)) if drift is None else link_weights(np.diff(window.starts)[:-1], drift)
         self._memory: Memory | None = None
         self._columns: tuple[Point | None, Array] = None, np.zeros(0)
@@ -357,7 +359,7 @@ class Problem:
         loss = huber_loss(z)
         lacking = np.isnan(loss) & np.isfinite(self.window.poses.q)
         shift = (point.shared - self.mean) / self.deviation
-        moved = (point.states - self.window.states) / tuning.START_SPREAD
+        moved = (point.states - self.window.states) / self.start_spread
         linked = np.einsum("si,sij,sj->", point.defect, self.link, point.defect)
         return float(np.nansum(loss) + lacking.sum() + shift @ shift + (moved * moved).sum() + linked)
 
@@ -537,9 +539,9 @@ def normal_equations(problem: Problem, point: Point, linear: Linear, variance: A
         gradient[:SIZE] += right[:SIZE]
         gradient[piece.own] += right[SIZE:]
     gradient[:SIZE] += (problem.mean - point.shared) / problem.deviation**2
-    gradient[SIZE:] += ((problem.window.states - point.states) / tuning.START_SPREAD**2).ravel()
+    gradient[SIZE:] += ((problem.window.states - point.states) / problem.start_spread**2).ravel()
     return normal.plus(
-        np.concatenate([1.0 / problem.deviation**2, np.tile(1.0 / tuning.START_SPREAD**2, swings)])
+        np.concatenate([1.0 / problem.deviation**2, np.tile(1.0 / problem.start_spread**2, swings)])
     ), gradient
 
 
@@ -595,7 +597,7 @@ def _descend(
 ) -> tuple[Point | None, float]:
     """Return the next point, or None if no step reduces the cost, and the damping for the next step."""
     scale = normal.diagonal()
-    deviations = np.concatenate([problem.deviation, np.tile(tuning.START_SPREAD, problem.window.swings)])
+    deviations = np.concatenate([problem.deviation, np.tile(problem.start_spread, problem.window.swings)])
     for _ in range(6):
         step = normal.plus(damping * scale).factorised().solve(gradient)
         step *= min(1.0, 1.0 / max(np.abs(step / deviations)[:SIZE].max(), 1e-12))

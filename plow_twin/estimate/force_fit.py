@@ -244,8 +244,10 @@ class _Joint:
             normal, score = weighted.T @ rows, weighted.T @ residual[inside]
             normal[np.ix_(places, places)] += piece.weighted.T @ piece.rows
             score[places] += piece.weighted.T @ piece.residual
-            normal[border:, border:] += np.diag(tuning.START_SPREAD**-2)
-            score[border:] += (self._problem.window.states - at.place.states)[piece.swing] / tuning.START_SPREAD**2
+            normal[border:, border:] += np.diag(self._problem.start_spread**-2)
+            score[border:] += (self._problem.window.states - at.place.states)[
+                piece.swing
+            ] / self._problem.start_spread**2
             out.append(_Block.of(normal, score, border))
         return out
 

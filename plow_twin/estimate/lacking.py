@@ -73,7 +73,7 @@ def _alternated(
             problem.forward.under(harmonics.added(felt)), problem.unknowns, problem.window, horizon=problem.horizon,
             differences=problem.differences, harmonics=harmonics,
         )  # fmt: skip
-        most = problem.deviation, tuning.START_SPREAD
+        most = problem.deviation, problem.start_spread
         shared, states = (np.clip(one, -bound, bound) for one, bound in zip((shared, states), most, strict=True))
         shared = problem.unknowns.within(found.shared + shared)
         states = better_states(problem, shared, found.point.states + states)

@@ -47,11 +47,19 @@ class Poses:
         x, y [m] and theta [rad]; NaN where a component was not measured.
     deviation : tuple of 3 float
         Stated standard deviation of each component; 0 if not stated.
+    assumed : ndarray, shape (n, 3), optional
+        Poses of a model, used where all three components are needed and a component was never measured.
     """
 
     t: Array
     q: Array
     deviation: Deviation = UNSTATED
+    assumed: Array | None = None
+
+    @property
+    def measured(self) -> NDArray[np.bool_]:
+        """Whether each component was ever measured, shape (3,)."""
+        return np.asarray(np.isfinite(self.q).any(axis=0))
 
     @staticmethod
     def of(t: ArrayLike, q: ArrayLike, deviation: Deviation = UNSTATED) -> tuple[Poses, int]:
@@ -87,11 +95,12 @@ class Poses:
     def between(self, start: float, end: float) -> Poses:
         """Return the poses stamped in [start, end)."""
         inside = (self.t >= start) & (self.t < end)
-        return Poses(self.t[inside], self.q[inside], self.deviation)
+        assumed = None if self.assumed is None else self.assumed[inside]
+        return Poses(self.t[inside], self.q[inside], self.deviation, assumed)
 
     def moved(self, by: Array) -> Poses:
         """Return the poses with `by`, shape (3,), added to each."""
-        return Poses(self.t, self.q + by, self.deviation)
+        return replace(self, q=self.q + by, assumed=None if self.assumed is None else self.assumed + by)
 
     def without_spikes(self, level: Array) -> tuple[Poses, int]:
         """Leave out values far from all four neighbours, and return their number.
@@ -355,8 +364,11 @@ def _from_lines(t: Array, value: Array) -> Array:
 
 
 def filled(poses: Poses) -> Array:
-    """Return the poses with missing values bridged by straight lines; zeros for a component that was never measured."""
-    out = np.zeros_like(poses.q)
+    """Return the poses with missing values bridged by straight lines.
+
+    A component that was never measured has its assumed values, or zeros.
+    """
+    out = np.zeros_like(poses.q) if poses.assumed is None else poses.assumed.copy()
     for i, column in enumerate(poses.q.T):
         there = np.isfinite(column)
         if there.any():

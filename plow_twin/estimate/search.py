@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from plow_twin.estimate import tuning
 from plow_twin.estimate.fit import LAG, Fit, Problem, Window, fit
 from plow_twin.estimate.forward import Forward
-from plow_twin.estimate.measurements import RESOLVING, Poses
+from plow_twin.estimate.measurements import RESOLVING, Poses, filled
 from plow_twin.estimate.priors import UNSTATED
 from plow_twin.estimate.start import cut, first_vectors, range_of_motion
 from plow_twin.estimate.unknowns import BIAS, DELAY, GAIN, GX, GY, SOFTNESS, Unknowns
@@ -159,7 +159,9 @@ def better_states(problem: Problem, shared: Array, states: Array) -> Array:
     """Replace each starting state by the end of the previous swing, if that fits the swing's first poses better."""
     window, scene = problem.window, problem.unknowns.scene_of(shared)
     gain = shared[GAIN]
-    out, scale = states.copy(), np.maximum(np.nanstd(window.poses.q, axis=0), 1e-6)
+    poses = window.poses
+    scale = np.maximum(np.nanstd(np.where(poses.measured, poses.q, filled(poses)), axis=0), 1e-6)
+    out = states.copy()
     times = window.poses.t - shared[DELAY]
     for index in range(window.swings - 1):
         span = window.starts[[index, index + 1]]

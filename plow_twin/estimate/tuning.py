@@ -222,6 +222,7 @@ JITTER_WEIGHT: Annotated[
 START_SPREAD: Annotated[
     Array, Tuned("m, m, rad, m/s, m/s, rad/s", "prior deviation of a starting state about its guess")
 ] = np.array([4e-3, 4e-3, 0.02, 0.2, 0.2, 1.0])
+ASSUMED: Annotated[float, Tuned("1", "factor on `START_SPREAD` for components that were never measured")] = 10.0
 PROBED_STATE: Annotated[
     Array, Tuned("m, m, rad, m/s, m/s, rad/s", "deviation of the displaced starting states that probe predictability")
 ] = np.array([2e-4, 2e-4, 8e-4, 6e-3, 6e-3, 3e-2])
@@ -234,6 +235,29 @@ MOST_WORK: Annotated[
         "a few seconds of a core",
     ),
 ] = (3_000_000, 3_500_000, 1_500_000)
+UNMEASURED_DRAWS: Annotated[
+    tuple[int, ...],
+    Tuned(
+        "1",
+        "if a component was never measured, number of drawn motions; of those improved; of those from which "
+        "`FIRST_PERIODS` are fitted",
+    ),
+] = (400, 10, 3)
+UNMEASURED_DEPTHS: Annotated[
+    tuple[float, float], Tuned("m", "penetrations of the softest and hardest contact among these draws")
+] = (5e-4, 4e-2)
+UNMEASURED_SCALES: Annotated[
+    tuple[float, ...],
+    Tuned("1", "deviations of the residuals in successive improvements, as shares of the scatter of the poses"),
+] = (0.1, 0.03, 0.0)
+UNMEASURED_STEPS: Annotated[int, Tuned("1", "largest number of steps of each improvement")] = 8
+UNMEASURED_LOAD: Annotated[
+    tuple[float, float],
+    Tuned("1, s", "error of the load as a share of its scatter, and its correlation time, that links the swings"),
+] = (0.05, 0.1)
+UNMEASURED_ROUNDS: Annotated[
+    int, Tuned("1", "largest number of times that an unfinished fit begins again with the motion found")
+] = 3
 FIRST_PERIODS: Annotated[float, Tuned("periods", "part of the window in which candidates are compared")] = 3.0
 FIRST_NOISE: Annotated[Array, Tuned("m, m, rad", "noise of x, y and theta in the first iteration")] = np.array(
     [1e-3, 1e-3, 4e-3]
@@ -296,10 +320,10 @@ OPTIMA: Annotated[
     tuple[float, ...],
     Tuned(
         "m",
-        "scatter of a clearance over the optima of the cost: hard contact, firm contact",
-        "the benchmark's group `hard`; seeds 43201 to 43215 (K 3e7 to 1.4e8)",
+        "scatter of a clearance over the optima of the cost: hard contact, firm contact, one component measured",
+        "the benchmark's group `hard`; seeds 43201 to 43215 (K 3e7 to 1.4e8); three machines of which only x was known",
     ),
-] = (4e-4, 4.5e-5)
+] = (4e-4, 4.5e-5, 8e-4)
 FIRM: Annotated[float, Tuned("m", "penetration below which a contact is firm", "as for `OPTIMA`")] = 3.5e-3
 KNOTS: Annotated[
     tuple[int, ...],

@@ -1,0 +1,199 @@
+"""Fit of poses of which one or two components were never measured.
+
+Without all components the range of motion is unknown, and with it the clearances from which a fit starts. In a soft
+contact, however, the believed load determines the motion after some periods, whatever its start. Vectors of unknowns
+are therefore drawn from the prior, and their motions are compared with the measured components. Levenberg-Marquardt
+steps improve the nearest of them. Their motions then take the place of the missing components where a fit cuts the
+poses into swings; the fit itself uses measured values only, and links the swings.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.estimate import tuning
+from plow_twin.estimate.fit import Fit, Problem, huber_loss, huber_weight
+from plow_twin.estimate.forward import Forward
+from plow_twin.estimate.measurements import Poses, filled
+from plow_twin.estimate.search import refine
+from plow_twin.estimate.start import noise_level
+from plow_twin.estimate.unknowns import BIAS, DELAY, GAIN, QUANTITIES, SIZE, SOFTNESS, Unknowns
+from plow_twin.model import geometry
+
+Array = NDArray[np.float64]
+
+#: Step: for the difference quotients with respect to bias and delay, whose residuals are linear, in m, m, rad, s.
+_STEPS: Final = np.array([one.step or 1e-3 for one in QUANTITIES])
+#: Bound: number of tries to shorten a step.
+_SHORTER: Final = 5
+
+
+class _Whole:
+    """The motion over the first `rows` poses as one run, and its distance from the measured components."""
+
+    def __init__(self, forward: Forward, unknowns: Unknowns, poses: Poses, period: float) -> None:
+        self.forward, self.unknowns, self.poses = forward, unknowns, poses
+        self.measured = poses.measured
+        self.size = np.where(self.measured, filled(poses).std(axis=0), 1.0)
+        self.noise = np.where(self.measured, np.maximum(noise_level(filled(poses)), 1e-7), 1.0)
+        #: mask of the poses that hardly depend on the unknown start
+        self._settled = poses.t - poses.t[0] >= period
+        self._start = np.concatenate([filled(poses)[0], np.zeros(3)])[None]
+        #: indices of the unknowns that these components can show
+        self.free = np.flatnonzero(np.concatenate([np.ones(BIAS.start), self.measured, np.ones(SIZE - BIAS.stop)]))
+        self.mean, self.deviation = unknowns.nominal(), unknowns.deviations()
+
+    def motion(self, vector: Array, rows: int) -> Array | None:
+        """Return the poses that a vector of unknowns predicts, without the bias, (n, 3); None if it cannot be run."""
+        vector = self.unknowns.within(vector)
+        t = self.poses.t[:rows] - vector[DELAY]
+        scene = self.unknowns.scene_of(vector)
+        run = self.forward.run(scene, vector[GAIN], t[:1], self._start, np.array([0, rows]), t)
+        return None if run is None else run.q
+
+    def residual(self, vector: Array, rows: int) -> Array | None:
+        """Return the measured minus the predicted components, shape (n, k); None if the vector cannot be run."""
+        q = self.motion(vector, rows)
+        if q is None:
+            return None
+        error = self.poses.q[:rows] - q - vector[BIAS]
+        return np.asarray(np.nan_to_num(error[self._settled[:rows]][:, self.measured]))
+
+    def centred(self, vector: Array, rows: int) -> tuple[float, Array] | None:
+        """Return the misfit of a vector with the bias that explains the mean residual, and this vector."""
+        error = self.residual(vector, rows)
+        if error is None:
+            return None
+        vector = vector.copy()
+        vector[BIAS][self.measured] += error.mean(axis=0)
+        left = (error - error.mean(axis=0)) / self.size[self.measured]
+        return float(np.minimum(left**2, 1.0).mean()), vector
+
+    def descend(self, vector: Array, rows: int, scale: Array) -> tuple[Array, float]:
+        """Return an improved vector, and Huber's function of its residuals relative to `scale`, shape (3,)."""
+        free, spread = self.free, self.deviation[self.free]
+        steps, damping = _STEPS[free], 1e-2
+
+        def rows_of(vector: Array) -> Array | None:
+            error = self.residual(vector, rows)
+            prior = (vector - self.mean)[free] / spread
+            return None if error is None else np.concatenate([(error / scale[self.measured]).ravel(), prior])
+
+        def cost(rows: Array) -> float:
+            return float(huber_loss(np.abs(rows[: -len(free)])).sum() + np.square(rows[-len(free) :]).sum())
+
+        here = rows_of(vector)
+        if here is None:
+            return vector, np.inf
+        for _ in range(tuning.UNMEASURED_STEPS):
+            weight = np.append(huber_weight(np.abs(here[: -len(free)])), np.ones(len(free)))
+            columns = np.zeros((len(here), len(free)))
+            for place, index in enumerate(free):
+                moved = vector.copy()
+                moved[index] += steps[place]
+                there = rows_of(moved)
+                if there is not None:
+                    columns[:, place] = (there - here) / steps[place]
+            normal = columns.T @ (weight[:, None] * columns)
+            gradient = columns.T @ (weight * here)
+            better = None
+            for _ in range(_SHORTER):
+                step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
+                trial = vector.copy()
+                trial[free] -= np.clip(step, -spread, spread)
+                trial = self.unknowns.within(trial)
+                there = rows_of(trial)
+                if there is not None and cost(there) < cost(here):
+                    better = trial, there
+                    break
+                damping = max(8.0 * damping, 1e-3)
+            if better is None:
+                break
+            gained, damping = cost(here) - cost(better[1]), max(0.2 * damping, 1e-6)
+            vector, here = better
+            if gained < tuning.ENOUGH:
+                break
+        return vector, cost(here)
+
+
+def fit_some_components(
+    forward: Forward, unknowns: Unknowns, poses: Poses, period: float, drift: Array, seed: int = 0
+) -> tuple[Problem, Fit] | None:
+    """Fit poses of which one or two components were never measured; None if no motion comes near them.
+
+    Parameters
+    ----------
+    forward, unknowns : Forward, Unknowns
+        Model under the believed load; prior.
+    poses : Poses
+        The poses, without any value of a component that was not measured.
+    period : float
+        Period of the load in s.
+    drift : ndarray, shape (3,)
+        Spectral density of an unknown acceleration, in m2/s3 and rad2/s3, which links the swings.
+    seed : int
+        Seed of the draws, and of the noise of the assumed values.
+    """
+    rng = np.random.default_rng(seed)
+    whole = _Whole(forward, unknowns, poses, period)
+    end = float(poses.t[0]) + tuning.FIRST_PERIODS * period
+    noise = np.where(whole.measured, whole.noise, _like_measured(whole))
+
+    def refined(shared: Array, end: float, before: Fit | None = None) -> tuple[Problem, Fit] | None:
+        q = whole.motion(shared, len(poses.t))
+        if q is None:
+            return None
+        if before is not None:
+            known = before.point.predicted
+            q[: len(known)] = np.where(np.isfinite(known), known, q[: len(known)])
+        # the assumed values have noise, because the cut into swings compares poses with their noise
+        q = q + shared[BIAS] + np.where(whole.measured, 0.0, noise) * rng.standard_normal(q.shape)
+        some = replace(poses, assumed=q).between(float(poses.t[0]), end)
+        return refine(forward.renewed(), unknowns, some, period, shared, noise, drift, close=True)
+
+    def finished(found: tuple[Problem, Fit], end: float) -> tuple[Problem, Fit]:
+        # each round begins with better values of the missing components
+        for _ in range(tuning.UNMEASURED_ROUNDS):
+            again = None if found[1].finished else refined(found[1].shared, end, found[1])
+            if again is None or again[1].loss > found[1].loss:
+                break
+            found = again
+        return found
+
+    candidates = [refined(vector, end) for vector in _starts(whole, int(np.searchsorted(poses.t, end)), rng)]
+    best = min((one for one in candidates if one is not None), key=lambda one: one[1].loss, default=None)
+    if best is None:
+        return None
+    found = refined(finished(best, end)[1].shared, np.inf)
+    return None if found is None else finished(found, np.inf)
+
+
+def _starts(whole: _Whole, rows: int, rng: np.random.Generator) -> list[Array]:
+    """Return vectors of unknowns whose motions over the first `rows` poses are nearest to the measured one."""
+    drawn, (draws, improved, kept) = [], tuning.UNMEASURED_DRAWS
+    for _ in range(draws):
+        vector = whole.mean + whole.deviation * rng.standard_normal(SIZE)
+        vector[BIAS], vector[DELAY] = 0.0, 0.0
+        vector[SOFTNESS] = np.log(np.exp(rng.uniform(*np.log(tuning.UNMEASURED_DEPTHS))) + tuning.RESOLVED)
+        found = whole.centred(whole.unknowns.within(vector), rows)
+        if found is not None:
+            drawn.append(found)
+    drawn.sort(key=lambda one: one[0])
+    better = []
+    for _, vector in drawn[:improved]:
+        cost = np.inf
+        for share in tuning.UNMEASURED_SCALES:
+            vector, cost = whole.descend(vector, rows, np.maximum(share * whole.size, whole.noise))
+        better.append((cost, vector))
+    return [vector for _, vector in sorted(better, key=lambda one: one[0])[:kept]]
+
+
+def _like_measured(whole: _Whole) -> Array:
+    """Return the noise of all components in m, m, rad if a sensor measured them as well as the measured ones."""
+    arm = geometry.half_diagonal(whole.unknowns.scene)
+    level = float((whole.noise * [1.0, 1.0, arm])[whole.measured].mean())
+    return level * np.array([1.0, 1.0, 1.0 / arm])
