@@ -43,6 +43,8 @@ __all__ = ["TwinBatch"]
 
 _Array = NDArray[np.float64]
 _NO_MARKS = np.zeros(0, np.int64)
+#: Size of a cache line in bytes.
+_LINE = 64
 #: Number of numbers that Python checks one by one in the time of a call of numpy.
 _FEW = 32
 #: Terms that have no effect if their parameters are zero, so that a scene without such a term can run with compiled
@@ -363,8 +365,8 @@ class TwinBatch:
     def _run(self, times: NDArray[np.float64], samples: NDArray[np.float64]) -> NDArray[np.void]:
         """Advance all twins under samples of shape (m or 1, n, 3) and return their rows, shape (m, n)."""
         in_lanes = self._workers[0].lanes is not None
-        # lanes write every field of their rows
-        rows = (np.empty if in_lanes else np.zeros)((len(self), len(times)), ADVANCE if in_lanes else ROW)
+        shape = len(self), len(times)
+        rows = _rows_to_fill(*shape) if in_lanes else np.zeros(shape, ROW)
 
         def run(index: int) -> None:
             worker, (first, last) = self._workers[index], self._edges[index : index + 2]
@@ -441,6 +443,12 @@ def _all_finite(numbers: NDArray[np.float64]) -> bool:
     if numbers.size <= _FEW:
         return all(map(math.isfinite, numbers.ravel().tolist()))
     return bool(np.isfinite(numbers).all())
+
+
+def _rows_to_fill(twins: int, times: int) -> NDArray[np.void]:
+    """Return rows of `ADVANCE` that start at cache lines; lanes write every field of their rows."""
+    memory = np.empty(twins * times * ADVANCE.itemsize + _LINE, np.uint8)
+    return np.ndarray((twins, times), ADVANCE, memory.data, -memory.ctypes.data % _LINE)
 
 
 class _Worker(NamedTuple):
