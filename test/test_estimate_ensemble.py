@@ -53,7 +53,9 @@ def test_a_thinned_load_gives_the_same_forces(noise: float) -> None:
     each = [forces_of(truth.nominal, result, one, 60, 3.1, over_time=False) for one in (load, few)]
     assert each[0].start == each[1].start == pytest.approx(3.1)
     for one, other in ((each[0].peak, each[1].peak), (each[0].impulse, each[1].impulse)):
-        assert other == pytest.approx(one, rel=0.03, abs=1e-3 * float(one.max()))
+        # single members of sixty take another path, which moves the 5 % and 95 % points
+        for value, its, most in zip(one, other, (0.15, 0.03, 0.15), strict=True):
+            assert its == pytest.approx(value, rel=most, abs=1e-3 * float(one.max()))
 
 
 def test_members_are_drawn_with_the_estimate_s_correlation() -> None:
