@@ -48,6 +48,15 @@ def test_data_that_contradict_themselves_are_withdrawn(name: str) -> None:
     assert result.reasons
 
 
+def test_a_small_drift_of_the_sensor_widens_the_interval() -> None:
+    truth = mismatched(replace(KINDS["drift"], periods=6.0, drift_m=1.6e-3), 1)
+    result = estimate(truth.nominal, truth.load, truth.poses)
+    assert any("shifted within the window" in reason for reason in result.reasons)
+    assert result.horizontal_state is result.vertical_state is State.ROUGH
+    for value, true in zip((result.horizontal, result.vertical), truth.clearance, strict=True):
+        assert value.deviation < 1e-3 and abs(value.mean - true) < 2.0 * value.deviation
+
+
 @pytest.mark.parametrize(
     "name",
     [

@@ -696,7 +696,10 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
     if beside is not None:
         published = np.maximum(beside.clearance, LEAST_CLEARANCE)
         spread = np.hypot(beside.clearance_deviation, _between_optima(problem, shared))
-    spread = np.hypot(spread, _unseen(fit))
+    # a change at an unknown moment moves the mean over the window by a uniformly distributed share of it
+    moved = verdict.changed / math.sqrt(3.0)
+    deviation[[GX, GY]] = np.hypot(deviation[[GX, GY]], moved)
+    spread = np.hypot(np.hypot(spread, moved), _unseen(fit))
     reasons = verdict.model + verdict.sensor + ([verdict.lacking] if verdict.lacking else [])
     if not finished and not suspect:
         gain = f"the cost would still fall by {fit.gain_left:.0f}, expected at most {tuning.OUTLYING**2:g}"

@@ -20,6 +20,7 @@ from plow_twin.estimate.measurements import FEWEST_FOR_SCATTER, FEWEST_POSES, Po
 from plow_twin.estimate.scales import scales_of
 from plow_twin.estimate.start import noise_level
 from plow_twin.estimate.unknowns import BIAS, DAMPING, GAIN, GX, GY, SIZE, SOFTNESS, with_other_law
+from plow_twin.model import geometry
 from plow_twin.solve.compiled_scene import inertias
 
 Array = NDArray[np.float64]
@@ -38,6 +39,7 @@ class Verdict:
     by_scale : whether the scales are the sensor's only fault
     broken : whether the sensor fails or the data contradict themselves, so that no estimate is possible
     lacking : the clearest harmonic that the measured load lacks and the fit includes
+    changed : (2,) small change of the clearances within the window in m, or of the bias along x and y
     """
 
     model: list[str] = field(default_factory=list)
@@ -46,6 +48,7 @@ class Verdict:
     by_scale: bool = False
     broken: bool = False
     lacking: str = ""
+    changed: Array = field(default_factory=lambda: np.zeros(2))
 
 
 def judge(problem: Problem, fit: Fit, period: float) -> Verdict:
@@ -256,15 +259,19 @@ def _change_within(problem: Problem, fit: Fit, verdict: Verdict) -> None:
     verdict.figures["change_share"] = share
     if max(bias, clearance) < tuning.CHANGE_CHI2:
         return
-    found = len(verdict.sensor) + len(verdict.model)
-    if bias >= clearance and (np.abs(shift) * [1.0, 1.0, 0.2]).max() > 0.5 * tuning.OBSERVED:
+    moved = np.hypot(shift[:2], geometry.half_diagonal(problem.unknowns.scene) * shift[2])
+    changed = np.zeros(2)
+    if bias >= clearance and moved.max() > 0.5 * tuning.OBSERVED:
         verdict.sensor.append(f"shifted within the window by {shift[0]:.2g} m, {shift[1]:.2g} m, {shift[2]:.2g} rad")
+        changed = moved
     elif clearance > bias and np.abs(growth).max() > 0.5 * tuning.OBSERVED:
         verdict.model.append(f"machine changed within the window: clearances by {growth[0]:.2g} m, {growth[1]:.2g} m")
+        changed = np.abs(growth)
     # residuals of a wrong load or law also resemble a change, but only a real change explains a large share of them
-    verdict.broken |= (
-        len(verdict.sensor) + len(verdict.model) > found and share > tuning.CHANGE_SHARE and _felt(problem, fit)
-    )
+    if changed.any() and share > tuning.CHANGE_SHARE and _felt(problem, fit):
+        # an interval can allow for a change that is smaller than the deviation of a rough clearance
+        verdict.broken |= bool(changed.max() > 2.0 * tuning.OBSERVED)
+        verdict.changed = changed
 
 
 def _felt(problem: Problem, fit: Fit) -> bool:
