@@ -281,11 +281,12 @@ def test_sparse_or_noisy_poses_give_no_narrow_interval_beside_the_truth(missing:
         assert state is not State.ESTIMATED or abs(value.mean - true) < 1.5 * (value.p95 - value.p05)
 
 
-def test_a_pose_with_a_large_stated_deviation_does_not_make_the_model_suspect() -> None:
+def test_a_component_with_a_large_stated_deviation_is_not_used() -> None:
     truth, _ = known()[0]
     result = estimate(truth.nominal, truth.load, Poses(truth.poses.t, truth.poses.q, (1.0, 1e-3, 1e-3)))
-    assert result.horizontal_state is result.vertical_state is State.NOT_OBSERVABLE and result.model == "ok"
-    assert result.reasons == ("x: stated deviation 1, expected at most 0.05",)
+    assert result.reasons == ("x: stated deviation 1, expected at most 0.05",) and result.model == "ok"
+    for value, true in zip((result.horizontal, result.vertical), truth.clearance, strict=True):
+        assert abs(value.mean - true) < 3.0 * value.deviation < 1e-3
 
 
 def test_a_silence_of_the_load_is_not_bridged() -> None:
@@ -341,16 +342,6 @@ def test_a_fit_that_cannot_be_computed_is_withdrawn(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(Arrow, "factorised", singular)
     result = estimate(truth.nominal, truth.load, truth.poses)
     assert result.horizontal_state is State.WITHDRAWN and "Singular matrix" in result.reasons[0]
-
-
-def test_a_component_never_measured_is_named_and_nothing_is_estimated() -> None:
-    truth, _ = known()[0]
-    q = truth.poses.q.copy()
-    q[:, 0] = np.nan
-    result = estimate(truth.nominal, truth.load, Poses(truth.poses.t, q))
-    assert result.horizontal_state is result.vertical_state is State.NOT_OBSERVABLE
-    assert result.reasons == ("x: measured 0 times, expected at least 20",)
-    assert result.horizontal.p05 < truth.clearance[0] < result.horizontal.p95
 
 
 def test_a_rough_load_costs_little_accuracy() -> None:
