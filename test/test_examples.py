@@ -35,7 +35,7 @@ def test_every_example_is_listed_and_has_a_short_readme() -> None:
 
 
 #: Examples that compile kernels of their own or take minutes.
-LONG = ("a_year", "calibration", "measured_drop", "own_contact_law")
+LONG = ("a_year", "calibration", "measured_drop")
 
 
 @pytest.mark.timeout(250)
