@@ -28,6 +28,7 @@ def test_the_believed_load_gives_clearances_where_components_are_missing(
     assert result.reasons == tuple(
         f"{COMPONENTS[index]}: measured {kept} times, expected at least 20" for index in missing
     )
+    assert result.motion is not None and np.isfinite(result.motion.model).mean() > 0.9
     for value, true in zip((result.horizontal, result.vertical), truth.clearance, strict=True):
         assert value.deviation < most and abs(value.mean - true) < 3.0 * value.deviation
 

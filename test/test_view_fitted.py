@@ -65,6 +65,16 @@ def test_without_a_fit_the_residuals_say_so(picture: FittedPicture) -> None:
     assert not any(axis.lines or axis.get_legend() or axis.get_yticks().size for axis in below)
 
 
+def test_a_component_that_was_not_measured_has_a_fitted_motion_without_residuals(picture: FittedPicture) -> None:
+    measured = picture.motion.measured.copy()
+    measured[:, 2] = np.nan
+    figure = replace(picture, motion=Motion(picture.motion.t, measured, picture.motion.model)).figure()
+    below = [axis for axis in figure.axes if axis.get_ylabel().startswith("residual")]
+    assert [[text.get_text() for text in axis.texts] for axis in below] == [[], [], ["not measured"]]
+    angle = next(axis for axis in figure.axes if axis.get_ylabel() == "θ [mrad]")
+    assert "fitted" in angle.get_legend_handles_labels()[1]
+
+
 def test_its_rerun_file_has_the_same_numbers(picture: FittedPicture, tmp_path: Path) -> None:
     write_fit_picture(picture, tmp_path / "fit.rrd")
     rows, table = {}, ""

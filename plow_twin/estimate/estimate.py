@@ -763,7 +763,7 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
             "gain_left": fit.gain_left,
             "work": float(problem.forward.work),
         },
-        motion=Motion(poses.t, poses.q, poses.q - fit.point.residual),
+        motion=Motion(poses.t, poses.q, fit.point.predicted + fit.shared[BIAS]),
     )
     if forces is None:
         return result

@@ -145,7 +145,7 @@ class Motion:
     """The measured motion, and the model's motion as the sensor would show it, that is with bias and delay.
 
     t : (n,) stamps in s
-    measured, model : (n, 3) x, y in m, theta in rad; NaN where nothing was measured or the model was not fitted
+    measured, model : (n, 3) x, y in m, theta in rad; NaN where not measured, and where the model was not fitted
     """
 
     t: Array

@@ -114,7 +114,8 @@ class FittedPicture:
         legend_beside(above)
         below.set_ylabel(f"residual\n[{unit}]")
         if not np.isfinite(residual).any():
-            below.text(0.5, 0.5, "no fit", transform=below.transAxes, ha="center", va="center", color="0.4")
+            missing = "not measured" if np.isfinite(model).any() else "no fit"
+            below.text(0.5, 0.5, missing, transform=below.transAxes, ha="center", va="center", color="0.4")
             below.set_yticks([])
             return
         below.plot(motion.t, residual, ".", ms=1.5, color="tab:red", label="measured − fitted")
