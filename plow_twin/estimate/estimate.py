@@ -122,7 +122,7 @@ def estimate_window(
     found = units.in_si(found, scene)
     if units.only_time and found.sensor == "ok":
         # the machine has the paper's size but a faster or slower load, so impacts last as long as in the paper
-        period = min(load.period(), float(poses.t[-1] - poses.t[0]))
+        period = _period(load, poses)
         unknowns = Unknowns.stated(scene, load, poses)
         found = under_uncertain_load(found, unknowns, thinned(load, period)[0], poses, period)
     return found, following
@@ -201,20 +201,16 @@ def _from_motion(
     if some is not None and not _is_dead(load, some):
         return _from_some_components(unknowns, load, some, lost, lacking), ()
     if lacking:
-        nothing = prior_of(unknowns, (float(poses.t[0]), float(poses.t[-1])), lost)
-        unseen = State.NOT_OBSERVABLE
-        return replace(nothing, horizontal_state=unseen, vertical_state=unseen, reasons=lacking), ()
+        return _not_observable(unknowns, poses, lost, lacking), ()
     if _is_dead(load, poses):
         return _without_fit(unknowns, poses, lost, "load: the same value throughout, while the head moves"), ()
     if _is_idle(scene, load, poses):
-        nothing = prior_of(unknowns, (float(poses.t[0]), float(poses.t[-1])), lost)
-        unseen, why = State.NOT_OBSERVABLE, "the head rests under a load that hardly changes"
-        return replace(nothing, horizontal_state=unseen, vertical_state=unseen, reasons=(why,)), ()
+        return _not_observable(unknowns, poses, lost, ("the head rests under a load that hardly changes",)), ()
     if _rests(poses):
         return _without_fit(
             unknowns, poses, lost, "the head rests under a load that changes: the head or its sensor is stuck"
         ), ()
-    period = min(load.period(), float(poses.t[-1] - poses.t[0]))
+    period = _period(load, poses)
     felt, broad = thinned(load, period)
     drift = tuning.LEFT_OPEN * np.array(felt.unknown) / np.asarray(inertias(scene)) ** 2 if broad else None
     forward = Forward(scene, felt)
@@ -249,7 +245,7 @@ def _from_some_components(
     If no motion under the believed load comes near the measured one, x and y are compared with motions under errors of
     the load.
     """
-    period = min(load.period(), float(poses.t[-1] - poses.t[0]))
+    period = _period(load, poses)
     felt, _ = thinned(load, period)
     share, time = tuning.UNMEASURED_LOAD
     drift = 2.0 * time * (share * load.wrench.std(axis=0) / np.asarray(inertias(unknowns.scene))) ** 2
@@ -258,11 +254,10 @@ def _from_some_components(
         result = summarise(*found, judge(*found, period), lost)
         if _known(result):
             return replace(result, reasons=(*lacking, *result.reasons))
-    nothing = replace(prior_of(unknowns, (float(poses.t[0]), float(poses.t[-1])), lost), reasons=lacking)
     if poses.measured[:2].all():
+        nothing = replace(prior_of(unknowns, (float(poses.t[0]), float(poses.t[-1])), lost), reasons=lacking)
         return under_uncertain_load(nothing, unknowns, felt, poses, period)
-    unseen = State.NOT_OBSERVABLE
-    return replace(nothing, horizontal_state=unseen, vertical_state=unseen)
+    return _not_observable(unknowns, poses, lost, lacking)
 
 
 def _searched(
@@ -313,6 +308,11 @@ def _searched(
         result = under_uncertain_load(result, unknowns, forward.load, poses, period, found)
     following = () if verdict.model or verdict.sensor or verdict.lacking else _next_guess(*found)
     return result if bounced is None else with_bounced(result, bounced, spent), following
+
+
+def _period(load: Load, poses: Poses) -> float:
+    """Return the load's period in s, at most the span of the poses."""
+    return min(load.period(), float(poses.t[-1] - poses.t[0]))
 
 
 def _fails(found: Fit, verdict: Verdict) -> bool:
@@ -996,6 +996,12 @@ def _rests(poses: Poses) -> bool:
     """Return whether the last three quarters of the poses are only noise."""
     q = filled(poses)[len(poses.t) // 4 :, poses.measured]
     return bool((q.std(axis=0) < tuning.RESTS * noise_level(q)).all())
+
+
+def _not_observable(unknowns: Unknowns, poses: Poses, lost: int, reasons: tuple[str, ...]) -> Estimate:
+    """Return the prior as an estimate from data that cannot show the clearances."""
+    nothing, unseen = prior_of(unknowns, (float(poses.t[0]), float(poses.t[-1])), lost), State.NOT_OBSERVABLE
+    return replace(nothing, horizontal_state=unseen, vertical_state=unseen, reasons=reasons)
 
 
 def _without_fit(

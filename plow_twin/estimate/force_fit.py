@@ -244,10 +244,9 @@ class _Joint:
             normal, score = weighted.T @ rows, weighted.T @ residual[inside]
             normal[np.ix_(places, places)] += piece.weighted.T @ piece.rows
             score[places] += piece.weighted.T @ piece.residual
-            normal[border:, border:] += np.diag(self._problem.start_spread**-2)
-            score[border:] += (self._problem.window.states - at.place.states)[
-                piece.swing
-            ] / self._problem.start_spread**2
+            spread, moved = self._problem.start_spread, self._problem.window.states - at.place.states
+            normal[border:, border:] += np.diag(spread**-2)
+            score[border:] += moved[piece.swing] / spread**2
             out.append(_Block.of(normal, score, border))
         return out
 

@@ -74,50 +74,62 @@ class _Whole:
         return float(np.minimum(left**2, 1.0).mean()), vector
 
     def descend(self, vector: Array, rows: int, scale: Array) -> tuple[Array, float]:
-        """Return an improved vector, and Huber's function of its residuals relative to `scale`, shape (3,)."""
-        free, spread = self.free, self.deviation[self.free]
-        steps, damping = _STEPS[free], 1e-2
-
-        def rows_of(vector: Array) -> Array | None:
-            error = self.residual(vector, rows)
-            prior = (vector - self.mean)[free] / spread
-            return None if error is None else np.concatenate([(error / scale[self.measured]).ravel(), prior])
-
-        def cost(rows: Array) -> float:
-            return float(huber_loss(np.abs(rows[: -len(free)])).sum() + np.square(rows[-len(free) :]).sum())
-
-        here = rows_of(vector)
+        """Return an improved vector, and the cost of its residuals relative to `scale`, shape (3,)."""
+        here, damping = self._normalised(vector, rows, scale), 1e-2
         if here is None:
             return vector, np.inf
         for _ in range(tuning.UNMEASURED_STEPS):
-            weight = np.append(huber_weight(np.abs(here[: -len(free)])), np.ones(len(free)))
-            columns = np.zeros((len(here), len(free)))
-            for place, index in enumerate(free):
-                moved = vector.copy()
-                moved[index] += steps[place]
-                there = rows_of(moved)
-                if there is not None:
-                    columns[:, place] = (there - here) / steps[place]
-            normal = columns.T @ (weight[:, None] * columns)
-            gradient = columns.T @ (weight * here)
-            better = None
-            for _ in range(_SHORTER):
-                step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
-                trial = vector.copy()
-                trial[free] -= np.clip(step, -spread, spread)
-                trial = self.unknowns.within(trial)
-                there = rows_of(trial)
-                if there is not None and cost(there) < cost(here):
-                    better = trial, there
-                    break
-                damping = max(8.0 * damping, 1e-3)
+            better, damping = self._better(vector, here, rows, scale, damping)
             if better is None:
                 break
-            gained, damping = cost(here) - cost(better[1]), max(0.2 * damping, 1e-6)
+            gained = self._cost(here) - self._cost(better[1])
             vector, here = better
             if gained < tuning.ENOUGH:
                 break
-        return vector, cost(here)
+        return vector, self._cost(here)
+
+    def _better(
+        self, vector: Array, here: Array, rows: int, scale: Array, damping: float
+    ) -> tuple[tuple[Array, Array] | None, float]:
+        """Return a vector of less cost with its residuals, or None, and the damping for the next step."""
+        free, spread, normal, gradient = (
+            self.free,
+            self.deviation[self.free],
+            *self._equations(vector, here, rows, scale),
+        )
+        for _ in range(_SHORTER):
+            step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
+            trial = vector.copy()
+            trial[free] -= np.clip(step, -spread, spread)
+            trial = self.unknowns.within(trial)
+            there = self._normalised(trial, rows, scale)
+            if there is not None and self._cost(there) < self._cost(here):
+                return (trial, there), max(0.2 * damping, 1e-6)
+            damping = max(8.0 * damping, 1e-3)
+        return None, damping
+
+    def _normalised(self, vector: Array, rows: int, scale: Array) -> Array | None:
+        """Return the residuals relative to `scale`, and then those of the prior; None if the vector cannot be run."""
+        error = self.residual(vector, rows)
+        prior = ((vector - self.mean) / self.deviation)[self.free]
+        return None if error is None else np.concatenate([(error / scale[self.measured]).ravel(), prior])
+
+    def _cost(self, normalised: Array) -> float:
+        """Return Huber's function of the residuals plus the squares of the prior's."""
+        error, prior = np.split(normalised, [-len(self.free)])
+        return float(huber_loss(np.abs(error)).sum() + np.square(prior).sum())
+
+    def _equations(self, vector: Array, here: Array, rows: int, scale: Array) -> tuple[Array, Array]:
+        """Return matrix and right-hand side of the normal equations for the free unknowns."""
+        columns = np.zeros((len(here), len(self.free)))
+        for place, index in enumerate(self.free):
+            moved = vector.copy()
+            moved[index] += _STEPS[index]
+            there = self._normalised(moved, rows, scale)
+            if there is not None:
+                columns[:, place] = (there - here) / _STEPS[index]
+        weight = np.append(huber_weight(np.abs(here[: -len(self.free)])), np.ones(len(self.free)))
+        return columns.T @ (weight[:, None] * columns), columns.T @ (weight * here)
 
 
 def fit_some_components(
